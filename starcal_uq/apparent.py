@@ -1,11 +1,12 @@
 """From catalogue directions to apparent ones: the Earth's velocity and the aberration of light.
 
-An observer that moves with velocity v sees every star displaced towards v by up to v/c: 20.5 arcsec for the Earth. The
-attitude absorbs the mean displacement of a frame; its change across the field (3.6 arcsec over 10 degrees) stretches the
-star pattern and would otherwise end up in the focal length.
+An observer that moves with velocity v sees every star displaced towards v by up to v/c: 20.5 arcsec for the Earth.
+The attitude absorbs the mean displacement of a frame; its change across the field (3.6 arcsec over 10 degrees)
+stretches the star pattern and would otherwise end up in the focal length.
 
-Not modelled: the deflection of light by the Sun (4 mas at 90 degrees from the Sun, 15 mas at 30), annual parallax (0.75
-arcsec for the nearest star, below 0.1 arcsec for all but a few dozen stars of naked-eye brightness) and refraction.
+Not modelled: the deflection of light by the Sun (4 mas at 90 degrees from the Sun, 15 mas at 30), annual parallax
+(0.75 arcsec for the nearest star, below 0.1 arcsec for all but a few dozen stars of naked-eye brightness) and
+refraction.
 """
 
 from __future__ import annotations
@@ -43,14 +44,14 @@ def earth_velocity_km_s(time_utc: Any) -> FloatArray:
     Parameters
     ----------
     time_utc
-        One UTC time or a sequence of them: ISO 8601 text ("2026-11-21T03:04:05.6", a trailing "Z" or an offset such as
-        "+02:00" is understood), `datetime.datetime` or `numpy.datetime64`. A time without an offset is UTC.
+        One UTC time or a sequence of them: ISO 8601 text ("2026-11-21T03:04:05.6", a trailing "Z" or an offset such
+        as "+02:00" is understood), `datetime.datetime` or `numpy.datetime64`. A time without an offset is UTC.
 
     Returns
     -------
     ndarray, shape (3,) for one time, (n, 3) for a sequence
-        Velocity in km/s, from `erfa.epv00` (a fit to DE405, good to 5 mm/s between 1900 and 2100). TT stands for TDB: their
-        difference of 2 ms moves the velocity by 1e-8 km/s.
+        Velocity in km/s, from `erfa.epv00` (a fit to DE405, good to 5 mm/s between 1900 and 2100). TT stands for
+        TDB: their difference of 2 ms moves the velocity by 1e-8 km/s.
 
     Raises
     ------
@@ -82,7 +83,8 @@ def aberrate(directions: FloatArray, velocity_km_s: FloatArray | Sequence[float]
     Returns
     -------
     ndarray, same shape as `directions`
-        Unit vectors, from `erfa.ab`. Its gravitational term is that of an observer 1 au from the Sun, 0.4 micro-arcsec.
+        Unit vectors, from `erfa.ab`. Its gravitational term is that of an observer 1 au from the Sun, 0.4
+        micro-arcsec.
 
     Raises
     ------
@@ -91,7 +93,7 @@ def aberrate(directions: FloatArray, velocity_km_s: FloatArray | Sequence[float]
     """
     import erfa
 
-    velocity = check_velocity(velocity_km_s) / LIGHT_SPEED_KM_S
+    velocity = check_velocity(velocity_km_s, len(directions) if directions.ndim == 2 else None) / LIGHT_SPEED_KM_S
     inverse_gamma = np.sqrt(1.0 - np.sum(velocity**2, axis=-1))
     return np.asarray(erfa.ab(directions, velocity, SUN_DISTANCE_AU, inverse_gamma), dtype=np.float64)
 
@@ -106,7 +108,8 @@ def make_apparent(
     Parameters
     ----------
     obs
-        Observations with catalogue directions and a `time_utc` in every row.
+        Observations with a `time_utc` in every row, whose directions are those of a catalogue (undeclared ones are
+        taken to be).
     observer_velocity_km_s
         Velocity relative to the Earth's centre, ICRS axes, km/s, shape (3,) or one row for each observation; zero by
         default. A low orbit adds 7.6 km/s (5 arcsec), a site on the ground at most 0.47 km/s (0.3 arcsec).
@@ -114,8 +117,8 @@ def make_apparent(
     Returns
     -------
     Observations
-        The same rows; `meta["directions"]` is "apparent", `meta["observer_velocity_km_s"]` is the mean of the barycentric
-        velocities that were applied, one for each row.
+        The same rows; `meta["directions"]` is "apparent", `meta["observer_velocity_km_s"]` is the mean of the
+        barycentric velocities that were applied, one for each row.
 
     Raises
     ------
@@ -140,7 +143,7 @@ def make_apparent(
     except CatalogueError as error:
         raise ObservationError(f"Column 'time_utc': {error}", column="time_utc") from error
     if observer_velocity_km_s is not None:
-        velocity = velocity + check_velocity(observer_velocity_km_s)
+        velocity = velocity + check_velocity(observer_velocity_km_s, len(obs))
     ra, dec = ra_dec_deg(aberrate(unit_vectors(obs.ra_deg, obs.dec_deg), velocity))
     mean = [float(component) for component in velocity.mean(axis=0)]
     return replace(
@@ -148,19 +151,25 @@ def make_apparent(
     )
 
 
-def check_velocity(velocity_km_s: FloatArray | Sequence[float]) -> FloatArray:
-    """The velocity as an array of shape (3,) or (n, 3), or a CatalogueError that says what is wrong with it."""
+def check_velocity(velocity_km_s: FloatArray | Sequence[float], rows: int | None = None) -> FloatArray:
+    """The velocity as an array, or a CatalogueError that says what is wrong with it.
+
+    Its shape must be (3,), or (rows, 3) where `rows` directions are given.
+    """
     try:
         velocity = np.asarray(velocity_km_s, dtype=np.float64)
     except (TypeError, ValueError):
         velocity = np.empty(0)
-    if velocity.ndim not in (1, 2) or velocity.shape[-1] != 3 or not np.isfinite(velocity).all():
+    shapes: tuple[tuple[int, ...], ...] = ((3,),) if rows is None else ((3,), (rows, 3))
+    if velocity.shape not in shapes or not np.isfinite(velocity).all():
         raise CatalogueError(
-            f"The observer's velocity must be three finite numbers in km/s (ICRS axes), not {velocity_km_s!r}."
+            "The observer's velocity must be three finite numbers in km/s (ICRS axes)"
+            + (f", or {rows} rows of them" if rows is not None else "")
+            + f"; it is {np.array2string(np.asarray(velocity_km_s), threshold=6)}."
         )
     fastest = float(np.sqrt((velocity**2).sum(axis=-1)).max(initial=0.0))
     if fastest > MAX_VELOCITY_KM_S:
-        raise CatalogueError(f"An observer's velocity of {fastest:.6g} km/s is not believable; give it in km/s, not m/s.")
+        raise CatalogueError(f"An observer's velocity of {fastest:.6g} km/s is not believable; was it in m/s?")
     return velocity
 
 

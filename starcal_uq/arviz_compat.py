@@ -1,8 +1,8 @@
 """The only importer of ArviZ: one set of functions over ArviZ 0.23 (`InferenceData`) and 1.x (`DataTree`).
 
-What differs between them and is settled here: the container of draws; `hdi_prob` that became `ci_prob`; a default
-`prob` of the tail ESS that went away; and Pareto smoothing, which takes log weights in 0.23 and *negated* log weights in
-1.x, without complaint when given the wrong ones.
+What differs between them and is settled here: the container of draws; the name of the probability of an interval; a
+default `prob` of the tail ESS that went away; and Pareto smoothing, which takes log weights in 0.23 and *negated* log
+weights in 1.x, without complaint when given the wrong ones.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Rotations as arrays: matrices, scalar-last quaternions and small left rotation vectors.
 
-Conventions: ``R_cam_icrs`` maps ICRS vectors to the camera frame, b = R r. Quaternions are (x, y, z, w) with the sense
-of ``scipy.spatial.transform.Rotation``. An attitude error is the *left* (camera-frame) rotation vector phi in
-R' = exp([phi]x) R: phi_x is pitch, phi_y yaw and phi_z roll about the boresight. Every function takes any number of
-leading axes.
+Conventions: ``R_cam_icrs`` maps ICRS vectors to the camera frame, b = R r. Quaternions are (x, y, z, w) with the
+sense of ``scipy.spatial.transform.Rotation``. An attitude error is the *left* (camera-frame) rotation vector phi
+in R' = exp([phi]x) R: phi_x is pitch, phi_y yaw and phi_z roll about the boresight. Every function takes any
+number of leading axes.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from starcal_uq._types import FloatArray
 def rotation_to_quaternion(rotation: FloatArray) -> FloatArray:
     """Quaternions of rotation matrices.
 
-    Of the four algebraically equal formulas the one with the largest divisor is used, matrix by matrix (Shepperd 1978),
-    so that half turns lose no digits.
+    Of the four algebraically equal formulas the one with the largest divisor is used, matrix by matrix (Shepperd
+    1978), so that half turns lose no digits.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def quaternion_vector(quaternion: FloatArray) -> FloatArray:
 
 
 def left_error(quaternion: FloatArray, reference: FloatArray) -> FloatArray:
-    """Camera-frame rotation vectors phi (..., 3) rad with R(quaternion) = exp([phi]x) R(reference); both (..., 4)."""
+    """Camera-frame rotation vectors phi (..., 3) rad, R(quaternion) = exp([phi]x) R(reference)."""
     conjugate = np.asarray(reference, dtype=float) * np.array([-1.0, -1.0, -1.0, 1.0])
     return quaternion_vector(quaternion_multiply(quaternion, conjugate))
 

@@ -20,14 +20,10 @@ from numpy.typing import ArrayLike
 
 from starcal_uq._types import BoolArray, FloatArray
 from starcal_uq.camera_files import camera_text, parse_table, read_camera
+from starcal_uq.camera_opencv import from_opencv, to_opencv
 from starcal_uq.distortion import get_model, parameter_names
 from starcal_uq.errors import CameraError, DistortionError
 from starcal_uq.runfolder import atomic_write_text, ensure_new
-
-# Place in OpenCV's (k1, k2, p1, p2, k3), and the power of f that makes our coefficient dimensionless.
-_OPENCV = {"k1": (0, 2), "k2": (1, 4), "p1": (2, 1), "p2": (3, 1), "k3": (4, 6)}
-# fx and fy of one focal length may differ by rounding in a text file, not by more.
-_SQUARE_RTOL = 1e-9
 
 
 @dataclass(frozen=True)
@@ -242,19 +238,7 @@ class Camera:
         CameraError
             For an inverse distortion model, which OpenCV has not.
         """
-        model = get_model(self.distortion)
-        if model.direction != "forward":
-            raise CameraError(
-                f"camera: distortion {self.distortion!r} maps distorted to ideal points, which OpenCV has no "
-                "coefficients for; calibrate with 'brown' to use OpenCV."
-            )
-        f = self.focal_px
-        matrix = np.array([[f, 0.0, self.x0_px], [0.0, f, self.y0_px], [0.0, 0.0, 1.0]])
-        dist = np.zeros(5)
-        for coefficient, value in zip(model.coefficients, self.coefficients, strict=True):
-            index, power = _OPENCV[coefficient.name]
-            dist[index] = value * f**power
-        return matrix, dist
+        return to_opencv(self.distortion, self.theta)
 
     @classmethod
     def from_opencv(
@@ -287,47 +271,16 @@ class Camera:
         CameraError
             For fx != fy, skew, or coefficients that the distortion model cannot hold.
         """
-        matrix = np.asarray(camera_matrix, dtype=np.float64)
-        if matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)):
-            raise CameraError("camera_matrix: give a 3x3 matrix of finite numbers.")
-        f, fy = float(matrix[0, 0]), float(matrix[1, 1])
-        if abs(fy - f) > _SQUARE_RTOL * abs(f):
-            raise CameraError(
-                f"camera_matrix: fx = {f!r} and fy = {fy!r} differ, but pixels are square here; "
-                "repeat OpenCV's calibration with CALIB_FIX_ASPECT_RATIO."
-            )
-        if matrix[0, 1] != 0.0 or matrix[1, 0] != 0.0 or tuple(matrix[2]) != (0.0, 0.0, 1.0):
-            raise CameraError(
-                "camera_matrix: it has skew or a scaled last row; give [[f, 0, x0], [0, f, y0], [0, 0, 1]]."
-            )
-        if f <= 0.0:
-            raise CameraError(f"camera_matrix: the focal length is {f!r}; it must be above 0.")
-        dist = np.zeros(0) if dist_coeffs is None else np.asarray(dist_coeffs, dtype=np.float64).ravel()
-        if np.any(dist[5:] != 0.0):
-            raise CameraError(
-                "dist_coeffs: rational, thin-prism and tilt terms have no counterpart here; "
-                "repeat OpenCV's calibration without those flags."
-            )
-        dist = np.concatenate([dist, np.zeros(5)])[:5]
-        values = {key: float(dist[index]) / f**power for key, (index, power) in _OPENCV.items()}
-        model = get_model(distortion or _smallest_model(values))
-        own = [c.name for c in model.coefficients]
-        left_out = [key for key, value in values.items() if value != 0.0 and key not in own]
-        if left_out or model.direction != "forward":
-            raise CameraError(
-                f"dist_coeffs: distortion {model.name!r} cannot hold "
-                f"{', '.join(left_out) or 'forward coefficients'}; choose another distortion, or repeat OpenCV's "
-                "calibration with k3, or p1 and p2, fixed at zero."
-            )
+        model, theta = from_opencv(camera_matrix, dist_coeffs, distortion)
         return cls(
             width_px=width_px,
             height_px=height_px,
             pixel_um=pixel_um,
-            focal_mm=f * pixel_um / 1000.0,
-            x0_px=float(matrix[0, 2]),
-            y0_px=float(matrix[1, 2]),
-            distortion=model.name,
-            coefficients=tuple(values[key] for key in own),
+            focal_mm=theta[2] * pixel_um / 1000.0,
+            x0_px=theta[0],
+            y0_px=theta[1],
+            distortion=model,
+            coefficients=tuple(theta[3:]),
             name=name,
         )
 
@@ -344,12 +297,6 @@ class Camera:
         rows += [(c.name, f"{k:.6g} {c.unit}") for c, k in zip(coefficients, self.coefficients, strict=True)]
         body = "".join(f"<tr><th>{key}</th><td>{value}</td></tr>" for key, value in rows)
         return f"<table><caption>{html.escape(self.name or 'Camera')}</caption>{body}</table>"
-
-
-def _smallest_model(values: Mapping[str, float]) -> str:
-    if values["p1"] != 0.0 or values["p2"] != 0.0:
-        return "brown_tangential"
-    return "brown3" if values["k3"] != 0.0 else "brown"
 
 
 def _whole(key: str, value: Any) -> int:

@@ -113,8 +113,10 @@ def parse_table(table: Mapping[str, Any], where: str) -> dict[str, Any]:
         values = _schema(distortion).model_validate(dict(table)).model_dump()
     except ValidationError as error:
         problems = [_problem(e, distortion) for e in error.errors()]
-        more = f" ({len(problems) - 1} more bad keys)" if len(problems) > 1 else ""
-        raise CameraError(f"{where}: {problems[0]}{more}{'' if problems[0].endswith('?') else '.'}") from None
+        others = len(problems) - 1
+        more = f" ({others} more bad key{'s' if others > 1 else ''})" if others else ""
+        end = "" if problems[0].endswith("?") and not more else "."
+        raise CameraError(f"{where}: {problems[0]}{more}{end}") from None
     values["coefficients"] = tuple(values.pop(c.name) for c in coefficients)
     return values
 
@@ -128,7 +130,7 @@ def read_camera(path: str | os.PathLike[str]) -> dict[str, Any]:
         If the file cannot be read, is no TOML, has no [camera] section, or its section is wrong.
     """
     path = Path(path)
-    if path.is_dir():
+    if os.path.isdir(path):
         raise CameraError(f"{path}: is a directory; name the camera's TOML file.")
     try:
         text = path.read_bytes().decode("utf-8-sig")
@@ -153,9 +155,7 @@ def read_camera(path: str | os.PathLike[str]) -> dict[str, Any]:
         raise CameraError(f"{path}: camera is no section; write [camera] above the camera's keys.")
     if content:
         first = next(iter(content))
-        raise CameraError(
-            f"{path}: {first} stands outside section [camera]; remove it or move it below [camera]."
-        )
+        raise CameraError(f"{path}: {first} stands outside section [camera]; remove it or move it below [camera].")
     return parse_table(section, f"{path}, section [camera]")
 
 

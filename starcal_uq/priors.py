@@ -275,9 +275,7 @@ class Priors:
 
 
 _FIELDS = tuple(field.name for field in dataclasses.fields(Priors))
-_POSITIVE = tuple(
-    name for name in _FIELDS if name not in ("principal_point_centre_px", "distortion", "per_star_sigma")
-)
+_POSITIVE = tuple(name for name in _FIELDS if name not in ("principal_point_centre_px", "distortion", "per_star_sigma"))
 _IN_FILES = tuple(name for name in _FIELDS if name not in ("distortion", "per_star_sigma"))
 
 

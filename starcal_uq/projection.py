@@ -23,7 +23,8 @@ from starcal_uq.errors import DistortionError
 from starcal_uq.kernels import Kernel, build_kernel
 
 _NEWTON_STEPS = 60
-_NEWTON_TOLERANCE_PX = 1e-12
+# The kernels take one more Newton step from the root, which squares the error of the root.
+_NEWTON_TOLERANCE_PX = 1e-8
 
 
 @dataclass(frozen=True)
@@ -199,10 +200,10 @@ def solve_displacement(
             moved[:, determinant[0] <= 0.0] = np.nan
             change = np.nanmax(np.abs(moved - point), initial=0.0)
             point = moved
-            if change < _NEWTON_TOLERANCE_PX * max(1.0, float(np.nanmax(np.abs(target), initial=0.0))):
+            if change < _NEWTON_TOLERANCE_PX:
                 return point
-        point = np.where(np.abs(moved - kernel(n, theta, target, moved)[0]) < 1e-9, moved, np.nan)
-    return point
+        settled = np.abs(point - kernel(n, theta, target, point)[0]).max(axis=0) < _NEWTON_TOLERANCE_PX
+    return np.where(settled, point, np.nan)
 
 
 def forward_root(model_name: str, theta: FloatArray, b: FloatArray) -> FloatArray:

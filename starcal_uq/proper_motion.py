@@ -19,8 +19,9 @@ def propagate_proper_motion(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Positions and proper motions after a time: uniform motion in space with no radial velocity.
 
-    The star moves along the straight line u + mu t in space, on a great circle of the sky, so that nothing special happens
-    near the poles (The Hipparcos Catalogue, ESA 1997, volume 1, section 1.5.5, with its radial terms left out).
+    The star moves along the straight line u + mu t in space, on a great circle of the sky, so that nothing special
+    happens near the poles (The Hipparcos Catalogue, ESA 1997, volume 1, section 1.5.5, with its radial terms left
+    out).
 
     Parameters
     ----------

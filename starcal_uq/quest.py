@@ -2,20 +2,19 @@
 
 Wahba's loss is L(R) = 1/2 sum_i w_i |b_i - R r_i|^2 with weights of sum one. Sources:
 
-- Shuster & Oh 1981, J. Guidance and Control 4(1), 70-77: the quaternion as the eigenvector of the 4x4 matrix K that
-  belongs to its largest eigenvalue, found by Newton's method from the sum of weights; the covariance
+- Shuster & Oh 1981, J. Guidance and Control 4(1), 70-77: the quaternion as the eigenvector of the 4x4 matrix
+  K that belongs to its largest eigenvalue, found by Newton's method from the sum of weights; the covariance
   [sum_i sigma_i^-2 (I - b_i b_i^T)]^-1.
-- Markley 1988, J. Astronautical Sciences 36(3), 245-258: the characteristic quartic of K factored as
-  p(l) = (l^2 - |B|^2)^2 - 8 l det B - 4 |adj B|^2. Unlike the expanded polynomial it gives the eigenvalue to rounding
-  error in narrow fields, where the two largest eigenvalues nearly coincide.
-- Shuster 2006, J. Astronautical Sciences 54(3-4): TASTE = sum_i |b_i - R r_i|^2 / sigma_i^2, chi-square with 2m-3
-  degrees of freedom.
+- Markley 1993, J. Astronautical Sciences 41(2), 261-280 (FOAM): the characteristic quartic of K factored as
+  p(l) = (l^2 - |B|^2)^2 - 8 l det B - 4 |adj B|^2. Unlike the expanded polynomial it gives the eigenvalue to
+  rounding error in narrow fields, where the two largest eigenvalues nearly coincide.
+- Shuster's TASTE = sum_i |b_i - R r_i|^2 / sigma_i^2, chi-square with 2m-3 degrees of freedom.
 
-Shuster avoids the singularity at half turns by *sequential rotations*: the references are first turned by half a turn
-about one axis, which permutes the quaternion so that another component serves as divisor. The same four solutions are
-the four rows of the adjugate of (K - l I), each parallel to the quaternion. The row with the largest diagonal entry is
-the one whose divisor is the largest component: that is how the rotation is chosen here, problem by problem. One Newton
-step on the rotation itself then removes what rounding the adjugate has cost.
+Shuster avoids the singularity at half turns by *sequential rotations*: the references are first turned by half a
+turn about one axis, which permutes the quaternion so that another component serves as divisor. The same four
+solutions are the four rows of the adjugate of (K - l I), each parallel to the quaternion. The row with the
+largest diagonal entry is the one whose divisor is the largest component: that is how the rotation is chosen here,
+problem by problem. One Newton step on the rotation itself then removes what rounding the adjugate has cost.
 """
 
 from __future__ import annotations
@@ -26,6 +25,7 @@ from typing import Literal
 
 import numpy as np
 
+from starcal_uq import wahba
 from starcal_uq._types import BoolArray, FloatArray, IntArray
 from starcal_uq.attitude import quaternion_to_rotation
 from starcal_uq.errors import StarcalError
@@ -34,7 +34,6 @@ from starcal_uq.errors import StarcalError
 _BLOCK = 32_768
 # Below this a rotation about one axis is lost in rounding: the stars span less than about 0.3 arcsec.
 _DEGENERATE = 1e-12
-_NEWTON_STEPS = 60
 
 
 class DegenerateFrameError(StarcalError):
@@ -43,8 +42,8 @@ class DegenerateFrameError(StarcalError):
     def __init__(self, frames: IntArray) -> None:
         more = f" (and {frames.size - 1} more)" if frames.size > 1 else ""
         super().__init__(
-            f"frame number {int(frames[0])}{more} does not determine an attitude, because it has fewer than two "
-            "distinct stars or values that are not finite: remove such frames, or pass on_degenerate='flag'."
+            f"frame number {int(frames[0])}{more} does not determine an attitude, because it has fewer than "
+            "two distinct stars or values that are not finite: remove such frames, or pass on_degenerate='flag'."
         )
         self.frames = frames
 
@@ -60,12 +59,12 @@ class QuestResult:
     lambda_max : (..., K) array
         Largest eigenvalue of K, weights of sum one: 1 - loss.
     loss : (..., K) array
-        Wahba's loss at the solution, weights of sum one. From the residuals where sigma_rad was given, otherwise
-        1 - lambda_max, whose rounding error is about 1e-15.
+        Wahba's loss at the solution, weights of sum one. From the residuals where sigma_rad was given,
+        otherwise 1 - lambda_max, whose rounding error is about 1e-15.
     observability : (..., K) array
-        Smallest eigenvalue of sum_i w_i (I - b_i b_i^T) to first order: variance of a unit-noise rotation about the
-        worst axis is its inverse. About half the mean squared distance from the field's centre, in rad^2, per axis
-        summed; zero for one star.
+        Least curvature of the loss, weights of sum one: the smallest eigenvalue of sum_i w_i (I - b_i b_i^T) to
+        first order, at worst a factor 3 below it. In a narrow field it is the mean squared angle from the
+        centroid of the stars, in rad^2; zero for one star.
     ok : (..., K) bool array
         False where the frame does not determine an attitude.
     dof : (K,) array
@@ -74,7 +73,7 @@ class QuestResult:
         Covariance of the left rotation error (pitch, yaw, roll) in rad^2. Without sigma_rad it is for
         sigma_i^2 = 1 / w_i rad^2 (1 rad^2 for every star without weights): multiply by the noise variance.
     taste : (..., K) array or None
-        Chi-square with `dof` degrees of freedom if sigma_rad is right and the identifications are; None without
+        Chi-square with `dof` degrees of freedom if sigma_rad and the identifications are right; None without
         sigma_rad.
     """
 
@@ -116,7 +115,8 @@ def quest(
     weights : (N,) array, optional
         Positive weights on any scale; equal by default.
     sigma_rad : float or (N,) array, optional
-        Direction noise per axis in rad. Sets the weights to sigma_rad^-2, scales the covariance, and asks for TASTE.
+        Direction noise per axis in rad. Sets the weights to sigma_rad^-2, scales the covariance, and asks for
+        TASTE.
     covariance : bool
         False saves the time for the covariances.
     on_degenerate : {"raise", "flag"}
@@ -125,7 +125,7 @@ def quest(
     Raises
     ------
     ValueError
-        Shapes that do not match, vectors that are not of unit length, weights or sigmas that are not positive.
+        Shapes that do not match, vectors that are not of unit length, weights or sigmas not positive.
     DegenerateFrameError
         One star, coinciding stars or values that are not finite, if `on_degenerate` is "raise".
     """
@@ -137,7 +137,8 @@ def quest(
     n_draws, n_frames = batch.shape[0], starts.size - 1
     references = r if r.ndim == 3 else r[None]
     shape = (n_draws, n_frames)
-    quaternions, lambda_max, loss, gap = np.empty((4, *shape)), np.empty(shape), np.empty(shape), np.empty(shape)
+    quaternions = np.empty((4, *shape))
+    lambda_max, loss, gap = np.empty((3, *shape))
     covariances = np.empty((6, *shape)) if covariance else None
     chi2 = np.empty(shape) if taste else None
 
@@ -149,14 +150,14 @@ def quest(
         total = np.diff(starts[frames.start : frames.stop + 1]).astype(float)
         if w_rows is not None:
             total = np.add.reduceat(w_rows, local)
-        profile = _profile(b3, r3, w_rows, local, total)
-        q, lam, gap[part] = _solve(profile)
+        profile = wahba.profile(b3, r3, w_rows, local, total)
+        q, lam, gap[part] = wahba.solve(profile)
         quaternions[:, draws, frames], lambda_max[part], loss[part] = q, lam, 1.0 - lam
         if covariances is not None:
-            covariances[:, draws, frames] = _inverse(_information(b3, w_rows, local))
+            covariances[:, draws, frames] = wahba.inverse(wahba.information(b3, w_rows, local))
         if chi2 is not None:
             counts = np.diff(starts[frames.start : frames.stop + 1])
-            chi2[part] = _squared_residuals(b3, r3, w_rows, local, counts, q)
+            chi2[part] = wahba.squared_residuals(b3, r3, w_rows, local, counts, q)
             loss[part] = 0.5 * chi2[part] / total
 
     ok = np.isfinite(lambda_max) & (gap > _DEGENERATE)
@@ -175,7 +176,7 @@ def quest(
         observability=gap[first],
         ok=ok[first],
         dof=2 * np.diff(starts) - 3,
-        covariance=None if covariances is None else _full(covariances)[first],
+        covariance=None if covariances is None else wahba.full(covariances)[first],
         taste=None if chi2 is None else chi2[first],
     )
 
@@ -228,177 +229,9 @@ def _blocks(starts: IntArray, n_draws: int) -> list[tuple[slice, slice, slice]]:
 
 
 def _components(vectors: FloatArray) -> FloatArray:
-    """Components first, (3, d, n): NumPy is several times faster on contiguous components than on 3-vectors."""
+    """Components first, (3, d, n)."""
     c = np.ascontiguousarray(np.moveaxis(vectors, -1, 0))
     norm2 = c[0] * c[0] + c[1] * c[1] + c[2] * c[2]
-    if norm2.min() < 1.0 - 1e-6 or norm2.max() > 1.0 + 1e-6:
+    if np.any(np.abs(norm2 - 1.0) > 1e-6):
         raise ValueError("QUEST needs unit vectors: normalise b and r first.")
     return c
-
-
-def _profile(
-    b: FloatArray, r: FloatArray, w: FloatArray | None, local: IntArray, total: FloatArray
-) -> list[list[FloatArray]]:
-    """Attitude profile matrix B_ij = sum w b_i r_j / sum w, each entry (d, k)."""
-    weighted = r if w is None else r * w
-    scale = 1.0 / total
-    return [[np.add.reduceat(b[i] * weighted[j], local, axis=-1) * scale for j in range(3)] for i in range(3)]
-
-
-def _solve(B: list[list[FloatArray]]) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Quaternions (4, d, k), largest eigenvalue (d, k) and observability (d, k)."""
-    (bxx, bxy, bxz), (byx, byy, byz), (bzx, bzy, bzz) = B
-    cofactors = (
-        byy * bzz - byz * bzy, byz * bzx - byx * bzz, byx * bzy - byy * bzx,
-        bxz * bzy - bxy * bzz, bxx * bzz - bxz * bzx, bxy * bzx - bxx * bzy,
-        bxy * byz - bxz * byy, bxz * byx - bxx * byz, bxx * byy - bxy * byx,
-    )  # fmt: skip
-    norm2 = _sum_of_squares((bxx, bxy, bxz, byx, byy, byz, bzx, bzy, bzz))
-    adjoint2 = _sum_of_squares(cofactors)
-    det = bxx * cofactors[0] + bxy * cofactors[1] + bxz * cofactors[2]
-    lam = _largest_root(norm2, adjoint2, det)
-    q = _adjugate_quaternion(B, lam)
-    q, curvature = _polish(q, B)
-    # |adj B| is about the second singular value of B: it sees coinciding stars, at which the quaternion is arbitrary
-    # and the curvature found at it may look sound.
-    return q, lam, np.minimum(curvature, np.sqrt(adjoint2 / np.where(norm2 > 0.0, norm2, 1.0)))
-
-
-def _sum_of_squares(parts: tuple[FloatArray, ...]) -> FloatArray:
-    total = parts[0] * parts[0]
-    for part in parts[1:]:
-        total += part * part
-    return total
-
-
-def _largest_root(norm2: FloatArray, adjoint2: FloatArray, det: FloatArray) -> FloatArray:
-    """Newton's method from the sum of weights, 1, an upper bound from which it descends monotonically."""
-    lam = np.ones_like(norm2)
-    for _ in range(_NEWTON_STEPS):
-        a = lam * lam - norm2
-        slope = 4.0 * lam * a - 8.0 * det
-        value = a * a - 8.0 * lam * det - 4.0 * adjoint2
-        # At a double root the slope vanishes with the value; a step that rounding makes negative has arrived.
-        step = np.maximum(value, 0.0) / np.where(slope > 0.0, slope, 1.0)
-        lam = lam - step
-        if not step.max() > 4e-16:
-            break
-    return lam
-
-
-def _adjugate_quaternion(B: list[list[FloatArray]], lam: FloatArray) -> FloatArray:
-    """Largest row of adj(K - lambda I), normalised: (4, d, k)."""
-    (bxx, bxy, bxz), (byx, byy, byz), (bzx, bzy, bzz) = B
-    a00, a11, a22, a33 = bxx - byy - bzz - lam, byy - bxx - bzz - lam, bzz - bxx - byy - lam, bxx + byy + bzz - lam
-    a01, a02, a12 = bxy + byx, bxz + bzx, byz + bzy
-    a03, a13, a23 = bzy - byz, bxz - bzx, byx - bxy
-    # 2x2 minors of the upper and of the lower two rows.
-    s0, s1, s2 = a00 * a11 - a01 * a01, a00 * a12 - a01 * a02, a00 * a13 - a01 * a03
-    s3, s4, s5 = a01 * a12 - a11 * a02, a01 * a13 - a11 * a03, a02 * a13 - a12 * a03
-    c5, c4, c3 = a22 * a33 - a23 * a23, a12 * a33 - a13 * a23, a12 * a23 - a13 * a22
-    c2, c1 = a02 * a33 - a03 * a23, a02 * a23 - a03 * a22
-    d00, d11 = a11 * c5 - a12 * c4 + a13 * c3, a00 * c5 - a02 * c2 + a03 * c1
-    d22, d33 = a03 * s4 - a13 * s2 + a33 * s0, a02 * s3 - a12 * s1 + a22 * s0
-    d01, d02, d03 = a02 * c4 - a01 * c5 - a03 * c3, a13 * s5 - a23 * s4 + a33 * s3, a22 * s4 - a12 * s5 - a23 * s3
-    d12, d13, d23 = a23 * s2 - a03 * s5 - a33 * s1, a02 * s5 - a22 * s2 + a23 * s1, a12 * s2 - a02 * s4 - a23 * s0
-    # All diagonal entries are <= 0 (three negative factors): the largest in magnitude is the smallest.
-    xy, zw = d00 < d11, d22 < d33
-    first = np.minimum(d00, d11) < np.minimum(d22, d33)
-    rows = ((d00, d01, d02, d03), (d01, d11, d12, d13), (d02, d12, d22, d23), (d03, d13, d23, d33))
-    q = np.empty((4, *lam.shape))
-    for i in range(4):
-        q[i] = np.where(first, np.where(xy, rows[0][i], rows[1][i]), np.where(zw, rows[2][i], rows[3][i]))
-    return _normalise(q)
-
-
-def _normalise(q: FloatArray) -> FloatArray:
-    norm = np.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
-    q /= np.where(norm > 0.0, norm, 1.0)
-    return q
-
-
-def _matrix(q: FloatArray) -> list[list[FloatArray]]:
-    x, y, z, w = q
-    xx, yy, zz, xy, xz, yz, xw, yw, zw = x * x, y * y, z * z, x * y, x * z, y * z, x * w, y * w, z * w
-    return [
-        [1.0 - 2.0 * (yy + zz), 2.0 * (xy - zw), 2.0 * (xz + yw)],
-        [2.0 * (xy + zw), 1.0 - 2.0 * (xx + zz), 2.0 * (yz - xw)],
-        [2.0 * (xz - yw), 2.0 * (yz + xw), 1.0 - 2.0 * (xx + yy)],
-    ]
-
-
-def _polish(q: FloatArray, B: list[list[FloatArray]]) -> tuple[FloatArray, FloatArray]:
-    """One Newton step of Wahba's loss on the left rotation vector, and the least curvature of the loss.
-
-    With M = B R^T the gradient is minus the axial vector of M, and the Hessian tr(M) I - (M + M^T)/2 has the eigenvalues
-    s_i + s_j (sums of two signed singular values of B).
-    """
-    R = _matrix(q)
-    M = [[B[i][0] * R[j][0] + B[i][1] * R[j][1] + B[i][2] * R[j][2] for j in range(3)] for i in range(3)]
-    gx, gy, gz = M[2][1] - M[1][2], M[0][2] - M[2][0], M[1][0] - M[0][1]
-    hxx, hyy, hzz = M[1][1] + M[2][2], M[0][0] + M[2][2], M[0][0] + M[1][1]
-    hxy, hxz, hyz = -0.5 * (M[0][1] + M[1][0]), -0.5 * (M[0][2] + M[2][0]), -0.5 * (M[1][2] + M[2][1])
-    ixx, iyy, izz = hyy * hzz - hyz * hyz, hxx * hzz - hxz * hxz, hxx * hyy - hxy * hxy
-    ixy, ixz, iyz = hxz * hyz - hxy * hzz, hxy * hyz - hxz * hyy, hxy * hxz - hxx * hyz
-    det = hxx * ixx + hxy * ixy + hxz * ixz
-    sound = det > 0.0
-    half = 0.5 / np.where(sound, det, np.inf)
-    px, py, pz = (
-        half * (ixx * gx + ixy * gy + ixz * gz),
-        half * (ixy * gx + iyy * gy + iyz * gz),
-        half * (ixz * gx + iyz * gy + izz * gz),
-    )
-    x, y, z, w = q
-    better = np.empty_like(q)
-    better[0] = x + px * w + py * z - pz * y
-    better[1] = y - px * z + py * w + pz * x
-    better[2] = z + px * y - py * x + pz * w
-    better[3] = w - px * x - py * y - pz * z
-    # For one small eigenvalue, det / (sum of principal minors) is that eigenvalue; at most a factor 3 below it.
-    minors = ixx + iyy + izz
-    curvature = np.where(sound, det, 0.0) / np.where(minors > 0.0, minors, np.inf)
-    return _normalise(better), curvature
-
-
-def _information(b: FloatArray, w: FloatArray | None, local: IntArray) -> FloatArray:
-    """Sum of w (I - b b^T), as (xx, yy, zz, xy, xz, yz): (6, d, k)."""
-    weighted = b if w is None else b * w
-    xx, yy, zz, xy, xz, yz = (
-        np.add.reduceat(weighted[i] * b[j], local, axis=-1)
-        for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    )
-    return np.stack((yy + zz, xx + zz, xx + yy, -xy, -xz, -yz))
-
-
-def _inverse(h: FloatArray) -> FloatArray:
-    """Inverse of symmetric 3x3 matrices given as (xx, yy, zz, xy, xz, yz); NaN where singular."""
-    xx, yy, zz, xy, xz, yz = h
-    inverse = np.stack(
-        (
-            yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy,
-            xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz,
-        )
-    )  # fmt: skip
-    det = xx * inverse[0] + xy * inverse[3] + xz * inverse[4]
-    inverse /= np.where(det > 0.0, det, np.nan)
-    return inverse
-
-
-def _full(h: FloatArray) -> FloatArray:
-    """(6, d, k) to (d, k, 3, 3)."""
-    return np.ascontiguousarray(np.moveaxis(h[[0, 3, 4, 3, 1, 5, 4, 5, 2]], 0, -1)).reshape(*h.shape[1:], 3, 3)
-
-
-def _squared_residuals(
-    b: FloatArray, r: FloatArray, w: FloatArray | None, local: IntArray, counts: IntArray, q: FloatArray
-) -> FloatArray:
-    """Sum of w |b - R r|^2 per frame, (d, k): from the residuals, as 1 - lambda would lose the digits."""
-    total = np.zeros(b.shape[1:])
-    for i, row in enumerate(_matrix(q)):
-        x, y, z = (np.repeat(entry, counts, axis=-1) for entry in row)
-        residual = b[i] - x * r[0] - y * r[1] - z * r[2]
-        total += residual * residual
-    if w is not None:
-        total *= w
-    result: FloatArray = np.add.reduceat(total, local, axis=-1)
-    return result

@@ -90,7 +90,9 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
             f"{path}: cannot be written ({reason}); check the permissions of the folder and the free space."
         ) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        # Asked first: in a folder that may not be searched, unlink would raise and hide the reason.
+        if os.path.lexists(temporary):
+            temporary.unlink()
 
 
 def atomic_write_bytes(path: PathLike, data: bytes) -> None:
@@ -242,12 +244,12 @@ class RunFolder:
         """
         if name not in _FILES:
             raise ValueError(f"a run folder has no {name!r}: use one of {', '.join(_FILES)}")
-        if self.path.exists() and not self.path.is_dir():
+        if os.path.exists(self.path) and not os.path.isdir(self.path):
             raise RunFolderError(f"{self.path}: is not a run folder but a file; name the folder given to -o.")
         file_name, remedy = _FILES[name]
-        if not self.path.is_dir():
+        if not os.path.isdir(self.path):
             raise RunFolderError(f"{self.path}: the run folder does not exist; check the path, or {remedy}.")
         path = self.path / file_name
-        if not path.exists():
+        if not os.path.exists(path):
             raise RunFolderError(f"{self.path}: the run folder has no {file_name}; {remedy}.")
         return path

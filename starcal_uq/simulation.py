@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq._types import FloatArray
+from starcal_uq._types import FloatArray, IntArray
 from starcal_uq.attitude import random_rotations
 from starcal_uq.camera import Camera
 from starcal_uq.errors import CatalogueError
@@ -95,28 +95,26 @@ def simulate(
     rng = np.random.default_rng(seed)
     margin_px = _EDGE_SIGMAS * sigma_px
     sky = _Sky(stars, camera, margin_px)
-    frames: list[tuple[FloatArray, FloatArray]] = []
+    frames: list[tuple[IntArray, FloatArray]] = []
     if attitudes is not None:
-        for index, rotation in enumerate(attitudes):
-            seen, xy = sky.view(rotation)
+        frames = sky.views(attitudes)
+        for index, (seen, _) in enumerate(frames):
             if len(seen) < min_stars:
                 raise CatalogueError(
                     f"the attitude with index {index} shows {len(seen)} stars, fewer than min_stars={min_stars}: "
                     "choose other attitudes, a deeper catalogue or a smaller min_stars."
                 )
-            frames.append((seen, xy))
     tries = 0
     while attitudes is None and len(frames) < n_frames:
-        for rotation in random_rotations(_BATCH, rng):
-            tries += 1
-            seen, xy = sky.view(rotation)
-            if len(seen) >= min_stars and len(frames) < n_frames:
-                frames.append((seen, xy))
+        views = sky.views(random_rotations(_BATCH, rng))
+        frames += [view for view in views if len(view[0]) >= min_stars]
+        tries += _BATCH
         if tries > _MAX_TRIES_PER_FRAME * (len(frames) + 1):
             raise CatalogueError(
                 f"only {len(frames)} of {tries} random attitudes show {min_stars} stars of the catalogue: "
                 "raise max_mag, or lower min_stars."
             )
+    frames = frames if attitudes is not None else frames[:n_frames]
     index = np.concatenate([seen for seen, _ in frames])
     xy = np.concatenate([xy for _, xy in frames])
     xy = xy + sigma_px * rng.standard_normal(xy.shape)
@@ -157,9 +155,12 @@ class _Sky:
             if fold_radius_px(camera.distortion, camera.theta, ideal_px) <= ideal_px:
                 self.min_cosine = float(np.min(b[:, 2]))
 
-    def view(self, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Catalogue indices (m,) and noise-free pixels (m, 2) of the stars on the detector."""
-        near = np.flatnonzero(self.directions @ rotation[2] > self.min_cosine)
-        xy = project(self.camera, self.directions[near] @ rotation.T)
+    def views(self, rotations: FloatArray) -> list[tuple[IntArray, FloatArray]]:
+        """Catalogue indices (m,) and noise-free pixels (m, 2) of the stars on the detector, for each rotation."""
+        frame, star = np.nonzero(rotations[:, 2] @ self.directions.T > self.min_cosine)
+        b = np.einsum("nij,nj->ni", rotations[frame], self.directions[star])
+        xy = project(self.camera, b)
         inside = np.all((xy > self.low) & (xy < self.high), axis=1)
-        return near[inside], xy[inside]
+        edges = np.searchsorted(frame[inside], np.arange(len(rotations) + 1))
+        star, xy = star[inside], xy[inside]
+        return [(star[i:j], xy[i:j]) for i, j in zip(edges[:-1], edges[1:], strict=True)]

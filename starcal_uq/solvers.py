@@ -18,6 +18,8 @@ from starcal_uq.status import Status
 
 _INITIAL_BOUND = 100.0
 _SINGULAR = 1e-13
+# Relative change of a cost that is rounding and nothing else.
+_ROUNDING = 1e-10
 
 
 class Normal(NamedTuple):
@@ -91,7 +93,8 @@ def _scaled_step(normal: Normal, scale: FloatArray, bound: float) -> tuple[Float
     """Minimise the Gauss-Newton model within ``|D p| <= bound``; returns the step and More's parameter."""
     matrix = normal.matrix / np.outer(scale, scale)
     values, vectors = np.linalg.eigh(matrix)
-    values = np.maximum(values, 0.0)
+    # Rounding can leave a singular direction slightly negative.
+    values = np.maximum(values, np.finfo(float).eps * values[-1])
     slope = vectors.T @ (normal.gradient / scale)
 
     def length(damping: float) -> float:
@@ -123,7 +126,7 @@ def levenberg_marquardt(
     start: FloatArray,
     *,
     max_iterations: int = 200,
-    tolerance: float = 1e-13,
+    tolerance: float = 1e-15,
     step_tolerance: float = 1e-13,
 ) -> Solution:
     """Minimise a sum of squares from its normal equations.
@@ -195,7 +198,7 @@ def levenberg_marquardt(
             costs.append(normal.cost)
             scale = np.maximum(scale, np.sqrt(np.diag(normal.matrix)))
         # Where the cost has reached rounding, a refused step with nothing left to gain is convergence as well.
-        if predicted <= tolerance and (ratio > 1e-4 or abs(actual) <= 1e3 * tolerance):
+        if predicted <= tolerance and (ratio > 1e-4 or abs(actual) <= _ROUNDING):
             return finish(Status.CONVERGED)
         if bound <= step_tolerance * float(np.linalg.norm(scale * theta)):
             return finish(Status.CONVERGED if predicted <= 1e-8 else Status.STALLED)

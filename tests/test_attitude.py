@@ -66,20 +66,26 @@ def test_left_error_is_in_the_camera_frame() -> None:
     np.testing.assert_allclose(found, phi, atol=2e-15)
 
 
+def haar_angle(angle: np.ndarray) -> np.ndarray:
+    """Distribution function of the angle of a uniformly random rotation."""
+    return (angle - np.sin(angle)) / np.pi
+
+
 def test_random_rotations_are_proper_and_uniform() -> None:
     from scipy import stats
 
     rotations = attitude.random_rotations(4000, np.random.default_rng(5))
-    np.testing.assert_allclose(rotations @ np.swapaxes(rotations, 1, 2), np.tile(np.eye(3), (4000, 1, 1)), atol=1e-14)
+    products = rotations @ np.swapaxes(rotations, 1, 2)
+    np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), products.shape), atol=1e-14)
     np.testing.assert_allclose(np.linalg.det(rotations), 1.0, atol=1e-13)
     # Haar measure: every entry is uniform on [-1, 1], and the angle has density (1 - cos a) / pi.
     for i in range(3):
         for j in range(3):
             assert stats.kstest(rotations[:, i, j], stats.uniform(-1.0, 2.0).cdf).pvalue > 1e-3
     angle = np.linalg.norm(attitude.rotation_vector(rotations), axis=1)
-    assert stats.kstest(angle, lambda a: (a - np.sin(a)) / np.pi).pvalue > 1e-3
+    assert stats.kstest(angle, haar_angle).pvalue > 1e-3
     # Control: a uniform angle about a uniform axis is not Haar measure.
-    assert stats.kstest(np.random.default_rng(6).uniform(0, np.pi, 4000), lambda a: (a - np.sin(a)) / np.pi).pvalue < 1e-6
+    assert stats.kstest(np.random.default_rng(6).uniform(0, np.pi, 4000), haar_angle).pvalue < 1e-6
 
 
 @pytest.mark.parametrize(

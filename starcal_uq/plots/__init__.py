@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from starcal_uq.plots.attitude import plot_attitude, plot_field_map
 from starcal_uq.plots.convergence import plot_convergence
-from starcal_uq.plots.matrix import plot_correlation, plot_couplings
-from starcal_uq.plots.posterior import plot_corner, plot_prior_posterior
+from starcal_uq.plots.corner import plot_corner
+from starcal_uq.plots.matrix import plot_correlation, plot_correlations, plot_couplings
+from starcal_uq.plots.prior import plot_prior_posterior
 from starcal_uq.plots.residuals import plot_residual_histogram, plot_residual_map, plot_residual_radius, plot_residuals
 
 __all__ = [
@@ -17,6 +18,7 @@ __all__ = [
     "plot_convergence",
     "plot_corner",
     "plot_correlation",
+    "plot_correlations",
     "plot_couplings",
     "plot_field_map",
     "plot_prior_posterior",

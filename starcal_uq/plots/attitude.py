@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from starcal_uq.fieldmap import FieldMap
-    from starcal_uq.propagate import AttitudeError
+    from starcal_uq.propagation import AttitudeError
 
 
 def plot_attitude(error: AttitudeError, ax: Axes | None = None) -> Axes:
@@ -24,9 +24,9 @@ def plot_attitude(error: AttitudeError, ax: Axes | None = None) -> Axes:
         ax = style.new_axes(7.2, 3.4)
     style.dress(ax, grid=True)
     series = (
-        ("centroid noise, per frame (NEA)", error.nea_arcsec, style.SKY, ""),
-        ("calibration: common rotation", error.common_arcsec, style.ORANGE, "//"),
-        ("calibration: frame-dependent rest", error.rest_arcsec, style.GREEN, ".."),
+        ("centroid noise (NEA)", error.nea_arcsec, style.SKY, ""),
+        ("calibration, common", error.common_arcsec, style.ORANGE, "//"),
+        ("calibration, rest", error.rest_arcsec, style.GREEN, ".."),
     )
     values = np.array([np.asarray(v, dtype=np.float64) for _, v, _, _ in series])
     positive = values[values > 0]
@@ -36,14 +36,21 @@ def plot_attitude(error: AttitudeError, ax: Axes | None = None) -> Axes:
         at = place + (i - 1) * 0.27
         ax.bar(at, np.maximum(values[i], floor), width=0.25, color=colour, hatch=hatch, edgecolor="white", label=name)
         for x, value in zip(at, values[i], strict=True):
-            ax.annotate(f"{significant(float(value))}″", (x, max(value, floor)), xytext=(0, 3), ha="center",
-                        textcoords="offset points", fontsize=style.TICK_SIZE, color=style.INK)
+            ax.annotate(
+                f"{significant(float(value))}″",
+                (x, max(value, floor)),
+                xytext=(0, 3),
+                ha="center",
+                textcoords="offset points",
+                fontsize=style.TICK_SIZE,
+                color=style.INK,
+            )
     ax.set_yscale("log")
-    ax.set_ylim(floor, max(float(positive.max()) if positive.size else 1.0, floor) * 12.0)
+    ax.set_ylim(floor, max(float(positive.max()) if positive.size else 1.0, floor) * 3.0)
     ax.set_xticks(place, error.axes, fontsize=style.LABEL_SIZE)
     ax.tick_params(axis="x", length=0)
     ax.grid(False, axis="x")
-    style.legend(ax, loc="upper left", ncols=3, columnspacing=1.2, handlelength=1.6)
+    style.legend(ax, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, ncols=3, columnspacing=1.4)
     style.label(ax, "", "", "1 sigma [arcsec]")
     return ax
 
@@ -60,11 +67,9 @@ def plot_field_map(field: FieldMap) -> Figure:
 def _panel(ax: Axes, field: FieldMap, values: FloatArray, title: str) -> None:
     style.dress(ax)
     x, y = np.asarray(field.x_px), np.asarray(field.y_px)
-    image = ax.pcolormesh(x, y, values, cmap="cividis", shading="gouraud", rasterized=True)
-    spread = float(np.ptp(values))
-    if spread > 1e-3 * float(np.mean(values)):
-        lines = ax.contour(x, y, values, levels=5, colors="white", linewidths=0.8)
-        ax.clabel(lines, fontsize=style.TICK_SIZE - 1.0, fmt=_level_text)
+    levels = _levels(values)
+    image = ax.contourf(x, y, values, levels=levels, cmap="cividis")
+    ax.contour(x, y, values, levels=levels[1:-1], colors="white", linewidths=0.5)
     ax.set_xlim(x[0], x[-1])
     ax.set_ylim(y[-1], y[0])
     ax.set_aspect("equal")
@@ -73,5 +78,11 @@ def _panel(ax: Axes, field: FieldMap, values: FloatArray, title: str) -> None:
     bar.formatter.set_useOffset(False)
 
 
-def _level_text(value: float) -> str:
-    return f"{value:.4g}"
+def _levels(values: FloatArray) -> FloatArray:
+    from matplotlib.ticker import MaxNLocator
+
+    low, high = float(np.min(values)), float(np.max(values))
+    if high - low <= 1e-9 * abs(high):
+        # A map without relief still needs two levels to be filled.
+        low, high = low - 0.05 * abs(low) - 1e-12, high + 0.05 * abs(high) + 1e-12
+    return np.asarray(MaxNLocator(10).tick_values(low, high), dtype=np.float64)

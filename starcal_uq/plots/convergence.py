@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq._types import FloatArray
+from starcal_uq.distortion import parameters as camera_parameters
 from starcal_uq.formatting import pretty_unit
 from starcal_uq.plots import style
-from starcal_uq.plots.scales import named_parameters
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from starcal_uq.calibrate import Calibration
+    from starcal_uq.calibration import Calibration
     from starcal_uq.camera import Camera
 
 _BANDS = ("#eef3f7", "#ffffff")
@@ -27,10 +27,10 @@ def plot_convergence(cal: Calibration, truth: Camera | None = None) -> Figure:
     Above: the value. Below: its distance from the truth if that is known, else from the final estimate, in units of the
     final standard deviation on an axis that is linear between -1 and 1 and logarithmic outside.
     """
-    parameters = named_parameters(cal.camera.distortion, tuple(cal.parameter_names))
+    parameters = camera_parameters(cal.camera.distortion)
     values, starts = _joined(cal)
     reference = np.asarray(truth.theta) if _comparable(truth, cal) and truth is not None else np.asarray(cal.theta)
-    figure = style.new_figure(1.2 + 2.0 * len(parameters), 4.9)
+    figure = style.new_figure(1.2 + 2.0 * len(parameters), 5.1)
     axes = figure.subplots(2, len(parameters), sharex=True, squeeze=False)
     iteration = np.arange(len(values))
     to_mm = cal.camera.pixel_um / 1000.0
@@ -53,12 +53,31 @@ def plot_convergence(cal: Calibration, truth: Camera | None = None) -> Figure:
     what = "truth" if _comparable(truth, cal) else "final estimate"
     axes[0, 0].set_ylabel("value", fontsize=style.LABEL_SIZE, color=style.INK)
     axes[1, 0].set_ylabel(f"distance from {what}\n[final sigma]", fontsize=style.LABEL_SIZE, color=style.INK)
+    _key(figure, cal, what)
     return figure
 
 
-def stage_words(cal: Calibration) -> list[str]:
-    """The stages in order, numbered as in the figure, without repeating a name that stage numbers already carry."""
-    return [f"{i} {stage.name}" for i, stage in enumerate(cal.stages, 1)]
+def _key(figure: Figure, cal: Calibration, what: str) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    stages = ", ".join(f"{i} {stage.name}" for i, stage in enumerate(cal.stages, 1))
+    handles: list[Line2D | Patch] = [
+        Line2D([], [], color=style.BLUE, marker="o", markersize=3.2, linewidth=1.2, label="estimate"),
+        Line2D([], [], color=style.VERMILLION, dashes=(4, 2), linewidth=1.0, label=what),
+        Patch(facecolor=style.GREEN, alpha=0.2, label="within 1 sigma"),
+        Line2D([], [], linestyle="none", label=f"Stages: {stages}"),
+    ]
+    figure.legend(
+        handles=handles,
+        loc="outside upper left",
+        ncols=4,
+        fontsize=style.LABEL_SIZE,
+        frameon=False,
+        labelcolor=style.INK,
+        columnspacing=1.6,
+        handlelength=1.8,
+    )
 
 
 def _comparable(truth: Camera | None, cal: Calibration) -> bool:
@@ -79,8 +98,15 @@ def _mark_stages(ax: Axes, starts: list[int], total: int) -> None:
     for i, (first, last) in enumerate(zip(starts, ends, strict=True)):
         ax.axvspan(first - 0.5, last - 0.5, color=_BANDS[i % 2], linewidth=0, zorder=0)
         if ax.get_subplotspec().is_first_row():  # type: ignore[union-attr]
-            ax.text(0.5 * (first + last - 1), 1.03, str(i + 1), transform=ax.get_xaxis_transform(), ha="center",
-                    fontsize=style.TICK_SIZE, color=style.GREY)
+            ax.text(
+                0.5 * (first + last - 1),
+                1.03,
+                str(i + 1),
+                transform=ax.get_xaxis_transform(),
+                ha="center",
+                fontsize=style.TICK_SIZE,
+                color=style.GREY,
+            )
     ax.set_xlim(-0.5, total - 0.5)
 
 

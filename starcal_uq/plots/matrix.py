@@ -13,8 +13,10 @@ from starcal_uq.plots import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
 
-    from starcal_uq.coupling import Coupling
+    from starcal_uq.couplings import Coupling
 
 _SYMBOLS = {"x0": "$x_0$", "y0": "$y_0$", "f": "$f$", "sigma": r"$\sigma$", "sigma_scale": r"$s_\sigma$"}
 _SYMBOLS |= {name: f"${name[0]}_{name[1]}$" for name in ("k1", "k2", "k3", "p1", "p2")}
@@ -33,18 +35,27 @@ def plot_correlation(coupling: Coupling, ax: Axes | None = None, *, extended: bo
         With the constant attitude errors pitch, yaw and roll that the parameters cause.
     """
     names = coupling.extended_names if extended else coupling.parameter_names
-    matrix = coupling.extended_correlation if extended else coupling.correlation
     if ax is None:
         side = 1.4 + 0.62 * len(names)
         ax = style.new_axes(side + 0.8, side)
-    image = _heat_map(ax, np.asarray(matrix), names)
-    if extended:
-        split = len(coupling.parameter_names) - 0.5
-        ax.axhline(split, color=style.INK, linewidth=1.2)
-        ax.axvline(split, color=style.INK, linewidth=1.2)
+    image = _extended(ax, coupling) if extended else _heat_map(ax, np.asarray(coupling.correlation), names)
     style.label(ax, "With the boresight" if extended else "Camera parameters")
     style.colour_bar(ax, image, "correlation")
     return ax
+
+
+def plot_correlations(coupling: Coupling) -> Figure:
+    """Both matrices side by side: the camera parameters alone, and with the boresight."""
+    p, q = len(coupling.parameter_names), len(coupling.extended_names)
+    figure = style.new_figure(11.0, 11.0 * q / (p + q) * 0.83 + 0.5)
+    left, right = figure.subplots(1, 2, width_ratios=(p, q))
+    _heat_map(left, np.asarray(coupling.correlation), coupling.parameter_names)
+    image = _extended(right, coupling)
+    style.label(left, "Camera parameters")
+    style.label(right, "With the constant attitude error they cause")
+    bar = figure.colorbar(image, ax=[left, right], fraction=0.03, pad=0.02, aspect=32)
+    style.dress_bar(bar, "correlation")
+    return figure
 
 
 def plot_couplings(coupling: Coupling, ax: Axes | None = None) -> Axes:
@@ -56,8 +67,15 @@ def plot_couplings(coupling: Coupling, ax: Axes | None = None) -> Axes:
     rows = np.arange(len(ratio))
     ax.barh(rows, ratio, color=style.BLUE, height=0.62)
     for row, value in zip(rows, ratio, strict=True):
-        ax.annotate(f"×{significant(float(value))}", (value, row), xytext=(4, 0), textcoords="offset points",
-                    va="center", fontsize=style.TICK_SIZE, color=style.INK)
+        ax.annotate(
+            f"×{significant(float(value))}",
+            (value, row),
+            xytext=(4, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=style.TICK_SIZE,
+            color=style.INK,
+        )
     ax.axvline(1.0, color=style.INK, linewidth=1.0)
     ax.set_yticks(rows, [symbol(n) for n in coupling.parameter_names], fontsize=style.LABEL_SIZE)
     ax.invert_yaxis()
@@ -72,7 +90,15 @@ def symbol(name: str) -> str:
     return _SYMBOLS.get(name, name)
 
 
-def _heat_map(ax: Axes, matrix: FloatArray, names: Sequence[str]) -> object:
+def _extended(ax: Axes, coupling: Coupling) -> AxesImage:
+    image = _heat_map(ax, np.asarray(coupling.extended_correlation), coupling.extended_names)
+    split = len(coupling.parameter_names) - 0.5
+    ax.axhline(split, color=style.INK, linewidth=1.2)
+    ax.axvline(split, color=style.INK, linewidth=1.2)
+    return image
+
+
+def _heat_map(ax: Axes, matrix: FloatArray, names: Sequence[str]) -> AxesImage:
     image = ax.imshow(matrix, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
     style.dress(ax)
     for spine in ax.spines.values():
@@ -88,8 +114,16 @@ def _heat_map(ax: Axes, matrix: FloatArray, names: Sequence[str]) -> object:
     for (row, column), value in np.ndenumerate(matrix):
         colour = "white" if abs(value) > 0.62 else style.INK
         weight = "bold" if row != column and abs(value) >= 0.7 else "normal"
-        ax.text(column, row, correlation_text(float(value), row == column), ha="center", va="center",
-                fontsize=style.TICK_SIZE, color=colour, weight=weight)
+        ax.text(
+            column,
+            row,
+            correlation_text(float(value), row == column),
+            ha="center",
+            va="center",
+            fontsize=style.TICK_SIZE,
+            color=colour,
+            weight=weight,
+        )
     return image
 
 

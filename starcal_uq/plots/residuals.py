@@ -2,87 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq._types import FloatArray
 from starcal_uq.formatting import significant
 from starcal_uq.plots import style
+from starcal_uq.residuals import bin_residuals, normalised_residuals, residual_scale
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from starcal_uq.calibrate import Calibration
+    from starcal_uq.calibration import Calibration
     from starcal_uq.observations import Observations
 
 # chi-square with 2 degrees of freedom at 99 %: a mean vector beyond it is drawn as significant.
 _CHI2_2_99 = 9.21
-_MIN_STARS = 5
-
-
-@dataclass(frozen=True)
-class BinnedResiduals:
-    """Mean residual vectors in square cells of the detector.
-
-    Attributes
-    ----------
-    centres : (n, 2) float array
-        Cell centres, px; cells with fewer than five stars are left out.
-    means : (n, 2) float array
-        Mean residuals, px.
-    counts : (n,) float array
-        Stars in the cell.
-    chi2 : (n,) float array
-        |mean|^2 over its variance if residuals are pure noise; two degrees of freedom.
-    cell_px : float
-        Side of a cell.
-    n_empty : int
-        Cells with fewer than five stars.
-    """
-
-    centres: FloatArray
-    means: FloatArray
-    counts: FloatArray
-    chi2: FloatArray
-    cell_px: float
-    n_empty: int
-
-
-def bin_residuals(cal: Calibration, obs: Observations) -> BinnedResiduals:
-    """Mean residual vectors in cells that hold about 25 stars each (4 to 12 cells along the longer side)."""
-    width, height = cal.camera.width_px, cal.camera.height_px
-    longer = max(width, height)
-    along = int(np.clip(np.sqrt(obs.n_stars / 25.0 * longer / min(width, height)), 4, 12))
-    cell = longer / along
-    nx, ny = int(np.ceil(width / cell - 1e-9)), int(np.ceil(height / cell - 1e-9))
-    column = np.clip(((obs.x_px + 0.5) / cell).astype(int), 0, nx - 1)
-    row = np.clip(((obs.y_px + 0.5) / cell).astype(int), 0, ny - 1)
-    index = row * nx + column
-    residuals = np.asarray(cal.residuals_px)
-    counts = np.bincount(index, minlength=nx * ny).astype(np.float64)
-    sums = np.stack([np.bincount(index, residuals[:, i], nx * ny) for i in (0, 1)], axis=1)
-    keep = counts >= _MIN_STARS
-    means = sums[keep] / counts[keep, None]
-    variance = residual_scale(cal, obs) ** 2
-    summed = np.bincount(index, variance, nx * ny)[keep]
-    chi2 = np.sum(sums[keep] ** 2, axis=1) / summed
-    flat = np.flatnonzero(keep)
-    centres = np.stack([(flat % nx + 0.5) * cell - 0.5, (flat // nx + 0.5) * cell - 0.5], axis=1)
-    return BinnedResiduals(centres, means, counts[keep], chi2, cell, int(np.count_nonzero(~keep)))
-
-
-def residual_scale(cal: Calibration, obs: Observations) -> FloatArray:
-    """Expected standard deviation of each residual per axis, px, shape (N,).
-
-    The fit takes up part of the noise: with d degrees of freedom in 2N numbers, residuals are smaller than the noise by
-    sqrt(d / 2N) on average.
-    """
-    shrink = np.sqrt(cal.dof / (2.0 * obs.n_stars))
-    stated = np.ones(obs.n_stars) if obs.sigma_px is None else np.asarray(obs.sigma_px)
-    return np.asarray(cal.sigma * shrink * stated, dtype=np.float64)
 
 
 def plot_residuals(cal: Calibration, obs: Observations) -> Figure:
@@ -102,30 +38,57 @@ def plot_residual_map(cal: Calibration, obs: Observations, ax: Axes | None = Non
     style.dress(ax)
     binned = bin_residuals(cal, obs)
     width, height = cal.camera.width_px, cal.camera.height_px
-    style.label(ax, "Mean residual over the field", "x [px]", "y [px]")
+    style.label(ax, "Mean residuals", "x [px]", "y [px]")
     ax.set_xlim(-0.5, width - 0.5)
     ax.set_ylim(height - 0.5, -0.5)
     ax.set_aspect("equal")
     for spine in ax.spines.values():
         spine.set_visible(True)
-    ax.scatter(obs.x_px, obs.y_px, s=1.0, color=style.GREY, alpha=float(np.clip(900 / obs.n_stars, 0.06, 0.4)), linewidths=0,
-               rasterized=True)
+    ax.scatter(
+        obs.x_px,
+        obs.y_px,
+        s=1.0,
+        color=style.GREY,
+        alpha=float(np.clip(4000 / obs.n_stars, 0.2, 0.6)),
+        linewidths=0,
+        rasterized=True,
+    )
     ax.plot([cal.camera.x0_px], [cal.camera.y0_px], marker="+", color=style.INK, markersize=10, markeredgewidth=1.2)
     if len(binned.counts) == 0:
         ax.text(0.5, 0.5, "too few stars per cell", transform=ax.transAxes, ha="center", color=style.INK)
         return ax
-    key = float(np.sqrt(2.0 * np.mean(residual_scale(cal, obs) ** 2) / np.median(binned.counts)))
+    key = float(np.sqrt(2.0 * np.mean(binned.noise_px**2)))
     longest = max(float(np.sqrt((binned.means**2).sum(1)).max()), key)
     scale = longest / (0.95 * binned.cell_px)
     strong = binned.chi2 > _CHI2_2_99
     for chosen, colour, thick in ((~strong, style.BLUE, 0.0045), (strong, style.VERMILLION, 0.0085)):
         if np.any(chosen):
-            arrows = ax.quiver(*binned.centres[chosen].T, *binned.means[chosen].T, angles="xy", scale_units="xy",
-                               scale=scale, color=colour, width=thick, pivot="mid")
-    ax.quiverkey(arrows, 0.04, -0.19, key, f"{significant(key)} px: expected from noise", coordinates="axes",
-                 labelpos="E", color=style.INK, fontproperties={"size": style.TICK_SIZE}, labelcolor=style.INK)
-    ax.text(1.0, -0.19, f"bold: beyond 99 % ({np.count_nonzero(strong)} of {strong.size})", transform=ax.transAxes,
-            ha="right", va="center", fontsize=style.TICK_SIZE, color=style.VERMILLION)
+            arrows = ax.quiver(
+                *binned.centres[chosen].T,
+                *binned.means[chosen].T,
+                angles="xy",
+                scale_units="xy",
+                scale=scale,
+                color=colour,
+                width=thick,
+                pivot="mid",
+            )
+    ax.quiverkey(
+        arrows,
+        0.66,
+        1.045,
+        key,
+        f"{significant(key)} px (noise)",
+        coordinates="axes",
+        labelpos="E",
+        labelcolor=style.INK,
+        fontproperties={"size": style.TICK_SIZE},
+    )
+    ax.set_xlabel(
+        f"x [px]\n{np.count_nonzero(strong)} of {strong.size} arrows bold: beyond 99 % of pure noise",
+        fontsize=style.LABEL_SIZE,
+        color=style.INK,
+    )
     return ax
 
 
@@ -149,13 +112,22 @@ def plot_residual_radius(cal: Calibration, obs: Observations, ax: Axes | None = 
     looks = ((style.BLUE, "o", "radial", -1), (style.ORANGE, "s", "tangential", 1))
     for part, (colour, marker, name, side) in zip(parts, looks, strict=True):
         mean = np.bincount(index, part, n_bins) / counts
-        ax.errorbar(centre + side * 0.004 * radius.max(), mean, spread, color=colour, marker=marker, markersize=4.5,
-                    linestyle="none", elinewidth=1.2, label=name)
+        ax.errorbar(
+            centre + side * 0.004 * radius.max(),
+            mean,
+            spread,
+            color=colour,
+            marker=marker,
+            markersize=4.5,
+            linestyle="none",
+            elinewidth=1.2,
+            label=name,
+        )
     ax.axhline(0.0, color=style.INK, linewidth=0.9)
     top = 1.35 * max(np.abs(ax.get_ylim()))
     ax.set_ylim(-top, top)
     style.legend(ax, loc="upper left", ncols=2, columnspacing=1.0, handletextpad=0.3)
-    style.label(ax, "Mean residual against radius", "distance from principal point [px]", "mean residual [px]")
+    style.label(ax, "Against radius", "distance from principal point [px]", "mean residual [px]")
     return ax
 
 
@@ -164,7 +136,7 @@ def plot_residual_histogram(cal: Calibration, obs: Observations, ax: Axes | None
     if ax is None:
         ax = style.new_axes(4.2, 3.8)
     style.dress(ax)
-    z = (np.asarray(cal.residuals_px) / residual_scale(cal, obs)[:, None]).ravel()
+    z = normalised_residuals(cal, obs).ravel()
     reach = float(np.clip(np.ceil(np.abs(z).max()), 4.0, 8.0))
     n_bins = int(np.clip(np.sqrt(z.size), 16, 60))
     edges = np.linspace(-reach, reach, n_bins + 1)
@@ -177,5 +149,5 @@ def plot_residual_histogram(cal: Calibration, obs: Observations, ax: Axes | None
     ax.set_yscale("log")
     ax.set_ylim(0.5, 6.0 * max(float(counts.max()), 1.0))
     style.legend(ax, loc="upper left", ncols=2, columnspacing=1.0)
-    style.label(ax, "Histogram", "residual / expected sigma", "number per bin")
+    style.label(ax, "Against a Gaussian", "residual / expected sigma", "number per bin")
     return ax

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from starcal_uq._types import FloatArray
-from starcal_uq.distortion import Parameter, parameters, sigma_parameter
+from starcal_uq.distortion import Parameter
 from starcal_uq.formatting import decimals_for, fixed, pretty_unit, superscript
 
 
@@ -42,8 +42,8 @@ def axis_scale(parameter: Parameter, estimate: float, sigma: float) -> AxisScale
     decimals = decimals_for(spread)
     text = fixed(value, decimals)
     rounded = round(value, decimals)
-    title = f"{parameter.latex} = {text} ± {fixed(spread, decimals)} {pretty_unit(parameter.scaled_unit)}".strip()
-    exponent = 3 * math.floor(math.log10(spread) / 3.0 + 1e-9) if 0.0 < spread < 0.01 else 0
+    title = f"{parameter.latex} = {_with_unit(f'{text} ± {fixed(spread, decimals)}', parameter)}"
+    exponent = 3 * round(math.log10(spread) / 3.0) if 0.0 < spread < 0.01 else 0
     power = 10.0**exponent
     unit = pretty_unit(parameter.scaled_unit)
     if exponent:
@@ -55,7 +55,6 @@ def axis_scale(parameter: Parameter, estimate: float, sigma: float) -> AxisScale
     return AxisScale(rounded * parameter.scale, parameter.scale * power, label, title)
 
 
-def named_parameters(model_name: str, names: tuple[str, ...]) -> tuple[Parameter, ...]:
-    """Registry entries of these names; the noise parameter may be among them."""
-    known = {p.name: p for p in (*parameters(model_name), sigma_parameter(False), sigma_parameter(True))}
-    return tuple(known[name] for name in names)
+def _with_unit(text: str, parameter: Parameter) -> str:
+    unit = pretty_unit(parameter.scaled_unit)
+    return f"({text}) × {unit}" if parameter.scale != 1.0 else f"{text} {unit}".strip()

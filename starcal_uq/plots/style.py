@@ -81,10 +81,15 @@ def legend(ax: Axes, **keywords: Any) -> None:
 def colour_bar(ax: Axes, image: Any, text: str) -> Any:
     """A colour bar of its own for one panel."""
     bar = ax.figure.colorbar(image, ax=ax, fraction=0.046, pad=0.03)
+    dress_bar(bar, text)
+    return bar
+
+
+def dress_bar(bar: Any, text: str) -> None:
+    """Label and ticks of a colour bar in the common sizes."""
     bar.set_label(text, fontsize=LABEL_SIZE, color=INK)
     bar.ax.tick_params(labelsize=TICK_SIZE, colors=INK, length=3.0, width=0.7)
     bar.outline.set_visible(False)
-    return bar
 
 
 def png_bytes(figure: Figure, dpi: int = DPI) -> bytes:

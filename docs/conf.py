@@ -1,0 +1,80 @@
+"""Configuration of the documentation; `make docs` builds it, with warnings as errors."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).parent
+PROJECT = tomllib.loads((HERE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+project = "starcal_uq"
+author = "The starcal_uq developers"
+copyright = "2026, The starcal_uq developers"
+version = release = PROJECT["version"]
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+]
+exclude_patterns = ["_build"]
+source_suffix = {".md": "markdown"}
+myst_enable_extensions = ["amsmath", "dollarmath"]
+myst_heading_anchors = 2
+
+autodoc_default_options = {"members": True, "member-order": "bysource", "show-inheritance": True}
+autodoc_typehints = "none"  # the docstrings state shapes and units, which annotations cannot
+napoleon_google_docstring = False
+napoleon_use_ivar = True  # fields of dataclasses are described once, in the docstring of the class
+napoleon_use_rtype = False
+napoleon_attr_annotations = False
+# Words of a docstring's types ("n_frames values") are taken for references; two classes may have such a field.
+suppress_warnings = ["ref.python"]
+
+html_theme = "furo"
+html_title = f"starcal_uq {release}"
+html_static_path: list[str] = []
+
+COMMANDS = ("demo", "simulate", "calibrate", "sample", "coupling", "propagate", "report", "run")
+
+
+def write_command_help(_app: object) -> None:
+    """Write the help texts as the installed command prints them, so that the page cannot go stale."""
+    command = str(Path(sys.executable).with_name("starcal-uq"))
+    environment = {**os.environ, "COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
+    texts = []
+    for arguments in ([], *([name] for name in COMMANDS)):
+        run = subprocess.run(
+            [command, *arguments, "--help"], env=environment, capture_output=True, text=True, check=True
+        )
+        lines = [line.rstrip() for line in run.stdout.strip().splitlines()]
+        texts.append("\n".join([" ".join(["$ starcal-uq", *arguments, "--help"]), "", *lines]))
+    (HERE / "reference" / "_commands.txt").write_text("\n\n\n".join(texts) + "\n", encoding="utf-8")
+
+
+def escape_formulas(_app: object, _what: str, _name: str, _object: object, _options: object, lines: list[str]) -> None:
+    """Keep the bars of |A| and the last underscore of `str_` from being read as markup; literals stay as they are."""
+    literal_above: int | None = None
+    for number, line in enumerate(lines):
+        indent = len(line) - len(line.lstrip())
+        if literal_above is not None and line.strip() and indent <= literal_above:
+            literal_above = None
+        if literal_above is None:
+            parts = re.split(r"(``.*?``|`.*?`)", line)
+            parts[::2] = [re.sub(r"(?<!\\)\||(?<=\w)_(?!\w)", r"\\\g<0>", part) for part in parts[::2]]
+            lines[number] = "".join(parts)
+            literal_above = indent if line.rstrip().endswith("::") else None
+
+
+def setup(app: Any) -> None:
+    """Called by Sphinx."""
+    app.connect("builder-inited", write_command_help)
+    app.connect("autodoc-process-docstring", escape_formulas, priority=400)  # before napoleon

@@ -1,0 +1,403 @@
+"""The command line: the only place where the steps are wired together and printed.
+
+Exit status 0 when all is well, 1 when a result is there but should not be trusted or the work was interrupted, 2 for
+bad input, always with one sentence that says what to do.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from starcal_uq.errors import StarcalError
+from starcal_uq.steps import Progress
+
+app = typer.Typer(
+    name="starcal-uq",
+    help="Probabilistic calibration of star sensors: from identified stars to a posterior and its attitude error.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+    epilog="Start with `starcal-uq demo`: the experiment of Ye & Yang 2017, from a star catalogue to a report.",
+)
+
+ObsFile = Annotated[
+    Path,
+    typer.Argument(
+        metavar="OBS",
+        help="Stars in pixels: CSV, ECSV or Parquet with columns frame, x_px, y_px, ra_deg, dec_deg and optionally "
+        "sigma_px, star_id, mag, time_utc, temperature_c.",
+    ),
+]
+CameraFile = Annotated[
+    Path, typer.Argument(metavar="CAMERA", help="Nominal camera (TOML with a [camera] table): the start, and the prior's centre.")
+]
+RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder made by `starcal-uq calibrate`.")]
+NewRun = Annotated[Path, typer.Option("-o", "--out", metavar="RUN", help="Folder for the results.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace results that exist.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the table as JSON.")]
+Seed = Annotated[int, typer.Option(help="Seed; the same seed repeats the result bit for bit.")]
+Method = Annotated[
+    str,
+    typer.Option(
+        help="efficient (three stages, then the attitude-marginalised likelihood) or three_stage (Ye & Yang 2017)."
+    ),
+]
+Solver = Annotated[str, typer.Option(help="lm, minpack, or ipopt (keeps the optics within physical bounds).")]
+Columns = Annotated[
+    list[str] | None,
+    typer.Option("--column", metavar="NAME=IN_FILE", help="A column that is called otherwise in the file; repeatable."),
+]
+Directions = Annotated[
+    str | None,
+    typer.Option(
+        help="What ra_deg and dec_deg are: apparent (as seen by the moving sensor), catalogue (aberration is then "
+        "applied at time_utc), or undeclared.",
+    ),
+]
+Velocity = Annotated[
+    str | None,
+    typer.Option("--observer-velocity", metavar="VX,VY,VZ", help="Velocity relative to the Earth's centre, km/s, ICRS axes."),
+]
+Ensembles = Annotated[int, typer.Option(min=2, help="Separately seeded ensembles of walkers.")]
+Walkers = Annotated[int, typer.Option(min=14, help="Walkers in each ensemble.")]
+Steps = Annotated[int, typer.Option(min=20, help="Steps kept of each walker.")]
+Sigma = Annotated[
+    float | None, typer.Option(help="Centroid noise in px per axis, if it is known; sampled otherwise.")
+]
+PriorFile = Annotated[
+    Path | None, typer.Option("--priors", help="TOML file with a [priors] table; wide defaults otherwise.")
+]
+Likelihood = Annotated[
+    str, typer.Option(help="auto (compressed, checked against exact), compressed, or exact.")
+]
+Draws = Annotated[int, typer.Option(min=50, help="Posterior draws that go through QUEST.")]
+
+
+@contextmanager
+def _progress(label: str) -> Iterator[Progress | None]:
+    """A progress bar on standard error, where that is a terminal."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from starcal_uq.console import err
+
+    if not err.is_terminal:
+        yield None
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=err, transient=True) as bar:
+        task = bar.add_task(label, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def _columns(pairs: list[str] | None) -> dict[str, str]:
+    found = {}
+    for pair in pairs or []:
+        name, separator, in_file = pair.partition("=")
+        if not (name and separator and in_file):
+            raise typer.BadParameter(f"{pair!r} is not NAME=IN_FILE, such as ra_deg=ra_apparent_deg.")
+        found[name] = in_file
+    return found
+
+
+def _velocity(text: str | None) -> tuple[float, float, float] | None:
+    if text is None:
+        return None
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is not three numbers in km/s, such as 7.5,0.0,0.0.") from None
+    return x, y, z
+
+
+def _load(obs_path: Path, camera_path: Path, columns: Any, directions: str | None, velocity: str | None) -> Any:
+    from starcal_uq.camera import Camera
+    from starcal_uq.console import warn_undeclared
+    from starcal_uq.steps import DIRECTIONS, read_observations
+
+    if directions is not None and directions not in DIRECTIONS:
+        raise typer.BadParameter(f"--directions {directions!r} is unknown: use one of {', '.join(DIRECTIONS)}.")
+    camera = Camera.load(camera_path)
+    obs = read_observations(
+        obs_path,
+        camera,
+        columns=_columns(columns),
+        directions=directions,
+        observer_velocity_km_s=_velocity(velocity),
+    )
+    warn_undeclared(obs)
+    return obs, camera
+
+
+def _check_new(path: Path, force: bool) -> None:
+    """Refuse before any work is done."""
+    from starcal_uq.runfolder import ensure_new
+
+    if not (path.is_dir() and not any(path.iterdir())):
+        ensure_new(path, force)
+
+
+@app.command()
+def demo(
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the results.")] = Path("starcal-demo"),
+    frames: Annotated[int, typer.Option(min=20, help="Number of frames.")] = 1000,
+    seed: Seed = 2017,
+    force: Force = False,
+) -> None:
+    """The experiment of Ye & Yang 2017, end to end, ending in DIR/report.html."""
+    from starcal_uq.catalogue import load_catalogue
+    from starcal_uq.console import err, show_calibration
+    from starcal_uq.runfolder import RunFolder
+    from starcal_uq.simulation import paper_camera, paper_start, simulate
+    from starcal_uq.steps import calibrate_step, coupling_step, propagate_step, report_step, sample_step
+
+    _check_new(out, force)
+    run = RunFolder(out)
+    err.print(f"Simulating {frames} frames of the paper's sensor (Gaia G <= 6, 0.05 px noise, seed {seed}) ...")
+    truth = paper_camera()
+    obs = simulate(
+        load_catalogue(max_mag=6.0, epoch=2026.9), truth, n_frames=frames, min_stars=10, sigma_px=0.05, seed=seed
+    )
+    err.print("Calibrating from f = 72 mm and the detector's centre ...")
+    calibration = calibrate_step(run, obs, paper_start(), method="efficient", solver="lm", force=force)
+    err.print("Sampling the posterior ...")
+    with _progress("sampling") as progress:
+        posterior = sample_step(run, force=True, progress=progress, seed=seed)
+    err.print("Couplings, attitude error, report ...")
+    coupling_step(run)
+    propagate_step(run, n_draws=300, seed=seed)
+    path = report_step(run)
+    show_calibration(calibration, truth)
+    _finish(path, posterior.diagnostics.ok)
+
+
+def _finish(report: Path, trustworthy: bool) -> None:
+    from starcal_uq.console import err
+
+    print(f"Report: {report.resolve()}")
+    if not trustworthy:
+        err.print("A check of the sampling failed; the report says which.", style="yellow")
+        raise typer.Exit(1)
+
+
+@app.command("simulate")
+def simulate_command(
+    camera: CameraFile,
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="OBS", help="Table to write (.csv, .ecsv, .parquet).")],
+    frames: Annotated[int, typer.Option(min=1, help="Number of frames, at random attitudes.")] = 1000,
+    sigma: Annotated[float, typer.Option(min=0.0, help="Centroid noise, px per axis.")] = 0.05,
+    max_mag: Annotated[float, typer.Option(help="Magnitude limit, Gaia G.")] = 6.0,
+    min_stars: Annotated[int, typer.Option(min=3, help="Attitudes with fewer stars are drawn again.")] = 10,
+    epoch: Annotated[float, typer.Option(help="Julian year of the star positions.")] = 2026.9,
+    seed: Seed = 0,
+    force: Force = False,
+) -> None:
+    """Simulate identified stars with the embedded catalogue; directions are written as the sensor saw them."""
+    from starcal_uq.camera import Camera
+    from starcal_uq.catalogue import load_catalogue
+    from starcal_uq.runfolder import ensure_new
+    from starcal_uq.simulation import simulate
+
+    ensure_new(out, force)
+    obs = simulate(
+        load_catalogue(max_mag=max_mag, epoch=epoch),
+        Camera.load(camera),
+        n_frames=frames,
+        min_stars=min_stars,
+        sigma_px=sigma,
+        seed=seed,
+    )
+    obs.save(out, force=force)
+    print(f"{obs.n_stars} stars in {obs.n_frames} frames: {out}")
+
+
+@app.command("calibrate")
+def calibrate_command(
+    observations: ObsFile,
+    camera: CameraFile,
+    out: NewRun,
+    method: Method = "efficient",
+    solver: Solver = "lm",
+    column: Columns = None,
+    directions: Directions = None,
+    observer_velocity: Velocity = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Estimate optics and distortion: three stages and refinement, with covariance."""
+    from starcal_uq.console import print_json, records, show_calibration
+    from starcal_uq.runfolder import RunFolder
+    from starcal_uq.steps import calibrate_step, truth_of
+
+    _check_new(out, force)
+    obs, nominal = _load(observations, camera, column, directions, observer_velocity)
+    calibration = calibrate_step(RunFolder(out), obs, nominal, method=method, solver=solver, force=force)
+    if json:
+        print_json({"status": calibration.status.name, "parameters": records(calibration.to_dataframe())})
+    else:
+        show_calibration(calibration, truth_of(obs))
+        print(f"Run folder: {out}. Next: starcal-uq sample {out}")
+
+
+@app.command("sample")
+def sample_command(
+    run: RunPath,
+    seed: Seed = 0,
+    sigma: Sigma = None,
+    priors: PriorFile = None,
+    ensembles: Ensembles = 4,
+    walkers: Walkers = 64,
+    steps: Steps = 200,
+    likelihood: Likelihood = "auto",
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Sample the posterior with emcee from the calibration; an interrupted command goes on where it stopped."""
+    from starcal_uq.console import print_json, records, show_posterior
+    from starcal_uq.runfolder import RunFolder
+
+    posterior = _sample(RunFolder(run), seed, sigma, priors, ensembles, walkers, steps, likelihood, force)
+    if json:
+        print_json({"ok": posterior.diagnostics.ok, "parameters": records(posterior.summary())})
+    else:
+        show_posterior(posterior)
+    if not posterior.diagnostics.ok:
+        raise typer.Exit(1)
+
+
+def _sample(
+    run: Any,
+    seed: int,
+    sigma: float | None,
+    priors: Path | None,
+    ensembles: int,
+    walkers: int,
+    steps: int,
+    likelihood: str,
+    force: bool,
+) -> Any:
+    from starcal_uq.steps import load_run, sample_step
+
+    options: dict[str, Any] = {
+        "seed": seed,
+        "sigma": "sampled" if sigma is None else sigma,
+        "n_ensembles": ensembles,
+        "n_walkers": walkers,
+        "n_steps": steps,
+        "likelihood": likelihood,
+    }
+    if priors is not None:
+        from starcal_uq.priors import Priors
+
+        obs, calibration = load_run(run)
+        options["priors"] = Priors.from_toml(priors, calibration.nominal, per_star_sigma=obs.sigma_px is not None)
+    with _progress("sampling") as progress:
+        return sample_step(run, force=force, progress=progress, **options)
+
+
+@app.command("coupling")
+def coupling_command(run: RunPath, json: Json = False) -> None:
+    """Correlations, variance inflation, weak directions and the principal point's near-gauge with the boresight."""
+    from starcal_uq.console import print_json, records, show_coupling
+    from starcal_uq.runfolder import RunFolder
+    from starcal_uq.steps import coupling_step
+
+    found = coupling_step(RunFolder(run))
+    if json:
+        words = [direction.words for direction in found.weak_directions]
+        print_json({"parameters": records(found.to_dataframe()), "directions": words})
+    else:
+        show_coupling(found)
+
+
+@app.command("propagate")
+def propagate_command(run: RunPath, draws: Draws = 300, seed: Seed = 0, json: Json = False) -> None:
+    """Attitude error that the calibration contributes, through QUEST: common rotation, the rest, and centroid noise."""
+    from starcal_uq.console import print_json, records, show_attitude
+    from starcal_uq.runfolder import RunFolder
+    from starcal_uq.steps import propagate_step
+
+    error, _ = propagate_step(RunFolder(run), n_draws=draws, seed=seed)
+    if json:
+        print_json({"attitude_error": records(error.to_dataframe())})
+    else:
+        show_attitude(error)
+
+
+@app.command("report")
+def report_command(run: RunPath) -> None:
+    """Write RUN/report.html, one self-contained file, from whatever the run holds."""
+    from starcal_uq.runfolder import RunFolder
+    from starcal_uq.steps import report_step
+
+    print(f"Report: {report_step(RunFolder(run)).resolve()}")
+
+
+@app.command("run")
+def run_command(
+    observations: ObsFile,
+    camera: CameraFile,
+    out: NewRun,
+    method: Method = "efficient",
+    solver: Solver = "lm",
+    column: Columns = None,
+    directions: Directions = None,
+    observer_velocity: Velocity = None,
+    seed: Seed = 0,
+    sigma: Sigma = None,
+    priors: PriorFile = None,
+    ensembles: Ensembles = 4,
+    walkers: Walkers = 64,
+    steps: Steps = 200,
+    likelihood: Likelihood = "auto",
+    draws: Draws = 300,
+    force: Force = False,
+) -> None:
+    """Calibrate, sample, couple, propagate and report: everything from OBS to RUN/report.html."""
+    from starcal_uq.console import show_attitude, show_calibration, show_posterior
+    from starcal_uq.runfolder import RunFolder
+    from starcal_uq.steps import calibrate_step, coupling_step, propagate_step, report_step, truth_of
+
+    _check_new(out, force)
+    obs, nominal = _load(observations, camera, column, directions, observer_velocity)
+    folder = RunFolder(out)
+    calibration = calibrate_step(folder, obs, nominal, method=method, solver=solver, force=force)
+    show_calibration(calibration, truth_of(obs))
+    posterior = _sample(folder, seed, sigma, priors, ensembles, walkers, steps, likelihood, True)
+    show_posterior(posterior)
+    coupling_step(folder)
+    error, _ = propagate_step(folder, n_draws=draws, seed=seed)
+    show_attitude(error)
+    _finish(report_step(folder), posterior.diagnostics.ok)
+
+
+def main() -> None:
+    """Entry point: every error a user can make is one sentence on standard error, never a traceback."""
+    from click.exceptions import Abort, ClickException, Exit
+
+    try:
+        code = app(standalone_mode=False)
+        sys.exit(code if isinstance(code, int) else 0)
+    except Exit as stop:
+        sys.exit(stop.exit_code)
+    except ClickException as error:
+        error.show()
+        sys.exit(2)
+    except StarcalError as error:
+        _fail(str(error), 2)
+    except (Abort, KeyboardInterrupt):
+        _fail("interrupted; files that were complete are kept, and `starcal-uq sample RUN` goes on where it stopped.", 1)
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        _fail(f"{place}{error.strerror or error}; check the path, its permissions and the space on the disk.", 2)
+
+
+def _fail(message: str, status: int) -> None:
+    print(f"error: {message}", file=sys.stderr)
+    sys.exit(status)

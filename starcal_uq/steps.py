@@ -1,0 +1,192 @@
+"""The steps of a run, each from files of the run folder to files of the run folder.
+
+The command line is a thin layer over these functions. Outputs that a later step derives (couplings, attitude error,
+report) are removed when a step they depend on is done again, so that a folder never mixes two runs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from starcal_uq.calibration import Calibration
+from starcal_uq.camera import Camera
+from starcal_uq.errors import CalibrationError, ObservationError
+from starcal_uq.observations import Observations, load_observations
+from starcal_uq.runfolder import RunFolder, atomic_path, ensure_new
+
+if TYPE_CHECKING:
+    from starcal_uq.couplings import Coupling
+    from starcal_uq.fieldmap import FieldMap
+    from starcal_uq.posterior import Posterior
+    from starcal_uq.propagation import AttitudeError
+
+Progress = Callable[[int, int], None]
+
+DIRECTIONS = ("undeclared", "catalogue", "apparent")
+_AFTER_SAMPLING = ("coupling", "attitude", "field_map", "budget", "report")
+_AFTER_CALIBRATION = ("posterior", *_AFTER_SAMPLING)
+_ALL = ("observations", "camera", "calibration", "arrays", *_AFTER_CALIBRATION)
+
+
+def read_observations(
+    path: Path,
+    camera: Camera,
+    *,
+    columns: Mapping[str, str] | None = None,
+    directions: str | None = None,
+    observer_velocity_km_s: Sequence[float] | None = None,
+) -> Observations:
+    """Read a table and make its directions apparent as far as the user has declared how.
+
+    Parameters
+    ----------
+    path : Path
+        CSV, ECSV or Parquet.
+    camera : Camera
+        Its detector bounds the pixels.
+    columns : mapping, optional
+        Names in the file of columns that are called otherwise.
+    directions : {"undeclared", "catalogue", "apparent"}, optional
+        What the directions in the file are; the file's own metadata by default. With ``catalogue``, or with an observer
+        velocity, annual aberration is applied at each row's ``time_utc``.
+    observer_velocity_km_s : (3,) sequence, optional
+        Velocity relative to the Earth's centre, ICRS axes.
+
+    Raises
+    ------
+    ObservationError
+        For bad rows, or when aberration is asked for without times.
+    """
+    obs = load_observations(path, camera=camera, columns=columns)
+    if directions is not None:
+        obs = obs.with_meta(directions=directions)
+    if obs.meta.get("directions") == "apparent":
+        if observer_velocity_km_s is not None:
+            raise ObservationError(
+                f"{path}: the directions are declared apparent already, so that an observer velocity would be applied "
+                "twice: leave out --observer-velocity, or declare --directions catalogue."
+            )
+        return obs
+    if obs.meta.get("directions") == "catalogue" or observer_velocity_km_s is not None:
+        from starcal_uq.apparent import make_apparent
+
+        try:
+            return make_apparent(obs, observer_velocity_km_s)
+        except ObservationError as error:
+            raise ObservationError(f"{path}: {error}", row=error.row, column=error.column) from error
+    return obs
+
+
+def start_run(run: RunFolder, force: bool) -> None:
+    """Refuse to write into a folder that holds anything, unless forced; then remove the files of a former run.
+
+    Raises
+    ------
+    RunFolderError
+        When the folder exists and is not empty.
+    """
+    if run.path.is_dir() and not any(run.path.iterdir()):
+        return
+    ensure_new(run.path, force)
+    if force and run.path.is_dir():
+        _remove(run, _ALL)
+
+
+def _remove(run: RunFolder, names: Sequence[str]) -> None:
+    for name in names:
+        path: Path = getattr(run, name)
+        path.unlink(missing_ok=True)
+
+
+def calibrate_step(
+    run: RunFolder, obs: Observations, nominal: Camera, *, method: str, solver: str, force: bool
+) -> Calibration:
+    """Calibrate and write observations, camera and calibration; nothing is written when the estimate fails."""
+    from starcal_uq.estimation import calibrate
+
+    calibration = calibrate(obs, nominal, method=method, solver=solver)
+    start_run(run, force)
+    run.create()
+    obs.save(run.observations, force=True)
+    nominal.save(run.camera, force=True)
+    calibration.save(run.calibration)
+    return calibration
+
+
+def load_run(run: RunFolder) -> tuple[Observations, Calibration]:
+    """Observations and calibration of a run.
+
+    Raises
+    ------
+    CalibrationError
+        When the two files do not belong together.
+    """
+    calibration = Calibration.load(run.require("calibration"))
+    obs = load_observations(run.require("observations"))
+    if obs.data_hash != calibration.provenance["data_sha256"]:
+        raise CalibrationError(
+            f"{run.path}: the calibration was made from other observations than {run.observations.name} holds: "
+            "run `starcal-uq calibrate` again."
+        )
+    return obs, calibration
+
+
+def sample_step(run: RunFolder, *, force: bool, progress: Progress | None = None, **options: Any) -> Posterior:
+    """Sample the posterior of a calibrated run and write it; an interrupted run goes on from its checkpoint."""
+    from starcal_uq.sampler import sample
+
+    ensure_new(run.posterior, force)
+    obs, calibration = load_run(run)
+    checkpoint = run.path / "sampling.checkpoint.npz"
+    posterior = sample(obs, calibration, progress=progress, checkpoint=checkpoint, **options)
+    posterior.save(run.posterior)
+    checkpoint.unlink(missing_ok=True)
+    _remove(run, _AFTER_SAMPLING)
+    return posterior
+
+
+def load_posterior(run: RunFolder) -> Posterior:
+    """Posterior of a sampled run."""
+    from starcal_uq.posterior import Posterior
+
+    return Posterior.load(run.require("posterior"))
+
+
+def coupling_step(run: RunFolder) -> Coupling:
+    """Analyse the couplings of the posterior, or of the calibration where there is no posterior yet."""
+    from starcal_uq.couplings import coupling
+
+    result = load_posterior(run) if run.posterior.exists() else load_run(run)[1]
+    found = coupling(result)
+    with atomic_path(run.coupling) as temporary:
+        found.to_dataframe().to_csv(temporary, index=False)
+    return found
+
+
+def propagate_step(run: RunFolder, *, n_draws: int, seed: int) -> tuple[AttitudeError, FieldMap]:
+    """Carry the posterior through QUEST on the observed frames, and over the field; write both."""
+    from starcal_uq.fieldmap import field_map
+    from starcal_uq.propagation import propagate
+
+    posterior = load_posterior(run)
+    obs, _ = load_run(run)
+    error = propagate(posterior, obs, n_draws=n_draws, seed=seed)
+    fields = field_map(posterior, obs)
+    error.save(run.attitude)
+    fields.save(run.field_map)
+    return error, fields
+
+
+def report_step(run: RunFolder) -> Path:
+    """Write the report of whatever the run holds; the truth of a simulation is shown beside the estimate."""
+    from starcal_uq.reporting import report
+
+    return report(run.path, truth=truth_of(load_observations(run.require("observations"))))
+
+
+def truth_of(obs: Observations) -> Camera | None:
+    """The camera that observations were simulated with, if they were."""
+    truth = obs.meta.get("truth")
+    return None if truth is None else Camera.from_dict(truth)

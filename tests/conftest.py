@@ -1,0 +1,50 @@
+"""What all tests share. It is read before any test imports NumPy, so thread counts can still be set."""
+
+from __future__ import annotations
+
+import os
+
+# One BLAS thread: the matrices here are too small to gain from more, sums come out in the same order on every machine,
+# and the test processes that share the cores do not slow each other down.
+for _library in ("OMP", "OPENBLAS", "MKL"):
+    os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+import warnings
+from importlib.metadata import version
+from pathlib import Path
+
+import hypothesis
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+# The same examples on every run: a failure in CI is a failure at the desk.
+hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None, database=None)
+hypothesis.settings.load_profile("repeatable")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Let ArviZ 0.23 print its once-a-day notice before the test processes start.
+
+    It keeps the date in one file, and two processes that write it at the same moment fail.
+    """
+    if not hasattr(config, "workerinput") and version("arviz").startswith("0."):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            import arviz  # noqa: F401
+
+
+@pytest.fixture(scope="session")
+def root() -> Path:
+    """The folder of the project."""
+    return ROOT
+
+
+@pytest.fixture(scope="session")
+def real_data() -> Path:
+    """The folder of real observations, which is kept beside the project and not in it."""
+    folder = ROOT.parent / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip(f"the real observations are not present ({folder})")
+    return folder

@@ -1,0 +1,155 @@
+"""The project as a whole: what an import costs, what the files agree on, what the machinery promises."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import statistics
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import nbformat
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+FIND_PYTHON = ROOT / "scripts" / "find_python.sh"
+HEAVY = ("arviz", "astropy", "casadi", "emcee", "jinja2", "matplotlib", "pandas", "pyarrow", "scipy", "xarray")
+
+
+def run_python(code: str) -> str:
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    return run.stdout
+
+
+def test_import_is_fast() -> None:
+    code = "import time; t = time.perf_counter(); import starcal_uq; print(time.perf_counter() - t)"
+    run_python(code)  # writes the compiled files
+    seconds = statistics.median(float(run_python(code)) for _ in range(7))
+    assert seconds < 0.3
+
+
+def test_import_loads_nothing_heavy() -> None:
+    code = f"import sys, starcal_uq; print([name for name in {HEAVY} if name in sys.modules])"
+    assert run_python(code).strip() == "[]"
+
+
+def test_every_public_name_exists() -> None:
+    code = (
+        "import starcal_uq as sc; print([n for n in sc.__all__ if not hasattr(sc, n)], set(sc.__all__) - set(dir(sc)))"
+    )
+    assert run_python(code).strip() == "[] set()"
+
+
+def test_versions_agree() -> None:
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["version"]
+    citation = re.search(r"^version: (\S+)$", (ROOT / "CITATION.cff").read_text("utf-8"), re.MULTILINE)
+    changelog = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE)
+    assert citation is not None
+    assert changelog is not None
+    assert (citation[1], changelog[1]) == (version, version)
+    assert run_python("import starcal_uq; print(starcal_uq.__version__)").strip() == version
+
+
+def test_import_contracts_hold() -> None:
+    command = Path(sys.executable).with_name("lint-imports")
+    if not command.exists():
+        pytest.skip("import-linter is not installed beside this interpreter")
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    run = subprocess.run([command, "--no-cache"], cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert run.returncode == 0, run.stdout + run.stderr
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "notebooks").glob("*.ipynb")), ids=lambda path: path.name)
+def test_notebooks_store_no_outputs(path: Path) -> None:
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert cells
+    assert all(not cell.outputs and cell.execution_count is None for cell in cells)
+
+
+@pytest.mark.parametrize("name", ["README.md", "CONTRIBUTING.md"])
+def test_make_commands_in_the_texts_exist(name: str) -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text("utf-8"), re.MULTILINE))
+    commands = set(re.findall(r"^ {4}make ([a-z-]+)|`make ([a-z-]+)", (ROOT / name).read_text("utf-8"), re.MULTILINE))
+    named = {first or second for first, second in commands}
+    assert named
+    assert named <= targets
+
+
+def test_links_in_the_texts_lead_somewhere() -> None:
+    pages = [*ROOT.glob("*.md"), *(page for page in ROOT.glob("docs/**/*.md") if "_build" not in page.parts)]
+    broken = [
+        f"{page.relative_to(ROOT)}: {target}"
+        for page in pages
+        for target in re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", page.read_text("utf-8"))
+        if not (page.parent / target).exists() and not (page.parent / f"{target}.md").exists()
+    ]
+    assert broken == []
+
+
+def test_constraints_pin_every_dependency() -> None:
+    """Every line pins one version, and both sides of Python 3.12 are covered."""
+    lines = [line for line in (ROOT / "constraints.txt").read_text("utf-8").splitlines() if not line.startswith("#")]
+    pattern = re.compile(r'([a-z0-9-]+)==[\w.]+(?: ; python_version (<|>=) "3\.12")?')
+    pinned: dict[str, set[str]] = {}
+    for line in lines:
+        match = pattern.fullmatch(line)
+        assert match, line
+        pinned.setdefault(match[1], set()).update({match[2]} if match[2] else {"<", ">="})
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
+    wanted = [*project["dependencies"], *(d for extra in project["optional-dependencies"].values() for d in extra)]
+    names = {re.split(r"[\[<>=]", requirement)[0].lower() for requirement in wanted}
+    assert {name for name in names if pinned.get(name) != {"<", ">="}} == set()
+
+
+def find_python(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = {"PATH": str(folder), "HOME": str(folder)}
+    command = [shutil.which("sh") or "/bin/sh", str(FIND_PYTHON), *arguments]
+    return subprocess.run(command, env=environment, capture_output=True, text=True)
+
+
+def script(path: Path, body: str) -> None:
+    path.write_text(f"#!/bin/sh\n{body}\n", "utf-8")
+    path.chmod(0o755)
+
+
+def test_interpreter_that_does_not_run_is_passed_over(tmp_path: Path) -> None:
+    script(tmp_path / "python3.13", "echo 'command not found' >&2; exit 127")
+    script(tmp_path / "python3", f'exec "{sys.executable}" "$@"')
+    run = find_python(tmp_path)
+    assert (run.returncode, run.stderr) == (0, "")
+    assert Path(run.stdout.strip()).samefile(sys.executable)
+
+
+def test_missing_interpreter_is_one_sentence(tmp_path: Path) -> None:
+    script(tmp_path / "python3", "exit 1")
+    run = find_python(tmp_path)
+    assert run.returncode == 1
+    assert run.stdout == ""
+    assert run.stderr.startswith("No Python 3.11 or newer was found")
+    assert len(run.stderr.splitlines()) == 1
+
+
+def test_interpreter_without_venv_names_the_package(tmp_path: Path) -> None:
+    script(tmp_path / "python3", f'case "$2" in *ensurepip*) exit 1;; esac; exec "{sys.executable}" "$@"')
+    run = find_python(tmp_path)
+    assert run.returncode == 1
+    assert f"apt install python{sys.version_info[0]}.{sys.version_info[1]}-venv" in run.stderr
+
+
+def test_second_interpreter_is_of_the_other_generation(tmp_path: Path) -> None:
+    script(tmp_path / "python3", f'exec "{sys.executable}" "$@"')
+    same = find_python(tmp_path, "--other", sys.executable)
+    assert (same.returncode, same.stdout) == (0, "")
+    # An interpreter that answers every question with yes passes for the other generation.
+    script(tmp_path / "python3.12", "exit 0")
+    script(tmp_path / "python3.11", "exit 0")
+    assert find_python(tmp_path, "--other", sys.executable, "none").stdout == ""
+    refused = find_python(tmp_path, "--other", sys.executable, str(tmp_path / "absent"))
+    assert refused.returncode == 1
+    assert "ALT_PYTHON" in refused.stderr
