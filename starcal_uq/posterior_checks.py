@@ -25,8 +25,8 @@ ACCEPTANCE_RANGE = (0.1, 0.98)
 AGREEMENT_BOUND = 0.05
 # Largest tolerated difference between compressed and exact log likelihood within three standard deviations, nat.
 COMPRESSED_BOUND = 0.5
-# Weights between exp(-0.1) and exp(0.1) cannot distort anything. k-hat does not know that: it is blind to scale, and the
-# cubic remainder of a good expansion has a heavy tail at 1e-5 nat.
+# Weights between exp(-0.1) and exp(0.1) cannot distort anything. k-hat does not know that: it is blind to scale, and
+# the cubic remainder of a good expansion has a heavy tail at 1e-5 nat.
 _HARMLESS = 0.1
 _OFF_DETECTOR_SHARE = 1e-3
 _PRIOR_LIMITS = 0.5

@@ -349,7 +349,6 @@ def _text_line(path: Path, row: int) -> int:
 
     with get_readable_fileobj(path) as file:
         lines: IntArray = np.array(
-            [number for number, line in enumerate(file, 1) if line.strip() and not line.startswith("#")],
-            dtype=np.int64
+            [number for number, line in enumerate(file, 1) if line.strip() and not line.startswith("#")], dtype=np.int64
         )
     return int(lines[min(row + 1, len(lines) - 1)])

@@ -81,8 +81,8 @@ def test_times_in_every_form_mean_the_same() -> None:
     assert np.isfinite(earth_velocity_km_s(["2016-12-31T23:59:60.5", "2090-01-01"])).all()
 
 
-@pytest.mark.parametrize("bad", ["yesterday", "2026-13-01", "2026-11-21T24:30", "2026-02-30", "1492-10-12", "2026",
-""]) def test_unreadable_times_are_named(bad: str) -> None:
+@pytest.mark.parametrize("bad", ["noon", "2026-13-01", "2026-11-21T24:30", "2026-02-30", "1492-10-12", "2026", ""])
+def test_unreadable_times_are_named(bad: str) -> None:
     with pytest.raises(CatalogueError, match=rf"'{bad}' \(number 2\) .* write it as"):
         earth_velocity_km_s(["2026-11-21", bad])
 
@@ -91,7 +91,8 @@ def test_aberration_against_an_independent_formula() -> None:
     directions = random_directions(200)
     for velocity in (np.array([-20.0, 18.0, 9.0]), np.array([0.0, 0.0, 7.6]), np.array([150.0, -400.0, 20.0])):
         # Erfa adds 0.4 micro-arcsec for the Sun's gravity at 30 km/s.
-        difference = np.linalg.norm(aberrate(directions, velocity) - boost(directions, velocity / LIGHT_SPEED_KM_S), axis=1)
+        expected = boost(directions, velocity / LIGHT_SPEED_KM_S)
+        difference = np.linalg.norm(aberrate(directions, velocity) - expected, axis=1)
         assert difference.max() < 0.02 * UAS * np.linalg.norm(velocity) + 1e-15
 
 
@@ -153,7 +154,7 @@ def test_make_apparent_refuses_what_it_cannot_do() -> None:
     with pytest.raises(ObservationError, match="no column 'time_utc'") as caught:
         make_apparent(observations(time_utc=None))
     assert caught.value.column == "time_utc"
-    with pytest.raises(ObservationError, match="'time_utc'.*'noon'"):
+    with pytest.raises(ObservationError, match=r"'time_utc'.*'noon'"):
         make_apparent(observations(time_utc=np.array([TIMES[0], TIMES[0], TIMES[1], "noon"])))
     with pytest.raises(CatalogueError, match="three finite numbers"):
         make_apparent(obs, (1.0, float("nan"), 0.0))

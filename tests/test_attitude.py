@@ -34,9 +34,7 @@ def test_quaternions_agree_with_scipy() -> None:
 
 def test_product_has_the_sense_of_matrices() -> None:
     a, b = attitude.random_rotations(2, np.random.default_rng(1))
-    product = attitude.quaternion_multiply(
-        attitude.rotation_to_quaternion(a), attitude.rotation_to_quaternion(b)
-    )
+    product = attitude.quaternion_multiply(attitude.rotation_to_quaternion(a), attitude.rotation_to_quaternion(b))
     np.testing.assert_allclose(attitude.quaternion_to_rotation(product), a @ b, atol=1e-14)
 
 
@@ -60,9 +58,7 @@ def test_left_error_is_in_the_camera_frame() -> None:
     reference = attitude.random_rotations(20, rng)
     phi = 1e-5 * rng.standard_normal((7, 20, 3))
     turned = attitude.exp_rotation(phi) @ reference
-    found = attitude.left_error(
-        attitude.rotation_to_quaternion(turned), attitude.rotation_to_quaternion(reference)
-    )
+    found = attitude.left_error(attitude.rotation_to_quaternion(turned), attitude.rotation_to_quaternion(reference))
     np.testing.assert_allclose(found, phi, atol=2e-15)
 
 

@@ -105,11 +105,12 @@ def test_arviz_data_has_scaled_coefficients_units_and_provenance(post: Posterior
     assert post.data is data
 
 
-def test_scaling_saves_the_effective_sample_size(post: Posterior) -> None:
+def test_scaling_saves_the_monte_carlo_error(post: Posterior) -> None:
     # ArviZ takes a range below 1e-15 for a constant and calls every draw independent.
-    k2 = post.draws[:, 4].reshape(4, -1) * 0.1
-    assert arviz_compat.ess_bulk(k2) == k2.size
-    assert arviz_compat.ess_bulk(k2 / 1e-15) < 0.9 * k2.size
+    k2 = post.draws[:, 4].reshape(4, -1)
+    assert np.ptp(k2) < 1e-15
+    assert arviz_compat.mcse_mean(k2) == pytest.approx(k2.std() / np.sqrt(k2.size), rel=1e-3)
+    assert post.diagnostics.mcse[4] > 1.2 * arviz_compat.mcse_mean(k2)
 
 
 def test_given_noise_is_an_attribute_not_a_variable(given: Posterior) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from starcal_uq.attitude import (
     rotation_to_quaternion,
     rotation_vector,
 )
-from starcal_uq.quest import DegenerateFrameError, quest
+from starcal_uq.wahba import DegenerateFrameError, quest
 
 stats = pytest.importorskip("scipy.stats")
 Rotation = pytest.importorskip("scipy.spatial.transform").Rotation
@@ -49,7 +50,7 @@ def frames(
 def davenport(b: np.ndarray, r: np.ndarray, starts: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Eigenvector of the largest eigenvalue of K, frame by frame."""
     quaternions, values = [], []
-    for i, j in zip(starts[:-1], starts[1:], strict=True):
+    for i, j in pairwise(starts):
         B = np.einsum("n,ni,nj->ij", w[i:j] / w[i:j].sum(), b[i:j], r[i:j])
         z = [[B[2, 1] - B[1, 2]], [B[0, 2] - B[2, 0]], [B[1, 0] - B[0, 1]]]
         K = np.block([[B + B.T - np.trace(B) * np.eye(3), np.array(z)], [np.array(z).T, np.trace(B)]])
@@ -102,7 +103,7 @@ def test_agrees_with_scipy_also_at_half_turns(sigma_rad: float) -> None:
     b, r, starts, _ = frames([12] * len(rotations), 15.0, sigma_rad, seed=6, rotations=rotations)
     w = rng.uniform(0.1, 3.0, len(b))
     result = quest(b, r, starts, w)
-    for k, (i, j) in enumerate(zip(starts[:-1], starts[1:], strict=True)):
+    for k, (i, j) in enumerate(pairwise(starts)):
         expected, _ = Rotation.align_vectors(b[i:j], r[i:j], weights=w[i:j])
         assert np.abs(rotation_vector(result.rotations[k] @ expected.as_matrix().T)).max() < 1e-12
     if sigma_rad == 0.0:
@@ -116,7 +117,7 @@ def test_draws_give_the_same_as_one_call_each(monkeypatch: pytest.MonkeyPatch) -
     sigma = np.random.default_rng(2).uniform(1e-5, 2e-5, len(b))
     single = [quest(d, r, starts, sigma_rad=sigma) for d in draws]
     for block in (1, 100, 300, 10**6):
-        monkeypatch.setattr("starcal_uq.quest._BLOCK", block)
+        monkeypatch.setattr("starcal_uq.wahba._BLOCK", block)
         for references in (r, np.broadcast_to(r, draws.shape)):
             batch = quest(draws, references, starts, sigma_rad=sigma)
             assert batch.rotations.shape == (5, 60, 3, 3)
@@ -135,9 +136,7 @@ def test_weights_and_sigmas_are_two_names_of_one_thing() -> None:
     plain = quest(b, r, starts)
     np.testing.assert_allclose(plain.covariance * 1e-10, quest(b, r, starts, sigma_rad=1e-5).covariance, rtol=1e-12)
     i, j = starts[3], starts[4]
-    information = np.sum(
-        (np.eye(3) - b[i:j, :, None] * b[i:j, None, :]) * sigma[i:j, None, None] ** -2.0, axis=0
-    )
+    information = np.sum((np.eye(3) - b[i:j, :, None] * b[i:j, None, :]) * sigma[i:j, None, None] ** -2.0, axis=0)
     np.testing.assert_allclose(by_sigma.covariance[3] @ information, np.eye(3), atol=1e-10)
     np.testing.assert_allclose(plain.loss, 0.5e-10 * quest(b, r, starts, sigma_rad=1e-5).taste / 9, rtol=1e-4)
 
@@ -265,7 +264,7 @@ def test_is_much_faster_than_scipy() -> None:
         if n_frames == len(starts) - 1:
             quest(b, r, starts)
         else:
-            for i, j in zip(starts[:n_frames], starts[1 : n_frames + 1], strict=True):
+            for i, j in pairwise(starts[: n_frames + 1]):
                 Rotation.align_vectors(b[i:j], r[i:j])
         return time.perf_counter() - begin
 

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from starcal_uq import arviz_compat
-from starcal_uq.ensemble import EnsembleSettings, make_moves, run_ensembles, student_t_proposal
 from starcal_uq.errors import SamplingError
+from starcal_uq.estimation import calibrate
 from starcal_uq.importance import importance_check, laplace_approximation, scaled_inverse, start_target
-from starcal_uq.posterior_checks import chain_order, check_compression, step_order
+from starcal_uq.posterior_checks import check_compression
 from starcal_uq.priors import Priors
 from starcal_uq.sampler import sample
 from starcal_uq.status import Status
 from tests.gaussian_camera import COVARIANCE, SD, GaussianLikelihood, gaussian_calibration
+from tests.scenes import camera, nominal, observations, with_sigmas
 
 QUICK: dict[str, Any] = {"n_ensembles": 2, "n_walkers": 16, "n_steps": 60, "n_burn": 5, "seed": 3}
 
@@ -91,52 +91,12 @@ def test_stretch_move_agrees() -> None:
     mean, covariance = conjugate(post.priors, cal)
     z = whitened(post.theta_draws, mean, covariance)
     assert np.max(np.abs(np.cov(z.T) - np.eye(5))) < 0.2
-    assert np.max(post.diagnostics.autocorrelation) > 10.0
-
-
-def _variance_z(moves: list[tuple[Any, float]] | None) -> float:
-    """Largest deviation of a variance from one in Monte Carlo errors, on a standard normal target."""
-    seeds = np.random.SeedSequence(11).spawn(4)
-    settings = EnsembleSettings(40, 300, 50, "mixture")
-    chains = run_ensembles(lambda u: -0.5 * np.sum(u * u, axis=1), 5, seeds, settings, moves=moves)
-    squares = chain_order(chains.u) ** 2
-    z = [(squares[..., i].mean() - 1.0) / arviz_compat.mcse_mean(squares[..., i]) for i in range(5)]
-    return float(np.max(np.abs(z)))
-
-
-def test_variance_is_right_and_the_test_can_tell() -> None:
-    import emcee
-
-    assert _variance_z(None) < 4.0
-    # Negative control: this move of emcee 3.1 is biased, to 0.7 of the variance.
-    assert _variance_z([(emcee.moves.DESnookerMove(), 1.0)]) > 6.0
-
-
-def test_independence_proposal_needs_its_hastings_factor() -> None:
-    import emcee
-
-    def density(u: np.ndarray) -> np.ndarray:
-        # Wider than the proposal, so that leaving out the factor would show.
-        return -0.5 * np.sum(u * u, axis=1) / 1.5**2
-
-    def without_factor(u: np.ndarray, random: Any) -> tuple[np.ndarray, np.ndarray]:
-        new, factor = student_t_proposal(8.0)(u, random)
-        return new, np.zeros_like(factor)
-
-    seeds, settings = np.random.SeedSequence(2).spawn(2), EnsembleSettings(64, 400, 50, "mixture")
-    variances = [
-        run_ensembles(density, 3, seeds, settings, moves=moves).u.var(axis=(0, 1, 2))
-        for moves in (make_moves("mixture"), [(emcee.moves.MHMove(without_factor), 1.0)])
-    ]
-    assert np.all(np.abs(variances[0] / 1.5**2 - 1.0) < 0.08)
-    assert np.all(np.abs(variances[1] / 1.5**2 - 1.0) > 0.2)
+    assert np.nanmax(post.diagnostics.autocorrelation) > 10.0
 
 
 def test_same_seed_same_bits_and_ensembles_differ() -> None:
     cal = gaussian_calibration()
-    first, second, other = (
-        sample(None, cal, **{**QUICK, "seed": seed}, likelihood="compressed") for seed in (3, 3, 4)
-    )
+    first, second, other = (sample(None, cal, **{**QUICK, "seed": seed}, likelihood="compressed") for seed in (3, 3, 4))
     assert np.array_equal(first.draws, second.draws)
     assert np.array_equal(first.log_posterior, second.log_posterior)
     assert first.diagnostics.psis_khat == second.diagnostics.psis_khat
@@ -238,7 +198,7 @@ def test_unsound_calibrations_are_refused() -> None:
     with pytest.raises(SamplingError, match="not positive definite"):
         sample(None, gaussian_calibration(information=-scaled_inverse(COVARIANCE)), **QUICK)
     priors = Priors.default(gaussian_calibration().nominal.replace(distortion="k1"))
-    with pytest.raises(SamplingError, match="Priors.default"):
+    with pytest.raises(SamplingError, match=r"Priors\.default"):
         sample(None, gaussian_calibration(), priors, **QUICK)
 
 
@@ -309,24 +269,6 @@ def test_compression_check_measures_the_difference() -> None:
     assert 0.5 < bad.max_difference < 1.9
 
 
-def test_chain_order_and_back() -> None:
-    values = np.arange(2 * 6 * 3 * 2).reshape(2, 6, 3, 2).astype(float)
-    ordered = chain_order(values)
-    assert np.array_equal(step_order(ordered, 6, 3), values)
-    # First half in time first; then by walker; then by step.
-    assert np.array_equal(ordered[0, :3], values[0, :3, 0])
-    assert np.array_equal(ordered[0, 3:6], values[0, :3, 1])
-    assert np.array_equal(ordered[0, 9:12], values[0, 3:, 0])
-
-
-def test_split_rhat_sees_a_drift_in_time() -> None:
-    rng = np.random.default_rng(1)
-    steps = rng.standard_normal((4, 200, 16))
-    assert arviz_compat.rhat(chain_order(steps)) < 1.01
-    drifting = steps + np.linspace(-0.5, 0.5, 200)[:, None]
-    assert arviz_compat.rhat(chain_order(drifting)) > 1.01
-
-
 def test_too_short_a_run_fails_its_checks() -> None:
     post = sample(None, gaussian_calibration(), **{**QUICK, "n_steps": 8}, likelihood="compressed")
     assert not post.diagnostics.ok
@@ -344,3 +286,76 @@ def test_surprising_results_are_said() -> None:
     away = gaussian_calibration(theta=off, compressed=likelihood)
     failures = sample(None, away, **QUICK, likelihood="compressed").diagnostics.failures
     assert any("off the detector" in f for f in failures)
+
+
+@pytest.fixture(scope="module")
+def few_frames() -> tuple[Any, Any]:
+    obs = observations(n_frames=8)
+    return obs, calibrate(obs, nominal(camera()))
+
+
+def test_compressed_and_exact_posteriors_are_the_same(few_frames: tuple[Any, Any]) -> None:
+    obs, cal = few_frames
+    auto, exact = (sample(obs, cal, **QUICK, likelihood=name) for name in ("auto", "exact"))
+    assert auto.diagnostics.likelihood_used == "compressed"
+    assert auto.diagnostics.compressed_max_difference < 0.1
+    assert any("differ by up to" in m for m in auto.diagnostics.messages)
+    assert np.isnan(exact.diagnostics.compressed_max_difference)
+    assert exact.diagnostics.likelihood_used == "exact"
+    # The same random numbers decide, so the draws themselves agree.
+    assert np.max(np.abs(auto.mean - exact.mean) / exact.sd[:5]) < 0.02
+    assert np.allclose(auto.sd, exact.sd, rtol=0.02)
+
+
+def spoilt(cal: Any) -> Any:
+    """A calibration whose compressed likelihood has half of the data counted twice."""
+    return dataclasses.replace(cal, compressed=dataclasses.replace(cal.compressed, gram=1.5 * cal.compressed.gram))
+
+
+@pytest.fixture(scope="module")
+def replaced(few_frames: tuple[Any, Any]) -> Any:
+    obs, cal = few_frames
+    return sample(obs, spoilt(cal), **QUICK)
+
+
+def test_a_wrong_compressed_likelihood_is_replaced(few_frames: tuple[Any, Any], replaced: Any) -> None:
+    obs, cal = few_frames
+    assert replaced.diagnostics.likelihood_used == "exact"
+    assert replaced.diagnostics.compressed_max_difference > 0.5
+    assert any("exact likelihood was sampled" in m for m in replaced.diagnostics.messages)
+    kept = sample(obs, spoilt(cal), **QUICK, likelihood="compressed")
+    assert any("use likelihood='auto'" in failure for failure in kept.diagnostics.failures)
+
+
+@pytest.mark.parametrize("stop", [40, 170])
+def test_a_replaced_likelihood_is_resumed(
+    few_frames: tuple[Any, Any], replaced: Any, tmp_path: Path, stop: int
+) -> None:
+    obs, cal = few_frames
+    wrong = spoilt(cal)
+    calls = 0
+
+    def interrupt(done: int, total: int) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == stop:
+            raise KeyboardInterrupt
+
+    checkpoint = tmp_path / "run.ckpt"
+    # 40 is in the compressed run, 170 in the exact run that follows it.
+    with pytest.raises(KeyboardInterrupt):
+        sample(obs, wrong, **QUICK, progress=interrupt, checkpoint=checkpoint)
+    post = sample(obs, wrong, **QUICK, checkpoint=checkpoint)
+    assert np.array_equal(post.draws, replaced.draws)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("model", ["none", "brown_tangential", "inverse"])
+def test_every_distortion_model_and_stated_noise(model: str) -> None:
+    obs = with_sigmas(observations(model))
+    cal = calibrate(obs, nominal(camera(model)))
+    post = sample(obs, cal, **{**QUICK, "n_walkers": 32, "n_steps": 100})
+    assert post.parameter_names == (*camera(model).parameter_names, "sigma_scale")
+    assert post.diagnostics.likelihood_used == "compressed"
+    assert np.max(np.abs(post.mean - cal.theta) / cal.sigmas) < 0.3
+    assert np.allclose(post.sd[:-1], cal.sigmas, rtol=0.2)

@@ -12,8 +12,10 @@ from starcal_uq.plots.corner import plot_corner
 from starcal_uq.plots.matrix import plot_correlation, plot_correlations, plot_couplings
 from starcal_uq.plots.prior import plot_prior_posterior
 from starcal_uq.plots.residuals import plot_residual_histogram, plot_residual_map, plot_residual_radius, plot_residuals
+from starcal_uq.plots.style import figure_of, png_bytes
 
 __all__ = [
+    "figure_of",
     "plot_attitude",
     "plot_convergence",
     "plot_corner",
@@ -26,4 +28,5 @@ __all__ = [
     "plot_residual_map",
     "plot_residual_radius",
     "plot_residuals",
+    "png_bytes",
 ]

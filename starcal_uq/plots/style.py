@@ -92,6 +92,15 @@ def dress_bar(bar: Any, text: str) -> None:
     bar.outline.set_visible(False)
 
 
+def figure_of(ax: Axes) -> Figure:
+    """The figure that a panel is on."""
+    from matplotlib.figure import Figure
+
+    figure = ax.figure
+    # A panel may lie on a part of a figure; what is saved is the whole.
+    return figure if isinstance(figure, Figure) else figure.figure
+
+
 def png_bytes(figure: Figure, dpi: int = DPI) -> bytes:
     """The figure as PNG, without a time stamp: the same figure gives the same bytes."""
     buffer = io.BytesIO()

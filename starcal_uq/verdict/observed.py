@@ -65,7 +65,7 @@ def residual_pattern(obs: Observations, cal: Calibration) -> Check:
             f"The residuals show a pattern of {significant(pattern)} px per axis ({significant(arcsec)} arcsec) that "
             "the model does not explain; it is not in any interval of this report."
         )
-    value = f"p = {significant(p_value)}, pattern {significant(pattern)} px"
+    value = f"p = {significant(p_value)}" + (f", pattern {significant(pattern)} px" if pattern > 0.0 else "")
     return Check("Pattern in the residuals", Question.TRUSTWORTHY, level, value, f"p ≥ {PATTERN_P:g}", sentence)
 
 

@@ -74,7 +74,7 @@ def independent_posterior(post: Posterior) -> Check:
     else:
         sentence = "Importance sampling gives other means or sigmas: at least one of the two is wrong."
     value = f"means {fixed(d.agreement_mean, 3)} sigma, sigmas {percent(d.agreement_sd)}, k-hat {fixed(d.psis_khat, 2)}"
-    threshold = f"{AGREEMENT_BOUND:g} sigma, {percent(AGREEMENT_BOUND)}, {KHAT_BOUND:g}"
+    threshold = f"{AGREEMENT_BOUND:g} sigma, {percent(AGREEMENT_BOUND, 1)}, {KHAT_BOUND:g}"
     return Check("Independent posterior", Question.TRUSTWORTHY, pass_or_fail(good), value, threshold, sentence)
 
 

@@ -1,0 +1,203 @@
+"""Timings of the main job beside the straightforward way of doing it, measured in one run.
+
+Run with ``make bench``. Every line is the median of several repeats on one core; ratios compare the two columns of the
+same run, so that they mean something on any machine.
+"""
+
+from __future__ import annotations
+
+import os
+
+# One thread each, so that ratios compare algorithms and not thread pools.
+for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
+import argparse
+import statistics
+import subprocess
+import sys
+from collections.abc import Callable
+from time import perf_counter
+
+import numpy as np
+import starcal_uq as sc
+from rich.console import Console
+from rich.table import Table
+from starcal_uq.estimation import calibrate
+from starcal_uq.frames import StarFrames
+from starcal_uq.likelihood import MarginalLikelihood
+from starcal_uq.pairs import PairObjective
+from starcal_uq.projection import forward_kernel, forward_root
+
+
+def seconds(run: Callable[[], object], repeats: int) -> float:
+    """Median wall time."""
+    times = []
+    for _ in range(repeats):
+        began = perf_counter()
+        run()
+        times.append(perf_counter() - began)
+    return statistics.median(times)
+
+
+def explicit_pairs(obs: sc.Observations) -> np.ndarray:
+    """The paper's three stages with SciPy's Levenberg-Marquardt on explicitly formed pairs, analytic Jacobian.
+
+    The rival is given the same generated kernels and derivatives and the same linear stage; only the sums over pairs are
+    formed one by one. Its covariance is the naive inverse of J^T J, which is all that SciPy offers.
+    """
+    from scipy.optimize import least_squares
+    from starcal_uq.stages import distortion_stage
+
+    frames, start = StarFrames.from_observations(obs), sc.paper_start()
+    theta = np.array(start.theta)
+    first = PairObjective(frames, "brown", fixed=np.zeros(2))
+    joint = PairObjective(frames, "brown")
+    pairs = joint.pair_indices()
+    for objective in (first, joint):
+        # Indices are formed once, as anyone would.
+        objective.pair_indices = lambda: pairs  # type: ignore[method-assign]
+
+    def solve(objective: PairObjective, x: np.ndarray) -> np.ndarray:
+        return least_squares(
+            lambda t: objective.residuals(t)[0],
+            x,
+            jac=lambda t: objective.residuals(t)[1],
+            method="lm",
+            x_scale="jac",
+            xtol=1e-12,
+            ftol=1e-12,
+        ).x
+
+    theta[:3] = solve(first, theta[:3])
+    theta = distortion_stage(frames, start, theta).theta
+    theta = solve(joint, np.array(theta))
+    jacobian = joint.residuals(theta)[1]
+    scale = np.linalg.norm(jacobian, axis=0)
+    np.linalg.inv((jacobian / scale).T @ (jacobian / scale))
+    return theta
+
+
+def import_seconds() -> float:
+    """Median time of ``import starcal_uq`` in fresh interpreters, beyond starting Python."""
+    code = "import time; t = time.perf_counter(); import starcal_uq; print(time.perf_counter() - t)"
+    times = [float(subprocess.check_output([sys.executable, "-c", code], text=True)) for _ in range(7)]
+    return statistics.median(times)
+
+
+def quest_rates(obs: sc.Observations) -> tuple[float, float]:
+    """12-star attitudes per second: batch QUEST, and SciPy's align_vectors called per frame."""
+    from scipy.spatial.transform import Rotation
+    from starcal_uq.attitude import random_rotations
+
+    rng = np.random.default_rng(0)
+    k, m = 4000, 12
+    b = rng.normal(0.0, 0.07, (k, m, 3)) + [0.0, 0.0, 1.0]
+    b /= np.linalg.norm(b, axis=2, keepdims=True)
+    r = np.einsum("kji,kmj->kmi", random_rotations(k, rng), b)
+    starts = np.arange(k + 1) * m
+    flat_b, flat_r = b.reshape(-1, 3), r.reshape(-1, 3)
+    ours = seconds(lambda: sc.quest(flat_b, flat_r, starts, covariance=False), 7)
+    few = 300
+    theirs = seconds(lambda: [Rotation.align_vectors(b[i], r[i]) for i in range(few)], 3)
+    return k / ours, few / theirs
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--frames", type=int, default=1000)
+    parser.add_argument("--repeats", type=int, default=7)
+    options = parser.parse_args()
+    stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
+    obs = sc.simulate(stars, sc.paper_camera(), n_frames=options.frames, sigma_px=0.05, seed=2017)
+    start = sc.paper_start()
+    n_pairs = PairObjective(StarFrames.from_observations(obs), "brown").n_pairs
+    console = Console(width=110)
+    console.print(f"{obs.n_frames} frames, {obs.n_stars} stars, {n_pairs} pairs; medians, one core")
+    table = Table()
+    for heading, justify in (("what", "left"), ("ours", "right"), ("rival", "right"), ("ratio", "right"), ("rival is", "left")):
+        table.add_column(heading, justify=justify)  # type: ignore[arg-type]
+
+    calibrate(obs, start, method="three_stage")
+    three = seconds(lambda: _three_stages(obs), options.repeats)
+    rival = seconds(lambda: explicit_pairs(obs), 3)
+    difference = np.max(np.abs(explicit_pairs(obs) - _three_stages(obs)[0]) / np.sqrt(np.diag(_three_stages(obs)[1])))
+    table.add_row(
+        "three stages with sandwich covariance",
+        f"{1e3 * three:.0f} ms",
+        f"{1e3 * rival:.0f} ms",
+        f"{rival / three:.0f}",
+        f"SciPy LM on explicit pairs (same optimum to {difference:.0e} sigma)",
+    )
+    whole = seconds(lambda: calibrate(obs, start), options.repeats)
+    table.add_row("the same, refined, with compressed likelihood", f"{1e3 * whole:.0f} ms", "", "", "")
+
+    cal = calibrate(obs, start)
+    sc.sample(obs, cal, seed=0, n_steps=40)
+    began = perf_counter()
+    post = sc.sample(obs, cal, seed=1)
+    sampling = perf_counter() - began
+    mixture = float(np.min(post.diagnostics.ess_bulk)) / post.diagnostics.n_evaluations
+    stretch_post = sc.sample(obs, cal, seed=1, moves="stretch", n_steps=2000)
+    stretch = float(np.min(stretch_post.diagnostics.ess_bulk)) / stretch_post.diagnostics.n_evaluations
+    table.add_row(
+        f"sampling: {np.min(post.diagnostics.ess_bulk):.0f} effective draws in",
+        f"{sampling:.2f} s",
+        "",
+        "",
+        "",
+    )
+    table.add_row(
+        "effective draws per 1000 evaluations",
+        f"{1e3 * mixture:.0f}",
+        f"{1e3 * stretch:.0f}",
+        f"{mixture / stretch:.0f}",
+        "emcee's stretch move",
+    )
+
+    exact = MarginalLikelihood(obs, "brown")
+    exact.use_rotations(exact.rotations_at(cal.theta))
+    thetas, sigmas = np.tile(cal.theta, (128, 1)), np.full(128, cal.sigma)
+    one = seconds(lambda: exact.log_likelihood(cal.theta, cal.sigma), 15)
+    many = seconds(lambda: cal.compressed.log_likelihood(thetas, sigmas), 50) / 128
+    table.add_row(
+        "one likelihood evaluation", f"{1e6 * many:.1f} us", f"{1e6 * one:.0f} us", f"{one / many:.0f}", "exact likelihood"
+    )
+
+    frames = StarFrames.from_observations(obs)
+    b = frames.rotated(exact.rotations_at(cal.theta))
+    root = forward_root("brown", cal.theta, b)
+    kernel = forward_kernel("brown", "first")
+    mapped = kernel.function.map(frames.n_stars)
+    shared = np.zeros((2, frames.n_stars))
+    ours = seconds(lambda: kernel(frames.n_stars, cal.theta, b, root), 30)
+    casadi_time = seconds(lambda: mapped(np.tile(cal.theta[:, None], frames.n_stars), b, shared), 5)
+    table.add_row(
+        "model with both Jacobians, all stars",
+        f"{1e3 * ours:.1f} ms",
+        f"{1e3 * casadi_time:.1f} ms",
+        f"{casadi_time / ours:.0f}",
+        "CasADi's mapped function",
+    )
+    rate, scipy_rate = quest_rates(obs)
+    table.add_row(
+        "12-star attitudes per second", f"{rate:,.0f}", f"{scipy_rate:,.0f}", f"{rate / scipy_rate:.0f}", "SciPy align_vectors"
+    )
+    table.add_row("import starcal_uq", f"{1e3 * import_seconds():.0f} ms", "", "", "")
+    console.print(table)
+
+
+def _three_stages(obs: sc.Observations) -> tuple[np.ndarray, np.ndarray]:
+    """The paper's three stages and their sandwich covariance, without the refinement."""
+    from starcal_uq.stages import distortion_stage, joint_stage, optics_stage
+
+    frames, start = StarFrames.from_observations(obs), sc.paper_start()
+    optics = optics_stage(frames, start, "lm", 200)
+    linear = distortion_stage(frames, start, optics.theta)
+    theta = joint_stage(frames, start, linear.theta, "lm", 200).theta
+    return theta, PairObjective(frames, "brown").godambe(theta)
+
+
+if __name__ == "__main__":
+    main()

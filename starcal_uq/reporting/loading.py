@@ -1,0 +1,121 @@
+"""Read what a run folder holds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from starcal_uq.calibration import Calibration
+from starcal_uq.camera import Camera
+from starcal_uq.errors import RunFolderError
+from starcal_uq.observations import Observations, load_observations
+
+if TYPE_CHECKING:
+    from starcal_uq.couplings import Coupling
+    from starcal_uq.fieldmap import FieldMap
+    from starcal_uq.posterior import Posterior
+    from starcal_uq.propagation import AttitudeError
+    from starcal_uq.runfolder import RunFolder
+
+
+@dataclass(frozen=True)
+class Missing:
+    """A part that the report lacks.
+
+    Attributes
+    ----------
+    what : str
+        The part, in words.
+    command : str
+        The command that makes it.
+    """
+
+    what: str
+    command: str
+
+
+@dataclass(frozen=True)
+class Results:
+    """Everything that a report is made from; None for what the run does not hold.
+
+    Attributes
+    ----------
+    name : str
+        Name of the run.
+    observations : Observations
+        The data.
+    calibration : Calibration
+        The estimate.
+    posterior : Posterior or None
+        The draws.
+    coupling : Coupling or None
+        The couplings, of the posterior if there is one, else of the estimate.
+    attitude : AttitudeError or None
+        The attitude error.
+    field_map : FieldMap or None
+        The direction uncertainty over the field.
+    truth : Camera or None
+        The camera of a simulation.
+    missing : tuple of Missing
+        What the run does not hold.
+    """
+
+    name: str
+    observations: Observations
+    calibration: Calibration
+    posterior: Posterior | None = None
+    coupling: Coupling | None = None
+    attitude: AttitudeError | None = None
+    field_map: FieldMap | None = None
+    truth: Camera | None = None
+    missing: tuple[Missing, ...] = ()
+
+
+def load_results(run: RunFolder, truth: Camera | None = None) -> Results:
+    """Load every result of a run.
+
+    Raises
+    ------
+    RunFolderError
+        If there is no calibration, or its data are not those of the run.
+    """
+    from starcal_uq.couplings import coupling
+    from starcal_uq.posterior import Posterior
+
+    calibration = Calibration.load(run.require("calibration"))
+    observations = load_observations(run.require("observations"))
+    if observations.data_hash != calibration.provenance.get("data_sha256"):
+        raise RunFolderError(
+            f"{run.path}: the calibration was made from other observations than {run.observations.name} holds; run "
+            "`starcal-uq calibrate` again."
+        )
+    missing = []
+    posterior = Posterior.load(run.posterior) if run.posterior.exists() else None
+    if posterior is None:
+        missing.append(Missing("The posterior", f"starcal-uq sample {run.path}"))
+    attitude, field_map = _attitude(run)
+    if attitude is None or field_map is None:
+        missing.append(Missing("The attitude error and the map over the field", f"starcal-uq propagate {run.path}"))
+    if truth is None and "truth" in observations.meta:
+        truth = Camera.from_dict(observations.meta["truth"])
+    return Results(
+        name=run.path.resolve().name,
+        observations=observations,
+        calibration=calibration,
+        posterior=posterior,
+        coupling=coupling(calibration if posterior is None else posterior),
+        attitude=attitude,
+        field_map=field_map,
+        truth=truth if truth is not None and truth.parameter_names == calibration.parameter_names else None,
+        missing=tuple(missing),
+    )
+
+
+def _attitude(run: RunFolder) -> tuple[AttitudeError | None, FieldMap | None]:
+    from starcal_uq.fieldmap import FieldMap
+    from starcal_uq.propagation import AttitudeError
+
+    return (
+        AttitudeError.load(run.attitude) if run.attitude.exists() else None,
+        FieldMap.load(run.field_map) if run.field_map.exists() else None,
+    )

@@ -1,0 +1,120 @@
+"""Fill the template."""
+
+from __future__ import annotations
+
+import base64
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from starcal_uq.distortion import get_model
+from starcal_uq.formatting import MINUS, count, join_words
+from starcal_uq.reporting import tables, words
+from starcal_uq.reporting.loading import Results
+from starcal_uq.verdict import Level, Question, judge, limits, worst
+
+_MARKS = {Level.PASS: "✓", Level.WARN: "!", Level.FAIL: "✗"}
+
+
+def render(results: Results, figures: Mapping[str, bytes]) -> str:
+    """The report as one HTML document.
+
+    Parameters
+    ----------
+    results
+        What to report.
+    figures
+        PNG images by the names of `starcal_uq.reporting.figures.draw_figures`; a missing one is left out.
+    """
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("starcal_uq", "templates"),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    environment.filters["symbol"] = tables.symbol
+    environment.filters["minus"] = _minus
+    return environment.get_template("report.html.j2").render(context(results, figures)) + "\n"
+
+
+def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
+    """What the template shows."""
+    cal, post, obs = results.calibration, results.posterior, results.observations
+    verdict = judge(obs, cal, post, results.truth)
+    converged = verdict.of(Question.CONVERGED)
+    trust = verdict.of(Question.TRUSTWORTHY)
+    return {
+        "title": (results.truth or cal.nominal).name or results.name,
+        "run_name": results.name,
+        "created": (post or cal).provenance.get("created_utc", ""),
+        "version": (post or cal).provenance.get("versions", {}).get("starcal_uq") or "",
+        "verdict": verdict,
+        "marks": _MARKS,
+        "Level": Level,
+        "converged_level": worst(converged),
+        "trust_level": worst(trust),
+        "converged_words": _answer(converged),
+        "trust_words": _answer(trust),
+        "limits": limits(obs, cal, results.coupling, results.attitude),
+        "data_sentence": words.data_sentence(results),
+        "results": results,
+        "names": [p.name for p in tables.all_parameters(results)],
+        "parameter_rows": tables.parameter_rows(results),
+        "attitude_rows": [] if results.attitude is None else tables.attitude_rows(results.attitude),
+        "coupling_rows": [] if results.coupling is None else tables.coupling_rows(results.coupling, results),
+        "weak_directions": [] if results.coupling is None else tables.weak_directions(results.coupling),
+        "diagnostics_rows": [] if post is None else tables.diagnostics_rows(post),
+        "methods_rows": tables.methods_rows(results),
+        "stage_rows": tables.stage_rows(results),
+        "pair_rows": tables.pair_rows(results),
+        "prior_rows": words.prior_rows(results),
+        "sigma_sentence": words.sigma_sentence(results),
+        "sampling_sentence": words.sampling_sentence(results),
+        "compressed_sentence": words.compressed_sentence(results),
+        **_distortion(results),
+        "degrees_of_freedom": count(cal.dof),
+        "provenance_rows": words.provenance_rows(results),
+        "images": {name: _image(png) for name, png in figures.items()},
+    }
+
+
+def _distortion(results: Results) -> dict[str, Any]:
+    """The formula of the distortion model, from its registry entry."""
+    model = get_model(results.calibration.camera.distortion)
+    radial = [(c.name, c.order - 1) for c in model.coefficients if c.name.startswith("k")]
+    forward = model.direction == "forward"
+    return {
+        "distortion_source": model.source,
+        "radial_terms": radial,
+        "decentring": [c.name for c in model.coefficients if not c.name.startswith("k")],
+        "from_point": "ideal" if forward else "distorted",
+        "to_point": "distorted" if forward else "ideal",
+    }
+
+
+def _image(png: bytes) -> dict[str, Any]:
+    """The data of an image and its width on the page: half its pixels, so that it is sharp on fine screens and paper."""
+    return {"data": base64.b64encode(png).decode("ascii"), "width": int.from_bytes(png[16:20], "big") // 2}
+
+
+def _answer(checks: tuple[Any, ...]) -> str:
+    """What to say in one line: the worst checks, or that all passed."""
+    bad = [check for check in checks if check.level is worst(checks)]
+    if not checks:
+        return "Nothing was checked."
+    if worst(checks) is Level.PASS:
+        return f"All {len(checks)} checks passed: {join_words([_lower(check.name) for check in checks])}."
+    return " ".join(check.sentence for check in bad)
+
+
+def _lower(name: str) -> str:
+    """First letter small, unless the name starts with an abbreviation."""
+    return name if name[1:2] in ("-", "") else name[0].lower() + name[1:]
+
+
+def _minus(text: str) -> str:
+    """True minus signs in front of numbers."""
+    return re.sub(r"(?<![\w.])-(?=\d)", MINUS, text)

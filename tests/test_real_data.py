@@ -1,0 +1,74 @@
+"""Real stars: a table measured in night-sky images of the European Space Agency, against an independent bundle fit."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+import starcal_uq as sc
+
+# Independent bundle fit of the table (apparent directions, SNR >= 10, 242 stars): value and standard error.
+INDEPENDENT = {"x0": (517.3, 1.0), "y0": (389.9, 1.4), "f": (5116.54, 0.28), "k1f2": (0.078, 0.017), "k2f4": (1.5, 1.1)}
+
+
+@pytest.fixture(scope="module")
+def camera(real_data):
+    return sc.Camera.load(real_data / "esa_tetra3_camera.toml")
+
+
+@pytest.fixture(scope="module")
+def table(real_data):
+    return real_data / "esa_tetra3_observations.csv"
+
+
+def _select(table, camera):
+    obs = sc.load_observations(
+        table, camera, columns={"ra_deg": "ra_apparent_deg", "dec_deg": "dec_apparent_deg"}
+    ).with_meta(directions="apparent")
+    with table.open() as stream:
+        snr = np.array([float(row["snr"]) for row in csv.DictReader(stream)])
+    return obs.select(snr >= 10)
+
+
+def test_all_stars_as_a_user_would_run_them(camera, table):
+    obs = sc.load_observations(table, camera)
+    assert not obs.directions_declared
+    cal = sc.calibrate(obs, camera)
+    assert (cal.n_stars, cal.n_frames) == (567, 8)
+    assert 0.08 < cal.sigma < 0.16
+    assert np.hypot(cal.theta[0] - 511.5, cal.theta[1] - 383.5) < 15.0
+    assert abs(cal.theta[2] - 5115.0) < 5.0
+    assert cal.correlation[3, 4] < -0.9
+
+
+def test_agrees_with_the_independent_fit(camera, table):
+    obs = _select(table, camera)
+    assert obs.n_stars == 242
+    cal = sc.calibrate(obs, camera)
+    f = cal.theta[2]
+    ours = dict(zip(INDEPENDENT, [*cal.theta[:3], cal.theta[3] * f**2, cal.theta[4] * f**4], strict=True))
+    sigmas = [*cal.sigmas[:3], cal.sigmas[3] * f**2, cal.sigmas[4] * f**4]
+    for (name, (value, error)), sigma in zip(INDEPENDENT.items(), sigmas, strict=True):
+        assert abs(ours[name] - value) < 0.3 * error, name
+        assert sigma == pytest.approx(error, rel=0.1), name
+    assert cal.sigma == pytest.approx(0.070, abs=0.002)
+    # The control: directions without aberration and refraction do not agree.
+    wrong = sc.calibrate(sc.load_observations(table, camera), camera)
+    assert abs(wrong.theta[2] - INDEPENDENT["f"][0]) > 5 * INDEPENDENT["f"][1]
+
+
+def test_one_coefficient_is_enough(camera, table):
+    cal = sc.calibrate(_select(table, camera), camera.replace(distortion="k1", coefficients=(0.0,)))
+    f = cal.theta[2]
+    assert cal.theta[3] * f**2 == pytest.approx(0.100, abs=0.004)
+    assert cal.sigmas[3] * f**2 == pytest.approx(0.004, rel=0.1)
+
+
+def test_posterior_of_few_frames_agrees_with_its_independent_check(camera, table):
+    obs = _select(table, camera)
+    cal = sc.calibrate(obs, camera)
+    post = sc.sample(obs, cal, seed=1)
+    assert post.diagnostics.ok, post.diagnostics.failures
+    assert np.all(np.abs(post.mean - cal.theta) / cal.sigmas < 0.3)
+    assert np.allclose(np.sqrt(np.diag(post.covariance)), cal.sigmas, rtol=0.1)
