@@ -49,7 +49,7 @@ docs: .venv/.installed-docs ## the documentation, into docs/_build/html; a warni
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --fresh-env docs docs/_build/html
 
 bench: .venv/.installed ## timings and effective draws, beside the straightforward way
-	$(BIN)/python benchmarks/run.py
+	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python benchmarks/run.py
 
 clean: ## remove everything that the other targets made
 	rm -rf .venv .venv-alt docs/_build docs/reference/_commands.txt starcal-demo dist

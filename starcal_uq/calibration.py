@@ -14,13 +14,15 @@ from starcal_uq.camera import Camera
 from starcal_uq.compressed import CompressedLikelihood
 from starcal_uq.distortion import parameters
 from starcal_uq.errors import RunFolderError
-from starcal_uq.formatting import fixed, decimals_for
+from starcal_uq.formatting import decimals_for, fixed
 from starcal_uq.runfolder import atomic_path, atomic_write_text
 from starcal_uq.stages import Stage
 from starcal_uq.status import Status
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from starcal_uq.observations import Observations
 
 _ARRAYS = (
     "theta",
@@ -155,15 +157,19 @@ class Calibration:
         ]
         unit = "px" if self.sigma_name == "sigma" else "1"
         rows.append(
-            {"parameter": self.sigma_name, "start": np.nan, "estimate": self.sigma, "sigma": self.sigma_std, "unit": unit}
+            {
+                "parameter": self.sigma_name,
+                "start": np.nan,
+                "estimate": self.sigma,
+                "sigma": self.sigma_std,
+                "unit": unit,
+            }
         )
         return pd.DataFrame(rows)
 
     def _repr_html_(self) -> str:
         rows = []
-        for parameter, value, sigma in zip(
-            parameters(self.camera.distortion), self.theta, self.sigmas, strict=True
-        ):
+        for parameter, value, sigma in zip(parameters(self.camera.distortion), self.theta, self.sigmas, strict=True):
             scaled, error = value / parameter.scale, sigma / parameter.scale
             decimals = decimals_for(error)
             rows.append(
@@ -181,6 +187,18 @@ class Calibration:
             "<table><thead><tr><th>parameter</th><th>estimate</th><th>sigma</th><th>unit</th></tr></thead>"
             f"<tbody>{''.join(rows)}</tbody></table>"
         )
+
+    def plot_convergence(self, **options: Any) -> Any:
+        """Estimates against iteration through the stages (the paper's Fig. 3); returns the matplotlib Figure."""
+        from starcal_uq.plots import plot_convergence
+
+        return plot_convergence(self, **options)
+
+    def plot_residuals(self, obs: Observations, **options: Any) -> Any:
+        """Residuals over the field, against radius, and against a Gaussian; returns the matplotlib Figure."""
+        from starcal_uq.plots import plot_residuals
+
+        return plot_residuals(self, obs, **options)
 
     def __repr__(self) -> str:
         values = ", ".join(
@@ -249,15 +267,14 @@ class Calibration:
                 )
                 for index, stage in enumerate(document["stages"])
             )
-            values = {name: arrays[name] if name in arrays else np.asarray(document[name]) for name in _ARRAYS}
+            values: AnyDict = {name: arrays[name] if name in arrays else np.asarray(document[name]) for name in _ARRAYS}
             return cls(
                 camera=Camera.from_dict(document["camera"]),
                 nominal=Camera.from_dict(document["nominal"]),
                 stages=stages,
                 status=Status[document["status"]],
                 compressed=CompressedLikelihood.from_dict(document["compressed"]),
-                **{name: document[name] for name in _SCALARS},
-                **values,
+                **(values | {name: document[name] for name in _SCALARS}),
             )
         except (OSError, KeyError, ValueError, TypeError) as error:
             raise RunFolderError(

@@ -36,7 +36,10 @@ ObsFile = Annotated[
     ),
 ]
 CameraFile = Annotated[
-    Path, typer.Argument(metavar="CAMERA", help="Nominal camera (TOML with a [camera] table): the start, and the prior's centre.")
+    Path,
+    typer.Argument(
+        metavar="CAMERA", help="Nominal camera (TOML with a [camera] table): the start, and the prior's centre."
+    ),
 ]
 RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder made by `starcal-uq calibrate`.")]
 NewRun = Annotated[Path, typer.Option("-o", "--out", metavar="RUN", help="Folder for the results.")]
@@ -63,20 +66,18 @@ Directions = Annotated[
 ]
 Velocity = Annotated[
     str | None,
-    typer.Option("--observer-velocity", metavar="VX,VY,VZ", help="Velocity relative to the Earth's centre, km/s, ICRS axes."),
+    typer.Option(
+        "--observer-velocity", metavar="VX,VY,VZ", help="Velocity relative to the Earth's centre, km/s, ICRS axes."
+    ),
 ]
 Ensembles = Annotated[int, typer.Option(min=2, help="Separately seeded ensembles of walkers.")]
 Walkers = Annotated[int, typer.Option(min=14, help="Walkers in each ensemble.")]
 Steps = Annotated[int, typer.Option(min=20, help="Steps kept of each walker.")]
-Sigma = Annotated[
-    float | None, typer.Option(help="Centroid noise in px per axis, if it is known; sampled otherwise.")
-]
+Sigma = Annotated[float | None, typer.Option(help="Centroid noise in px per axis, if it is known; sampled otherwise.")]
 PriorFile = Annotated[
     Path | None, typer.Option("--priors", help="TOML file with a [priors] table; wide defaults otherwise.")
 ]
-Likelihood = Annotated[
-    str, typer.Option(help="auto (compressed, checked against exact), compressed, or exact.")
-]
+Likelihood = Annotated[str, typer.Option(help="auto (compressed, checked against exact), compressed, or exact.")]
 Draws = Annotated[int, typer.Option(min=50, help="Posterior draws that go through QUEST.")]
 
 
@@ -135,17 +136,11 @@ def _load(obs_path: Path, camera_path: Path, columns: Any, directions: str | Non
     return obs, camera
 
 
-def _check_new(path: Path, force: bool) -> None:
-    """Refuse before any work is done."""
-    from starcal_uq.runfolder import ensure_new
-
-    if not (path.is_dir() and not any(path.iterdir())):
-        ensure_new(path, force)
-
-
 @app.command()
 def demo(
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the results.")] = Path("starcal-demo"),
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the results.")] = Path(
+        "starcal-demo"
+    ),
     frames: Annotated[int, typer.Option(min=20, help="Number of frames.")] = 1000,
     seed: Seed = 2017,
     force: Force = False,
@@ -155,10 +150,17 @@ def demo(
     from starcal_uq.console import err, show_calibration
     from starcal_uq.runfolder import RunFolder
     from starcal_uq.simulation import paper_camera, paper_start, simulate
-    from starcal_uq.steps import calibrate_step, coupling_step, propagate_step, report_step, sample_step
+    from starcal_uq.steps import (
+        calibrate_step,
+        check_new_run,
+        coupling_step,
+        propagate_step,
+        report_step,
+        sample_step,
+    )
 
-    _check_new(out, force)
     run = RunFolder(out)
+    check_new_run(run, force)
     err.print(f"Simulating {frames} frames of the paper's sensor (Gaia G <= 6, 0.05 px noise, seed {seed}) ...")
     truth = paper_camera()
     obs = simulate(
@@ -233,9 +235,9 @@ def calibrate_command(
     """Estimate optics and distortion: three stages and refinement, with covariance."""
     from starcal_uq.console import print_json, records, show_calibration
     from starcal_uq.runfolder import RunFolder
-    from starcal_uq.steps import calibrate_step, truth_of
+    from starcal_uq.steps import calibrate_step, check_new_run, truth_of
 
-    _check_new(out, force)
+    check_new_run(RunFolder(out), force)
     obs, nominal = _load(observations, camera, column, directions, observer_velocity)
     calibration = calibrate_step(RunFolder(out), obs, nominal, method=method, solver=solver, force=force)
     if json:
@@ -362,11 +364,18 @@ def run_command(
     """Calibrate, sample, couple, propagate and report: everything from OBS to RUN/report.html."""
     from starcal_uq.console import show_attitude, show_calibration, show_posterior
     from starcal_uq.runfolder import RunFolder
-    from starcal_uq.steps import calibrate_step, coupling_step, propagate_step, report_step, truth_of
+    from starcal_uq.steps import (
+        calibrate_step,
+        check_new_run,
+        coupling_step,
+        propagate_step,
+        report_step,
+        truth_of,
+    )
 
-    _check_new(out, force)
-    obs, nominal = _load(observations, camera, column, directions, observer_velocity)
     folder = RunFolder(out)
+    check_new_run(folder, force)
+    obs, nominal = _load(observations, camera, column, directions, observer_velocity)
     calibration = calibrate_step(folder, obs, nominal, method=method, solver=solver, force=force)
     show_calibration(calibration, truth_of(obs))
     posterior = _sample(folder, seed, sigma, priors, ensembles, walkers, steps, likelihood, True)
@@ -379,23 +388,29 @@ def run_command(
 
 def main() -> None:
     """Entry point: every error a user can make is one sentence on standard error, never a traceback."""
-    from click.exceptions import Abort, ClickException, Exit
+    from typer.exceptions import TyperException
 
     try:
         code = app(standalone_mode=False)
         sys.exit(code if isinstance(code, int) else 0)
-    except Exit as stop:
+    except typer.Exit as stop:
         sys.exit(stop.exit_code)
-    except ClickException as error:
-        error.show()
-        sys.exit(2)
+    except TyperException as error:
+        _fail(_usage_sentence(error), 2)
     except StarcalError as error:
         _fail(str(error), 2)
-    except (Abort, KeyboardInterrupt):
-        _fail("interrupted; files that were complete are kept, and `starcal-uq sample RUN` goes on where it stopped.", 1)
+    except (typer.Abort, KeyboardInterrupt):
+        _fail("interrupted; what was complete is kept, and `starcal-uq sample RUN` goes on where it stopped.", 1)
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
         _fail(f"{place}{error.strerror or error}; check the path, its permissions and the space on the disk.", 2)
+
+
+def _usage_sentence(error: Exception) -> str:
+    """What is wrong with a call, and where to look."""
+    words = getattr(error, "format_message", None)
+    message = words() if callable(words) else str(error)
+    return f"{message.strip().rstrip('.')}; see `starcal-uq --help`."
 
 
 def _fail(message: str, status: int) -> None:

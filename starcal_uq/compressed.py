@@ -89,16 +89,14 @@ class CompressedLikelihood:
 
     def to_dict(self) -> AnyDict:
         """Plain lists and numbers, lossless."""
-        return {
-            name: value.tolist() if isinstance(value, np.ndarray) else value
-            for name, value in vars(self).items()
-        }
+        return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(self).items()}
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> CompressedLikelihood:
         """Inverse of `to_dict`."""
         arrays = ("theta_hat", "whitening", "gram", "log_determinant_slope")
-        return cls(**{k: np.asarray(v, dtype=np.float64) if k in arrays else v for k, v in data.items()})
+        values: AnyDict = {k: np.asarray(v, dtype=np.float64) if k in arrays else v for k, v in data.items()}
+        return cls(**values)
 
 
 @dataclass(frozen=True)

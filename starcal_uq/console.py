@@ -27,8 +27,9 @@ out = Console()
 err = Console(stderr=True)
 
 UNDECLARED = (
-    "Neither time nor observer velocity was declared: annual aberration stretches a 10 degree field by up to 3.6 arcsec, "
-    "which can move f by many sigma. Declare --directions apparent, or --directions catalogue with a time_utc column."
+    "Neither time nor observer velocity was declared: annual aberration stretches a 10 degree field by up to "
+    "3.6 arcsec, which can move f by many sigma. Declare --directions apparent, or --directions catalogue with a "
+    "time_utc column."
 )
 
 
@@ -73,9 +74,7 @@ def show_calibration(calibration: Calibration, truth: Camera | None = None) -> N
     specs = parameters(calibration.camera.distortion)
     for index, (spec, value, sigma) in enumerate(zip(specs, calibration.theta, calibration.sigmas, strict=True)):
         decimals = decimals_for(sigma / spec.scale)
-        cells = [
-            fixed(number / spec.scale, decimals) for number in (calibration.nominal.theta[index], value, sigma)
-        ]
+        cells = [fixed(number / spec.scale, decimals) for number in (calibration.nominal.theta[index], value, sigma)]
         if truth is not None:
             known = truth.theta[index]
             cells += [fixed(known / spec.scale, decimals), fixed((value - known) / sigma, 2)]
@@ -157,9 +156,7 @@ def show_attitude(error: AttitudeError) -> None:
     for column in frame.columns:
         table.add_column(str(column), justify="left" if frame[column].dtype == object else "right")
     for row in records(frame):
-        table.add_row(
-            *(significant(value, 3) if isinstance(value, float) else _word(value) for value in row.values())
-        )
+        table.add_row(*(significant(value, 3) if isinstance(value, float) else _word(value) for value in row.values()))
     out.print(table)
 
 

@@ -131,9 +131,7 @@ _OPTICS = (
     Parameter("f", "px", 1.0, "px", "$f$", "focal length"),
 )
 _SIGMA = Parameter("sigma", "px", 1.0, "px", r"$\sigma$", "centroid noise per axis")
-_SIGMA_SCALE = Parameter(
-    "sigma_scale", "1", 1.0, "1", r"$s_\sigma$", "common factor on the stated noise of the stars"
-)
+_SIGMA_SCALE = Parameter("sigma_scale", "1", 1.0, "1", r"$s_\sigma$", "common factor on the stated noise of the stars")
 
 
 def model_names() -> tuple[str, ...]:
@@ -152,9 +150,7 @@ def get_model(name: str) -> DistortionModel:
     try:
         return _MODELS[name]
     except KeyError:
-        raise DistortionError(
-            f"distortion model {name!r} is unknown: use one of {', '.join(model_names())}."
-        ) from None
+        raise DistortionError(f"distortion model {name!r} is unknown: use one of {', '.join(model_names())}.") from None
 
 
 def parameters(model_name: str) -> tuple[Parameter, ...]:

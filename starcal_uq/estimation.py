@@ -53,8 +53,9 @@ def calibrate(
         both; its covariance is the sandwich of composite likelihood. ``efficient`` goes on to the
         attitude-marginalised likelihood, whose covariance is the Cramer-Rao bound.
     solver : {"lm", "minpack", "ipopt"}
-        Levenberg-Marquardt on normal equations, MINPACK on explicit pairs (where there are at most 500,000 of them), or IPOPT with the
-        principal point kept on the detector, f > 0 and the distortion monotonic. The refinement always uses the first.
+        Levenberg-Marquardt on normal equations, MINPACK on explicit pairs (where there are at most 500,000 of them), or
+        IPOPT with the principal point kept on the detector, f > 0 and the distortion monotonic. The refinement always
+        uses the first.
     max_iterations : int
         Limit for each stage.
     throw : bool

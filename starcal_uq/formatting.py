@@ -71,7 +71,7 @@ def significant(value: float, digits: int = 2) -> str:
 
 def percent(fraction: float, digits: int = 2) -> str:
     """A fraction in per cent."""
-    return f"{significant(100.0 * fraction, digits)} %"
+    return f"{significant(100.0 * fraction, digits)}\N{NO-BREAK SPACE}%"
 
 
 def count(number: int) -> str:

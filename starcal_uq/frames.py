@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -82,7 +83,7 @@ class StarFrames:
         n_parts = max(1, -(-self.n_stars // max_stars))
         targets = np.linspace(0, self.n_stars, n_parts + 1)
         edges = np.unique(np.searchsorted(self.starts, targets))
-        return [(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        return [(int(a), int(b)) for a, b in pairwise(edges)]
 
     def rotated(self, rotations: FloatArray) -> FloatArray:
         """Catalogue directions in the camera frame: ``b = R r`` with R_cam_icrs (K, 3, 3); (3, N)."""

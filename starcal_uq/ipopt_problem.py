@@ -29,12 +29,12 @@ class _Cache:
         return self.normal
 
 
-class _Objective(ca.Callback):  # type: ignore[misc]
+class _Objective(ca.Callback):
     """Half the scaled cost."""
 
     def __init__(self, cache: _Cache, p: int) -> None:
         ca.Callback.__init__(self)
-        self.cache, self.p = cache, p
+        self.model, self.p = cache, p
         self.gradient = _Gradient(cache, p)
         self.construct("objective", {})
 
@@ -42,8 +42,8 @@ class _Objective(ca.Callback):  # type: ignore[misc]
         return ca.Sparsity.dense(self.p, 1)
 
     def eval(self, arg: Any) -> list[Any]:
-        cost = self.cache.at(arg[0]).cost
-        return [0.5 * cost / self.cache.unit if np.isfinite(cost) else np.nan]
+        cost = self.model.at(arg[0]).cost
+        return [0.5 * cost / self.model.unit if np.isfinite(cost) else np.nan]
 
     def has_jacobian(self) -> bool:
         return True
@@ -53,12 +53,12 @@ class _Objective(ca.Callback):  # type: ignore[misc]
         return ca.Function(name, [z, f], [self.gradient(z).T], inames, onames)
 
 
-class _Gradient(ca.Callback):  # type: ignore[misc]
+class _Gradient(ca.Callback):
     """Gradient of half the scaled cost."""
 
     def __init__(self, cache: _Cache, p: int) -> None:
         ca.Callback.__init__(self)
-        self.cache, self.p = cache, p
+        self.model, self.p = cache, p
         self.construct("gradient", {})
 
     def get_sparsity_in(self, i: int) -> Any:
@@ -68,15 +68,15 @@ class _Gradient(ca.Callback):  # type: ignore[misc]
         return ca.Sparsity.dense(self.p, 1)
 
     def eval(self, arg: Any) -> list[Any]:
-        return [self.cache.at(arg[0]).gradient * self.cache.scale / self.cache.unit]
+        return [self.model.at(arg[0]).gradient * self.model.scale / self.model.unit]
 
 
-class _Hessian(ca.Callback):  # type: ignore[misc]
+class _Hessian(ca.Callback):
     """Gauss-Newton Hessian of the Lagrangian (the constraints' curvature is left out)."""
 
     def __init__(self, cache: _Cache, p: int, n_constraints: int) -> None:
         ca.Callback.__init__(self)
-        self.cache, self.p, self.n_constraints = cache, p, n_constraints
+        self.model, self.p, self.n_constraints = cache, p, n_constraints
         self.construct("hessian", {})
 
     def get_n_in(self) -> int:
@@ -95,11 +95,11 @@ class _Hessian(ca.Callback):  # type: ignore[misc]
         return ca.Sparsity.upper(self.p)
 
     def eval(self, arg: Any) -> list[Any]:
-        matrix = self.cache.at(arg[0]).matrix * np.outer(self.cache.scale, self.cache.scale) / self.cache.unit
+        matrix = self.model.at(arg[0]).matrix * np.outer(self.model.scale, self.model.scale) / self.model.unit
         return [ca.triu(ca.DM(float(arg[2]) * matrix))]
 
 
-class _Recorder(ca.Callback):  # type: ignore[misc]
+class _Recorder(ca.Callback):
     """Keeps IPOPT's iterates."""
 
     def __init__(self, p: int, n_constraints: int) -> None:

@@ -133,14 +133,10 @@ class Kernel:
                 ],
                 [output[:, block] for output in outputs],
             )
-        return tuple(
-            output.reshape(*shape, n) for output, shape in zip(outputs, self.shapes, strict=True)
-        )
+        return tuple(output.reshape(*shape, n) for output, shape in zip(outputs, self.shapes, strict=True))
 
 
-def build_kernel(
-    name: str, inputs: Sequence[Any], outputs: Sequence[Any], shapes: Sequence[tuple[int, ...]]
-) -> Kernel:
+def build_kernel(name: str, inputs: Sequence[Any], outputs: Sequence[Any], shapes: Sequence[tuple[int, ...]]) -> Kernel:
     """Build a kernel from CasADi expressions.
 
     Parameters
@@ -154,9 +150,7 @@ def build_kernel(
     """
     import casadi as ca
 
-    function = ca.Function(
-        name, list(inputs), [ca.densify(ca.vec(ca.SX(output))) for output in outputs], {"cse": True}
-    )
+    function = ca.Function(name, list(inputs), [ca.densify(ca.vec(ca.SX(output))) for output in outputs], {"cse": True})
     scope: dict[str, Any] = {"np": np}
     # The source is generated from CasADi's instruction list above and holds nothing from outside.
     exec(compile(emit_source(function, name), f"<kernel {name}>", "exec"), scope)

@@ -87,9 +87,7 @@ class MarginalLikelihood:
     def _quest_weights(self) -> FloatArray | None:
         return None if self.frames.weight is None else self.frames.weight**2
 
-    def _attitude_step(
-        self, theta: FloatArray, rotations: FloatArray
-    ) -> tuple[Profile, FloatArray, FloatArray]:
+    def _attitude_step(self, theta: FloatArray, rotations: FloatArray) -> tuple[Profile, FloatArray, FloatArray]:
         """The model at given attitudes, the Gauss-Newton step (3, K), and the cost (K,) predicted after it."""
         frames = self.frames
         b = frames.rotated(rotations)
@@ -155,9 +153,7 @@ class MarginalLikelihood:
         state, cost = self.profile(theta, self._rotations)
         if not np.isfinite(cost):
             return -np.inf
-        return float(
-            -0.5 * cost / sigma**2 - self.dof * np.log(sigma) - 0.5 * np.sum(state.log_determinant)
-        )
+        return float(-0.5 * cost / sigma**2 - self.dof * np.log(sigma) - 0.5 * np.sum(state.log_determinant))
 
     def derivatives(self, theta: FloatArray, state: Profile) -> FloatArray:
         """Derivative (p, 2, N) of the whitened prediction with respect to theta at fixed attitudes."""

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from starcal_uq._types import FloatArray
+from starcal_uq._types import FloatArray, IntArray
 from starcal_uq.camera import Camera
 from starcal_uq.distortion import get_model
 from starcal_uq.errors import DistortionError
@@ -103,9 +103,10 @@ def backward_expression(model_name: str, s: Symbols) -> Any:
     return direction / ca.sqrt(ca.sumsqr(direction))
 
 
-def second_index(n: int) -> tuple[FloatArray, ...]:
+def second_index(n: int) -> tuple[IntArray, IntArray]:
     """Row and column of every unique second derivative of n variables, in kernel order."""
-    return np.triu_indices(n)
+    rows, columns = np.triu_indices(n)
+    return rows.astype(np.int64), columns.astype(np.int64)
 
 
 @lru_cache(maxsize=64)
@@ -125,7 +126,8 @@ def forward_kernel(model_name: str, order: str) -> Kernel:
     s = _symbols(model_name)
     p = s.theta.numel()
     xy = forward_expression(model_name, s, newton_steps=2 if order == "second" else 1)
-    outputs, shapes = [xy], [(2,)]
+    outputs: list[Any] = [xy]
+    shapes: list[tuple[int, ...]] = [(2,)]
     if order in ("first", "second"):
         # casadi.vec is column-major, so the Jacobian (2, p) becomes rows of (p, 2).
         outputs.append(ca.jacobian(xy, s.theta))
@@ -151,7 +153,8 @@ def backward_kernel(model_name: str, derivatives: bool) -> Kernel:
 
     s = _symbols(model_name)
     direction = backward_expression(model_name, s)
-    outputs, shapes = [direction], [(3,)]
+    outputs: list[Any] = [direction]
+    shapes: list[tuple[int, ...]] = [(3,)]
     if derivatives:
         outputs.append(ca.jacobian(direction, s.theta))
         shapes.append((s.theta.numel(), 3))
@@ -224,21 +227,15 @@ def unproject_theta(model_name: str, theta: FloatArray, xy: FloatArray) -> Float
     """Unit vectors (N, 3) in the camera frame of pixels xy (N, 2) for parameters theta (p,)."""
     pixel = np.ascontiguousarray(np.asarray(xy, dtype=np.float64).T)
     theta = np.asarray(theta, dtype=np.float64)
-    (b,) = backward_kernel(model_name, False)(
-        pixel.shape[1], theta, pixel, backward_root(model_name, theta, pixel)
-    )
+    (b,) = backward_kernel(model_name, False)(pixel.shape[1], theta, pixel, backward_root(model_name, theta, pixel))
     return b.T
 
 
-def unproject_jacobian(
-    model_name: str, theta: FloatArray, xy: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def unproject_jacobian(model_name: str, theta: FloatArray, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Unit vectors b (N, 3) of pixels xy (N, 2), and their derivatives db/dtheta (N, 3, p)."""
     pixel = np.ascontiguousarray(np.asarray(xy, dtype=np.float64).T)
     theta = np.asarray(theta, dtype=np.float64)
-    b, db = backward_kernel(model_name, True)(
-        pixel.shape[1], theta, pixel, backward_root(model_name, theta, pixel)
-    )
+    b, db = backward_kernel(model_name, True)(pixel.shape[1], theta, pixel, backward_root(model_name, theta, pixel))
     return b.T, db.transpose(2, 1, 0)
 
 
@@ -250,9 +247,7 @@ def fold_radius_px(model_name: str, theta: FloatArray, max_radius_px: float) -> 
     """
     radius = np.linspace(0.0, max_radius_px, 501)[1:]
     angle = np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
-    points = np.stack(
-        [np.outer(np.cos(angle), radius).ravel(), np.outer(np.sin(angle), radius).ravel()]
-    )
+    points = np.stack([np.outer(np.cos(angle), radius).ravel(), np.outer(np.sin(angle), radius).ravel()])
     _, determinant = _newton_kernel(model_name)(points.shape[1], theta, points, points)
     # det <= 0 marks a fold; a second crossing can make it positive again, so the first one counts.
     folded = (determinant[0].reshape(angle.size, radius.size) <= 0.0).any(axis=0)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -98,10 +99,10 @@ def simulate(
     frames: list[tuple[IntArray, FloatArray]] = []
     if attitudes is not None:
         frames = sky.views(attitudes)
-        for index, (seen, _) in enumerate(frames):
+        for number, (seen, _) in enumerate(frames):
             if len(seen) < min_stars:
                 raise CatalogueError(
-                    f"the attitude with index {index} shows {len(seen)} stars, fewer than min_stars={min_stars}: "
+                    f"the attitude with index {number} shows {len(seen)} stars, fewer than min_stars={min_stars}: "
                     "choose other attitudes, a deeper catalogue or a smaller min_stars."
                 )
     tries = 0
@@ -144,9 +145,7 @@ class _Sky:
         self.directions = stars.directions_icrs
         self.low = -0.5 + margin_px
         self.high = np.array([camera.width_px, camera.height_px]) - 0.5 - margin_px
-        corners = np.array(
-            [(x, y) for x in (-0.5, camera.width_px - 0.5) for y in (-0.5, camera.height_px - 0.5)]
-        )
+        corners = np.array([(x, y) for x in (-0.5, camera.width_px - 0.5) for y in (-0.5, camera.height_px - 0.5)])
         b = unproject(camera, corners)
         # A little wider than the farthest corner; the exact cut is made in pixels.
         self.min_cosine = float(np.cos(1.02 * np.max(np.arccos(b[:, 2]))))
@@ -163,4 +162,4 @@ class _Sky:
         inside = np.all((xy > self.low) & (xy < self.high), axis=1)
         edges = np.searchsorted(frame[inside], np.arange(len(rotations) + 1))
         star, xy = star[inside], xy[inside]
-        return [(star[i:j], xy[i:j]) for i, j in zip(edges[:-1], edges[1:], strict=True)]
+        return [(star[i:j], xy[i:j]) for i, j in pairwise(edges)]

@@ -1,8 +1,8 @@
 """Least-squares solvers behind one call: Levenberg-Marquardt on normal equations, MINPACK, and IPOPT.
 
-The Levenberg-Marquardt iteration is that of More (1978), "The Levenberg-Marquardt algorithm: implementation and theory",
-which MINPACK implements on the full Jacobian; here the trust-region step is found from the p x p normal equations, so
-that an objective over any number of residuals costs what one evaluation of its sums costs.
+The Levenberg-Marquardt iteration is that of More (1978), "The Levenberg-Marquardt algorithm: implementation and
+theory", which MINPACK implements on the full Jacobian; here the trust-region step is found from the p x p normal
+equations, so that an objective over any number of residuals costs what one evaluation of its sums costs.
 """
 
 from __future__ import annotations
@@ -261,9 +261,7 @@ def minpack(residuals: Residuals, evaluate: Evaluate, start: FloatArray, *, max_
     return Solution(theta, final, trajectory, costs, status, int(info["nfev"]))
 
 
-def ipopt(
-    evaluate: Evaluate, start: FloatArray, constraints: Constraints, *, max_iterations: int = 200
-) -> Solution:
+def ipopt(evaluate: Evaluate, start: FloatArray, constraints: Constraints, *, max_iterations: int = 200) -> Solution:
     """Minimise a sum of squares under constraints with IPOPT, through CasADi.
 
     The objective enters as callbacks (value, gradient, Gauss-Newton Hessian), in variables scaled by the curvature at

@@ -69,9 +69,7 @@ def constraints_for(camera: Camera, n_parameters: int) -> Constraints:
     return Constraints(lower, upper, lambda theta: monotonic_expression(camera.distortion, theta, radius))
 
 
-def _solve(
-    objective: PairObjective, start: FloatArray, camera: Camera, solver: str, max_iterations: int
-) -> Solution:
+def _solve(objective: PairObjective, start: FloatArray, camera: Camera, solver: str, max_iterations: int) -> Solution:
     if solver == "ipopt":
         constraints = constraints_for(camera, objective.n_parameters)
         return ipopt(objective.evaluate, start, constraints, max_iterations=max_iterations)
@@ -110,7 +108,7 @@ def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> S
     """
     began = perf_counter()
     model = get_model(camera.distortion)
-    x0, y0, f = theta[:3]
+    f = theta[2]
     offset = frames.pixel - theta[:2, None]
     direction = np.vstack([offset, np.full(frames.n_stars, f)])
     rotations = quest((direction / np.linalg.norm(direction, axis=0)).T, frames.r.T, frames.starts).rotations
@@ -129,14 +127,10 @@ def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> S
     return Stage("distortion", trajectory, np.array(cost), Status.CONVERGED, 1, perf_counter() - began)
 
 
-def joint_stage(
-    frames: StarFrames, camera: Camera, theta: FloatArray, solver: str, max_iterations: int
-) -> Stage:
+def joint_stage(frames: StarFrames, camera: Camera, theta: FloatArray, solver: str, max_iterations: int) -> Stage:
     """Stage 3: all parameters on interstar angles (the paper's section 2.3)."""
     objective = PairObjective(frames, camera.distortion)
-    return _timed(
-        "all", lambda: _solve(objective, theta, camera, solver, max_iterations), np.zeros(0)
-    )
+    return _timed("all", lambda: _solve(objective, theta, camera, solver, max_iterations), np.zeros(0))
 
 
 def refinement_stage(likelihood: MarginalLikelihood, theta: FloatArray, max_iterations: int) -> Stage:

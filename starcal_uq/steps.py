@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from starcal_uq.calibration import Calibration
 from starcal_uq.camera import Camera
-from starcal_uq.errors import CalibrationError, ObservationError
+from starcal_uq.errors import CalibrationError, ObservationError, RunFolderError
 from starcal_uq.observations import Observations, load_observations
 from starcal_uq.runfolder import RunFolder, atomic_path, ensure_new
 
@@ -79,19 +79,20 @@ def read_observations(
     return obs
 
 
-def start_run(run: RunFolder, force: bool) -> None:
-    """Refuse to write into a folder that holds anything, unless forced; then remove the files of a former run.
+def check_new_run(run: RunFolder, force: bool) -> None:
+    """Refuse a folder that holds anything, unless forced; called before any work is done.
 
     Raises
     ------
     RunFolderError
-        When the folder exists and is not empty.
+        When the folder exists and is not empty, or is a file.
     """
-    if run.path.is_dir() and not any(run.path.iterdir()):
-        return
-    ensure_new(run.path, force)
-    if force and run.path.is_dir():
-        _remove(run, _ALL)
+    if run.path.exists() and not run.path.is_dir():
+        raise RunFolderError(f"{run.path}: is a file, not a folder for results; name another folder.")
+    if run.path.is_dir() and any(run.path.iterdir()) and not force:
+        raise RunFolderError(
+            f"{run.path}: the folder exists and is not empty; name another, or replace its results with --force."
+        )
 
 
 def _remove(run: RunFolder, names: Sequence[str]) -> None:
@@ -107,7 +108,8 @@ def calibrate_step(
     from starcal_uq.estimation import calibrate
 
     calibration = calibrate(obs, nominal, method=method, solver=solver)
-    start_run(run, force)
+    check_new_run(run, force)
+    _remove(run, _ALL)
     run.create()
     obs.save(run.observations, force=True)
     nominal.save(run.camera, force=True)
@@ -135,10 +137,10 @@ def load_run(run: RunFolder) -> tuple[Observations, Calibration]:
 
 def sample_step(run: RunFolder, *, force: bool, progress: Progress | None = None, **options: Any) -> Posterior:
     """Sample the posterior of a calibrated run and write it; an interrupted run goes on from its checkpoint."""
+    obs, calibration = load_run(run)
+    ensure_new(run.posterior, force)
     from starcal_uq.sampler import sample
 
-    ensure_new(run.posterior, force)
-    obs, calibration = load_run(run)
     checkpoint = run.path / "sampling.checkpoint.npz"
     posterior = sample(obs, calibration, progress=progress, checkpoint=checkpoint, **options)
     posterior.save(run.posterior)
@@ -167,11 +169,11 @@ def coupling_step(run: RunFolder) -> Coupling:
 
 def propagate_step(run: RunFolder, *, n_draws: int, seed: int) -> tuple[AttitudeError, FieldMap]:
     """Carry the posterior through QUEST on the observed frames, and over the field; write both."""
+    posterior = load_posterior(run)
+    obs, _ = load_run(run)
     from starcal_uq.fieldmap import field_map
     from starcal_uq.propagation import propagate
 
-    posterior = load_posterior(run)
-    obs, _ = load_run(run)
     error = propagate(posterior, obs, n_draws=n_draws, seed=seed)
     fields = field_map(posterior, obs)
     error.save(run.attitude)
@@ -181,9 +183,10 @@ def propagate_step(run: RunFolder, *, n_draws: int, seed: int) -> tuple[Attitude
 
 def report_step(run: RunFolder) -> Path:
     """Write the report of whatever the run holds; the truth of a simulation is shown beside the estimate."""
+    truth = truth_of(load_observations(run.require("observations")))
     from starcal_uq.reporting import report
 
-    return report(run.path, truth=truth_of(load_observations(run.require("observations"))))
+    return report(run.path, truth=truth)
 
 
 def truth_of(obs: Observations) -> Camera | None:

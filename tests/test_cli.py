@@ -7,6 +7,7 @@ import sys
 
 import numpy as np
 import pytest
+
 import starcal_uq as sc
 from starcal_uq.cli import main
 from tests.scenes import observations
@@ -122,7 +123,8 @@ def test_demo_ends_with_the_table_of_truth_and_the_report(cli, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "command", [(), *((c,) for c in "demo simulate calibrate sample coupling propagate report run".split())]
+    "command",
+    [(), ("demo",), ("simulate",), ("calibrate",), ("sample",), ("coupling",), ("propagate",), ("report",), ("run",)],
 )
 def test_help_teaches(cli, command):
     status, out, _ = cli(*command, "--help")
@@ -195,11 +197,12 @@ MISTAKES = {
     "too few stars": (_short_frame, ["obs.csv", "frame 0"]),
     "duplicate star": (_duplicate_star, ["obs.csv", "line 3"]),
     "declination of 91": (_cells(4, "dec_deg", "91.0"), ["obs.csv", "line 4", "dec_deg", "91"]),
-    "unknown key": (_text("camera.toml", "focal_mm =", "focal_length ="), ["camera.toml", "focal_length"]),
+    "unknown key": (_text("camera.toml", "[camera]", "[camera]\nfocal_length = 70.0"), ["camera.toml", "focal_length"]),
+    "missing key": (_text("camera.toml", "focal_mm =", "# focal_mm ="), ["camera.toml", "focal_mm"]),
     "missing section": (_text("camera.toml", "[camera]", "[kamera]"), ["camera.toml", "camera"]),
     "broken TOML": (_text("camera.toml", "[camera]", "[camera"), ["camera.toml"]),
     "empty file": (lambda folder: (folder / "obs.csv").write_text(""), ["obs.csv", "empty"]),
-    "a directory": (_directory, ["obs.csv", "folder"]),
+    "a directory": (_directory, ["obs.csv", "director"]),
     "missing file": (lambda folder: (folder / "obs.csv").unlink(), ["obs.csv"]),
 }
 
@@ -278,9 +281,9 @@ def test_a_calibration_that_fails_leaves_no_folder(cli, inputs, tmp_path):
     shuffled = rng.permutation(obs.n_stars)
     import dataclasses
 
-    dataclasses.replace(obs, ra_deg=obs.ra_deg[shuffled], dec_deg=obs.dec_deg[shuffled], star_id=None).save(
-        inputs / "wrong.csv"
-    )
+    # Right ascensions keep the rows distinct; the declinations belong to other stars.
+    wrong = dataclasses.replace(obs, dec_deg=-obs.dec_deg[shuffled], ra_deg=obs.ra_deg, star_id=None)
+    wrong.save(inputs / "wrong.csv")
     status, _, err = cli("calibrate", inputs / "wrong.csv", inputs / "camera.toml", "-o", "run")
     assert status == 2
     assert "error: the calibration" in err
@@ -291,7 +294,15 @@ def test_declared_directions_and_renamed_columns(cli, inputs):
     text = (inputs / "obs.csv").read_text().replace("ra_deg", "alpha", 1)
     (inputs / "obs.csv").write_text(text)
     status, _, err = cli(
-        "calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--column", "ra_deg=alpha", "--directions", "apparent"
+        "calibrate",
+        inputs / "obs.csv",
+        inputs / "camera.toml",
+        "-o",
+        "run",
+        "--column",
+        "ra_deg=alpha",
+        "--directions",
+        "apparent",
     )
     assert status == 0
     assert "warning" not in err

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 import starcal_uq as sc
 from tests.scenes import camera, nominal, observations
 

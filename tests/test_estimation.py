@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+
 import starcal_uq as sc
 from starcal_uq.distortion import model_names
 from starcal_uq.errors import CalibrationError, RunFolderError
@@ -104,7 +105,7 @@ def test_saves_itself_without_loss(tmp_path):
     assert np.array_equal(cal.compressed.gram, again.compressed.gram)
     assert list(cal.to_dataframe()["parameter"]) == ["x0", "y0", "f", "k1", "k2", "sigma"]
     assert "focal length" in cal._repr_html_()
-    with pytest.raises(RunFolderError, match="missing.json"):
+    with pytest.raises(RunFolderError, match=r"missing\.json"):
         sc.Calibration.load(tmp_path / "missing.json")
 
 
@@ -168,9 +169,7 @@ def test_a_thousand_random_starts_reach_one_optimum():
     failures, worst = 0, 0.0
     for _ in range(1000):
         x, y = 511.5 + rng.uniform(-0.15, 0.15, 2) * 1024
-        start = sc.paper_start().replace(
-            x0_px=x, y0_px=y, focal_mm=sc.paper_camera().focal_mm * rng.uniform(0.9, 1.1)
-        )
+        start = sc.paper_start().replace(x0_px=x, y0_px=y, focal_mm=sc.paper_camera().focal_mm * rng.uniform(0.9, 1.1))
         cal = sc.calibrate(obs, start, throw=False)
         if cal.status.ok:
             worst = max(worst, float(np.max(np.abs(cal.theta - reference.theta) / cal.sigmas)))

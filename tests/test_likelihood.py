@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+
 from starcal_uq.attitude import exp_rotation
 from starcal_uq.compressed import CompressedLikelihood, compress
 from starcal_uq.distortion import model_names
@@ -83,9 +84,7 @@ def test_generalised_least_squares_over_pairs_has_the_same_information():
             up, down = part.pixel.T.copy(), part.pixel.T.copy()
             up[:, axis] += step
             down[:, axis] -= step
-            d = (
-                unproject_jacobian("brown", theta, up)[0] - unproject_jacobian("brown", theta, down)[0]
-            ) / (2 * step)
+            d = (unproject_jacobian("brown", theta, up)[0] - unproject_jacobian("brown", theta, down)[0]) / (2 * step)
             rows = np.arange(len(i))
             design[rows, 2 * i + axis] = np.sum(d[i] * b[j], axis=1)
             design[rows, 2 * j + axis] = np.sum(d[j] * b[i], axis=1)
@@ -147,7 +146,9 @@ def test_compressed_adds_over_frames_and_survives_a_round_trip():
     cal = _estimate(obs, "brown")
     whole = cal.compressed
     parts = [
-        compress(MarginalLikelihood(obs.select_frames(ids), "brown"), whole.theta_hat, whole.whitening @ whole.whitening.T)
+        compress(
+            MarginalLikelihood(obs.select_frames(ids), "brown"), whole.theta_hat, whole.whitening @ whole.whitening.T
+        )
         for ids in (obs.frame_ids[:25], obs.frame_ids[25:])
     ]
     assert np.allclose(sum(part.gram for part in parts), whole.gram, rtol=1e-6, atol=1e-7 * whole.gram.max() * 1e-3)

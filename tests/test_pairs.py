@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from starcal_uq.distortion import model_names
 from starcal_uq.frames import StarFrames
 from starcal_uq.pairs import PairObjective

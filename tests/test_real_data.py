@@ -6,6 +6,7 @@ import csv
 
 import numpy as np
 import pytest
+
 import starcal_uq as sc
 
 # Independent bundle fit of the table (apparent directions, SNR >= 10, 242 stars): value and standard error.

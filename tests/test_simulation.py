@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import starcal_uq as sc
 from scipy import stats
+
+import starcal_uq as sc
 from starcal_uq.attitude import random_rotations
 from tests.scenes import camera, observations
 
@@ -32,9 +33,7 @@ def test_noise_free_pixels_are_projections_at_one_attitude_per_frame():
     obs = observations(sigma_px=0.0)
     b = sc.unproject(camera(), obs.xy)
     result = sc.quest(b, obs.directions_icrs, obs.frame_starts)
-    rotated = np.einsum(
-        "nij,nj->ni", np.repeat(result.rotations, obs.stars_per_frame, axis=0), obs.directions_icrs
-    )
+    rotated = np.einsum("nij,nj->ni", np.repeat(result.rotations, obs.stars_per_frame, axis=0), obs.directions_icrs)
     assert np.max(np.abs(rotated - b)) < 1e-13
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from starcal_uq.solvers import Constraints, Normal, ipopt, levenberg_marquardt, minpack
 from starcal_uq.status import Status
 
@@ -35,7 +36,9 @@ def _rational(data):
     def residuals(b):
         top, bottom = x**2 + x * b[1], x**2 + x * b[2] + b[3]
         ratio = top / bottom
-        return b[0] * ratio - y, b[0] * np.stack([ratio / b[0], x / bottom, -ratio * x / bottom, -ratio / bottom], axis=1)
+        return b[0] * ratio - y, b[0] * np.stack(
+            [ratio / b[0], x / bottom, -ratio * x / bottom, -ratio / bottom], axis=1
+        )
 
     return residuals
 

@@ -11,7 +11,7 @@ from starcal_uq.distortion import get_model
 from starcal_uq.formatting import MINUS, count, join_words
 from starcal_uq.reporting import tables, words
 from starcal_uq.reporting.loading import Results
-from starcal_uq.verdict import Level, Question, judge, limits, worst
+from starcal_uq.verdict import Check, Level, Question, judge, limits, worst
 
 _MARKS = {Level.PASS: "✓", Level.WARN: "!", Level.FAIL: "✗"}
 
@@ -96,18 +96,24 @@ def _distortion(results: Results) -> dict[str, Any]:
 
 
 def _image(png: bytes) -> dict[str, Any]:
-    """The data of an image and its width on the page: half its pixels, so that it is sharp on fine screens and paper."""
+    """An image and its width on the page: half its pixels, so that it is sharp on fine screens and on paper."""
     return {"data": base64.b64encode(png).decode("ascii"), "width": int.from_bytes(png[16:20], "big") // 2}
 
 
-def _answer(checks: tuple[Any, ...]) -> str:
-    """What to say in one line: the worst checks, or that all passed."""
-    bad = [check for check in checks if check.level is worst(checks)]
-    if not checks:
-        return "Nothing was checked."
+def _answer(checks: tuple[Check, ...]) -> str:
+    """The outcome of some checks in one line; what failed is explained elsewhere."""
     if worst(checks) is Level.PASS:
-        return f"All {len(checks)} checks passed: {join_words([_lower(check.name) for check in checks])}."
-    return " ".join(check.sentence for check in bad)
+        return f"All {len(checks)} checks passed: {_listed(checks)}."
+    parts = []
+    for level, verb in ((Level.FAIL, "failed"), (Level.WARN, "raised a warning"), (Level.PASS, "passed")):
+        found = tuple(check for check in checks if check.level is level)
+        if found:
+            parts.append(f"{len(found)} of {len(checks)} {verb}: {_listed(found)}.")
+    return " ".join(parts)
+
+
+def _listed(checks: tuple[Check, ...]) -> str:
+    return join_words([_lower(check.name) for check in checks])
 
 
 def _lower(name: str) -> str:

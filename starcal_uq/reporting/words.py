@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 _DIRECTIONS = {
     "apparent": "apparent directions (aberration included)",
     "catalogue": "directions straight from a catalogue (aberration not included)",
-    "undeclared": "directions of which it is not declared whether they are apparent",
+    "undeclared": "directions not declared as apparent or as straight from a catalogue",
 }
 
 
@@ -29,7 +29,7 @@ def data_sentence(results: Results) -> str:
     source = {"simulated": "Simulated data: "}.get(str(obs.meta.get("source", "")), "")
     stars = f"{plural(obs.n_stars, 'star')} in {plural(obs.n_frames, 'frame')} ({each})"
     unique = ""
-    if obs.star_id is not None:
+    if obs.star_id is not None and len(np.unique(obs.star_id)) < obs.n_stars:
         unique = f", {count(len(np.unique(obs.star_id)))} different stars"
     directions = _DIRECTIONS[str(obs.meta["directions"])]
     camera = cal.camera
