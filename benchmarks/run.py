@@ -206,8 +206,9 @@ def _three_stages(obs: sc.Observations) -> tuple[np.ndarray, np.ndarray]:
     frames, start = StarFrames.from_observations(obs), sc.paper_start()
     optics = optics_stage(frames, start, "lm", 200)
     linear = distortion_stage(frames, start, optics.theta)
-    theta = joint_stage(frames, start, linear.theta, "lm", 200).theta
-    return theta, PairObjective(frames, "brown").godambe(theta)
+    pairs = PairObjective(frames, "brown")
+    theta = joint_stage(pairs, start, linear.theta, "lm", 200).theta
+    return theta, pairs.godambe(theta)
 
 
 if __name__ == "__main__":

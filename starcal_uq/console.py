@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,7 +24,11 @@ if TYPE_CHECKING:
     from starcal_uq.posterior import Posterior
     from starcal_uq.propagation import AttitudeError
 
-out = Console()
+# Where the output is not a terminal it has no width of its own; tables then get the room they need.
+_WIDTH = None if sys.stdout.isatty() else 110
+AXES = ("pitch", "yaw", "roll")
+
+out = Console(width=_WIDTH)
 err = Console(stderr=True)
 
 UNDECLARED = (
@@ -125,51 +130,62 @@ def show_posterior(posterior: Posterior) -> None:
         )
     out.print(table)
     for message in diagnostics.messages:
-        out.print(message, style=None if diagnostics.ok else "yellow", highlight=False)
+        out.print(message, style=None if diagnostics.ok else "yellow", highlight=False, soft_wrap=True)
 
 
 def show_coupling(found: Coupling) -> None:
-    """Sigmas, inflation and correlations."""
-    table = Table(title="Coupling", title_justify="left")
+    """Sigmas and their inflation, correlations, and the weak directions in words."""
+    table = Table(title="Coupling: what not knowing the others costs", title_justify="left")
     table.add_column("parameter", style="bold")
     for heading in ("sigma", "others known", "variance inflation"):
         table.add_column(heading, justify="right")
-    for name in found.extended_names:
-        table.add_column(f"r({name})", justify="right")
+    table.add_column("unit")
     for index, name in enumerate(found.parameter_names):
         table.add_row(
             name,
             significant(float(found.sigma_marginal[index]), 3),
             significant(float(found.sigma_conditional[index]), 3),
             significant(float(found.variance_inflation[index]), 3),
-            *(fixed(float(value), 2) for value in found.extended_correlation[index]),
+            pretty_unit(found.units[index]),
         )
     out.print(table)
+    table = Table(title="Correlations, with the rotation common to all frames", title_justify="left")
+    table.add_column("", style="bold")
+    for name in found.extended_names:
+        table.add_column(name, justify="right")
+    for name, row in zip(found.extended_names, found.extended_correlation, strict=True):
+        table.add_row(name, *(fixed(float(value), 2) for value in row))
+    out.print(table)
     for direction in found.weak_directions:
-        out.print(f"  {direction.words}", highlight=False)
+        out.print(f"- {direction.words}", highlight=False, soft_wrap=True)
 
 
 def show_attitude(error: AttitudeError) -> None:
-    """Attitude error by contributor and axis."""
-    table = Table(title="Attitude error, arcsec", title_justify="left")
+    """Attitude error by contributor and axis, 1 sigma, with the 95 % half-widths in brackets."""
     frame = error.to_dataframe()
-    for column in frame.columns:
-        table.add_column(str(column), justify="left" if frame[column].dtype == object else "right")
-    for row in records(frame):
-        table.add_row(*(significant(value, 3) if isinstance(value, float) else _word(value) for value in row.values()))
+    table = Table(title="Attitude error, arcsec, 1 sigma", title_justify="left")
+    table.add_column("contributor", style="bold", no_wrap=True)
+    for axis in AXES:
+        table.add_column(axis, justify="right")
+    table.add_column("two-axis 95 %", justify="right")
+    table.add_column("absorbed by alignment")
+    for contributor, rows in frame.groupby("contributor", sort=False):
+        cells = rows.set_index("axis")
+        shown = [significant(float(cells.at[axis, "sigma_arcsec"]), 2) for axis in AXES]
+        across = [float(row.p95_arcsec) for row in rows.itertuples() if row.axis not in AXES]
+        shown.append(significant(across[0], 2) if across else "")
+        table.add_row(str(contributor), *shown, _word(rows["absorbed_by_alignment"].iloc[0]))
     out.print(table)
 
 
 def _word(value: Any) -> str:
-    if isinstance(value, (bool, np.bool_)):
-        return "yes" if value else "no"
-    return str(value)
+    return ("yes" if value else "no") if isinstance(value, (bool, np.bool_)) else str(value)
 
 
 def warn_undeclared(obs: Observations) -> None:
     """Say what follows when nothing is known of the observer's motion."""
     if not obs.directions_declared:
-        err.print(f"warning: {UNDECLARED}", style="yellow", highlight=False)
+        err.print(f"warning: {UNDECLARED}", style="yellow", highlight=False, soft_wrap=True)
     ignored = obs.meta.get("ignored_columns")
     if ignored:
-        err.print(f"note: columns not used: {', '.join(ignored)}", highlight=False)
+        err.print(f"note: columns not used: {', '.join(ignored)}", highlight=False, soft_wrap=True)

@@ -84,9 +84,10 @@ def calibrate(
             "parameters and the noise: add stars or frames, or choose a distortion model with fewer coefficients.",
             Status.SINGULAR,
         )
-    stages = _pair_stages(frames, camera, solver, max_iterations)
+    pairs = PairObjective(frames, camera.distortion)
+    stages = _pair_stages(pairs, camera, solver, max_iterations)
     pair_theta = stages[-1].theta
-    pair_covariance = PairObjective(frames, camera.distortion).godambe(pair_theta)
+    pair_covariance = pairs.godambe(pair_theta)
     status = stages[-1].status
     if status.ok:
         likelihood.use_rotations(likelihood.start_rotations(pair_theta))
@@ -105,15 +106,16 @@ def calibrate(
     return calibration
 
 
-def _pair_stages(frames: StarFrames, camera: Camera, solver: str, max_iterations: int) -> list[Stage]:
+def _pair_stages(pairs: PairObjective, camera: Camera, solver: str, max_iterations: int) -> list[Stage]:
+    frames = pairs.frames
     stages = [optics_stage(frames, camera, solver, max_iterations)]
     # Without an optical axis there is nothing to attach the distortion to; later stages would only hide it.
     if len(camera.theta) > 3 and stages[0].status is not Status.NOT_FINITE:
         stages.append(distortion_stage(frames, camera, stages[0].theta))
-        stages.append(joint_stage(frames, camera, stages[1].theta, solver, max_iterations))
+        stages.append(joint_stage(pairs, camera, stages[1].theta, solver, max_iterations))
         if stages[-1].status is Status.NOT_FINITE:
             # The linear stage can overshoot into a fold; the undistorted optics are the safer start.
-            stages[-1] = joint_stage(frames, camera, stages[0].theta, solver, max_iterations)
+            stages[-1] = joint_stage(pairs, camera, stages[0].theta, solver, max_iterations)
     return stages
 
 

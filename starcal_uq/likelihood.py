@@ -19,7 +19,7 @@ from starcal_uq._types import FloatArray
 from starcal_uq.attitude import exp_rotation
 from starcal_uq.frames import StarFrames
 from starcal_uq.projection import forward_kernel, forward_root, unproject_theta
-from starcal_uq.quest import quest
+from starcal_uq.wahba import quest
 from starcal_uq.solvers import Normal
 from starcal_uq.symmetric import COLUMNS, ROWS, inverse_symmetric
 

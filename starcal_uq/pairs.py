@@ -17,7 +17,7 @@ from starcal_uq._types import FloatArray, IntArray
 from starcal_uq.distortion import get_model
 from starcal_uq.frames import StarFrames
 from starcal_uq.projection import backward_kernel, backward_root
-from starcal_uq.quest import quest
+from starcal_uq.wahba import quest
 from starcal_uq.solvers import Normal, is_singular
 
 # Stars per block: small enough that its arrays stay in cache, large enough to hide the interpreter.
@@ -61,6 +61,7 @@ class PairObjective:
 
     def __init__(self, frames: StarFrames, model_name: str, fixed: FloatArray | None = None) -> None:
         self.frames = frames
+        self._last: tuple[FloatArray, Normal, FloatArray] | None = None
         self._blocks = [frames.part(first, last) for first, last in frames.parts(_BLOCK_STARS)]
         self.model_name = model_name
         self.fixed = np.zeros(0) if fixed is None else np.asarray(fixed, dtype=np.float64)
@@ -101,7 +102,13 @@ class PairObjective:
         return self._evaluate(theta)[0]
 
     def _evaluate(self, theta: FloatArray) -> tuple[Normal, FloatArray]:
-        """As `evaluate`, with the gradient of every frame (p, K)."""
+        """As `evaluate`, with the gradient of every frame (p, K); the last point is remembered."""
+        theta = np.array(theta, dtype=np.float64)
+        if self._last is None or not np.array_equal(theta, self._last[0]):
+            self._last = (theta, *self._sum_over_blocks(theta))
+        return self._last[1:]
+
+    def _sum_over_blocks(self, theta: FloatArray) -> tuple[Normal, FloatArray]:
         p = self.n_parameters
         cost, matrix, scores = 0.0, np.zeros((p, p)), []
         with np.errstate(all="ignore"):

@@ -15,10 +15,12 @@ from starcal_uq.frames import StarFrames
 from starcal_uq.likelihood import MarginalLikelihood
 from starcal_uq.pairs import PairObjective
 from starcal_uq.projection import monotonic_expression
-from starcal_uq.quest import quest
+from starcal_uq.wahba import quest
 from starcal_uq.solvers import Constraints, Solution, ipopt, levenberg_marquardt, minpack
 from starcal_uq.status import Status
 
+# Predicted gain of a pair stage that is not worth an evaluation: 1e-4 sigma or less for 30,000 residuals.
+_PAIR_TOLERANCE = 1e-13
 # Explicit pairs need about 100 bytes each and parameter; beyond this the normal equations serve.
 MAX_EXPLICIT_PAIRS = 500_000
 
@@ -75,7 +77,7 @@ def _solve(objective: PairObjective, start: FloatArray, camera: Camera, solver: 
         return ipopt(objective.evaluate, start, constraints, max_iterations=max_iterations)
     if solver == "minpack" and objective.n_pairs <= MAX_EXPLICIT_PAIRS:
         return minpack(objective.residuals, objective.evaluate, start, max_iterations=max_iterations)
-    return levenberg_marquardt(objective.evaluate, start, max_iterations=max_iterations)
+    return levenberg_marquardt(objective.evaluate, start, max_iterations=max_iterations, tolerance=_PAIR_TOLERANCE)
 
 
 def _timed(name: str, run: Callable[[], Solution], tail: FloatArray) -> Stage:
@@ -127,9 +129,10 @@ def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> S
     return Stage("distortion", trajectory, np.array(cost), Status.CONVERGED, 1, perf_counter() - began)
 
 
-def joint_stage(frames: StarFrames, camera: Camera, theta: FloatArray, solver: str, max_iterations: int) -> Stage:
+def joint_stage(
+    objective: PairObjective, camera: Camera, theta: FloatArray, solver: str, max_iterations: int
+) -> Stage:
     """Stage 3: all parameters on interstar angles (the paper's section 2.3)."""
-    objective = PairObjective(frames, camera.distortion)
     return _timed("all", lambda: _solve(objective, theta, camera, solver, max_iterations), np.zeros(0))
 
 

@@ -143,7 +143,7 @@ def sample_step(run: RunFolder, *, force: bool, progress: Progress | None = None
 
     checkpoint = run.path / "sampling.checkpoint.npz"
     posterior = sample(obs, calibration, progress=progress, checkpoint=checkpoint, **options)
-    posterior.save(run.posterior)
+    posterior.save(run.posterior, force=True)
     checkpoint.unlink(missing_ok=True)
     _remove(run, _AFTER_SAMPLING)
     return posterior

@@ -12,10 +12,14 @@ from starcal_uq.plots import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.colors import Normalize
     from matplotlib.figure import Figure
 
     from starcal_uq.fieldmap import FieldMap
     from starcal_uq.propagation import AttitudeError
+
+_STARS_SHOWN = 600
+_WIDE = 5.0
 
 
 def plot_attitude(error: AttitudeError, ax: Axes | None = None) -> Axes:
@@ -65,24 +69,42 @@ def plot_field_map(field: FieldMap) -> Figure:
 
 
 def _panel(ax: Axes, field: FieldMap, values: FloatArray, title: str) -> None:
+    from matplotlib.ticker import FuncFormatter
+
     style.dress(ax)
     x, y = np.asarray(field.x_px), np.asarray(field.y_px)
-    levels = _levels(values)
-    image = ax.contourf(x, y, values, levels=levels, cmap="cividis")
+    levels, norm = _levels(values)
+    image = ax.contourf(x, y, values, levels=levels, norm=norm, cmap="cividis")
     ax.contour(x, y, values, levels=levels[1:-1], colors="white", linewidths=0.5)
+    # A sample is enough to show where stars were, and evenly spaced rows are a sample.
+    some = slice(None, None, max(1, len(field.star_x_px) // _STARS_SHOWN))
+    ax.scatter(field.star_x_px[some], field.star_y_px[some], s=2.0, color="white", alpha=0.45, linewidths=0)
     ax.set_xlim(x[0], x[-1])
     ax.set_ylim(y[-1], y[0])
     ax.set_aspect("equal")
     style.label(ax, title, "x [px]", "y [px]")
     bar = style.colour_bar(ax, image, "1 sigma [arcsec]")
-    bar.formatter.set_useOffset(False)
+    bar.set_ticks(levels[:: max(1, len(levels) // 8)])
+    bar.formatter = FuncFormatter(lambda value, _: f"{value:.6g}")
+    bar.update_ticks()
+    bar.ax.minorticks_off()
 
 
-def _levels(values: FloatArray) -> FloatArray:
+def _levels(values: FloatArray) -> tuple[FloatArray, Normalize | None]:
+    """Round levels; in equal ratios where the map spans more than a factor of five, else a few would hold it all."""
+    from matplotlib.colors import LogNorm
     from matplotlib.ticker import MaxNLocator
 
     low, high = float(np.min(values)), float(np.max(values))
+    if low > 0.0 and high > _WIDE * low:
+        decades = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
+        steps = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if high < 50.0 * low else (1.0, 2.0, 5.0)
+        candidates = np.outer(decades, steps).ravel()
+        first = int(np.searchsorted(candidates, low * (1.0 + 1e-9), side="right")) - 1
+        last = int(np.searchsorted(candidates, high * (1.0 - 1e-9)))
+        levels = candidates[first : last + 1]
+        return levels, LogNorm(float(levels[0]), float(levels[-1]))
     if high - low <= 1e-9 * abs(high):
         # A map without relief still needs two levels to be filled.
         low, high = low - 0.05 * abs(low) - 1e-12, high + 0.05 * abs(high) + 1e-12
-    return np.asarray(MaxNLocator(10).tick_values(low, high), dtype=np.float64)
+    return np.asarray(MaxNLocator(10).tick_values(low, high), dtype=np.float64), None

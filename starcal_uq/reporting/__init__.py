@@ -43,8 +43,9 @@ def report(run_path: str | os.PathLike[str], truth: Camera | None = None) -> Pat
     run = RunFolder(run_path)
     results = load_results(run, truth)
     figures = draw_figures(results)
+    page = render(results, figures)
     run.figures.mkdir(exist_ok=True)
     for name, png in figures.items():
         atomic_write_bytes(run.figures / f"{name}.png", png)
-    atomic_write_text(run.report, render(results, figures))
+    atomic_write_text(run.report, page)
     return run.report

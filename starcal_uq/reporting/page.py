@@ -43,7 +43,7 @@ def render(results: Results, figures: Mapping[str, bytes]) -> str:
 def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
     """What the template shows."""
     cal, post, obs = results.calibration, results.posterior, results.observations
-    verdict = judge(obs, cal, post, results.truth)
+    verdict = judge(obs, cal, post, results.truth, results.attitude)
     converged = verdict.of(Question.CONVERGED)
     trust = verdict.of(Question.TRUSTWORTHY)
     return {
@@ -64,6 +64,7 @@ def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
         "names": [p.name for p in tables.all_parameters(results)],
         "parameter_rows": tables.parameter_rows(results),
         "attitude_rows": [] if results.attitude is None else tables.attitude_rows(results.attitude),
+        "attitude_sentence": words.attitude_sentence(results),
         "coupling_rows": [] if results.coupling is None else tables.coupling_rows(results.coupling, results),
         "weak_directions": [] if results.coupling is None else tables.weak_directions(results.coupling),
         "diagnostics_rows": [] if post is None else tables.diagnostics_rows(post),

@@ -14,7 +14,6 @@ from starcal_uq.verdict import truth_z
 if TYPE_CHECKING:
     from markupsafe import Markup
 
-    from starcal_uq._types import FloatArray
     from starcal_uq.couplings import Coupling
     from starcal_uq.posterior import Posterior
     from starcal_uq.propagation import AttitudeError
@@ -22,8 +21,8 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 
-# Two-sided quantiles of the normal distribution: 95 % and 99.7 %.
-Z_95, Z_997 = 1.959964, 2.967738
+# Two-sided 95 % quantile of the normal distribution.
+Z_95 = 1.959964
 
 
 def symbol(name: str) -> Markup:
@@ -112,26 +111,27 @@ def _parameter_row(
     }
 
 
+_ATTITUDE_NOTES = (
+    "random, new in every frame",
+    "one constant for the mission",
+    "depends on where the stars are",
+    "common rotation and rest together",
+)
+
+
 def attitude_rows(error: AttitudeError) -> list[Row]:
-    """Contributions to the attitude error: 1 sigma, 95 % and 99.7 % for each axis, arcsec."""
-    total = np.hypot(np.asarray(error.common_arcsec), np.asarray(error.rest_arcsec))
-    series: tuple[tuple[str, str, FloatArray, str], ...] = (
-        ("Centroid noise (NEA)", "random, new in every frame", error.nea_arcsec, "no"),
-        ("Calibration: common rotation", "one constant for the mission", error.common_arcsec, "yes"),
-        ("Calibration: frame-dependent rest", "depends on where the stars are", error.rest_arcsec, "no"),
-        ("Calibration, total", "common rotation and rest", total, "in part"),
-    )
-    return [
-        {
-            "name": name,
-            "note": note,
-            "sigma": [significant(float(v)) for v in values],
-            "q95": [significant(float(v) * Z_95) for v in values],
-            "q997": [significant(float(v) * Z_997) for v in values],
-            "absorbed": absorbed,
+    """Contributions to the attitude error: 1 sigma, 95 % and 99.7 % for each axis and across the boresight, arcsec."""
+    table = error.to_dataframe()
+    rows = []
+    for (name, group), note in zip(table.groupby("contributor", sort=False), _ATTITUDE_NOTES, strict=True):
+        columns = {
+            column: [significant(float(v)) for v in group[f"{column}_arcsec"]]
+            for column in ("sigma", "p95", "p997", "first_order")
         }
-        for name, note, values, absorbed in series
-    ]
+        text = str(name)
+        absorbed = str(group["absorbed_by_alignment"].iloc[0])
+        rows.append({"name": text[0].upper() + text[1:], "note": note, "absorbed": absorbed, **columns})
+    return rows
 
 
 def coupling_rows(coupling: Coupling, results: Results) -> list[Row]:

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.formatting import count, fixed, plural, significant
+from starcal_uq.formatting import count, fixed, percent, plural, significant
+from starcal_uq.verdict import propagation_difference
 
 if TYPE_CHECKING:
     from starcal_uq.reporting.loading import Results
@@ -61,6 +62,17 @@ def sigma_sentence(results: Results) -> str:
     if post.sigma_sampled:
         return f"The noise σ ({kind}) is a parameter: it is sampled with the others, on its logarithm."
     return f"The noise σ ({kind}) was given as {significant(float(post.sigma_draws[0]), 4)} and not sampled."
+
+
+def attitude_sentence(results: Results) -> str:
+    """What the numbers of the attitude table rest on."""
+    error = results.attitude
+    if error is None:
+        return ""
+    return (
+        f"{plural(error.n_draws, 'posterior draw')} through QUEST on the {plural(error.n_frames, 'observed frame')}; "
+        f"first-order propagation gives the same σ within {percent(propagation_difference(error))}."
+    )
 
 
 def prior_rows(results: Results) -> list[dict[str, str]]:

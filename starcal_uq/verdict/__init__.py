@@ -15,14 +15,27 @@ from starcal_uq.verdict.estimate import truth_z
 from starcal_uq.verdict.levels import Check, Level, Question
 from starcal_uq.verdict.limits import limits
 from starcal_uq.verdict.observed import aberration_words
+from starcal_uq.verdict.sampling import propagation_difference
 
 if TYPE_CHECKING:
     from starcal_uq.calibration import Calibration
     from starcal_uq.camera import Camera
     from starcal_uq.observations import Observations
     from starcal_uq.posterior import Posterior
+    from starcal_uq.propagation import AttitudeError
 
-__all__ = ["Check", "Level", "Question", "Verdict", "aberration_words", "judge", "limits", "truth_z", "worst"]
+__all__ = [
+    "Check",
+    "Level",
+    "Question",
+    "Verdict",
+    "aberration_words",
+    "judge",
+    "limits",
+    "propagation_difference",
+    "truth_z",
+    "worst",
+]
 
 
 @dataclass(frozen=True)
@@ -59,7 +72,13 @@ def worst(checks: tuple[Check, ...]) -> Level:
     return max((check.level for check in checks), key=lambda level: level.rank, default=Level.PASS)
 
 
-def judge(obs: Observations, cal: Calibration, post: Posterior | None = None, truth: Camera | None = None) -> Verdict:
+def judge(
+    obs: Observations,
+    cal: Calibration,
+    post: Posterior | None = None,
+    truth: Camera | None = None,
+    attitude: AttitudeError | None = None,
+) -> Verdict:
     """Check a run.
 
     Parameters
@@ -70,6 +89,8 @@ def judge(obs: Observations, cal: Calibration, post: Posterior | None = None, tr
         The posterior, if there is one.
     truth
         The camera of a simulation, if it is known.
+    attitude
+        The propagated attitude error, if there is one.
     """
     checks: list[Check | None] = [estimate.estimation(cal), estimate.estimators_agree(cal)]
     if post is not None:
@@ -79,6 +100,8 @@ def judge(obs: Observations, cal: Calibration, post: Posterior | None = None, tr
     checks += [observed.noise(cal), observed.coverage(obs, cal)]
     if post is not None:
         checks += [sampling.prior_influence(post)]
+    if attitude is not None:
+        checks += [sampling.propagation(attitude)]
     if truth is not None and truth.parameter_names == cal.parameter_names:
         checks += [estimate.against_truth(cal, truth, post)]
     found = tuple(check for check in checks if check is not None)

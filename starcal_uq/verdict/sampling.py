@@ -19,8 +19,11 @@ from starcal_uq.verdict.levels import Check, Level, Question, pass_or_fail, pass
 
 if TYPE_CHECKING:
     from starcal_uq.posterior import Posterior
+    from starcal_uq.propagation import AttitudeError
 
 PRIOR_SHARE, PRIOR_PULL = 0.5, 3.0
+# What first order leaves out, and how many Monte Carlo errors of a sampled sigma are tolerated beyond it.
+PROPAGATION_SLACK, PROPAGATION_ERRORS = 0.03, 4.0
 
 
 def chains_agree(post: Posterior) -> Check:
@@ -115,6 +118,31 @@ def prior_influence(post: Posterior) -> Check:
     value = f"sigma {percent(float(share[largest]))} of the prior's ({names[largest]})"
     level = pass_or_warn(not limited and not pulled)
     return Check("Influence of the priors", Question.TRUSTWORTHY, level, value, f"≤ {percent(PRIOR_SHARE)}", sentence)
+
+
+def propagation(error: AttitudeError) -> Check:
+    """Do draws through QUEST and first-order propagation give the same attitude error?"""
+    largest = propagation_difference(error)
+    # A standard deviation from n draws has a relative error of at most 1 / sqrt(2 n).
+    bound = PROPAGATION_SLACK + PROPAGATION_ERRORS / float(np.sqrt(2.0 * error.n_draws))
+    good = largest <= bound
+    sentence = (
+        "Draws through QUEST and first-order propagation give the same attitude error."
+        if good
+        else "Draws through QUEST and first-order propagation differ: prefer the draws, and raise their number."
+    )
+    value = f"sigmas within {percent(largest)}"
+    threshold = f"≤ {percent(bound)}"
+    return Check("Propagation to attitude", Question.TRUSTWORTHY, pass_or_warn(good), value, threshold, sentence)
+
+
+def propagation_difference(error: AttitudeError) -> float:
+    """Largest relative difference between sampled and first-order sigmas of the calibration's parts."""
+    sampled = np.concatenate([error.common_arcsec, error.rest_arcsec])
+    first_order = np.concatenate([error.analytic_common_arcsec, error.analytic_rest_arcsec])
+    # Parts without an effect worth the name (below a microarcsecond) have no ratio.
+    real = np.maximum(sampled, first_order) > 1e-6
+    return float(np.max(np.abs(sampled[real] / np.maximum(first_order[real], 1e-12) - 1.0), initial=0.0))
 
 
 def _sampling(name: str, good: bool, value: str, threshold: str, sentence: str) -> Check:
