@@ -87,7 +87,8 @@ class FieldMap:
             If the file is missing or is not a field map.
         """
         try:
-            with np.load(path, allow_pickle=False) as arrays:
+            # Opened here: NumPy leaves a file open that turns out not to be what it seems.
+            with open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
                 return cls(**{f.name: arrays[f.name] for f in fields(cls)})
         except OSError as error:
             raise RunFolderError(

@@ -19,6 +19,7 @@ that standard deviation.
 
 from __future__ import annotations
 
+import csv
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 
 AXES = ("pitch", "yaw", "roll")
 CROSS_BORESIGHT = "cross-boresight"
+_COLUMNS = (*AXES, CROSS_BORESIGHT)
 CONTRIBUTORS = (
     "centroid noise (NEA)",
     "calibration, common rotation",
@@ -126,16 +128,15 @@ class AttitudeError:
             self.analytic_rest_arcsec,
             np.hypot(self.analytic_common_arcsec, self.analytic_rest_arcsec),
         )
-        n_axes = len(AXES) + 1
         return pd.DataFrame(
             {
-                "contributor": np.repeat(CONTRIBUTORS, n_axes).astype(object),
-                "axis": np.array((*AXES, CROSS_BORESIGHT) * len(CONTRIBUTORS), dtype=object),
+                "contributor": np.repeat(CONTRIBUTORS, len(_COLUMNS)).astype(object),
+                "axis": np.array(_COLUMNS * len(CONTRIBUTORS), dtype=object),
                 "sigma_arcsec": np.concatenate([_with_cross(values) for values in sampled]),
                 "p95_arcsec": self.p95_arcsec.ravel(),
                 "p997_arcsec": self.p997_arcsec.ravel(),
                 "first_order_arcsec": np.concatenate([_with_cross(values) for values in analytic]),
-                "absorbed_by_alignment": np.repeat(_ABSORBED, n_axes).astype(object),
+                "absorbed_by_alignment": np.repeat(_ABSORBED, len(_COLUMNS)).astype(object),
             }
         )
 
@@ -154,23 +155,20 @@ class AttitudeError:
         RunFolderError
             If the file is missing or is not such a table.
         """
-        import pandas as pd
-
+        names = ("sigma", "p95", "p997", "first_order")
         try:
-            table = pd.read_csv(path, float_precision="round_trip")
-            rows = table.set_index(["contributor", "axis"], verify_integrity=True)
-            rows = rows.loc[[(c, a) for c in CONTRIBUTORS for a in (*AXES, CROSS_BORESIGHT)]]
-            shape = (len(CONTRIBUTORS), len(AXES) + 1)
+            with open(path, newline="", encoding="utf-8") as file:
+                rows = {(row["contributor"], row["axis"]): row for row in csv.DictReader(file)}
+            chosen = [[rows[contributor, axis] for axis in _COLUMNS] for contributor in CONTRIBUTORS]
             sigma, p95, p997, analytic = (
-                rows[f"{name}_arcsec"].to_numpy(dtype=np.float64).reshape(shape)
-                for name in ("sigma", "p95", "p997", "first_order")
+                np.array([[float(row[f"{name}_arcsec"]) for row in line] for line in chosen]) for name in names
             )
-            counts = {name: int(rows[name].iloc[0]) for name in ("n_draws", "n_frames")}
+            counts = {name: int(chosen[0][0][name]) for name in ("n_draws", "n_frames")}
         except OSError as error:
             raise RunFolderError(
                 f"{path}: cannot be read ({error.strerror or error}); run `starcal-uq propagate RUN` first."
             ) from error
-        except (KeyError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, csv.Error) as error:
             raise RunFolderError(
                 f"{path}: is not a table of attitude errors; run `starcal-uq propagate RUN` to write it again."
             ) from error

@@ -181,6 +181,9 @@ def levenberg_marquardt(
         predicted = curvature + 2.0 * penalty
         actual = 1.0 - trial.cost / normal.cost if np.isfinite(trial.cost) else -np.inf
         ratio = actual / predicted if predicted > 0.0 else 0.0
+        if predicted <= _ROUNDING and abs(actual) <= _ROUNDING:
+            # The cost can no longer tell the step from rounding, but the gradient still can.
+            ratio = 1.0
         if ratio <= 0.25:
             if actual >= 0.0:
                 factor = 0.5
@@ -197,8 +200,7 @@ def levenberg_marquardt(
             trajectory.append(theta)
             costs.append(normal.cost)
             scale = np.maximum(scale, np.sqrt(np.diag(normal.matrix)))
-        # Where the cost has reached rounding, a refused step with nothing left to gain is convergence as well.
-        if predicted <= tolerance and (ratio > 1e-4 or abs(actual) <= _ROUNDING):
+        if predicted <= tolerance and ratio > 1e-4:
             return finish(Status.CONVERGED)
         if bound <= step_tolerance * float(np.linalg.norm(scale * theta)):
             return finish(Status.CONVERGED if predicted <= 1e-8 else Status.STALLED)

@@ -21,6 +21,8 @@ from starcal_uq.status import Status
 
 # Predicted gain of a pair stage that is not worth an evaluation: 1e-4 sigma or less for 30,000 residuals.
 _PAIR_TOLERANCE = 1e-13
+# The estimate itself is taken to rounding, so that every start ends in the same digits.
+_REFINEMENT_TOLERANCE = 1e-18
 # Explicit pairs need about 100 bytes each and parameter; beyond this the normal equations serve.
 MAX_EXPLICIT_PAIRS = 500_000
 
@@ -140,6 +142,8 @@ def refinement_stage(likelihood: MarginalLikelihood, theta: FloatArray, max_iter
     """Stage 4: all parameters on the attitude-marginalised likelihood, which reaches the Cramer-Rao bound."""
     return _timed(
         "refinement",
-        lambda: levenberg_marquardt(likelihood.evaluate, theta, max_iterations=max_iterations),
+        lambda: levenberg_marquardt(
+            likelihood.evaluate, theta, max_iterations=max_iterations, tolerance=_REFINEMENT_TOLERANCE
+        ),
         np.zeros(0),
     )

@@ -195,8 +195,11 @@ def _replicates(seeds, sigma_claimed=1.0):
 
 @pytest.mark.slow
 def test_the_spread_over_seeds_is_the_sigma_that_is_reported():
-    """Paper's set-up, 200 seeds: variance ratios 0.8-1.2 and coverage 91-98 %, against sigma and Cramer-Rao bound."""
-    errors, sigmas, pair_errors, pair_sigmas = _replicates(range(200))
+    """Paper's set-up: variance ratios 0.8-1.2 and coverage 91-98 %, against sigma and Cramer-Rao bound.
+
+    400 seeds rather than 200: with 200 a right 95 % interval leaves 98 % once in ninety times for each parameter.
+    """
+    errors, sigmas, pair_errors, pair_sigmas = _replicates(range(400))
     for e, s in ((errors, sigmas), (pair_errors, pair_sigmas)):
         ratio = np.mean(e**2, axis=0) / np.mean(s**2, axis=0)
         assert (ratio > 0.8).all(), ratio
@@ -204,8 +207,8 @@ def test_the_spread_over_seeds_is_the_sigma_that_is_reported():
         coverage = np.mean(np.abs(e / s) < 1.96, axis=0)
         assert (coverage >= 0.91).all(), coverage
         assert (coverage <= 0.98).all(), coverage
-        # Bias is within what 200 replicates can show.
-        assert (np.abs(np.mean(e / s, axis=0)) < 4 / np.sqrt(200)).all()
+        # Bias is within what the replicates can show.
+        assert (np.abs(np.mean(e / s, axis=0)) < 4 / np.sqrt(len(e))).all()
     # Negative control: sigmas understated to the size that naive pairs claim do not pass.
     naive = sigmas / 2.5
     assert (np.mean(np.abs(errors / naive) < 1.96, axis=0) < 0.91).all()

@@ -44,7 +44,12 @@ def errors():
         rest_arcsec=np.array([0.02, 0.02, 0.2]),
     )
     field = SimpleNamespace(
-        x_px=x, y_px=y, sigma_absolute_arcsec=5.0 + 0.01 * radius, sigma_compensated_arcsec=0.01 * radius**2
+        x_px=x,
+        y_px=y,
+        sigma_absolute_arcsec=5.0 + 0.01 * radius,
+        sigma_compensated_arcsec=0.002 + 0.1 * radius**4,
+        star_x_px=np.linspace(0.0, 1000.0, 30),
+        star_y_px=np.linspace(0.0, 700.0, 30),
     )
     return attitude, field
 
@@ -197,14 +202,20 @@ def test_field_map_has_a_colour_bar_for_each_panel(errors):
     figure = drawn(plots.plot_field_map(field))
     assert len(figure.axes) == 4
     assert figure.axes[0].get_ylim()[0] > figure.axes[0].get_ylim()[1]
+    assert overlapping(figure) == []
+    # The compensated map spans a factor of fifty: levels in equal ratios, printed without powers of ten.
+    bar = figure.axes[3]
+    assert bar.get_yscale() == "log"
+    assert "0.01" in [label.get_text() for label in bar.get_yticklabels()]
     field.sigma_absolute_arcsec = np.full_like(field.sigma_absolute_arcsec, 5.0)
     field.sigma_compensated_arcsec = np.zeros_like(field.sigma_absolute_arcsec)
     drawn(plots.plot_field_map(field))
 
 
 def test_figures_are_repeatable_and_show_themselves(run):
-    assert plots.png_bytes(plots.plot_corner(run.post), dpi=40) == plots.png_bytes(plots.plot_corner(run.post), dpi=40)
-    assert plots.plot_convergence(run.cal)._repr_png_().startswith(PNG)
+    first, second = (plots.png_bytes(plots.figure_of(plots.plot_couplings(run.coupling)), dpi=40) for _ in range(2))
+    assert first == second
+    assert plots.plot_correlations(run.coupling)._repr_png_().startswith(PNG)
 
 
 def test_settings_of_the_user_stay_untouched(run):

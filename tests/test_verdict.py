@@ -10,7 +10,7 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.residuals import bin_residuals, normalised_residuals, residual_scale
-from starcal_uq.verdict import Level, Question, judge, limits
+from starcal_uq.verdict import Level, Question, judge, limits, propagation_difference
 from tests.scenes import camera, observations, with_sigmas
 
 
@@ -187,3 +187,14 @@ def test_limits_name_the_largest_term_and_the_coupling(run):
     assert "k1 trades against k2" in sentences[1] or "f trades against" in sentences[1]
     error.common_arcsec = (0.1, 0.1, 0.1)
     assert "centroid noise of a single frame dominates" in limits(run.obs, run.cal, attitude=error)[0]
+
+
+def test_propagation_that_departs_from_first_order_warns(run):
+    error = sc.propagate(run.post, run.obs, n_draws=200, seed=1)
+    verdict = judge(run.obs, run.cal, run.post, run.truth, error)
+    assert verdict.level is Level.PASS
+    assert verdict.checks[-2].name == "Propagation to attitude"
+    other = dataclasses.replace(error, analytic_rest_arcsec=error.analytic_rest_arcsec * 1.6)
+    check = judge(run.obs, run.cal, run.post, None, other).checks[-1]
+    assert check.level is Level.WARN
+    assert propagation_difference(other) == pytest.approx(0.375, abs=0.1)

@@ -61,7 +61,8 @@ def plot_attitude(error: AttitudeError, ax: Axes | None = None) -> Axes:
 
 def plot_field_map(field: FieldMap) -> Figure:
     """Direction uncertainty over the detector: absolute, and after the best constant rotation is removed."""
-    figure = style.new_figure(11.0, 4.5)
+    # As tall as the panels, or the colour bars would outgrow them.
+    figure = style.new_figure(11.0, 0.8 + 4.05 * float(np.ptp(field.y_px) / np.ptp(field.x_px)))
     left, right = figure.subplots(1, 2)
     _panel(left, field, field.sigma_absolute_arcsec, "Absolute")
     _panel(right, field, field.sigma_compensated_arcsec, "After removing the best constant rotation")
