@@ -47,7 +47,7 @@ def explicit_pairs(obs: sc.Observations) -> np.ndarray:
 
     frames, start = StarFrames.from_observations(obs), sc.paper_start()
     theta = np.array(start.theta)
-    first = PairObjective(frames, "brown", fixed=np.zeros(2))
+    first = PairObjective(frames, "none")
     joint = PairObjective(frames, "brown")
     pairs = joint.pair_indices()
     for objective in (first, joint):

@@ -170,21 +170,25 @@ def demo(
     calibration = calibrate_step(run, obs, paper_start(), method="efficient", solver="lm", force=force)
     err.print("Sampling the posterior ...")
     with _progress("sampling") as progress:
-        posterior = sample_step(run, force=True, progress=progress, seed=seed)
+        sample_step(run, force=True, progress=progress, seed=seed)
     err.print("Couplings, attitude error, report ...")
     coupling_step(run)
     propagate_step(run, n_draws=300, seed=seed)
     path = report_step(run)
     show_calibration(calibration, truth)
-    _finish(path, posterior.diagnostics.ok)
+    _finish(run, path)
 
 
-def _finish(report: Path, trustworthy: bool) -> None:
-    from starcal_uq.console import err
+def _finish(run: Any, report: Path) -> None:
+    """Verdict, then the path of the report; status 1 when a check failed."""
+    from starcal_uq.console import show_verdict
+    from starcal_uq.steps import verdict_step
+    from starcal_uq.verdict import Level
 
+    verdict = verdict_step(run)
+    show_verdict(verdict)
     print(f"Report: {report.resolve()}")
-    if not trustworthy:
-        err.print("A check of the sampling failed; the report says which.", style="yellow")
+    if verdict.level is Level.FAIL:
         raise typer.Exit(1)
 
 
@@ -383,7 +387,7 @@ def run_command(
     coupling_step(folder)
     error, _ = propagate_step(folder, n_draws=draws, seed=seed)
     show_attitude(error)
-    _finish(report_step(folder), posterior.diagnostics.ok)
+    _finish(folder, report_step(folder))
 
 
 def main() -> None:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from starcal_uq.observations import Observations
     from starcal_uq.posterior import Posterior
     from starcal_uq.propagation import AttitudeError
+    from starcal_uq.verdict import Verdict
 
 # Where the output is not a terminal it has no width of its own; tables then get the room they need.
 _WIDTH = None if sys.stdout.isatty() else 110
@@ -180,6 +181,15 @@ def show_attitude(error: AttitudeError) -> None:
 
 def _word(value: Any) -> str:
     return ("yes" if value else "no") if isinstance(value, (bool, np.bool_)) else str(value)
+
+
+def show_verdict(verdict: Verdict) -> None:
+    """The headline, and every check that did not pass."""
+    style = {"pass": "green", "warning": "yellow", "fail": "red"}[verdict.level.value]
+    out.print(f"Verdict ({verdict.level.value}): {verdict.headline}", style=style, highlight=False, soft_wrap=True)
+    for check in verdict.checks:
+        if check.level.value != "pass":
+            out.print(f"- {check.level.value}: {check.sentence}", highlight=False, soft_wrap=True)
 
 
 def warn_undeclared(obs: Observations) -> None:

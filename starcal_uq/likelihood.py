@@ -19,9 +19,9 @@ from starcal_uq._types import FloatArray
 from starcal_uq.attitude import exp_rotation
 from starcal_uq.frames import StarFrames
 from starcal_uq.projection import forward_kernel, forward_root, unproject_theta
-from starcal_uq.wahba import quest
 from starcal_uq.solvers import Normal
 from starcal_uq.symmetric import COLUMNS, ROWS, inverse_symmetric
+from starcal_uq.wahba import quest
 
 if TYPE_CHECKING:
     from starcal_uq.observations import Observations

@@ -9,6 +9,7 @@ small, and every term below is formed from E, so that nothing cancels:
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,11 +18,14 @@ from starcal_uq._types import FloatArray, IntArray
 from starcal_uq.distortion import get_model
 from starcal_uq.frames import StarFrames
 from starcal_uq.projection import backward_kernel, backward_root
-from starcal_uq.wahba import quest
 from starcal_uq.solvers import Normal, is_singular
+from starcal_uq.wahba import quest
 
 # Stars per block: small enough that its arrays stay in cache, large enough to hide the interpreter.
 _BLOCK_STARS = 4096
+# The objective does not depend on how the catalogue is turned; a turn that is right to within this many pixels keeps E
+# small enough for eleven digits of the cost.
+_TURN_AGAIN_PX = 30.0
 
 
 def _gram(frames: StarFrames, a: FloatArray, b: FloatArray) -> FloatArray:
@@ -46,6 +50,17 @@ class _Terms:
     db: FloatArray
 
 
+def _block_terms(frames: StarFrames, catalogue: FloatArray, b: FloatArray, db: FloatArray) -> _Terms:
+    """Terms of one block; `catalogue` are the catalogue directions (3, N), turned nearly into the camera frame."""
+    e = b - catalogue
+    ee, rr, re = _gram(frames, e, e), _gram(frames, catalogue, catalogue), _gram(frames, catalogue, e)
+    er = re.transpose(1, 0, 2)
+    cost = np.sum(ee * rr + re * er + 2.0 * ee * re + 0.5 * ee * ee, axis=(0, 1))
+    # D B = R' (E^T B) + E (R'^T B) + E (E^T B), with B = R' + E.
+    d_b = _apply(catalogue, frames.spread(er + ee)) + _apply(e, frames.spread(rr + re + er + ee))
+    return _Terms(cost, d_b, b, db)
+
+
 class PairObjective:
     """Sum of squared differences of interstar cosines over all pairs of a frame and all frames.
 
@@ -54,18 +69,18 @@ class PairObjective:
     frames : StarFrames
         Data.
     model_name : str
-        Distortion model. Per-star weights are not used: the paper's objective has none.
-    fixed : (q,) array, optional
-        Trailing parameters held fixed (the distortion coefficients in stage 1); `evaluate` then takes the rest.
+        Distortion model; ``none`` for the paper's first stage. Per-star weights are not used: the paper's objective has
+        none.
     """
 
-    def __init__(self, frames: StarFrames, model_name: str, fixed: FloatArray | None = None) -> None:
+    def __init__(self, frames: StarFrames, model_name: str) -> None:
         self.frames = frames
-        self._last: tuple[FloatArray, Normal, FloatArray] | None = None
-        self._blocks = [frames.part(first, last) for first, last in frames.parts(_BLOCK_STARS)]
         self.model_name = model_name
-        self.fixed = np.zeros(0) if fixed is None else np.asarray(fixed, dtype=np.float64)
-        self.n_parameters = 3 + len(get_model(model_name).coefficients) - len(self.fixed)
+        self.n_parameters = 3 + len(get_model(model_name).coefficients)
+        self._blocks = [frames.part(first, last) for first, last in frames.parts(_BLOCK_STARS)]
+        self._turned_at: FloatArray | None = None
+        self._turned: list[FloatArray] = []
+        self._last: tuple[FloatArray, Normal, FloatArray] | None = None
 
     @property
     def n_pairs(self) -> int:
@@ -75,27 +90,28 @@ class PairObjective:
 
     def directions(self, theta: FloatArray, frames: StarFrames) -> tuple[FloatArray, FloatArray]:
         """Measured unit vectors (3, N) and their derivatives (p, 3, N)."""
-        full = np.concatenate([theta, self.fixed])
-        root = backward_root(self.model_name, full, frames.pixel)
-        b, db = backward_kernel(self.model_name, True)(frames.n_stars, full, frames.pixel, root)
-        return b, db[: self.n_parameters]
+        root = backward_root(self.model_name, theta, frames.pixel)
+        b, db = backward_kernel(self.model_name, True)(frames.n_stars, theta, frames.pixel, root)
+        return b, db
 
-    def _terms(self, theta: FloatArray, frames: StarFrames) -> _Terms:
-        b, db = self.directions(theta, frames)
-        # Any rotation is exact; the best one makes E as small as the noise.
-        rotations = quest(b.T, frames.r.T, frames.starts, covariance=False, on_degenerate="flag").rotations
-        catalogue = frames.rotated(rotations)
-        e = b - catalogue
-        ee, rr, re = _gram(frames, e, e), _gram(frames, catalogue, catalogue), _gram(frames, catalogue, e)
-        er = re.transpose(1, 0, 2)
-        cost = np.sum(ee * rr + re * er + 2.0 * ee * re + 0.5 * ee * ee, axis=(0, 1))
-        # D B = R' (E^T B) + E (R'^T B) + E (E^T B), with B = R' + E.
-        d_b = _apply(catalogue, frames.spread(er + ee)) + _apply(e, frames.spread(rr + re + er + ee))
-        return _Terms(cost, d_b, b, db)
+    def _terms(self, theta: FloatArray) -> Iterator[tuple[StarFrames, _Terms]]:
+        """Terms of the objective, block by block."""
+        turn = self._turned_at is None or np.max(np.abs(theta[:3] - self._turned_at)) > _TURN_AGAIN_PX
+        if turn:
+            self._turned_at, self._turned = theta[:3].copy(), []
+        for index, frames in enumerate(self._blocks):
+            b, db = self.directions(theta, frames)
+            if turn:
+                found = quest(b.T, frames.r.T, frames.starts, covariance=False, on_degenerate="flag")
+                self._turned.append(frames.rotated(found.rotations))
+                if not found.ok.all():
+                    # No reference to keep: the model is not finite here.
+                    self._turned_at = None
+            yield frames, _block_terms(frames, self._turned[index], b, db)
 
     def cost(self, theta: FloatArray) -> float:
         """The objective S(theta)."""
-        return float(sum(np.sum(self._terms(theta, part).cost) for part in self._blocks))
+        return self.evaluate(theta).cost
 
     def evaluate(self, theta: FloatArray) -> Normal:
         """Cost, gradient ``J^T r`` and Gauss-Newton matrix ``J^T J`` over all pairs."""
@@ -104,6 +120,9 @@ class PairObjective:
     def _evaluate(self, theta: FloatArray) -> tuple[Normal, FloatArray]:
         """As `evaluate`, with the gradient of every frame (p, K); the last point is remembered."""
         theta = np.array(theta, dtype=np.float64)
+        if not np.isfinite(theta).all():
+            p = self.n_parameters
+            return Normal(float("inf"), np.full(p, np.nan), np.full((p, p), np.nan)), np.full((p, 1), np.nan)
         if self._last is None or not np.array_equal(theta, self._last[0]):
             self._last = (theta, *self._sum_over_blocks(theta))
         return self._last[1:]
@@ -112,8 +131,7 @@ class PairObjective:
         p = self.n_parameters
         cost, matrix, scores = 0.0, np.zeros((p, p)), []
         with np.errstate(all="ignore"):
-            for part in self._blocks:
-                terms = self._terms(theta, part)
+            for part, terms in self._terms(theta):
                 b, db = terms.b, terms.db
                 cost += float(np.sum(terms.cost))
                 scores.append(part.sum(np.sum(db * terms.d_b, axis=1)))

@@ -15,9 +15,9 @@ from starcal_uq.frames import StarFrames
 from starcal_uq.likelihood import MarginalLikelihood
 from starcal_uq.pairs import PairObjective
 from starcal_uq.projection import monotonic_expression
-from starcal_uq.wahba import quest
 from starcal_uq.solvers import Constraints, Solution, ipopt, levenberg_marquardt, minpack
 from starcal_uq.status import Status
+from starcal_uq.wahba import quest
 
 # Predicted gain of a pair stage that is not worth an evaluation: 1e-4 sigma or less for 30,000 residuals.
 _PAIR_TOLERANCE = 1e-13
@@ -98,9 +98,9 @@ def _timed(name: str, run: Callable[[], Solution], tail: FloatArray) -> Stage:
 
 def optics_stage(frames: StarFrames, camera: Camera, solver: str, max_iterations: int) -> Stage:
     """Stage 1: x0, y0 and f on interstar angles, distortion ignored (the paper's section 2.1)."""
-    zeros = np.zeros(len(camera.theta) - 3)
-    objective = PairObjective(frames, camera.distortion, fixed=zeros)
+    objective = PairObjective(frames, "none")
     start = np.array(camera.theta[:3])
+    zeros = np.zeros(len(camera.theta) - 3)
     return _timed("optics", lambda: _solve(objective, start, camera, solver, max_iterations), zeros)
 
 
@@ -115,7 +115,8 @@ def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> S
     f = theta[2]
     offset = frames.pixel - theta[:2, None]
     direction = np.vstack([offset, np.full(frames.n_stars, f)])
-    rotations = quest((direction / np.linalg.norm(direction, axis=0)).T, frames.r.T, frames.starts).rotations
+    b = (direction / np.linalg.norm(direction, axis=0)).T
+    rotations = quest(b, frames.r.T, frames.starts, covariance=False).rotations
     b = frames.rotated(rotations)
     ideal = f * b[:2] / b[2]
     # Every model is linear in its coefficients; forward models act on ideal points, inverse ones on measured points.
@@ -131,9 +132,7 @@ def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> S
     return Stage("distortion", trajectory, np.array(cost), Status.CONVERGED, 1, perf_counter() - began)
 
 
-def joint_stage(
-    objective: PairObjective, camera: Camera, theta: FloatArray, solver: str, max_iterations: int
-) -> Stage:
+def joint_stage(objective: PairObjective, camera: Camera, theta: FloatArray, solver: str, max_iterations: int) -> Stage:
     """Stage 3: all parameters on interstar angles (the paper's section 2.3)."""
     return _timed("all", lambda: _solve(objective, theta, camera, solver, max_iterations), np.zeros(0))
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from starcal_uq.fieldmap import FieldMap
     from starcal_uq.posterior import Posterior
     from starcal_uq.propagation import AttitudeError
+    from starcal_uq.verdict import Verdict
 
 Progress = Callable[[int, int], None]
 
@@ -183,10 +184,18 @@ def propagate_step(run: RunFolder, *, n_draws: int, seed: int) -> tuple[Attitude
 
 def report_step(run: RunFolder) -> Path:
     """Write the report of whatever the run holds; the truth of a simulation is shown beside the estimate."""
-    truth = truth_of(load_observations(run.require("observations")))
     from starcal_uq.reporting import report
 
-    return report(run.path, truth=truth)
+    return report(run.path)
+
+
+def verdict_step(run: RunFolder) -> Verdict:
+    """The verdict on whatever the run holds, as the report states it."""
+    from starcal_uq.reporting import load_results
+    from starcal_uq.verdict import judge
+
+    found = load_results(run)
+    return judge(found.observations, found.calibration, found.posterior, found.truth, found.attitude)
 
 
 def truth_of(obs: Observations) -> Camera | None:

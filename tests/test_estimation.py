@@ -37,8 +37,9 @@ def test_three_stages_as_the_paper_describes_them():
     assert (optics.trajectory[:, 3:] == 0.0).all()
     assert np.array_equal(linear.trajectory[0, :3], optics.theta[:3])
     assert np.array_equal(joint.trajectory[0], linear.theta)
-    assert (np.diff(optics.cost) <= 0.0).all()
-    assert (np.diff(joint.cost) <= 0.0).all()
+    for stage in (optics, joint):
+        # Each step lowers the cost, down to where the cost itself is rounding.
+        assert (np.diff(stage.cost) <= 1e-10 * stage.cost[:-1]).all()
     assert np.array_equal(cal.theta, cal.pair_theta)
     assert np.array_equal(cal.covariance, cal.pair_covariance)
     efficient = sc.calibrate(obs, sc.paper_start())

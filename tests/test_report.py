@@ -205,7 +205,7 @@ def test_a_failed_check_turns_the_verdict_red(full):
     diagnostics = dataclasses.replace(results.posterior.diagnostics, rhat=np.full(6, 1.2))
     results = dataclasses.replace(results, posterior=dataclasses.replace(results.posterior, diagnostics=diagnostics))
     text = render(results, {})
-    assert "Do not use these numbers: r-hat failed." in Page(text).text.lower().replace("do not", "Do not")
+    assert "Do not use these numbers: R-hat failed." in Page(text).text
     assert 'class="verdict fail"' in text
 
 

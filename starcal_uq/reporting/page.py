@@ -104,7 +104,8 @@ def _image(png: bytes) -> dict[str, Any]:
 def _answer(checks: tuple[Check, ...]) -> str:
     """The outcome of some checks in one line; what failed is explained elsewhere."""
     if worst(checks) is Level.PASS:
-        return f"All {len(checks)} checks passed: {_listed(checks)}."
+        every = "Both" if len(checks) == 2 else f"All {len(checks)}"
+        return f"{every} checks passed: {_listed(checks)}."
     parts = []
     for level, verb in ((Level.FAIL, "failed"), (Level.WARN, "raised a warning"), (Level.PASS, "passed")):
         found = tuple(check for check in checks if check.level is level)
@@ -114,12 +115,7 @@ def _answer(checks: tuple[Check, ...]) -> str:
 
 
 def _listed(checks: tuple[Check, ...]) -> str:
-    return join_words([_lower(check.name) for check in checks])
-
-
-def _lower(name: str) -> str:
-    """First letter small, unless the name starts with an abbreviation."""
-    return name if name[1:2] in ("-", "") else name[0].lower() + name[1:]
+    return join_words([check.phrase for check in checks])
 
 
 def _minus(text: str) -> str:

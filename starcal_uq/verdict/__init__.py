@@ -109,8 +109,8 @@ def judge(
 
 
 def _headline(checks: tuple[Check, ...], sampled: bool) -> str:
-    failed = [c.name.lower() for c in checks if c.level is Level.FAIL]
-    warned = [c.name.lower() for c in checks if c.level is Level.WARN]
+    failed = [c.phrase for c in checks if c.level is Level.FAIL]
+    warned = [c.phrase for c in checks if c.level is Level.WARN]
     if failed:
         return f"Do not use these numbers: {join_words(failed)} failed."
     if warned:

@@ -51,6 +51,11 @@ class Check:
     threshold: str
     sentence: str
 
+    @property
+    def phrase(self) -> str:
+        """The name for use within a sentence: no capital, unless it starts with a symbol such as R-hat."""
+        return self.name if self.name[1:2] == "-" else self.name[0].lower() + self.name[1:]
+
 
 def pass_or_fail(good: bool) -> Level:
     """For checks that decide whether the numbers may be used at all."""
