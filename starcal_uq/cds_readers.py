@@ -211,7 +211,8 @@ class _Rows:
     def present(self, labels: tuple[str, ...]) -> BoolArray:
         """Whether every number of an angle is there."""
         numbers = [self.columns[label] for label in labels if not label.endswith("-")]
-        return np.isfinite(np.array(numbers)).all(axis=0)
+        finite: BoolArray = np.isfinite(np.array(numbers)).all(axis=0)
+        return finite
 
     def angle(self, labels: tuple[str, ...], present: BoolArray) -> FloatArray:
         """Hours or degrees from one label, or from sexagesimal parts with an optional sign, shape (n,)."""
