@@ -138,7 +138,9 @@ class Coupling:
 
     def _repr_html_(self) -> str:
         directions = "".join(f"<li>{direction.words}</li>" for direction in self.weak_directions[:2])
-        table = self.to_dataframe().to_html(index=False, float_format=lambda value: f"{value:.3g}")
+        table = self.to_dataframe()
+        table = table[[name for name in table.columns if not name.startswith("corr_")]]
+        table = table.to_html(index=False, float_format=lambda value: f"{value:.3g}", border=0)
         return f"<p><b>Coupling</b></p><ul>{directions}</ul>{table}"
 
 

@@ -291,7 +291,7 @@ class Observations:
         shown = {name: values[:5].tolist() for name, values in self.columns.items()}
         head = "".join(f"<th>{name}</th>" for name in shown)
         body = "".join(
-            "<tr>" + "".join(f"<td>{html.escape(str(value))}</td>" for value in row) + "</tr>"
+            "<tr>" + "".join(f"<td>{html.escape(_shown(value))}</td>" for value in row) + "</tr>"
             for row in zip(*shown.values(), strict=True)
         )
         title = f"{self.n_stars} stars in {self.n_frames} frames, directions {self.meta['directions']}"
@@ -327,6 +327,11 @@ def load_observations(
     from starcal_uq.observation_files import read_observations
 
     return read_observations(path, camera, columns or {})
+
+
+def _shown(value: Any) -> str:
+    """A cell for people: five decimals are a hundredth of a milli-pixel and 0.04 arcsec."""
+    return f"{value:.5f}" if isinstance(value, float) else str(value)
 
 
 def _array(name: str, values: Any) -> Any:

@@ -372,9 +372,11 @@ class Posterior:
         return plot_prior_posterior(self, **options)
 
     def _repr_html_(self) -> str:
-        columns = ["parameter", "scaled_unit", *(f"scaled_{n}" for n in _NUMBERS), "rhat", "ess_bulk", "ess_tail"]
+        shown = ("mean", "sd", "q2.5", "q97.5", "prior_sd")
+        columns = ["parameter", "scaled_unit", *(f"scaled_{n}" for n in shown), "rhat", "ess_bulk"]
         table = self.summary()[columns].rename(columns=lambda name: name.removeprefix("scaled_"))
-        html = table.to_html(index=False, float_format=lambda v: f"{v:.6g}", border=0)
+        formats = {"rhat": "{:.4f}".format, "ess_bulk": "{:.0f}".format}
+        html = table.to_html(index=False, float_format=lambda v: f"{v:.6g}", formatters=formats, border=0)
         verdict = "passes every check" if self.diagnostics.ok else "must not be used as it is"
         return (
             f"<p><b>Posterior</b>: {len(self.draws)} draws of {self.n_ensembles} ensembles; {verdict}.</p>"

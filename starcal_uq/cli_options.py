@@ -1,0 +1,83 @@
+"""Arguments and options that several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+ObsFile = Annotated[
+    Path,
+    typer.Argument(
+        metavar="OBS",
+        help="Stars in pixels: CSV, ECSV or Parquet with columns frame, x_px, y_px, ra_deg, dec_deg and optionally "
+        "sigma_px, star_id, mag, time_utc, temperature_c.",
+    ),
+]
+CameraFile = Annotated[
+    Path,
+    typer.Argument(
+        metavar="CAMERA", help="Nominal camera (TOML with a [camera] table): the start, and the prior's centre."
+    ),
+]
+RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder made by `starcal-uq calibrate`.")]
+NewRun = Annotated[Path, typer.Option("-o", "--out", metavar="RUN", help="Folder for the results.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace results that exist.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the table as JSON.")]
+Seed = Annotated[int, typer.Option(help="Seed; the same seed repeats the result bit for bit.")]
+Method = Annotated[
+    str,
+    typer.Option(
+        help="efficient (three stages, then the attitude-marginalised likelihood) or three_stage (Ye & Yang 2017)."
+    ),
+]
+Solver = Annotated[str, typer.Option(help="lm, minpack, or ipopt (keeps the optics within physical bounds).")]
+Columns = Annotated[
+    list[str] | None,
+    typer.Option("--column", metavar="NAME=IN_FILE", help="A column that is called otherwise in the file; repeatable."),
+]
+Directions = Annotated[
+    str | None,
+    typer.Option(
+        help="What ra_deg and dec_deg are: apparent (as seen by the moving sensor), catalogue (aberration is then "
+        "applied at time_utc), or undeclared.",
+    ),
+]
+Velocity = Annotated[
+    str | None,
+    typer.Option(
+        "--observer-velocity", metavar="VX,VY,VZ", help="Velocity relative to the Earth's centre, km/s, ICRS axes."
+    ),
+]
+Ensembles = Annotated[int, typer.Option(min=2, help="Separately seeded ensembles of walkers.")]
+Walkers = Annotated[int, typer.Option(min=14, help="Walkers in each ensemble.")]
+Steps = Annotated[int, typer.Option(min=20, help="Steps kept of each walker.")]
+Sigma = Annotated[float | None, typer.Option(help="Centroid noise in px per axis, if it is known; sampled otherwise.")]
+PriorFile = Annotated[
+    Path | None, typer.Option("--priors", help="TOML file with a [priors] table; wide defaults otherwise.")
+]
+Likelihood = Annotated[str, typer.Option(help="auto (compressed, checked against exact), compressed, or exact.")]
+Draws = Annotated[int, typer.Option(min=50, help="Posterior draws that go through QUEST.")]
+
+
+def parse_columns(pairs: list[str] | None) -> dict[str, str]:
+    """``NAME=IN_FILE`` pairs as a mapping."""
+    found = {}
+    for pair in pairs or []:
+        name, separator, in_file = pair.partition("=")
+        if not (name and separator and in_file):
+            raise typer.BadParameter(f"{pair!r} is not NAME=IN_FILE, such as ra_deg=ra_apparent_deg.")
+        found[name] = in_file
+    return found
+
+
+def parse_velocity(text: str | None) -> tuple[float, float, float] | None:
+    """``VX,VY,VZ`` as numbers."""
+    if text is None:
+        return None
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is not three numbers in km/s, such as 7.5,0.0,0.0.") from None
+    return x, y, z
