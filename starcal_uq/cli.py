@@ -51,6 +51,23 @@ app = typer.Typer(
 )
 
 
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from starcal_uq import __version__
+
+        print(f"starcal-uq {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def common(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Probabilistic calibration of star sensors: from identified stars to a posterior and its attitude error."""
+
+
 @contextmanager
 def _progress(label: str) -> Iterator[Progress | None]:
     """A progress bar on standard error, where that is a terminal."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from starcal_uq._types import FloatArray, IntArray
 from starcal_uq.errors import SamplingError
+from starcal_uq.interrupts import interrupt_between_steps
 from starcal_uq.importance import Density, student_t_log_density
 from starcal_uq.runfolder import atomic_path
 
@@ -131,18 +132,21 @@ def run_ensembles(
     per_ensemble = settings.n_burn + settings.n_steps
     chunk = max(_CHUNK_STEPS, -(-settings.n_steps // _MAX_CHUNKS))
     total = per_ensemble * len(seeds)
-    for index in range(store.ensemble, len(seeds)):
-        state = store.state or _start(density, dim, seeds[index], settings.n_walkers)
-        sampler = emcee.EnsembleSampler(settings.n_walkers, dim, density, moves=weighted, vectorize=True)
-        for first, last in _chunks(store.step, settings, chunk):
-            sampler.reset()
-            steps = sampler.sample(state, iterations=last - first, skip_initial_state_check=True)
-            for step, last_state in enumerate(steps, start=first + 1):
-                state = last_state
-                if progress is not None:
-                    progress(index * per_ensemble + step, total)
-            store.add(index, first, last, sampler, state)
-        store.next_ensemble()
+    # emcee prints a page about any exception in the density, Ctrl-C included.
+    with interrupt_between_steps() as check_interrupt:
+        for index in range(store.ensemble, len(seeds)):
+            state = store.state or _start(density, dim, seeds[index], settings.n_walkers)
+            sampler = emcee.EnsembleSampler(settings.n_walkers, dim, density, moves=weighted, vectorize=True)
+            for first, last in _chunks(store.step, settings, chunk):
+                sampler.reset()
+                steps = sampler.sample(state, iterations=last - first, skip_initial_state_check=True)
+                for step, last_state in enumerate(steps, start=first + 1):
+                    state = last_state
+                    check_interrupt()
+                    if progress is not None:
+                        progress(index * per_ensemble + step, total)
+                store.add(index, first, last, sampler, state)
+            store.next_ensemble()
     return store.chains()
 
 
