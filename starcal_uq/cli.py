@@ -7,8 +7,6 @@ bad input, always with one sentence that says what to do.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,6 +18,7 @@ from starcal_uq.cli_options import (
     Directions,
     Draws,
     Ensembles,
+    Evaluation,
     Force,
     Json,
     Likelihood,
@@ -27,7 +26,9 @@ from starcal_uq.cli_options import (
     NewRun,
     ObsFile,
     PriorFile,
+    Robust,
     RunPath,
+    Screen,
     Seed,
     Sigma,
     Solver,
@@ -37,8 +38,9 @@ from starcal_uq.cli_options import (
     parse_columns,
     parse_velocity,
 )
+from starcal_uq.cli_statistics import register
 from starcal_uq.errors import StarcalError
-from starcal_uq.steps import Progress
+from starcal_uq.progress import progress_bar
 
 app = typer.Typer(
     name="starcal-uq",
@@ -68,20 +70,10 @@ def common(
     """Probabilistic calibration of star sensors: from identified stars to a posterior and its attitude error."""
 
 
-@contextmanager
-def _progress(label: str) -> Iterator[Progress | None]:
-    """A progress bar on standard error, where that is a terminal."""
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    from starcal_uq.console import err
-
-    if not err.is_terminal:
-        yield None
-        return
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=err, transient=True) as bar:
-        task = bar.add_task(label, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+def _estimator(method: str, solver: str, robust: bool) -> dict[str, Any]:
+    """Options of `calibrate`."""
+    options: dict[str, Any] = {"method": method, "solver": solver}
+    return options | {"likelihood": "student_t"} if robust else options
 
 
 def _load(obs_path: Path, camera_path: Path, columns: Any, directions: str | None, velocity: str | None) -> Any:
@@ -115,6 +107,7 @@ def demo(
     """The experiment of Ye & Yang 2017, end to end, ending in DIR/report.html."""
     from starcal_uq.catalogue import load_catalogue
     from starcal_uq.console import err, show_calibration
+    from starcal_uq.diagnosis import diagnose_run
     from starcal_uq.runfolder import RunFolder
     from starcal_uq.simulation import paper_camera, paper_start, simulate
     from starcal_uq.steps import (
@@ -134,13 +127,16 @@ def demo(
         load_catalogue(max_mag=6.0, epoch=2026.9), truth, n_frames=frames, min_stars=10, sigma_px=0.05, seed=seed
     )
     err.print("Calibrating from f = 72 mm and the detector's centre ...")
-    calibration = calibrate_step(run, obs, paper_start(), method="efficient", solver="lm", force=force)
+    calibration, _ = calibrate_step(run, obs, paper_start(), force=force)
     err.print("Sampling the posterior ...")
-    with _progress("sampling") as progress:
+    with progress_bar("sampling") as progress:
         sample_step(run, force=True, progress=progress, seed=seed)
-    err.print("Couplings, attitude error, report ...")
+    err.print("Couplings, attitude error ...")
     coupling_step(run)
     propagate_step(run, n_draws=300, seed=seed)
+    err.print("Questioning the model: misfit, jackknife, other distortion models, other starts ...")
+    with progress_bar("diagnosis") as progress:
+        diagnose_run(out, seed=seed, progress=progress)
     path = report_step(run)
     show_calibration(calibration, truth)
     _finish(run, path)
@@ -197,6 +193,8 @@ def calibrate_command(
     out: NewRun,
     method: Method = "efficient",
     solver: Solver = "lm",
+    screen: Screen = False,
+    robust: Robust = False,
     column: Columns = None,
     directions: Directions = None,
     observer_velocity: Velocity = None,
@@ -204,13 +202,17 @@ def calibrate_command(
     json: Json = False,
 ) -> None:
     """Estimate optics and distortion: three stages and refinement, with covariance."""
-    from starcal_uq.console import print_json, records, show_calibration
+    from starcal_uq.console import print_json, records, show_calibration, show_screening
     from starcal_uq.runfolder import RunFolder
     from starcal_uq.steps import calibrate_step, check_new_run, truth_of
 
     check_new_run(RunFolder(out), force)
     obs, nominal = _load(observations, camera, column, directions, observer_velocity)
-    calibration = calibrate_step(RunFolder(out), obs, nominal, method=method, solver=solver, force=force)
+    calibration, screening = calibrate_step(
+        RunFolder(out), obs, nominal, force=force, screening=screen, **_estimator(method, solver, robust)
+    )
+    if screening is not None:
+        show_screening(screening)
     if json:
         print_json({"status": calibration.status.name, "parameters": records(calibration.to_dataframe())})
     else:
@@ -227,7 +229,8 @@ def sample_command(
     ensembles: Ensembles = 4,
     walkers: Walkers = 64,
     steps: Steps = 200,
-    likelihood: Likelihood = "auto",
+    likelihood: Likelihood = None,
+    evaluation: Evaluation = "auto",
     force: Force = False,
     json: Json = False,
 ) -> None:
@@ -235,7 +238,7 @@ def sample_command(
     from starcal_uq.console import print_json, records, show_posterior
     from starcal_uq.runfolder import RunFolder
 
-    posterior = _sample(RunFolder(run), seed, sigma, priors, ensembles, walkers, steps, likelihood, force)
+    posterior = _sample(RunFolder(run), seed, sigma, priors, ensembles, walkers, steps, likelihood, evaluation, force)
     if json:
         print_json({"ok": posterior.diagnostics.ok, "parameters": records(posterior.summary())})
     else:
@@ -252,10 +255,15 @@ def _sample(
     ensembles: int,
     walkers: int,
     steps: int,
-    likelihood: str,
+    likelihood: str | None,
+    evaluation: str,
     force: bool,
 ) -> Any:
-    from starcal_uq.steps import load_run, sample_step
+    import warnings
+
+    from starcal_uq.console import err
+    from starcal_uq.likelihoods import NaivePairsWarning
+    from starcal_uq.steps import read_priors, sample_step
 
     options: dict[str, Any] = {
         "seed": seed,
@@ -264,14 +272,16 @@ def _sample(
         "n_walkers": walkers,
         "n_steps": steps,
         "likelihood": likelihood,
+        "evaluation": evaluation,
     }
     if priors is not None:
-        from starcal_uq.priors import Priors
-
-        obs, calibration = load_run(run)
-        options["priors"] = Priors.from_toml(priors, calibration.nominal, per_star_sigma=obs.sigma_px is not None)
-    with _progress("sampling") as progress:
-        return sample_step(run, force=force, progress=progress, **options)
+        options["priors"] = read_priors(run, priors)
+    with progress_bar("sampling") as progress, warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", NaivePairsWarning)
+        posterior = sample_step(run, force=force, progress=progress, **options)
+    for warning in caught:
+        err.print(f"warning: {warning.message}", style="yellow", highlight=False, soft_wrap=True)
+    return posterior
 
 
 @app.command("coupling")
@@ -319,6 +329,8 @@ def run_command(
     out: NewRun,
     method: Method = "efficient",
     solver: Solver = "lm",
+    screen: Screen = False,
+    robust: Robust = False,
     column: Columns = None,
     directions: Directions = None,
     observer_velocity: Velocity = None,
@@ -328,12 +340,14 @@ def run_command(
     ensembles: Ensembles = 4,
     walkers: Walkers = 64,
     steps: Steps = 200,
-    likelihood: Likelihood = "auto",
+    likelihood: Likelihood = None,
+    evaluation: Evaluation = "auto",
     draws: Draws = 300,
     force: Force = False,
 ) -> None:
     """Calibrate, sample, couple, propagate and report: everything from OBS to RUN/report.html."""
-    from starcal_uq.console import show_attitude, show_calibration, show_posterior
+    from starcal_uq.console import show_attitude, show_calibration, show_posterior, show_screening
+    from starcal_uq.diagnosis import diagnose_run
     from starcal_uq.runfolder import RunFolder
     from starcal_uq.steps import (
         calibrate_step,
@@ -347,14 +361,23 @@ def run_command(
     folder = RunFolder(out)
     check_new_run(folder, force)
     obs, nominal = _load(observations, camera, column, directions, observer_velocity)
-    calibration = calibrate_step(folder, obs, nominal, method=method, solver=solver, force=force)
+    calibration, screening = calibrate_step(
+        folder, obs, nominal, force=force, screening=screen, **_estimator(method, solver, robust)
+    )
+    if screening is not None:
+        show_screening(screening)
     show_calibration(calibration, truth_of(obs))
-    posterior = _sample(folder, seed, sigma, priors, ensembles, walkers, steps, likelihood, True)
+    posterior = _sample(folder, seed, sigma, priors, ensembles, walkers, steps, likelihood, evaluation, True)
     show_posterior(posterior)
     coupling_step(folder)
     error, _ = propagate_step(folder, n_draws=draws, seed=seed)
     show_attitude(error)
+    with progress_bar("diagnosis") as progress:
+        diagnose_run(out, seed=seed, progress=progress)
     _finish(folder, report_step(folder))
+
+
+register(app)
 
 
 def main() -> None:

@@ -57,7 +57,19 @@ Sigma = Annotated[float | None, typer.Option(help="Centroid noise in px per axis
 PriorFile = Annotated[
     Path | None, typer.Option("--priors", help="TOML file with a [priors] table; wide defaults otherwise.")
 ]
-Likelihood = Annotated[str, typer.Option(help="auto (compressed, checked against exact), compressed, or exact.")]
+Likelihood = Annotated[
+    str | None,
+    typer.Option(
+        help="marginal (Gaussian, attitudes marginalised), pairs (interstar angles, Godambe's curvature), "
+        "student_t (heavy tails, for wrong identifications), or pairs_naive (to see what goes wrong); by default that "
+        "of the calibration."
+    ),
+]
+Evaluation = Annotated[str, typer.Option(help="auto (compressed, checked against exact), compressed, or exact.")]
+Screen = Annotated[bool, typer.Option("--screen", help="Leave out wrong identifications first; they are listed.")]
+Robust = Annotated[
+    bool, typer.Option("--robust", help="Refine with Student-t tails, which wrong identifications hardly move.")
+]
 Draws = Annotated[int, typer.Option(min=50, help="Posterior draws that go through QUEST.")]
 
 

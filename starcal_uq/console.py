@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from starcal_uq.observations import Observations
     from starcal_uq.posterior import Posterior
     from starcal_uq.propagation import AttitudeError
+    from starcal_uq.screening_result import Screening
     from starcal_uq.verdict import Verdict
 
 # Where the output is not a terminal it has no width of its own; tables then get the room they need.
@@ -181,6 +183,22 @@ def show_attitude(error: AttitudeError) -> None:
 
 def _word(value: Any) -> str:
     return ("yes" if value else "no") if isinstance(value, (bool, np.bool_)) else str(value)
+
+
+def show_table(frame: pd.DataFrame, title: str, columns: Sequence[str] | None = None) -> None:
+    """Chosen columns of a data frame, numbers with three digits; files and JSON have the rest."""
+    frame = frame if columns is None else frame[list(columns)]
+    table = Table(title=title, title_justify="left")
+    for column in frame.columns:
+        table.add_column(str(column).replace("_", " "), justify="left" if frame[column].dtype == object else "right")
+    for row in records(frame):
+        table.add_row(*(significant(value, 3) if isinstance(value, float) else str(value) for value in row.values()))
+    out.print(table)
+
+
+def show_screening(screening: Screening) -> None:
+    """What was left out, by reason, and what a user should look at."""
+    out.print(screening.summary(), highlight=False, soft_wrap=True)
 
 
 def show_verdict(verdict: Verdict) -> None:

@@ -12,8 +12,8 @@ import numpy as np
 
 from starcal_uq._types import FloatArray, IntArray
 from starcal_uq.errors import SamplingError
-from starcal_uq.interrupts import interrupt_between_steps
 from starcal_uq.importance import Density, student_t_log_density
+from starcal_uq.interrupts import interrupt_between_steps
 from starcal_uq.runfolder import atomic_path
 
 Moves = Literal["mixture", "stretch"]

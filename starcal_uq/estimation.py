@@ -17,16 +17,21 @@ from starcal_uq.frames import StarFrames
 from starcal_uq.likelihood import MarginalLikelihood
 from starcal_uq.pairs import PairObjective
 from starcal_uq.projection import fold_radius_px
+from starcal_uq.robust import compress_reweighted, refine, robust_start
 from starcal_uq.runfolder import provenance
 from starcal_uq.solvers import is_singular
 from starcal_uq.stages import Stage, distortion_stage, joint_stage, optics_stage, refinement_stage
 from starcal_uq.status import Status
+from starcal_uq.student import parse_dof
 
 if TYPE_CHECKING:
     from starcal_uq.observations import Observations
 
 METHODS = ("efficient", "three_stage")
+LIKELIHOODS = ("marginal", "student_t")
 SOLVERS = ("lm", "minpack", "ipopt")
+# Stage 1 that moves the principal point by more than this fraction of the width has met strong distortion.
+_FAR = 0.05
 # Noise above this fraction of the detector's width means that the stars are not the ones they are said to be.
 _IMPLAUSIBLE_NOISE = 0.01
 
@@ -39,6 +44,8 @@ def calibrate(
     solver: str = "lm",
     max_iterations: int = 200,
     throw: bool = True,
+    likelihood: str = "marginal",
+    dof: float | str | None = None,
 ) -> Calibration:
     """Estimate optics and distortion from identified stars.
 
@@ -60,6 +67,15 @@ def calibrate(
         Limit for each stage.
     throw : bool
         Raise when the estimate is not good; otherwise `Calibration.status` says so, as long as there is an estimate.
+    likelihood : {"marginal", "student_t"}
+        What the refinement maximises: Gaussian noise, or a Student t per star for tables with wrong identifications.
+        With ``student_t`` the stages see only stars whose angles agree with those of their frame, the refinement sees
+        all that can be in the field, `covariance` is the sandwich one, `information` the observed one, `sigma` the
+        scale of the t, `chi2` is summed with the stars' weights, and `compressed` is the Gaussian likelihood of the
+        reweighted stars.
+    dof : float or "free", optional
+        Degrees of freedom of ``student_t``, 2 to 200, by default 4; "free" estimates them, with the gamma prior of
+        Juarez & Steel (2010) on what exceeds 2.
 
     Returns
     -------
@@ -75,16 +91,40 @@ def calibrate(
         raise CalibrationError(f"method {method!r} is unknown: use one of {', '.join(METHODS)}.")
     if solver not in SOLVERS:
         raise CalibrationError(f"solver {solver!r} is unknown: use one of {', '.join(SOLVERS)}.")
-    frames = StarFrames.from_observations(obs)
-    likelihood = MarginalLikelihood(frames, camera.distortion)
-    p = len(camera.theta)
-    if likelihood.dof <= p:
+    if likelihood not in LIKELIHOODS:
+        raise CalibrationError(f"likelihood {likelihood!r} is unknown: use one of {', '.join(LIKELIHOODS)}.")
+    nu = parse_dof(dof, CalibrationError)
+    if likelihood == "marginal" and dof is not None:
+        raise CalibrationError("degrees of freedom (dof) belong to likelihood='student_t': leave dof out, or use that.")
+    if likelihood == "student_t" and method != "efficient":
         raise CalibrationError(
-            f"{frames.n_stars} stars in {frames.n_frames} frames give {likelihood.dof} independent numbers for {p} "
+            f"method {method!r} has no Student-t likelihood: use method='efficient', or likelihood='marginal'."
+        )
+    frames = StarFrames.from_observations(obs)
+    gaussian = MarginalLikelihood(frames, camera.distortion)
+    p = len(camera.theta)
+    if gaussian.dof <= p:
+        raise CalibrationError(
+            f"{frames.n_stars} stars in {frames.n_frames} frames give {gaussian.dof} independent numbers for {p} "
             "parameters and the noise: add stars or frames, or choose a distortion model with fewer coefficients.",
             Status.SINGULAR,
         )
-    pairs = PairObjective(frames, camera.distortion)
+    if likelihood == "student_t":
+        calibration = _robust(obs, camera, frames, solver, max_iterations, nu)
+    else:
+        calibration = _gaussian(obs, camera, gaussian, method, solver, max_iterations)
+    if throw and not calibration.status.ok:
+        raise CalibrationError(
+            f"the calibration did not end well ({calibration.status.name}): {calibration.status.remedy}.",
+            calibration.status,
+        )
+    return calibration
+
+
+def _gaussian(
+    obs: Observations, camera: Camera, likelihood: MarginalLikelihood, method: str, solver: str, max_iterations: int
+) -> Calibration:
+    pairs = PairObjective(likelihood.frames, camera.distortion)
     stages = _pair_stages(pairs, camera, solver, max_iterations)
     pair_theta = stages[-1].theta
     pair_covariance = pairs.godambe(pair_theta)
@@ -97,13 +137,59 @@ def calibrate(
         elif method == "efficient":
             stages.append(refinement_stage(likelihood, pair_theta, max_iterations))
             status = stages[-1].status
-    calibration = _assemble(obs, camera, method, solver, likelihood, stages, status, pair_theta, pair_covariance)
-    if throw and not calibration.status.ok:
-        raise CalibrationError(
-            f"the calibration did not end well ({calibration.status.name}): {calibration.status.remedy}.",
-            calibration.status,
-        )
-    return calibration
+    return _assemble(obs, camera, method, solver, likelihood, stages, status, pair_theta, pair_covariance)
+
+
+def _robust(
+    obs: Observations, camera: Camera, frames: StarFrames, solver: str, max_iterations: int, nu: float | None
+) -> Calibration:
+    model = camera.distortion
+
+    def fit(trusted: StarFrames, all_parameters: bool) -> list[Stage]:
+        if all_parameters:
+            return _pair_stages(PairObjective(trusted, model), camera, solver, max_iterations)
+        return [optics_stage(trusted, camera, solver, max_iterations)]
+
+    start = robust_start(frames, model, camera.theta, fit)
+    pair_theta = start.stages[-1].theta
+    found = refine(frames, model, pair_theta, start.rotations, nu, max_iterations)
+    theta, sigma, state, information = found.stage.theta, found.sigma, found.state, found.information
+    status = found.stage.status
+    if not np.isfinite(state.value) or is_singular(information.matrix):
+        reason = status if not status.ok else Status.SINGULAR
+        raise CalibrationError(f"the calibration failed ({reason.name}): {reason.remedy}.", reason)
+    weight = frames.weight
+    result = camera.with_theta(theta)
+    residuals = state.e if weight is None else state.e / weight
+    settings: dict[str, object] = {"method": "efficient", "solver": solver, "distortion": model}
+    settings |= {"likelihood": "student_t", "dof": "free" if nu is None else nu}
+    record = provenance(None, settings, obs.data_hash)
+    record["student_t"] = {"dof": found.nu, "dof_std": found.nu_std, "stars_out_of_field": int(np.sum(~state.seen))}
+    return Calibration(
+        camera=result,
+        nominal=camera,
+        method="efficient",
+        solver=solver,
+        theta=theta,
+        covariance=found.covariance,
+        sigma=sigma,
+        sigma_std=found.sigma_std,
+        sigma_name=sigma_parameter(weight is not None).name,
+        stages=(*start.stages, found.stage),
+        status=_check(result, status),
+        frame_ids=obs.frame_ids,
+        quaternions=rotation_to_quaternion(state.rotations),
+        residuals_px=residuals.T,
+        chi2=float(np.sum(state.weight * state.e**2)),
+        dof=state.dof - len(theta),
+        information=information.matrix,
+        rotation_per_theta=information.rotation_per_theta,
+        attitude_noise=information.attitude_noise,
+        pair_theta=pair_theta,
+        pair_covariance=PairObjective(start.frames, model).godambe(pair_theta),
+        compressed=compress_reweighted(found),
+        provenance=record,
+    )
 
 
 def _pair_stages(pairs: PairObjective, camera: Camera, solver: str, max_iterations: int) -> list[Stage]:
@@ -113,10 +199,20 @@ def _pair_stages(pairs: PairObjective, camera: Camera, solver: str, max_iteratio
     if len(camera.theta) > 3 and stages[0].status is not Status.NOT_FINITE:
         stages.append(distortion_stage(frames, camera, stages[0].theta))
         stages.append(joint_stage(pairs, camera, stages[1].theta, solver, max_iterations))
-        if stages[-1].status is Status.NOT_FINITE:
-            # The linear stage can overshoot into a fold; the undistorted optics are the safer start.
-            stages[-1] = joint_stage(pairs, camera, stages[0].theta, solver, max_iterations)
+        moved = float(np.max(np.abs(stages[0].theta[:2] - camera.theta[:2])))
+        if not stages[-1].status.ok or moved > _FAR * camera.width_px:
+            # Distortion of tens of pixels pulls the undistorted fit far from the axis, and the linear stage may then
+            # lead to another minimum or into a fold; the nominal optics without distortion are the safer start.
+            start = np.concatenate([camera.theta[:3], np.zeros(len(camera.theta) - 3)])
+            again = joint_stage(pairs, camera, start, solver, max_iterations)
+            stages[-1] = min(stages[-1], again, key=_badness)
     return stages
+
+
+def _badness(stage: Stage) -> tuple[bool, float]:
+    """Converged before not, then by cost."""
+    cost = float(stage.cost[-1])
+    return not stage.status.ok, cost if np.isfinite(cost) else float("inf")
 
 
 def _noise_px(likelihood: MarginalLikelihood, theta: FloatArray) -> float:

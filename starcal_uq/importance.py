@@ -25,7 +25,8 @@ _NEWTON_STEPS = 20
 # Expected gain of a further Newton step, nat: the mode is then known to 1 % of a standard deviation.
 _GAIN = 1e-4
 
-LogLikelihood = Callable[[FloatArray, FloatArray], FloatArray]
+# From theta (n, p), sigma (n,) and, where the likelihood has one, its further parameter (n,).
+LogLikelihood = Callable[..., FloatArray]
 Density = Callable[[FloatArray], FloatArray]
 
 
@@ -37,21 +38,48 @@ class Likelihood(Protocol):
 
 
 @dataclass(frozen=True)
+class Extra:
+    """A parameter of the likelihood beyond theta and sigma, sampled as the logarithm of what exceeds its bound.
+
+    Attributes
+    ----------
+    name : str
+        Of the parameter.
+    log_prior : callable
+        Log prior density of that logarithm.
+    value : float
+        Start.
+    log_sd : float
+        Expected standard deviation of that logarithm.
+    bound : float
+        The parameter is larger.
+    """
+
+    name: str
+    log_prior: Callable[[FloatArray], FloatArray]
+    value: float
+    log_sd: float
+    bound: float
+
+
+@dataclass(frozen=True)
 class Target:
     """Posterior density over u.
 
     Attributes
     ----------
     log_likelihood : callable
-        ``(theta (n, p), sigma (n,)) -> (n,)``.
+        ``(theta (n, p), sigma (n,)) -> (n,)``, with `extra` ``(theta, sigma, extra (n,))``.
     priors : Priors
         Proper priors.
     centre : array (d,)
-        Origin of u: theta, then log sigma if it is sampled.
+        Origin of u: theta, then log sigma if it is sampled, then that of `extra` if there is one.
     transform : array (d, d)
         Square root of the covariance at the origin.
     sigma : float or None
         The noise if it is given.
+    extra : Extra or None
+        A further parameter of the likelihood.
     """
 
     log_likelihood: LogLikelihood
@@ -59,6 +87,7 @@ class Target:
     centre: FloatArray
     transform: FloatArray
     sigma: float | None
+    extra: Extra | None = None
 
     @property
     def dim(self) -> int:
@@ -66,21 +95,33 @@ class Target:
         return len(self.centre)
 
     def natural(self, u: FloatArray) -> FloatArray:
-        """Parameters (n, p+1) at u (n, d): theta in px units, sigma last."""
+        """Parameters at u (n, d): theta in px units, sigma, and `extra` if there is one: (n, p+1) or (n, p+2)."""
         point = self.centre + u @ self.transform.T
-        if self.sigma is not None:
-            return np.column_stack([point, np.full(len(point), self.sigma)])
-        point[:, -1] = np.exp(point[:, -1])
-        return point
+        p = len(self.priors.names) - 1
+        noise = np.exp(point[:, p]) if self.sigma is None else np.full(len(point), self.sigma)
+        columns = [point[:, :p], noise]
+        if self.extra is not None:
+            columns.append(self.extra.bound + np.exp(point[:, -1]))
+        return np.column_stack(columns)
+
+    def arguments(self, natural: FloatArray) -> tuple[FloatArray, ...]:
+        """Columns of `natural` as the likelihood takes them."""
+        p = len(self.priors.names) - 1
+        return (natural[:, :p], *natural[:, p:].T)
+
+    def likelihood_at(self, u: FloatArray) -> FloatArray:
+        """Log likelihood (n,) at u (n, d)."""
+        return self.log_likelihood(*self.arguments(self.natural(u)))
 
     def log_density(self, u: FloatArray) -> FloatArray:
         """Log posterior density (n,) per unit of theta and log sigma, up to a constant; -inf where undefined."""
-        natural = self.natural(u)
-        theta, sigma = natural[:, :-1], natural[:, -1]
-        value = self.log_likelihood(theta, sigma) + self.priors.log_density_theta(theta)
+        theta, sigma, *extra = self.arguments(self.natural(u))
+        value = self.log_likelihood(theta, sigma, *extra) + self.priors.log_density_theta(theta)
         if self.sigma is None:
             # The prior of log sigma, not of sigma: the coordinate is log sigma, so no Jacobian is owed.
             value = value + self.priors.log_density_log_sigma(np.log(sigma))
+        if self.extra is not None:
+            value = value + self.extra.log_prior(np.log(extra[0] - self.extra.bound))
         return np.where(np.isnan(value), -np.inf, value)
 
 
@@ -107,6 +148,7 @@ def start_target(
     sigma: float,
     dof: float,
     sigma_given: bool,
+    extra: Extra | None = None,
 ) -> Target:
     """A target whitened by Fisher information plus prior precision at an estimate.
 
@@ -126,6 +168,8 @@ def start_target(
         Independent residuals; a Gaussian likelihood has curvature ``2 dof`` in log sigma.
     sigma_given : bool
         True if the noise is not sampled.
+    extra : Extra, optional
+        A further parameter of the likelihood.
 
     Raises
     ------
@@ -133,13 +177,15 @@ def start_target(
         If information and prior together do not determine every parameter.
     """
     p = len(theta)
-    d = p if sigma_given else p + 1
+    d = p + (not sigma_given) + (extra is not None)
     precision, centre = np.zeros((d, d)), np.zeros(d)
     precision[:p, :p] = information + priors.precision(priors.names[:-1])
     centre[:p] = theta
     if not sigma_given:
         precision[p, p] = 2.0 * dof + priors.sigma_log_sd**-2.0
         centre[p] = np.log(sigma)
+    if extra is not None:
+        precision[-1, -1], centre[-1] = extra.log_sd**-2.0, np.log(extra.value - extra.bound)
     try:
         transform = scaled_cholesky(scaled_inverse(precision))
     except np.linalg.LinAlgError:
@@ -149,7 +195,7 @@ def start_target(
             "the Fisher information of the calibration is not positive definite: repeat the calibration, with more "
             "stars or a distortion model with fewer coefficients."
         )
-    return Target(log_likelihood, priors, centre, transform, sigma if sigma_given else None)
+    return Target(log_likelihood, priors, centre, transform, sigma if sigma_given else None, extra)
 
 
 def laplace_approximation(start: Target) -> tuple[Target, Laplace]:
@@ -181,6 +227,8 @@ def laplace_approximation(start: Target) -> tuple[Target, Laplace]:
         )
         steps += 1
     names = list(target.priors.names[:-1]) + (["log_sigma"] if target.sigma is None else [])
+    if target.extra is not None:
+        names.append(f"log_{target.extra.name}")
     covariance = _outer(target.transform)
     return target, Laplace(tuple(names), target.centre, covariance, target.transform, steps, converged)
 

@@ -115,11 +115,13 @@ class Diagnostics:
         Pareto shape of the weights exact over compressed at all checked draws; 0 where all differences are below 0.1
         nat, and no tail can matter.
     likelihood_used : str
-        ``compressed``, ``exact``, or the name of the likelihood that was passed.
+        How it was evaluated: ``compressed``, ``exact``, or the name of the likelihood that was passed.
     failures : tuple of str
         Every criterion that was missed, one sentence each.
     messages : tuple of str
         `failures`, then what is worth knowing.
+    likelihood : str
+        ``marginal``, ``pairs``, ``pairs_naive``, ``student_t``, or the name of the likelihood that was passed.
     """
 
     rhat: FloatArray
@@ -142,6 +144,7 @@ class Diagnostics:
     likelihood_used: str
     failures: tuple[str, ...]
     messages: tuple[str, ...]
+    likelihood: str = "marginal"
 
     @property
     def ok(self) -> bool:
@@ -181,6 +184,8 @@ class Posterior:
         The calibrated camera around which everything is linearised.
     provenance : dict
         Seed, settings, versions, time and data hash.
+    dof_draws : array (n,) or None
+        Draws of the degrees of freedom of a Student-t likelihood where they were free.
     """
 
     parameter_names: tuple[str, ...]
@@ -198,6 +203,7 @@ class Posterior:
     attitude_noise: FloatArray
     camera: Camera
     provenance: AnyDict
+    dof_draws: FloatArray | None = None
 
     @property
     def camera_names(self) -> tuple[str, ...]:

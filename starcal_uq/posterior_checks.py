@@ -75,20 +75,20 @@ def check_compression(
     Parameters
     ----------
     compressed, exact : callable
-        ``(theta (n, p), sigma (n,)) -> (n,)``.
+        As `Target.log_likelihood`.
     target : Target
         Its origin is the mode.
     draws : array (n, p+1)
-        Posterior draws, px units.
+        Posterior draws, px units; with a further column where the likelihood has a further parameter.
     laplace : Laplace
         Measures the distance from the mode.
     """
     from starcal_uq.arviz_compat import psis
 
-    p = draws.shape[1] - 1
-    points = np.concatenate([target.natural(np.zeros((1, target.dim))), draws])
-    theta, sigma = points[:, :p], points[:, p]
-    difference = exact(theta, sigma) - compressed(theta, sigma)
+    points = target.arguments(np.concatenate([target.natural(np.zeros((1, target.dim))), draws]))
+    theta = points[0]
+    p = theta.shape[1]
+    difference = exact(*points) - compressed(*points)
     difference = difference[1:] - difference[0]
     # The factor is lower triangular, so its leading block is the factor of theta's covariance.
     scale = np.diag(laplace.transform)[:p]
@@ -246,7 +246,7 @@ def _check_failures(
     elif not agree:
         failures.append(f"{agreement[0].upper()}{agreement[1:]}.")
     if compression.n_draws and not compression.good and likelihood_used == "compressed":
-        failures.append(f"The {compression.words}: use likelihood='auto' or 'exact'.")
+        failures.append(f"The {compression.words}: use evaluation='auto' or 'exact'.")
     return failures
 
 

@@ -31,6 +31,8 @@ _ARRAYS = {
     "rotation_per_theta": ("axis", "camera_parameter"),
     "attitude_noise": ("axis", "axis_2"),
 }
+# Present only where the likelihood has such a parameter.
+_OPTIONAL = {"dof_draws": ("sample",)}
 _PLAIN = ("n_ensembles", "n_walkers", "n_steps", "sigma_sampled", "provenance")
 
 
@@ -71,8 +73,9 @@ def save_posterior(posterior: Posterior, path: str | os.PathLike[str], force: bo
         "diagnostics": posterior.diagnostics,
         **{name: getattr(posterior, name) for name in _PLAIN},
     }
+    arrays = {name: (dims, getattr(posterior, name)) for name, dims in (_ARRAYS | _OPTIONAL).items()}
     root = xr.Dataset(
-        {name: (dims, getattr(posterior, name)) for name, dims in _ARRAYS.items()},
+        {name: value for name, value in arrays.items() if value[1] is not None},
         attrs={"format": _FORMAT, "record": to_json(record)},
     )
     tree = xr.DataTree.from_dict({"/": root, **posterior.datasets()})
@@ -92,6 +95,8 @@ def load_posterior(path: str | os.PathLike[str]) -> Posterior:
                 raise RunFolderError(f"{path}: is not a posterior of this version; run `starcal-uq sample RUN` again.")
             record = json.loads(str(file.attrs["record"]))
             arrays: dict[str, Any] = {name: np.asarray(file.variables[name][...], dtype=np.float64) for name in _ARRAYS}
+            present = [name for name in _OPTIONAL if name in file.variables]
+            arrays |= {name: np.asarray(file.variables[name][...], dtype=np.float64) for name in present}
     except (OSError, KeyError, ValueError) as error:
         raise RunFolderError(
             f"{path}: cannot be read as a posterior ({error}); run `starcal-uq sample RUN` again."

@@ -1,113 +1,96 @@
-"""Priors in physical terms, all proper: what was believed before the stars were seen.
+"""Priors, all proper: what was believed before the stars were seen.
 
-Normal on the camera parameters, log-normal on the noise. A prior on a distortion coefficient is stated as the
-displacement that its term causes at the corner of the field: a prior on the raw number means something else for every
-lens, and quietly regularises it.
+Normal on the camera parameters, log-normal on the noise. `Priors` is what every user of a prior relies on; the two
+kinds are `physical_priors.PhysicalPriors` (independent, in physical terms; the default) and
+`gaussian_priors.GaussianPriors` (a full covariance, such as the posterior of an earlier run).
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-import tomllib
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from starcal_uq._types import FloatArray
-from starcal_uq.distortion import get_model, parameter_names
+from starcal_uq.distortion import parameter_names, parameters, sigma_parameter
 from starcal_uq.errors import PriorError
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from starcal_uq.camera import Camera
+    from starcal_uq.physical_priors import PhysicalPriors
 
 SIGMA_NAMES = ("sigma", "sigma_scale")
-
-# Wide on purpose: a tenth of the detector, 5 % of the focal length and a twentieth of the image radius cover any camera
-# whose data sheet is not wrong, and are hundreds of times wider than what a night of stars determines.
-_PRINCIPAL_POINT_FRACTION = 0.1
-_FOCAL_FRACTION = 0.05
-_DISTORTION_FRACTION = 0.05
-_SIGMA_PX = (0.1, 1.5)
-_SIGMA_SCALE = (1.0, 0.7)
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
-@dataclass(frozen=True)
-class Priors:
-    """Independent proper priors on the parameters of one camera.
+class Priors(ABC):
+    """A proper prior on the parameters of one camera: joint normal, and log-normal for the noise.
 
     Attributes
     ----------
-    principal_point_px : float
-        Standard deviation of x0 and of y0, px.
-    principal_point_centre_px : tuple of float
-        Mean of (x0, y0), px.
-    focal_fraction : float
-        Standard deviation of the focal length relative to `focal_px`.
-    focal_px : float
-        Mean of the focal length, px.
-    distortion_corner_px : float
-        Standard deviation of the displacement by each distortion term alone at `corner_radius_px`, px.
-    corner_radius_px : float
-        Distance from the principal point at which the displacement is stated, px.
-    sigma_median : float
-        Median of the centroid noise: px, or a factor where every star states its own noise.
-    sigma_log_sd : float
-        Standard deviation of the logarithm of the noise.
     distortion : str
         Name of the distortion model, which gives names and orders of the coefficients.
     per_star_sigma : bool
         True where the noise parameter is a common factor on stated noises.
+    sigma_median : float
+        Median of the centroid noise: px, or a factor where every star states its own noise.
+    sigma_log_sd : float
+        Standard deviation of the logarithm of the noise.
     """
 
-    principal_point_px: float
-    principal_point_centre_px: tuple[float, float]
-    focal_fraction: float
-    focal_px: float
-    distortion_corner_px: float
-    corner_radius_px: float
+    distortion: str
+    per_star_sigma: bool
     sigma_median: float
     sigma_log_sd: float
-    distortion: str = "brown"
-    per_star_sigma: bool = False
 
-    def __post_init__(self) -> None:
-        centre = tuple(float(v) for v in self.principal_point_centre_px)
-        if len(centre) != 2 or not all(math.isfinite(v) for v in centre):
-            raise PriorError(
-                f"prior 'principal_point_centre_px' is {self.principal_point_centre_px}: give two finite numbers."
-            )
-        object.__setattr__(self, "principal_point_centre_px", centre)
-        for name in _POSITIVE:
-            value = float(getattr(self, name))
-            if not (math.isfinite(value) and value > 0.0):
-                raise PriorError(f"prior {name!r} is {value:g}: it must be a finite number above zero.")
-            object.__setattr__(self, name, value)
-        get_model(self.distortion)
+    @abstractmethod
+    def theta_moments(self) -> tuple[FloatArray, FloatArray]:
+        """Mean (p,) and covariance (p, p) of the camera parameters, px units."""
 
-    @classmethod
-    def default(cls, camera: Camera, per_star_sigma: bool = False) -> Priors:
-        """Wide priors around a nominal camera (see the module's constants for the widths)."""
-        median, log_sd = _SIGMA_SCALE if per_star_sigma else _SIGMA_PX
-        centre = camera.centre_px
-        return cls(
-            principal_point_px=_PRINCIPAL_POINT_FRACTION * max(camera.width_px, camera.height_px),
-            principal_point_centre_px=(float(centre[0]), float(centre[1])),
-            focal_fraction=_FOCAL_FRACTION,
-            focal_px=float(camera.focal_px),
-            distortion_corner_px=_DISTORTION_FRACTION * float(camera.corner_radius_px),
-            corner_radius_px=float(camera.corner_radius_px),
-            sigma_median=median,
-            sigma_log_sd=log_sd,
-            distortion=camera.distortion,
-            per_star_sigma=per_star_sigma,
-        )
+    @abstractmethod
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values, for files."""
+
+    @abstractmethod
+    def _statement(self, name: str) -> str:
+        """The prior on one camera parameter in words."""
+
+    @staticmethod
+    def default(camera: Camera, per_star_sigma: bool = False) -> PhysicalPriors:
+        """Wide priors around a nominal camera; see `physical_priors`."""
+        from starcal_uq.physical_priors import PhysicalPriors
+
+        return PhysicalPriors.around(camera, per_star_sigma)
+
+    @staticmethod
+    def from_toml(path: str | Path, camera: Camera, per_star_sigma: bool = False) -> PhysicalPriors:
+        """Read a ``[priors]`` table; what it leaves out keeps its default for this camera.
+
+        Raises
+        ------
+        PriorError
+            For a file that cannot be read, an unknown key or a value that is not a proper prior.
+        """
+        from starcal_uq.physical_priors import priors_from_toml
+
+        return priors_from_toml(path, camera, per_star_sigma)
+
+    @staticmethod
+    def from_dict(values: Mapping[str, Any]) -> Priors:
+        """Read what `to_dict` wrote, of either kind."""
+        from starcal_uq.gaussian_priors import KIND, GaussianPriors
+        from starcal_uq.physical_priors import PhysicalPriors
+
+        if values.get("kind") == KIND:
+            return GaussianPriors.read(values)
+        return PhysicalPriors.read(values)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -115,20 +98,15 @@ class Priors:
         return (*parameter_names(self.distortion), SIGMA_NAMES[self.per_star_sigma])
 
     def _moments(self) -> dict[str, tuple[float, float]]:
-        x0, y0 = self.principal_point_centre_px
-        moments = {
-            "x0": (x0, self.principal_point_px),
-            "y0": (y0, self.principal_point_px),
-            "f": (self.focal_px, self.focal_fraction * self.focal_px),
-        }
-        for coefficient in get_model(self.distortion).coefficients:
-            sd = self.distortion_corner_px / self.corner_radius_px**coefficient.order
-            moments[coefficient.name] = (0.0, sd)
+        mean, covariance = self.theta_moments()
+        sd = np.sqrt(np.diag(covariance))
+        names = parameter_names(self.distortion)
+        moments = {name: (float(mean[i]), float(sd[i])) for i, name in enumerate(names)}
         # Moments of a log-normal variable with median m and log sd s.
         growth = math.exp(self.sigma_log_sd**2)
-        mean = self.sigma_median * math.sqrt(growth)
+        noise = self.sigma_median * math.sqrt(growth)
         for name in SIGMA_NAMES:
-            moments[name] = (mean, mean * math.sqrt(growth - 1.0))
+            moments[name] = (noise, noise * math.sqrt(growth - 1.0))
         return moments
 
     def mean(self, names: Sequence[str]) -> FloatArray:
@@ -150,15 +128,26 @@ class Priors:
         return np.array([moments[name][index] for name in names])
 
     def precision(self, names: Sequence[str]) -> FloatArray:
-        """Precision matrix (p, p) of the normal prior on the named camera parameters."""
-        return np.diag(self.sd(names) ** -2.0)
+        """Precision matrix (n, n) of the normal prior on the named camera parameters, the others left free."""
+        sd = self.sd(names)
+        known = parameter_names(self.distortion)
+        rows = [known.index(name) for name in names]
+        correlation = self._correlation()[np.ix_(rows, rows)]
+        return np.asarray(np.linalg.inv(correlation) / np.outer(sd, sd))
+
+    def _correlation(self) -> FloatArray:
+        covariance = self.theta_moments()[1]
+        sd = np.sqrt(np.diag(covariance))
+        return np.asarray(covariance / np.outer(sd, sd))
 
     def log_density_theta(self, theta: FloatArray) -> FloatArray:
         """Log density (n,) of camera parameters (n, p), per unit of each parameter."""
         names = parameter_names(self.distortion)
         sd = self.sd(names)
-        z = (np.atleast_2d(theta) - self.mean(names)) / sd
-        return np.asarray(-0.5 * np.sum(z * z, axis=1) - np.sum(np.log(sd)) - 0.5 * len(names) * _LOG_2PI)
+        factor = np.linalg.cholesky(self._correlation())
+        z = (np.atleast_2d(theta) - self.mean(names)) / sd @ np.linalg.inv(factor).T
+        log_volume = np.sum(np.log(sd)) + np.sum(np.log(np.diag(factor)))
+        return np.asarray(-0.5 * np.sum(z * z, axis=1) - log_volume - 0.5 * len(names) * _LOG_2PI)
 
     def log_density_log_sigma(self, log_sigma: FloatArray) -> FloatArray:
         """Log density (n,) of the logarithm of the noise, per unit of the logarithm."""
@@ -198,93 +187,69 @@ class Priors:
     def draw(self, n: int, rng: np.random.Generator) -> FloatArray:
         """Draw (n, p+1) parameters from the prior, the noise in the last column."""
         names = parameter_names(self.distortion)
-        theta = self.mean(names) + self.sd(names) * rng.standard_normal((n, len(names)))
+        u = rng.standard_normal((n, len(names))) @ np.linalg.cholesky(self._correlation()).T
+        theta = self.mean(names) + self.sd(names) * u
         sigma = self.sigma_median * np.exp(self.sigma_log_sd * rng.standard_normal(n))
         return np.column_stack([theta, sigma])
 
-    def replace(self, **changes: Any) -> Priors:
+    def replace(self, **changes: Any) -> Self:
         """The same priors with some fields changed."""
-        unknown = sorted(set(changes) - set(_FIELDS))
+        fields = [field.name for field in dataclasses.fields(self)]  # type: ignore[arg-type]
+        unknown = sorted(set(changes) - set(fields))
         if unknown:
-            raise PriorError(f"there is no prior named {unknown[0]!r}: use one of {', '.join(_FIELDS)}.")
-        return dataclasses.replace(self, **changes)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, for files."""
-        return {**dataclasses.asdict(self), "principal_point_centre_px": list(self.principal_point_centre_px)}
-
-    @classmethod
-    def from_dict(cls, values: Mapping[str, Any]) -> Priors:
-        """Read what `to_dict` wrote."""
-        return cls(**{**values, "principal_point_centre_px": tuple(values["principal_point_centre_px"])})
-
-    @classmethod
-    def from_toml(cls, path: str | Path, camera: Camera, per_star_sigma: bool = False) -> Priors:
-        """Read a ``[priors]`` table; what it leaves out keeps its default for this camera.
-
-        Raises
-        ------
-        PriorError
-            For a file that cannot be read, an unknown key or a value that is not a proper prior.
-        """
-        try:
-            document = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-            raise PriorError(f"{path}: cannot be read as TOML ({error}).") from error
-        table = document.get("priors")
-        if not isinstance(table, dict):
-            raise PriorError(f"{path}: the section [priors] is missing; add it above the priors.")
-        _check_table(path, table)
-        if "principal_point_centre_px" in table:
-            table["principal_point_centre_px"] = tuple(table["principal_point_centre_px"])
-        try:
-            return cls.default(camera, per_star_sigma).replace(**table)
-        except PriorError as error:
-            raise PriorError(f"{path}: {error}") from None
+            raise PriorError(f"there is no prior named {unknown[0]!r}: use one of {', '.join(fields)}.")
+        return dataclasses.replace(self, **changes)  # type: ignore[type-var]
 
     def to_dataframe(self) -> pd.DataFrame:
-        """One row per parameter: unit, mean, sd, and the statement in physical terms."""
+        """One row per parameter: unit, mean, sd, and the statement in words."""
         import pandas as pd
-
-        from starcal_uq.distortion import parameters, sigma_parameter
 
         shown = [*parameters(self.distortion), sigma_parameter(self.per_star_sigma)]
         names = [p.name for p in shown]
+        noise = f"log-normal, median {self.sigma_median:g} with log sd {self.sigma_log_sd:g}"
         return pd.DataFrame(
             {
                 "parameter": names,
                 "unit": [p.unit for p in shown],
                 "mean": self.mean(names),
                 "sd": self.sd(names),
-                "statement": [self._statement(name) for name in names],
+                "statement": [*(self._statement(name) for name in names[:-1]), noise],
             }
         )
-
-    def _statement(self, name: str) -> str:
-        if name in ("x0", "y0"):
-            centre = self.principal_point_centre_px["xy".index(name[0])]
-            return f"normal, {centre:g} px with sd {self.principal_point_px:g} px"
-        if name == "f":
-            return f"normal, {self.focal_px:g} px with sd {100 * self.focal_fraction:g} %"
-        if name in SIGMA_NAMES:
-            return f"log-normal, median {self.sigma_median:g} with log sd {self.sigma_log_sd:g}"
-        return f"normal, displacement 0 with sd {self.distortion_corner_px:g} px at {self.corner_radius_px:g} px"
 
     def _repr_html_(self) -> str:
         return str(self.to_dataframe().to_html(index=False, float_format=lambda v: f"{v:.4g}"))
 
 
-_FIELDS = tuple(field.name for field in dataclasses.fields(Priors))
-_POSITIVE = tuple(name for name in _FIELDS if name not in ("principal_point_centre_px", "distortion", "per_star_sigma"))
-_IN_FILES = tuple(name for name in _FIELDS if name not in ("distortion", "per_star_sigma"))
+def positive_number(name: str, value: Any) -> float:
+    """A finite number above zero.
+
+    Raises
+    ------
+    PriorError
+        Otherwise.
+    """
+    number = float(value)
+    if not (math.isfinite(number) and number > 0.0):
+        raise PriorError(f"prior {name!r} is {number:g}: it must be a finite number above zero.")
+    return number
 
 
-def _check_table(path: str | Path, table: Mapping[str, Any]) -> None:
-    for key, value in table.items():
-        if key not in _IN_FILES:
-            raise PriorError(f"{path}: unknown key {key!r} in [priors]; use one of {', '.join(_IN_FILES)}.")
-        numbers = value if isinstance(value, list) else [value]
-        wanted = 2 if key == "principal_point_centre_px" else 1
-        numeric = all(isinstance(v, int | float) and not isinstance(v, bool) for v in numbers)
-        if not numeric or len(numbers) != wanted or isinstance(value, list) != (wanted == 2):
-            raise PriorError(f"{path}: key {key!r} in [priors] must be {'two numbers' if wanted == 2 else 'a number'}.")
+def read_priors_table(path: str | Path) -> dict[str, Any]:
+    """The ``[priors]`` table of a TOML file.
+
+    Raises
+    ------
+    PriorError
+        For a file that cannot be read, or without the table.
+    """
+    import tomllib
+
+    try:
+        document = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise PriorError(f"{path}: cannot be read as TOML ({error}).") from error
+    table = document.get("priors")
+    if not isinstance(table, dict):
+        raise PriorError(f"{path}: the section [priors] is missing; add it above the priors.")
+    return table

@@ -90,13 +90,15 @@ def forward_expression(model_name: str, s: Symbols, newton_steps: int) -> Any:
     return s.theta[:2] + ca.vertcat(point[0], point[1])
 
 
-def backward_expression(model_name: str, s: Symbols) -> Any:
+def backward_expression(model_name: str, s: Symbols, newton_steps: int) -> Any:
     """Unit vector in the camera frame of a measured pixel position (casadi.SX, 3)."""
     import casadi as ca
 
     offset = s.pixel - s.theta[:2]
     if get_model(model_name).direction == "forward":
-        point, _ = _newton_step(model_name, s.root, offset, s.theta)
+        point = s.root
+        for _ in range(newton_steps):
+            point, _ = _newton_step(model_name, point, offset, s.theta)
     else:
         point = _displaced(model_name, offset, s.theta)
     direction = ca.vertcat(point[0], point[1], s.theta[2])
@@ -152,13 +154,29 @@ def backward_kernel(model_name: str, derivatives: bool) -> Kernel:
     import casadi as ca
 
     s = _symbols(model_name)
-    direction = backward_expression(model_name, s)
+    direction = backward_expression(model_name, s, newton_steps=1)
     outputs: list[Any] = [direction]
     shapes: list[tuple[int, ...]] = [(3,)]
     if derivatives:
         outputs.append(ca.jacobian(direction, s.theta))
         shapes.append((s.theta.numel(), 3))
     return build_kernel(f"backward_{model_name}_{derivatives}", [s.theta, s.pixel, s.root], outputs, shapes)
+
+
+@lru_cache(maxsize=32)
+def backward_second_kernel(model_name: str) -> Kernel:
+    """Kernel from pixels to unit vectors (3,), d/dtheta (p, 3), and unique second derivatives (p (p + 1) / 2, 3)."""
+    import casadi as ca
+
+    s = _symbols(model_name)
+    p = s.theta.numel()
+    direction = backward_expression(model_name, s, newton_steps=2)
+    hessians = [ca.hessian(direction[axis], s.theta)[0] for axis in range(3)]
+    rows, columns = second_index(p)
+    entries = [hessians[axis][int(i), int(j)] for i, j in zip(rows, columns, strict=True) for axis in range(3)]
+    outputs = [direction, ca.jacobian(direction, s.theta), ca.vertcat(*entries)]
+    shapes = [(3,), (p, 3), (len(rows), 3)]
+    return build_kernel(f"backward_second_{model_name}", [s.theta, s.pixel, s.root], outputs, shapes)
 
 
 @lru_cache(maxsize=32)

@@ -113,3 +113,84 @@ def residual_scale(cal: Calibration, obs: Observations) -> FloatArray:
 def normalised_residuals(cal: Calibration, obs: Observations) -> FloatArray:
     """Residuals in units of their expected standard deviation, shape (N, 2)."""
     return np.asarray(cal.residuals_px / residual_scale(cal, obs)[:, None], dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Profile1D:
+    """Mean residuals in bins of one quantity, for two components.
+
+    Attributes
+    ----------
+    title, label : str
+        What they are held against, and the axis label with its unit.
+    names : tuple of str
+        The two components.
+    centres : (n,) array
+        Mean of the quantity in each bin.
+    means : (2, n) array
+        Mean residuals, px.
+    errors : (n,) array
+        Standard error of a mean from noise alone, px.
+    """
+
+    title: str
+    label: str
+    names: tuple[str, str]
+    centres: FloatArray
+    means: FloatArray
+    errors: FloatArray
+
+
+_XY, _POLAR = ("x", "y"), ("radial", "tangential")
+
+
+def residual_profiles(cal: Calibration, obs: Observations) -> tuple[Profile1D, ...]:
+    """Residuals against azimuth, pixel phase in x and y, order of frames, magnitude and temperature, in bins.
+
+    The phase is that of the predicted position, from -0.5 to 0.5 px around the centre of a pixel. Quantities that the
+    table lacks, or that do not vary, are left out.
+    """
+    residuals = np.asarray(cal.residuals_px).T
+    predicted = obs.xy.T - residuals
+    offset = predicted - cal.theta[:2, None]
+    unit = offset / np.maximum(np.hypot(*offset), 1e-9)
+    polar = np.stack([np.sum(residuals * unit, axis=0), unit[0] * residuals[1] - unit[1] * residuals[0]])
+    phase = predicted - np.round(predicted)
+    order = np.searchsorted(obs.frame_ids, obs.frame).astype(np.float64)
+    wanted: list[tuple[str, str, tuple[str, str], FloatArray | None, FloatArray]] = [
+        ("Azimuth", "azimuth in the field [°]", _POLAR, np.degrees(np.arctan2(offset[1], offset[0])), polar),
+        ("Pixel phase in x", "phase in x [px]", _XY, phase[0], residuals),
+        ("Pixel phase in y", "phase in y [px]", _XY, phase[1], residuals),
+        ("Order of frames", "frame, in order", _POLAR, order, polar),
+        ("Magnitude", "magnitude", _XY, obs.mag, residuals),
+        ("Temperature", "temperature [°C]", _POLAR, obs.temperature_c, polar),
+    ]
+    scale2 = residual_scale(cal, obs) ** 2
+    found = []
+    for title, label, names, values, parts in wanted:
+        if values is not None and np.nanstd(values) > 1e-9:
+            found.append(_profile(title, label, names, values, parts, scale2))
+    return tuple(found)
+
+
+def _profile(
+    title: str, label: str, names: tuple[str, str], values: FloatArray, parts: FloatArray, scale2: FloatArray
+) -> Profile1D:
+    known = np.isfinite(values)
+    values, parts, scale2 = values[known], parts[:, known], scale2[known]
+    n_bins = int(np.clip(len(values) // 30, 3, 16))
+    # Bins of equal number, so that all error bars mean the same; equal values stay in one bin.
+    edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, n_bins + 1)))
+    index = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0))
+    counts = np.bincount(index)
+    kept = counts > 0
+    counts = counts[kept].astype(np.float64)
+    sums = np.stack([np.bincount(index, part)[kept] for part in parts])
+    return Profile1D(
+        title=title,
+        label=label,
+        names=names,
+        centres=np.bincount(index, values)[kept] / counts,
+        means=sums / counts,
+        errors=np.sqrt(np.bincount(index, scale2)[kept]) / counts,
+    )

@@ -20,6 +20,8 @@ _INITIAL_BOUND = 100.0
 _SINGULAR = 1e-13
 # Relative change of a cost that is rounding and nothing else.
 _ROUNDING = 1e-10
+# A step this small against the parameters is none, whatever the cost does: data without noise end here.
+_NEGLIGIBLE = 1e-10
 
 
 class Normal(NamedTuple):
@@ -203,8 +205,16 @@ def levenberg_marquardt(
         if predicted <= tolerance and ratio > 1e-4:
             return finish(Status.CONVERGED)
         if bound <= step_tolerance * float(np.linalg.norm(scale * theta)):
-            return finish(Status.CONVERGED if predicted <= 1e-8 else Status.STALLED)
+            settled = predicted <= 1e-8 or _newton_length(normal, scale) <= _NEGLIGIBLE * float(
+                np.linalg.norm(scale * theta)
+            )
+            return finish(Status.CONVERGED if settled else Status.STALLED)
     return finish(Status.MAX_ITERATIONS)
+
+
+def _newton_length(normal: Normal, scale: FloatArray) -> float:
+    """Length of the undamped step in scaled parameters: what separates the point from its optimum."""
+    return float(np.linalg.norm(scale * _scaled_step(normal, scale, np.inf)[0]))
 
 
 def is_singular(matrix: FloatArray) -> bool:

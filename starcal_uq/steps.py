@@ -6,26 +6,31 @@ report) are removed when a step they depend on is done again, so that a folder n
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.calibration import Calibration
 from starcal_uq.camera import Camera
+from starcal_uq.distortion import sigma_parameter
 from starcal_uq.errors import CalibrationError, ObservationError, RunFolderError
 from starcal_uq.observations import Observations, load_observations
+from starcal_uq.progress import Progress
 from starcal_uq.runfolder import RunFolder, atomic_path, ensure_new
 
 if TYPE_CHECKING:
     from starcal_uq.couplings import Coupling
     from starcal_uq.fieldmap import FieldMap
     from starcal_uq.posterior import Posterior
+    from starcal_uq.priors import Priors
     from starcal_uq.propagation import AttitudeError
+    from starcal_uq.screening_result import Screening
     from starcal_uq.verdict import Verdict
 
-Progress = Callable[[int, int], None]
 
 DIRECTIONS = ("undeclared", "catalogue", "apparent")
+REJECTED = "rejected.csv"
+DIAGNOSIS_FILES = ("diagnosis.json", "misfit.csv", "jackknife.csv", "comparison.csv", "predictive.csv")
 _AFTER_SAMPLING = ("coupling", "attitude", "field_map", "budget", "report")
 _AFTER_CALIBRATION = ("posterior", *_AFTER_SAMPLING)
 _ALL = ("observations", "camera", "calibration", "arrays", *_AFTER_CALIBRATION)
@@ -100,22 +105,44 @@ def _remove(run: RunFolder, names: Sequence[str]) -> None:
     for name in names:
         path: Path = getattr(run, name)
         path.unlink(missing_ok=True)
+    if "calibration" in names:
+        for name in (REJECTED, *DIAGNOSIS_FILES):
+            (run.path / name).unlink(missing_ok=True)
 
 
 def calibrate_step(
-    run: RunFolder, obs: Observations, nominal: Camera, *, method: str, solver: str, force: bool
-) -> Calibration:
-    """Calibrate and write observations, camera and calibration; nothing is written when the estimate fails."""
-    from starcal_uq.estimation import calibrate
+    run: RunFolder,
+    obs: Observations,
+    nominal: Camera,
+    *,
+    force: bool,
+    screening: bool = False,
+    **options: Any,
+) -> tuple[Calibration, Screening | None]:
+    """Calibrate and write observations, camera and calibration; nothing is written when the estimate fails.
 
-    calibration = calibrate(obs, nominal, method=method, solver=solver)
+    With `screening`, wrong identifications are left out first; the run then holds the kept rows, and
+    ``rejected.csv`` the others with their reasons. `options` go to `calibrate`.
+    """
+    found: Screening | None = None
+    if screening:
+        from starcal_uq.screening import screen
+
+        found = screen(obs, nominal, **options)
+        obs, calibration = found.observations, found.calibration
+    else:
+        from starcal_uq.estimation import calibrate
+
+        calibration = calibrate(obs, nominal, **options)
     check_new_run(run, force)
     _remove(run, _ALL)
     run.create()
     obs.save(run.observations, force=True)
     nominal.save(run.camera, force=True)
     calibration.save(run.calibration)
-    return calibration
+    if found is not None:
+        found.save(run.path / REJECTED, force=True)
+    return calibration, found
 
 
 def load_run(run: RunFolder) -> tuple[Observations, Calibration]:
@@ -138,10 +165,16 @@ def load_run(run: RunFolder) -> tuple[Observations, Calibration]:
 
 def sample_step(run: RunFolder, *, force: bool, progress: Progress | None = None, **options: Any) -> Posterior:
     """Sample the posterior of a calibrated run and write it; an interrupted run goes on from its checkpoint."""
-    obs, calibration = load_run(run)
+    calibration = Calibration.load(run.require("calibration"))
+    # A merged run may have no stars of its own; its compressed likelihood is all that sampling needs.
+    merged = calibration.provenance.get("merge", {})
+    obs = None if merged.get("has_observations") is False else load_run(run)[0]
     ensure_new(run.posterior, force)
     from starcal_uq.sampler import sample
 
+    if options.get("likelihood") is None:
+        # A calibration knows which likelihood its estimate maximises.
+        options["likelihood"] = calibration.provenance.get("settings", {}).get("likelihood", "marginal")
     checkpoint = run.path / "sampling.checkpoint.npz"
     posterior = sample(obs, calibration, progress=progress, checkpoint=checkpoint, **options)
     posterior.save(run.posterior, force=True)
@@ -166,6 +199,16 @@ def coupling_step(run: RunFolder) -> Coupling:
     with atomic_path(run.coupling) as temporary:
         found.to_dataframe().to_csv(temporary, index=False)
     return found
+
+
+def read_priors(run: RunFolder, path: Path) -> Priors:
+    """Priors of a TOML file for a run: physical terms, or the posterior of an earlier run."""
+    from starcal_uq.chaining import load_priors
+    from starcal_uq.merging import data_hashes
+
+    calibration = Calibration.load(run.require("calibration"))
+    per_star = calibration.sigma_name == sigma_parameter(True).name
+    return load_priors(path, calibration.nominal, per_star, data_hashes(calibration.provenance))
 
 
 def propagate_step(run: RunFolder, *, n_draws: int, seed: int) -> tuple[AttitudeError, FieldMap]:
@@ -195,7 +238,14 @@ def verdict_step(run: RunFolder) -> Verdict:
     from starcal_uq.verdict import judge
 
     found = load_results(run)
-    return judge(found.observations, found.calibration, found.posterior, found.truth, found.attitude)
+    return judge(
+        found.observations,
+        found.calibration,
+        found.posterior,
+        found.truth,
+        found.attitude,
+        diagnosis=found.diagnosis,
+    )
 
 
 def truth_of(obs: Observations) -> Camera | None:

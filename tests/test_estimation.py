@@ -117,6 +117,24 @@ def test_repeats_bit_for_bit():
     assert np.array_equal(a.covariance, b.covariance)
 
 
+@pytest.mark.parametrize("k1", [-2e-7, -8e-8, 8e-8, 2e-7])
+def test_distortion_of_tens_of_pixels(k1):
+    """The fit without distortion then lands hundreds of pixels off the axis; the result must not stay there."""
+    truth = camera("brown").replace(coefficients=(k1, 0.0))
+    stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
+    obs = sc.simulate(stars, truth, n_frames=60, min_stars=8, sigma_px=0.05, seed=3)
+    cal = sc.calibrate(obs, sc.paper_start())
+    assert cal.status is Status.CONVERGED
+    assert np.max(np.abs(cal.theta - truth.theta) / cal.sigmas) < 4.0
+
+
+def test_data_without_noise_give_the_truth():
+    cal = sc.calibrate(observations(sigma_px=0.0), sc.paper_start())
+    assert cal.status is Status.CONVERGED
+    assert np.allclose(cal.theta[:3], camera().theta[:3], rtol=0, atol=1e-9)
+    assert np.allclose(cal.theta[3:], camera().theta[3:], rtol=1e-8)
+
+
 def test_too_few_stars_for_the_parameters():
     obs = observations(n_frames=60)
     three = obs.select(np.isin(np.arange(obs.n_stars), [0, 1, 2]))

@@ -7,6 +7,7 @@ import threading
 
 import numpy as np
 import pytest
+
 import starcal_uq as sc
 from starcal_uq.interrupts import interrupt_between_steps
 from tests.scenes import observations

@@ -9,7 +9,6 @@ from scipy.optimize import least_squares
 from starcal_uq.attitude import exp_rotation
 from starcal_uq.compressed import CompressedLikelihood, compress
 from starcal_uq.distortion import model_names
-from starcal_uq.frames import StarFrames
 from starcal_uq.likelihood import MarginalLikelihood
 from starcal_uq.projection import project
 from tests.scenes import camera, observations, with_sigmas
@@ -56,47 +55,6 @@ def test_information_is_the_schur_complement_of_the_attitudes():
     scale = _information_scale(schur)
     difference = (likelihood.evaluate(theta).matrix - schur) * np.outer(scale, scale)
     assert np.max(np.abs(difference)) < 1e-8
-
-
-def test_generalised_least_squares_over_pairs_has_the_same_information():
-    """With their full covariance the pairs know as much as the pixels, once attitudes are free."""
-    from starcal_uq.pairs import PairObjective
-    from starcal_uq.projection import unproject_jacobian
-
-    obs = observations(n_frames=6)
-    theta, cam = camera().theta, camera()
-    frames = StarFrames.from_observations(obs)
-    state, _ = MarginalLikelihood(frames, "brown").profile(theta)
-    # Noise-free pixels, so that both linearise at the same point.
-    pixel = project(cam, state.b.T).T
-    frames = StarFrames(pixel, frames.r, None, frames.starts)
-    expected = MarginalLikelihood(frames, "brown").evaluate(theta).matrix
-    total = np.zeros((5, 5))
-    for k in range(frames.n_frames):
-        part = frames.part(k, k + 1)
-        _, jacobian = PairObjective(part, "brown").residuals(theta)
-        i, j = PairObjective(part, "brown").pair_indices()
-        b, _ = unproject_jacobian("brown", theta, part.pixel.T)
-        # d(b_i.b_j)/d(pixel) by central differences of the directions.
-        step = 0.5
-        design = np.zeros((len(i), 2 * part.n_stars))
-        for axis in range(2):
-            up, down = part.pixel.T.copy(), part.pixel.T.copy()
-            up[:, axis] += step
-            down[:, axis] -= step
-            d = (unproject_jacobian("brown", theta, up)[0] - unproject_jacobian("brown", theta, down)[0]) / (2 * step)
-            rows = np.arange(len(i))
-            design[rows, 2 * i + axis] = np.sum(d[i] * b[j], axis=1)
-            design[rows, 2 * j + axis] = np.sum(d[j] * b[i], axis=1)
-        # Of m (m - 1) / 2 pairs 2 m - 3 are independent: the covariance has that rank.
-        u, s, _ = np.linalg.svd(design, full_matrices=False)
-        rank = 2 * part.n_stars - 3
-        assert s[rank - 1] > 1e-5 * s[0]
-        assert s[min(rank, len(s) - 1)] < 1e-6 * s[0]
-        whitened = (u[:, :rank].T @ jacobian) / s[:rank, None]
-        total += whitened.T @ whitened
-    scale = _information_scale(expected)
-    assert np.max(np.abs((total - expected) * np.outer(scale, scale))) < 1e-5
 
 
 @pytest.mark.parametrize("model", model_names())

@@ -19,12 +19,12 @@ from tests.gaussian_camera import gaussian_calibration
 
 @pytest.fixture(scope="module")
 def post() -> Posterior:
-    return sample(None, gaussian_calibration(), n_walkers=16, n_steps=100, seed=7, likelihood="compressed")
+    return sample(None, gaussian_calibration(), n_walkers=16, n_steps=100, seed=7, evaluation="compressed")
 
 
 @pytest.fixture(scope="module")
 def given() -> Posterior:
-    return sample(None, gaussian_calibration(), sigma=0.05, n_walkers=16, n_steps=20, seed=7, likelihood="compressed")
+    return sample(None, gaussian_calibration(), sigma=0.05, n_walkers=16, n_steps=20, seed=7, evaluation="compressed")
 
 
 def assert_same(a: object, b: object) -> None:

@@ -171,3 +171,11 @@ def test_second_interpreter_is_of_the_other_generation(tmp_path: Path) -> None:
     refused = find_python(tmp_path, "--other", sys.executable, str(tmp_path / "absent"))
     assert refused.returncode == 1
     assert "ALT_PYTHON" in refused.stderr
+
+
+def test_no_public_function_shares_its_name_with_a_module() -> None:
+    """Importing such a module would put it in the function's place (`sc.calibrate` would no longer be callable)."""
+    import starcal_uq
+
+    modules = {path.stem for path in (ROOT / "starcal_uq").iterdir()}
+    assert not modules & set(starcal_uq.__all__)

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
+from starcal_uq.diagnosis import FILE, diagnose_run
 from starcal_uq.reporting import load_results, render
 from starcal_uq.reporting.tables import attitude_rows, parameter_rows, symbol, weak_directions
 from tests.scenes import camera, nominal, observations
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 SECTIONS = {"parameters", "attitude", "posterior", "coupling", "residuals", "convergence", "checks"}
-SECTIONS |= {"diagnostics", "method", "provenance"}
+SECTIONS |= {"misfit", "diagnostics", "method", "provenance"}
 
 
 class Page(HTMLParser):
@@ -72,6 +73,7 @@ def full(tmp_path_factory):
     post.save(run.posterior)
     sc.propagate(post, obs, n_draws=200, seed=1).save(run.attitude)
     sc.field_map(post, obs, n=9).save(run.field_map)
+    diagnose_run(run.path, n_starts=1)
     assert sc.report(run.path) == run.report
     return run
 
@@ -96,7 +98,7 @@ def test_every_section_is_there_and_every_link_leads_somewhere(full):
     found = page(full)
     assert found.ids >= SECTIONS
     assert {link.removeprefix("#") for link in found.links} == SECTIONS
-    assert len(found.images) == 8
+    assert len(found.images) == 10
     assert all(image["alt"] for image in found.images)
 
 
@@ -118,8 +120,10 @@ def test_figures_are_files_too(full):
         "corner",
         "correlation",
         "field_map",
+        "misfit",
         "price_of_coupling",
         "prior_posterior",
+        "residual_profiles",
         "residuals",
     }
 
@@ -180,6 +184,32 @@ def test_without_posterior_the_report_says_which_command_makes_it(run):
     assert not found.ids & {"attitude", "posterior", "diagnostics"}
     assert {link.removeprefix("#") for link in found.links} <= found.ids
     assert "not been sampled" in found.text
+
+
+def test_misfit_section_shows_tests_jackknife_models_and_replicates(full):
+    text = page(full).text
+    section = text[text.rindex("Model error is in no posterior") : text.index("Fig. 3 of Ye")]
+    for words_of in (
+        "Error with the pixel phase in x",
+        "None found anything (16 tests",
+        "Jackknife over frames",
+        "No other model predicts left-out frames better than 'brown'",
+        "brown (this report)",
+        "rejected",
+        "excess kurtosis",
+    ):
+        assert words_of in section, words_of
+    assert "Focal length" in text and "Common rotation, yaw" in text
+
+
+def test_without_diagnosis_or_with_that_of_another_estimate_the_command_is_named(run):
+    text = (run.path / FILE).read_text(encoding="utf-8")
+    (run.path / FILE).write_text(text.replace('"theta": [\n  5', '"theta": [\n  6'), encoding="utf-8")
+    for _ in range(2):
+        found = words(run)
+        assert f"starcal-uq diagnose {run.path}" in found
+        assert "Jackknife over frames" not in found
+        (run.path / FILE).unlink(missing_ok=True)
 
 
 def test_undeclared_directions_are_warned_of_before_any_table(run):

@@ -39,7 +39,7 @@ def conjugate(priors: Priors, cal: Any) -> tuple[np.ndarray, np.ndarray]:
 
 def test_known_posterior_is_recovered_at_extreme_scales() -> None:
     cal = gaussian_calibration()
-    post = sample(None, cal, sigma=0.05, seed=1, likelihood="compressed")
+    post = sample(None, cal, sigma=0.05, seed=1, evaluation="compressed")
     mean, covariance = conjugate(post.priors, cal)
     z = whitened(post.theta_draws, mean, covariance)
     assert np.max(np.abs(z.mean(axis=0))) < 0.04
@@ -52,7 +52,7 @@ def test_informative_prior_shifts_the_posterior_as_it_must() -> None:
     cal = gaussian_calibration()
     # A focal length known to 0.02 px, 0.05 px away from the estimate, also moves k1 and k2 through their couplings.
     priors = Priors.default(cal.nominal).replace(focal_px=cal.theta[2] + 0.05, focal_fraction=0.02 / cal.theta[2])
-    post = sample(None, cal, priors, sigma=0.05, seed=1, likelihood="compressed")
+    post = sample(None, cal, priors, sigma=0.05, seed=1, evaluation="compressed")
     mean, covariance = conjugate(priors, cal)
     assert abs(mean[3] - cal.theta[3]) > 0.5 * SD[3]
     assert np.max(np.abs(post.mean - mean) / np.sqrt(np.diag(covariance))) < 0.05
@@ -63,7 +63,7 @@ def test_informative_prior_shifts_the_posterior_as_it_must() -> None:
 def test_noise_has_the_posterior_found_by_quadrature() -> None:
     # So few degrees of freedom that a forgotten Jacobian (a factor sigma) would move the mean by about 0.2 sd.
     cal = gaussian_calibration(dof=12)
-    post = sample(None, cal, seed=1, likelihood="compressed")
+    post = sample(None, cal, seed=1, evaluation="compressed")
     s = np.geomspace(0.005, 2.0, 20_001)
     # Theta integrated out over its flat likelihood gives sigma^5.
     log_density = -6.0 * (0.05 / s) ** 2 - (12 - 5) * np.log(s)
@@ -76,7 +76,7 @@ def test_noise_has_the_posterior_found_by_quadrature() -> None:
 
 
 def test_defaults_give_ten_thousand_effective_draws() -> None:
-    d = sample(None, gaussian_calibration(), seed=5, likelihood="compressed").diagnostics
+    d = sample(None, gaussian_calibration(), seed=5, evaluation="compressed").diagnostics
     assert d.ok, d.messages
     assert np.min(d.ess_bulk) > 10_000
     assert np.min(d.ess_tail) > 10_000
@@ -87,7 +87,7 @@ def test_defaults_give_ten_thousand_effective_draws() -> None:
 
 def test_stretch_move_agrees() -> None:
     cal = gaussian_calibration()
-    post = sample(None, cal, sigma=0.05, moves="stretch", n_steps=400, seed=1, likelihood="compressed")
+    post = sample(None, cal, sigma=0.05, moves="stretch", n_steps=400, seed=1, evaluation="compressed")
     mean, covariance = conjugate(post.priors, cal)
     z = whitened(post.theta_draws, mean, covariance)
     assert np.max(np.abs(np.cov(z.T) - np.eye(5))) < 0.2
@@ -96,7 +96,7 @@ def test_stretch_move_agrees() -> None:
 
 def test_same_seed_same_bits_and_ensembles_differ() -> None:
     cal = gaussian_calibration()
-    first, second, other = (sample(None, cal, **{**QUICK, "seed": seed}, likelihood="compressed") for seed in (3, 3, 4))
+    first, second, other = (sample(None, cal, **{**QUICK, "seed": seed}, evaluation="compressed") for seed in (3, 3, 4))
     assert np.array_equal(first.draws, second.draws)
     assert np.array_equal(first.log_posterior, second.log_posterior)
     assert first.diagnostics.psis_khat == second.diagnostics.psis_khat
@@ -108,15 +108,15 @@ def test_same_seed_same_bits_and_ensembles_differ() -> None:
 def test_a_seed_is_taken_and_recorded() -> None:
     cal = gaussian_calibration()
     options = {**QUICK, "seed": None}
-    post = sample(None, cal, **options, likelihood="compressed")
-    again = sample(None, cal, **{**options, "seed": post.provenance["seed"]}, likelihood="compressed")
+    post = sample(None, cal, **options, evaluation="compressed")
+    again = sample(None, cal, **{**options, "seed": post.provenance["seed"]}, evaluation="compressed")
     assert np.array_equal(post.draws, again.draws)
 
 
 @pytest.mark.parametrize("stop", [3, 40, 65, 90, 129])
 def test_resumed_run_is_the_uninterrupted_run(tmp_path: Path, stop: int) -> None:
     cal, checkpoint = gaussian_calibration(), tmp_path / "run.ckpt"
-    whole = sample(None, cal, **QUICK, likelihood="compressed")
+    whole = sample(None, cal, **QUICK, evaluation="compressed")
 
     def interrupt(done: int, total: int) -> None:
         assert total == 2 * 65
@@ -124,10 +124,10 @@ def test_resumed_run_is_the_uninterrupted_run(tmp_path: Path, stop: int) -> None
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        sample(None, cal, **QUICK, likelihood="compressed", checkpoint=checkpoint, progress=interrupt)
+        sample(None, cal, **QUICK, evaluation="compressed", checkpoint=checkpoint, progress=interrupt)
     seen: list[int] = []
     resumed = sample(
-        None, cal, **QUICK, likelihood="compressed", checkpoint=checkpoint, progress=lambda done, _: seen.append(done)
+        None, cal, **QUICK, evaluation="compressed", checkpoint=checkpoint, progress=lambda done, _: seen.append(done)
     )
     assert np.array_equal(resumed.draws, whole.draws)
     assert np.array_equal(resumed.log_posterior, whole.log_posterior)
@@ -146,16 +146,16 @@ def test_checkpoint_of_other_settings_is_refused(tmp_path: Path) -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        sample(None, cal, **QUICK, likelihood="compressed", checkpoint=checkpoint, progress=interrupt)
+        sample(None, cal, **QUICK, evaluation="compressed", checkpoint=checkpoint, progress=interrupt)
     with pytest.raises(SamplingError, match="other data or settings"):
-        sample(None, cal, **{**QUICK, "seed": 4}, likelihood="compressed", checkpoint=checkpoint)
+        sample(None, cal, **{**QUICK, "seed": 4}, evaluation="compressed", checkpoint=checkpoint)
     checkpoint.write_bytes(b"not a checkpoint")
     with pytest.raises(SamplingError, match="cannot be read as a checkpoint"):
-        sample(None, cal, **QUICK, likelihood="compressed", checkpoint=checkpoint)
+        sample(None, cal, **QUICK, evaluation="compressed", checkpoint=checkpoint)
 
 
 def test_given_noise_fills_the_last_column() -> None:
-    post = sample(None, gaussian_calibration(), sigma=0.07, **QUICK, likelihood="compressed")
+    post = sample(None, gaussian_calibration(), sigma=0.07, **QUICK, evaluation="compressed")
     assert np.all(post.sigma_draws == 0.07)
     assert not post.sigma_sampled
     assert post.draws.shape[1] == 6
@@ -183,8 +183,12 @@ def test_any_likelihood_with_the_right_method() -> None:
         ({"moves": "snooker"}, "mixture, stretch"),
         ({"sigma": 0.0}, "above zero"),
         ({"sigma": "free"}, "'sampled'"),
-        ({"likelihood": "naive"}, "auto, compressed, exact"),
-        ({"likelihood": "exact"}, "needs the observations"),
+        ({"evaluation": "naive"}, "auto, compressed, exact"),
+        ({"evaluation": "exact"}, "needs the observations"),
+        ({"likelihood": "naive"}, "marginal, pairs, pairs_naive, student_t"),
+        ({"likelihood": "exact"}, "use evaluation='exact'"),
+        ({"likelihood": "pairs"}, "needs the observations"),
+        ({"dof": 4.0}, "belong to likelihood='student_t'"),
     ],
 )
 def test_settings_that_cannot_work_are_refused(options: dict[str, Any], match: str) -> None:
@@ -270,7 +274,7 @@ def test_compression_check_measures_the_difference() -> None:
 
 
 def test_too_short_a_run_fails_its_checks() -> None:
-    post = sample(None, gaussian_calibration(), **{**QUICK, "n_steps": 8}, likelihood="compressed")
+    post = sample(None, gaussian_calibration(), **{**QUICK, "n_steps": 8}, evaluation="compressed")
     assert not post.diagnostics.ok
     assert any("effective sample size" in failure for failure in post.diagnostics.failures)
     assert post.diagnostics.messages[0] == post.diagnostics.failures[0]
@@ -279,12 +283,12 @@ def test_too_short_a_run_fails_its_checks() -> None:
 def test_surprising_results_are_said() -> None:
     cal = gaussian_calibration()
     priors = Priors.default(cal.nominal).replace(focal_fraction=0.001)
-    messages = sample(None, cal, priors, **QUICK, likelihood="compressed").diagnostics.messages
+    messages = sample(None, cal, priors, **QUICK, evaluation="compressed").diagnostics.messages
     assert any("prior standard deviations away" in m for m in messages)
     off = cal.camera.replace(x0_px=-3.0).theta
     likelihood = GaussianLikelihood(off, cal.information, cal.sigma, cal.dof)
     away = gaussian_calibration(theta=off, compressed=likelihood)
-    failures = sample(None, away, **QUICK, likelihood="compressed").diagnostics.failures
+    failures = sample(None, away, **QUICK, evaluation="compressed").diagnostics.failures
     assert any("off the detector" in f for f in failures)
 
 
@@ -296,7 +300,7 @@ def few_frames() -> tuple[Any, Any]:
 
 def test_compressed_and_exact_posteriors_are_the_same(few_frames: tuple[Any, Any]) -> None:
     obs, cal = few_frames
-    auto, exact = (sample(obs, cal, **QUICK, likelihood=name) for name in ("auto", "exact"))
+    auto, exact = (sample(obs, cal, **QUICK, evaluation=name) for name in ("auto", "exact"))
     assert auto.diagnostics.likelihood_used == "compressed"
     assert auto.diagnostics.compressed_max_difference < 0.1
     assert any("differ by up to" in m for m in auto.diagnostics.messages)
@@ -323,8 +327,8 @@ def test_a_wrong_compressed_likelihood_is_replaced(few_frames: tuple[Any, Any], 
     assert replaced.diagnostics.likelihood_used == "exact"
     assert replaced.diagnostics.compressed_max_difference > 0.5
     assert any("exact likelihood was sampled" in m for m in replaced.diagnostics.messages)
-    kept = sample(obs, spoilt(cal), **QUICK, likelihood="compressed")
-    assert any("use likelihood='auto'" in failure for failure in kept.diagnostics.failures)
+    kept = sample(obs, spoilt(cal), **QUICK, evaluation="compressed")
+    assert any("use evaluation='auto'" in failure for failure in kept.diagnostics.failures)
 
 
 @pytest.mark.parametrize("stop", [40, 170])

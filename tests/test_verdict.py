@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
+from starcal_uq.diagnosis import diagnose
+from starcal_uq.reporting.tables import mean_to_mcse
 from starcal_uq.residuals import bin_residuals, normalised_residuals, residual_scale
 from starcal_uq.verdict import Level, Question, judge, limits, propagation_difference
 from tests.scenes import camera, observations, with_sigmas
@@ -32,7 +34,7 @@ def with_diagnostics(post, **changes):
 def test_a_good_run_passes_every_check(run):
     verdict = judge(run.obs, run.cal, run.post, run.truth)
     assert verdict.level is Level.PASS, verdict.at(Level.FAIL) + verdict.at(Level.WARN)
-    assert len(verdict.checks) == 14
+    assert len(verdict.checks) == 18
     assert {check.question for check in verdict.checks} == set(Question)
     assert all(check.sentence.endswith(".") and check.value and check.threshold for check in verdict.checks)
     assert "every check passed" in verdict.headline
@@ -53,6 +55,7 @@ def test_without_posterior_the_headline_says_so(run):
         ("Independent posterior", {"psis_khat": 0.9}),
         ("Independent posterior", {"agreement_sd": 0.5}),
         ("Likelihood", {"compressed_max_difference": 3.0}),
+        ("Kind of likelihood", {"likelihood": "pairs_naive"}),
     ],
 )
 def test_bad_sampling_fails(run, name, changes):
@@ -61,6 +64,123 @@ def test_bad_sampling_fails(run, name, changes):
     verdict = judge(run.obs, run.cal, post)
     assert verdict.level is Level.FAIL
     assert verdict.headline.startswith("Do not use")
+
+
+def with_draws(post, change):
+    draws = post.draws.copy()
+    change(draws)
+    # A new object: means and standard deviations are remembered.
+    return dataclasses.replace(post, draws=draws)
+
+
+def test_derived_quantities_have_diagnostics_of_their_own(run):
+    """The rotation that the first ensemble implies is another one, although no diagnostic of a parameter says so."""
+    quarter = len(run.post.draws) // run.post.n_ensembles
+
+    def shift(draws):
+        draws[:quarter, 0] += 0.5 * run.post.sd[0]
+
+    check = outcome("Derived quantities", run.obs, run.cal, with_draws(run.post, shift))
+    assert check.level is Level.FAIL
+    assert "Common rotation, yaw" in check.sentence
+    assert outcome("R-hat", run.obs, run.cal, with_draws(run.post, shift)).level is Level.PASS
+
+
+def test_draws_off_the_detector_or_folded_fail(run):
+    def push(draws):
+        draws[: len(draws) // 100, 0] += 600.0
+
+    def fold(draws):
+        draws[:, 3] = -2e-6
+
+    check = outcome("Bounds", run.obs, run.cal, with_draws(run.post, push))
+    assert check.level is Level.FAIL and "off the detector" in check.sentence
+    check = outcome("Bounds", run.obs, run.cal, with_draws(run.post, fold))
+    assert check.level is Level.FAIL and "folds" in check.sentence
+    assert outcome("Bounds", run.obs, run.cal, run.post).level is Level.PASS
+
+
+def test_digits_that_monte_carlo_error_reaches_warn(run):
+    check = outcome("Digits", run.obs, run.cal, with_diagnostics(run.post, mcse=0.2 * run.post.sd))
+    assert check.level is Level.WARN
+    assert mean_to_mcse(12.34567, 0.012) == "12.3"
+    assert mean_to_mcse(12.34567, 0.0008) == "12.346"
+
+
+def test_a_posterior_of_other_data_fails(run):
+    other = dataclasses.replace(run.post, provenance={**run.post.provenance, "data_sha256": "0" * 64})
+    assert outcome("Data of the posterior", run.obs, run.cal, other).level is Level.FAIL
+
+
+@pytest.fixture(scope="module")
+def found(run):
+    return diagnose(run.obs, run.cal, models=("k1", "brown"), n_starts=2)
+
+
+class TestDiagnosis:
+    """Every check of the model, as it is and turned to its other outcome."""
+
+    def check(self, run, found, name):
+        verdict = judge(run.obs, run.cal, diagnosis=found)
+        return next(check for check in verdict.checks if check.name == name)
+
+    def test_all_pass_on_data_of_the_model(self, run, found):
+        verdict = judge(run.obs, run.cal, diagnosis=found)
+        assert verdict.level is Level.PASS, verdict.at(Level.WARN) + verdict.at(Level.FAIL)
+        names = {check.name for check in verdict.checks}
+        assert names >= {"Unexplained structure", "Jackknife over frames", "Distortion model", "Other starts"}
+        assert "Posterior predictive check" in names
+        assert all(check.sentence.endswith(".") and check.value and check.threshold for check in verdict.checks)
+        assert not any(s.startswith("The model") for s in limits(run.obs, run.cal, diagnosis=found))
+
+    def reject(self, found, start, p):
+        tests = tuple(
+            dataclasses.replace(t, p_value=p, p_holm=p, size_px=0.02 if t.dof else t.size_px)
+            if t.name.startswith(start)
+            else t
+            for t in found.misfit.tests
+        )
+        return dataclasses.replace(found, misfit=dataclasses.replace(found.misfit, tests=tests))
+
+    def test_structure_warns_or_fails_by_what_it_does(self, run, found):
+        weak = self.check(run, self.reject(found, "decentring", 0.01), "Unexplained structure")
+        strong = self.check(run, self.reject(found, "decentring", 1e-6), "Unexplained structure")
+        phase = self.check(run, self.reject(found, "error with the pixel phase in x", 1e-9), "Unexplained structure")
+        noise = self.check(run, self.reject(found, "noise that changes with mag", 1e-9), "Unexplained structure")
+        assert [c.level for c in (weak, strong, phase, noise)] == [Level.WARN, Level.FAIL, Level.WARN, Level.WARN]
+        assert "moves the parameters" in strong.sentence and "like more noise" in phase.sentence
+        assert "decentring" in strong.sentence
+
+    def test_frames_that_disagree_warn_with_the_factor(self, run, found):
+        scatter = dataclasses.replace(found.jackknife, jackknife_covariance=4.0 * found.jackknife.formal_covariance)
+        check = self.check(run, dataclasses.replace(found, jackknife=scatter), "Jackknife over frames")
+        assert check.level is Level.WARN
+        assert "up to 2.00" in check.sentence
+
+    def test_a_rejected_model_fails(self, run, found):
+        poor = dataclasses.replace(found, comparison=dataclasses.replace(found.comparison, fitted="k1"))
+        check = self.check(run, poor, "Distortion model")
+        assert check.level is Level.FAIL and "use 'brown'" in check.sentence
+
+    def test_replicates_and_starts(self, run, found):
+        odd = dataclasses.replace(found.predictive.statistics[1], p_value=0.0)
+        predictive = dataclasses.replace(found.predictive, statistics=(odd,))
+        check = self.check(run, dataclasses.replace(found, predictive=predictive), "Posterior predictive check")
+        assert check.level is Level.WARN and "largest residual" in check.sentence
+        for change, level in (({"better": 1, "same": 1}, Level.FAIL), ({"same": 1, "failed": 1}, Level.WARN)):
+            starts = dataclasses.replace(found.starts, **change)
+            assert self.check(run, dataclasses.replace(found, starts=starts), "Other starts").level is level
+
+    def test_a_model_that_moves_attitudes_is_a_limit(self, run, found):
+        scores = tuple(
+            dataclasses.replace(s, rejected=False, common_arcsec=(300.0, 0.0, 0.0)) if s.model == "k1" else s
+            for s in found.comparison.scores
+        )
+        moved = dataclasses.replace(found, comparison=dataclasses.replace(found.comparison, scores=scores))
+        sentence = limits(run.obs, run.cal, diagnosis=moved)[0]
+        assert "'k1' fits as well" in sentence and "300 arcsec" in sentence
+        bent = self.reject(found, "decentring", 1e-6)
+        assert "decentring" in limits(run.obs, run.cal, diagnosis=bent)[0]
 
 
 def test_an_unchecked_likelihood_warns(run):

@@ -10,23 +10,37 @@ from starcal_uq.plots.attitude import plot_attitude, plot_field_map
 from starcal_uq.plots.convergence import plot_convergence
 from starcal_uq.plots.corner import plot_corner
 from starcal_uq.plots.matrix import plot_correlation, plot_correlations, plot_couplings
+from starcal_uq.plots.misfit import (
+    plot_comparison,
+    plot_diagnosis,
+    plot_jackknife,
+    plot_misfit,
+    plot_residual_profiles,
+)
 from starcal_uq.plots.prior import plot_prior_posterior
 from starcal_uq.plots.residuals import plot_residual_histogram, plot_residual_map, plot_residual_radius, plot_residuals
 from starcal_uq.plots.style import figure_of, png_bytes
+from starcal_uq.plots.validation import plot_validation
 
 __all__ = [
     "figure_of",
     "plot_attitude",
+    "plot_comparison",
     "plot_convergence",
     "plot_corner",
     "plot_correlation",
     "plot_correlations",
     "plot_couplings",
+    "plot_diagnosis",
     "plot_field_map",
+    "plot_jackknife",
+    "plot_misfit",
     "plot_prior_posterior",
     "plot_residual_histogram",
     "plot_residual_map",
+    "plot_residual_profiles",
     "plot_residual_radius",
     "plot_residuals",
+    "plot_validation",
     "png_bytes",
 ]

@@ -14,7 +14,13 @@ if TYPE_CHECKING:
 def draw_figures(results: Results) -> dict[str, bytes]:
     """Every figure that the results allow, as PNG, by name."""
     cal, obs, truth = results.calibration, results.observations, results.truth
-    drawn = {"residuals": plots.plot_residuals(cal, obs), "convergence": plots.plot_convergence(cal, truth)}
+    drawn = {
+        "residuals": plots.plot_residuals(cal, obs),
+        "residual_profiles": plots.plot_residual_profiles(cal, obs),
+        "convergence": plots.plot_convergence(cal, truth),
+    }
+    if results.diagnosis is not None:
+        drawn["misfit"] = plots.plot_diagnosis(results.diagnosis)
     if results.posterior is not None:
         drawn["corner"] = plots.plot_corner(results.posterior, cal, truth)
         drawn["prior_posterior"] = plots.plot_prior_posterior(results.posterior, truth)

@@ -12,6 +12,7 @@ from starcal_uq.observations import Observations, load_observations
 
 if TYPE_CHECKING:
     from starcal_uq.couplings import Coupling
+    from starcal_uq.diagnosis import Diagnosis
     from starcal_uq.fieldmap import FieldMap
     from starcal_uq.posterior import Posterior
     from starcal_uq.propagation import AttitudeError
@@ -54,6 +55,8 @@ class Results:
         The attitude error.
     field_map : FieldMap or None
         The direction uncertainty over the field.
+    diagnosis : Diagnosis or None
+        What questions the model: tests for misfit, jackknife, comparison of models.
     truth : Camera or None
         The camera of a simulation.
     missing : tuple of Missing
@@ -67,6 +70,7 @@ class Results:
     coupling: Coupling | None = None
     attitude: AttitudeError | None = None
     field_map: FieldMap | None = None
+    diagnosis: Diagnosis | None = None
     truth: Camera | None = None
     missing: tuple[Missing, ...] = ()
 
@@ -80,6 +84,7 @@ def load_results(run: RunFolder, truth: Camera | None = None) -> Results:
         If there is no calibration, or its data are not those of the run.
     """
     from starcal_uq.couplings import coupling
+    from starcal_uq.diagnosis import load_diagnosis
     from starcal_uq.posterior import Posterior
 
     calibration = Calibration.load(run.require("calibration"))
@@ -96,6 +101,10 @@ def load_results(run: RunFolder, truth: Camera | None = None) -> Results:
     attitude, field_map = _attitude(run)
     if attitude is None or field_map is None:
         missing.append(Missing("The attitude error and the map over the field", f"starcal-uq propagate {run.path}"))
+    diagnosis = load_diagnosis(run, calibration)
+    if diagnosis is None:
+        what = "The tests for misfit, the jackknife and the comparison of distortion models"
+        missing.append(Missing(what, f"starcal-uq diagnose {run.path}"))
     if truth is None and "truth" in observations.meta:
         truth = Camera.from_dict(observations.meta["truth"])
     return Results(
@@ -106,6 +115,7 @@ def load_results(run: RunFolder, truth: Camera | None = None) -> Results:
         coupling=coupling(calibration if posterior is None else posterior),
         attitude=attitude,
         field_map=field_map,
+        diagnosis=diagnosis,
         truth=truth if truth is not None and truth.parameter_names == calibration.parameter_names else None,
         missing=tuple(missing),
     )

@@ -9,7 +9,7 @@ from typing import Any
 
 from starcal_uq.distortion import get_model
 from starcal_uq.formatting import MINUS, count, join_words
-from starcal_uq.reporting import tables, words
+from starcal_uq.reporting import model_tables, tables, words
 from starcal_uq.reporting.loading import Results
 from starcal_uq.verdict import Check, Level, Question, judge, limits, worst
 
@@ -43,7 +43,7 @@ def render(results: Results, figures: Mapping[str, bytes]) -> str:
 def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
     """What the template shows."""
     cal, post, obs = results.calibration, results.posterior, results.observations
-    verdict = judge(obs, cal, post, results.truth, results.attitude)
+    verdict = judge(obs, cal, post, results.truth, results.attitude, results.diagnosis)
     converged = verdict.of(Question.CONVERGED)
     trust = verdict.of(Question.TRUSTWORTHY)
     return {
@@ -58,7 +58,7 @@ def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
         "trust_level": worst(trust),
         "converged_words": _answer(converged),
         "trust_words": _answer(trust),
-        "limits": limits(obs, cal, results.coupling, results.attitude),
+        "limits": limits(obs, cal, results.coupling, results.attitude, results.diagnosis),
         "data_sentence": words.data_sentence(results),
         "results": results,
         "names": [p.name for p in tables.all_parameters(results)],
@@ -69,9 +69,12 @@ def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
         "weak_directions": [] if results.coupling is None else tables.weak_directions(results.coupling),
         "diagnostics_rows": [] if post is None else tables.diagnostics_rows(post),
         "methods_rows": tables.methods_rows(results),
+        "derived_rows": [] if post is None else model_tables.derived_rows(post),
+        **model_tables.diagnosis_context(results.diagnosis, cal),
         "stage_rows": tables.stage_rows(results),
         "pair_rows": tables.pair_rows(results),
         "prior_rows": words.prior_rows(results),
+        "likelihood_sentence": words.likelihood_sentence(results),
         "sigma_sentence": words.sigma_sentence(results),
         "sampling_sentence": words.sampling_sentence(results),
         "compressed_sentence": words.compressed_sentence(results),

@@ -188,10 +188,19 @@ def diagnostics_rows(post: Posterior) -> list[Row]:
                 "tail": count(int(d.ess_tail[i])),
                 "mcse": _with_unit(significant(float(d.mcse[i]) / parameter.scale), parameter),
                 "mcse_share": percent(float(d.mcse[i] / post.sd[i])),
+                "mean": mean_to_mcse(
+                    float(post.draws[:, i].mean()) / parameter.scale, float(d.mcse[i]) / parameter.scale
+                ),
                 "tau": fixed(float(d.autocorrelation[i]), 1),
             }
         )
     return rows
+
+
+def mean_to_mcse(mean: float, mcse: float) -> str:
+    """A mean with the digits that its Monte Carlo error leaves: the last one is larger than the error."""
+    decimals = 0 if not mcse > 0.0 else max(0, int(np.floor(-np.log10(mcse))))
+    return fixed(mean, decimals)
 
 
 def _with_unit(number: str, parameter: Parameter) -> str:

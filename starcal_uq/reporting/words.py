@@ -64,6 +64,28 @@ def sigma_sentence(results: Results) -> str:
     return f"The noise σ ({kind}) was given as {significant(float(post.sigma_draws[0]), 4)} and not sampled."
 
 
+def likelihood_sentence(results: Results) -> str:
+    """Which likelihood was sampled, where it is not the one whose formula the report shows."""
+    post = results.posterior
+    kind = "marginal" if post is None else post.diagnostics.likelihood
+    known = {
+        "marginal": "",
+        "student_t": (
+            "The posterior of this run is that of the robust variant: each star’s residual follows a bivariate Student "
+            "t instead of a Gaussian, with the attitude of the frame integrated out in the same way."
+        ),
+        "pairs": (
+            "The posterior of this run is that of the angles between stars, a composite likelihood whose curvature is "
+            "adjusted to its Godambe information."
+        ),
+        "pairs_naive": (
+            "The posterior of this run takes the angles between stars as independent, which they are not: its "
+            "intervals are several times too narrow."
+        ),
+    }
+    return known.get(kind, f"The posterior of this run is that of the likelihood “{kind}” that was passed.")
+
+
 def attitude_sentence(results: Results) -> str:
     """What the numbers of the attitude table rest on."""
     error = results.attitude
@@ -120,6 +142,8 @@ def provenance_rows(results: Results) -> list[tuple[str, str]]:
     steps: list[tuple[str, Mapping[str, Any]]] = [("Calibration", results.calibration.provenance)]
     if results.posterior is not None:
         steps.append(("Sampling", results.posterior.provenance))
+    if results.diagnosis is not None:
+        steps.append(("Diagnosis", results.diagnosis.provenance))
     for name, step in steps:
         rows.append((f"{name}, time", str(step.get("created_utc", "unknown"))))
         if step.get("seed") is not None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from starcal_uq.formatting import join_words
-from starcal_uq.verdict import estimate, observed, sampling
+from starcal_uq.verdict import estimate, model, observed, sampling
 from starcal_uq.verdict.estimate import truth_z
 from starcal_uq.verdict.levels import Check, Level, Question
 from starcal_uq.verdict.limits import limits
@@ -20,6 +20,7 @@ from starcal_uq.verdict.sampling import propagation_difference
 if TYPE_CHECKING:
     from starcal_uq.calibration import Calibration
     from starcal_uq.camera import Camera
+    from starcal_uq.diagnosis import Diagnosis
     from starcal_uq.observations import Observations
     from starcal_uq.posterior import Posterior
     from starcal_uq.propagation import AttitudeError
@@ -78,6 +79,7 @@ def judge(
     post: Posterior | None = None,
     truth: Camera | None = None,
     attitude: AttitudeError | None = None,
+    diagnosis: Diagnosis | None = None,
 ) -> Verdict:
     """Check a run.
 
@@ -91,13 +93,24 @@ def judge(
         The camera of a simulation, if it is known.
     attitude
         The propagated attitude error, if there is one.
+    diagnosis
+        What questions the model, if it was made.
     """
     checks: list[Check | None] = [estimate.estimation(cal), estimate.estimators_agree(cal)]
+    if diagnosis is not None and diagnosis.starts is not None:
+        checks += [model.starts(diagnosis.starts)]
     if post is not None:
+        from starcal_uq.derived import derived_quantities
+
+        checks += [sampling.same_data(post, obs)]
         checks += [sampling.chains_agree(post), sampling.effective_draws(post), sampling.acceptance(post)]
+        checks += [sampling.derived_converged(derived_quantities(post)), sampling.digits(post), sampling.bounds(post)]
         checks += [sampling.independent_posterior(post), sampling.likelihood_exact(post)]
+        checks += [sampling.likelihood_kind(post)]
     checks += [observed.directions(obs, cal), observed.residual_pattern(obs, cal), observed.outliers(obs, cal)]
     checks += [observed.noise(cal), observed.coverage(obs, cal)]
+    if diagnosis is not None:
+        checks += model.model_checks(diagnosis)
     if post is not None:
         checks += [sampling.prior_influence(post)]
     if attitude is not None:

@@ -8,20 +8,28 @@ import numpy as np
 
 from starcal_uq.formatting import significant
 from starcal_uq.residuals import bin_residuals
+from starcal_uq.verdict.model import MISFIT_P
 from starcal_uq.verdict.observed import ARCSEC_PER_RAD, PATTERN_P
 
 if TYPE_CHECKING:
     from starcal_uq.calibration import Calibration
     from starcal_uq.couplings import Coupling
+    from starcal_uq.diagnosis import Diagnosis
     from starcal_uq.observations import Observations
     from starcal_uq.propagation import AttitudeError
 
 _STRONG = 0.7
+# A shift within two standard deviations is what noise in the further parameters gives.
+_MODEL_SIGMAS = 2.0
 _CROSS = slice(0, 2)
 
 
 def limits(
-    obs: Observations, cal: Calibration, coupling: Coupling | None = None, attitude: AttitudeError | None = None
+    obs: Observations,
+    cal: Calibration,
+    coupling: Coupling | None = None,
+    attitude: AttitudeError | None = None,
+    diagnosis: Diagnosis | None = None,
 ) -> tuple[str, ...]:
     """What limits the result, the most important first; one sentence each.
 
@@ -31,8 +39,11 @@ def limits(
         The data and the estimate.
     coupling, attitude
         Results of `starcal_uq.coupling` and `starcal_uq.propagate`, where they exist.
+    diagnosis
+        Tests for misfit and the comparison of models, where they exist.
     """
     found = [_systematic(obs, cal)]
+    found += [_structure(cal, diagnosis), _model_choice(cal, diagnosis)] if diagnosis is not None else []
     found += [_attitude(attitude)] if attitude is not None else []
     found += [_coupled(coupling)] if coupling is not None else []
     return tuple(sentence for sentence in found if sentence)
@@ -48,6 +59,39 @@ def _systematic(obs: Observations, cal: Calibration) -> str:
     if obs.meta.get("directions") != "apparent":
         return "Knowledge of the directions: until they are known to be apparent, f is conditional on that."
     return ""
+
+
+def _structure(cal: Calibration, diagnosis: Diagnosis) -> str:
+    """The largest pattern among those that the tests found."""
+    sized = [test for test in diagnosis.misfit.found(MISFIT_P) if test.size_px > 0.0]
+    if not sized:
+        return ""
+    worst = max(sized, key=lambda test: test.size_px)
+    arcsec = worst.size_px / cal.camera.focal_px * ARCSEC_PER_RAD
+    return (
+        f"The model: the largest structure that it leaves in the residuals is {worst.name}, "
+        f"{significant(worst.size_px)} px ({significant(arcsec)} arcsec) per star."
+    )
+
+
+def _model_choice(cal: Calibration, diagnosis: Diagnosis) -> str:
+    """How far attitudes move under models that fit as well, where that is more than the uncertainty within one."""
+    if diagnosis.comparison is None:
+        return ""
+    others = [score for score in diagnosis.comparison.accepted if score.model != diagnosis.comparison.fitted]
+    if not others:
+        return ""
+    score = max(others, key=lambda s: float(np.hypot(*s.common_arcsec[:2])))
+    moved = float(np.hypot(*score.common_arcsec[:2]))
+    covariance = cal.rotation_per_theta @ cal.covariance @ cal.rotation_per_theta.T
+    within = float(np.sqrt(np.trace(covariance[:2, :2]))) * ARCSEC_PER_RAD
+    if moved <= _MODEL_SIGMAS * within:
+        return ""
+    return (
+        f"The choice of the distortion model: {score.model!r} fits as well and moves attitudes by {significant(moved)} "
+        f"arcsec in common across the boresight; the uncertainty within {cal.camera.distortion!r} is "
+        f"{significant(within)} arcsec."
+    )
 
 
 def _attitude(error: AttitudeError) -> str:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.formatting import count, fixed, join_words, percent, significant
+from starcal_uq.formatting import count, decimals_for, fixed, join_words, percent, significant
 from starcal_uq.posterior_checks import (
     ACCEPTANCE_RANGE,
     AGREEMENT_BOUND,
@@ -18,9 +18,13 @@ from starcal_uq.posterior_checks import (
 from starcal_uq.verdict.levels import Check, Level, Question, pass_or_fail, pass_or_warn
 
 if TYPE_CHECKING:
+    from starcal_uq.derived import Derived
+    from starcal_uq.observations import Observations
     from starcal_uq.posterior import Posterior
     from starcal_uq.propagation import AttitudeError
 
+_FOLD_DRAWS = 40
+BOUNDS_SHARE = 1e-3
 PRIOR_SHARE, PRIOR_PULL = 0.5, 3.0
 # What first order leaves out, and how many Monte Carlo errors of a sampled sigma are tolerated beyond it.
 PROPAGATION_SLACK, PROPAGATION_ERRORS = 0.03, 4.0
@@ -98,6 +102,94 @@ def likelihood_exact(post: Posterior) -> Check | None:
     )
     value = f"{significant(d.compressed_max_difference)} nat"
     return Check("Likelihood", Question.TRUSTWORTHY, pass_or_fail(good), value, threshold, sentence)
+
+
+def likelihood_kind(post: Posterior) -> Check | None:
+    """Was a likelihood sampled whose intervals are known to be wrong?"""
+    kind = post.diagnostics.likelihood
+    if kind == "marginal":
+        return None
+    good = kind != "pairs_naive"
+    sentence = (
+        f"The posterior is that of the likelihood {kind!r}."
+        if good
+        else "Pairs of stars were taken as independent: the intervals are several times too narrow."
+    )
+    threshold = "not 'pairs_naive'"
+    return Check("Kind of likelihood", Question.TRUSTWORTHY, pass_or_fail(good), kind, threshold, sentence)
+
+
+def same_data(post: Posterior, obs: Observations) -> Check:
+    """Was the posterior sampled from these observations?"""
+    good = post.provenance.get("data_sha256") == obs.data_hash
+    sentence = (
+        "The posterior was sampled from the observations at hand."
+        if good
+        else "The posterior was sampled from other observations than those at hand: sample again."
+    )
+    value = f"SHA-256 {str(post.provenance.get('data_sha256'))[:12]}…"
+    threshold = f"{obs.data_hash[:12]}…"
+    return Check("Data of the posterior", Question.CONVERGED, pass_or_fail(good), value, threshold, sentence)
+
+
+def derived_converged(found: tuple[Derived, ...]) -> Check:
+    """R-hat and effective draws of what follows from the parameters."""
+    rhat = max(found, key=lambda d: d.rhat)
+    fewest = min(found, key=lambda d: min(d.ess_bulk, d.ess_tail))
+    ess = min(fewest.ess_bulk, fewest.ess_tail)
+    good = rhat.rhat < RHAT_BOUND and ess > ESS_BOUND
+    sentence = (
+        "Focal length in mm, displacement at the corner and common rotation have converged too."
+        if good
+        else f"{(rhat if rhat.rhat >= RHAT_BOUND else fewest).name.capitalize()} has not converged: raise n_steps."
+    )
+    value = f"R-hat {fixed(rhat.rhat, 4)}, {count(int(ess))} draws"
+    return _sampling("Derived quantities", good, value, f"< {RHAT_BOUND}, > {ESS_BOUND:g}", sentence)
+
+
+def digits(post: Posterior) -> Check:
+    """Does Monte Carlo error leave the printed digits alone?"""
+    names, d = post.parameter_names, post.diagnostics
+    # Digits are printed to the second one of sigma; the unit of the last is what the error must not exceed.
+    worst, largest = names[0], 0.0
+    for i in post.sampled:
+        scale = post.parameters[i].scale
+        unit = 10.0 ** -decimals_for(float(post.sd[i]) / scale)
+        share = float(d.mcse[i]) / scale / unit
+        if share > largest:
+            worst, largest = names[i], share
+    good = largest <= 1.0
+    sentence = (
+        "Monte Carlo error does not reach the last printed digit of any mean."
+        if good
+        else f"Monte Carlo error reaches the last printed digit of {worst}: raise n_steps before quoting it."
+    )
+    value = f"{fixed(largest, 2)} units of the last digit ({worst})"
+    return Check("Digits", Question.CONVERGED, pass_or_warn(good), value, "≤ 1", sentence)
+
+
+def bounds(post: Posterior) -> Check:
+    """Do draws touch the edges of what a camera can be?"""
+    from starcal_uq.projection import fold_radius_px
+
+    camera, theta = post.camera, post.theta_draws
+    outside = float(np.mean(~camera.contains(theta[:, :2]) | (theta[:, 2] <= 0.0)))
+    few = theta[np.linspace(0, len(theta) - 1, _FOLD_DRAWS).astype(int)]
+    radius = camera.corner_radius_px
+    folded = float(np.mean([fold_radius_px(camera.distortion, draw, radius) <= radius for draw in few]))
+    sd = post.sd[:3]
+    edges = np.array([camera.width_px - 0.5, camera.height_px - 0.5])
+    room = np.concatenate([(post.mean[:2] + 0.5) / sd[:2], (edges - post.mean[:2]) / sd[:2], post.mean[2:3] / sd[2:3]])
+    good = outside <= BOUNDS_SHARE and folded == 0.0
+    if good:
+        sentence = "No draw has its principal point off the detector, f below zero or a distortion that folds."
+    elif folded > 0.0:
+        sentence = "The distortion of some draws folds over within the field: the data do not determine it."
+    else:
+        sentence = "Draws have their principal point off the detector or f below zero: add frames."
+    value = f"nearest bound {significant(float(np.min(room)))} sigma away"
+    share = f"≤ {percent(BOUNDS_SHARE, 1)} of draws outside"
+    return Check("Bounds", Question.CONVERGED, pass_or_fail(good), value, share, sentence)
 
 
 def prior_influence(post: Posterior) -> Check:
