@@ -58,8 +58,8 @@ def plot_jackknife(found: Jackknife, ax: Axes | None = None) -> Axes:
     ax.axhline(1.0, color=style.INK, linewidth=0.9)
     ax.set_xticks(rows, found.parameter_names)
     top = max(float(np.max([high, found.ratio, found.sandwich_ratio])), 1.2)
-    ax.set_ylim(min(0.5, float(low.min()) - 0.05), 1.0 + 1.5 * (top - 1.0))
-    style.legend(ax, loc="upper left", ncols=3, columnspacing=0.7, handletextpad=0.2, handlelength=1.0)
+    ax.set_ylim(min(0.5, float(low.min()) - 0.05), 1.0 + 1.8 * (top - 1.0))
+    style.legend(ax, loc="upper left", ncols=2, columnspacing=0.7, handletextpad=0.2, handlelength=1.0)
     style.label(ax, "Frames against formal errors", "", "ratio to formal sigma")
     return ax
 
