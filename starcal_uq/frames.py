@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq._types import FloatArray, IntArray
+from starcal_uq._types import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from starcal_uq.observations import Observations
@@ -76,6 +76,16 @@ class StarFrames:
             r=self.r[:, stars],
             weight=None if self.weight is None else self.weight[stars],
             starts=self.starts[first : last + 1] - self.starts[first],
+        )
+
+    def select(self, mask: BoolArray) -> StarFrames:
+        """The stars of a mask (N,); frames that keep none are left out."""
+        sizes = self.sum(mask.astype(np.float64)).astype(np.int64)
+        return StarFrames(
+            pixel=np.ascontiguousarray(self.pixel[:, mask]),
+            r=np.ascontiguousarray(self.r[:, mask]),
+            weight=None if self.weight is None else self.weight[mask],
+            starts=np.concatenate([[0], np.cumsum(sizes[sizes > 0])]).astype(np.int64),
         )
 
     def parts(self, max_stars: int = 100_000) -> list[tuple[int, int]]:

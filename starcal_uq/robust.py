@@ -91,14 +91,7 @@ def usable_stars(frames: StarFrames, model_name: str, theta: FloatArray) -> Bool
 def subset(frames: StarFrames, kept: BoolArray) -> StarFrames:
     """Some of the stars, without frames that keep fewer than three."""
     enough = frames.spread(frames.sum(kept.astype(np.float64))) >= 3.0
-    mask = kept & enough
-    sizes = frames.sum(mask.astype(np.float64)).astype(np.int64)
-    return StarFrames(
-        pixel=np.ascontiguousarray(frames.pixel[:, mask]),
-        r=np.ascontiguousarray(frames.r[:, mask]),
-        weight=None if frames.weight is None else frames.weight[mask],
-        starts=np.concatenate([[0], np.cumsum(sizes[sizes > 0])]).astype(np.int64),
-    )
+    return frames.select(kept & enough)
 
 
 def robust_start(frames: StarFrames, model_name: str, theta: FloatArray, fit: FitStages) -> RobustStart:

@@ -155,11 +155,11 @@ def star_residuals(frames: StarFrames, model_name: str, theta: FloatArray, in_us
     in_use = in_use & rows
     if not active.any():
         raise CalibrationError("no frame is left with three stars that agree: " + Status.INCONSISTENT.remedy + ".")
-    likelihood = MarginalLikelihood(_part(frames, in_use, counts[active]), model_name)
+    likelihood = MarginalLikelihood(frames.select(in_use), model_name)
     state, cost = likelihood.profile(theta)
     if not np.isfinite(cost):
         raise CalibrationError(f"the stars in use fit no attitude: {Status.INCONSISTENT.remedy}.", Status.INCONSISTENT)
-    seen = _part(frames, rows, frames.sizes[active])
+    seen = frames.select(rows)
     t, residual, offset = _compare(likelihood, state, seen, theta, in_use[rows])
     n = frames.n_stars
     result = np.full((3, n), np.nan)
@@ -167,15 +167,6 @@ def star_residuals(frames: StarFrames, model_name: str, theta: FloatArray, in_us
     frame_cost, frame_count = np.zeros(frames.n_frames), np.where(active, counts, 0)
     frame_cost[active] = likelihood.frames.sum(np.sum(state.e**2, axis=0))
     return StarResiduals(result[0], result[1], result[2], frame_cost, frame_count, in_use, likelihood.dof - len(theta))
-
-
-def _part(frames: StarFrames, mask: BoolArray, counts: IntArray) -> StarFrames:
-    return StarFrames(
-        pixel=frames.pixel[:, mask],
-        r=frames.r[:, mask],
-        weight=None if frames.weight is None else frames.weight[mask],
-        starts=np.concatenate([[0], np.cumsum(counts)]),
-    )
 
 
 def _compare(
