@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -19,14 +20,20 @@ copyright = "2026, The starcal_uq developers"
 version = release = PROJECT["version"]
 
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.mathjax",
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
 ]
 exclude_patterns = ["_build"]
-source_suffix = {".md": "markdown"}
+source_suffix = {".md": "myst-nb", ".ipynb": "myst-nb"}
+# Notebooks are executed on every build, each in a folder of its own; one that fails fails the build.
+nb_execution_mode = "force"
+nb_execution_in_temp = True
+nb_execution_timeout = 300
+nb_execution_raise_on_error = True
+nb_merge_streams = True
 myst_enable_extensions = ["amsmath", "dollarmath"]
 myst_heading_anchors = 2
 
@@ -43,7 +50,20 @@ html_theme = "furo"
 html_title = f"starcal_uq {release}"
 html_static_path: list[str] = []
 
-COMMANDS = ("demo", "simulate", "calibrate", "sample", "coupling", "propagate", "report", "run")
+
+
+def copy_notebooks(_app: object) -> None:
+    """Bring the notebooks where Sphinx looks for them."""
+    for notebook in (HERE.parent / "notebooks").glob("*.ipynb"):
+        (HERE / "notebooks").mkdir(exist_ok=True)
+        shutil.copyfile(notebook, HERE / "notebooks" / notebook.name)
+
+
+def command_names() -> list[str]:
+    """The commands of the command line, in the order of its help."""
+    from starcal_uq.cli import app
+
+    return [str(command.name or command.callback.__name__) for command in app.registered_commands if command.callback]
 
 
 def write_command_help(_app: object) -> None:
@@ -51,7 +71,7 @@ def write_command_help(_app: object) -> None:
     command = str(Path(sys.executable).with_name("starcal-uq"))
     environment = {**os.environ, "COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
     texts = []
-    for arguments in ([], *([name] for name in COMMANDS)):
+    for arguments in ([], *([name] for name in command_names())):
         run = subprocess.run(
             [command, *arguments, "--help"], env=environment, capture_output=True, text=True, check=True
         )
@@ -77,4 +97,5 @@ def escape_formulas(_app: object, _what: str, _name: str, _object: object, _opti
 def setup(app: Any) -> None:
     """Called by Sphinx."""
     app.connect("builder-inited", write_command_help)
+    app.connect("builder-inited", copy_notebooks)
     app.connect("autodoc-process-docstring", escape_formulas, priority=400)  # before napoleon
