@@ -107,17 +107,9 @@ def demo(
     """The experiment of Ye & Yang 2017, end to end, ending in DIR/report.html."""
     from starcal_uq.catalogue import load_catalogue
     from starcal_uq.console import err, show_calibration
-    from starcal_uq.diagnosis import diagnose_run
     from starcal_uq.runfolder import RunFolder
     from starcal_uq.simulation import paper_camera, paper_start, simulate
-    from starcal_uq.steps import (
-        calibrate_step,
-        check_new_run,
-        coupling_step,
-        propagate_step,
-        report_step,
-        sample_step,
-    )
+    from starcal_uq.steps import calibrate_step, check_new_run
 
     run = RunFolder(out)
     check_new_run(run, force)
@@ -128,18 +120,26 @@ def demo(
     )
     err.print("Calibrating from f = 72 mm and the detector's centre ...")
     calibration, _ = calibrate_step(run, obs, paper_start(), force=force)
-    err.print("Sampling the posterior ...")
-    with progress_bar("sampling") as progress:
-        sample_step(run, force=True, progress=progress, seed=seed)
-    err.print("Couplings, attitude error ...")
-    coupling_step(run)
-    propagate_step(run, n_draws=300, seed=seed)
-    err.print("Questioning the model: misfit, jackknife, other distortion models, other starts ...")
-    with progress_bar("diagnosis") as progress:
-        diagnose_run(out, seed=seed, progress=progress)
-    path = report_step(run)
     show_calibration(calibration, truth)
-    _finish(run, path)
+    err.print("Sampling the posterior, couplings, attitude error, then questioning the model ...")
+    _after_calibration(run, seed, 300)
+
+
+def _after_calibration(run: Any, seed: int, draws: int, *, show: bool = False, **sampling: Any) -> None:
+    """Sample, couple, propagate, question the model, report; status 1 when a check failed."""
+    from starcal_uq.console import show_attitude, show_posterior
+    from starcal_uq.diagnosis import diagnose_run
+    from starcal_uq.steps import coupling_step, propagate_step, report_step
+
+    posterior = _sample(run, seed, force=True, **sampling)
+    coupling_step(run)
+    error, _ = propagate_step(run, n_draws=draws, seed=seed)
+    if show:
+        show_posterior(posterior)
+        show_attitude(error)
+    with progress_bar("diagnosis") as progress:
+        diagnose_run(run.path, seed=seed, progress=progress)
+    _finish(run, report_step(run))
 
 
 def _finish(run: Any, report: Path) -> None:
@@ -238,7 +238,18 @@ def sample_command(
     from starcal_uq.console import print_json, records, show_posterior
     from starcal_uq.runfolder import RunFolder
 
-    posterior = _sample(RunFolder(run), seed, sigma, priors, ensembles, walkers, steps, likelihood, evaluation, force)
+    posterior = _sample(
+        RunFolder(run),
+        seed,
+        sigma=sigma,
+        priors=priors,
+        ensembles=ensembles,
+        walkers=walkers,
+        steps=steps,
+        likelihood=likelihood,
+        evaluation=evaluation,
+        force=force,
+    )
     if json:
         print_json({"ok": posterior.diagnostics.ok, "parameters": records(posterior.summary())})
     else:
@@ -250,14 +261,15 @@ def sample_command(
 def _sample(
     run: Any,
     seed: int,
-    sigma: float | None,
-    priors: Path | None,
-    ensembles: int,
-    walkers: int,
-    steps: int,
-    likelihood: str | None,
-    evaluation: str,
-    force: bool,
+    *,
+    sigma: float | None = None,
+    priors: Path | None = None,
+    ensembles: int = 4,
+    walkers: int = 64,
+    steps: int = 200,
+    likelihood: str | None = None,
+    evaluation: str = "auto",
+    force: bool = False,
 ) -> Any:
     import warnings
 
@@ -346,17 +358,9 @@ def run_command(
     force: Force = False,
 ) -> None:
     """Calibrate, sample, couple, propagate and report: everything from OBS to RUN/report.html."""
-    from starcal_uq.console import show_attitude, show_calibration, show_posterior, show_screening
-    from starcal_uq.diagnosis import diagnose_run
+    from starcal_uq.console import show_calibration, show_screening
     from starcal_uq.runfolder import RunFolder
-    from starcal_uq.steps import (
-        calibrate_step,
-        check_new_run,
-        coupling_step,
-        propagate_step,
-        report_step,
-        truth_of,
-    )
+    from starcal_uq.steps import calibrate_step, check_new_run, truth_of
 
     folder = RunFolder(out)
     check_new_run(folder, force)
@@ -367,14 +371,19 @@ def run_command(
     if screening is not None:
         show_screening(screening)
     show_calibration(calibration, truth_of(obs))
-    posterior = _sample(folder, seed, sigma, priors, ensembles, walkers, steps, likelihood, evaluation, True)
-    show_posterior(posterior)
-    coupling_step(folder)
-    error, _ = propagate_step(folder, n_draws=draws, seed=seed)
-    show_attitude(error)
-    with progress_bar("diagnosis") as progress:
-        diagnose_run(out, seed=seed, progress=progress)
-    _finish(folder, report_step(folder))
+    _after_calibration(
+        folder,
+        seed,
+        draws,
+        show=True,
+        sigma=sigma,
+        priors=priors,
+        ensembles=ensembles,
+        walkers=walkers,
+        steps=steps,
+        likelihood=likelihood,
+        evaluation=evaluation,
+    )
 
 
 register(app)
