@@ -10,7 +10,9 @@ import argparse
 import statistics
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
+from pathlib import Path
 from time import perf_counter
 
 import numpy as np
@@ -19,10 +21,13 @@ from rich.table import Table
 
 import starcal_uq as sc
 from starcal_uq.estimation import calibrate
+from starcal_uq.frame_streams import stream_frames
 from starcal_uq.frames import StarFrames
 from starcal_uq.likelihood import MarginalLikelihood
+from starcal_uq.pair_innovations import frame_normals
 from starcal_uq.pairs import PairObjective
 from starcal_uq.projection import forward_kernel, forward_root
+from starcal_uq.recursion_options import RecursionOptions
 
 
 def seconds(run: Callable[[], object], repeats: int) -> float:
@@ -72,6 +77,66 @@ def explicit_pairs(obs: sc.Observations) -> np.ndarray:
     scale = np.linalg.norm(jacobian, axis=0)
     np.linalg.inv((jacobian / scale).T @ (jacobian / scale))
     return theta
+
+
+def explicit_innovations(frames: StarFrames, theta: np.ndarray, count: int) -> np.ndarray:
+    """Information of the first frames on the optics, from explicitly formed pairs and the pseudo-inverse.
+
+    The rival is given the same directions and derivatives; it forms every pair's derivatives with respect to the pixels
+    and the parameters, and the minimum-norm solution by NumPy.
+    """
+    total = np.zeros((3, 3))
+    for k in range(count):
+        frame = frames.part(k, k + 1)
+        objective = PairObjective(frame, "none")
+        b, db = objective.directions(theta, frame)
+        i, j = np.triu_indices(frame.n_stars, 1)
+        rows = np.arange(len(i))
+        by_pixel = np.zeros((len(i), 2, frame.n_stars))
+        for axis in range(2):
+            by_pixel[rows, axis, i] = -np.sum(db[axis][:, i] * b[:, j], axis=0)
+            by_pixel[rows, axis, j] = -np.sum(db[axis][:, j] * b[:, i], axis=0)
+        slopes = np.sum(db[:, :, i] * b[:, j] + db[:, :, j] * b[:, i], axis=1).T
+        reduced = np.linalg.pinv(by_pixel.reshape(len(i), -1), rcond=1e-9) @ slopes
+        total += reduced.T @ reduced
+    return total
+
+
+def add_baselines(table: Table, obs: sc.Observations, efficient: float, repeats: int) -> None:
+    """Rows of the methods that the paper compares itself with, per 1000 frames."""
+    start, thousands = sc.paper_start(), obs.n_frames / 1000.0
+    for label, method, options in (
+        ("least squares, distortion ignored", "least_squares", None),
+        ("Samaan: filter and linear distortion", "samaan", None),
+        ("Griffith: recursive least squares", "griffith", None),
+        ("Griffith with the distortion", "griffith", RecursionOptions(parameters="all")),
+        ("Griffith, pairs as if independent", "griffith", RecursionOptions(pair_covariance="diagonal")),
+    ):
+        time = seconds(lambda m=method, o=options: calibrate(obs, start, method=m, recursion=o), repeats)  # type: ignore[misc]
+        table.add_row(
+            f"{label}, 1000 frames",
+            f"{1e3 * time / thousands:.0f} ms",
+            f"{1e3 * efficient / thousands:.0f} ms",
+            f"{efficient / time:.1f}",
+            "method='efficient'",
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "frames.parquet"
+        obs.save(path)
+        streamed = seconds(lambda: calibrate(stream_frames(path), start, method="griffith"), repeats)
+    table.add_row("Griffith from a file, frame by frame", f"{1e3 * streamed / thousands:.0f} ms", "", "", "")
+    frames, theta, few = StarFrames.from_observations(obs), start.theta[:3], min(100, obs.n_frames)
+    ours = seconds(lambda: frame_normals(frames, "none", theta, np.ones(3)), repeats) / obs.n_frames
+    rival = seconds(lambda: explicit_innovations(frames, theta, few), 3) / few
+    total = np.sum(frame_normals(frames.part(0, few), "none", theta, np.ones(3)).grams, axis=0)[1:, 1:]
+    difference = np.max(np.abs(explicit_innovations(frames, theta, few) / total - 1.0))
+    table.add_row(
+        "a frame's pairs with their full covariance",
+        f"{1e6 * ours:.0f} us",
+        f"{1e6 * rival:.0f} us",
+        f"{rival / ours:.0f}",
+        f"explicit pairs, pseudo-inverse (same to {difference:.0e})",
+    )
 
 
 def import_seconds() -> float:
@@ -135,6 +200,8 @@ def main() -> None:
     )
     whole = seconds(lambda: calibrate(obs, start), options.repeats)
     table.add_row("the same, refined, with compressed likelihood", f"{1e3 * whole:.0f} ms", "", "", "")
+
+    add_baselines(table, obs, whole, options.repeats)
 
     cal = calibrate(obs, start)
     sc.sample(obs, cal, seed=0, n_steps=40)

@@ -51,7 +51,6 @@ html_title = f"starcal_uq {release}"
 html_static_path: list[str] = []
 
 
-
 def copy_notebooks(_app: object) -> None:
     """Bring the notebooks where Sphinx looks for them."""
     for notebook in (HERE.parent / "notebooks").glob("*.ipynb"):

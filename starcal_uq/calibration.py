@@ -13,7 +13,7 @@ from starcal_uq._types import AnyDict, FloatArray, IntArray
 from starcal_uq.camera import Camera
 from starcal_uq.compressed import CompressedLikelihood
 from starcal_uq.distortion import parameters
-from starcal_uq.errors import RunFolderError
+from starcal_uq.errors import CalibrationError, RunFolderError
 from starcal_uq.formatting import decimals_for, fixed
 from starcal_uq.runfolder import atomic_path, atomic_write_text
 from starcal_uq.stages import Stage
@@ -43,7 +43,9 @@ _SCALARS = ("method", "solver", "sigma", "sigma_std", "sigma_name", "chi2", "dof
 class Calibration:
     """Optics and distortion estimated from star observations.
 
-    p is the number of parameters, K of frames, N of stars.
+    p is the number of parameters, K of frames, N of stars. A recursive method that was given a stream of frames has
+    kept none of them: its `frame_ids`, `quaternions` and `residuals_px` are empty, `chi2` and `compressed` are those of
+    the linearised frames, and `n_stars` and `n_frames` count what went by.
 
     Attributes
     ----------
@@ -52,9 +54,9 @@ class Calibration:
     nominal : Camera
         The start.
     method : str
-        ``efficient`` or ``three_stage``.
+        ``efficient``, ``three_stage``, ``least_squares``, ``samaan`` or ``griffith``.
     solver : str
-        ``lm``, ``minpack`` or ``ipopt``.
+        ``lm``, ``minpack``, ``ipopt``, or ``filter`` for the recursive methods.
     theta : (p,) array
         Estimate in px units, order x0, y0, f, k...
     covariance : (p, p) array
@@ -86,7 +88,7 @@ class Calibration:
     attitude_noise : (3, 3) array
         Mean over frames of the attitude covariance due to centroid noise, rad^2.
     pair_theta : (p,) array
-        Estimate of stage 3, the paper's.
+        Estimate from interstar angles: that of stage 3, the paper's, or of the method itself where it has no other.
     pair_covariance : (p, p) array
         Its sandwich (Godambe) covariance.
     compressed : CompressedLikelihood
@@ -138,12 +140,17 @@ class Calibration:
     @property
     def n_stars(self) -> int:
         """Number of stars."""
-        return len(self.residuals_px)
+        return len(self.residuals_px) or self.compressed.n_stars
 
     @property
     def n_frames(self) -> int:
         """Number of frames."""
-        return len(self.frame_ids)
+        return len(self.frame_ids) or self.compressed.n_frames
+
+    @property
+    def has_residuals(self) -> bool:
+        """False for the result of a stream, whose stars are gone."""
+        return len(self.residuals_px) > 0
 
     def to_dataframe(self) -> pd.DataFrame:
         """One row per parameter: start, estimate, sigma and unit; the noise is the last row."""
@@ -196,6 +203,10 @@ class Calibration:
 
     def plot_residuals(self, obs: Observations, **options: Any) -> Any:
         """Residuals over the field, against radius, and against a Gaussian; returns the matplotlib Figure."""
+        if not self.has_residuals:
+            raise CalibrationError(
+                "this calibration comes from a stream of frames and kept no residuals: calibrate loaded observations."
+            )
         from starcal_uq.plots import plot_residuals
 
         return plot_residuals(self, obs, **options)
@@ -220,6 +231,8 @@ class Calibration:
         stages = []
         for index, stage in enumerate(self.stages):
             arrays[f"stage{index}_trajectory"], arrays[f"stage{index}_cost"] = stage.trajectory, stage.cost
+            if stage.sigmas is not None:
+                arrays[f"stage{index}_sigmas"] = stage.sigmas
             stages.append(
                 {
                     "name": stage.name,
@@ -264,6 +277,7 @@ class Calibration:
                     status=Status[stage["status"]],
                     evaluations=stage["evaluations"],
                     seconds=stage["seconds"],
+                    sigmas=arrays.get(f"stage{index}_sigmas"),
                 )
                 for index, stage in enumerate(document["stages"])
             )

@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
+from starcal_uq.cli_filter import register as register_filter
 from starcal_uq.cli_options import (
     CameraFile,
     Columns,
@@ -38,7 +39,8 @@ from starcal_uq.cli_options import (
     parse_columns,
     parse_velocity,
 )
-from starcal_uq.cli_statistics import register
+from starcal_uq.cli_paper import register as register_paper
+from starcal_uq.cli_statistics import register as register_statistics
 from starcal_uq.errors import StarcalError
 from starcal_uq.progress import progress_bar
 
@@ -386,7 +388,9 @@ def run_command(
     )
 
 
-register(app)
+register_filter(app)
+register_statistics(app)
+register_paper(app)
 
 
 def main() -> None:
@@ -403,7 +407,7 @@ def main() -> None:
     except StarcalError as error:
         _fail(str(error), 2)
     except (typer.Abort, KeyboardInterrupt):
-        _fail("interrupted; what was complete is kept, and `starcal-uq sample RUN` goes on where it stopped.", 1)
+        _fail("interrupted; what was complete is kept, and `sample` and `filter` go on where they stopped.", 1)
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
         _fail(f"{place}{error.strerror or error}; check the path, its permissions and the space on the disk.", 2)

@@ -29,7 +29,8 @@ Seed = Annotated[int, typer.Option(help="Seed; the same seed repeats the result 
 Method = Annotated[
     str,
     typer.Option(
-        help="efficient (three stages, then the attitude-marginalised likelihood) or three_stage (Ye & Yang 2017)."
+        help="efficient (three stages, then the attitude-marginalised likelihood), three_stage (Ye & Yang 2017), or a "
+        "baseline: least_squares, samaan (Kalman filter), griffith (recursive least squares)."
     ),
 ]
 Solver = Annotated[str, typer.Option(help="lm, minpack, or ipopt (keeps the optics within physical bounds).")]

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
 
 import numpy as np
 
-from starcal_uq._types import FloatArray
+from starcal_uq.assembly import IMPLAUSIBLE_NOISE, assemble, check_camera, noise_px
 from starcal_uq.attitude import rotation_to_quaternion
+from starcal_uq.baselines import check_count, least_squares, recursive
 from starcal_uq.calibration import Calibration
 from starcal_uq.camera import Camera
-from starcal_uq.compressed import compress
 from starcal_uq.distortion import sigma_parameter
 from starcal_uq.errors import CalibrationError
 from starcal_uq.frames import StarFrames
 from starcal_uq.likelihood import MarginalLikelihood
+from starcal_uq.observations import Observations
 from starcal_uq.pairs import PairObjective
-from starcal_uq.projection import fold_radius_px
+from starcal_uq.recursion_options import RECURSIVE_METHODS, RecursionOptions
+from starcal_uq.recursive_calibration import raise_unless_good
 from starcal_uq.robust import compress_reweighted, refine, robust_start
 from starcal_uq.runfolder import provenance
 from starcal_uq.solvers import is_singular
@@ -24,20 +26,15 @@ from starcal_uq.stages import Stage, distortion_stage, joint_stage, optics_stage
 from starcal_uq.status import Status
 from starcal_uq.student import parse_dof
 
-if TYPE_CHECKING:
-    from starcal_uq.observations import Observations
-
-METHODS = ("efficient", "three_stage")
+METHODS = ("efficient", "three_stage", "least_squares", "samaan", "griffith")
 LIKELIHOODS = ("marginal", "student_t")
 SOLVERS = ("lm", "minpack", "ipopt")
 # Stage 1 that moves the principal point by more than this fraction of the width has met strong distortion.
 _FAR = 0.05
-# Noise above this fraction of the detector's width means that the stars are not the ones they are said to be.
-_IMPLAUSIBLE_NOISE = 0.01
 
 
 def calibrate(
-    obs: Observations,
+    obs: Observations | Iterable[Observations],
     camera: Camera,
     *,
     method: str = "efficient",
@@ -46,23 +43,31 @@ def calibrate(
     throw: bool = True,
     likelihood: str = "marginal",
     dof: float | str | None = None,
+    recursion: RecursionOptions | None = None,
 ) -> Calibration:
     """Estimate optics and distortion from identified stars.
 
     Parameters
     ----------
-    obs : Observations
-        Stars with pixel positions and catalogue directions; at least three per frame.
+    obs : Observations or iterable of Observations
+        Stars with pixel positions and catalogue directions; at least three per frame. The recursive methods also take
+        a stream: any iterable of Observations of one or several frames, such as `stream_frames`. They keep none of
+        them, so that the result has no residuals and attitudes.
     camera : Camera
         Start values; its `distortion` names the model. The coefficients start from zero, as in the paper.
-    method : {"efficient", "three_stage"}
+    method : {"efficient", "three_stage", "least_squares", "samaan", "griffith"}
         ``three_stage`` is Ye & Yang 2017: interstar angles without distortion, linear distortion, interstar angles with
         both; its covariance is the sandwich of composite likelihood. ``efficient`` goes on to the
-        attitude-marginalised likelihood, whose covariance is the Cramer-Rao bound.
+        attitude-marginalised likelihood, whose covariance is the Cramer-Rao bound. The others are what the paper
+        compares itself with: ``least_squares`` fits the optics to interstar angles as if there were no distortion, and
+        its result's model is ``none``; ``samaan`` filters the optics frame by frame from the least-squares solution of
+        the first frames, and fits the distortion linearly afterwards; ``griffith`` is recursive least squares from the
+        start values, for the optics alone (model ``none``) unless `recursion` says otherwise. Their covariances are the
+        spread over repeated data sets; the bias from the distortion that they ignore is not in them.
     solver : {"lm", "minpack", "ipopt"}
         Levenberg-Marquardt on normal equations, MINPACK on explicit pairs (where there are at most 500,000 of them), or
         IPOPT with the principal point kept on the detector, f > 0 and the distortion monotonic. The refinement always
-        uses the first.
+        uses the first; the recursive methods use none.
     max_iterations : int
         Limit for each stage.
     throw : bool
@@ -76,6 +81,8 @@ def calibrate(
     dof : float or "free", optional
         Degrees of freedom of ``student_t``, 2 to 200, by default 4; "free" estimates them, with the gamma prior of
         Juarez & Steel (2010) on what exceeds 2.
+    recursion : RecursionOptions, optional
+        Options of ``samaan`` and ``griffith``.
 
     Returns
     -------
@@ -100,24 +107,26 @@ def calibrate(
         raise CalibrationError(
             f"method {method!r} has no Student-t likelihood: use method='efficient', or likelihood='marginal'."
         )
-    frames = StarFrames.from_observations(obs)
-    gaussian = MarginalLikelihood(frames, camera.distortion)
-    p = len(camera.theta)
-    if gaussian.dof <= p:
+    if recursion is not None and method not in RECURSIVE_METHODS:
+        raise CalibrationError(f"method {method!r} is not recursive: leave recursion out, or use samaan or griffith.")
+    if method in RECURSIVE_METHODS:
+        calibration = recursive(obs, camera, method, recursion)
+    elif not isinstance(obs, Observations):
         raise CalibrationError(
-            f"{frames.n_stars} stars in {frames.n_frames} frames give {gaussian.dof} independent numbers for {p} "
-            "parameters and the noise: add stars or frames, or choose a distortion model with fewer coefficients.",
-            Status.SINGULAR,
+            f"method {method!r} needs all frames at once, as Observations: load them, or use samaan or griffith."
         )
-    if likelihood == "student_t":
-        calibration = _robust(obs, camera, frames, solver, max_iterations, nu)
+    elif method == "least_squares":
+        calibration = least_squares(obs, camera, solver, max_iterations)
     else:
-        calibration = _gaussian(obs, camera, gaussian, method, solver, max_iterations)
-    if throw and not calibration.status.ok:
-        raise CalibrationError(
-            f"the calibration did not end well ({calibration.status.name}): {calibration.status.remedy}.",
-            calibration.status,
-        )
+        frames = StarFrames.from_observations(obs)
+        gaussian = MarginalLikelihood(frames, camera.distortion)
+        check_count(gaussian, camera)
+        if likelihood == "student_t":
+            calibration = _robust(obs, camera, frames, solver, max_iterations, nu)
+        else:
+            calibration = _gaussian(obs, camera, gaussian, method, solver, max_iterations)
+    if throw:
+        raise_unless_good(calibration.status)
     return calibration
 
 
@@ -131,13 +140,13 @@ def _gaussian(
     status = stages[-1].status
     if status.ok:
         likelihood.use_rotations(likelihood.start_rotations(pair_theta))
-        if _noise_px(likelihood, pair_theta) > _IMPLAUSIBLE_NOISE * camera.width_px:
+        if noise_px(likelihood, pair_theta) > IMPLAUSIBLE_NOISE * camera.width_px:
             # Interstar angles do not see a mirror, nor does their noise show a few wrong stars; positions do.
             status = Status.INCONSISTENT
         elif method == "efficient":
             stages.append(refinement_stage(likelihood, pair_theta, max_iterations))
             status = stages[-1].status
-    return _assemble(obs, camera, method, solver, likelihood, stages, status, pair_theta, pair_covariance)
+    return assemble(obs, camera, method, solver, likelihood, stages, status, pair_theta, pair_covariance)
 
 
 def _robust(
@@ -176,7 +185,7 @@ def _robust(
         sigma_std=found.sigma_std,
         sigma_name=sigma_parameter(weight is not None).name,
         stages=(*start.stages, found.stage),
-        status=_check(result, status),
+        status=check_camera(result, status),
         frame_ids=obs.frame_ids,
         quaternions=rotation_to_quaternion(state.rotations),
         residuals_px=residuals.T,
@@ -213,93 +222,3 @@ def _badness(stage: Stage) -> tuple[bool, float]:
     """Converged before not, then by cost."""
     cost = float(stage.cost[-1])
     return not stage.status.ok, cost if np.isfinite(cost) else float("inf")
-
-
-def _noise_px(likelihood: MarginalLikelihood, theta: FloatArray) -> float:
-    """Root mean square of the residuals per axis, px; infinite when the model is not finite."""
-    state, cost = likelihood.profile(theta)
-    if not np.isfinite(cost):
-        return float("inf")
-    weight = likelihood.frames.weight
-    return float(np.sqrt(np.mean((state.e if weight is None else state.e / weight) ** 2)))
-
-
-def _check(camera: Camera, status: Status) -> Status:
-    if not status.ok:
-        return status
-    x0, y0 = camera.theta[:2]
-    if not (-0.5 <= x0 <= camera.width_px - 0.5 and -0.5 <= y0 <= camera.height_px - 0.5):
-        return Status.OUTSIDE_DETECTOR
-    if fold_radius_px(camera.distortion, camera.theta, camera.corner_radius_px) <= camera.corner_radius_px:
-        return Status.FOLDED
-    return status
-
-
-def _assemble(
-    obs: Observations,
-    nominal: Camera,
-    method: str,
-    solver: str,
-    likelihood: MarginalLikelihood,
-    stages: list[Stage],
-    status: Status,
-    pair_theta: FloatArray,
-    pair_covariance: FloatArray,
-) -> Calibration:
-    """Covariance, noise, residuals and the compressed likelihood at the estimate."""
-    theta = stages[-1].theta
-    refined = stages[-1].name == "refinement"
-    p = len(theta)
-    if not status.ok and not np.isfinite(_noise_px(likelihood, theta)):
-        raise CalibrationError(f"the calibration failed ({status.name}): {status.remedy}.", status)
-    normal = likelihood.evaluate(theta)
-    if not np.isfinite(normal.cost) or is_singular(normal.matrix):
-        reason = status if not status.ok else Status.SINGULAR if np.isfinite(normal.cost) else Status.NOT_FINITE
-        raise CalibrationError(f"the calibration failed ({reason.name}): {reason.remedy}.", reason)
-    dof = likelihood.dof - p
-    sigma = float(np.sqrt(normal.cost / dof))
-    efficient = _scaled_inverse(normal.matrix) * sigma**2
-    compressed = compress(likelihood, theta, efficient, likelihood.rotations_at(theta))
-    if refined:
-        # The rotation-volume term of the likelihood moves its maximum by about 0.01 sigma: one Newton step.
-        theta = theta - 0.5 * compressed.whitening @ compressed.log_determinant_slope
-    state, cost = likelihood.profile(theta, likelihood.rotations_at(theta))
-    response = likelihood.attitude_response(state, likelihood.derivatives(theta, state))
-    weight = likelihood.frames.weight
-    camera = nominal.with_theta(theta)
-    residuals = state.e if weight is None else state.e / weight
-    return Calibration(
-        camera=camera,
-        nominal=nominal,
-        method=method,
-        solver=solver,
-        theta=theta,
-        covariance=efficient if refined else pair_covariance,
-        sigma=sigma,
-        sigma_std=sigma / float(np.sqrt(2.0 * dof)),
-        sigma_name=sigma_parameter(weight is not None).name,
-        stages=tuple(stages),
-        status=_check(camera, status),
-        frame_ids=obs.frame_ids,
-        quaternions=rotation_to_quaternion(state.rotations),
-        residuals_px=residuals.T,
-        chi2=cost,
-        dof=dof,
-        information=normal.matrix / sigma**2,
-        rotation_per_theta=-np.mean(response, axis=2).T,
-        attitude_noise=np.mean(state.inverse, axis=2) * sigma**2,
-        pair_theta=pair_theta,
-        pair_covariance=pair_covariance,
-        compressed=compressed,
-        provenance=provenance(
-            None,
-            {"method": method, "solver": solver, "distortion": nominal.distortion},
-            obs.data_hash,
-        ),
-    )
-
-
-def _scaled_inverse(matrix: FloatArray) -> FloatArray:
-    scale = 1.0 / np.sqrt(np.diag(matrix))
-    inverse: FloatArray = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
-    return inverse

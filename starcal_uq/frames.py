@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -43,6 +44,21 @@ class StarFrames:
             r=np.ascontiguousarray(obs.directions_icrs.T),
             weight=None if obs.sigma_px is None else 1.0 / obs.sigma_px,
             starts=obs.frame_starts,
+        )
+
+    @classmethod
+    def joined(cls, pieces: Sequence[StarFrames]) -> StarFrames:
+        """The frames of several pieces, one after the other; all or none of them have weights."""
+        if len(pieces) == 1:
+            return pieces[0]
+        offsets = np.cumsum([0, *(piece.n_stars for piece in pieces)])
+        weights = [piece.weight for piece in pieces if piece.weight is not None]
+        starts = [piece.starts[:-1] + offset for piece, offset in zip(pieces, offsets[:-1], strict=True)]
+        return cls(
+            pixel=np.concatenate([piece.pixel for piece in pieces], axis=1),
+            r=np.concatenate([piece.r for piece in pieces], axis=1),
+            weight=np.concatenate(weights) if len(weights) == len(pieces) else None,
+            starts=np.concatenate([*starts, offsets[-1:]]),
         )
 
     @property

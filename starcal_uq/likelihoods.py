@@ -9,7 +9,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -126,10 +126,37 @@ def find_source(
     if not isinstance(likelihood, str):
         at = (cal.theta, cal.information, cal.sigma, float(cal.dof))
         return Source(label_of(likelihood), *at, exact=likelihood.log_likelihood, fast=None)
+    source = _named_source(likelihood, obs, cal, dof)
+    if (ignored := _settings(cal).get("ignored_distortion")) is None:
+        return source
+    failure = (
+        f"The method {cal.method!r} ignores the distortion (model {ignored!r} was given): this posterior is that of a "
+        "camera without any, and neither its centre nor its width holds otherwise; use method='efficient'."
+    )
+    return replace(source, failures=(*source.failures, failure))
+
+
+def _named_source(likelihood: str, obs: Observations | None, cal: Calibration, dof: float | str | None) -> Source:
+    settings = _settings(cal)
+    if obs is None and settings.get("stream") and settings.get("method") == "samaan":
+        raise SamplingError(
+            "a stream leaves only the quadratic likelihood around the estimate, and samaan's is far from its maximum: "
+            "give obs, or calibrate with method='griffith' and parameters='all'."
+        )
     if likelihood == "marginal":
         return _marginal(obs, cal)
     if obs is None:
         raise SamplingError(f"the likelihood {likelihood!r} needs the observations: give obs.")
+    if not cal.has_residuals:
+        raise SamplingError(
+            f"the likelihood {likelihood!r} needs the attitudes and residuals of every frame, which a stream does not "
+            "keep: calibrate the table with method='efficient', or use likelihood='marginal'."
+        )
+    if likelihood != "student_t" and settings.get("method") in ("samaan", "griffith"):
+        raise SamplingError(
+            f"the likelihood {likelihood!r} has its maximum at the least-squares estimate over pairs, which method "
+            f"{settings['method']!r} does not find: calibrate with method='three_stage'."
+        )
     if likelihood == "student_t":
         return _student(obs, cal, dof)
     return _pairs(obs, cal, adjusted=likelihood == "pairs")
@@ -202,7 +229,7 @@ def _pairs(obs: Observations, cal: Calibration, adjusted: bool) -> Source:
             f"The {found.n_pairs} pairs of stars are treated as independent (pairs_naive): the intervals are about "
             f"{found.narrowness:.1f} times too narrow and must not be used; use likelihood='pairs' or 'marginal'."
         )
-        warnings.warn(failure, NaivePairsWarning, stacklevel=4)
+        warnings.warn(failure, NaivePairsWarning, stacklevel=5)
         failures, notes = (failure,), ()
     return Source(
         name="pairs" if adjusted else "pairs_naive",

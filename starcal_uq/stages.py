@@ -34,17 +34,21 @@ class Stage:
     Attributes
     ----------
     name : str
-        ``optics``, ``distortion``, ``all`` (the paper's three) or ``refinement``.
+        ``optics``, ``distortion``, ``all`` (the paper's three), ``refinement``, or ``filter`` (recursive methods).
     trajectory : (n, p) array
-        Estimates after each iteration, px units, the start first.
+        Estimates after each iteration, px units, the start first; of a filter, after each frame.
     cost : (n,) array
-        The stage's own cost along the trajectory: rad^2 over pairs, px^2 in the linear stage and the refinement.
+        The stage's own cost along the trajectory: rad^2 over pairs, px^2 in the linear stage and the refinement; of a
+        filter, the sum of its whitened innovations so far, px^2 (or in units of the stated noise).
     status : Status
         How it ended.
     evaluations : int
         Evaluations of the model.
     seconds : float
         Wall time.
+    sigmas : (n, p) array or None
+        Of a filter, the standard deviations that it claims after each frame, px units; zero where a parameter is not
+        estimated.
     """
 
     name: str
@@ -53,6 +57,7 @@ class Stage:
     status: Status
     evaluations: int
     seconds: float
+    sigmas: FloatArray | None = None
 
     @property
     def theta(self) -> FloatArray:

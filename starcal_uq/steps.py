@@ -166,9 +166,7 @@ def load_run(run: RunFolder) -> tuple[Observations, Calibration]:
 def sample_step(run: RunFolder, *, force: bool, progress: Progress | None = None, **options: Any) -> Posterior:
     """Sample the posterior of a calibrated run and write it; an interrupted run goes on from its checkpoint."""
     calibration = Calibration.load(run.require("calibration"))
-    # A merged run may have no stars of its own; its compressed likelihood is all that sampling needs.
-    merged = calibration.provenance.get("merge", {})
-    obs = None if merged.get("has_observations") is False else load_run(run)[0]
+    obs = load_run(run)[0] if _has_observations(calibration) else None
     ensure_new(run.posterior, force)
     from starcal_uq.sampler import sample
 
@@ -183,6 +181,12 @@ def sample_step(run: RunFolder, *, force: bool, progress: Progress | None = None
     return posterior
 
 
+def _has_observations(calibration: Calibration) -> bool:
+    """Merged runs may have no stars of their own, streams have none; sampling needs only the compressed likelihood."""
+    record = calibration.provenance
+    return record.get("merge", {}).get("has_observations") is not False and not record["settings"].get("stream", False)
+
+
 def load_posterior(run: RunFolder) -> Posterior:
     """Posterior of a sampled run."""
     from starcal_uq.posterior import Posterior
@@ -194,7 +198,7 @@ def coupling_step(run: RunFolder) -> Coupling:
     """Analyse the couplings of the posterior, or of the calibration where there is no posterior yet."""
     from starcal_uq.couplings import coupling
 
-    result = load_posterior(run) if run.posterior.exists() else load_run(run)[1]
+    result = load_posterior(run) if run.posterior.exists() else Calibration.load(run.require("calibration"))
     found = coupling(result)
     with atomic_path(run.coupling) as temporary:
         found.to_dataframe().to_csv(temporary, index=False)
@@ -214,6 +218,11 @@ def read_priors(run: RunFolder, path: Path) -> Priors:
 def propagate_step(run: RunFolder, *, n_draws: int, seed: int) -> tuple[AttitudeError, FieldMap]:
     """Carry the posterior through QUEST on the observed frames, and over the field; write both."""
     posterior = load_posterior(run)
+    if not _has_observations(Calibration.load(run.require("calibration"))) and not run.observations.exists():
+        raise RunFolderError(
+            f"{run.path}: holds no observations, so that there are no frames to propagate to: calibrate a table that "
+            "fits into memory with `starcal-uq calibrate`."
+        )
     obs, _ = load_run(run)
     from starcal_uq.fieldmap import field_map
     from starcal_uq.propagation import propagate

@@ -9,6 +9,7 @@ from __future__ import annotations
 from starcal_uq.plots.attitude import plot_attitude, plot_field_map
 from starcal_uq.plots.convergence import plot_convergence
 from starcal_uq.plots.corner import plot_corner
+from starcal_uq.plots.interaction import plot_interaction
 from starcal_uq.plots.matrix import plot_correlation, plot_correlations, plot_couplings
 from starcal_uq.plots.misfit import (
     plot_comparison,
@@ -17,7 +18,9 @@ from starcal_uq.plots.misfit import (
     plot_misfit,
     plot_residual_profiles,
 )
+from starcal_uq.plots.paper import plot_error_fields, plot_printed_numbers, plot_trajectories
 from starcal_uq.plots.prior import plot_prior_posterior
+from starcal_uq.plots.replicates import plot_replicates
 from starcal_uq.plots.residuals import plot_residual_histogram, plot_residual_map, plot_residual_radius, plot_residuals
 from starcal_uq.plots.style import figure_of, png_bytes
 from starcal_uq.plots.validation import plot_validation
@@ -32,15 +35,20 @@ __all__ = [
     "plot_correlations",
     "plot_couplings",
     "plot_diagnosis",
+    "plot_error_fields",
     "plot_field_map",
+    "plot_interaction",
     "plot_jackknife",
     "plot_misfit",
+    "plot_printed_numbers",
     "plot_prior_posterior",
+    "plot_replicates",
     "plot_residual_histogram",
     "plot_residual_map",
     "plot_residual_profiles",
     "plot_residual_radius",
     "plot_residuals",
+    "plot_trajectories",
     "plot_validation",
     "png_bytes",
 ]

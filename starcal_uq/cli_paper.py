@@ -1,0 +1,77 @@
+"""The command that runs the paper again: reproduce."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from starcal_uq.cli_options import Force, Json, Seed
+from starcal_uq.progress import progress_bar
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the command line."""
+    app.command("reproduce")(reproduce_command)
+
+
+def reproduce_command(
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for report, tables and figures.")],
+    replicates: Annotated[
+        int, typer.Option(min=3, help="Repetitions of the experiment, each with its own seed.")
+    ] = 200,
+    frames: Annotated[int, typer.Option(min=20, help="Frames in each.")] = 1000,
+    convention: Annotated[
+        str, typer.Option(help="eq14 (ideal to distorted, as everybody's models) or eq6 (distorted to ideal).")
+    ] = "eq14",
+    study: Annotated[bool, typer.Option(help="Also study the interaction of optics and distortion.")] = True,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as processors by default.")] = None,
+    seed: Seed = 2017,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Run Ye & Yang 2017 again: each of its numbers beside ours, with the uncertainty that they lack."""
+    from starcal_uq.console import out as console
+    from starcal_uq.console import print_json, records, show_table
+    from starcal_uq.reproduction import reproduce
+    from starcal_uq.simulation import CONVENTIONS
+
+    if convention not in CONVENTIONS:
+        raise typer.BadParameter(f"--convention {convention!r} is unknown: use one of {', '.join(CONVENTIONS)}.")
+    with progress_bar("reproduction") as progress:
+        found = reproduce(
+            out,
+            n_replicates=replicates,
+            n_frames=frames,
+            seed=seed,
+            convention=convention,
+            workers=workers,
+            progress=progress,
+            study=study,
+            force=force,
+        )
+    published = found.published()
+    if json:
+        print_json({"verdict": found.verdict, "published": records(published)})
+    else:
+        show_table(_readable(published), "What the paper prints, and what comes out over seeds")
+        console.print(found.verdict, highlight=False, soft_wrap=True)
+        print(f"Report: {found.report.resolve()}")
+
+
+def _readable(published: pd.DataFrame) -> pd.DataFrame:
+    """The columns that fit a terminal, each number with the digits that its spread leaves it."""
+    from starcal_uq.formatting import significant, with_sigma
+
+    table = published[["place", "method", "quantity", "printed"]].copy()
+    table["ours"] = [
+        f"{with_sigma(mean, spread)} ± {significant(spread)}"
+        for mean, spread in zip(published["main_mean"], published["main_spread"], strict=True)
+    ]
+    table["z"] = published["main_z"]
+    table["outcome"] = published["outcome"]
+    return table

@@ -1,0 +1,125 @@
+"""What Ye & Yang (2017) print about their simulated experiment, each number once and with its place.
+
+Ye Tao, Yang Fei: "Autonomous calibration of star sensors based on nonlinear optimization algorithm", Optics and
+Precision Engineering 25(9), 2483-2489, doi 10.3788/OPE.20172509.2483. Numbers are kept as printed: how many digits an
+author gives is part of what is claimed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from decimal import Decimal
+
+LEAST_SQUARES, SAMAAN, PROPOSED = "least_squares", "samaan", "three_stage"
+# Rows of their Table 2, in order, as methods of `calibrate`.
+PAPER_METHODS = (LEAST_SQUARES, SAMAAN, PROPOSED)
+# Error sizes: never negative, and compared on a logarithmic scale.
+ERROR_SIZES = ("reprojection_px", "max_residual_px", "y0_error_px")
+
+
+@dataclass(frozen=True)
+class Printed:
+    """A number of the paper.
+
+    Attributes
+    ----------
+    method : str
+        The method it belongs to, by its name in `calibrate`.
+    quantity : str
+        ``f_mm``, ``x0_px``, ``y0_px``, ``k1``, ``k2`` (px^-2, px^-4), ``reprojection_px``, ``max_residual_px`` or
+        ``y0_error_px``.
+    text : str
+        As printed.
+    place : str
+        Where.
+    """
+
+    method: str
+    quantity: str
+    text: str
+    place: str
+
+    @property
+    def value(self) -> float:
+        """The number."""
+        return float(self.text)
+
+    @property
+    def unit_in_last_place(self) -> float:
+        """Place value of the last digit printed."""
+        return float(Decimal(1).scaleb(int(Decimal(self.text).as_tuple().exponent)))
+
+    @property
+    def is_error_size(self) -> bool:
+        """Whether it is the size of an error, which cannot be negative."""
+        return self.quantity in ERROR_SIZES
+
+
+def _row(method: str, place: str, **values: str) -> tuple[Printed, ...]:
+    return tuple(Printed(method, quantity, text, place) for quantity, text in values.items())
+
+
+TABLE_2: tuple[Printed, ...] = (
+    *_row(LEAST_SQUARES, "Table 2, row 1", f_mm="70.2122", x0_px="500.09", y0_px="527.70", reprojection_px="0.0567"),
+    *_row(
+        SAMAAN,
+        "Table 2, row 2",
+        f_mm="70.2293",
+        x0_px="500.18",
+        y0_px="531.23",
+        k1="2.76e-10",
+        k2="-1.88e-15",
+        reprojection_px="0.0379",
+    ),
+    *_row(
+        PROPOSED,
+        "Table 2, row 3",
+        f_mm="70.2259",
+        x0_px="500.03",
+        y0_px="530.09",
+        k1="2.14e-10",
+        k2="-3.56e-15",
+        reprojection_px="0.0038",
+    ),
+)
+SECTION_3_2: tuple[Printed, ...] = (Printed(PROPOSED, "y0_error_px", "0.13", "section 3.2"),)
+SECTION_3_3: tuple[Printed, ...] = (
+    *_row(SAMAAN, "section 3.3", k1="3.09e-10", k2="-1.23e-15"),
+    *_row(PROPOSED, "section 3.3", k1="1.732e-10", k2="-3.449e-15"),
+    Printed(LEAST_SQUARES, "max_residual_px", "0.81", "section 3.3, Fig. 4"),
+    Printed(SAMAAN, "max_residual_px", "0.12", "section 3.3, Fig. 5"),
+    Printed(PROPOSED, "max_residual_px", "0.015", "section 3.3, Fig. 6; abstract; conclusion"),
+)
+PUBLISHED: tuple[Printed, ...] = (*TABLE_2, *SECTION_3_2, *SECTION_3_3)
+
+# Table 1 and section 3: what was simulated. Sections 3.2 and 3.3: where the estimation starts.
+TRUTH = {
+    "width_px": 1024,
+    "height_px": 1024,
+    "pixel_um": 12.0,
+    "focal_mm": 70.2262,
+    "x0_px": 500.0,
+    "y0_px": 530.0,
+    "k1": 2.0e-10,
+    "k2": -3.5e-15,
+}
+START = {"focal_mm": 72.0, "x0_px": 512.0, "y0_px": 512.0}
+N_FRAMES, MIN_STARS, SIGMA_PX, MAX_MAG, N_STARS = 1000, 10, 0.05, 6.0, 5103
+# "Two orders of magnitude" more precise than the other methods: abstract, section 3.3, conclusion.
+CLAIMED_RATIO = 100.0
+# The error of y0 of both other methods "exceeds 2 to 3 pixels": section 3.2.
+CLAIMED_Y0_ERROR_PX = (2.0, 3.0)
+
+
+def printed(method: str, quantity: str, place: str = "") -> Printed:
+    """The printed number of a method and quantity; the first whose place starts as given.
+
+    Raises
+    ------
+    KeyError
+        Where the paper prints none.
+    """
+    for number in PUBLISHED:
+        if (number.method, number.quantity) == (method, quantity) and number.place.startswith(place):
+            return number
+    raise KeyError(f"the paper prints no {quantity} of {method}{' in ' + place if place else ''}.")
