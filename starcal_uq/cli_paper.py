@@ -22,7 +22,7 @@ def register(app: typer.Typer) -> None:
 def reproduce_command(
     out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for report, tables and figures.")],
     replicates: Annotated[
-        int, typer.Option(min=3, help="Repetitions of the experiment, each with its own seed.")
+        int, typer.Option(min=8, help="Repetitions of the experiment, each with its own seed.")
     ] = 200,
     frames: Annotated[int, typer.Option(min=20, help="Frames in each.")] = 1000,
     convention: Annotated[

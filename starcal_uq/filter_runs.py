@@ -7,7 +7,7 @@ estimates after every frame.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -88,10 +88,15 @@ def filter_run(
         raise RunFolderError(
             f"{run.path}: the folder exists and is not empty; name another, or replace its results with --force."
         )
-    run.create()
-    atomic_write_text(run.path / SOURCE, json.dumps(identity) + "\n")
-    _feed(filtering, stream, state)
+
+    def keep() -> None:
+        run.create()
+        atomic_write_text(run.path / SOURCE, json.dumps(identity) + "\n")
+        filtering.save(state)
+
+    _feed(filtering, stream, keep)
     calibration = filtering.result()
+    run.create()
     camera.save(run.camera, force=True)
     calibration.save(run.calibration)
     with atomic_path(run.path / HISTORY) as temporary:
@@ -101,8 +106,8 @@ def filter_run(
     return calibration
 
 
-def _feed(filtering: RecursiveCalibration, stream: FrameStream, state: Path) -> None:
-    """Give the filter the frames that it has not seen."""
+def _feed(filtering: RecursiveCalibration, stream: FrameStream, keep: Callable[[], None]) -> None:
+    """Give the filter the frames that it has not seen; `keep` saves its state."""
     frames = iter(stream)
     next(islice(frames, filtering.n_frames, filtering.n_frames), None)
     saved = filtering.n_frames
@@ -113,10 +118,10 @@ def _feed(filtering: RecursiveCalibration, stream: FrameStream, state: Path) -> 
                 if index % _CHUNK == 0:
                     check()
                 if filtering.n_frames - saved >= _SAVE_EVERY:
-                    filtering.save(state)
+                    keep()
                     saved = filtering.n_frames
         except KeyboardInterrupt:
-            filtering.save(state)
+            keep()
             raise
 
 
