@@ -70,6 +70,24 @@ def earth_velocity_km_s(time_utc: Any) -> FloatArray:
     return velocity[0] if np.ndim(time_utc) == 0 else velocity
 
 
+def julian_year(time_utc: Any) -> float:
+    """Mean of some UTC times as a Julian year, for the epoch of a catalogue.
+
+    Parameters
+    ----------
+    time_utc
+        As for `earth_velocity_km_s`.
+
+    Raises
+    ------
+    CatalogueError
+        As `earth_velocity_km_s`.
+    """
+    times = np.atleast_1d(np.asarray(time_utc))
+    days = [sum(_terrestrial_time(str(text), times)) for text in times.astype(str)]
+    return float(2000.0 + (np.mean(days) - 2451545.0) / 365.25)
+
+
 def aberrate(directions: FloatArray, velocity_km_s: FloatArray | Sequence[float]) -> FloatArray:
     """Apparent directions for a moving observer: special-relativistic aberration.
 

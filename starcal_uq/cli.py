@@ -13,6 +13,8 @@ from typing import Annotated, Any
 import typer
 
 from starcal_uq.cli_filter import register as register_filter
+from starcal_uq.cli_images import load_images
+from starcal_uq.cli_images import register as register_images
 from starcal_uq.cli_options import (
     CameraFile,
     Columns,
@@ -166,6 +168,13 @@ def simulate_command(
     max_mag: Annotated[float, typer.Option(help="Magnitude limit, Gaia G.")] = 6.0,
     min_stars: Annotated[int, typer.Option(min=3, help="Attitudes with fewer stars are drawn again.")] = 10,
     epoch: Annotated[float, typer.Option(help="Julian year of the star positions.")] = 2026.9,
+    images: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Also render the frames as FITS images into this folder.")
+    ] = None,
+    sensor: Annotated[
+        Path | None,
+        typer.Option(help="Detector of the images (TOML with a [sensor] table); a small tracker's by default."),
+    ] = None,
     seed: Seed = 0,
     force: Force = False,
 ) -> None:
@@ -176,14 +185,28 @@ def simulate_command(
     from starcal_uq.simulation import simulate
 
     ensure_new(out, force)
-    obs = simulate(
-        load_catalogue(max_mag=max_mag, epoch=epoch),
-        Camera.load(camera),
-        n_frames=frames,
-        min_stars=min_stars,
-        sigma_px=sigma,
-        seed=seed,
-    )
+    if sensor is not None and images is None:
+        raise typer.BadParameter("--sensor describes the detector of images: give --images DIR as well.")
+    stars, truth = load_catalogue(max_mag=max_mag, epoch=epoch), Camera.load(camera)
+    obs = simulate(stars, truth, n_frames=frames, min_stars=min_stars, sigma_px=sigma, seed=seed)
+    if images is not None:
+        from starcal_uq.rendering_runs import render_frames
+        from starcal_uq.sensor import Sensor
+
+        with progress_bar("images") as progress:
+            paths = render_frames(
+                stars,
+                truth,
+                images,
+                n_frames=frames,
+                min_stars=min_stars,
+                sensor=Sensor() if sensor is None else Sensor.load(sensor),
+                seed=seed,
+                sigma_px=sigma,
+                force=force,
+                progress=progress,
+            )
+        print(f"{len(paths)} images: {images}")
     obs.save(out, force=force)
     print(f"{obs.n_stars} stars in {obs.n_frames} frames: {out}")
 
@@ -338,7 +361,14 @@ def report_command(run: RunPath) -> None:
 
 @app.command("run")
 def run_command(
-    observations: ObsFile,
+    inputs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="OBS|IMAGES...",
+            help="A table of identified stars (see `calibrate`), or images (FITS, TIFF, PNG, JPEG) or folders of them, "
+            "whose stars are then found and identified.",
+        ),
+    ],
     camera: CameraFile,
     out: NewRun,
     method: Method = "efficient",
@@ -348,6 +378,8 @@ def run_command(
     column: Columns = None,
     directions: Directions = None,
     observer_velocity: Velocity = None,
+    max_mag: Annotated[float, typer.Option(help="Images: magnitude limit of the catalogue, Gaia G.")] = 7.0,
+    gain: Annotated[float | None, typer.Option(help="Images: electrons per count, where they do not say it.")] = None,
     seed: Seed = 0,
     sigma: Sigma = None,
     priors: PriorFile = None,
@@ -359,17 +391,26 @@ def run_command(
     draws: Draws = 300,
     force: Force = False,
 ) -> None:
-    """Calibrate, sample, couple, propagate and report: everything from OBS to RUN/report.html."""
+    """Calibrate, sample, couple, propagate and report: everything from stars or images to RUN/report.html."""
     from starcal_uq.console import show_calibration, show_screening
+    from starcal_uq.image_steps import are_images, save_image_results
     from starcal_uq.runfolder import RunFolder
     from starcal_uq.steps import calibrate_step, check_new_run, truth_of
 
     folder = RunFolder(out)
     check_new_run(folder, force)
-    obs, nominal = _load(observations, camera, column, directions, observer_velocity)
+    images = are_images(inputs)
+    if images:
+        obs, nominal, centroids, found = load_images(inputs, camera, max_mag, gain, directions)
+    elif len(inputs) == 1:
+        obs, nominal = _load(inputs[0], camera, column, directions, observer_velocity)
+    else:
+        raise typer.BadParameter(f"{inputs[1]} is no image: give one table of observations, or images only.")
     calibration, screening = calibrate_step(
         folder, obs, nominal, force=force, screening=screen, **_estimator(method, solver, robust)
     )
+    if images:
+        save_image_results(folder, centroids, found)
     if screening is not None:
         show_screening(screening)
     show_calibration(calibration, truth_of(obs))
@@ -388,6 +429,7 @@ def run_command(
     )
 
 
+register_images(app)
 register_filter(app)
 register_statistics(app)
 register_paper(app)

@@ -21,6 +21,10 @@ class CameraError(StarcalError):
     """A camera description is incomplete, inconsistent or unreadable."""
 
 
+class SensorError(StarcalError):
+    """A sensor description is inconsistent or unreadable, or asks for an image that cannot be rendered."""
+
+
 class DistortionError(StarcalError):
     """A distortion model is unknown, or cannot be inverted where it was asked for."""
 
@@ -57,6 +61,10 @@ class CatalogueError(StarcalError):
     """A star catalogue cannot be read or does not hold what was asked for."""
 
 
+class IdentificationError(StarcalError):
+    """Stars cannot be identified with what was given."""
+
+
 class CalibrationError(StarcalError):
     """The estimate was not found; `status` says why and what to do."""
 
@@ -71,6 +79,10 @@ class PriorError(StarcalError):
 
 class SamplingError(StarcalError):
     """The posterior could not be sampled from the given start."""
+
+
+class ImageError(StarcalError):
+    """An image file is missing, damaged, empty or of the wrong size."""
 
 
 class RunFolderError(StarcalError):

@@ -21,8 +21,7 @@ if TYPE_CHECKING:
 _BATCH = 256
 _MAX_TRIES_PER_FRAME = 2000
 # Stars nearer to the edge than this many sigma are left out, so that noise does not decide which stars are seen.
-_EDGE_SIGMAS = 6.0
-
+EDGE_SIGMAS = 6.0
 
 # The equation of Ye & Yang 2017 that is read as the distortion of their simulation, and the model that says the same.
 CONVENTIONS = {"eq14": "brown", "eq6": "inverse"}
@@ -112,28 +111,8 @@ def simulate(
             "needs at least 3 stars, and there must be at least one frame."
         )
     rng = np.random.default_rng(seed)
-    margin_px = _EDGE_SIGMAS * sigma_px
-    sky = _Sky(stars, camera, margin_px)
-    frames: list[tuple[IntArray, FloatArray]] = []
-    if attitudes is not None:
-        frames = sky.views(attitudes)
-        for number, (seen, _) in enumerate(frames):
-            if len(seen) < min_stars:
-                raise CatalogueError(
-                    f"the attitude with index {number} shows {len(seen)} stars, fewer than min_stars={min_stars}: "
-                    "choose other attitudes, a deeper catalogue or a smaller min_stars."
-                )
-    tries = 0
-    while attitudes is None and len(frames) < n_frames:
-        views = sky.views(random_rotations(_BATCH, rng))
-        frames += [view for view in views if len(view[0]) >= min_stars]
-        tries += _BATCH
-        if tries > _MAX_TRIES_PER_FRAME * (len(frames) + 1):
-            raise CatalogueError(
-                f"only {len(frames)} of {tries} random attitudes show {min_stars} stars of the catalogue: "
-                "raise max_mag, or lower min_stars."
-            )
-    frames = frames if attitudes is not None else frames[:n_frames]
+    sky = Sky(stars, camera, EDGE_SIGMAS * sigma_px)
+    _, frames = choose_attitudes(sky, rng, n_frames=n_frames, min_stars=min_stars, attitudes=attitudes)
     index = np.concatenate([seen for seen, _ in frames])
     xy = np.concatenate([xy for _, xy in frames])
     xy = xy + sigma_px * rng.standard_normal(xy.shape)
@@ -155,16 +134,80 @@ def simulate(
     )
 
 
-class _Sky:
-    """Finds the stars of a catalogue on the detector."""
+def choose_attitudes(
+    sky: Sky, rng: np.random.Generator, *, n_frames: int, min_stars: int, attitudes: FloatArray | None = None
+) -> tuple[FloatArray, list[tuple[IntArray, FloatArray]]]:
+    """Attitudes that show at least `min_stars` stars: random ones, or the given ones after a check.
+
+    Parameters
+    ----------
+    sky : Sky
+        Catalogue and camera.
+    rng : numpy.random.Generator
+        Source of the attitudes; it is left alone when `attitudes` are given.
+    n_frames, min_stars : int
+        As for `simulate`.
+    attitudes : (n_frames, 3, 3) array, optional
+        R_cam_icrs.
+
+    Returns
+    -------
+    rotations : (n, 3, 3) array
+    views : list of (indices, pixels)
+        As `Sky.views` returns them for these rotations.
+
+    Raises
+    ------
+    CatalogueError
+        When a given attitude shows fewer stars, or random ones nearly always do.
+    """
+    if attitudes is not None:
+        frames = sky.views(attitudes)
+        for number, (seen, _) in enumerate(frames):
+            if len(seen) < min_stars:
+                raise CatalogueError(
+                    f"the attitude with index {number} shows {len(seen)} stars, fewer than min_stars={min_stars}: "
+                    "choose other attitudes, a deeper catalogue or a smaller min_stars."
+                )
+        return attitudes, frames
+    chosen: list[FloatArray] = []
+    frames = []
+    tries = 0
+    while len(frames) < n_frames:
+        rotations = random_rotations(_BATCH, rng)
+        views = sky.views(rotations)
+        enough = [number for number, view in enumerate(views) if len(view[0]) >= min_stars]
+        frames += [views[number] for number in enough]
+        chosen.append(rotations[enough])
+        tries += _BATCH
+        if tries > _MAX_TRIES_PER_FRAME * (len(frames) + 1):
+            raise CatalogueError(
+                f"only {len(frames)} of {tries} random attitudes show {min_stars} stars of the catalogue: "
+                "raise max_mag, or lower min_stars."
+            )
+    return np.concatenate(chosen)[:n_frames], frames[:n_frames]
+
+
+class Sky:
+    """Finds the stars of a catalogue on the detector.
+
+    Parameters
+    ----------
+    stars : StarCatalogue
+        Catalogue.
+    camera : Camera
+        Optics and detector.
+    margin_px : float
+        Stars nearer to the edge than this are left out; a negative margin lets in stars outside the detector.
+    """
 
     def __init__(self, stars: StarCatalogue, camera: Camera, margin_px: float) -> None:
         self.camera = camera
         self.directions = stars.directions_icrs
         self.low = -0.5 + margin_px
         self.high = np.array([camera.width_px, camera.height_px]) - 0.5 - margin_px
-        corners = np.array([(x, y) for x in (-0.5, camera.width_px - 0.5) for y in (-0.5, camera.height_px - 0.5)])
-        b = unproject(camera, corners)
+        low, high = min(-0.5, self.low), np.maximum(np.array([camera.width_px, camera.height_px]) - 0.5, self.high)
+        b = unproject(camera, np.array([(x, y) for x in (low, high[0]) for y in (low, high[1])]))
         # A little wider than the farthest corner; the exact cut is made in pixels.
         self.min_cosine = float(np.cos(1.02 * np.max(np.arccos(b[:, 2]))))
         if self.min_cosine > 0.0:

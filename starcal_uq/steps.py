@@ -198,8 +198,7 @@ def coupling_step(run: RunFolder) -> Coupling:
     """Analyse the couplings of the posterior, or of the calibration where there is no posterior yet."""
     from starcal_uq.couplings import coupling
 
-    result = load_posterior(run) if run.posterior.exists() else Calibration.load(run.require("calibration"))
-    found = coupling(result)
+    found = coupling(best_calibration(run))
     with atomic_path(run.coupling) as temporary:
         found.to_dataframe().to_csv(temporary, index=False)
     return found
@@ -261,3 +260,8 @@ def truth_of(obs: Observations) -> Camera | None:
     """The camera that observations were simulated with, if they were."""
     truth = obs.meta.get("truth")
     return None if truth is None else Camera.from_dict(truth)
+
+
+def best_calibration(run: RunFolder) -> Calibration | Posterior:
+    """What a run knows of the camera: its posterior, or its calibration where there is no posterior yet."""
+    return load_posterior(run) if run.posterior.exists() else Calibration.load(run.require("calibration"))

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import tempfile
 
 # One BLAS thread: the matrices here are too small to gain from more, sums come out in the same order on every machine,
 # and the test processes that share the cores do not slow each other down.
 for _library in ("OMP", "OPENBLAS", "MKL"):
     os.environ.setdefault(f"{_library}_NUM_THREADS", "1")
 os.environ.setdefault("MPLBACKEND", "Agg")
+# Caches of the tests stay out of the home folder.
+os.environ["XDG_CACHE_HOME"] = os.path.join(tempfile.gettempdir(), "starcal_uq-test-cache")
 
 import warnings
 from importlib.metadata import version

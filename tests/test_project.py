@@ -113,7 +113,7 @@ def test_every_import_is_a_declared_dependency() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     declared = {re.split(r"[\[<>=]", requirement)[0].replace("-", "_") for requirement in project["dependencies"]}
     # Names that differ from their package's, the engine named in an extra, and parts of ArviZ 1 and of pydantic.
-    declared |= {"erfa", "h5py", "arviz_base", "arviz_plots", "arviz_stats", "pydantic_core"}
+    declared |= {"PIL", "erfa", "h5py", "arviz_base", "arviz_plots", "arviz_stats", "pydantic_core"}
     declared |= {"starcal_uq", *sys.stdlib_module_names}
     undeclared = set()
     for path in (ROOT / "starcal_uq").rglob("*.py"):

@@ -1,0 +1,304 @@
+"""Frames read from files: FITS, TIFF, PNG and JPEG become arrays whose first row is y = 0."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import os
+import warnings
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq._types import AnyDict
+from starcal_uq.errors import ImageError
+from starcal_uq.formatting import plural
+
+if TYPE_CHECKING:
+    from starcal_uq.camera import Camera
+
+FITS_ENDINGS = (".fits", ".fit", ".fts", ".fits.gz", ".fit.gz", ".fts.gz")
+IMAGE_ENDINGS = (*FITS_ENDINGS, ".tiff", ".tif", ".png", ".jpg", ".jpeg")
+# Rec. 601, as pillow weighs the colours of 8-bit images.
+_LUMINANCE = (0.299, 0.587, 0.114)
+# Full scale of the converters that write into 16 bits without shifting.
+_FULL_SCALES = (1023, 4095, 16383)
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """One frame.
+
+    Attributes
+    ----------
+    data : array, shape (height, width)
+        Counts; ``data[y, x]`` is the pixel whose centre is (x, y). Integers as the file holds them, or floating-point
+        numbers, where NaN marks a pixel without a value.
+    name : str
+        Name, in messages and tables; of a file its name without the folder.
+    time_utc : str or None
+        Middle of the exposure, UTC, ISO 8601.
+    exposure_s : float or None
+        Exposure time, seconds.
+    saturation : float or None
+        Counts at and above which a pixel is saturated.
+    header : dict
+        What the file says of itself: keyword to plain value.
+    gain_e_per_count : float or None
+        Electrons per count.
+    messages : tuple of str
+        What was done to the pixels in reading, one sentence each.
+    """
+
+    data: np.ndarray[Any, Any]
+    name: str = ""
+    time_utc: str | None = None
+    exposure_s: float | None = None
+    saturation: float | None = None
+    header: AnyDict = field(default_factory=dict)
+    gain_e_per_count: float | None = None
+    messages: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        data = np.asarray(self.data)
+        if data.ndim != 2 or data.dtype.kind not in "buif":
+            raise ImageError(
+                f"{self._label}: the pixels are {data.dtype} of shape {data.shape}; give numbers in rows and columns."
+            )
+        if not data.size:
+            raise ImageError(f"{self._label}: the image has no pixels; leave it out.")
+        object.__setattr__(self, "data", data)
+
+    @property
+    def _label(self) -> str:
+        return self.name or "image"
+
+    @property
+    def height_px(self) -> int:
+        """Number of rows."""
+        return int(self.data.shape[0])
+
+    @property
+    def width_px(self) -> int:
+        """Number of columns."""
+        return int(self.data.shape[1])
+
+    def check_size(self, camera: Camera) -> None:
+        """Refuse an image that is not the size of the camera's detector.
+
+        Raises
+        ------
+        ImageError
+            If width or height differ.
+        """
+        if (self.width_px, self.height_px) != (camera.width_px, camera.height_px):
+            raise ImageError(
+                f"{self._label}: the image is {self.width_px} x {self.height_px} px and the camera has "
+                f"{camera.width_px} x {camera.height_px} px; give the camera file that belongs to it."
+            )
+
+    def __repr__(self) -> str:
+        size = f"{self.width_px} x {self.height_px} px, {self.data.dtype}"
+        return f"Image({self.name!r}, {size}{', ' + self.time_utc if self.time_utc else ''})"
+
+
+def read_image(path: str | os.PathLike[str], camera: Camera | None = None) -> Image:
+    """Read one frame (``.fits``, ``.fit``, ``.fits.gz``, ``.tiff``, ``.png``, ``.jpg``).
+
+    The rows are kept in the order of the file, so the first row is y = 0. A colour image becomes its luminance; of a
+    file with several images the first is taken; `messages` of the result say so.
+
+    Parameters
+    ----------
+    path
+        The file.
+    camera
+        If given, the image must be the size of its detector.
+
+    Raises
+    ------
+    ImageError
+        If the file is missing, truncated, no image, or of the wrong size.
+    """
+    path = Path(path)
+    data = _read_bytes(path)
+    name = path.name.lower()
+    if not name.endswith(IMAGE_ENDINGS):
+        raise ImageError(f"{path}: the ending {path.suffix or '(none)'} is unknown; use {', '.join(IMAGE_ENDINGS)}.")
+    image = _read_fits(path, data) if name.endswith(FITS_ENDINGS) else _read_picture(path, data)
+    if camera is not None:
+        image.check_size(camera)
+    return image
+
+
+def _read_bytes(path: Path) -> bytes:
+    if os.path.isdir(path):
+        raise ImageError(f"{path}: is a directory; name an image file.")
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise ImageError(f"{path}: the file does not exist; check the path.") from None
+    except OSError as error:
+        raise ImageError(f"{path}: cannot be read ({error.strerror}); check its permissions.") from error
+    if not data:
+        raise ImageError(f"{path}: the file is empty; copy it again or leave it out.")
+    return data
+
+
+def _broken(path: Path) -> ImageError:
+    return ImageError(f"{path}: the file is truncated or damaged; copy it again or leave it out.")
+
+
+def _read_fits(path: Path, data: bytes) -> Image:
+    from astropy.io import fits
+
+    if data.startswith(b"\x1f\x8b"):
+        try:
+            data = gzip.decompress(data)
+        except (OSError, EOFError, zlib.error) as error:
+            raise _broken(path) from error
+    if not data.startswith(b"SIMPLE"):
+        raise ImageError(f"{path}: the file is not a FITS image; check what it is, or name it by its format.")
+    messages: list[str] = []
+    with warnings.catch_warnings():
+        # Astropy warns of a truncated file and then pads it or fails later; both are one error here.
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("error", message=".*(truncated|Error validating header).*")
+        try:
+            with fits.open(io.BytesIO(data), memmap=False) as hdus:
+                for hdu in hdus:
+                    if hdu.is_image and hdu.header.get("NAXIS", 0) >= 2:
+                        pixels = np.array(hdu.data)
+                        header = {k: v for k, v in hdu.header.items() if k and k not in ("COMMENT", "HISTORY")}
+                        header = {k: v for k, v in header.items() if isinstance(v, str | bool | int | float)}
+                        break
+                else:
+                    raise ImageError(f"{path}: the FITS file holds no image; leave it out.")
+        except ImageError:
+            raise
+        except Exception as error:  # astropy raises whatever the broken bytes lead to
+            raise _broken(path) from error
+    if not pixels.size:
+        raise ImageError(f"{path}: the image has no pixels; leave it out.")
+    if pixels.ndim > 2:
+        planes = int(np.prod(pixels.shape[:-2]))
+        pixels = pixels.reshape(-1, *pixels.shape[-2:])[0]
+        if planes > 1:
+            messages.append(f"{path.name}: the first of {planes} planes was taken.")
+    pixels = np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("="))
+    exposure = _positive(header, "EXPTIME", "EXPOSURE")
+    return Image(
+        _checked(path, pixels, messages),
+        path.name,
+        time_utc=_middle(header, exposure),
+        exposure_s=exposure,
+        saturation=_positive(header, "SATURATE", "SATLEVEL") or _full_scale(pixels),
+        header=header,
+        gain_e_per_count=_positive(header, "EGAIN", "GAIN"),
+        messages=tuple(messages),
+    )
+
+
+def _read_picture(path: Path, data: bytes) -> Image:
+    import PIL.Image
+
+    messages: list[str] = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            picture: Any = PIL.Image.open(io.BytesIO(data))
+        except PIL.UnidentifiedImageError:
+            raise ImageError(
+                f"{path}: the file is not an image, is damaged, or is of a kind that is not read (such as colour in "
+                "16 bits); save it as FITS or as a grey TIFF or PNG."
+            ) from None
+        except Exception as error:
+            raise _broken(path) from error
+        try:
+            picture.load()
+            # A palette or transparency is resolved first; black and white become 0 and 255.
+            if picture.mode in ("P", "PA", "CMYK", "YCbCr", "RGBA", "LAB", "HSV"):
+                picture = picture.convert("RGB")
+            elif picture.mode in ("1", "LA"):
+                picture = picture.convert("L")
+            pixels = np.array(picture)
+        except Exception as error:  # decoders raise whatever the broken bytes lead to
+            raise _broken(path) from error
+    if pixels.ndim == 3:
+        # Grey pictures saved as RGB lose nothing.
+        grey = bool(np.all(pixels == pixels[..., :1]))
+        saturation: float | None = 255.0
+        whole = pixels
+        pixels = whole[..., 0] if grey else (whole @ np.array(_LUMINANCE, np.float32)).astype(np.float32)
+        if not grey:
+            # One saturated colour spoils the sum before the sum reaches its own limit.
+            pixels[(whole == 255).any(axis=-1)] = 255.0
+            messages.append(
+                f"{path.name}: the colour image was turned into luminance; colours sampled in a mosaic make centroids "
+                "worse than predicted."
+            )
+    else:
+        saturation = _full_scale(pixels)
+    if picture.format == "JPEG" or path.suffix.lower() in (".jpg", ".jpeg"):
+        messages.append(f"{path.name}: JPEG compression changes the noise; use FITS, TIFF or PNG where you can.")
+    planes = getattr(picture, "n_frames", 1)
+    if planes > 1:
+        messages.append(f"{path.name}: the first of {planes} planes was taken.")
+    return Image(_checked(path, pixels, messages), path.name, saturation=saturation, messages=tuple(messages))
+
+
+def _checked(path: Path, pixels: Any, messages: list[str]) -> Any:
+    """`pixels` as 32-bit floats where they are floats; a message where some are no numbers."""
+    if pixels.dtype.kind != "f":
+        return pixels
+    bad = int(np.count_nonzero(~np.isfinite(pixels)))
+    if bad == pixels.size:
+        raise ImageError(f"{path}: no pixel has a value; leave the image out.")
+    if bad:
+        pixels = np.where(np.isfinite(pixels), pixels, np.nan)
+        messages.append(
+            f"{path.name}: {plural(bad, 'pixel')} without a value (NaN) {'was' if bad == 1 else 'were'} masked."
+        )
+    return pixels.astype(np.float32)
+
+
+def _full_scale(pixels: Any) -> float | None:
+    """Saturation of integers: the highest value of their type, or of a converter with fewer bits that is reached."""
+    if pixels.dtype.kind not in "ui" or pixels.dtype.itemsize > 2:
+        return None
+    highest = int(pixels.max())
+    if highest in _FULL_SCALES and np.count_nonzero(pixels == highest) > 1:
+        return float(highest)
+    return float(np.iinfo(pixels.dtype).max)
+
+
+def _positive(header: Mapping[str, Any], *keys: str) -> float | None:
+    for key in keys:
+        try:
+            value = float(header[key])
+        except (KeyError, TypeError, ValueError):
+            continue
+        if np.isfinite(value) and value > 0.0:
+            return value
+    return None
+
+
+def _middle(header: Mapping[str, Any], exposure_s: float | None) -> str | None:
+    """Middle of the exposure: DATE-AVG, or DATE-OBS (its start) plus half the exposure."""
+    for key, delay in (("DATE-AVG", 0.0), ("DATE-OBS", 0.5 * (exposure_s or 0.0))):
+        text = str(header.get(key, "")).strip().rstrip("Z")
+        if key == "DATE-OBS" and "T" not in text and header.get("TIME-OBS"):
+            text = f"{text}T{str(header['TIME-OBS']).strip()}"
+        try:
+            time = datetime.fromisoformat(text)
+        except ValueError:
+            continue
+        # A date alone is no time of day.
+        if "T" in text:
+            return (time.replace(tzinfo=None) + timedelta(seconds=delay)).isoformat(timespec="microseconds")
+    return None

@@ -1,0 +1,124 @@
+"""From images to a report at the command line, and the bootstrap behind it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.bootstrapping import bootstrap
+from starcal_uq.image_steps import counted, epoch_of
+from tests.test_cli import cli, inputs
+
+__all__ = ["cli", "inputs"]
+
+ESA = Path(__file__).resolve().parents[2] / "shared" / "data" / "esa-tetra3"
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("frames")
+    stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
+    sc.render_frames(stars, sc.paper_camera(), folder, n_frames=25, seed=3, times_utc=["2026-11-25T00:00:00"] * 25)
+    return folder
+
+
+def test_simulated_images_go_through_the_commands_one_by_one(cli, tmp_path):
+    sc.paper_camera().save(tmp_path / "truth.toml")
+    sc.paper_start().save(tmp_path / "camera.toml")
+    status, out, _ = cli("simulate", "truth.toml", "-o", "obs.parquet", "--frames", 4, "--images", "img", "--seed", 1)
+    assert status == 0
+    assert len(list((tmp_path / "img").glob("*.fits"))) == 4
+    status, out, err = cli("centroid", "img", "-o", "centroids.parquet", "--camera", "camera.toml")
+    assert status == 0, err
+    status, out, _ = cli("identify", "centroids.parquet", "camera.toml", "-o", "found.csv", "--max-mag", 6, "--json")
+    assert status == 0
+    document = json.loads(out)
+    assert [frame["status"] for frame in document["frames"]] == ["identified"] * 4
+    found, truth = sc.load_observations(tmp_path / "found.csv"), sc.load_observations(tmp_path / "obs.parquet")
+    right = set(zip(truth.frame.tolist(), truth.star_id.tolist(), strict=True))
+    # Stars within six sigma of the edge are in the images but not in the table.
+    wrong = [pair for pair in zip(found.frame.tolist(), found.star_id.tolist(), strict=True) if pair not in right]
+    assert len(wrong) <= 0.03 * found.n_stars
+
+
+def test_run_from_images_to_report(cli, frames, tmp_path):
+    sc.paper_start().save(tmp_path / "camera.toml")
+    options = ("--directions", "apparent", "--max-mag", 6, "--screen", "--steps", 40)
+    status, _, err = cli("run", frames, "camera.toml", "-o", "run", *options)
+    assert status in (0, 1), err
+    assert "with the nominal camera" in err
+    run = sc.RunFolder(tmp_path / "run")
+    assert run.report.exists()
+    assert len(pd.read_csv(run.path / "identification.csv")) == 25
+    assert sc.Centroids.load(run.path / "centroids.parquet").n_frames == 25
+    cal, truth = sc.Calibration.load(run.calibration), sc.paper_camera().theta
+    assert np.all(np.abs(cal.theta - truth) < 4.0 * cal.sigmas)
+    # What centroiding predicted is what the calibration finds.
+    assert cal.sigma_name == "sigma_scale"
+    assert cal.sigma == pytest.approx(1.0, abs=0.1)
+
+
+def test_bootstrap_says_what_changed(frames):
+    table = sc.extract_centroids(frames)
+    stars = sc.load_catalogue(max_mag=6.0, epoch=epoch_of(table))
+    found = bootstrap(table, sc.paper_start(), stars)
+    assert len(found.rounds) == 2
+    assert found.identification.n_identified == 25
+    assert "new" in found.summary
+    assert "standard deviations" in found.summary
+    none = table.select_frames([])
+    with pytest.raises(sc.IdentificationError, match="no frame is identified"):
+        bootstrap(none, sc.paper_start(), stars)
+
+
+def test_bad_input_is_one_sentence(cli, tmp_path):
+    sc.paper_start().save(tmp_path / "camera.toml")
+    (tmp_path / "broken.fits").write_bytes(b"SIMPLE  =                    T")
+    (tmp_path / "text.png").write_text("no image")
+    (tmp_path / "empty").mkdir()
+    for command, status in (
+        (("centroid", "missing.fits", "-o", "c.csv"), (1, 2)),
+        (("centroid", "empty", "-o", "c.csv"), (2,)),
+        (("centroid", "broken.fits", "text.png", "-o", "d.csv"), (1,)),
+        (("identify", "missing.csv", "camera.toml", "-o", "o.csv"), (2,)),
+        (("run", "broken.fits", "camera.toml", "-o", "run"), (2,)),
+        (("run", "one.csv", "two.csv", "camera.toml", "-o", "run"), (2,)),
+        (("simulate", "camera.toml", "-o", "s.csv", "--sensor", "x.toml"), (2,)),
+    ):
+        found, out, err = cli(*command)
+        assert found in status, (command, out, err)
+        assert "Traceback" not in err
+        assert err.strip()
+    assert not (tmp_path / "run").exists()
+    assert not (tmp_path / "o.csv").exists()
+
+
+def test_one_message_for_many_images():
+    assert counted(["a: dark.", "b: dark.", "c: odd."]) == ["2 images: dark.", "c: odd."]
+
+
+@pytest.mark.skipif(not ESA.is_dir(), reason="the real frames are not here")
+def test_real_frames_from_images_to_observations(cli, tmp_path):
+    camera = ESA.parent / "esa_tetra3_camera.toml"
+    status, _, _ = cli("centroid", ESA, "-o", "c.parquet", "--camera", camera)
+    assert status == 0
+    arguments = ("c.parquet", camera, "-o", "o.csv", "--max-mag", 7.5, "--epoch", 2019.57, "--json")
+    status, out, _ = cli("identify", *arguments)
+    assert status == 0
+    assert [frame["status"] for frame in json.loads(out)["frames"]] == ["identified"] * 8
+    found = sc.load_observations(tmp_path / "o.csv")
+    table = pd.read_csv(ESA.parent / "esa_tetra3_observations.csv")
+    n = 0
+    for frame, x, y, ra, dec in table[["frame", "x_px", "y_px", "ra_deg", "dec_deg"]].to_numpy():
+        here = (found.frame == frame) & (np.hypot(found.x_px - x, found.y_px - y) < 1.0)
+        if here.any():
+            n += 1
+            off = np.hypot((found.ra_deg[here][0] - ra) * np.cos(np.radians(dec)), found.dec_deg[here][0] - dec)
+            assert off * 3600.0 < 20.0, "a wrong identification"
+    assert n > 400
+    assert found.n_stars / 8 >= 30
