@@ -379,6 +379,9 @@ def run_command(
     directions: Directions = None,
     observer_velocity: Velocity = None,
     max_mag: Annotated[float, typer.Option(help="Images: magnitude limit of the catalogue, Gaia G.")] = 7.0,
+    epoch: Annotated[
+        float | None, typer.Option(help="Images: Julian year of the star positions; the images' own by default.")
+    ] = None,
     gain: Annotated[float | None, typer.Option(help="Images: electrons per count, where they do not say it.")] = None,
     seed: Seed = 0,
     sigma: Sigma = None,
@@ -401,7 +404,9 @@ def run_command(
     check_new_run(folder, force)
     images = are_images(inputs)
     if images:
-        obs, nominal, centroids, found = load_images(inputs, camera, max_mag, gain, directions)
+        obs, nominal, centroids, found = load_images(
+            inputs, camera, max_mag=max_mag, epoch=epoch, gain=gain, directions=directions
+        )
     elif len(inputs) == 1:
         obs, nominal = _load(inputs[0], camera, column, directions, observer_velocity)
     else:

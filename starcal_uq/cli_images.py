@@ -108,6 +108,7 @@ def identify_command(
     nominal = Camera.load(camera)
     known = None if calibration is None else best_calibration(RunFolder(calibration))
     stars = load_catalogue(max_mag=max_mag, epoch=epoch_of(table) if epoch is None else epoch)
+    _say_epoch(table, epoch)
     with progress_bar("frames") as progress:
         found = identify(
             table,
@@ -131,7 +132,13 @@ def identify_command(
 
 
 def load_images(
-    images: list[Path], camera_path: Path, max_mag: float, gain: float | None, directions: str | None
+    images: list[Path],
+    camera_path: Path,
+    *,
+    max_mag: float,
+    epoch: float | None,
+    gain: float | None,
+    directions: str | None,
 ) -> tuple[Observations, Camera, Centroids, Bootstrap]:
     """Observations of images, and what is worth telling on the way."""
     from starcal_uq.camera import Camera
@@ -144,13 +151,28 @@ def load_images(
     camera = Camera.load(camera_path)
     with progress_bar("images") as progress:
         obs, centroids, found = observations_from_images(
-            images, camera, max_mag=max_mag, gain_e_per_count=gain, directions=directions, progress=progress
+            images,
+            camera,
+            max_mag=max_mag,
+            epoch=epoch,
+            gain_e_per_count=gain,
+            directions=directions,
+            progress=progress,
         )
     _say(counted(centroids.messages))
+    _say_epoch(centroids, epoch)
     for words in (centroids.summary, found.identification.summary, found.summary):
         err.print(words, highlight=False, soft_wrap=True)
+    left_out = obs.meta.get("disturbed_stars", 0)
+    if left_out:
+        err.print(f"{left_out} stars left out, because the light of a neighbour displaces them.", highlight=False)
     warn_undeclared(obs)
     return obs, camera, centroids, found
+
+
+def _say_epoch(centroids: Centroids, epoch: float | None) -> None:
+    if epoch is None and not (centroids.time_utc != "").any():
+        _say(("the images have no time: the stars are taken where they were in 2016; --epoch says when it was.",))
 
 
 def _say(messages: Sequence[str]) -> None:

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from starcal_uq.apparent import julian_year, make_apparent
 from starcal_uq.runfolder import RunFolder, atomic_path
 
@@ -51,6 +53,7 @@ def observations_from_images(
     camera: Camera,
     *,
     max_mag: float,
+    epoch: float | None = None,
     gain_e_per_count: float | None = None,
     directions: str | None = None,
     progress: Progress | None = None,
@@ -65,6 +68,8 @@ def observations_from_images(
         The nominal camera.
     max_mag : float
         Magnitude limit of the embedded catalogue, Gaia G.
+    epoch : float, optional
+        Julian year of the star positions; that of the images by default (`epoch_of`).
     gain_e_per_count : float, optional
         Where the files do not say it.
     directions : {"apparent", "undeclared", "catalogue"}, optional
@@ -81,11 +86,16 @@ def observations_from_images(
     from starcal_uq.bootstrapping import bootstrap
     from starcal_uq.catalogue import load_catalogue
     from starcal_uq.centroiding import extract_centroids
+    from starcal_uq.double_stars import without_disturbed
 
     centroids = extract_centroids(list(images), camera=camera, gain_e_per_count=gain_e_per_count, progress=progress)
-    stars = load_catalogue(max_mag=max_mag, epoch=epoch_of(centroids))
+    stars = load_catalogue(max_mag=max_mag, epoch=epoch_of(centroids) if epoch is None else epoch)
+
+    width = centroids.psf_sigma_px[np.isfinite(centroids.psf_sigma_px)]
+    psf_sigma_px = float(np.median(width)) if len(width) else 1.0
 
     def prepare(obs: Observations) -> Observations:
+        obs = without_disturbed(obs, stars, camera, psf_sigma_px)
         timed = obs.time_utc is not None and bool((obs.time_utc != "").all())
         if directions == "catalogue" or (directions is None and timed):
             return make_apparent(obs.with_meta(directions="catalogue"))

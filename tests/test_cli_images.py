@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.spatial import cKDTree
 
 import starcal_uq as sc
 from starcal_uq.bootstrapping import bootstrap
+from starcal_uq.double_stars import disturbed_stars, without_disturbed
 from starcal_uq.image_steps import counted, epoch_of
 from tests.test_cli import cli, inputs
 
@@ -122,3 +124,36 @@ def test_real_frames_from_images_to_observations(cli, tmp_path):
             assert off * 3600.0 < 20.0, "a wrong identification"
     assert n > 400
     assert found.n_stars / 8 >= 30
+
+
+def test_stars_beside_a_neighbour_are_left_out():
+    truth = sc.paper_camera()
+    stars = sc.load_catalogue(max_mag=7.0)
+    obs = sc.simulate(stars, truth, n_frames=40, min_stars=10, seed=2)
+    mask = disturbed_stars(obs, stars, truth)
+    assert 0 < mask.sum() < 0.05 * obs.n_stars
+    kept = without_disturbed(obs, stars, truth)
+    assert kept.meta["disturbed_stars"] >= mask.sum()
+    # For the others, the nearest neighbour moves the light by less than a fifth of 0.05 px, or is out of reach.
+    distance, index = cKDTree(stars.directions_icrs).query(kept.directions_icrs, k=2)
+    near, flux = distance[:, 1] * truth.focal_px, 10.0 ** (-0.4 * (stars.mag[index[:, 1]] - kept.mag))
+    assert np.all((near * flux / (1.0 + flux) <= 0.2 * 0.05 + 1e-9) | (near > 3.99))
+    # Wider star images reach farther.
+    assert disturbed_stars(obs, stars, truth, psf_sigma_px=3.0).sum() > mask.sum()
+
+
+@pytest.mark.slow
+def test_rendered_frames_through_the_whole_chain(tmp_path):
+    truth = sc.paper_camera()
+    stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
+    sc.render_frames(stars, truth, tmp_path, n_frames=300, seed=11)
+    table = sc.extract_centroids(tmp_path)
+    found = bootstrap(table, sc.paper_start(), stars, prepare=lambda obs: without_disturbed(obs, stars, truth))
+    cal = found.calibration
+    assert found.identification.n_identified == 300
+    assert np.all(np.abs((cal.theta - truth.theta) / cal.sigmas) < 4.0)
+    assert cal.sigma == pytest.approx(1.0, abs=0.03)
+    # The control: stars where they were eleven years before are not what the camera saw.
+    old = sc.load_catalogue(max_mag=6.0, epoch=2016.0)
+    control = bootstrap(table, sc.paper_start(), old, prepare=lambda obs: without_disturbed(obs, old, truth))
+    assert control.calibration.sigma > 1.3
