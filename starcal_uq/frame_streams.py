@@ -16,7 +16,7 @@ import numpy as np
 from starcal_uq._types import AnyDict, IntArray
 from starcal_uq.errors import ObservationError
 from starcal_uq.observation_checks import check_columns, raise_problems
-from starcal_uq.observation_files import RawTable, _check_names, _convert, _from_arrow, _meta
+from starcal_uq.observation_files import RawTable, arrow_values, check_names, convert_columns, table_meta
 from starcal_uq.observations import COLUMNS, Observations
 
 if TYPE_CHECKING:
@@ -163,8 +163,8 @@ def _frames_of(path: Path, stream: FrameStream, seen: _Seen) -> Iterator[Observa
     for raw in batches(path, set(wanted.values()), stream.batch_rows):
         word = raw.word
         if held is None:
-            _check_names(path, raw, names, stream.columns)
-            meta = _meta(path, raw, names, stream.columns)
+            check_names(path, raw, names, stream.columns)
+            meta = table_meta(path, raw, names, stream.columns)
         rows = _typed(path, raw, wanted, None if held is None else set(held.columns))
         rows = rows if held is None else held.followed_by(rows)
         frame = rows.columns["frame"]
@@ -180,7 +180,7 @@ def _frames_of(path: Path, stream: FrameStream, seen: _Seen) -> Iterator[Observa
 
 def _typed(path: Path, raw: RawTable, wanted: Mapping[str, str], known: set[str] | None) -> _Rows:
     """The wanted columns of a batch in their types."""
-    columns, problems, _ = _convert(path, raw, wanted)
+    columns, problems, _ = convert_columns(path, raw, wanted)
     raise_problems(str(path), raw.word, raw.numbers, problems)
     if known is not None and set(columns) != known:
         raise ObservationError(
@@ -228,7 +228,7 @@ def _parquet_batches(path: Path, wanted: set[str], batch_rows: int) -> Iterator[
                 numbers = np.arange(first, first + batch.num_rows)
                 first += batch.num_rows
                 if batch.num_rows:
-                    arrays = {name: _from_arrow(pa.chunked_array([batch.column(name)])) for name in columns}
+                    arrays = {name: arrow_values(pa.chunked_array([batch.column(name)])) for name in columns}
                     yield RawTable(arrays, names, numbers, "row", meta)
     except (pa.ArrowException, OSError) as error:
         reason = str(error).splitlines()[0]

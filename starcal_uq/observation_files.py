@@ -100,15 +100,15 @@ def read_observations(path: str | os.PathLike[str], camera: Camera | None, mappi
     ending = _ending(path)
     names = {name: mapping.get(name, name) for name in COLUMNS}
     raw = _read(path, _read_bytes(path), ending, set(names.values()))
-    _check_names(path, raw, names, mapping)
+    check_names(path, raw, names, mapping)
     if not len(raw.numbers):
         raise ObservationError(f"{path}: the table has a header but no rows; give a table with observations.")
-    columns, problems, unknown_frame = _convert(path, raw, names)
+    columns, problems, unknown_frame = convert_columns(path, raw, names)
     problems += check_columns(columns, camera, unknown_frame)
     # A message names the column as it is called in this file.
     named = [replace(p, column=names[p.column] if p.column else None) for p in problems]
     raise_problems(str(path), raw.word, raw.numbers, named)
-    return Observations(**columns, meta=_meta(path, raw, names, mapping))
+    return Observations(**columns, meta=table_meta(path, raw, names, mapping))
 
 
 def _read(path: Path, data: bytes, ending: str, wanted: set[str]) -> RawTable:
@@ -117,7 +117,8 @@ def _read(path: Path, data: bytes, ending: str, wanted: set[str]) -> RawTable:
     return _read_text(path, data, ecsv=ending == ".ecsv")
 
 
-def _check_names(path: Path, raw: RawTable, names: Mapping[str, str], mapping: Mapping[str, str]) -> None:
+def check_names(path: Path, raw: RawTable, names: Mapping[str, str], mapping: Mapping[str, str]) -> None:
+    """Raise `ObservationError` where a column is missing that is required or was named."""
     missing = [c for c in names if names[c] not in raw.names and (COLUMNS[c].required or c in mapping)]
     if missing:
         wanted = names[missing[0]]
@@ -133,7 +134,9 @@ def _check_names(path: Path, raw: RawTable, names: Mapping[str, str], mapping: M
             raise ObservationError(f"{path}: column {name} occurs twice; remove or rename one.", column=name)
 
 
-def _convert(path: Path, raw: RawTable, names: Mapping[str, str]) -> tuple[dict[str, Any], list[Problem], BoolArray]:
+def convert_columns(
+    path: Path, raw: RawTable, names: Mapping[str, str]
+) -> tuple[dict[str, Any], list[Problem], BoolArray]:
     """Typed columns, what was wrong with their cells, and the rows whose frame is unknown."""
     columns: dict[str, Any] = {}
     problems = list(raw.problems)
@@ -181,7 +184,8 @@ def _to_unit(path: Path, name: str, values: FloatArray, unit: str) -> FloatArray
     return converted
 
 
-def _meta(path: Path, raw: RawTable, names: Mapping[str, str], mapping: Mapping[str, str]) -> AnyDict:
+def table_meta(path: Path, raw: RawTable, names: Mapping[str, str], mapping: Mapping[str, str]) -> AnyDict:
+    """The metadata of a table: what the file carries, where it came from, and which columns were ignored."""
     meta = {"source": str(path), **raw.meta}
     ignored = [name for name in raw.names if name not in names.values()]
     meta["ignored_columns"] = ignored or list(meta.get("ignored_columns", []))
@@ -288,13 +292,13 @@ def _read_parquet(path: Path, data: bytes, wanted: set[str]) -> RawTable:
     except (pa.ArrowException, OSError) as error:
         reason = str(error).splitlines()[0]
         raise ObservationError(f"{path}: is no readable Parquet file ({reason}); write it again.") from None
-    columns = {name: _from_arrow(table.column(name)) for name in table.column_names}
+    columns = {name: arrow_values(table.column(name)) for name in table.column_names}
     stored = (file.schema_arrow.metadata or {}).get(_META_KEY)
     meta = json.loads(stored) if stored else {}
     return RawTable(columns, names, np.arange(1, table.num_rows + 1), "row", meta)
 
 
-def _from_arrow(column: Any) -> Any:
+def arrow_values(column: Any) -> Any:
     """An arrow column as an array if it holds numbers without nulls, else as texts."""
     import pyarrow as pa
 
