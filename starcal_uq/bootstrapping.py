@@ -30,11 +30,11 @@ class Bootstrap:
 
     Attributes
     ----------
-    rounds : tuple of (Identification, Calibration)
-        In their order.
+    rounds : tuple of (Identification, Observations, Calibration)
+        In their order; the observations are those that were calibrated.
     """
 
-    rounds: tuple[tuple[Identification, Calibration], ...]
+    rounds: tuple[tuple[Identification, Observations, Calibration], ...]
 
     @property
     def identification(self) -> Identification:
@@ -42,14 +42,19 @@ class Bootstrap:
         return self.rounds[-1][0]
 
     @property
+    def observations(self) -> Observations:
+        """The last ones."""
+        return self.rounds[-1][1]
+
+    @property
     def calibration(self) -> Calibration:
         """The last one."""
-        return self.rounds[-1][1]
+        return self.rounds[-1][2]
 
     @property
     def summary(self) -> str:
         """What the second round changed, in words."""
-        (before, first), (after, second) = self.rounds[0], self.rounds[-1]
+        (before, _, first), (after, _, second) = self.rounds[0], self.rounds[-1]
         old, new = _pairs(before.observations), _pairs(after.observations)
         words = (
             f"{plural(len(old), 'star')} in {plural(before.n_identified, 'frame')} with the nominal camera, "
@@ -98,16 +103,15 @@ def bootstrap(
     """
     from starcal_uq.estimation import calibrate
 
-    rounds: list[tuple[Identification, Calibration]] = []
+    rounds: list[tuple[Identification, Observations, Calibration]] = []
     known: Calibration | None = None
     for _ in range(2):
         found = identify(centroids, camera, stars, calibration=known, **(identification or {}))
         if not found.n_identified:
             raise IdentificationError(f"no frame is identified: {found.summary}")
         obs = found.observations if prepare is None else prepare(found.observations)
-        start = camera.with_theta(camera.theta)
-        known = calibrate(obs, start, **(method or {}))
-        rounds.append((found, known))
+        known = calibrate(obs, camera, **(method or {}))
+        rounds.append((found, obs, known))
     return Bootstrap(tuple(rounds))
 
 

@@ -17,31 +17,20 @@ import numpy as np
 from starcal_uq._types import AnyDict
 from starcal_uq.centroids import COLUMNS, FRAME_COLUMNS, Centroids
 from starcal_uq.errors import ObservationError
+from starcal_uq.frame_rows import as_plain, table_ending
 from starcal_uq.runfolder import atomic_path, ensure_new
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-_ENDINGS = (".csv", ".ecsv", ".parquet")
 _KEY = "starcal_uq_centroids"
 _TRUTH = {"True": True, "False": False}
 _MARK = f"# {_KEY} "
 
 
-def _ending(path: Path) -> str:
-    ending = path.suffix.lower()
-    if ending not in _ENDINGS:
-        raise ObservationError(f"{path}: the ending {ending or '(none)'} is unknown; use {', '.join(_ENDINGS)}.")
-    return ending
-
-
-def _plain(value: Any) -> Any:
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
-
-
 def write_centroids(centroids: Centroids, path: str | os.PathLike[str], force: bool) -> None:
     """See `Centroids.save`."""
-    ending = _ending(Path(path))
+    ending = table_ending(Path(path))
     ensure_new(path, force)
     frames = {
         # JSON has no NaN: null stands for it.
@@ -49,7 +38,7 @@ def write_centroids(centroids: Centroids, path: str | os.PathLike[str], force: b
         for name in FRAME_COLUMNS
     }
     document = {"frames": frames, "messages": list(centroids.messages), "meta": centroids.meta}
-    text = json.dumps(document, default=_plain)
+    text = json.dumps(document, default=as_plain)
     with atomic_path(path) as temporary:
         if ending == ".csv":
             rows = centroids.to_dataframe().to_csv(index=False, lineterminator="\n")
@@ -77,7 +66,7 @@ def _table(centroids: Centroids, text: str) -> Any:
 def read_centroids(path: str | os.PathLike[str]) -> Centroids:
     """See `Centroids.load`."""
     path = Path(path)
-    ending = _ending(path)
+    ending = table_ending(path)
     if not os.path.isfile(path):
         raise ObservationError(f"{path}: the file does not exist; check the path.")
     read = {".csv": _read_csv, ".ecsv": _read_ecsv, ".parquet": _read_parquet}[ending]

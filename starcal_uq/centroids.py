@@ -8,7 +8,6 @@ from __future__ import annotations
 import html
 import os
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from numpy.typing import ArrayLike
 from starcal_uq._types import AnyDict, BoolArray, FloatArray, IntArray, StrArray
 from starcal_uq.errors import ObservationError
 from starcal_uq.formatting import plural
+from starcal_uq.frame_rows import FrameRows, locked
 
 # Name -> (type, description), of one row per star and of one entry per frame.
 COLUMNS: dict[str, tuple[type, str]] = {
@@ -45,7 +45,7 @@ FRAME_COLUMNS: dict[str, tuple[type, str]] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Centroids:
+class Centroids(FrameRows):
     """Star positions with their covariances; one row per star and frame, sorted by frame.
 
     Rows given in another order are sorted by frame; within a frame they keep their order, which
@@ -122,23 +122,13 @@ class Centroids:
                     )
             order = np.argsort(arrays[key], kind="stable")
             for name, values in arrays.items():
-                values = values[order]
-                values.setflags(write=False)
-                object.__setattr__(self, name, values)
+                object.__setattr__(self, name, locked(values[order]))
         if np.any(self.frame_ids[1:] == self.frame_ids[:-1]):
             raise ObservationError("centroids: frame_ids holds a number twice; number the frames differently.")
         if len(stray := np.setdiff1d(self.frame, self.frame_ids)):
             raise ObservationError(f"centroids: frame {stray[0]} is not among frame_ids; list every frame there.")
         object.__setattr__(self, "messages", tuple(self.messages))
         object.__setattr__(self, "meta", dict(self.meta))
-
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    @property
-    def n_stars(self) -> int:
-        """Number of rows N: stars summed over frames."""
-        return len(self.frame)
 
     @property
     def n_frames(self) -> int:
@@ -149,25 +139,6 @@ class Centroids:
     def n_left_out(self) -> int:
         """Number of frames that could not be used."""
         return int(np.count_nonzero(self.problem != ""))
-
-    @cached_property
-    def frame_starts(self) -> IntArray:
-        """First row of each frame, and N, shape (K + 1,): frame k has rows ``starts[k]:starts[k + 1]``."""
-        starts = np.append(np.searchsorted(self.frame, self.frame_ids), len(self.frame)).astype(np.int64)
-        starts.setflags(write=False)
-        return starts
-
-    @property
-    def stars_per_frame(self) -> IntArray:
-        """Number of stars in each frame, shape (K,)."""
-        return np.diff(self.frame_starts)
-
-    @cached_property
-    def xy(self) -> FloatArray:
-        """Centroids, shape (N, 2), pixels."""
-        xy: FloatArray = np.column_stack([self.x_px, self.y_px])
-        xy.setflags(write=False)
-        return xy
 
     @property
     def covariance_px2(self) -> FloatArray:
@@ -183,12 +154,7 @@ class Centroids:
 
     def select(self, mask: ArrayLike) -> Centroids:
         """The rows where `mask` (bool, shape (N,)) is true; every frame keeps its place."""
-        chosen = np.asarray(mask)
-        if chosen.dtype != np.bool_ or chosen.shape != self.frame.shape:
-            raise ObservationError(
-                f"centroids: the mask is {chosen.dtype} of shape {chosen.shape}; "
-                f"give true or false for each of the {len(self)} rows."
-            )
+        chosen = self._mask(mask, "centroids")
         return replace(self, **{name: getattr(self, name)[chosen] for name in COLUMNS})
 
     def select_frames(self, ids: ArrayLike) -> Centroids:
@@ -199,9 +165,7 @@ class Centroids:
         ObservationError
             If there is no such frame.
         """
-        wanted = np.asarray(ids).ravel()
-        if len(missing := np.setdiff1d(wanted, self.frame_ids)):
-            raise ObservationError(f"centroids: there is no frame {missing[0]}; choose among frame_ids.")
+        wanted = self._frame_numbers(ids, "centroids")
         kept = np.isin(self.frame_ids, wanted)
         frames: AnyDict = {name: getattr(self, name)[kept] for name in FRAME_COLUMNS}
         rows: AnyDict = {name: getattr(self, name)[np.isin(self.frame, wanted)] for name in COLUMNS}

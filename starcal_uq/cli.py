@@ -111,9 +111,9 @@ def demo(
     """The experiment of Ye & Yang 2017, end to end, ending in DIR/report.html."""
     from starcal_uq.catalogue import load_catalogue
     from starcal_uq.console import err, show_calibration
-    from starcal_uq.runfolder import RunFolder
+    from starcal_uq.runfolder import RunFolder, check_new_run
     from starcal_uq.simulation import paper_camera, paper_start, simulate
-    from starcal_uq.steps import calibrate_step, check_new_run
+    from starcal_uq.steps import calibrate_step
 
     run = RunFolder(out)
     check_new_run(run, force)
@@ -228,8 +228,8 @@ def calibrate_command(
 ) -> None:
     """Estimate optics and distortion: three stages and refinement, with covariance."""
     from starcal_uq.console import print_json, records, show_calibration, show_screening
-    from starcal_uq.runfolder import RunFolder
-    from starcal_uq.steps import calibrate_step, check_new_run, truth_of
+    from starcal_uq.runfolder import RunFolder, check_new_run
+    from starcal_uq.steps import calibrate_step, truth_of
 
     check_new_run(RunFolder(out), force)
     obs, nominal = _load(observations, camera, column, directions, observer_velocity)
@@ -397,8 +397,8 @@ def run_command(
     """Calibrate, sample, couple, propagate and report: everything from stars or images to RUN/report.html."""
     from starcal_uq.console import show_calibration, show_screening
     from starcal_uq.image_steps import are_images, save_image_results
-    from starcal_uq.runfolder import RunFolder
-    from starcal_uq.steps import calibrate_step, check_new_run, truth_of
+    from starcal_uq.runfolder import RunFolder, check_new_run
+    from starcal_uq.steps import calibrate_step, truth_of
 
     folder = RunFolder(out)
     check_new_run(folder, force)

@@ -56,8 +56,7 @@ def validate_command(
     from starcal_uq.camera import Camera
     from starcal_uq.console import out as console
     from starcal_uq.console import print_json, records, show_table
-    from starcal_uq.runfolder import RunFolder, atomic_write_bytes
-    from starcal_uq.steps import check_new_run
+    from starcal_uq.runfolder import RunFolder, atomic_write_bytes, check_new_run
     from starcal_uq.validation import TRUTHS, validate
 
     if truth not in TRUTHS:

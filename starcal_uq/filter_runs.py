@@ -19,7 +19,7 @@ from starcal_uq.frame_streams import FrameStream, stream_frames
 from starcal_uq.interrupts import interrupt_between_steps
 from starcal_uq.recursion_options import RecursionOptions
 from starcal_uq.recursive_calibration import RecursiveCalibration
-from starcal_uq.runfolder import RunFolder, atomic_path, atomic_write_text
+from starcal_uq.runfolder import RunFolder, atomic_path, atomic_write_text, check_new_run
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -84,10 +84,8 @@ def filter_run(
     if state.exists():
         _check_same(run.path / SOURCE, identity)
         filtering = RecursiveCalibration.load(state)
-    elif run.path.is_dir() and any(run.path.iterdir()) and not force:
-        raise RunFolderError(
-            f"{run.path}: the folder exists and is not empty; name another, or replace its results with --force."
-        )
+    else:
+        check_new_run(run, force)
 
     def keep() -> None:
         run.create()

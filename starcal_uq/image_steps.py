@@ -102,7 +102,7 @@ def observations_from_images(
         return obs.with_meta(directions=directions or "undeclared")
 
     found = bootstrap(centroids, camera, stars, prepare=prepare)
-    return prepare(found.identification.observations), centroids, found
+    return found.observations, centroids, found
 
 
 def save_image_results(run: RunFolder, centroids: Centroids, found: Bootstrap) -> None:

@@ -290,6 +290,21 @@ def _jacobian(state: CameraState, r: FloatArray, g: FieldGeometry) -> tuple[Floa
     return u, j
 
 
+def _linearised(
+    state: CameraState,
+    u: FloatArray,
+    sigma_px: FloatArray,
+    r: FloatArray,
+    centroid: IntArray,
+    star: IntArray,
+    g: FieldGeometry,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Residuals (2, m), their derivatives (2, m, q), weights (m,), and the weighted derivatives as rows (2 m, q)."""
+    predicted, j = _jacobian(state, r[star], g)
+    weight = 1.0 / sigma_px[centroid]
+    return (u[centroid] - predicted).T, j, weight, (j * weight[:, None]).reshape(-1, j.shape[2])
+
+
 def _fit(
     state: CameraState,
     u: FloatArray,
@@ -301,10 +316,7 @@ def _fit(
     prior: FloatArray,
 ) -> tuple[CameraState, FloatArray]:
     """One damped Gauss-Newton step, and the residuals (m, 2) that it predicts."""
-    predicted, j = _jacobian(state, r[star], g)
-    e = (u[centroid] - predicted).T
-    weight = 1.0 / sigma_px[centroid]
-    a = (j * weight[:, None]).reshape(-1, j.shape[2])
+    e, j, weight, a = _linearised(state, u, sigma_px, r, centroid, star, g)
     normal = a.T @ a
     normal[np.diag_indices(len(normal))] += prior
     gradient = a.T @ (e * weight).ravel()
@@ -325,11 +337,9 @@ def _information(
     g: FieldGeometry,
 ) -> tuple[FloatArray, FloatArray]:
     """Normal equations of the shared parameters with the attitude eliminated."""
-    predicted, j = _jacobian(state, r[star], g)
-    weight = 1.0 / sigma_px[centroid]
-    a = (j * weight[:, None]).reshape(-1, j.shape[2])
-    e = ((u[centroid] - predicted).T * weight).ravel()
+    e, _, weight, a = _linearised(state, u, sigma_px, r, centroid, star, g)
     attitude, shared = a[:, :3], a[:, 3:]
+    e = (e * weight).ravel()
     onto = np.linalg.solve(attitude.T @ attitude, attitude.T @ np.column_stack([shared, e]))
     rest = shared - attitude @ onto[:, :-1]
     information = rest.T @ rest

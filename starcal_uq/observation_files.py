@@ -18,6 +18,7 @@ import numpy as np
 
 from starcal_uq._types import AnyDict, BoolArray, FloatArray, IntArray
 from starcal_uq.errors import ObservationError
+from starcal_uq.frame_rows import as_plain, table_ending
 from starcal_uq.observation_checks import (
     Problem,
     check_columns,
@@ -32,7 +33,6 @@ from starcal_uq.runfolder import atomic_path, atomic_write_text, ensure_new
 if TYPE_CHECKING:
     from starcal_uq.camera import Camera
 
-_ENDINGS = (".csv", ".ecsv", ".parquet")
 _META_KEY = b"starcal_uq"
 
 
@@ -67,13 +67,6 @@ class RawTable:
     problems: list[Problem] = field(default_factory=list)
 
 
-def _ending(path: Path) -> str:
-    ending = path.suffix.lower()
-    if ending not in _ENDINGS:
-        raise ObservationError(f"{path}: the ending {ending or '(none)'} is unknown; use {', '.join(_ENDINGS)}.")
-    return ending
-
-
 def _read_bytes(path: Path) -> bytes:
     try:
         data = path.read_bytes()
@@ -97,7 +90,7 @@ def read_observations(path: str | os.PathLike[str], camera: Camera | None, mappi
     path = Path(path)
     if os.path.isdir(path):
         raise ObservationError(f"{path}: is a directory; name a file of observations.")
-    ending = _ending(path)
+    ending = table_ending(path)
     names = {name: mapping.get(name, name) for name in COLUMNS}
     raw = _read(path, _read_bytes(path), ending, set(names.values()))
     check_names(path, raw, names, mapping)
@@ -277,7 +270,7 @@ def _ecsv_header(path: Path, text: str) -> AnyDict:
 def _ecsv_meta(header: AnyDict) -> AnyDict:
     stored = dict(header.get("meta") or {})
     values = {key: value for key, value in stored.items() if not str(key).startswith("__")}
-    plain: AnyDict = json.loads(json.dumps(values, default=_plain))
+    plain: AnyDict = json.loads(json.dumps(values, default=as_plain))
     return plain
 
 
@@ -311,19 +304,14 @@ def arrow_values(column: Any) -> Any:
     return ["" if value is None else str(value) for value in column.to_pylist()]
 
 
-def _plain(value: Any) -> Any:
-    """For json.dumps: numpy values as Python's, anything else in words."""
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
-
-
 def write_observations(observations: Observations, path: str | os.PathLike[str], force: bool) -> None:
     """See `Observations.save`."""
-    ending = _ending(Path(path))
+    ending = table_ending(Path(path))
     ensure_new(path, force)
     if ending == ".csv":
         atomic_write_text(path, _csv_text(observations))
         return
-    meta = json.loads(json.dumps(observations.meta, default=_plain))
+    meta = json.loads(json.dumps(observations.meta, default=as_plain))
     with atomic_path(path) as temporary:
         if ending == ".ecsv":
             table = observations.with_meta().to_table()

@@ -12,18 +12,17 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from starcal_uq._types import AnyDict, FloatArray, IntArray, StrArray
 from starcal_uq.errors import ObservationError
+from starcal_uq.frame_rows import FrameRows, locked
 
 if TYPE_CHECKING:
     from starcal_uq.camera import Camera
-
-_Array = TypeVar("_Array", bound="np.ndarray[Any, Any]")
 
 
 @dataclass(frozen=True)
@@ -73,7 +72,7 @@ _DTYPES: dict[str, type] = {"whole": np.int64, "number": np.float64, "text": np.
 
 
 @dataclass(frozen=True, eq=False)
-class Observations:
+class Observations(FrameRows):
     """Stars measured in pixels, with their directions; one row per star and frame, sorted by frame.
 
     Rows given in another order are sorted by frame; within a frame they keep their order. The arrays are
@@ -135,7 +134,7 @@ class Observations:
         for name, values in columns.items():
             # A column without a single value is as good as absent, and files do not tell the two apart.
             absent = COLUMNS[name].gaps and n > 0 and _all_missing(values)
-            object.__setattr__(self, name, None if absent else _locked(values))
+            object.__setattr__(self, name, None if absent else locked(values))
         directions = self.meta.get("directions", "undeclared")
         if directions not in ("apparent", "catalogue", "undeclared"):
             raise ObservationError(
@@ -148,14 +147,6 @@ class Observations:
         """The columns that are present, in their fixed order: name to array of shape (N,)."""
         return {name: getattr(self, name) for name in COLUMNS if getattr(self, name) is not None}
 
-    def __len__(self) -> int:
-        return len(self.frame)
-
-    @property
-    def n_stars(self) -> int:
-        """Number of rows N: stars summed over frames."""
-        return len(self.frame)
-
     @property
     def n_frames(self) -> int:
         """Number of frames K."""
@@ -164,29 +155,13 @@ class Observations:
     @cached_property
     def frame_ids(self) -> IntArray:
         """Frame numbers that occur, ascending, shape (K,)."""
-        return _locked(np.unique(self.frame))
-
-    @cached_property
-    def frame_starts(self) -> IntArray:
-        """First row of each frame, and N, shape (K + 1,): frame k has rows ``starts[k]:starts[k + 1]``."""
-        starts = np.searchsorted(self.frame, self.frame_ids).astype(np.int64)
-        return _locked(np.append(starts, np.int64(len(self.frame))))
-
-    @property
-    def stars_per_frame(self) -> IntArray:
-        """Number of stars in each frame, shape (K,)."""
-        return np.diff(self.frame_starts)
-
-    @cached_property
-    def xy(self) -> FloatArray:
-        """Centroids, shape (N, 2), pixels."""
-        return _locked(np.column_stack([self.x_px, self.y_px]))
+        return locked(np.unique(self.frame))
 
     @cached_property
     def directions_icrs(self) -> FloatArray:
         """Unit vectors of the directions, shape (N, 3), ICRS axes."""
         ra, dec = np.radians(self.ra_deg), np.radians(self.dec_deg)
-        return _locked(np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]))
+        return locked(np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]))
 
     @property
     def directions_declared(self) -> bool:
@@ -210,12 +185,7 @@ class Observations:
 
     def select(self, mask: ArrayLike) -> Observations:
         """The rows where `mask` (bool, shape (N,)) is true."""
-        chosen = np.asarray(mask)
-        if chosen.dtype != np.bool_ or chosen.shape != self.frame.shape:
-            raise ObservationError(
-                f"observations: the mask is {chosen.dtype} of shape {chosen.shape}; "
-                f"give true or false for each of the {len(self)} rows."
-            )
+        chosen = self._mask(mask, "observations")
         return replace(self, **{name: values[chosen] for name, values in self.columns.items()})
 
     def select_frames(self, ids: ArrayLike) -> Observations:
@@ -226,10 +196,7 @@ class Observations:
         ObservationError
             If a frame does not occur in the table.
         """
-        wanted = np.asarray(ids).ravel()
-        missing = np.setdiff1d(wanted, self.frame_ids)
-        if missing.size:
-            raise ObservationError(f"observations: there is no frame {missing[0]}; choose among frame_ids.")
+        wanted = self._frame_numbers(ids, "observations")
         return self.select(np.isin(self.frame, wanted))
 
     def with_meta(self, **entries: Any) -> Observations:
@@ -358,8 +325,3 @@ def _array(name: str, values: Any) -> Any:
 
 def _all_missing(values: Any) -> bool:
     return bool(np.all(values == "" if values.dtype.kind == "U" else np.isnan(values)))
-
-
-def _locked(array: _Array) -> _Array:
-    array.setflags(write=False)
-    return array

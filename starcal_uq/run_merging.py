@@ -13,7 +13,7 @@ from starcal_uq.errors import CalibrationError, RunFolderError
 from starcal_uq.expansion import optimum
 from starcal_uq.merging import merge, renumbered
 from starcal_uq.observations import COLUMNS, Observations, load_observations
-from starcal_uq.runfolder import PathLike, RunFolder
+from starcal_uq.runfolder import PathLike, RunFolder, check_new_run
 
 _FILES = (
     "observations",
@@ -188,9 +188,4 @@ def _check_target(target: RunFolder, folders: Sequence[RunFolder], force: bool) 
     place: Path = target.path.resolve()
     if any(folder.path.resolve() == place for folder in folders):
         raise RunFolderError(f"{target.path}: is one of the runs to merge; name another folder for the result.")
-    if target.path.exists() and not target.path.is_dir():
-        raise RunFolderError(f"{target.path}: is a file, not a folder for results; name another folder.")
-    if target.path.is_dir() and any(target.path.iterdir()) and not force:
-        raise RunFolderError(
-            f"{target.path}: the folder exists and is not empty; name another, or replace its results with --force."
-        )
+    check_new_run(target, force)

@@ -255,3 +255,19 @@ class RunFolder:
         if not os.path.exists(path):
             raise RunFolderError(f"{self.path}: the run folder has no {file_name}; {remedy}.")
         return path
+
+
+def check_new_run(run: RunFolder, force: bool) -> None:
+    """Refuse a folder that holds anything, unless forced; called before any work is done.
+
+    Raises
+    ------
+    RunFolderError
+        When the folder exists and is not empty, or is a file.
+    """
+    if run.path.exists() and not run.path.is_dir():
+        raise RunFolderError(f"{run.path}: is a file, not a folder for results; name another folder.")
+    if run.path.is_dir() and any(run.path.iterdir()) and not force:
+        raise RunFolderError(
+            f"{run.path}: the folder exists and is not empty; name another, or replace its results with --force."
+        )

@@ -16,7 +16,7 @@ from starcal_uq.distortion import sigma_parameter
 from starcal_uq.errors import CalibrationError, ObservationError, RunFolderError
 from starcal_uq.observations import Observations, load_observations
 from starcal_uq.progress import Progress
-from starcal_uq.runfolder import RunFolder, atomic_path, ensure_new
+from starcal_uq.runfolder import RunFolder, atomic_path, check_new_run, ensure_new
 
 if TYPE_CHECKING:
     from starcal_uq.couplings import Coupling
@@ -83,22 +83,6 @@ def read_observations(
         except ObservationError as error:
             raise ObservationError(f"{path}: {error}", row=error.row, column=error.column) from error
     return obs
-
-
-def check_new_run(run: RunFolder, force: bool) -> None:
-    """Refuse a folder that holds anything, unless forced; called before any work is done.
-
-    Raises
-    ------
-    RunFolderError
-        When the folder exists and is not empty, or is a file.
-    """
-    if run.path.exists() and not run.path.is_dir():
-        raise RunFolderError(f"{run.path}: is a file, not a folder for results; name another folder.")
-    if run.path.is_dir() and any(run.path.iterdir()) and not force:
-        raise RunFolderError(
-            f"{run.path}: the folder exists and is not empty; name another, or replace its results with --force."
-        )
 
 
 def _remove(run: RunFolder, names: Sequence[str]) -> None:

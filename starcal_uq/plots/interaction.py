@@ -136,11 +136,4 @@ def _legend(figure: Figure, methods: list[str]) -> None:
         Line2D([], [], color=style.INK, linestyle="--", label="spread"),
         Line2D([], [], color=style.INK, linestyle=":", label="noise alone, where it differs from the spread"),
     ]
-    figure.legend(
-        handles=handles,
-        loc="outside upper center",
-        ncols=len(handles),
-        fontsize=style.TICK_SIZE,
-        frameon=False,
-        labelcolor=style.INK,
-    )
+    style.legend_above(figure, handles)

@@ -157,13 +157,10 @@ def _trajectory_key(figure: Figure, colours: Mapping[str, str], printed: bool) -
                 label="printed in the paper",
             )
         )
-    figure.legend(
-        handles=handles,
-        loc="outside upper center",
-        ncols=len(handles),
+    style.legend_above(
+        figure,
+        handles,
         fontsize=style.LABEL_SIZE,
-        frameon=False,
-        labelcolor=style.INK,
         columnspacing=1.4,
         handlelength=1.8,
     )

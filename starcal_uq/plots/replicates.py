@@ -133,13 +133,9 @@ def _legend(figure: Figure, found: Replicates) -> None:
         Patch(color=style.LIGHT, label="Cramer-Rao bound"),
     ]
     frames = found.provenance["settings"].get("n_frames")
-    figure.legend(
-        handles=handles,
-        loc="outside upper center",
-        ncols=len(handles),
-        fontsize=style.TICK_SIZE,
-        frameon=False,
-        labelcolor=style.INK,
+    style.legend_above(
+        figure,
+        handles,
         title=f"{found.n_replicates} replicates" + ("" if frames is None else f" of {frames} frames"),
         title_fontsize=style.TITLE_SIZE,
     )

@@ -78,6 +78,12 @@ def legend(ax: Axes, **keywords: Any) -> None:
     ax.legend(**{**options, **keywords})
 
 
+def legend_above(figure: Figure, handles: Any, **keywords: Any) -> None:
+    """One legend for all panels, in a line above them."""
+    options: dict[str, Any] = {"ncols": len(handles), "fontsize": TICK_SIZE, "frameon": False, "labelcolor": INK}
+    figure.legend(handles=handles, loc="outside upper center", **{**options, **keywords})
+
+
 def colour_bar(ax: Axes, image: Any, text: str) -> Any:
     """A colour bar of its own for one panel."""
     bar = ax.figure.colorbar(image, ax=ax, fraction=0.046, pad=0.03)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import base64
 import re
 from collections.abc import Mapping
 from typing import Any
 
 from starcal_uq.distortion import get_model
 from starcal_uq.formatting import MINUS, count, join_words
+from starcal_uq.html_pages import embedded_image, template_environment
 from starcal_uq.reporting import model_tables, tables, words
 from starcal_uq.reporting.loading import Results
 from starcal_uq.verdict import Check, Level, Question, judge, limits, worst
@@ -26,15 +26,7 @@ def render(results: Results, figures: Mapping[str, bytes]) -> str:
     figures
         PNG images by the names of `starcal_uq.reporting.figures.draw_figures`; a missing one is left out.
     """
-    import jinja2
-
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("starcal_uq", "templates"),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
+    environment = template_environment()
     environment.filters["symbol"] = tables.symbol
     environment.filters["minus"] = _minus
     return environment.get_template("report.html.j2").render(context(results, figures)) + "\n"
@@ -81,7 +73,7 @@ def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
         **_distortion(results),
         "degrees_of_freedom": count(cal.dof),
         "provenance_rows": words.provenance_rows(results),
-        "images": {name: _image(png) for name, png in figures.items()},
+        "images": {name: embedded_image(png) for name, png in figures.items()},
     }
 
 
@@ -97,11 +89,6 @@ def _distortion(results: Results) -> dict[str, Any]:
         "from_point": "ideal" if forward else "distorted",
         "to_point": "distorted" if forward else "ideal",
     }
-
-
-def _image(png: bytes) -> dict[str, Any]:
-    """An image and its width on the page: half its pixels, so that it is sharp on fine screens and on paper."""
-    return {"data": base64.b64encode(png).decode("ascii"), "width": int.from_bytes(png[16:20], "big") // 2}
 
 
 def _answer(checks: tuple[Check, ...]) -> str:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.formatting import count
+from starcal_uq.html_pages import embedded_image, template_environment
 from starcal_uq.reproduction import report_tables as tables
 from starcal_uq.reproduction import report_words as words
 from starcal_uq.reproduction.judgement import Outcome
@@ -46,16 +46,7 @@ def render(found: Reproduction, figures: Mapping[str, bytes]) -> str:
     figures
         PNG images by the names of `draw_figures`; a missing one is left out.
     """
-    import jinja2
-
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("starcal_uq", "templates"),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
-    )
-    return environment.get_template(TEMPLATE).render(context(found, figures)) + "\n"
+    return template_environment().get_template(TEMPLATE).render(context(found, figures)) + "\n"
 
 
 def context(found: Reproduction, figures: Mapping[str, bytes]) -> dict[str, Any]:
@@ -92,10 +83,5 @@ def context(found: Reproduction, figures: Mapping[str, bytes]) -> dict[str, Any]
         "n_stars": count(N_STARS),
         "equation": words.EQUATIONS[found.run.convention],
         "provenance_rows": words.provenance_rows(found),
-        "images": {name: _image(png) for name, png in figures.items()},
+        "images": {name: embedded_image(png) for name, png in figures.items()},
     }
-
-
-def _image(png: bytes) -> dict[str, Any]:
-    """An image and its width on the page: half its pixels, so that it is sharp on fine screens and on paper."""
-    return {"data": base64.b64encode(png).decode("ascii"), "width": int.from_bytes(png[16:20], "big") // 2}
