@@ -54,14 +54,18 @@ _LOCATION = {
     "Screening": "screening_result",
     "Sensor": "sensor",
     "SensorError": "errors",
+    "Site": "site",
+    "SiteError": "errors",
     "StarCatalogue": "catalogue",
     "StarcalError": "errors",
     "Status": "status",
     "Validation": "validation_result",
     "aberrate": "apparent",
     "accept_inflation": "jackknife",
+    "apparent_directions": "apparent",
     "bootstrap": "bootstrapping",
     "calibrate": "estimation",
+    "catalogue_directions": "apparent",
     "compare_models": "model_comparison",
     "consistency_of": "consistency",
     "contaminate": "wrong_identifications",
@@ -108,6 +112,7 @@ _LOCATION = {
     "truth_table": "rendered_files",
     "unproject": "projection",
     "validate": "validation",
+    "without_low_stars": "apparent",
 }
 
 __all__ = [
@@ -154,6 +159,8 @@ __all__ = [
     "Screening",
     "Sensor",
     "SensorError",
+    "Site",
+    "SiteError",
     "StarCatalogue",
     "StarcalError",
     "Status",
@@ -161,8 +168,10 @@ __all__ = [
     "__version__",
     "aberrate",
     "accept_inflation",
+    "apparent_directions",
     "bootstrap",
     "calibrate",
+    "catalogue_directions",
     "compare_models",
     "consistency_of",
     "contaminate",
@@ -209,6 +218,7 @@ __all__ = [
     "truth_table",
     "unproject",
     "validate",
+    "without_low_stars",
 ]
 
 

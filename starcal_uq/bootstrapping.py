@@ -8,12 +8,14 @@ finds more stars and refuses what fitted by luck.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.errors import IdentificationError
 from starcal_uq.formatting import plural
 from starcal_uq.identification import identify
+from starcal_uq.image_record import identified_pairs
+from starcal_uq.sky_displacement import ToCatalogue, as_measured, mirrored, undisplaced
 
 if TYPE_CHECKING:
     from starcal_uq.calibration import Calibration
@@ -55,7 +57,7 @@ class Bootstrap:
     def summary(self) -> str:
         """What the second round changed, in words."""
         (before, _, first), (after, _, second) = self.rounds[0], self.rounds[-1]
-        old, new = _pairs(before.observations), _pairs(after.observations)
+        old, new = identified_pairs(before.observations), identified_pairs(after.observations)
         words = (
             f"{plural(len(old), 'star')} in {plural(before.n_identified, 'frame')} with the nominal camera, "
             f"{plural(len(new), 'star')} in {plural(after.n_identified, 'frame')} with the calibrated one: "
@@ -74,6 +76,7 @@ def bootstrap(
     stars: StarCatalogue,
     *,
     prepare: Callable[[Observations], Observations] | None = None,
+    to_catalogue: ToCatalogue | None = None,
     method: dict[str, Any] | None = None,
     identification: dict[str, Any] | None = None,
 ) -> Bootstrap:
@@ -89,6 +92,10 @@ def bootstrap(
         Catalogue.
     prepare : callable, optional
         What is done to observations before they are calibrated, such as making directions apparent.
+    to_catalogue : callable, optional
+        Where `prepare` makes directions apparent, its inverse: apparent directions (n, 3) and their times (n,) to
+        catalogue directions (n, 3). The second identification then looks for stars where they are seen. It is not
+        used where `prepare` leaves the directions as they are.
     method : dict, optional
         Options of `calibrate`.
     identification : dict, optional
@@ -103,19 +110,36 @@ def bootstrap(
     """
     from starcal_uq.estimation import calibrate
 
+    options = identification or {}
+    found = identify(centroids, camera, stars, **options)
     rounds: list[tuple[Identification, Observations, Calibration]] = []
-    known: Calibration | None = None
-    for _ in range(2):
-        found = identify(centroids, camera, stars, calibration=known, **(identification or {}))
+    for number in range(2):
         if not found.n_identified:
             raise IdentificationError(f"no frame is identified: {found.summary}")
         obs = found.observations if prepare is None else prepare(found.observations)
-        known = calibrate(obs, camera, **(method or {}))
+        known = calibrate(obs, found.nominal if number == 0 else rounds[0][0].nominal, **(method or {}))
         rounds.append((found, obs, known))
+        if number == 0:
+            found = _again(centroids, found, obs, known, stars, to_catalogue, options)
     return Bootstrap(tuple(rounds))
 
 
-def _pairs(obs: Observations) -> set[tuple[int, str]]:
-    if obs.star_id is None:
-        return set()
-    return set(zip(obs.frame.tolist(), obs.star_id.tolist(), strict=True))
+def _again(
+    centroids: Centroids,
+    first: Identification,
+    obs: Observations,
+    known: Calibration,
+    stars: StarCatalogue,
+    to_catalogue: ToCatalogue | None,
+    options: dict[str, Any],
+) -> Identification:
+    """The second identification, with the calibrated camera and centroids freed from what displaces the stars."""
+    flipped = first.parity == "mirrored"
+    table = mirrored(centroids, known.camera.width_px) if flipped else centroids
+    moved = table
+    if to_catalogue is not None and obs.meta["directions"] == "apparent":
+        moved = undisplaced(table, obs, known.camera, to_catalogue)
+    found = identify(moved, known.camera, stars, calibration=known, **options)
+    if found.n_identified:
+        found = replace(found, observations=as_measured(found.observations, moved, table))
+    return replace(found, parity="mirrored") if flipped else found

@@ -229,3 +229,13 @@ def _solve(normal: FloatArray, right: FloatArray) -> FloatArray:
     inverse = _inverse(normal)
     steps: FloatArray = (np.where(np.isfinite(inverse), inverse, 0.0) @ right)[:, :, 0]
     return steps
+
+
+def near_pairs(x: FloatArray, y: FloatArray, reach: float) -> IntArray:
+    """Pairs (i, j), in both orders, of positions closer than `reach`."""
+    from scipy.spatial import cKDTree
+
+    if len(x) < 2:
+        return np.zeros((0, 2), dtype=np.int64)
+    pairs = cKDTree(np.column_stack([x, y])).query_pairs(reach, output_type="ndarray").astype(np.int64)
+    return np.concatenate([pairs, pairs[:, ::-1]])

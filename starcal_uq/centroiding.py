@@ -19,10 +19,16 @@ from starcal_uq.centroids import COLUMNS, FRAME_COLUMNS, Centroids
 from starcal_uq.errors import ImageError
 from starcal_uq.formatting import plural
 from starcal_uq.image_files import IMAGE_ENDINGS, Image, read_image
+from starcal_uq.pixel_phase import phase_error, without_phase_error
 from starcal_uq.star_detection import DetectionOptions, FrameStars, find_stars
 
 if TYPE_CHECKING:
     from starcal_uq.camera import Camera
+
+# Images whose Gaussian is wider, sharper cores and all, are sampled well enough.
+_UNDERSAMPLED_PX = 0.85
+# Fainter stars are more easily found where the light falls into one pixel.
+_PHASE_SNR = 10.0
 
 Source = Image | str | os.PathLike[str]
 
@@ -38,6 +44,7 @@ def extract_centroids(
     min_pixels: int = 1,
     psf_sigma_px: float | None = None,
     max_stars: int | None = None,
+    correct_pixel_phase: bool = True,
     progress: Callable[[int, int], None] | None = None,
 ) -> Centroids:
     """Find the stars in images and measure their positions with covariances.
@@ -50,8 +57,9 @@ def extract_centroids(
     camera
         If given, every image must be the size of its detector.
     gain_e_per_count
-        Electrons per count; by default what the file says. Without it the photon noise of the stars themselves is
-        left away, so that `sigma_px` of bright stars comes out too small; a message says so.
+        Electrons per count; by default what the file says. Without it, it is read off the noise of the background
+        where that is bright and uneven enough, for `sigma_px` only. Where it is not, the photon noise of the stars
+        themselves is left away, so that `sigma_px` of bright stars comes out too small. A message says which.
     read_noise_e
         Read noise, electrons per pixel: a floor for the measured noise (needs the gain).
     saturation
@@ -65,6 +73,10 @@ def extract_centroids(
         Width of the star images before integration over pixels; by default it is measured in each image.
     max_stars
         Keep at most so many stars per frame, the brightest.
+    correct_pixel_phase
+        Centroids of undersampled star images that are no Gaussians are drawn to the centres of the pixels. Where the
+        places of many stars show it (4 standard deviations), it is taken out, and a message says how much it was. All
+        images are then taken to be of one camera.
     progress
         Called with (frames done, frames in all).
 
@@ -94,7 +106,7 @@ def extract_centroids(
         table.add(number, source, camera, options)
         if progress is not None:
             progress(number + 1, len(sources))
-    return table.centroids(options)
+    return table.centroids(options, correct_pixel_phase)
 
 
 @dataclass
@@ -143,26 +155,36 @@ class _Table:
         self.numbers += [number] * len(found.columns["x_px"])
         self.gains.append(found.gain_e_per_count)
 
-    def centroids(self, options: DetectionOptions) -> Centroids:
+    def centroids(self, options: DetectionOptions, correct_pixel_phase: bool) -> Centroids:
         columns: AnyDict = {"frame": np.array(self.numbers, dtype=np.int64)}
         for name, (kind, _) in COLUMNS.items():
             if name != "frame":
                 parts = [stars.columns[name] for stars in self.stars]
                 columns[name] = np.concatenate(parts) if parts else np.zeros(0, dtype=kind)
+        amplitudes = self._correct_pixel_phase(columns) if correct_pixel_phase else (0.0, 0.0)
         known = [gain for gain in self.gains if gain is not None]
         if known and len(known) < len(self.gains):
             # One unit for the whole table: counts are what every frame has.
             self.messages.append("The gain is known for some frames only; give one for all to get comparable fluxes.")
-        if len(known) < len(self.gains):
+        measured = [s.measured_gain_e_per_count for s in self.stars if s.measured_gain_e_per_count is not None]
+        if measured:
+            self.messages.append(
+                f"The gain is not given; the noise of the background says {float(np.median(measured)):.3g} electrons "
+                f"per count in {plural(len(measured), 'frame')}, which was taken for the photon noise of the stars."
+            )
+        n_without = len(self.gains) - len(known) - len(measured)
+        if n_without:
             self.messages.append(
                 "The gain is unknown for "
-                f"{plural(len(self.gains) - len(known), 'frame')}, so the photon noise of the stars is not in their "
+                f"{plural(n_without, 'frame')}, so the photon noise of the stars is not in their "
                 "sigma, which is too small for bright stars; give the gain in electrons per count."
             )
         meta = {
             "settings": options.to_dict(),
             "gain_e_per_count": known[0] if len(set(known)) == 1 and len(known) == len(self.gains) else None,
+            "gain_from_noise_e_per_count": float(np.median(measured)) if measured else None,
             "flux_unit": "electrons" if known and len(known) == len(self.gains) else "counts",
+            "pixel_phase_px": list(amplitudes),
             "images_sha256": self.digest.hexdigest(),
         }
         if known and len(known) < len(self.gains):
@@ -170,6 +192,29 @@ class _Table:
             columns["flux"] = columns["flux"] / per_star
         frames: AnyDict = {name: [entry[name] for entry in self.frames] for name in FRAME_COLUMNS}
         return Centroids(**columns, **frames, messages=tuple(self.messages), meta=meta)
+
+    def _correct_pixel_phase(self, columns: AnyDict) -> tuple[float, float]:
+        """Take errors by pixel phase out of `columns`, and give their amplitudes in x and y, pixels."""
+        sharp = [stars.windowed and stars.psf_sigma_px < _UNDERSAMPLED_PX for stars in self.stars]
+        rows = np.repeat(np.array(sharp, dtype=np.bool_), [len(stars.columns["x_px"]) for stars in self.stars])
+        clear = rows & (columns["snr"] > _PHASE_SNR) & ~(columns["blended"] | columns["saturated"] | columns["edge"])
+        x, y = columns["x_px"].copy(), columns["y_px"].copy()
+        found = phase_error(x[clear], y[clear]), phase_error(y[clear], x[clear])
+        moved = []
+        for name, place, error in zip("xy", (x, y), found, strict=True):
+            if error.amplitude_px:
+                variance = columns[f"var_{name}_px2"]
+                true, factor = without_phase_error(place[rows], variance[rows], error.amplitude_px)
+                columns[f"{name}_px"][rows] = true
+                variance[rows] *= factor**2
+                columns["cov_xy_px2"][rows] *= factor
+                moved.append(f"{error.amplitude_px:.3f} \u00b1 {error.sigma_px:.3f} px in {name}")
+        if moved:
+            self.messages.append(
+                f"Centroids crowd at the centres of the pixels in {plural(sum(sharp), 'frame')}, because the star "
+                f"images are too sharp for the pixels; errors of up to {' and '.join(moved)} were taken out."
+            )
+        return found[0].amplitude_px, found[1].amplitude_px
 
 
 def _sources(images: Source | Iterable[Source]) -> list[Source]:

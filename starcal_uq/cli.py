@@ -20,9 +20,11 @@ from starcal_uq.cli_options import (
     Columns,
     Directions,
     Draws,
+    Engine,
     Ensembles,
     Evaluation,
     Force,
+    InSpace,
     Json,
     Likelihood,
     Method,
@@ -34,8 +36,10 @@ from starcal_uq.cli_options import (
     Screen,
     Seed,
     Sigma,
+    SiteFile,
     Solver,
     Steps,
+    TimeUtc,
     Velocity,
     Walkers,
     parse_columns,
@@ -80,9 +84,18 @@ def _estimator(method: str, solver: str, robust: bool) -> dict[str, Any]:
     return options | {"likelihood": "student_t"} if robust else options
 
 
-def _load(obs_path: Path, camera_path: Path, columns: Any, directions: str | None, velocity: str | None) -> Any:
+def _load(
+    obs_path: Path,
+    camera_path: Path,
+    columns: Any,
+    directions: str | None,
+    velocity: str | None,
+    site: Path | None,
+    in_space: bool,
+) -> Any:
     from starcal_uq.camera import Camera
     from starcal_uq.console import warn_undeclared
+    from starcal_uq.site import Site
     from starcal_uq.steps import DIRECTIONS, read_observations
 
     if directions is not None and directions not in DIRECTIONS:
@@ -94,6 +107,8 @@ def _load(obs_path: Path, camera_path: Path, columns: Any, directions: str | Non
         columns=parse_columns(columns),
         directions=directions,
         observer_velocity_km_s=parse_velocity(velocity),
+        site=None if site is None else Site.load(site),
+        in_space=in_space,
     )
     warn_undeclared(obs)
     return obs, camera
@@ -223,21 +238,24 @@ def calibrate_command(
     column: Columns = None,
     directions: Directions = None,
     observer_velocity: Velocity = None,
+    site: SiteFile = None,
+    in_space: InSpace = False,
     force: Force = False,
     json: Json = False,
 ) -> None:
     """Estimate optics and distortion: three stages and refinement, with covariance."""
-    from starcal_uq.console import print_json, records, show_calibration, show_screening
+    from starcal_uq.console import print_json, records, show_calibration, show_screening, warn_air
     from starcal_uq.runfolder import RunFolder, check_new_run
     from starcal_uq.steps import calibrate_step, truth_of
 
     check_new_run(RunFolder(out), force)
-    obs, nominal = _load(observations, camera, column, directions, observer_velocity)
+    obs, nominal = _load(observations, camera, column, directions, observer_velocity, site, in_space)
     calibration, screening = calibrate_step(
         RunFolder(out), obs, nominal, force=force, screening=screen, **_estimator(method, solver, robust)
     )
     if screening is not None:
         show_screening(screening)
+    warn_air(obs, calibration)
     if json:
         print_json({"status": calibration.status.name, "parameters": records(calibration.to_dataframe())})
     else:
@@ -378,11 +396,15 @@ def run_command(
     column: Columns = None,
     directions: Directions = None,
     observer_velocity: Velocity = None,
+    site: SiteFile = None,
+    in_space: InSpace = False,
     max_mag: Annotated[float, typer.Option(help="Images: magnitude limit of the catalogue, Gaia G.")] = 7.0,
     epoch: Annotated[
         float | None, typer.Option(help="Images: Julian year of the star positions; the images' own by default.")
     ] = None,
     gain: Annotated[float | None, typer.Option(help="Images: electrons per count, where they do not say it.")] = None,
+    time: TimeUtc = None,
+    engine: Engine = "pyramid",
     seed: Seed = 0,
     sigma: Sigma = None,
     priors: PriorFile = None,
@@ -395,7 +417,7 @@ def run_command(
     force: Force = False,
 ) -> None:
     """Calibrate, sample, couple, propagate and report: everything from stars or images to RUN/report.html."""
-    from starcal_uq.console import show_calibration, show_screening
+    from starcal_uq.console import show_calibration, show_screening, warn_air
     from starcal_uq.image_steps import are_images, save_image_results
     from starcal_uq.runfolder import RunFolder, check_new_run
     from starcal_uq.steps import calibrate_step, truth_of
@@ -405,10 +427,19 @@ def run_command(
     images = are_images(inputs)
     if images:
         obs, nominal, centroids, found = load_images(
-            inputs, camera, max_mag=max_mag, epoch=epoch, gain=gain, directions=directions
+            inputs,
+            camera,
+            max_mag=max_mag,
+            epoch=epoch,
+            gain=gain,
+            directions=directions,
+            site=site,
+            in_space=in_space,
+            time_utc=time,
+            engine=engine,
         )
     elif len(inputs) == 1:
-        obs, nominal = _load(inputs[0], camera, column, directions, observer_velocity)
+        obs, nominal = _load(inputs[0], camera, column, directions, observer_velocity, site, in_space)
     else:
         raise typer.BadParameter(f"{inputs[1]} is no image: give one table of observations, or images only.")
     calibration, screening = calibrate_step(
@@ -419,6 +450,7 @@ def run_command(
     if screening is not None:
         show_screening(screening)
     show_calibration(calibration, truth_of(obs))
+    warn_air(obs, calibration)
     _after_calibration(
         folder,
         seed,

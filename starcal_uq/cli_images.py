@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from starcal_uq.cli_options import CameraFile, Force, Json
+from starcal_uq.cli_options import CameraFile, Engine, Force, Json, TimeUtc, parse_engine
 from starcal_uq.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -43,6 +43,10 @@ def centroid_command(
     threshold: Annotated[float, typer.Option(help="Detection threshold, standard deviations.")] = 5.0,
     psf_sigma: Annotated[float | None, typer.Option(help="Width of the star images, px; measured by default.")] = None,
     max_stars: Annotated[int | None, typer.Option(min=1, help="Keep the brightest so many per frame.")] = None,
+    pixel_phase: Annotated[
+        bool, typer.Option(help="Take out errors that repeat with the place within a pixel, where images show them.")
+    ] = True,
+    time: TimeUtc = None,
     force: Force = False,
     json: Json = False,
 ) -> None:
@@ -50,7 +54,7 @@ def centroid_command(
     from starcal_uq.camera import Camera
     from starcal_uq.centroiding import extract_centroids
     from starcal_uq.console import print_json, records
-    from starcal_uq.image_steps import counted
+    from starcal_uq.image_steps import counted, with_time
     from starcal_uq.runfolder import ensure_new
 
     ensure_new(out, force)
@@ -65,8 +69,10 @@ def centroid_command(
             threshold_sigma=threshold,
             psf_sigma_px=psf_sigma,
             max_stars=max_stars,
+            correct_pixel_phase=pixel_phase,
             progress=progress,
         )
+    found = with_time(found, time)
     found.save(out, force=force)
     if json:
         print_json({"summary": found.summary, "frames": records(found.frames_dataframe())})
@@ -90,6 +96,7 @@ def identify_command(
     ] = None,
     focal_tolerance: Annotated[float, typer.Option(help="Relative error of the nominal focal length.")] = 0.03,
     centre_tolerance: Annotated[float, typer.Option(help="Error of the nominal principal point, px.")] = 20.0,
+    engine: Engine = "pyramid",
     force: Force = False,
     json: Json = False,
 ) -> None:
@@ -117,6 +124,7 @@ def identify_command(
             calibration=known,
             focal_tolerance=focal_tolerance,
             centre_tolerance_px=centre_tolerance,
+            engine=parse_engine(engine),
             progress=progress,
         )
     if found.n_identified:
@@ -139,16 +147,22 @@ def load_images(
     epoch: float | None,
     gain: float | None,
     directions: str | None,
+    site: Path | None,
+    in_space: bool,
+    time_utc: str | None,
+    engine: str,
 ) -> tuple[Observations, Camera, Centroids, Bootstrap]:
     """Observations of images, and what is worth telling on the way."""
     from starcal_uq.camera import Camera
     from starcal_uq.console import err, warn_undeclared
     from starcal_uq.image_steps import counted, observations_from_images
+    from starcal_uq.site import Site
     from starcal_uq.steps import DIRECTIONS
 
     if directions is not None and directions not in DIRECTIONS:
         raise typer.BadParameter(f"--directions {directions!r} is unknown: use one of {', '.join(DIRECTIONS)}.")
     camera = Camera.load(camera_path)
+    place = None if site is None else Site.load(site)
     with progress_bar("images") as progress:
         obs, centroids, found = observations_from_images(
             images,
@@ -157,6 +171,10 @@ def load_images(
             epoch=epoch,
             gain_e_per_count=gain,
             directions=directions,
+            site=place,
+            in_space=in_space,
+            time_utc=time_utc,
+            engine=parse_engine(engine),
             progress=progress,
         )
     _say(counted(centroids.messages))
@@ -167,7 +185,8 @@ def load_images(
     if left_out:
         err.print(f"{left_out} stars left out, because the light of a neighbour displaces them.", highlight=False)
     warn_undeclared(obs)
-    return obs, camera, centroids, found
+    # Of mirrored images x is counted from the right edge, and so is this camera's.
+    return obs, found.identification.nominal if found.identification.parity == "mirrored" else camera, centroids, found
 
 
 def _say_epoch(centroids: Centroids, epoch: float | None) -> None:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from starcal_uq.identification_engines import Engine as EngineName
 
 ObsFile = Annotated[
     Path,
@@ -51,6 +54,25 @@ Velocity = Annotated[
         "--observer-velocity", metavar="VX,VY,VZ", help="Velocity relative to the Earth's centre, km/s, ICRS axes."
     ),
 ]
+SiteFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--site",
+        metavar="SITE",
+        help="Where on the ground the camera stood (TOML with a [site] table): refraction and daily aberration are "
+        "applied.",
+    ),
+]
+InSpace = Annotated[bool, typer.Option("--in-space", help="The camera was above the air; refraction does not matter.")]
+TimeUtc = Annotated[
+    str | None,
+    typer.Option(
+        "--time",
+        metavar="UTC",
+        help="Images: middle of the exposure of files that do not say it; goes before a time in the file's name.",
+    ),
+]
+Engine = Annotated[str, typer.Option(help="What finds attitudes: pyramid, or tetra3rs (extra of that name).")]
 Ensembles = Annotated[int, typer.Option(min=2, help="Separately seeded ensembles of walkers.")]
 Walkers = Annotated[int, typer.Option(min=14, help="Walkers in each ensemble.")]
 Steps = Annotated[int, typer.Option(min=20, help="Steps kept of each walker.")]
@@ -72,6 +94,16 @@ Robust = Annotated[
     bool, typer.Option("--robust", help="Refine with Student-t tails, which wrong identifications hardly move.")
 ]
 Draws = Annotated[int, typer.Option(min=50, help="Posterior draws that go through QUEST.")]
+
+
+def parse_engine(name: str) -> EngineName:
+    """The engine of that name."""
+    from starcal_uq.identification_engines import ENGINES
+
+    for engine in ENGINES:
+        if engine == name:
+            return engine
+    raise typer.BadParameter(f"--engine {name!r} is unknown: use one of {', '.join(ENGINES)}.")
 
 
 def parse_columns(pairs: list[str] | None) -> dict[str, str]:

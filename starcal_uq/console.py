@@ -14,7 +14,7 @@ from rich.table import Table
 from starcal_uq._types import AnyDict
 from starcal_uq.camera import Camera
 from starcal_uq.distortion import parameters
-from starcal_uq.formatting import decimals_for, fixed, pretty_unit, significant
+from starcal_uq.formatting import decimals_for, fixed, plural, pretty_unit, significant
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -210,10 +210,28 @@ def show_verdict(verdict: Verdict) -> None:
             out.print(f"- {check.level.value}: {check.sentence}", highlight=False, soft_wrap=True)
 
 
+def warn_air(obs: Observations, cal: Calibration) -> None:
+    """Say what refraction does to the focal length where nothing is known of the air."""
+    from starcal_uq.verdict.air import REMEDY, air, conditional_words
+
+    if air(obs) == "unknown":
+        err.print(f"warning: {conditional_words(cal)} {REMEDY}", style="yellow", highlight=False, soft_wrap=True)
+
+
 def warn_undeclared(obs: Observations) -> None:
-    """Say what follows when nothing is known of the observer's motion."""
+    """Say what follows when nothing is known of the observer's motion, and what was left out."""
     if not obs.directions_declared:
         err.print(f"warning: {UNDECLARED}", style="yellow", highlight=False, soft_wrap=True)
+    floor = obs.meta.get("noise_floor_px")
+    if floor:
+        words = (
+            f"note: even bright stars scatter by {significant(floor)} px; this was added to the noise of every star."
+        )
+        err.print(words, highlight=False, soft_wrap=True)
+    low = obs.meta.get("low_stars", 0)
+    if low:
+        words = f"note: {plural(int(low), 'star')} left out, because they stood lower than 10 degrees."
+        err.print(words, highlight=False, soft_wrap=True)
     ignored = obs.meta.get("ignored_columns")
     if ignored:
         err.print(f"note: columns not used: {', '.join(ignored)}", highlight=False, soft_wrap=True)

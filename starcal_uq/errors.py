@@ -61,6 +61,10 @@ class CatalogueError(StarcalError):
     """A star catalogue cannot be read or does not hold what was asked for."""
 
 
+class SiteError(StarcalError):
+    """A site on the ground is incomplete, out of range or unreadable."""
+
+
 class IdentificationError(StarcalError):
     """Stars cannot be identified with what was given."""
 

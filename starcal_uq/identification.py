@@ -19,6 +19,7 @@ from starcal_uq.camera import Camera
 from starcal_uq.catalogue import StarCatalogue
 from starcal_uq.distortion import get_model
 from starcal_uq.errors import IdentificationError
+from starcal_uq.identification_engines import Engine, prepare_engine
 from starcal_uq.identification_result import FrameIdentification, Identification, Parity
 from starcal_uq.identification_search import (
     LEAST_SIGMA_PX,
@@ -27,6 +28,7 @@ from starcal_uq.identification_search import (
     Found,
     FrameTable,
     Search,
+    field_geometry,
     has_radial,
 )
 from starcal_uq.observations import Observations
@@ -60,6 +62,7 @@ def identify(
     focal_tolerance: float = 0.03,
     centre_tolerance_px: float = 20.0,
     distortion_tolerance_px: float = 1.0,
+    engine: Engine = "pyramid",
     share_camera: bool = True,
     cache: bool = True,
     cache_dir: str | PathLike[str] | None = None,
@@ -71,7 +74,9 @@ def identify(
     ----------
     centroids
         Measured stars: arrays `frame`, `x_px`, `y_px`, `flux`, `sigma_px` with a row for each, and `frame_ids`,
-        `image`, `time_utc` with a row for each frame. Frames without stars keep their place.
+        `image`, `time_utc` with a row for each frame. Frames without stars keep their place. Flux is compared with the
+        catalogue's magnitudes frame by frame (`star_brightness`), except where `saturated`, if there, says otherwise;
+        equal fluxes say nothing.
     camera
         The nominal camera.
     stars
@@ -86,6 +91,9 @@ def identify(
     distortion_tolerance_px
         Displacement at the detector's corner by distortion that the nominal camera does not have, px. Where less than
         half of the frames are found, the others are tried with four times as much, and as mirror images.
+    engine
+        What finds attitudes: "pyramid", this package's pattern search, or "tetra3rs", a solver in Rust, which needs
+        the package of that name (extra `tetra3rs`). Matching and acceptance are the same.
     share_camera
         Whether all frames come from one camera, so that those that are found help to find the others. The result does
         not depend on the order of the frames.
@@ -104,14 +112,16 @@ def identify(
     Raises
     ------
     IdentificationError
-        A centroid is not finite or off the detector, a tolerance makes no sense, or the catalogue is too small.
+        A centroid is not finite or off the detector, a tolerance makes no sense, the catalogue is too small, or the
+        engine is not installed.
     """
     _check(centroids, camera, stars, focal_tolerance, centre_tolerance_px, distortion_tolerance_px)
     tolerance = CameraTolerance(focal_tolerance, centre_tolerance_px, distortion_tolerance_px)
     if calibration is not None:
         camera, tolerance = calibration.camera, calibrated_tolerance(calibration, tolerance)
     field = FrameTable(centroids, camera)
-    search = Search(camera, stars, tolerance, cache, cache_dir)
+    proposer = prepare_engine(engine, stars, field_geometry(camera), tolerance, cache, cache_dir)
+    search = Search(camera, stars, tolerance, proposer=proposer)
     n = len(field.ids)
     found = []
     for k in range(n):
@@ -123,7 +133,7 @@ def identify(
     if len(failed) > _solved(found):
         # Every frame of a camera has one handedness: the one that more frames have.
         flipped = FrameTable(centroids, camera, mirrored=True)
-        mirror = Search(flipped.camera, stars, tolerance, cache, cache_dir, search.pairs)
+        mirror = Search(flipped.camera, stars, tolerance, proposer=proposer)
         other = _retry(mirror, flipped, failed)
         if _solved(other.values()) > _solved(found):
             parity, field, search = "mirrored", flipped, mirror
@@ -230,6 +240,7 @@ def _result(
                 n_centroids=len(field.xy[k]),
                 n_identified=0 if f.match is None else len(f.match),
                 n_ambiguous=0 if f.match is None else f.match.n_ambiguous,
+                n_unlike_brightness=0 if f.match is None else f.match.n_unlike_brightness,
                 log10_expected_false=float("nan") if f.match is None else f.match.log10_false,
                 quaternion=None if i is None else rotation_to_quaternion(rotations[i]),
                 noise_scale=float("nan") if f.match is None else f.match.noise_scale,

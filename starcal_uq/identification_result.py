@@ -11,6 +11,7 @@ import numpy as np
 
 from starcal_uq._types import FloatArray
 from starcal_uq.camera import Camera
+from starcal_uq.formatting import plural
 from starcal_uq.observations import Observations
 
 if TYPE_CHECKING:
@@ -38,6 +39,8 @@ class FrameIdentification:
         Centroids, and those with a catalogue star.
     n_ambiguous : int
         Centroids left out because two stars, or two centroids, are too close to tell which is which.
+    n_unlike_brightness : int
+        Centroids left out because they are farther from their star, and less of its brightness, than chance explains.
     log10_expected_false : float
         Decimal logarithm of the number of wrong attitudes, on the whole sky, expected to match as well; NaN if not
         identified.
@@ -58,6 +61,7 @@ class FrameIdentification:
     n_centroids: int
     n_identified: int
     n_ambiguous: int
+    n_unlike_brightness: int
     log10_expected_false: float
     quaternion: FloatArray | None
     noise_scale: float
@@ -110,6 +114,9 @@ class Identification:
         rest = [f"{counts[status]} {_REASONS[status]}" for status in STATUSES[1:] if counts[status]]
         if rest:
             words += f" Left out: {'; '.join(rest)}."
+        unlike = sum(frame.n_unlike_brightness for frame in self.frames)
+        if unlike:
+            words += f" {plural(unlike, 'match', 'matches')} given up, because the brightness is unlike the star's."
         if self.n_identified:
             change = 100.0 * (self.camera.focal_px / self.nominal.focal_px - 1.0)
             words += f" The focal length is {abs(change):.2f} % {'longer' if change >= 0 else 'shorter'} than nominal."

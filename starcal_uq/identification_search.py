@@ -14,11 +14,14 @@ from starcal_uq._types import FloatArray, IntArray, StrArray
 from starcal_uq.camera import Camera
 from starcal_uq.catalogue import StarCatalogue
 from starcal_uq.distortion import get_model
+from starcal_uq.field_stars import Sky
+from starcal_uq.identification_engines import Proposer, PyramidProposer, prepare_pairs
 from starcal_uq.identification_result import Status
-from starcal_uq.matching import CameraState, Match, Sky, match_frame, start_state
+from starcal_uq.matching import CameraState, Match, match_frame, start_state
 from starcal_uq.projection import unproject
-from starcal_uq.pyramid import CameraTolerance, FieldGeometry, hypotheses
-from starcal_uq.star_pairs import StarPairs, cached_star_pairs, find_star_pairs
+from starcal_uq.pyramid import CameraTolerance, FieldGeometry
+from starcal_uq.star_brightness import instrumental_mag
+from starcal_uq.star_pairs import StarPairs
 
 # A frame is identified when fewer wrong attitudes than this are expected to match as well.
 MAX_EXPECTED_FALSE = 1e-4
@@ -85,6 +88,10 @@ class FrameTable:
         self.xy: list[FloatArray] = [xy[rows] for rows in self.rows]
         sigma = np.hypot(np.asarray(table.sigma_px, dtype=np.float64), LEAST_SIGMA_PX)
         self.sigma: list[FloatArray] = [sigma[rows] for rows in self.rows]
+        flux = np.asarray(table.flux, dtype=np.float64)
+        if len(saturated := np.asarray(getattr(table, "saturated", ()), dtype=np.bool_)):
+            flux = np.where(saturated, np.nan, flux)
+        self.mag = [instrumental_mag(flux[rows]) for rows in self.rows]
         self.points = self._ideal(self.camera)
 
     def _ideal(self, camera: Camera) -> list[FloatArray]:
@@ -110,31 +117,27 @@ class Search:
         camera: Camera,
         stars: StarCatalogue,
         tolerance: CameraTolerance,
-        cache: bool,
-        cache_dir: str | PathLike[str] | None,
+        cache: bool = True,
+        cache_dir: str | PathLike[str] | None = None,
         pairs: StarPairs | None = None,
+        *,
+        proposer: Proposer | None = None,
     ) -> None:
-        from scipy.spatial import cKDTree
-
-        f, w, h = camera.focal_px, camera.width_px, camera.height_px
-        self.geometry = FieldGeometry(f, w, h, camera.corner_radius_px)
+        self.geometry = field_geometry(camera)
         self.tolerance, self.radial = tolerance, has_radial(camera)
         self.centroids: tuple[int, ...] = _CENTROIDS
         self.triangles = _MAX_TRIANGLES
-        directions = stars.directions_icrs
-        if pairs is None:
-            largest = 2.0 * float(np.arctan(0.5 * np.hypot(w, h) / f)) * (1.0 + tolerance.focal) + 0.002
-            # Rounded, so that cameras of nearly the same field share a file.
-            largest = float(np.ceil(largest * 200.0) / 200.0)
-            field_sr = float(f"{w * h / f**2:.2g}")
-            pairs = (
-                cached_star_pairs(directions, stars.mag, field_sr, largest, cache_dir)
-                if cache
-                else find_star_pairs(directions, stars.mag, field_sr, largest)
-            )
-        self.pairs = pairs
-        self.tree = cKDTree(pairs.directions)
-        self.sky = Sky(directions, stars.mag, self.geometry)
+        if proposer is None:
+            proposer = PyramidProposer(pairs or prepare_pairs(stars, self.geometry, tolerance, cache, cache_dir))
+        self.proposer = proposer
+        self.sky = Sky(stars.directions_icrs, stars.mag, self.geometry)
+
+    @property
+    def pairs(self) -> StarPairs:
+        """The pattern stars, for another search in the same catalogue."""
+        if not isinstance(self.proposer, PyramidProposer):
+            raise AttributeError("only the engine `pyramid` has pairs of stars")
+        return self.proposer.pairs
 
     def widened(self, factor: float) -> Search:
         """The same for a lens with more distortion."""
@@ -165,7 +168,7 @@ class Search:
         clock = perf_counter()
         if len(field.points[k]) < MIN_STARS:
             return Found("too few stars", None, perf_counter() - clock)
-        status, match = self._look(field.points[k], field.sigma[k])
+        status, match = self._look(field, k)
         return Found(status, match, perf_counter() - clock)
 
     def again(self, field: FrameTable, k: int, first: Found, shared: FloatArray) -> Found:
@@ -176,20 +179,32 @@ class Search:
             return replace(found, seconds=found.seconds + first.seconds)
         state = first.match.state
         start = CameraState(state.rotation, state.shared - shared)
-        match = match_frame(
-            field.points[k], field.sigma[k], self.sky, start, self.tolerance, radial=self.radial, polished=True
-        )
+        match = self._matched(field, k, start, polished=True)
         seconds = first.seconds + perf_counter() - clock
         # A frame that fits by itself but not with the camera of the others is not trusted.
         if match is None or match.log10_false > np.log10(MAX_EXPECTED_FALSE):
             return Found("not identified", None, seconds)
         return Found(first.status, match, seconds)
 
-    def _look(self, points: FloatArray, sigma: FloatArray) -> tuple[Status, Match | None]:
+    def _matched(self, field: FrameTable, k: int, start: CameraState, polished: bool = False) -> Match | None:
+        return match_frame(
+            field.points[k],
+            field.sigma[k],
+            self.sky,
+            start,
+            self.tolerance,
+            mag=field.mag[k],
+            radial=self.radial,
+            polished=polished,
+        )
+
+    def _look(self, field: FrameTable, k: int) -> tuple[Status, Match | None]:
+        searched = 0
         for n_centroids in self.centroids:
-            if len(points) <= _CENTROIDS[0] < n_centroids:
-                continue
-            accepted = list(self._accepted(points, sigma, n_centroids))
+            if len(field.xy[k]) <= searched:
+                break
+            accepted = list(self._accepted(field, k, n_centroids, searched))
+            searched = n_centroids
             if accepted:
                 best = min(accepted, key=lambda match: match.log10_false)
                 turn = best.state.rotation.T
@@ -199,17 +214,17 @@ class Search:
                 return ("ambiguous", None) if far else ("identified", best)
         return "not identified", None
 
-    def _accepted(self, points: FloatArray, sigma: FloatArray, n_centroids: int) -> Iterator[Match]:
+    def _accepted(self, field: FrameTable, k: int, n_centroids: int, searched: int) -> Iterator[Match]:
         """Acceptable matches, up to the first that is beyond doubt and complete, or some triangles more."""
-        batches = hypotheses(points, sigma, self.pairs, self.tree, self.geometry, self.tolerance, n_centroids)
+        points, sigma = field.points[k], field.sigma[k]
+        batches = self.proposer.hypotheses(points, sigma, self.geometry, self.tolerance, n_centroids, searched)
         left = self.triangles
         for batch in batches:
             if left <= 0:
                 return
             left -= 1
             for hypothesis in batch:
-                start = start_state(hypothesis)
-                match = match_frame(points, sigma, self.sky, start, self.tolerance, radial=self.radial)
+                match = self._matched(field, k, start_state(hypothesis))
                 if match is None or match.log10_false >= np.log10(MAX_EXPECTED_FALSE):
                     continue
                 yield match
@@ -229,6 +244,11 @@ class Search:
         scale = 1.0 / np.sqrt(np.diag(information))
         covariance = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
         return covariance @ np.sum([m.gradient for m in matches], axis=0), covariance
+
+
+def field_geometry(camera: Camera) -> FieldGeometry:
+    """The camera as the search sees it."""
+    return FieldGeometry(camera.focal_px, camera.width_px, camera.height_px, camera.corner_radius_px)
 
 
 def has_radial(camera: Camera) -> bool:

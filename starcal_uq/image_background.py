@@ -10,6 +10,7 @@ import numpy as np
 from starcal_uq._types import BoolArray
 from starcal_uq.errors import ImageError
 from starcal_uq.image_files import Image
+from starcal_uq.photon_transfer import counts_per_electron
 
 # SExtractor's clipping at 3 sigma takes this part of Gaussian noise.
 _CLIPPED = 0.983
@@ -38,6 +39,8 @@ class PreparedImage:
         Pixels to use, None for all; saturated pixels, None for none.
     counts_per_e : float
         Inverse gain, 0 where unknown.
+    gain_is_measured : bool
+        Whether the gain was read off the noise of the background because none is known.
     """
 
     counts: Any
@@ -45,6 +48,7 @@ class PreparedImage:
     usable: BoolArray | None
     saturated: BoolArray | None
     counts_per_e: float
+    gain_is_measured: bool = False
 
 
 def prepare_image(
@@ -57,7 +61,7 @@ def prepare_image(
     image
         The image.
     gain
-        Electrons per count, None where unknown.
+        Electrons per count, None where unknown: it is then read off the noise of the background if that will do.
     read_noise_e
         Floor of the noise, electrons (needs the gain).
     saturation
@@ -118,7 +122,10 @@ def prepare_image(
     noise = np.maximum(spread.rms() / _CLIPPED, floor)
     if not whole:
         counts[~finite] = 0.0
-    frame = PreparedImage(counts, noise, usable, too_bright, 1.0 / gain if gain else 0.0)
+    counts_per_e = 1.0 / gain if gain else 0.0
+    if not gain and image.data.dtype.kind in "ui" and image.data.dtype.itemsize > 1:
+        counts_per_e = counts_per_electron(filled)
+    frame = PreparedImage(counts, noise, usable, too_bright, counts_per_e, not gain and counts_per_e > 0.0)
     return frame, float(background.globalback), max(float(spread.globalrms) / _CLIPPED, floor)
 
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import gzip
 import io
 import os
+import re
 import warnings
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,7 @@ import numpy as np
 from starcal_uq._types import AnyDict
 from starcal_uq.errors import ImageError
 from starcal_uq.formatting import plural
+from starcal_uq.utc_times import FIRST_YEAR, LAST_YEAR
 
 if TYPE_CHECKING:
     from starcal_uq.camera import Camera
@@ -28,6 +30,12 @@ IMAGE_ENDINGS = (*FITS_ENDINGS, ".tiff", ".tif", ".png", ".jpg", ".jpeg")
 _LUMINANCE = (0.299, 0.587, 0.114)
 # Full scale of the converters that write into 16 bits without shifting.
 _FULL_SCALES = (1023, 4095, 16383)
+# Ten blocks, of 36 cards each.
+_HEADER_BYTES = 28800
+# ISO 8601 as far as names of files allow it: colons are left out or replaced.
+_TIME_IN_NAME = re.compile(
+    r"(?<!\d)(\d{4})-?(\d\d)-?(\d\d)T(\d\d)[-:_.]?(\d\d)[-:_.]?(\d\d)(?:[.,](\d{1,6})(?!\d))?(?!\d)", re.ASCII
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +50,7 @@ class Image:
     name : str
         Name, in messages and tables; of a file its name without the folder.
     time_utc : str or None
-        Middle of the exposure, UTC, ISO 8601.
+        Middle of the exposure, UTC, ISO 8601; where the file does not say it, the time in its name.
     exposure_s : float or None
         Exposure time, seconds.
     saturation : float or None
@@ -111,7 +119,8 @@ def read_image(path: str | os.PathLike[str], camera: Camera | None = None) -> Im
     """Read one frame (``.fits``, ``.fit``, ``.fits.gz``, ``.tiff``, ``.png``, ``.jpg``).
 
     The rows are kept in the order of the file, so the first row is y = 0. A colour image becomes its luminance; of a
-    file with several images the first is taken; `messages` of the result say so.
+    file with several images the first is taken; without a time in the header, one in the file's name is taken (such as
+    2019-07-29T204726); `messages` of the result say so.
 
     Parameters
     ----------
@@ -133,7 +142,40 @@ def read_image(path: str | os.PathLike[str], camera: Camera | None = None) -> Im
     image = _read_fits(path, data) if name.endswith(FITS_ENDINGS) else _read_picture(path, data)
     if camera is not None:
         image.check_size(camera)
+    time = time_in_name(path.name)
+    if image.time_utc is None and time is not None:
+        image = replace(image, time_utc=time, messages=(*image.messages, time_in_name_message(path.name)))
     return image
+
+
+def is_rendered(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is a FITS image that this package rendered."""
+    if not Path(path).name.lower().endswith(FITS_ENDINGS):
+        return False
+    try:
+        with open(path, "rb") as file:
+            return b"CREATOR = 'starcal-uq" in file.read(_HEADER_BYTES)
+    except OSError:
+        return False
+
+
+def time_in_name(name: str) -> str | None:
+    """The UTC time in a file's name, such as 2019-07-29T204726, as ISO 8601 text."""
+    for match in _TIME_IN_NAME.finditer(name):
+        year, month, day, hour, minute, second = (int(group) for group in match.groups()[:6])
+        try:
+            time = datetime(year, month, day, hour, minute, second)
+        except ValueError:
+            continue
+        if not FIRST_YEAR <= year <= LAST_YEAR:
+            continue
+        return f"{time.isoformat()}{'.' + match[7] if match[7] else ''}"
+    return None
+
+
+def time_in_name_message(name: str) -> str:
+    """What is said of an image whose time is that in its name."""
+    return f"{name}: the time was taken from the name of the file, as UTC; the file itself has none."
 
 
 def _read_bytes(path: Path) -> bytes:

@@ -2,26 +2,39 @@
 
 from __future__ import annotations
 
-from collections import Counter
+import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.apparent import julian_year, make_apparent
+from starcal_uq.apparent import catalogue_directions, make_apparent, without_low_stars
+from starcal_uq.errors import ObservationError
+from starcal_uq.formatting import plural
+from starcal_uq.image_record import IMAGES, record_images
+from starcal_uq.noise_floor import settle_noise
 from starcal_uq.runfolder import RunFolder, atomic_path
+from starcal_uq.site import check_sky
+from starcal_uq.utc_times import julian_year
 
 if TYPE_CHECKING:
+    from starcal_uq._types import FloatArray, StrArray
     from starcal_uq.bootstrapping import Bootstrap
     from starcal_uq.camera import Camera
     from starcal_uq.centroids import Centroids
+    from starcal_uq.identification_engines import Engine
     from starcal_uq.observations import Observations
     from starcal_uq.progress import Progress
+    from starcal_uq.site import Site
 
 CENTROIDS, IDENTIFICATION = "centroids.parquet", "identification.csv"
 # Where the embedded catalogue has its stars; images without a time are compared with these.
 _CATALOGUE_EPOCH = 2016.0
+_NUMBER = re.compile(r"\d+(?:\.\d+)?")
+# Magnitudes; the embedded catalogue ends at the second.
+_FAINTER_NEIGHBOURS, _FAINTEST = 1.5, 10.0
 
 
 def are_images(paths: Sequence[Path]) -> bool:
@@ -42,10 +55,25 @@ def epoch_of(centroids: Centroids) -> float:
 
 
 def counted(messages: Sequence[str]) -> list[str]:
-    """Messages about many images, each sentence once with the number of images it stands for."""
-    sentences = Counter(message.partition(": ")[2] or message for message in messages)
-    first = {message.partition(": ")[2] or message: message for message in reversed(messages)}
-    return [first[sentence] if count == 1 else f"{count} images: {sentence}" for sentence, count in sentences.items()]
+    """Messages about many images, each sentence once with the number of images it stands for.
+
+    Sentences that differ in their numbers only are one, with the range of each number.
+    """
+    alike: dict[str, list[str]] = {}
+    for message in messages:
+        alike.setdefault(_NUMBER.sub("#", message.partition(": ")[2] or message), []).append(message)
+    return [group[0] if len(group) == 1 else _together(group) for group in alike.values()]
+
+
+def _together(messages: Sequence[str]) -> str:
+    sentences = [message.partition(": ")[2] or message for message in messages]
+    ranges = []
+    for column in zip(*(_NUMBER.findall(sentence) for sentence in sentences), strict=True):
+        low, high = min(column, key=float), max(column, key=float)
+        ranges.append(low if low == high else f"{low} to {high}")
+    pieces = _NUMBER.split(sentences[0])
+    words = "".join(piece + number for piece, number in zip(pieces, [*ranges, ""], strict=True))
+    return f"{len(messages)} images: {words}"
 
 
 def observations_from_images(
@@ -56,6 +84,10 @@ def observations_from_images(
     epoch: float | None = None,
     gain_e_per_count: float | None = None,
     directions: str | None = None,
+    site: Site | None = None,
+    in_space: bool = False,
+    time_utc: str | None = None,
+    engine: Engine = "pyramid",
     progress: Progress | None = None,
 ) -> tuple[Observations, Centroids, Bootstrap]:
     """Find, identify and calibrate with the nominal camera, then identify again with what was learnt.
@@ -75,6 +107,15 @@ def observations_from_images(
     directions : {"apparent", "undeclared", "catalogue"}, optional
         By default annual aberration is applied where every image has a time, and nothing is declared where not.
         ``apparent`` takes the catalogue's directions for what the camera saw, as in rendered images.
+    site : Site, optional
+        Where on the ground the camera stood: diurnal aberration and refraction are applied too, and stars lower than
+        ten degrees left out.
+    in_space : bool
+        Whether the camera was above the air, so that nothing need be said of refraction.
+    time_utc : str, optional
+        Middle of the exposure of all images whose files do not say it; it goes before a time in a file's name.
+    engine : {"pyramid", "tetra3rs"}
+        What finds attitudes.
     progress : callable, optional
         Called with (images done, images in all).
 
@@ -82,31 +123,105 @@ def observations_from_images(
     ------
     ImageError, IdentificationError, CalibrationError
         When nothing can be made of the images.
+    ObservationError
+        When a site is given and an image has no time, or shows stars that were below the horizon there.
+    CatalogueError
+        When the time is not readable.
     """
     from starcal_uq.bootstrapping import bootstrap
     from starcal_uq.catalogue import load_catalogue
     from starcal_uq.centroiding import extract_centroids
     from starcal_uq.double_stars import without_disturbed
 
+    check_sky(directions, site, in_space)
+    if time_utc is not None:
+        julian_year(time_utc)
     centroids = extract_centroids(list(images), camera=camera, gain_e_per_count=gain_e_per_count, progress=progress)
-    stars = load_catalogue(max_mag=max_mag, epoch=epoch_of(centroids) if epoch is None else epoch)
+    centroids = with_time(centroids, time_utc)
+    if site is not None:
+        _check_times(centroids)
+    year = epoch_of(centroids) if epoch is None else epoch
+    stars = load_catalogue(max_mag=max_mag, epoch=year)
+    # A neighbour need not be bright enough to be identified to displace a star.
+    neighbours = load_catalogue(max_mag=max(max_mag, min(max_mag + _FAINTER_NEIGHBOURS, _FAINTEST)), epoch=year)
 
+    rendered = _rendered(images)
+    motion = directions in (None, "catalogue")
     width = centroids.psf_sigma_px[np.isfinite(centroids.psf_sigma_px)]
     psf_sigma_px = float(np.median(width)) if len(width) else 1.0
 
     def prepare(obs: Observations) -> Observations:
-        obs = without_disturbed(obs, stars, camera, psf_sigma_px)
+        obs = without_disturbed(obs, neighbours, camera, psf_sigma_px)
+        if in_space or rendered:
+            obs = obs.with_meta(observer="space" if in_space else "rendered")
         timed = obs.time_utc is not None and bool((obs.time_utc != "").all())
-        if directions == "catalogue" or (directions is None and timed):
-            return make_apparent(obs.with_meta(directions="catalogue"))
-        return obs.with_meta(directions=directions or "undeclared")
+        if not motion or (directions is None and not timed):
+            return obs.with_meta(directions=directions or "undeclared")
+        obs = obs.with_meta(directions="catalogue")
+        return make_apparent(obs if site is None else without_low_stars(obs, site), site=site)
 
-    found = bootstrap(centroids, camera, stars, prepare=prepare)
-    return found.observations, centroids, found
+    def to_catalogue(apparent: FloatArray, times: StrArray) -> FloatArray:
+        return catalogue_directions(apparent, times, site=site)
+
+    found = bootstrap(
+        centroids,
+        camera,
+        stars,
+        prepare=prepare,
+        to_catalogue=to_catalogue if motion else None,
+        identification={"engine": engine},
+    )
+    return settle_noise(found.observations, found.calibration), centroids, found
+
+
+def with_time(centroids: Centroids, time_utc: str | None) -> Centroids:
+    """Centroids with a time (UTC) for all frames whose images do not say it, be it in their header.
+
+    Parameters
+    ----------
+    centroids : Centroids
+        Times from the names of files give way.
+    time_utc : str or None
+        Middle of the exposure; None leaves all as it is.
+    """
+    from starcal_uq.image_files import time_in_name_message
+
+    if time_utc is None:
+        return centroids
+    named = {time_in_name_message(str(name)) for name in centroids.image}
+    said = named & set(centroids.messages)
+    times = [
+        time_utc if time == "" or time_in_name_message(str(name)) in said else str(time)
+        for name, time in zip(centroids.image, centroids.time_utc, strict=True)
+    ]
+    kept = tuple(message for message in centroids.messages if message not in said)
+    return replace(centroids, time_utc=np.array(times, dtype=np.str_), messages=kept)
+
+
+def _rendered(images: Sequence[Path]) -> bool:
+    """Whether all images come from `render_frames`, whose stars shine through no air."""
+    from starcal_uq.image_files import IMAGE_ENDINGS, is_rendered
+
+    paths = [p for path in images for p in (sorted(path.iterdir()) if path.is_dir() else [path])]
+    paths = [path for path in paths if path.name.lower().endswith(IMAGE_ENDINGS)]
+    return bool(paths) and all(is_rendered(path) for path in paths)
+
+
+def _check_times(centroids: Centroids) -> None:
+    used = (centroids.problem == "") & (centroids.stars_per_frame > 0)
+    untimed = centroids.image[used & (centroids.time_utc == "")]
+    if len(untimed):
+        others = f" (and {plural(len(untimed) - 1, 'other')})" if len(untimed) > 1 else ""
+        raise ObservationError(
+            f"{untimed[0]}{others}: the image has no time, without which the site does not say where the stars stood; "
+            "give the time (UTC, such as 2026-11-21T03:04:05).",
+            column="time_utc",
+        )
 
 
 def save_image_results(run: RunFolder, centroids: Centroids, found: Bootstrap) -> None:
     """Keep the centroids and the record of every frame in the run folder."""
     centroids.save(run.path / CENTROIDS, force=True)
+    record_images(centroids, found).save(run.path / IMAGES)
     with atomic_path(run.path / IDENTIFICATION) as temporary:
         found.identification.to_dataframe().to_csv(temporary, index=False)

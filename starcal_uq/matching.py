@@ -12,13 +12,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import lgamma, log, pi
-from typing import Any
 
 import numpy as np
 
 from starcal_uq._types import FloatArray, IntArray
 from starcal_uq.attitude import exp_rotation
+from starcal_uq.field_stars import Sky
 from starcal_uq.pyramid import SIGMAS, CameraTolerance, FieldGeometry, Hypothesis
+from starcal_uq.star_brightness import unlike_brightness
 
 # Parameters after the three of the attitude: ln F, d_x, d_y, kappa.
 N_SHARED = 4
@@ -26,57 +27,6 @@ N_SHARED = 4
 _LEAST_GATE_SIGMA_PX = 0.1
 # A star is ambiguous if the next one, on the sky or on the detector, is not this much farther in sigma^2: exp(-14).
 _DISTINCT = 28.0
-# Centroids are compared with the catalogue down to where a field holds this many stars for each, and some more.
-_STARS_PER_CENTROID, _STARS_MORE = 2.0, 20
-
-
-class Sky:
-    """A catalogue, searched to the depth that suits a frame.
-
-    Parameters
-    ----------
-    directions : (N, 3) array
-        Unit vectors.
-    mag : (N,) array
-        Magnitudes.
-    geometry : FieldGeometry
-        The field of view.
-    """
-
-    def __init__(self, directions: FloatArray, mag: FloatArray, geometry: FieldGeometry) -> None:
-        self.rows: IntArray = np.argsort(mag, kind="stable").astype(np.int64)
-        self.directions = np.ascontiguousarray(directions[self.rows])
-        self.geometry = geometry
-        self._trees: dict[int, Any] = {}
-
-    def depth(self, n_centroids: int) -> int:
-        """Number of stars on the whole sky that a frame with so many centroids is compared with."""
-        g = self.geometry
-        field_sr = g.width_px * g.height_px / g.focal_px**2
-        wanted = (_STARS_PER_CENTROID * n_centroids + _STARS_MORE) * 4.0 * pi / field_sr
-        return min(len(self.rows), _step(wanted))
-
-    def seen_by(self, geometry: FieldGeometry) -> Sky:
-        """The same catalogue for another camera."""
-        other = object.__new__(Sky)
-        other.__dict__.update(self.__dict__)
-        other.geometry = geometry
-        return other
-
-    def around(self, boresight: FloatArray, radius_rad: float, depth: int) -> IntArray:
-        """Stars, by brightness rank, within an angle of a direction."""
-        from scipy.spatial import cKDTree
-
-        if depth not in self._trees:
-            self._trees[depth] = cKDTree(self.directions[:depth])
-        chord = 2.0 * np.sin(0.5 * min(radius_rad, pi))
-        found = self._trees[depth].query_ball_point(boresight, chord, return_sorted=True)
-        return np.asarray(found, dtype=np.int64)
-
-
-def _step(wanted: float) -> int:
-    """The next power of the square root of two: few different depths, because each has its own tree."""
-    return int(np.ceil(2.0 ** (np.ceil(2.0 * np.log2(wanted)) / 2.0)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,6 +65,8 @@ class Match:
         Decimal logarithm of the expected number of wrong attitudes on the whole sky that match as well.
     n_ambiguous : int
         Centroids that more than one star fits.
+    n_unlike_brightness : int
+        Centroids left out because they are farther from their star, and less of its brightness, than chance explains.
     information : (4, 4) array, gradient : (4,) array
         What the frame says about the shared parameters, attitude eliminated: information times their best value is
         ``gradient``.
@@ -128,6 +80,7 @@ class Match:
     noise_scale: float
     log10_false: float
     n_ambiguous: int
+    n_unlike_brightness: int
     information: FloatArray
     gradient: FloatArray
 
@@ -147,6 +100,7 @@ def match_frame(
     start: CameraState,
     tolerance: CameraTolerance,
     *,
+    mag: FloatArray | None = None,
     radial: bool = True,
     polished: bool = False,
 ) -> Match | None:
@@ -164,6 +118,8 @@ def match_frame(
         A first state.
     tolerance : CameraTolerance
         How far the camera may be from its nominal values.
+    mag : (n,) array, optional
+        Instrumental magnitudes, NaN where not known: doubtful matches of unlike brightness are left out.
     radial : bool
         Whether kappa is fitted.
     polished : bool
@@ -206,6 +162,15 @@ def match_frame(
     if len(star) < 4:
         return None
     e = u[centroid] - predicted[star]
+    refused = np.zeros(len(star), dtype=np.bool_)
+    if mag is not None:
+        misfit = np.sum(e * e, axis=1) / (np.maximum(sigma_px[centroid], _LEAST_GATE_SIGMA_PX) * noise_scale) ** 2
+        refused = unlike_brightness(mag[centroid] - sky.mag[ranks[star]], misfit)
+    if refused.any():
+        centroid, star = centroid[~refused], star[~refused]
+        if len(star) < 4:
+            return None
+        state, e = _fit(state, u, sigma_px, r, centroid, star, g, prior)
     information, gradient = _information(state, u, sigma_px * noise_scale, r, centroid, star, g)
     on_detector = np.all(np.abs(predicted) < 0.5 * np.array([g.width_px, g.height_px]) + 30.0, axis=1)
     density = max(int(on_detector.sum()), 4) / (g.width_px * g.height_px)
@@ -219,6 +184,7 @@ def match_frame(
         noise_scale,
         expected,
         int(ambiguous),
+        int(refused.sum()),
         information,
         gradient,
     )
@@ -347,12 +313,16 @@ def _information(
 
 
 def _noise_scale(e: FloatArray, sigma_px: FloatArray) -> float:
-    """Noise found over noise stated, from the median of the squared residuals; between 1 and 4."""
+    """Noise found over noise stated, from the median of the squared residuals; between 1 and 4.
+
+    Less one standard deviation of that, so that chance does not widen the gates: false stars come with their area.
+    """
     m = len(e)
     squared = np.sum(e * e, axis=1) / sigma_px**2
     # Chi-square with two degrees of freedom has the median 2 ln 2; seven parameters were fitted, damped.
     share = max(1.0 - 5.0 / (2.0 * m), 0.3)
     found = float(np.sqrt(np.median(squared) / (2.0 * np.log(2.0) * share)))
+    found /= 1.0 + 0.5 / (np.log(2.0) * np.sqrt(m))
     return min(max(found, 1.0), 4.0) if m >= 6 else 1.0
 
 

@@ -90,6 +90,27 @@ def mortari_order(n: int) -> IntArray:
     return np.array(triangles, dtype=np.int64).reshape(-1, 3)
 
 
+def first_order(n: int, more: bool) -> IntArray:
+    """The triangles of a first search among n centroids: all of them, or the first half where there are more centroids.
+
+    Half of the triangles find what most of them would; the rest are better spent on other centroids.
+    """
+    triangles = mortari_order(n)
+    return triangles[: len(triangles) // 2] if more else triangles
+
+
+def remaining_order(n: int, searched: int) -> IntArray:
+    """Triangles of n centroids whose numbers are all even or all odd, without those of a first search.
+
+    A quarter of all triangles, and yet any five true stars have three of one parity among them.
+    """
+    triangles = mortari_order(n)
+    parity = triangles % 2
+    kept = triangles[np.all(parity == parity[:, :1], axis=1)]
+    done = {tuple(three) for three in first_order(searched, n > searched).tolist()}
+    return np.array([three for three in kept.tolist() if tuple(three) not in done], dtype=np.int64).reshape(-1, 3)
+
+
 def hypotheses(
     points: FloatArray,
     sigma_px: FloatArray,
@@ -98,6 +119,7 @@ def hypotheses(
     geometry: FieldGeometry,
     tolerance: CameraTolerance,
     max_centroids: int = 12,
+    searched: int = 0,
 ) -> Iterator[list[Hypothesis]]:
     """For each triangle, the hypotheses that a fourth star supports, best first.
 
@@ -115,23 +137,29 @@ def hypotheses(
         The nominal camera, and how far it may be off.
     max_centroids : int
         Triangles are made of so many centroids, the brightest.
+    searched : int
+        So many centroids were searched before: only triangles that this has left are made (`remaining_order`).
     """
     n = min(len(points), max_centroids)
     if n < 4:
         return
+    triangles = remaining_order(n, searched) if searched else first_order(n, len(points) > n)
     u, sigma = points[:n], sigma_px[:n]
     b = _directions(u, np.array([geometry.focal_px]))[0]
     angle = angle_between(b[:, None], b[None])
     length = np.hypot(*(u[:, None] - u[None]).transpose(2, 0, 1))
-    for triangle in _sorted_triangles(n, length, geometry):
-        found = _look_up(triangle, b, angle, sigma, pairs, geometry, tolerance)
+    bases: dict[tuple[int, int], tuple[IntArray, IntArray, FloatArray]] = {}
+    for triangle in _sorted_triangles(triangles, length, geometry):
+        found = _look_up(triangle, b, angle, sigma, pairs, geometry, tolerance, bases)
         if len(found):
             yield _supported(triangle, found, u, sigma, angle, length, pairs, tree, geometry, tolerance)
 
 
-def _sorted_triangles(n: int, length: FloatArray, geometry: FieldGeometry) -> list[tuple[int, int, int]]:
-    """Triangles as (i, j, k) with the base i-j: the shortest side that is long enough, otherwise the longest."""
-    triangles = mortari_order(n)
+def _sorted_triangles(triangles: IntArray, length: FloatArray, geometry: FieldGeometry) -> list[tuple[int, int, int]]:
+    """Triangles as (i, j, k) with the base i-j: the shortest side that is long enough, otherwise the longest.
+
+    Star k is nearer to i than to j, which leaves the fewest stars to look at.
+    """
     sides = np.array([(0, 1, 2), (1, 2, 0), (2, 0, 1)])
     options = triangles[:, sides]
     size = length[options[..., 0], options[..., 1]]
@@ -141,7 +169,7 @@ def _sorted_triangles(n: int, length: FloatArray, geometry: FieldGeometry) -> li
     rows = np.arange(len(triangles))
     chosen, base = options[rows, best], size[rows, best]
     order = np.lexsort((base, rows // _GROUP))
-    return [(int(i), int(j), int(k)) for i, j, k in chosen[order]]
+    return [(i, j, k) if length[i, k] <= length[j, k] else (j, i, k) for i, j, k in chosen[order].tolist()]
 
 
 def _look_up(
@@ -152,18 +180,20 @@ def _look_up(
     pairs: StarPairs,
     geometry: FieldGeometry,
     tolerance: CameraTolerance,
+    bases: dict[tuple[int, int], tuple[IntArray, IntArray, FloatArray]],
 ) -> IntArray:
-    """Catalogue triangles (m, 3) with these sides and this handedness."""
+    """Catalogue triangles (m, 3) with these sides and this handedness; `bases` keeps the pairs for each base."""
     i, j, k = triangle
     f, bias = geometry.focal_px, geometry.relative_bias(tolerance)
     noise = SIGMAS * np.sqrt(2.0) * float(max(sigma[i], sigma[j], sigma[k])) / f
     base = angle[i, j]
-    slack = base * (tolerance.focal + bias) + noise
-    low, high = np.searchsorted(pairs.angle, (base - slack, base + slack))
-    cut = slice(int(low), int(high))
-    a = np.concatenate([pairs.first[cut], pairs.second[cut]])
-    c = np.concatenate([pairs.second[cut], pairs.first[cut]])
-    scale = np.concatenate([pairs.angle[cut], pairs.angle[cut]]) / base
+    key = (min(i, j), max(i, j))
+    if key not in bases:
+        slack = base * (tolerance.focal + bias) + SIGMAS * np.hypot(sigma[i], sigma[j]) / f
+        low, high = np.searchsorted(pairs.angle, (base - slack, base + slack))
+        first, second, size = pairs.first[low:high], pairs.second[low:high], pairs.angle[low:high] / base
+        bases[key] = np.concatenate([first, second]), np.concatenate([second, first]), np.concatenate([size, size])
+    a, c, scale = bases[key]
     near = angle[i, k]
     near_tol = noise * np.hypot(1.0, near / base) + bias * near
     row, third = pairs.near_angle(a, scale * near, near_tol)
@@ -205,9 +235,9 @@ def _supported(
     # Roll from the longest side.
     p, q = max(((0, 1), (1, 2), (2, 0)), key=lambda side: length[corner[side[0]], corner[side[1]]])
     camera_axes = _axes(b[:, corner], p, q)
-    rotation = np.einsum("mai,maj->mij", camera_axes, _axes(r, p, q))
+    rotation = camera_axes.transpose(0, 2, 1) @ _axes(r, p, q)
     others = np.array([m for m in range(len(u)) if m not in corner])
-    sky = np.einsum("mij,mni->mnj", rotation, b[:, others])
+    sky = b[:, others] @ rotation
     span = length[corner[p], corner[q]]
     reach = np.hypot(*(u[others] - u[corner].mean(axis=0)).T)
     noise = float(np.max(sigma[corner]))

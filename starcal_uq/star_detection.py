@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
-from starcal_uq._types import AnyDict, BoolArray, FloatArray, IntArray
-from starcal_uq.centroid_fits import Stamps, StarFit, cut_stamps, explained, fit_stars
+from starcal_uq._types import AnyDict, BoolArray, IntArray
+from starcal_uq.centroid_fits import Stamps, StarFit, cut_stamps, explained, fit_stars, near_pairs
 from starcal_uq.errors import ImageError
 from starcal_uq.formatting import plural
 from starcal_uq.image_background import PreparedImage, prepare_image
 from starcal_uq.image_files import Image
 from starcal_uq.psf_measurement import FIRST_SIGMA_PX, half_stamp_px, measure_psf, moment_sigma_px, pixel_at
+from starcal_uq.windowed_centroids import windowed
 
 # Half the detection kernel: what lies farther out adds 1 % to the signal-to-noise ratio and doubles the time.
 _KERNEL_HALF_SIGMAS, _KERNEL_HALF_MAX = 2.5, 5
-# Star images with this part of their light beyond the Gaussian are no Gaussians, and get windowed centroids. The window
-# is wide enough to bridge the pixels of an undersampled image.
-_MISFIT, _WINDOW_SIGMA_PX = 0.1, 1.5
 _MAX_DETECTIONS = 5000
 # A width is preferred to that of the PSF if it lowers chi squared by this much.
 _CHI2_MARGIN = 9.0
@@ -54,9 +52,13 @@ class FrameStars:
     background, noise, psf_sigma_px : float
         Median background and noise, counts; width of the star images.
     gain_e_per_count : float or None
-        The gain that was used.
+        The gain that was given, by which fluxes are in electrons.
+    measured_gain_e_per_count : float or None
+        The gain read off the noise of the background where none was given; it serves the noise of the stars only.
     messages : list of str
         What was left out, without the name of the image.
+    windowed : bool
+        Whether the centroids are windowed because the star images are no round Gaussians.
     """
 
     columns: dict[str, Any]
@@ -65,6 +67,8 @@ class FrameStars:
     psf_sigma_px: float
     gain_e_per_count: float | None
     messages: list[str]
+    measured_gain_e_per_count: float | None = None
+    windowed: bool = False
 
 
 def find_stars(image: Image, options: DetectionOptions) -> FrameStars:
@@ -83,7 +87,7 @@ def find_stars(image: Image, options: DetectionOptions) -> FrameStars:
     messages: list[str] = []
     objects, n_blobs = _without_blobs(objects, moment_sigma_px(objects, start))
     measured = measure_psf(frame, objects)
-    sigma, misfit = measured or (start, 0.0)
+    sigma = start if measured is None else measured.sigma_px
     if options.psf_sigma_px is not None:
         sigma = options.psf_sigma_px
     elif measured is None and len(objects):
@@ -93,11 +97,12 @@ def find_stars(image: Image, options: DetectionOptions) -> FrameStars:
         )
     stamps, fit = _fit(frame, objects, sigma)
     kind = _classify(frame, objects, stamps, fit, measured is not None or options.psf_sigma_px is not None)
-    if abs(misfit) > _MISFIT:
-        fit = _windowed(frame, fit)
+    shape = "" if measured is None else measured.shape_words
+    if shape:
+        fit = windowed(frame, fit)
         messages.append(
-            f"the star images are no Gaussians ({abs(100.0 * misfit):.0f} % of their light is elsewhere), so their "
-            "centroids are windowed, and what their shape adds to the errors is not in sigma."
+            f"the star images are {shape}, so their centroids are windowed, and what their shape adds to the errors is "
+            "not in sigma."
         )
     counts = {word: int(np.count_nonzero(kind == code)) for code, word in enumerate(_KINDS)}
     counts["extended"] += n_blobs
@@ -111,7 +116,8 @@ def find_stars(image: Image, options: DetectionOptions) -> FrameStars:
     columns = _columns(image, frame, fit, stamps, sigma, gain, order)
     if not len(order):
         messages.append("no star was found.")
-    return FrameStars(columns, background, noise, float(sigma), gain, messages)
+    measured_gain = 1.0 / frame.counts_per_e if frame.gain_is_measured else None
+    return FrameStars(columns, background, noise, float(sigma), gain, messages, measured_gain, bool(shape))
 
 
 def _detect(frame: PreparedImage, name: str, sigma: float, options: DetectionOptions) -> Any:
@@ -169,43 +175,7 @@ def _fit(frame: PreparedImage, objects: Any, sigma: float) -> tuple[Stamps, Star
         good = (flags == 0) & (np.hypot(xw - x, yw - y) < 1.0)
         x, y = np.where(good, xw, x), np.where(good, yw, y)
     stamps = cut_stamps(frame.counts, frame.usable, x, y, half, frame.noise, frame.counts_per_e)
-    return stamps, fit_stars(stamps, x, y, sigma, pairs=_pairs(x, y, 2.0 * half))
-
-
-def _windowed(frame: PreparedImage, fit: StarFit) -> StarFit:
-    """`fit` with windowed centroids and their covariance for the stars that stand alone."""
-    import sep
-
-    window = np.maximum(_WINDOW_SIGMA_PX, 1.2 * fit.sigma_px)
-    x, y, flags = sep.winpos(frame.counts, fit.x_px, fit.y_px, window)
-    half = int(np.ceil(4.0 * window.max(initial=_WINDOW_SIGMA_PX)))
-    stamps = cut_stamps(frame.counts, None, x, y, half, frame.noise, frame.counts_per_e)
-    steps = np.arange(2 * half + 1)
-    u = (steps + stamps.x0[:, None])[:, None, :] - x[:, None, None]
-    v = (steps + stamps.y0[:, None])[:, :, None] - y[:, None, None]
-    weight = np.exp(-0.5 * (u * u + v * v) / window[:, None, None] ** 2) * stamps.good
-    light = np.sum(weight * stamps.counts, (1, 2))
-    variance = stamps.variance[:, None, None] + stamps.counts_per_e * np.maximum(stamps.counts, 0.0)
-    covariance = fit.covariance.copy()
-    # The weight follows the centroid, which doubles every error (SExtractor's ERRX2WIN and its likes).
-    scale = 4.0 * weight**2 * variance / np.where(light > 0.0, light, np.inf)[:, None, None] ** 2
-    for i, j, product in ((0, 0, u * u), (1, 1, v * v), (0, 1, u * v), (1, 0, u * v)):
-        covariance[:, i, j] = np.sum(scale * product, (1, 2))
-    near = _pairs(fit.x_px, fit.y_px, 4.0 * float(window.max(initial=0.0)))
-    use = (flags == 0) & (light > 0.0) & (np.hypot(x - fit.x_px, y - fit.y_px) < 1.0) & stamps.good.all((1, 2))
-    use[near[fit.flux[near[:, 1]] > 0.01 * fit.flux[near[:, 0]], 0]] = False
-    x, y = np.where(use, x, fit.x_px), np.where(use, y, fit.y_px)
-    return replace(fit, x_px=x, y_px=y, covariance=np.where(use[:, None, None], covariance, fit.covariance))
-
-
-def _pairs(x: FloatArray, y: FloatArray, reach: float) -> IntArray:
-    """Pairs (i, j), in both orders, of positions closer than `reach`."""
-    from scipy.spatial import cKDTree
-
-    if len(x) < 2:
-        return np.zeros((0, 2), dtype=np.int64)
-    pairs = cKDTree(np.column_stack([x, y])).query_pairs(reach, output_type="ndarray").astype(np.int64)
-    return np.concatenate([pairs, pairs[:, ::-1]])
+    return stamps, fit_stars(stamps, x, y, sigma, pairs=near_pairs(x, y, 2.0 * half))
 
 
 _KINDS = ("star", "too sharp for a star (hot pixel or cosmic ray)", "extended", "not measurable")
@@ -258,7 +228,7 @@ def _columns(
     )
     margin = np.minimum.reduce([x, width - 1 - x, y, height - 1 - y]) + 0.5
     blended = np.zeros(len(order), dtype=np.bool_)
-    near = _pairs(x, y, 6.0 * sigma)
+    near = near_pairs(x, y, 6.0 * sigma)
     # A star a hundred times fainter moves its neighbour by less than the noise.
     blended[near[flux[near[:, 1]] > 0.01 * flux[near[:, 0]], 0]] = True
     return {

@@ -83,28 +83,31 @@ class StarPairs:
         partner : (h,) array of int
             The pattern star.
         """
-        edges, width = self._steps
-        first = np.clip(((angle_rad - tolerance_rad) / width).astype(np.int64), 0, _STEPS - 1)
-        last = np.clip(((angle_rad + tolerance_rad) / width).astype(np.int64), 0, _STEPS - 1)
-        start = edges[star * _STEPS + first]
-        count = edges[star * _STEPS + last + 1] - start
-        some = np.flatnonzero(count)
+        edges, per_rad = self._steps
+        place = star * _STEPS
+        # NumPy's `clip` takes longer than these arrays of some thousand numbers deserve.
+        first = np.maximum((angle_rad - tolerance_rad) * per_rad, 0.0).astype(np.int64)
+        last = np.minimum((angle_rad + tolerance_rad) * per_rad, _STEPS - 1.0).astype(np.int64)
+        start = edges[place + np.minimum(first, _STEPS - 1)]
+        count = edges[place + last + 1] - start
+        # A range beyond the largest angle is the last step, which the comparison below empties.
+        some = np.flatnonzero(count > 0)
         start, count = start[some], count[some]
         total = np.cumsum(count)
         n = int(total[-1]) if len(total) else 0
         question = np.repeat(some, count)
         row = np.arange(n) + np.repeat(start - (total - count), count)
-        inside = np.abs(self.neighbour_angle[row] - angle_rad[question]) <= tolerance_rad
-        return question[inside].astype(np.int64), self.neighbour[row[inside]]
+        inside = np.flatnonzero(np.abs(self.neighbour_angle[row] - angle_rad[question]) <= tolerance_rad)
+        return question[inside], self.neighbour[row[inside]]
 
     @cached_property
     def _steps(self) -> tuple[IntArray, float]:
-        """Where each step of each star's neighbours begins, (n * steps + 1,), and the width of a step, rad."""
+        """Where each step of each star's neighbours begins, (n * steps + 1,), and the steps per rad."""
         width = (float(self.angle[-1]) if len(self.angle) else 1.0) / _STEPS * (1.0 + 1e-12)
         star = np.repeat(np.arange(len(self)), np.diff(self.neighbour_start))
-        step = np.clip((self.neighbour_angle / width).astype(np.int64), 0, _STEPS - 1)
+        step = np.clip((self.neighbour_angle * (1.0 / width)).astype(np.int64), 0, _STEPS - 1)
         counts = np.bincount(star * _STEPS + step, minlength=len(self) * _STEPS)
-        return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), width
+        return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), 1.0 / width
 
 
 def find_star_pairs(

@@ -17,6 +17,7 @@ from starcal_uq.errors import CalibrationError, ObservationError, RunFolderError
 from starcal_uq.observations import Observations, load_observations
 from starcal_uq.progress import Progress
 from starcal_uq.runfolder import RunFolder, atomic_path, check_new_run, ensure_new
+from starcal_uq.site import check_sky
 
 if TYPE_CHECKING:
     from starcal_uq.couplings import Coupling
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from starcal_uq.priors import Priors
     from starcal_uq.propagation import AttitudeError
     from starcal_uq.screening_result import Screening
+    from starcal_uq.site import Site
     from starcal_uq.verdict import Verdict
 
 
@@ -43,6 +45,8 @@ def read_observations(
     columns: Mapping[str, str] | None = None,
     directions: str | None = None,
     observer_velocity_km_s: Sequence[float] | None = None,
+    site: Site | None = None,
+    in_space: bool = False,
 ) -> Observations:
     """Read a table and make its directions apparent as far as the user has declared how.
 
@@ -59,15 +63,27 @@ def read_observations(
         velocity, annual aberration is applied at each row's ``time_utc``.
     observer_velocity_km_s : (3,) sequence, optional
         Velocity relative to the Earth's centre, ICRS axes.
+    site : Site, optional
+        Where on the ground the camera stood: refraction and daily aberration are applied too, and stars lower than ten
+        degrees left out.
+    in_space : bool
+        Whether the camera was above the air, so that nothing need be said of refraction.
 
     Raises
     ------
     ObservationError
         For bad rows, or when aberration is asked for without times.
+    SiteError
+        For a site together with directions that need none.
     """
     obs = load_observations(path, camera=camera, columns=columns)
     if directions is not None:
         obs = obs.with_meta(directions=directions)
+    # A table that says nothing of its directions is taken to hold a catalogue's.
+    declared = obs.meta.get("directions")
+    check_sky(directions if declared == "undeclared" else declared, site, in_space)
+    if in_space:
+        obs = obs.with_meta(observer="space")
     if obs.meta.get("directions") == "apparent":
         if observer_velocity_km_s is not None:
             raise ObservationError(
@@ -75,11 +91,13 @@ def read_observations(
                 "twice: leave out --observer-velocity, or declare --directions catalogue."
             )
         return obs
-    if obs.meta.get("directions") == "catalogue" or observer_velocity_km_s is not None:
-        from starcal_uq.apparent import make_apparent
+    if obs.meta.get("directions") == "catalogue" or observer_velocity_km_s is not None or site is not None:
+        from starcal_uq.apparent import make_apparent, without_low_stars
 
         try:
-            return make_apparent(obs, observer_velocity_km_s)
+            return make_apparent(
+                obs if site is None else without_low_stars(obs, site), observer_velocity_km_s, site=site
+            )
         except ObservationError as error:
             raise ObservationError(f"{path}: {error}", row=error.row, column=error.column) from error
     return obs

@@ -55,7 +55,7 @@ def test_run_from_images_to_report(cli, frames, tmp_path):
     assert status in (0, 1), err
     assert "with the nominal camera" in err
     run = sc.RunFolder(tmp_path / "run")
-    assert run.report.exists()
+    assert "identified anew" in run.report.read_text("utf-8")
     assert len(pd.read_csv(run.path / "identification.csv")) == 25
     assert sc.Centroids.load(run.path / "centroids.parquet").n_frames == 25
     cal, truth = sc.Calibration.load(run.calibration), sc.paper_camera().theta
@@ -102,6 +102,9 @@ def test_bad_input_is_one_sentence(cli, tmp_path):
 
 def test_one_message_for_many_images():
     assert counted(["a: dark.", "b: dark.", "c: odd."]) == ["2 images: dark.", "c: odd."]
+    found = counted(["a1: 3 of 10 % left.", "b2: 12 of 10 % left.", "c: 1.5 of 9 % left."])
+    assert found == ["3 images: 1.5 to 12 of 9 to 10 % left."]
+    assert counted(["In all 7."]) == ["In all 7."]
 
 
 @pytest.mark.skipif(not ESA.is_dir(), reason="the real frames are not here")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import sys
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -12,13 +14,17 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
+from starcal_uq import matching
 from starcal_uq.attitude import quaternion_to_rotation, random_rotations
+from starcal_uq.centroiding import extract_centroids
 from starcal_uq.directions import ra_dec_deg, unit_vectors
 from starcal_uq.errors import IdentificationError
 from starcal_uq.identification import calibrated_tolerance, identify
+from starcal_uq.identification_engines import ENGINES
 from starcal_uq.projection import unproject
-from starcal_uq.pyramid import CameraTolerance, mortari_order
+from starcal_uq.pyramid import CameraTolerance, first_order, mortari_order, remaining_order
 from starcal_uq.simulation import Sky
+from starcal_uq.star_brightness import instrumental_mag, unlike_brightness
 from starcal_uq.star_pairs import angle_between, cached_star_pairs, default_cache_dir, find_star_pairs
 
 SIGMA = 0.3
@@ -124,6 +130,67 @@ def test_false_and_missing_stars(stars: Any, folder: Path) -> None:
     found = identify(table, square_camera(12.0), stars, cache_dir=folder)
     assert found.n_identified >= 58
     assert wrong_rows(found, table, names) <= 1
+
+
+@pytest.fixture(scope="module")
+def disturbed(stars: Any) -> tuple[Any, Any]:
+    """Frames in which a false star lies beside the place of a missing one, at 2.5 sigma, and the rows of these."""
+    table, *_ = random_frames(stars, square_camera(12.0), 40, 14)
+    rows = np.array([np.flatnonzero(table.frame == k)[7] for k in range(40)])
+    angle = np.random.default_rng(15).random(40) * 2.0 * np.pi
+    table.x_px[rows] += 2.5 * SIGMA * np.cos(angle)
+    table.y_px[rows] += 2.5 * SIGMA * np.sin(angle)
+    return table, rows
+
+
+def refused_stars(table: Any, rows: Any, found: Any) -> tuple[int, int]:
+    """Planted rows that are identified, and how many matches were given up for their brightness."""
+    o = found.observations
+    used = set(zip(o.frame.tolist(), o.x_px.tolist(), strict=True))
+    kept = sum((f, x) in used for f, x in zip(table.frame[rows].tolist(), table.x_px[rows].tolist(), strict=True))
+    return kept, sum(frame.n_unlike_brightness for frame in found.frames)
+
+
+@pytest.mark.parametrize("gain", [1.0, 3e4])
+def test_false_stars_are_known_by_their_brightness(
+    stars: Any, folder: Path, disturbed: tuple[Any, Any], gain: float
+) -> None:
+    """Faint false stars beside the places of brighter ones are refused; those of the right brightness cannot be."""
+    table, rows = disturbed
+    like = SimpleNamespace(**vars(table) | {"flux": gain * table.flux})
+    kept, unlike = refused_stars(like, rows, identify(like, square_camera(12.0), stars, cache_dir=folder))
+    assert kept >= 20
+    assert unlike <= 4
+    flux = gain * table.flux
+    flux[rows] *= 10.0 ** (-0.4 * 1.5)
+    faint = SimpleNamespace(**vars(table) | {"flux": flux})
+    found = identify(faint, square_camera(12.0), stars, cache_dir=folder)
+    assert refused_stars(faint, rows, found)[0] <= kept // 3
+    assert refused_stars(faint, rows, found)[1] >= 12
+    assert found.n_identified == 40
+    assert "brightness is unlike" in found.summary
+    # Where all fluxes are equal they say nothing.
+    flat = SimpleNamespace(**vars(table) | {"flux": np.ones(len(flux))})
+    assert refused_stars(flat, rows, identify(flat, square_camera(12.0), stars, cache_dir=folder))[1] == 0
+
+
+def test_brightness_is_only_a_second_opinion() -> None:
+    """Variable, saturated and few stars stay; what is far from its place or much too bright does not."""
+    rng = np.random.default_rng(16)
+    difference, misfit = 7.0 + 0.2 * rng.standard_normal(30), np.full(30, 1.0)
+    difference[0], difference[1], misfit[1], difference[2], misfit[2] = 8.5, 8.5, 10.0, 3.5, 0.0
+    assert np.flatnonzero(unlike_brightness(difference, misfit)).tolist() == [1, 2]
+    saturated = np.where(difference > 8.0, np.nan, difference)
+    assert np.flatnonzero(unlike_brightness(saturated, misfit)).tolist() == [2]
+    # A gain, and a frame whose brightness is only known to half a magnitude.
+    assert np.array_equal(unlike_brightness(difference + 4.0, misfit), unlike_brightness(difference, misfit))
+    assert not unlike_brightness(7.0 + 0.6 * rng.standard_normal(30), np.full(30, 3.0)).any()
+    assert not unlike_brightness(difference[:5], misfit[:5]).any()
+    assert instrumental_mag(np.full(9, 3.0)) is None
+    assert instrumental_mag(np.empty(0)) is None
+    found = instrumental_mag(np.array([100.0, 1.0, 0.0, -2.0, np.nan]))
+    assert found is not None
+    assert found[:2].tolist() == [-5.0, 0.0] and np.isnan(found[2:]).all()
 
 
 def test_taste_follows_chi_square(stars: Any, folder: Path) -> None:
@@ -284,6 +351,49 @@ def test_triangles_do_not_stay_with_one_star() -> None:
     assert np.bincount(order[:6].ravel()).max() <= 3
 
 
+def test_triangles_left_after_a_first_search() -> None:
+    """Every five stars hold a triangle of the first or of the second search, and none is in both."""
+    first, left = ({tuple(t) for t in order.tolist()} for order in (first_order(10, True), remaining_order(16, 10)))
+    assert len(first) + len(left) < 170
+    assert not first & left
+    for five in combinations(range(16), 5):
+        assert any(three in left or three in first for three in combinations(five, 3))
+    assert len(first_order(10, False)) == 120
+
+
+@pytest.mark.parametrize(("fov_deg", "focal", "shift_px"), [(12.0, 1.02, 10.0), (20.0, 0.97, -20.0)])
+def test_engines_agree(stars: Any, folder: Path, fov_deg: float, focal: float, shift_px: float) -> None:
+    """tetra3rs finds other patterns, and the same stars come out."""
+    pytest.importorskip("tetra3rs", reason="the extra `tetra3rs` is not installed")
+    table, names, _ = random_frames(stars, square_camera(fov_deg, focal, shift_px), 30, 17)
+    ours, theirs = (
+        identify(table, square_camera(fov_deg), stars, engine=engine, cache_dir=folder) for engine in ENGINES
+    )
+    assert ours.n_identified == theirs.n_identified == 30
+    assert np.array_equal(ours.observations.frame, theirs.observations.frame)
+    assert np.array_equal(ours.observations.star_id, theirs.observations.star_id)
+    assert np.array_equal(ours.observations.x_px, theirs.observations.x_px)
+    assert wrong_rows(theirs, table, names) == 0
+    for a, b in zip(ours.frames, theirs.frames, strict=True):
+        assert np.allclose(a.quaternion, b.quaternion, atol=1e-7)
+    assert abs(ours.camera.focal_px / theirs.camera.focal_px - 1.0) < 1e-7
+    table.x_px = 1023.0 - table.x_px
+    assert identify(table, square_camera(fov_deg), stars, engine="tetra3rs").parity == "mirrored"
+    rng = np.random.default_rng(18)
+    nothing = centroid_table([(rng.random((12, 2)) * 1023.0, rng.random(12)) for _ in range(3)])
+    assert identify(nothing, square_camera(fov_deg), stars, engine="tetra3rs").n_identified == 0
+
+
+def test_engine_that_is_not_there(stars: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "tetra3rs", None)
+    table, *_ = random_frames(stars, square_camera(12.0), 1, 12)
+    with pytest.raises(IdentificationError, match=r"pip install .starcal-uq\[tetra3rs\]"):
+        identify(table, square_camera(12.0), stars, engine="tetra3rs")
+    engine: Any = "astrometry"
+    with pytest.raises(IdentificationError, match="no engine 'astrometry'"):
+        identify(table, square_camera(12.0), stars, engine=engine)
+
+
 def test_bad_input(stars: Any, folder: Path) -> None:
     table, *_ = random_frames(stars, square_camera(12.0), 1, 12)
     with pytest.raises(IdentificationError, match="tolerances"):
@@ -323,3 +433,28 @@ def test_real_frames(folder: Path) -> None:
     # Refraction is in the focal length here, and an independent fit without it has 5114.3 px.
     assert abs(found.camera.focal_px - 5114.3) < 2.0
     assert all(f.noise_scale < 1.5 for f in found.frames)
+
+
+def test_brightness_of_real_frames(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another band, saturated and variable stars: no star of the table is refused, and two of a thousand at most."""
+    images = sorted((DATA / "esa-tetra3").glob("*.tiff"))
+    if not images:
+        pytest.skip("the real frames are not there (../shared/data)")
+    nominal = sc.Camera.load(DATA / "esa_tetra3_camera.toml")
+    table = extract_centroids(images, camera=nominal)
+    stars = sc.load_catalogue(8.0, epoch=2019.57)
+    found = identify(table, nominal, stars, cache_dir=folder)
+    assert found.n_identified == 8
+    assert sum(f.n_unlike_brightness for f in found.frames) <= 0.002 * len(found.observations)
+    monkeypatch.setattr(matching, "unlike_brightness", lambda difference, misfit: np.zeros(len(misfit), dtype=bool))
+    every = identify(table, nominal, stars, cache_dir=folder).observations
+    o = found.observations
+    kept = set(zip(o.frame.tolist(), o.star_id.tolist(), strict=True))
+    refused = [
+        i for i, key in enumerate(zip(every.frame.tolist(), every.star_id.tolist(), strict=True)) if key not in kept
+    ]
+    with (DATA / "esa_tetra3_observations.csv").open() as file:
+        rows = [(int(row["frame"]), float(row["x_px"]), float(row["y_px"])) for row in csv.DictReader(file)]
+    frame, x, y = np.array(rows).T
+    for i in refused:
+        assert np.hypot(x - every.x_px[i], y - every.y_px[i])[frame == every.frame[i]].min() > 3.0

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from starcal_uq.couplings import Coupling
     from starcal_uq.diagnosis import Diagnosis
     from starcal_uq.fieldmap import FieldMap
+    from starcal_uq.image_record import ImageRecord
     from starcal_uq.posterior import Posterior
     from starcal_uq.propagation import AttitudeError
     from starcal_uq.runfolder import RunFolder
@@ -59,6 +60,8 @@ class Results:
         What questions the model: tests for misfit, jackknife, comparison of models.
     truth : Camera or None
         The camera of a simulation.
+    images : ImageRecord or None
+        What became of the images, where the run started from images.
     missing : tuple of Missing
         What the run does not hold.
     """
@@ -72,6 +75,7 @@ class Results:
     field_map: FieldMap | None = None
     diagnosis: Diagnosis | None = None
     truth: Camera | None = None
+    images: ImageRecord | None = None
     missing: tuple[Missing, ...] = ()
 
 
@@ -117,8 +121,17 @@ def load_results(run: RunFolder, truth: Camera | None = None) -> Results:
         field_map=field_map,
         diagnosis=diagnosis,
         truth=truth if truth is not None and truth.parameter_names == calibration.parameter_names else None,
+        images=load_image_record(run),
         missing=tuple(missing),
     )
+
+
+def load_image_record(run: RunFolder) -> ImageRecord | None:
+    """The record of the images that a run started from, if it did."""
+    from starcal_uq.image_record import IMAGES, ImageRecord
+
+    path = run.path / IMAGES
+    return ImageRecord.load(path) if path.exists() else None
 
 
 def _attitude(run: RunFolder) -> tuple[AttitudeError | None, FieldMap | None]:

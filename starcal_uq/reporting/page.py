@@ -9,7 +9,7 @@ from typing import Any
 from starcal_uq.distortion import get_model
 from starcal_uq.formatting import MINUS, count, join_words
 from starcal_uq.html_pages import embedded_image, template_environment
-from starcal_uq.reporting import model_tables, tables, words
+from starcal_uq.reporting import image_tables, model_tables, tables, words
 from starcal_uq.reporting.loading import Results
 from starcal_uq.verdict import Check, Level, Question, judge, limits, worst
 
@@ -63,6 +63,7 @@ def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
         "methods_rows": tables.methods_rows(results),
         "derived_rows": [] if post is None else model_tables.derived_rows(post),
         **model_tables.diagnosis_context(results.diagnosis, cal),
+        **image_tables.image_context(results.images, cal),
         "stage_rows": tables.stage_rows(results),
         "pair_rows": tables.pair_rows(results),
         "prior_rows": words.prior_rows(results),

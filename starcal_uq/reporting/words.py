@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.formatting import count, fixed, percent, plural, significant
-from starcal_uq.verdict import propagation_difference
+from starcal_uq.verdict import air, conditional_words, corrected_words, propagation_difference
 
 if TYPE_CHECKING:
+    from starcal_uq.observations import Observations
     from starcal_uq.reporting.loading import Results
 
 _DIRECTIONS = {
@@ -32,20 +33,42 @@ def data_sentence(results: Results) -> str:
     unique = ""
     if obs.star_id is not None and len(np.unique(obs.star_id)) < obs.n_stars:
         unique = f", {count(len(np.unique(obs.star_id)))} different stars"
-    directions = _DIRECTIONS[str(obs.meta["directions"])]
     camera = cal.camera
     horizontal, vertical = camera.fov_deg
     return (
-        f"{source}{stars}{unique}, with {directions}. Camera: {camera.width_px} × {camera.height_px} pixels of "
+        f"{source}{stars}{unique}, with {_directions(obs)}. Camera: {camera.width_px} × {camera.height_px} pixels of "
         f"{camera.pixel_um:g} µm, {fixed(horizontal, 1)}° × {fixed(vertical, 1)}° field, distortion model "
-        f"“{camera.distortion}”. Centroid noise was {_noise_words(results)}."
+        f"“{camera.distortion}”. Centroid noise was {_noise_words(results)}.{_air_words(results)}"
     )
+
+
+def _directions(obs: Observations) -> str:
+    declared = str(obs.meta["directions"])
+    if declared == "apparent" and air(obs) == "corrected":
+        return "apparent directions (aberration and refraction included)"
+    if declared == "apparent" and air(obs) == "unknown":
+        return "directions that include aberration but no refraction"
+    return _DIRECTIONS[declared]
+
+
+def _air_words(results: Results) -> str:
+    """What refraction does to f, where the stars were or may have been seen through air."""
+    obs, cal = results.observations, results.calibration
+    if air(obs) == "corrected":
+        return f" {corrected_words(obs, cal)}"
+    return f" {conditional_words(cal)}" if air(obs) == "unknown" else ""
 
 
 def _noise_words(results: Results) -> str:
     cal, post = results.calibration, results.posterior
     if cal.sigma_name == "sigma_scale":
-        return f"stated star by star; the data ask for {significant(cal.sigma, 3)} times that"
+        floor = results.observations.meta.get("noise_floor_px")
+        more = (
+            f", with {significant(float(floor))} px per axis added that even bright stars show in their residuals"
+            if floor
+            else ""
+        )
+        return f"stated star by star{more}; the data ask for {significant(cal.sigma, 3)} times that"
     if post is not None and not post.sigma_sampled:
         return f"given as {significant(float(post.sigma_draws[0]), 3)} px per axis"
     return f"estimated from the data: {significant(cal.sigma, 3)} px per axis"

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from starcal_uq.formatting import join_words
 from starcal_uq.verdict import estimate, model, observed, sampling
+from starcal_uq.verdict.air import air, conditional_words, corrected_words
 from starcal_uq.verdict.estimate import truth_z
 from starcal_uq.verdict.levels import Check, Level, Question
 from starcal_uq.verdict.limits import limits
@@ -31,6 +32,9 @@ __all__ = [
     "Question",
     "Verdict",
     "aberration_words",
+    "air",
+    "conditional_words",
+    "corrected_words",
     "judge",
     "limits",
     "propagation_difference",

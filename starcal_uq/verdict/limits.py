@@ -8,6 +8,7 @@ import numpy as np
 
 from starcal_uq.formatting import significant
 from starcal_uq.residuals import bin_residuals
+from starcal_uq.verdict.air import air
 from starcal_uq.verdict.model import MISFIT_P
 from starcal_uq.verdict.observed import ARCSEC_PER_RAD, PATTERN_P
 
@@ -58,6 +59,8 @@ def _systematic(obs: Observations, cal: Calibration) -> str:
         )
     if obs.meta.get("directions") != "apparent":
         return "Knowledge of the directions: until they are known to be apparent, f is conditional on that."
+    if air(obs) == "unknown":
+        return "Refraction: until the site is stated, or that the camera was in space, f is conditional on it."
     return ""
 
 

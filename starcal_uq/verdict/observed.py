@@ -8,6 +8,8 @@ import numpy as np
 
 from starcal_uq.formatting import fixed, percent, plural, significant
 from starcal_uq.residuals import bin_residuals, normalised_residuals
+from starcal_uq.site import Site
+from starcal_uq.verdict.air import REMEDY, air, conditional_words
 from starcal_uq.verdict.levels import Check, Level, Question, pass_or_warn
 
 if TYPE_CHECKING:
@@ -27,13 +29,25 @@ MIN_FRAMES = 5
 
 
 def directions(obs: Observations, cal: Calibration) -> Check:
-    """Is annual aberration in the directions?"""
+    """Is annual aberration in the directions, and refraction where there is air?"""
     declared = str(obs.meta.get("directions", "undeclared"))
     name, threshold = "Catalogue directions", "apparent"
+    seen = air(obs)
+    if declared == "apparent" and seen == "unknown":
+        sentence = f"Aberration is in the directions, refraction is not. {conditional_words(cal)} {REMEDY}"
+        return Check(name, Question.TRUSTWORTHY, Level.WARN, "without refraction", threshold, sentence)
     if declared == "apparent":
         sentence = "The directions are declared as apparent: aberration is in them."
+        if obs.meta.get("observer") == "space":
+            sentence = "Aberration is in the directions; the camera was in space."
+        if seen == "corrected":
+            sentence = (
+                f"Aberration and refraction at the site ({Site.from_dict(obs.meta['site'])}) are in the directions."
+            )
         return Check(name, Question.TRUSTWORTHY, Level.PASS, declared, threshold, sentence)
     sentence = f"{_undeclared(obs)} {aberration_words(cal)}"
+    if seen == "unknown":
+        sentence += f" {conditional_words(cal)} {REMEDY}"
     return Check(name, Question.TRUSTWORTHY, Level.WARN, declared, threshold, sentence)
 
 

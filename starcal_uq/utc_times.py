@@ -1,0 +1,104 @@
+"""UTC times as text to two-part Julian dates."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from typing import Any
+
+import numpy as np
+
+from starcal_uq._types import FloatArray, IntArray
+from starcal_uq.errors import CatalogueError
+
+FIRST_YEAR, LAST_YEAR = 1960, 2100
+
+_ISO = re.compile(
+    r"(\d{4})-(\d\d)-(\d\d)(?:[T ](\d\d):(\d\d)(?::(\d\d(?:\.\d*)?))?)?\s*(Z|UTC|[+-]\d\d:?\d\d)?", re.ASCII
+)
+
+
+def julian_days(time_utc: Any, ut1_minus_utc_s: float = 0.0) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Julian dates of the different times among some UTC times.
+
+    Parameters
+    ----------
+    time_utc
+        One UTC time or a sequence of n: ISO 8601 text ("2026-11-21T03:04:05.6", a trailing "Z" or an offset such as
+        "+02:00" is understood), `datetime.datetime` or `numpy.datetime64`. A time without an offset is UTC.
+    ut1_minus_utc_s
+        UT1 - UTC, seconds.
+
+    Returns
+    -------
+    tt, ut1 : ndarray, shape (m, 2)
+        Two-part Julian dates of the m different times; a table of observations repeats one time for every star of a
+        frame.
+    inverse : ndarray, shape (n,)
+        Which of them each time is.
+
+    Raises
+    ------
+    CatalogueError
+        A time is not readable; the message quotes it and gives its place in the sequence, from 1.
+    """
+    times = np.atleast_1d(np.asarray(time_utc)).astype(str)
+    unique, inverse = np.unique(times, return_inverse=True)
+    days = np.array([_days(str(text), times, ut1_minus_utc_s) for text in unique], dtype=np.float64).reshape(-1, 2, 2)
+    return days[:, 0], days[:, 1], inverse.reshape(-1).astype(np.int64)
+
+
+def julian_year(time_utc: Any) -> float:
+    """Mean of some UTC times as a Julian year, for the epoch of a catalogue.
+
+    Parameters
+    ----------
+    time_utc
+        As for `julian_days`.
+
+    Raises
+    ------
+    CatalogueError
+        As `julian_days`.
+    """
+    tt, _, inverse = julian_days(time_utc)
+    return float(2000.0 + (np.mean(tt.sum(axis=1)[inverse]) - 2451545.0) / 365.25)
+
+
+def _days(text: str, times: Any, ut1_minus_utc_s: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Two-part Julian dates, TT and UT1, of one UTC time."""
+    import erfa
+
+    match = _ISO.fullmatch(text.strip())
+    try:
+        if match is None:
+            raise ValueError("not ISO 8601")
+        if not FIRST_YEAR <= int(match[1]) <= LAST_YEAR:
+            raise ValueError("outside the years of UTC and of the Earth's ephemeris")
+        year, month, day, hour, minute = (int(group or 0) for group in match.groups()[:5])
+        second = float(match[6] or 0.0)
+        with warnings.catch_warnings():
+            # "Dubious year": leap seconds of the future are not known; ten of them change the Earth's velocity by
+            # 6e-5 km/s. "Time is after end of day" and the like are errors of the input.
+            warnings.simplefilter("error", erfa.ErfaWarning)
+            warnings.filterwarnings("ignore", message=".*dubious year", category=erfa.ErfaWarning)
+            utc = erfa.dtf2d("UTC", year, month, day, hour, minute, second)
+            tt1, tt2 = erfa.taitt(*erfa.utctai(*utc))
+            ut1, ut2 = erfa.utcut1(*utc, ut1_minus_utc_s)
+    except (ValueError, erfa.ErfaError, erfa.ErfaWarning) as error:
+        place = int(np.flatnonzero(times == text)[0]) + 1
+        raise CatalogueError(
+            f"The time {text!r} (number {place}) is not a UTC time between {FIRST_YEAR} and {LAST_YEAR}; "
+            "write it as 2026-11-21T03:04:05.6."
+        ) from error
+    offset = _offset_days(match[7])
+    return (float(tt1), float(tt2) - offset), (float(ut1), float(ut2) - offset)
+
+
+def _offset_days(zone: str | None) -> float:
+    """Offset of a local time from UTC, days east positive."""
+    if zone is None or zone[0] not in "+-":
+        return 0.0
+    digits = zone[1:].replace(":", "")
+    minutes = 60 * int(digits[:2]) + int(digits[2:])
+    return (minutes if zone[0] == "+" else -minutes) / 1440.0
