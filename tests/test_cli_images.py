@@ -160,3 +160,31 @@ def test_rendered_frames_through_the_whole_chain(tmp_path):
     old = sc.load_catalogue(max_mag=6.0, epoch=2016.0)
     control = bootstrap(table, sc.paper_start(), old, prepare=lambda obs: without_disturbed(obs, old, truth))
     assert control.calibration.sigma > 1.3
+
+
+@pytest.mark.skipif(not ESA.is_dir(), reason="the real frames are not here")
+def test_real_frames_from_images_to_the_report(cli, tmp_path):
+    camera = ESA.parent / "esa_tetra3_camera.toml"
+    sc.Site(52.2, 4.42, pressure_hpa=1013.0, temperature_c=20.0, name="Noordwijk").save(tmp_path / "site.toml")
+    status, _, err = cli("run", ESA, camera, "-o", "run", "--site", "site.toml", "--screen")
+    # Warnings only: the pixel phase that correction leaves, and a little with magnitude.
+    assert status == 0, err
+    assert "was added to the noise of every star" in err
+    run = sc.RunFolder(tmp_path / "run")
+    obs, cal = sc.load_observations(run.observations), sc.Calibration.load(run.calibration)
+    assert 0.03 < obs.meta["noise_floor_px"] < 0.05
+    assert cal.sigma == pytest.approx(1.0, abs=0.1)
+    f = cal.theta[2]
+    scale = np.array([1.0, 1.0, 1.0, f**2, f**4])
+    independent = np.array([[517.3, 1.0], [389.9, 1.4], [5116.54, 0.28], [0.078, 0.017], [1.5, 1.1]])
+    z = (cal.theta * scale - independent[:, 0]) / np.hypot(cal.sigmas * scale, independent[:, 1])
+    assert np.all(np.abs(z) < 2.0), z
+    report = run.report.read_text("utf-8")
+    assert "Noordwijk" in report
+    assert "8 of 8 images used" in report
+    # The control: without the site f is too short, and the report neither believes nor hides it.
+    status, _, err = cli("run", ESA, camera, "-o", "bare", "--screen")
+    assert status == 1
+    assert "conditional on refraction" in err
+    bare = sc.Calibration.load(sc.RunFolder(tmp_path / "bare").calibration)
+    assert (bare.theta[2] - 5116.54) / np.hypot(bare.sigmas[2], 0.28) < -5.0
