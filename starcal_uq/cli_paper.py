@@ -70,7 +70,7 @@ def field_command(
     reading: Annotated[
         str, typer.Option(help="window (the middle of a larger detector, 10.8 degrees) or full (all of it).")
     ] = "window",
-    replicates: Annotated[int, typer.Option(min=8, help="Repetitions behind the ranges of the errors.")] = 100,
+    replicates: Annotated[int, typer.Option(min=20, help="Repetitions behind the ranges of the errors.")] = 100,
     workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as processors by default.")] = None,
     seed: Seed = 2017,
     force: Force = False,
@@ -100,7 +100,9 @@ def field_command(
     if json:
         print_json({"verdict": found.verdict, "table_3": records(table)})
     else:
-        show_table(table, "Table 3, printed and simulated")
+        show_table(
+            _readable_table_3(table), "Table 3: rates in %, errors in arcsec, with 95 % ranges"
+        )
         console.print(found.verdict, highlight=False, soft_wrap=True)
         print(f"Report: {found.report.resolve()}")
 
@@ -117,3 +119,28 @@ def _readable(published: pd.DataFrame) -> pd.DataFrame:
     table["z"] = published["main_z"]
     table["outcome"] = published["outcome"]
     return table
+
+
+def _readable_table_3(table: pd.DataFrame) -> pd.DataFrame:
+    """The columns that fit a terminal: printed, ours as it stands, ours after alignment, and which of them agrees."""
+    import pandas as pd
+
+    from starcal_uq.formatting import significant
+
+    def ranged(row: pd.Series, prefix: str, value: str) -> str:
+        if pd.isna(row[value]):
+            return ""
+        ends = " to ".join(significant(float(row[f"{prefix}{end}"]), 3) for end in ("low", "high"))
+        return f"{significant(float(row[value]), 3)} ({ends})"
+
+    words = {"rate_percent": "rate", "pitch_arcsec": "pitch", "yaw_arcsec": "yaw", "roll_arcsec": "roll"}
+    return pd.DataFrame(
+        {
+            "method": [method.replace("_", " ") for method in table["method"]],
+            "": [words[quantity] for quantity in table["quantity"]],
+            "printed": table["printed"],
+            "true attitude": [ranged(row, "", "ours") for _, row in table.iterrows()],
+            "after alignment": [ranged(row, "aligned_", "aligned") for _, row in table.iterrows()],
+            "print agrees": table["agrees"],
+        }
+    )

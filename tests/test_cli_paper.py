@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 
 import pandas as pd
+import pytest
 
 from tests.test_cli import cli, inputs
 
@@ -23,7 +24,7 @@ def test_reproduce_writes_a_report_and_tables(cli, tmp_path):
 
     status, _, err = cli("reproduce", "-o", "paper", *size)
     assert status == 2
-    assert "holds files already" in err
+    assert "exists and is not empty" in err
 
 
 def test_reproduce_refuses_nonsense(cli, tmp_path):
@@ -32,6 +33,27 @@ def test_reproduce_refuses_nonsense(cli, tmp_path):
         assert status == 2
         assert wrong[0].lstrip("-") in err
     assert not (tmp_path / "paper").exists()
+
+
+@pytest.mark.slow
+def test_reproduce_field_writes_a_page_and_tables(cli, tmp_path):
+    size = ("--replicates", 20, "--frames", 20, "--workers", 1)
+    status, out, _ = cli("reproduce-field", "-o", "field", *size)
+    assert status == 0
+    assert "after alignment" in out
+    assert len(pd.read_csv(tmp_path / "field" / "table_3.csv")) == 16
+    assert (tmp_path / "field" / "field.html").exists()
+    status, _, err = cli("reproduce-field", "-o", "field", *size)
+    assert status == 2
+    assert "exists and is not empty" in err
+
+
+def test_reproduce_field_refuses_nonsense(cli, tmp_path):
+    for wrong in (("--reading", "half"), ("--replicates", 2), ("--frames", 3)):
+        status, _, err = cli("reproduce-field", "-o", "field", *wrong)
+        assert status == 2
+        assert wrong[0].lstrip("-") in err
+    assert not (tmp_path / "field").exists()
 
 
 def test_filter_then_sample(cli, inputs, tmp_path):

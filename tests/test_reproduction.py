@@ -483,7 +483,7 @@ def test_progress_rises_to_the_end(small: tuple[Reproduction, list[tuple[int, in
 
 def test_refusals(small: tuple[Reproduction, list[tuple[int, int]]], tmp_path: Path) -> None:
     found, _ = small
-    with pytest.raises(sc.RunFolderError, match="holds files already"):
+    with pytest.raises(sc.RunFolderError, match="exists and is not empty"):
         command.reproduce(found.path)
     file = tmp_path / "file"
     file.write_text("x")

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcal_uq._types import AnyDict
-from starcal_uq.errors import CalibrationError, RunFolderError
+from starcal_uq.errors import CalibrationError
 from starcal_uq.reproduction.published import PAPER_METHODS
-from starcal_uq.runfolder import PathLike, RunFolder, atomic_path, atomic_write_bytes, atomic_write_text, provenance
+from starcal_uq.runfolder import (
+    PathLike,
+    RunFolder,
+    atomic_path,
+    atomic_write_bytes,
+    atomic_write_text,
+    check_new_run,
+    provenance,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -90,7 +97,7 @@ def reproduce(
     from starcal_uq.simulation import paper_camera, paper_start
 
     folder = Path(out)
-    _check_folder(folder, force)
+    check_new_run(RunFolder(folder), force)
     _check_sizes(n_replicates, n_frames)
     bar = _Bar(progress, study)
     truth, start = paper_camera(convention), paper_start(convention)
@@ -170,15 +177,6 @@ class _Bar:
     def _show(self) -> None:
         if self.progress is not None:
             self.progress(self.done, self.total)
-
-
-def _check_folder(folder: Path, force: bool) -> None:
-    if os.path.exists(folder) and not folder.is_dir():
-        raise RunFolderError(f"{folder}: is a file; name a folder for the reproduction.")
-    if not force and folder.is_dir() and any(folder.iterdir()):
-        raise RunFolderError(
-            f"{folder}: the folder holds files already; choose another name or use --force (force=True in Python)."
-        )
 
 
 def _check_sizes(n_replicates: int, n_frames: int) -> None:
