@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
 if TYPE_CHECKING:
     from starcal_uq.identification_engines import Engine as EngineName
+
+ChoiceT = TypeVar("ChoiceT", bound=str)
 
 ObsFile = Annotated[
     Path,
@@ -96,14 +99,21 @@ Robust = Annotated[
 Draws = Annotated[int, typer.Option(min=50, help="Posterior draws that go through QUEST.")]
 
 
+def parse_choice(option: str, given: str | None, choices: Sequence[ChoiceT]) -> ChoiceT | None:
+    """The choice of that name; None where none was made."""
+    if given is None:
+        return None
+    for choice in choices:
+        if choice == given:
+            return choice
+    raise typer.BadParameter(f"{option} {given!r} is unknown: use one of {', '.join(choices)}.")
+
+
 def parse_engine(name: str) -> EngineName:
     """The engine of that name."""
     from starcal_uq.identification_engines import ENGINES
 
-    for engine in ENGINES:
-        if engine == name:
-            return engine
-    raise typer.BadParameter(f"--engine {name!r} is unknown: use one of {', '.join(ENGINES)}.")
+    return parse_choice("--engine", name, ENGINES) or "pyramid"
 
 
 def parse_columns(pairs: list[str] | None) -> dict[str, str]:

@@ -100,9 +100,7 @@ def field_command(
     if json:
         print_json({"verdict": found.verdict, "table_3": records(table)})
     else:
-        show_table(
-            _readable_table_3(table), "Table 3: rates in %, errors in arcsec, with 95 % ranges"
-        )
+        show_table(_readable_table_3(table), "Table 3: rates in %, errors in arcsec, with 95 % ranges")
         console.print(found.verdict, highlight=False, soft_wrap=True)
         print(f"Report: {found.report.resolve()}")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -185,14 +186,22 @@ def _word(value: Any) -> str:
     return ("yes" if value else "no") if isinstance(value, (bool, np.bool_)) else str(value)
 
 
+def _cell(value: Any) -> str:
+    """A number with three digits, a dash where there is none."""
+    if not isinstance(value, float):
+        return str(value)
+    return "–" if math.isnan(value) else significant(value, 3)
+
+
 def show_table(frame: pd.DataFrame, title: str, columns: Sequence[str] | None = None) -> None:
     """Chosen columns of a data frame, numbers with three digits; files and JSON have the rest."""
     frame = frame if columns is None else frame[list(columns)]
     table = Table(title=title, title_justify="left")
     for column in frame.columns:
-        table.add_column(str(column).replace("_", " "), justify="left" if frame[column].dtype == object else "right")
+        numbers = np.issubdtype(np.asarray(frame[column]).dtype, np.number)
+        table.add_column(str(column).replace("_", " "), justify="right" if numbers else "left")
     for row in records(frame):
-        table.add_row(*(significant(value, 3) if isinstance(value, float) else str(value) for value in row.values()))
+        table.add_row(*(_cell(value) for value in row.values()))
     out.print(table)
 
 

@@ -57,6 +57,10 @@ class ObservationError(StarcalError):
         self.problems = tuple(problems)
 
 
+class AttitudeProfileError(StarcalError):
+    """An attitude profile is unreadable, or its times or quaternions cannot be used."""
+
+
 class CatalogueError(StarcalError):
     """A star catalogue cannot be read or does not hold what was asked for."""
 
@@ -85,8 +89,20 @@ class SamplingError(StarcalError):
     """The posterior could not be sampled from the given start."""
 
 
+class PlanningError(StarcalError):
+    """A calibration cannot be planned with what was given, or its aim cannot be reached."""
+
+
+class ComparisonError(StarcalError):
+    """Two calibrations cannot be compared, or a table of frames cannot be split."""
+
+
 class ImageError(StarcalError):
     """An image file is missing, damaged, empty or of the wrong size."""
+
+
+class BudgetError(StarcalError):
+    """An error budget is incomplete, contradicts itself or is unreadable."""
 
 
 class RunFolderError(StarcalError):

@@ -9,6 +9,9 @@ that. The rotation that a parameter error delta causes, phi = -K delta, is the l
 where A is the derivative of the directions with respect to a rotation and the weight W is uniform over the detector
 area. What remains has the covariance (B + A K) Sigma (B + A K)^T. Directions are unit vectors, so that all of this is
 in radians in the tangent plane of each direction; no pixel scale enters.
+
+The *equivalent principal point* says the common rotation in pixels: it is the shift of (x0, y0) that alone would turn
+the field by the same pitch and yaw.
 """
 
 from __future__ import annotations
@@ -21,6 +24,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq._types import FloatArray
+from starcal_uq.direction_fields import (
+    ARCSEC,
+    area_weights,
+    detector_axes,
+    grid_points,
+    rotated,
+    rotation_response,
+    tangent_axes,
+)
 from starcal_uq.errors import RunFolderError
 from starcal_uq.formatting import significant
 from starcal_uq.projection import unproject, unproject_jacobian
@@ -32,7 +44,13 @@ if TYPE_CHECKING:
     from starcal_uq.observations import Observations
     from starcal_uq.posterior import Posterior
 
-_ARCSEC = 648_000.0 / np.pi
+# Fields that files of earlier versions lack.
+_LATER = (
+    "covariance_absolute_arcsec2",
+    "covariance_compensated_arcsec2",
+    "rotation_covariance_arcsec2",
+    "equivalent_covariance_px2",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +70,14 @@ class FieldMap:
         Along the worst direction.
     star_x_px, star_y_px : (N,) array
         Where stars were observed: beyond them the map is extrapolated.
+    covariance_absolute_arcsec2, covariance_compensated_arcsec2 : (ny, nx, 2, 2) array or None
+        Covariance of each direction along camera X and Y (x and y of the image), from which the 1-sigma ellipses are
+        drawn; None when read from a file of an earlier version, which did not keep it.
+    rotation_covariance_arcsec2 : (3, 3) array or None
+        Covariance of the rotation that was removed: pitch, yaw, roll; None as above.
+    equivalent_covariance_px2 : (2, 2) array or None
+        Covariance of the shift of the principal point (x0, y0) that alone would cause the pitch and yaw of that
+        rotation; None as above.
     """
 
     x_px: FloatArray
@@ -62,24 +88,44 @@ class FieldMap:
     worst_compensated_arcsec: FloatArray
     star_x_px: FloatArray
     star_y_px: FloatArray
+    covariance_absolute_arcsec2: FloatArray | None = None
+    covariance_compensated_arcsec2: FloatArray | None = None
+    rotation_covariance_arcsec2: FloatArray | None = None
+    equivalent_covariance_px2: FloatArray | None = None
+
+    @property
+    def equivalent_principal_point_px(self) -> FloatArray | None:
+        """1-sigma error (2,) of the principal point, x and y, that alone would cause the common rotation, px."""
+        return _root_diagonal(self.equivalent_covariance_px2)
+
+    @property
+    def equivalent_principal_point_arcsec(self) -> FloatArray | None:
+        """The same as an angle (2,): standard deviation of the yaw that x0 stands for, and of the pitch of y0."""
+        angles = _root_diagonal(self.rotation_covariance_arcsec2)
+        return None if angles is None else angles[[1, 0]]
 
     def to_dataframe(self) -> pd.DataFrame:
-        """One row per grid pixel: ``x_px``, ``y_px`` and the four maps."""
+        """One row per grid pixel: ``x_px``, ``y_px``, the four maps, and the entries of both covariances."""
         import pandas as pd
 
         x, y = np.meshgrid(self.x_px, self.y_px)
         maps = {f.name: getattr(self, f.name).ravel() for f in fields(self) if f.name.endswith("arcsec")}
+        kinds = {"absolute": self.covariance_absolute_arcsec2, "compensated": self.covariance_compensated_arcsec2}
+        entries = {"xx": (0, 0), "xy": (0, 1), "yy": (1, 1)}
+        for kind, covariance in kinds.items():
+            if covariance is not None:
+                maps |= {f"{kind}_{name}_arcsec2": covariance[:, :, i, j].ravel() for name, (i, j) in entries.items()}
         return pd.DataFrame({"x_px": x.ravel(), "y_px": y.ravel(), **maps})
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all arrays to one ``.npz`` file, atomically; overwritten."""
-        arrays = {f.name: getattr(self, f.name) for f in fields(self)}
+        arrays = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
         with atomic_path(path) as temporary, open(temporary, "wb") as file:
             np.savez_compressed(file, allow_pickle=False, **arrays)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> FieldMap:
-        """Read what `save` wrote, without loss.
+        """Read what `save` wrote, without loss; a file of an earlier version lacks the ellipses.
 
         Raises
         ------
@@ -89,7 +135,8 @@ class FieldMap:
         try:
             # Opened here: NumPy leaves a file open that turns out not to be what it seems.
             with open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
-                return cls(**{f.name: arrays[f.name] for f in fields(cls)})
+                names = [f.name for f in fields(cls) if f.name not in _LATER or f.name in arrays.files]
+                return cls(**{name: arrays[name] for name in names})
         except OSError as error:
             raise RunFolderError(
                 f"{path}: cannot be read ({error.strerror or error}); run `starcal-uq propagate RUN` first."
@@ -116,8 +163,17 @@ class FieldMap:
             f"<table><thead><tr>{head}</tr></thead><tbody>"
             f"{row('absolute', self.sigma_absolute_arcsec, self.worst_absolute_arcsec)}"
             f"{row('best rotation removed', self.sigma_compensated_arcsec, self.worst_compensated_arcsec)}"
-            "</tbody></table>"
+            f"</tbody></table>{self._equivalent_html()}"
         )
+
+    def _equivalent_html(self) -> str:
+        pixels, angles = self.equivalent_principal_point_px, self.equivalent_principal_point_arcsec
+        if pixels is None or angles is None:
+            return ""
+        x, y = (
+            f"{significant(float(p))} px ({significant(float(a))} arcsec)" for p, a in zip(pixels, angles, strict=True)
+        )
+        return f"<p>Equivalent principal point, 1 sigma: {x} along x, {y} along y.</p>"
 
 
 def field_map(post: Posterior, obs: Observations, n: int = 25) -> FieldMap:
@@ -139,52 +195,47 @@ def field_map(post: Posterior, obs: Observations, n: int = 25) -> FieldMap:
     DistortionError
         When the distortion at the posterior mean folds over within the detector.
     """
-    if n < 2:
-        raise ValueError(f"a map needs at least 2 grid points along each side, not {n}.")
     camera = post.camera.with_theta(post.mean)
-    x = np.linspace(-0.5, camera.width_px - 0.5, n)
-    y = np.linspace(-0.5, camera.height_px - 0.5, n)
-    xy = np.column_stack([grid.ravel() for grid in np.meshgrid(x, y)])
+    x, y = detector_axes(camera, n)
+    xy = grid_points(x, y)
     unproject(camera, xy)
     b, B = unproject_jacobian(camera.distortion, post.mean, xy)
-    # The trapezoidal rule: grid points on an edge stand for half the area, those in a corner for a quarter.
-    side = np.ones(n)
-    side[[0, -1]] = 0.5
-    compensated = B + _rotated(-_rotation_response(b, B, np.outer(side, side).ravel()), b)
-    maps = [_ellipse(D, post.covariance, (n, n)) for D in (B, compensated)]
+    response = rotation_response(b, B, area_weights(n))
+    axes = tangent_axes(b)
+    absolute, compensated = (
+        _covariances(axes @ D, post.covariance, n) * ARCSEC**2 for D in (B, B + rotated(-response, b))
+    )
+    rms, worst = zip(*(_sigmas(covariance) for covariance in (absolute, compensated)), strict=True)
+    # What a shift of the principal point does to pitch and yaw, and the shift that does what all parameters did.
+    shift = np.linalg.solve(response[:2, :2], response[:2])
     return FieldMap(
         x_px=x,
         y_px=y,
-        sigma_absolute_arcsec=maps[0][0],
-        sigma_compensated_arcsec=maps[1][0],
-        worst_absolute_arcsec=maps[0][1],
-        worst_compensated_arcsec=maps[1][1],
+        sigma_absolute_arcsec=rms[0],
+        sigma_compensated_arcsec=rms[1],
+        worst_absolute_arcsec=worst[0],
+        worst_compensated_arcsec=worst[1],
         star_x_px=obs.x_px,
         star_y_px=obs.y_px,
+        covariance_absolute_arcsec2=absolute,
+        covariance_compensated_arcsec2=compensated,
+        rotation_covariance_arcsec2=response @ post.covariance @ response.T * ARCSEC**2,
+        equivalent_covariance_px2=shift @ post.covariance @ shift.T,
     )
 
 
-def _rotation_response(b: FloatArray, B: FloatArray, w: FloatArray) -> FloatArray:
-    """Rotation (3, p) that fits the displacements B (N, 3, p) of directions b (N, 3) best, with weights w (N,).
-
-    A phi = phi x b, so that A^T A = I - b b^T and A^T B = b x B.
-    """
-    normal = np.einsum("n,nij->ij", w, np.eye(3) - b[:, :, None] * b[:, None, :])
-    torque = np.einsum("n,npi->ip", w, np.cross(b[:, None], np.swapaxes(B, 1, 2)))
-    response: FloatArray = np.linalg.solve(normal, torque)
-    return response
+def _covariances(J: FloatArray, covariance: FloatArray, n: int) -> FloatArray:
+    """Covariances (n, n, 2, 2) of directions whose derivatives along the tangent axes are J (n * n, 2, p)."""
+    matrices: FloatArray = J @ covariance @ np.swapaxes(J, 1, 2)
+    return matrices.reshape(n, n, 2, 2)
 
 
-def _rotated(K: FloatArray, b: FloatArray) -> FloatArray:
-    """Displacements (N, 3, p) of the directions b (N, 3) by the rotations K (3, p)."""
-    return np.swapaxes(np.cross(K.T[None], b[:, None]), 1, 2)
+def _sigmas(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Per-axis root mean square and largest semi-axis of ellipses (..., 2, 2)."""
+    xx, yy, xy = covariance[..., 0, 0], covariance[..., 1, 1], covariance[..., 0, 1]
+    half_trace, half_gap = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
+    return np.sqrt(half_trace), np.sqrt(half_trace + half_gap)
 
 
-def _ellipse(D: FloatArray, covariance: FloatArray, shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-    """Per-axis root mean square and largest semi-axis, arcsec, of the covariances D Sigma D^T."""
-    C = D @ covariance @ np.swapaxes(D, 1, 2)
-    # The covariance has rank two, in the tangent plane: its non-zero eigenvalues from trace and |C|^2.
-    half_trace = 0.5 * np.trace(C, axis1=1, axis2=2)
-    half_gap = np.sqrt(np.maximum(0.5 * np.sum(C * C, axis=(1, 2)) - half_trace**2, 0.0))
-    rms, worst = np.sqrt(half_trace), np.sqrt(half_trace + half_gap)
-    return rms.reshape(shape) * _ARCSEC, worst.reshape(shape) * _ARCSEC
+def _root_diagonal(covariance: FloatArray | None) -> FloatArray | None:
+    return None if covariance is None else np.sqrt(np.diag(covariance))

@@ -35,6 +35,7 @@ _FILES: dict[str, tuple[str, str]] = {
     "coupling": ("coupling.csv", "run `starcal-uq coupling RUN` first"),
     "attitude": ("attitude.csv", "run `starcal-uq propagate RUN` first"),
     "field_map": ("field_map.npz", "run `starcal-uq propagate RUN` first"),
+    "spectrum": ("error_spectrum.npz", "run `starcal-uq propagate RUN --attitudes PROFILE` first"),
     "budget": ("budget.csv", "run `starcal-uq budget RUN` first"),
     "figures": ("figures", "run `starcal-uq report RUN` first"),
     "report": ("report.html", "run `starcal-uq report RUN` first"),
@@ -218,6 +219,11 @@ class RunFolder:
     def field_map(self) -> Path:
         """Direction uncertainty over the field (NPZ)."""
         return self._file("field_map")
+
+    @property
+    def spectrum(self) -> Path:
+        """Spectrum of the frame-dependent error along an attitude profile (NPZ)."""
+        return self._file("spectrum")
 
     @property
     def budget(self) -> Path:

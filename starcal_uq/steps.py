@@ -7,6 +7,7 @@ report) are removed when a step they depend on is done again, so that a folder n
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,7 @@ from starcal_uq.runfolder import RunFolder, atomic_path, check_new_run, ensure_n
 from starcal_uq.site import check_sky
 
 if TYPE_CHECKING:
+    from starcal_uq.attitude_profile import Scalar, Sense
     from starcal_uq.couplings import Coupling
     from starcal_uq.fieldmap import FieldMap
     from starcal_uq.posterior import Posterior
@@ -27,13 +29,14 @@ if TYPE_CHECKING:
     from starcal_uq.propagation import AttitudeError
     from starcal_uq.screening_result import Screening
     from starcal_uq.site import Site
+    from starcal_uq.spectrum_result import ErrorSpectrum
     from starcal_uq.verdict import Verdict
 
 
 DIRECTIONS = ("undeclared", "catalogue", "apparent")
 REJECTED = "rejected.csv"
 DIAGNOSIS_FILES = ("diagnosis.json", "misfit.csv", "jackknife.csv", "comparison.csv", "predictive.csv")
-_AFTER_SAMPLING = ("coupling", "attitude", "field_map", "budget", "report")
+_AFTER_SAMPLING = ("coupling", "attitude", "field_map", "spectrum", "budget", "report")
 _AFTER_CALIBRATION = ("posterior", *_AFTER_SAMPLING)
 _ALL = ("observations", "camera", "calibration", "arrays", *_AFTER_CALIBRATION)
 
@@ -216,8 +219,62 @@ def read_priors(run: RunFolder, path: Path) -> Priors:
     return load_priors(path, calibration.nominal, per_star, data_hashes(calibration.provenance))
 
 
-def propagate_step(run: RunFolder, *, n_draws: int, seed: int) -> tuple[AttitudeError, FieldMap]:
-    """Carry the posterior through QUEST on the observed frames, and over the field; write both."""
+@dataclass(frozen=True)
+class MissionSky:
+    """Frames that a mission will see, in place of the observed ones.
+
+    Attributes
+    ----------
+    profile : Path or None
+        Attitudes over time; random ones where it is None.
+    max_mag : float
+        Magnitude limit of the sensor in flight, Gaia G.
+    epoch : float
+        Julian year of the star positions.
+    n_frames : int
+        Number of random attitudes.
+    min_stars : int or None
+        Frames with fewer stars give no attitude; 5 at random attitudes and 3 along a profile by default.
+    rate_hz : float or None
+        Frames per second along the profile; its own instants where it is None.
+    scalar, sense
+        Of the profile's quaternions, as for `starcal_uq.load_attitude_profile`.
+    """
+
+    profile: Path | None = None
+    max_mag: float = 6.0
+    epoch: float = 2026.9
+    n_frames: int = 1000
+    min_stars: int | None = None
+    rate_hz: float | None = None
+    scalar: Scalar | None = None
+    sense: Sense = "icrs_to_camera"
+
+    def frames(self, posterior: Posterior, obs: Observations, seed: int) -> Observations:
+        """Noise-free frames, with the noise of the observed ones by magnitude where it is stated."""
+        from starcal_uq.attitude_profile import load_attitude_profile
+        from starcal_uq.catalogue import load_catalogue
+        from starcal_uq.mission_geometry import mission_frames, profile_frames
+
+        stars = load_catalogue(max_mag=self.max_mag, epoch=self.epoch)
+        camera = posterior.camera.with_theta(posterior.mean)
+        like = obs if posterior.sigma_name == sigma_parameter(True).name else None
+        if self.profile is None:
+            return mission_frames(
+                stars, camera, n_frames=self.n_frames, min_stars=self.min_stars or 5, seed=seed, noise_like=like
+            )
+        profile = load_attitude_profile(self.profile, scalar=self.scalar, sense=self.sense)
+        frames = profile_frames(stars, camera, profile, self.rate_hz, min_stars=self.min_stars or 3, noise_like=like)
+        return frames.with_meta(messages=[*profile.messages])
+
+
+def propagate_step(
+    run: RunFolder, *, n_draws: int, seed: int, sky: MissionSky | None = None
+) -> tuple[AttitudeError, FieldMap, ErrorSpectrum | None]:
+    """Carry the posterior through QUEST on the observed frames or a mission's, and over the field; write all of it.
+
+    Along an attitude profile the spectrum of the frame-dependent part is written as well.
+    """
     posterior = load_posterior(run)
     if not _has_observations(Calibration.load(run.require("calibration"))) and not run.observations.exists():
         raise RunFolderError(
@@ -228,11 +285,21 @@ def propagate_step(run: RunFolder, *, n_draws: int, seed: int) -> tuple[Attitude
     from starcal_uq.fieldmap import field_map
     from starcal_uq.propagation import propagate
 
-    error = propagate(posterior, obs, n_draws=n_draws, seed=seed)
+    frames = obs if sky is None else sky.frames(posterior, obs, seed)
+    error = propagate(posterior, frames, n_draws=n_draws, seed=seed)
     fields = field_map(posterior, obs)
+    spectrum = None
+    if sky is not None and sky.profile is not None:
+        from starcal_uq.slew_spectrum import error_spectrum
+
+        spectrum = error_spectrum(posterior, frames, n_draws=min(n_draws, 100), seed=seed)
+    # What rests on the attitude error of before goes with it.
+    _remove(run, ("spectrum", "budget"))
     error.save(run.attitude)
     fields.save(run.field_map)
-    return error, fields
+    if spectrum is not None:
+        spectrum.save(run.spectrum)
+    return error, fields, spectrum
 
 
 def report_step(run: RunFolder) -> Path:

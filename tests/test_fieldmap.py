@@ -137,3 +137,65 @@ def test_what_cannot_be_mapped_is_said() -> None:
     folded.mean = folded.mean * np.array([1, 1, 1, -1e4, 1])
     with pytest.raises(DistortionError, match="folds over"):
         field_map(folded, observations())
+
+
+def test_ellipses_are_those_of_draws() -> None:
+    """Covariance along camera X and Y, against draws of directions turned back by the linear best rotation."""
+    post = posterior()
+    found = field_map(post, observations(), n=5)
+    assert found.covariance_compensated_arcsec2.shape == (5, 5, 2, 2)
+    sd = np.sqrt(np.diag(COVARIANCE))
+    root = sd[:, None] * np.linalg.cholesky(COVARIANCE / np.outer(sd, sd))
+    draws = post.mean + np.random.default_rng(1).standard_normal((4000, 5)) @ root.T
+    xy = np.column_stack([g.ravel() for g in np.meshgrid(found.x_px, found.y_px)])
+    b = unproject_theta("brown", post.mean, xy)
+    moved = np.stack([unproject_theta("brown", theta, xy) for theta in draws])
+    edge = np.where(np.isin(np.arange(5), (0, 4)), 0.5, 1.0)
+    rotation = quest(moved, b, np.array([0, 25]), np.outer(edge, edge).ravel()).rotations[:, 0]
+    back = np.einsum("dji,dnj->dni", rotation, moved) - b
+    # Within 6 degrees of the boresight camera X and Y are the tangent axes to half a per cent.
+    for difference, covariance in (
+        (moved - b, found.covariance_absolute_arcsec2),
+        (back, found.covariance_compensated_arcsec2),
+    ):
+        e = difference[:, :, :2] * ARCSEC
+        scatter = np.einsum("dni,dnj->nij", e, e).reshape(5, 5, 2, 2) / 4000
+        scale = np.sqrt(np.einsum("yxii,yxjj->yxij", covariance, covariance))
+        np.testing.assert_allclose(scatter / scale, covariance / scale, atol=0.06)
+    # Off the diagonals of the detector the ellipses of a radial model are turned: the entry is not there by symmetry.
+    assert (
+        abs(found.covariance_compensated_arcsec2[0, 0, 0, 1]) > 0.3 * found.covariance_compensated_arcsec2[0, 0, 0, 0]
+    )
+
+
+def test_equivalent_principal_point() -> None:
+    """An error of x0 alone is itself; through the other parameters the point moves further."""
+    only_x0 = field_map(posterior(np.diag([0.15**2, 0, 0, 0, 0])), observations())
+    np.testing.assert_allclose(only_x0.equivalent_principal_point_px, [0.15, 0.0], atol=1e-9)
+    arcsec = 0.15 / camera("brown").theta[2] * ARCSEC
+    np.testing.assert_allclose(only_x0.equivalent_principal_point_arcsec, [arcsec, 0.0], atol=0.02 * arcsec)
+    # A focal length error turns the field only because the principal point is off the centre.
+    only_f = field_map(posterior(np.diag([0, 0, 0.028**2, 0, 0])), observations())
+    assert 0.0 < only_f.equivalent_principal_point_px[1] < 0.028 * 50 / 5852
+    found = paper_map()
+    assert (found.equivalent_principal_point_px >= 0.149).all()
+    assert "Equivalent principal point" in found._repr_html_()
+    # Pitch goes with y0 and yaw with x0, not the other way round.
+    assert only_x0.rotation_covariance_arcsec2[0, 0] < 1e-6 * only_x0.rotation_covariance_arcsec2[1, 1]
+
+
+def test_files_of_earlier_versions_lack_the_ellipses_only(tmp_path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    found = paper_map()
+    old = {f.name: getattr(found, f.name) for f in dataclasses.fields(FieldMap) if not f.name.endswith("2")}
+    np.savez(tmp_path / "field_map.npz", **old)
+    loaded = FieldMap.load(tmp_path / "field_map.npz")
+    assert loaded.covariance_absolute_arcsec2 is None
+    assert loaded.equivalent_principal_point_px is None
+    assert "Equivalent" not in loaded._repr_html_()
+    assert isinstance(loaded.plot_field_map(), Figure)
+    loaded.save(tmp_path / "again.npz")
+    assert FieldMap.load(tmp_path / "again.npz").covariance_compensated_arcsec2 is None
+    assert "compensated_xy_arcsec2" in found.to_dataframe()
+    assert "compensated_xy_arcsec2" not in loaded.to_dataframe()

@@ -43,11 +43,15 @@ def errors():
         common_arcsec=np.array([5.4, 5.5, 0.1]),
         rest_arcsec=np.array([0.02, 0.02, 0.2]),
     )
+    absolute, compensated = 5.0 + 0.01 * radius, 0.002 + 0.1 * radius**4
+    shape = np.array([[1.2, 0.3], [0.3, 0.8]])
     field = SimpleNamespace(
         x_px=x,
         y_px=y,
-        sigma_absolute_arcsec=5.0 + 0.01 * radius,
-        sigma_compensated_arcsec=0.002 + 0.1 * radius**4,
+        sigma_absolute_arcsec=absolute,
+        sigma_compensated_arcsec=compensated,
+        covariance_absolute_arcsec2=absolute[..., None, None] ** 2 * shape,
+        covariance_compensated_arcsec2=compensated[..., None, None] ** 2 * shape,
         star_x_px=np.linspace(0.0, 1000.0, 30),
         star_y_px=np.linspace(0.0, 700.0, 30),
     )
@@ -209,7 +213,24 @@ def test_field_map_has_a_colour_bar_for_each_panel(errors):
     assert "0.01" in [label.get_text() for label in bar.get_yticklabels()]
     field.sigma_absolute_arcsec = np.full_like(field.sigma_absolute_arcsec, 5.0)
     field.sigma_compensated_arcsec = np.zeros_like(field.sigma_absolute_arcsec)
+    field.covariance_compensated_arcsec2 = np.zeros_like(field.covariance_absolute_arcsec2)
     drawn(plots.plot_field_map(field))
+
+
+def test_ellipses_of_the_field_map_lie_within_their_cells(errors):
+    _, field = errors
+    figure = drawn(plots.plot_field_map(field))
+    ellipses = figure.axes[0].collections[-1]
+    places = ellipses.get_offsets()
+    step = min(np.diff(np.unique(places[:, i])).min() for i in (0, 1))
+    assert 0.85 * step < ellipses.get_widths().max() <= step
+    assert (ellipses.get_widths() > ellipses.get_heights()).all()
+    # The long axis points along rising x and y, which is downwards to the right.
+    assert np.all((ellipses.get_angles() % 180.0 > 0.0) & (ellipses.get_angles() % 180.0 < 45.0))
+    assert "semi-axis 5″" in [text.get_text() for text in figure.axes[0].texts]
+    # A map of an earlier version has no ellipses and is drawn all the same.
+    field.covariance_absolute_arcsec2 = field.covariance_compensated_arcsec2 = None
+    assert not drawn(plots.plot_field_map(field)).axes[0].texts
 
 
 def test_figures_are_repeatable_and_show_themselves(run):

@@ -10,14 +10,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+import starcal_uq as sc
 from starcal_uq.attitude import left_error, rotation_to_quaternion, rotation_vector
+from starcal_uq.attitude_error import AXES, CONTRIBUTORS, AttitudeError
 from starcal_uq.calibration import Calibration
+from starcal_uq.catalogue import load_catalogue
 from starcal_uq.errors import DistortionError, ObservationError, RunFolderError, SamplingError
 from starcal_uq.estimation import calibrate
+from starcal_uq.mission_geometry import mission_frames, noise_by_magnitude
 from starcal_uq.observations import Observations
 from starcal_uq.projection import unproject_theta
-from starcal_uq.propagation import AXES, CONTRIBUTORS, AttitudeError, propagate
+from starcal_uq.propagation import propagate
+from starcal_uq.simulation import paper_start
 from starcal_uq.wahba import quest
+from tests.attitude_campaigns import clean_frames, failures, fly, linear_estimator, with_noise
 from tests.scenes import camera, nominal, observations, with_sigmas
 
 ARCSEC = 648_000.0 / np.pi
@@ -107,12 +113,16 @@ def test_few_draws_tell_nearly_as_much_as_all() -> None:
 @pytest.mark.parametrize("stated", [False, True])
 def test_sampled_and_first_order_agree(model: str, stated: bool) -> None:
     obs, cal = scene(model, stated)
-    found = propagate(gaussian_posterior(cal), obs, n_draws=50)
-    # First order weights pixels, QUEST directions; across the boresight that makes hardly a difference.
-    np.testing.assert_allclose(found.common_arcsec[:2], found.analytic_common_arcsec[:2], rtol=0.01)
-    np.testing.assert_allclose(found.common_arcsec[2], found.analytic_common_arcsec[2], rtol=0.15)
-    np.testing.assert_allclose(found.rest_arcsec, found.analytic_rest_arcsec, rtol=0.01)
-    np.testing.assert_allclose(found.nea_arcsec, found.analytic_nea_arcsec, rtol=0.02)
+    post = gaussian_posterior(cal)
+    found = propagate(post, obs, n_draws=50)
+    assert found.agreement.largest < 5e-3
+    assert found.agreement.ratio.shape == (3, 3)
+    assert "agree within" in found.agreement.sentence
+    # The likelihood's own linearisation weights pixels, QUEST directions: across the boresight hardly a difference.
+    common = ARCSEC * np.sqrt(np.diag(post.rotation_per_theta @ post.covariance @ post.rotation_per_theta.T))
+    np.testing.assert_allclose(found.common_arcsec[:2], common[:2], rtol=0.01)
+    np.testing.assert_allclose(found.common_arcsec[2], common[2], rtol=0.15)
+    np.testing.assert_allclose(found.nea_arcsec, ARCSEC * np.sqrt(np.diag(post.attitude_noise)), rtol=0.02)
 
 
 def test_sampling_sees_what_first_order_does_not() -> None:
@@ -121,7 +131,82 @@ def test_sampling_sees_what_first_order_does_not() -> None:
     found = propagate(gaussian_posterior(cal, n=500, scale=100.0), obs, n_draws=500)
     raw = found.common_draws_arcsec.std(axis=0, ddof=1)
     np.testing.assert_allclose(found.common_arcsec, raw, rtol=1e-6)
-    assert np.max(np.abs(found.common_arcsec / found.analytic_common_arcsec - 1.0)) > 0.1
+    assert found.agreement.largest > 0.02
+    assert "the sampled values hold" in found.agreement.sentence
+    table = found.agreement.to_dataframe()
+    assert list(table.columns) == ["contributor", "axis", "sampled_over_first_order"]
+    assert np.nanmax(np.abs(table["sampled_over_first_order"] - 1.0)) == found.agreement.largest
+    assert found.agreement.sentence in found.agreement._repr_html_()
+
+
+def test_interaction_is_what_the_sum_of_the_parts_misses() -> None:
+    """Both at once, solved here, against the parts; it is a product of the two, so that each scales it."""
+    obs, cal = scene()
+    base = propagate(gaussian_posterior(cal), obs).interaction_arcsec
+    wide = propagate(gaussian_posterior(cal, scale=10.0), obs).interaction_arcsec
+    np.testing.assert_allclose(wide / base, 10.0, rtol=0.02)
+    noisy = gaussian_posterior(cal)
+    noisy.sigma_draws = 10.0 * noisy.sigma_draws
+    np.testing.assert_allclose(propagate(noisy, obs).interaction_arcsec / base, 10.0, rtol=0.02)
+
+    post, rng, n = gaussian_posterior(cal), np.random.default_rng(8), 60
+    r, starts = obs.directions_icrs, obs.frame_starts
+    shift = post.theta_draws[:n]
+    e = post.sigma_draws.mean() * rng.standard_normal((n, obs.n_stars, 2))
+
+    def attitudes(thetas: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+        return quest(
+            np.stack([unproject_theta("brown", t, p) for t, p in zip(thetas, pixels, strict=True)]), r, starts
+        ).quaternions
+
+    same, pixels = np.repeat(post.mean[None], n, axis=0), np.broadcast_to(obs.xy, e.shape)
+    reference = attitudes(same[:1], pixels[:1])
+    phi = [
+        left_error(attitudes(*pair), reference) for pair in ((shift, obs.xy + e), (shift, pixels), (same, obs.xy + e))
+    ]
+    found = ARCSEC * np.sqrt(np.mean((phi[0] - phi[1] - phi[2]) ** 2, axis=(0, 1)))
+    np.testing.assert_allclose(found, base, rtol=0.3)
+    # Control: without taking both parts away, it is larger by three orders of magnitude.
+    assert (ARCSEC * np.sqrt(np.mean((phi[0] - phi[1]) ** 2, axis=(0, 1))) > 1e3 * base).all()
+
+
+def test_frames_of_a_mission_count_and_not_those_of_the_calibration() -> None:
+    obs, cal = scene()
+    post = gaussian_posterior(cal)
+    stars = load_catalogue(max_mag=7.0, epoch=2026.9)
+    deep = mission_frames(stars, cal.camera, n_frames=150, seed=2)
+    found, observed = propagate(post, deep, n_draws=20), propagate(post, obs, n_draws=20)
+    assert found.frames.startswith("random attitudes, ")
+    assert "magnitude 7.0" in found.frames
+    assert observed.frames == "observed frames"
+    # Noise falls with the root of the stars; the common rotation stays, because it is the camera's.
+    ratio = (deep.n_stars / deep.n_frames) / (obs.n_stars / obs.n_frames)
+    np.testing.assert_allclose(observed.nea_arcsec[:2] / found.nea_arcsec[:2], np.sqrt(ratio), rtol=0.1)
+    np.testing.assert_allclose(found.common_arcsec[:2], observed.common_arcsec[:2], rtol=0.01)
+    assert (found.rest_arcsec < observed.rest_arcsec).all()
+    assert found.agreement.largest < 2e-3
+
+
+def test_stated_noise_is_carried_over_by_magnitude() -> None:
+    obs, cal = scene(stated=True)
+    post = gaussian_posterior(cal)
+    stars = load_catalogue(max_mag=6.0, epoch=2026.9)
+    with pytest.raises(ObservationError, match="noise_like=observations"):
+        propagate(post, mission_frames(stars, cal.camera, n_frames=20), n_draws=5)
+    frames = mission_frames(stars, cal.camera, n_frames=100, noise_like=obs)
+    found, own = propagate(post, frames, n_draws=20), propagate(post, obs, n_draws=20)
+    # The median of the stated noise says less than all of it: stars of little noise carry an attitude.
+    assert np.all((found.nea_arcsec > own.nea_arcsec) & (found.nea_arcsec < 3.0 * own.nea_arcsec))
+    with pytest.raises(ObservationError, match="noise_like has no column sigma_px"):
+        mission_frames(stars, cal.camera, n_frames=20, noise_like=scene()[0])
+
+    mag = np.linspace(2.0, 6.0, 2000)
+    like = SimpleNamespace(mag=mag, sigma_px=0.01 * 10 ** (0.2 * (mag - 2.0)))
+    asked = np.array([1.0, 3.0, 5.0, 7.0, np.nan])
+    values = noise_by_magnitude(like, asked)
+    np.testing.assert_allclose(values[1:4], 0.01 * 10 ** (0.2 * (asked[1:4] - 2.0)), rtol=0.02)
+    assert values[0] == pytest.approx(0.01, rel=0.1)
+    assert values[4] == np.median(like.sigma_px)
 
 
 def test_principal_point_is_a_rotation_of_the_camera() -> None:
@@ -209,10 +294,10 @@ def test_table_has_one_row_per_contributor_and_axis() -> None:
         "first_order_arcsec",
         "absorbed_by_alignment",
     ]
-    assert list(table["axis"]) == [*AXES, "cross-boresight"] * 4
+    assert list(table["axis"]) == [*AXES, "cross-boresight"] * 5
     assert list(table["contributor"].unique()) == list(CONTRIBUTORS)
     absorbed = table.groupby("contributor", sort=False)["absorbed_by_alignment"].first()
-    assert list(absorbed) == ["no", "yes", "no", "in part"]
+    assert list(absorbed) == ["no", "yes", "no", "in part", "no"]
     rows = table.set_index(["contributor", "axis"])["sigma_arcsec"]
     assert rows["calibration, common rotation", "yaw"] == found.common_arcsec[1]
     across = np.sqrt(np.mean(found.nea_arcsec[:2] ** 2))
@@ -233,8 +318,48 @@ def test_file_keeps_every_digit(tmp_path: Path) -> None:
     loaded = AttitudeError.load(path)
     for field in dataclasses.fields(AttitudeError)[:10]:
         np.testing.assert_array_equal(getattr(loaded, field.name), getattr(found, field.name), err_msg=field.name)
+    np.testing.assert_array_equal(loaded.interaction_arcsec, found.interaction_arcsec)
+    assert loaded.frames == found.frames
     assert loaded.common_draws_arcsec is None
     assert loaded.to_dataframe().equals(found.to_dataframe())
+
+
+def test_file_of_an_earlier_version_is_read_and_the_interaction_not_known(tmp_path: Path) -> None:
+    import pandas as pd
+
+    from starcal_uq.reporting.tables import attitude_rows
+
+    found, path = error(), tmp_path / "attitude.csv"
+    found.save(path)
+    table = pd.read_csv(path)
+    table[~table["contributor"].str.startswith("interaction")].drop(columns="frames").to_csv(path, index=False)
+    loaded = AttitudeError.load(path)
+    np.testing.assert_array_equal(loaded.rest_arcsec, found.rest_arcsec)
+    np.testing.assert_array_equal(loaded.p95_arcsec[:4], found.p95_arcsec[:4])
+    # Not zero, which would read as assessed.
+    assert np.isnan(loaded.interaction_arcsec).all()
+    assert np.isnan(loaded.p95_arcsec[4]).all()
+    assert "not known" in loaded._repr_html_()
+    row = attitude_rows(loaded)[-1]
+    assert row["sigma"] == ["—"] * 4
+    assert row["note"].startswith("not sampled by the version")
+    assert attitude_rows(found)[-1]["sigma"][2] == "<\N{NO-BREAK SPACE}0.001"
+    loaded.save(path)
+    assert np.isnan(AttitudeError.load(path).interaction_arcsec).all()
+    # Control: a missing number elsewhere is not excused.
+    table.loc[0, "sigma_arcsec"] = np.nan
+    table.to_csv(path, index=False)
+    with pytest.raises(RunFolderError, match="is not a table"):
+        AttitudeError.load(path)
+
+
+def test_one_number_is_taken_apart() -> None:
+    found = error()
+    assert "smaller by a factor of" in found.one_number_sentence
+    swapped = dataclasses.replace(found, common_arcsec=found.rest_arcsec, rest_arcsec=found.common_arcsec)
+    assert "no alignment absorbs it" in swapped.one_number_sentence
+    none = dataclasses.replace(found, rest_arcsec=np.zeros(3))
+    assert "is a common rotation of" in none.one_number_sentence
 
 
 @pytest.mark.parametrize(
@@ -267,6 +392,51 @@ def test_plots_itself() -> None:
     from matplotlib.axes import Axes
 
     assert isinstance(error().plot_attitude(), Axes)
+
+
+@pytest.mark.slow
+def test_propagated_posterior_against_campaigns_with_known_attitudes() -> None:
+    """A thousand frames: one campaign from pixels to its posterior, six thousand others that it must foretell."""
+    clean = clean_frames(1000)
+    rng = np.random.default_rng(0)
+    obs = with_noise(clean, 0.05 * rng.standard_normal(clean.xy.shape))
+    cal = calibrate(obs, paper_start())
+    post = sc.sample(obs, cal, seed=1)
+    found = propagate(post, obs)
+
+    # The linear estimator of the campaigns is what `calibrate` does.
+    G, truth, sd = linear_estimator(clean, camera("brown")), camera("brown").theta, np.sqrt(np.diag(cal.covariance))
+    for _ in range(3):
+        e = 0.05 * rng.standard_normal(clean.xy.shape)
+        linear = truth + np.einsum("na,pna->p", e, G)
+        assert np.abs((calibrate(with_noise(clean, e), paper_start()).theta - linear) / sd).max() < 0.05
+
+    narrow = dataclasses.replace(post, draws=post.draws.copy())
+    narrow.draws[:, :-1] += 0.1 * (post.mean - post.draws[:, :-1])
+    quiet = dataclasses.replace(post, draws=post.draws * np.append(np.ones(5), 0.9))
+    rows = [0, 2, 1, 3, 4]
+    confused = dataclasses.replace(
+        found, common_arcsec=found.rest_arcsec, rest_arcsec=found.common_arcsec, p95_arcsec=found.p95_arcsec[rows]
+    )
+    errors = (found, propagate(narrow, obs), propagate(quiet, obs), confused)
+    flown = fly(clean, errors, n=6000)
+    assert failures(flown[0], errors[0]) == set()
+    # Controls: a posterior 10 % too narrow, noise 10 % too small, and the two parts of the calibration confused.
+    assert failures(flown[1], errors[1]) == {"common", "rest"}
+    assert failures(flown[2], errors[2]) == {"nea"}
+    assert failures(flown[3], errors[3]) == {"common", "rest"}
+
+    # Noise and calibration are uncorrelated even on the calibration's own frames, so that squares add up.
+    assert np.abs(flown[0].correlation).max() < 0.01
+    parts = np.sqrt(sum(values**2 for values in flown[0].rms.values()))
+    np.testing.assert_allclose(flown[0].together, parts, rtol=0.005)
+    np.testing.assert_allclose(flown[0].interaction, found.interaction_arcsec, rtol=0.2)
+
+    # The set-up of Ye & Yang (2017): noise, a constant ten times as large, and next to nothing that remains.
+    nea, common, rest = found.nea_arcsec, found.common_arcsec, found.rest_arcsec
+    assert np.all((nea[:2] > 0.43) & (nea[:2] < 0.5)) and 6.0 < nea[2] < 7.2
+    assert np.all((common[:2] > 4.3) & (common[:2] < 5.6))
+    assert rest.max() < 0.1
 
 
 @pytest.mark.slow

@@ -192,6 +192,33 @@ def test_two_stars_close_together_have_an_honest_covariance() -> None:
     assert np.abs(rotation_vector(result.rotations[0] @ rotation.T)).max() < 1e-7
 
 
+@pytest.mark.parametrize("scene", ["two stars", "stars on a line", "cluster off the axis"])
+def test_nearly_collinear_stars_have_an_honest_covariance(scene: str) -> None:
+    """Ill-conditioned, not degenerate: roll, or a turn about the cluster, is known worse by orders of magnitude."""
+    rng = np.random.default_rng(24)
+    along, across = {
+        "two stars": (np.array([0.0, 2e-4]), np.array([0.0, 1e-4])),
+        "stars on a line": (np.linspace(-0.1, 0.1, 9), 1e-6 * rng.standard_normal(9)),
+        "cluster off the axis": (0.09 + 1e-4 * rng.standard_normal(6), 0.08 + 1e-4 * rng.standard_normal(6)),
+    }[scene]
+    b = np.column_stack((along, across, np.ones_like(along)))
+    b /= np.linalg.norm(b, axis=1, keepdims=True)
+    rotation = random_rotations(1, rng)[0]
+    sigma = 1e-7
+    noisy = perturbed(np.broadcast_to(b, (20_000, *b.shape)), np.full(len(b), sigma), rng)
+    result = quest(noisy, b @ rotation, np.array([0, len(b)]), sigma_rad=sigma)
+    assert result.ok.all()
+    errors = left_error(result.quaternions, rotation_to_quaternion(rotation))[:, 0]
+    covariance = np.linalg.inv(np.sum(np.eye(3) - b[:, :, None] * b[:, None, :], axis=0) / sigma**2)
+    assert whitened_excess(errors, covariance) < 4.5
+    root = np.linalg.inv(np.linalg.cholesky(covariance))
+    np.testing.assert_allclose(root @ result.covariance[0, 0] @ root.T, np.eye(3), atol=0.05)
+    # Control: the covariance of a sound frame of as many stars is wrong by far.
+    sound = directions(len(b), 12.0, rng)
+    other = np.linalg.inv(np.sum(np.eye(3) - sound[:, :, None] * sound[:, None, :], axis=0) / sigma**2)
+    assert whitened_excess(errors, other) > 30.0
+
+
 def degenerate_frames() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Sound, one star, coinciding stars, opposite stars, NaN, sound."""
     b, r, starts, _ = frames([5, 1, 3, 2, 4, 5], 12.0, 1e-5, seed=18)
@@ -271,6 +298,19 @@ def test_is_much_faster_than_scipy() -> None:
     ours = min(seconds(20_000) for _ in range(5)) / 20_000
     scipy = min(seconds(200) for _ in range(5)) / 200
     assert scipy > 20.0 * ours
+
+
+@pytest.mark.slow
+def test_solves_half_a_million_frames_a_second() -> None:
+    """Processor time, so that other processes do not count."""
+    b, r, starts, _ = frames([12] * 20_000, 12.0, 1e-5, seed=22)
+
+    def seconds() -> float:
+        begin = time.process_time()
+        quest(b, r, starts, covariance=False)
+        return time.process_time() - begin
+
+    assert 20_000 / min(seconds() for _ in range(15)) > 500_000
 
 
 def test_result_rotations_and_quaternions_agree() -> None:

@@ -11,6 +11,7 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.diagnosis import FILE, diagnose_run
+from starcal_uq.formatting import significant
 from starcal_uq.reporting import load_results, render
 from starcal_uq.reporting.tables import attitude_rows, parameter_rows, symbol, weak_directions
 from tests.scenes import camera, nominal, observations
@@ -98,7 +99,7 @@ def test_every_section_is_there_and_every_link_leads_somewhere(full):
     found = page(full)
     assert found.ids >= SECTIONS
     assert {link.removeprefix("#") for link in found.links} == SECTIONS
-    assert len(found.images) == 10
+    assert len(found.images) == 11
     assert all(image["alt"] for image in found.images)
 
 
@@ -109,7 +110,7 @@ def test_one_file_without_network_or_script(full):
     assert all(image["src"].startswith("data:image/png;base64,") for image in found.images)
     assert "http" not in text.replace("http-equiv", "")
     assert "url(" not in text and "@import" not in text
-    assert len(text) < 3_000_000
+    assert len(text) < 4_000_000
 
 
 def test_figures_are_files_too(full):
@@ -119,6 +120,7 @@ def test_figures_are_files_too(full):
         "convergence",
         "corner",
         "correlation",
+        "distortion_curve",
         "field_map",
         "misfit",
         "price_of_coupling",
@@ -159,10 +161,18 @@ def test_digits_end_at_the_second_digit_of_sigma(full):
         assert len(row["estimate"].partition(".")[2]) == len(row["sigma"].partition(".")[2])
 
 
+def test_field_map_and_distortion_in_words(full):
+    text = page(full).text
+    assert "Equivalent principal point" in text
+    assert "the distortion is" in text
+    field = load_results(full).field_map
+    assert f"{significant(field.equivalent_principal_point_px[0])} px" in text
+
+
 def test_attitude_table(full):
     error = load_results(full).attitude
     rows = attitude_rows(error)
-    assert [row["absorbed"] for row in rows] == ["no", "yes", "no", "in part"]
+    assert [row["absorbed"] for row in rows] == ["no", "yes", "no", "in part", "no"]
     assert all(len(row[group]) == 4 for row in rows for group in ("sigma", "p95", "p997"))
     assert float(rows[1]["sigma"][0]) == pytest.approx(error.common_arcsec[0], rel=0.05)
 

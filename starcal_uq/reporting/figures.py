@@ -31,4 +31,6 @@ def draw_figures(results: Results) -> dict[str, bytes]:
         drawn["attitude"] = plots.figure_of(plots.plot_attitude(results.attitude))
     if results.field_map is not None:
         drawn["field_map"] = plots.plot_field_map(results.field_map)
+    if results.distortion_curve is not None:
+        drawn["distortion_curve"] = plots.plot_distortion_curve(results.distortion_curve)
     return {name: png_bytes(figure) for name, figure in drawn.items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 from starcal_uq.calibration import Calibration
@@ -11,8 +12,10 @@ from starcal_uq.errors import RunFolderError
 from starcal_uq.observations import Observations, load_observations
 
 if TYPE_CHECKING:
+    from starcal_uq.budget_result import Budget
     from starcal_uq.couplings import Coupling
     from starcal_uq.diagnosis import Diagnosis
+    from starcal_uq.distortion_bands import DistortionCurve
     from starcal_uq.fieldmap import FieldMap
     from starcal_uq.image_record import ImageRecord
     from starcal_uq.posterior import Posterior
@@ -62,6 +65,8 @@ class Results:
         The camera of a simulation.
     images : ImageRecord or None
         What became of the images, where the run started from images.
+    budget : Budget or None
+        The attitude error budget.
     missing : tuple of Missing
         What the run does not hold.
     """
@@ -76,7 +81,21 @@ class Results:
     diagnosis: Diagnosis | None = None
     truth: Camera | None = None
     images: ImageRecord | None = None
+    budget: Budget | None = None
     missing: tuple[Missing, ...] = ()
+
+    @cached_property
+    def distortion_curve(self) -> DistortionCurve | None:
+        """Distortion against radius with its bands; None without a posterior or distortion, or where a draw folds."""
+        from starcal_uq.distortion_bands import distortion_curve
+        from starcal_uq.errors import DistortionError
+
+        if self.posterior is None:
+            return None
+        try:
+            return distortion_curve(self.posterior, self.observations)
+        except DistortionError:
+            return None
 
 
 def load_results(run: RunFolder, truth: Camera | None = None) -> Results:
@@ -122,8 +141,15 @@ def load_results(run: RunFolder, truth: Camera | None = None) -> Results:
         diagnosis=diagnosis,
         truth=truth if truth is not None and truth.parameter_names == calibration.parameter_names else None,
         images=load_image_record(run),
+        budget=_budget(run),
         missing=tuple(missing),
     )
+
+
+def _budget(run: RunFolder) -> Budget | None:
+    from starcal_uq.budget_result import Budget
+
+    return Budget.load(run.budget) if run.budget.exists() else None
 
 
 def load_image_record(run: RunFolder) -> ImageRecord | None:

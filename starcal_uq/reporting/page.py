@@ -9,7 +9,7 @@ from typing import Any
 from starcal_uq.distortion import get_model
 from starcal_uq.formatting import MINUS, count, join_words
 from starcal_uq.html_pages import embedded_image, template_environment
-from starcal_uq.reporting import image_tables, model_tables, tables, words
+from starcal_uq.reporting import budget_tables, field_words, image_tables, model_tables, tables, words
 from starcal_uq.reporting.loading import Results
 from starcal_uq.verdict import Check, Level, Question, judge, limits, worst
 
@@ -57,6 +57,7 @@ def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
         "parameter_rows": tables.parameter_rows(results),
         "attitude_rows": [] if results.attitude is None else tables.attitude_rows(results.attitude),
         "attitude_sentence": words.attitude_sentence(results),
+        "equivalent_sentence": field_words.equivalent_sentence(results.field_map),
         "coupling_rows": [] if results.coupling is None else tables.coupling_rows(results.coupling, results),
         "weak_directions": [] if results.coupling is None else tables.weak_directions(results.coupling),
         "diagnostics_rows": [] if post is None else tables.diagnostics_rows(post),
@@ -64,6 +65,7 @@ def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
         "derived_rows": [] if post is None else model_tables.derived_rows(post),
         **model_tables.diagnosis_context(results.diagnosis, cal),
         **image_tables.image_context(results.images, cal),
+        **budget_tables.budget_context(results.budget),
         "stage_rows": tables.stage_rows(results),
         "pair_rows": tables.pair_rows(results),
         "prior_rows": words.prior_rows(results),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.attitude_error import CONTRIBUTORS, INTERACTION
 from starcal_uq.distortion import Parameter, parameters, sigma_parameter
 from starcal_uq.formatting import count, decimals_for, fixed, percent, pretty_unit, significant, with_sigma
 from starcal_uq.verdict import truth_z
@@ -14,9 +15,9 @@ from starcal_uq.verdict import truth_z
 if TYPE_CHECKING:
     from markupsafe import Markup
 
+    from starcal_uq.attitude_error import AttitudeError
     from starcal_uq.couplings import Coupling
     from starcal_uq.posterior import Posterior
-    from starcal_uq.propagation import AttitudeError
     from starcal_uq.reporting.loading import Results
 
 Row = dict[str, Any]
@@ -116,6 +117,7 @@ _ATTITUDE_NOTES = (
     "one constant for the mission",
     "depends on where the stars are",
     "common rotation and rest together",
+    "beyond the sum of both",
 )
 
 
@@ -123,15 +125,26 @@ def attitude_rows(error: AttitudeError) -> list[Row]:
     """Contributions to the attitude error: 1 sigma, 95 % and 99.7 % for each axis and across the boresight, arcsec."""
     table = error.to_dataframe()
     rows = []
-    for (name, group), note in zip(table.groupby("contributor", sort=False), _ATTITUDE_NOTES, strict=True):
+    for (contributor, group), note in zip(table.groupby("contributor", sort=False), _ATTITUDE_NOTES, strict=True):
+        shown = _small if contributor == INTERACTION else significant
         columns = {
-            column: [significant(float(v)) for v in group[f"{column}_arcsec"]]
+            column: ["–" if np.isnan(v) else shown(float(v)) for v in group[f"{column}_arcsec"]]
             for column in ("sigma", "p95", "p997", "first_order")
         }
-        text = str(name)
+        text = str(contributor)
+        if group["sigma_arcsec"].isna().any():
+            note = "not sampled by the version that wrote this run"
         absorbed = str(group["absorbed_by_alignment"].iloc[0])
-        rows.append({"name": text[0].upper() + text[1:], "note": note, "absorbed": absorbed, **columns})
+        name = text[0].upper() + text[1:]
+        rows.append({"name": name, "note": note, "absorbed": absorbed, "total": text == CONTRIBUTORS[3], **columns})
     return rows
+
+
+def _small(arcsec: float) -> str:
+    """The interaction is shown to be small, and no more: twelve columns leave no room for powers of ten."""
+    if np.isnan(arcsec):
+        return "—"
+    return "< 0.001".replace(" ", "\N{NO-BREAK SPACE}") if 0.0 < arcsec < 0.0005 else significant(arcsec)
 
 
 def coupling_rows(coupling: Coupling, results: Results) -> list[Row]:

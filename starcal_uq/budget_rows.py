@@ -1,0 +1,248 @@
+"""The rows of an error budget: one contributor on one axis, and the contributors that no budget may leave out.
+
+The classes are those of ECSS-E-ST-60-20C (star sensors): bias, thermo-elastic error, field-of-view spatial error, pixel
+spatial error, aberration, temporal noise, measurement date error. What a calibration cannot know is in this list too,
+so that it is read as "not assessed" and never as zero.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+AXES = ("pitch", "yaw", "roll")
+CROSS_BORESIGHT = "cross-boresight"
+TOTAL_AXES = (*AXES, CROSS_BORESIGHT)
+AXIS_LABELS = {
+    "pitch": "X (pitch)",
+    "yaw": "Y (yaw)",
+    "roll": "Z (roll)",
+    CROSS_BORESIGHT: "X and Y together",
+}
+
+DISTRIBUTIONS = ("gaussian", "uniform", "arcsine", "rayleigh", "constant")
+TIME_CLASSES = ("constant", "long-term", "orbital", "field", "frame to frame")
+INTERPRETATIONS = ("ensemble", "temporal", "mixed")
+ABSORBED = ("yes", "no", "in part", "caused by it")
+SCOPES = ("before alignment", "after alignment")
+SOURCES = ("posterior", "file", "not assessed")
+ECSS_CLASSES = (
+    "bias",
+    "thermo-elastic",
+    "FOV spatial",
+    "pixel spatial",
+    "aberration",
+    "temporal noise (NEA)",
+    "measurement date",
+    "robustness",
+    "other",
+)
+
+NEA = "centroid noise (NEA)"
+COMMON = "calibration, common rotation"
+REST = "calibration, rest"
+INTERACTION = "interaction, calibration and noise"
+_NAN = float("nan")
+# Two-sided 99.7 % quantile of a Gaussian error, standard deviations.
+GAUSSIAN_997 = 2.9677379253417833
+
+
+@dataclass(frozen=True)
+class Contributor:
+    """One contributor to the attitude error on one axis.
+
+    Attributes
+    ----------
+    name : str
+        What it is.
+    ecss_class : str
+        Class of ECSS-E-ST-60-20C, one of `ECSS_CLASSES`.
+    axis : str
+        ``pitch`` (about camera X), ``yaw`` (about Y) or ``roll`` (about the boresight, Z).
+    mean_arcsec, sigma_arcsec : float
+        Mean and standard deviation, arcsec; NaN where not assessed.
+    distribution : str
+        One of `DISTRIBUTIONS`: shape around the mean. ``constant`` has no spread.
+    time_class : str
+        How fast it changes, one of `TIME_CLASSES`; ``field`` as stars move over the field of view.
+    interpretation : str
+        What it is random over: ``ensemble`` (of calibrations and units: constant in time), ``temporal`` or ``mixed``.
+    absorbed_by_alignment : str
+        Does an alignment calibration with the same camera parameters take it up? ``caused by it`` marks what exists
+        only after it. ``in part`` counts in full.
+    correlation_group : str
+        Rows of one group and axis err together, their sigmas add; empty if it errs alone.
+    tail_997 : float
+        Half-width that holds 99.7 % of the absolute deviations, standard deviations. Above 2.968 for a Gaussian error
+        whose sigma changes from frame to frame.
+    conditions, provenance : str
+        Under what conditions it holds, and where the number is from.
+    source : str
+        ``posterior``, ``file`` or ``not assessed``.
+    raw_sigma_arcsec : float
+        Sigma before inflation for what tests of the model found; NaN if it was not inflated.
+    applies : bool
+        False where the file states that there is no such error: it then counts as zero, with that as its reason.
+    """
+
+    name: str
+    ecss_class: str
+    axis: str
+    mean_arcsec: float = _NAN
+    sigma_arcsec: float = _NAN
+    distribution: str = "gaussian"
+    time_class: str = "constant"
+    interpretation: str = "ensemble"
+    absorbed_by_alignment: str = "no"
+    correlation_group: str = ""
+    tail_997: float = GAUSSIAN_997
+    conditions: str = ""
+    provenance: str = ""
+    source: str = "not assessed"
+    raw_sigma_arcsec: float = _NAN
+    applies: bool = True
+
+    @property
+    def assessed(self) -> bool:
+        """False if nobody has put a number on it."""
+        return self.source != "not assessed"
+
+    @property
+    def inflated(self) -> bool:
+        """True if sigma is larger than the posterior's own."""
+        return not math.isnan(self.raw_sigma_arcsec)
+
+    @property
+    def combination(self) -> str:
+        """How it enters the totals."""
+        if not self.assessed:
+            return "not in the totals"
+        if not self.applies:
+            return "none"
+        if self.distribution == "constant":
+            return "mean: linear"
+        group = f"linear within group {self.correlation_group!r}, then in squares" if self.correlation_group else ""
+        return group or "in squares"
+
+    def counts(self, scope: str) -> bool:
+        """True if it exists in this scope, one of `SCOPES`."""
+        if self.absorbed_by_alignment == "yes":
+            return scope == SCOPES[0]
+        if self.absorbed_by_alignment == "caused by it":
+            return scope == SCOPES[1]
+        return True
+
+
+@dataclass(frozen=True)
+class Expected:
+    """A contributor that a star-sensor budget must name.
+
+    Attributes
+    ----------
+    name, ecss_class, time_class, interpretation, absorbed_by_alignment, distribution : str
+        As in `Contributor`; a file may state otherwise.
+    what : str
+        What it is and where its number comes from, for people.
+    """
+
+    name: str
+    ecss_class: str
+    time_class: str
+    interpretation: str
+    absorbed_by_alignment: str
+    distribution: str
+    what: str
+
+
+FROM_POSTERIOR = (
+    Expected(
+        *(COMMON, "bias", "constant", "ensemble", "yes", "gaussian"),
+        "error of the camera parameters that turns all attitudes alike",
+    ),
+    Expected(
+        *(REST, "FOV spatial", "field", "mixed", "no", "gaussian"),
+        "error of the camera parameters that depends on where the stars are",
+    ),
+    Expected(
+        *(NEA, "temporal noise (NEA)", "frame to frame", "temporal", "no", "gaussian"),
+        "noise of the centroids",
+    ),
+)
+INTERACTING = Expected(
+    *(INTERACTION, "temporal noise (NEA)", "frame to frame", "mixed", "no", "gaussian"),
+    "what is left when noise and calibration error act together",
+)
+FROM_FILE = (
+    Expected(
+        *("on-ground alignment measurement", "bias", "constant", "ensemble", "yes", "gaussian"),
+        "alignment of the sensor's frame with its mounting reference (cube, feet), as measured before launch",
+    ),
+    Expected(
+        *("launch and settling shift", "bias", "constant", "ensemble", "yes", "uniform"),
+        "change of that alignment from its measurement to the start of the mission: launch loads, gravity, moisture",
+    ),
+    Expected(
+        *("alignment calibration in flight", "bias", "long-term", "ensemble", "caused by it", "gaussian"),
+        "error of the in-flight estimate that replaces the rows it absorbs",
+    ),
+    Expected(
+        *("thermo-elastic distortion", "thermo-elastic", "orbital", "temporal", "no", "arcsine"),
+        "motion of boresight against mounting reference with temperature and its gradients over orbit and season",
+    ),
+    Expected(
+        *("drift of focal length and distortion", "FOV spatial", "long-term", "ensemble", "no", "gaussian"),
+        "change of the camera since the calibration: temperature, vacuum, ageing",
+    ),
+    Expected(
+        *("chromatic and asymmetric star images", "FOV spatial", "field", "mixed", "no", "gaussian"),
+        "shift of centroids with star colour, field position and focus that no distortion model holds",
+    ),
+    Expected(
+        *("star catalogue", "FOV spatial", "field", "mixed", "no", "gaussian"),
+        "errors of catalogue positions: proper motion since epoch, parallax, double stars",
+    ),
+    Expected(
+        *("pixel spatial error", "pixel spatial", "field", "mixed", "no", "gaussian"),
+        "centroid interpolation, photo-response and dark-signal non-uniformity, as far as the calibration frames did "
+        "not hold it as noise",
+    ),
+    Expected(
+        *("aberration residual", "aberration", "orbital", "temporal", "no", "arcsine"),
+        "what the on-board correction of aberration leaves: velocity error, or the whole effect if it is not corrected",
+    ),
+    Expected(
+        *("measurement date error", "measurement date", "frame to frame", "temporal", "no", "uniform"),
+        "error of the time tag times the angular rate",
+    ),
+    Expected(
+        *("motion during exposure", "temporal noise (NEA)", "frame to frame", "temporal", "no", "gaussian"),
+        "smear, jitter and rolling shutter at the mission's rates, beyond those of the calibration frames",
+    ),
+    Expected(
+        *("end-of-life noise", "temporal noise (NEA)", "long-term", "temporal", "no", "gaussian"),
+        "growth of the noise with radiation dose, dark current, loss of transmission",
+    ),
+    Expected(
+        *("straylight, particles and false stars", "robustness", "frame to frame", "temporal", "no", "gaussian"),
+        "added error at the exclusion angles and particle fluxes that the mission has to endure",
+    ),
+)
+
+
+def confidence_text(confidence: float) -> str:
+    """A confidence in per cent, with the digits it has: 99.7 %."""
+    return f"{100.0 * confidence:.6g}\N{NO-BREAK SPACE}%"
+
+
+def not_assessed(expected: Expected, axis: str) -> Contributor:
+    """A row that says that nobody has put a number on it."""
+    return Contributor(
+        name=expected.name,
+        ecss_class=expected.ecss_class,
+        axis=axis,
+        distribution=expected.distribution,
+        time_class=expected.time_class,
+        interpretation=expected.interpretation,
+        absorbed_by_alignment=expected.absorbed_by_alignment,
+        conditions=expected.what,
+    )

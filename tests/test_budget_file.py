@@ -1,0 +1,217 @@
+"""The budget file: what it may say, and the sentence for what it may not."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+
+from starcal_uq.budget_file import load_budget_file
+from starcal_uq.budget_rows import AXES, FROM_FILE, Contributor, not_assessed
+from starcal_uq.budget_template import template_text, write_budget_template
+from starcal_uq.errors import BudgetError, RunFolderError
+
+ROW = """
+[[contributor]]
+name = "star catalogue"
+axis = "all"
+sigma_arcsec = 0.2
+provenance = "catalogue note"
+"""
+LIMIT = """
+[[requirement]]
+name = "R-1"
+axis = "cross-boresight"
+limit_arcsec = 10.0
+"""
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "budget.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_a_contributor_takes_what_is_expected_of_it(tmp_path: Path) -> None:
+    found = load_budget_file(written(tmp_path, ROW))
+    assert [row.axis for row in found.contributors] == list(AXES)
+    first = found.contributors[0]
+    assert (first.ecss_class, first.time_class, first.interpretation) == ("FOV spatial", "field", "mixed")
+    assert first.sigma_arcsec == 0.2 and first.mean_arcsec == 0.0 and first.source == "file"
+
+
+@pytest.mark.parametrize(
+    ("axis", "expected"),
+    [
+        ("X", ("pitch",)),
+        ("yaw", ("yaw",)),
+        ("z", ("roll",)),
+        ("cross-boresight", ("pitch", "yaw")),
+        ("all", AXES),
+    ],
+)
+def test_axes(tmp_path: Path, axis: str, expected: tuple[str, ...]) -> None:
+    found = load_budget_file(written(tmp_path, ROW.replace('"all"', f'"{axis}"')))
+    assert tuple(row.axis for row in found.contributors) == expected
+
+
+@pytest.mark.parametrize(
+    ("lines", "sigma", "mean"),
+    [
+        ('distribution = "uniform"\nhalf_width_arcsec = 3.0', 3.0 / math.sqrt(3.0), 0.0),
+        ('distribution = "arcsine"\nhalf_width_arcsec = 3.0\nmean_arcsec = -1', 3.0 / math.sqrt(2.0), -1.0),
+        ('distribution = "constant"\nmean_arcsec = 2.0', 0.0, 2.0),
+        ('distribution = "rayleigh"\nsigma_arcsec = 1.0', 1.0, math.sqrt(math.pi / (4.0 - math.pi))),
+        ("applies = false", 0.0, 0.0),
+    ],
+)
+def test_moments(tmp_path: Path, lines: str, sigma: float, mean: float) -> None:
+    row = load_budget_file(written(tmp_path, ROW.replace("sigma_arcsec = 0.2", lines))).contributors[0]
+    assert row.sigma_arcsec == pytest.approx(sigma) and row.mean_arcsec == pytest.approx(mean)
+    assert row.applies is ("applies" not in lines)
+
+
+def test_requirements_take_the_confidence_of_the_file(tmp_path: Path) -> None:
+    text = "[budget]\ntitle = 'T'\nconfidence = 0.95\n" + LIMIT + LIMIT.replace("R-1", "R-2") + "confidence = 0.5\n"
+    found = load_budget_file(written(tmp_path, text))
+    assert (found.title, found.confidence) == ("T", 0.95)
+    assert [asked.confidence for asked in found.requirements] == [0.95, 0.5]
+    asked = found.requirements[0]
+    assert (asked.scope, asked.interpretation, asked.judged_by) == ("after alignment", "mixed", "both")
+
+
+def test_a_byte_order_mark_is_no_error(tmp_path: Path) -> None:
+    path = tmp_path / "budget.toml"
+    path.write_bytes(b"\xef\xbb\xbf" + ROW.encode())
+    assert len(load_budget_file(path).contributors) == 3
+
+
+BAD = {
+    "sigmas": (ROW.replace("sigma_arcsec", "sigma_arcsecs"), "did you mean sigma_arcsec"),
+    "no name": (ROW.replace('name = "star catalogue"', ""), "key name is missing"),
+    "axis": (ROW.replace('"all"', '"w"'), "key axis is 'w'"),
+    "sigma text": (ROW.replace("0.2", '"0.2"'), "key sigma_arcsec is '0.2'; write a finite number"),
+    "sigma true": (ROW.replace("0.2", "true"), "key sigma_arcsec is True"),
+    "sigma negative": (ROW.replace("0.2", "-0.2"), "key sigma_arcsec is -0.2"),
+    "sigma infinite": (ROW.replace("0.2", "inf"), "write a finite number"),
+    "no sigma": (ROW.replace("sigma_arcsec = 0.2", ""), "write either sigma_arcsec or half_width_arcsec"),
+    "both": (ROW + "half_width_arcsec = 1.0\n", "are both given"),
+    "half width of a gaussian": (ROW.replace("sigma_arc", "half_width_arc"), "a gaussian error has no end"),
+    "constant with sigma": (ROW + 'distribution = "constant"\n', "a constant has no spread"),
+    "distribution": (ROW + 'distribution = "normal"\n', "key distribution is 'normal'; write one of 'gaussian'"),
+    "class": (ROW + 'ecss_class = "noise"\n', "key ecss_class is 'noise'"),
+    "no provenance": (ROW.replace("provenance", "conditions"), "key provenance is missing"),
+    "applies": (ROW + "applies = 'no'\n", "write true or false"),
+    "posterior's": (ROW.replace("star catalogue", "centroid noise (NEA)"), "filled by the posterior"),
+    "twice": (ROW + ROW, "star catalogue, axis pitch is stated twice"),
+    "one bracket": (
+        ROW.replace("[[contributor]]", "[contributor]"),
+        "must be written with two brackets, [[contributor]]",
+    ),
+    "other table": (ROW + "[limits]\na = 1\n", "limits is not known"),
+    "confidence": ("[budget]\nconfidence = 99.7\n", "write 0.997 for 99.7 %"),
+    "confidence 1": ("[budget]\nconfidence = 1\n", "lies between 0 and 1"),
+    "limit": (LIMIT.replace("10.0", "0"), "write a positive number of arcsec"),
+    "no limit": (LIMIT.replace("limit_arcsec = 10.0", ""), "key limit_arcsec is missing"),
+    "axis of a limit": (LIMIT.replace("cross-boresight", "all"), "key axis is 'all'"),
+    "scope": (LIMIT + 'scope = "later"\n', "key scope is 'later'; write one of 'before alignment'"),
+    "limits twice": (LIMIT + LIMIT, "requirement R-1 is stated twice"),
+    "no toml": ("[[contributor]\n", "is not valid TOML"),
+    "no table": ("contributor = [1]\n", "is no table"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_what_is_wrong_is_said_in_one_sentence_with_file_and_key(tmp_path: Path, case: str) -> None:
+    text, sentence = BAD[case]
+    path = written(tmp_path, text)
+    with pytest.raises(BudgetError) as caught:
+        load_budget_file(path)
+    assert sentence in str(caught.value) and str(path) in str(caught.value)
+    assert "\n" not in str(caught.value).strip() and str(caught.value).endswith((".", "?"))
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(BudgetError, match="--template"):
+        load_budget_file(tmp_path / "none.toml")
+    with pytest.raises(BudgetError, match="cannot be read"):
+        load_budget_file(tmp_path)
+    path = tmp_path / "latin.toml"
+    path.write_bytes(b"# \xe9\n")
+    with pytest.raises(BudgetError, match="UTF-8"):
+        load_budget_file(path)
+
+
+def test_the_template_states_nothing_and_lists_everything(tmp_path: Path) -> None:
+    path = tmp_path / "starter.toml"
+    write_budget_template(path)
+    found = load_budget_file(path)
+    assert not found.contributors and not found.requirements and found.confidence == 0.997
+    text = path.read_text(encoding="utf-8")
+    assert all(f'# name = "{entry.name}"' in text for entry in FROM_FILE)
+    assert max(len(line) for line in text.splitlines()) <= 120
+    with pytest.raises(RunFolderError, match="exists already"):
+        write_budget_template(path)
+    write_budget_template(path, force=True)
+
+
+def test_an_uncommented_template_loads_once_numbers_are_in(tmp_path: Path) -> None:
+    body = template_text().split("# [[requirement]]", 1)[1]
+    lines = ["[[requirement]]"]
+    for line in body.splitlines():
+        bare = line.removeprefix("# ")
+        if line.startswith("# ") and (" = " in f"{bare} " or bare.startswith("[[")):
+            bare = bare.replace('provenance = ""', 'provenance = "test"')
+            lines.append(bare + "1.5" if bare.rstrip().endswith("arcsec =") else bare)
+            lines[-1] = lines[-1].replace("arcsec =1.5", "arcsec = 1.5")
+    found = load_budget_file(written(tmp_path, "\n".join(lines)))
+    assert {(row.name, row.axis) for row in found.contributors} == {
+        (entry.name, axis) for entry in FROM_FILE for axis in AXES
+    }
+    assert len(found.requirements) == 1
+    by_name = {row.name: row for row in found.contributors}
+    for entry in FROM_FILE:
+        assert by_name[entry.name].ecss_class == entry.ecss_class
+        assert by_name[entry.name].distribution == entry.distribution
+
+
+def test_the_template_leaves_out_what_is_assessed() -> None:
+    rows = [not_assessed(entry, axis) for entry in FROM_FILE for axis in AXES]
+    catalogue = "star catalogue"
+    rows = [
+        Contributor(row.name, row.ecss_class, row.axis, 0.0, 1.0, source="file")
+        if row.name == catalogue or (row.name == "end-of-life noise" and row.axis != "roll")
+        else row
+        for row in rows
+    ]
+    text = template_text(rows)
+    assert f'name = "{catalogue}"' not in text
+    part = text.split('# name = "end-of-life noise"', 1)[1].split("[[contributor]]")[0]
+    assert '# axis = "Z"' in part and text.count('# name = "end-of-life noise"') == 1
+
+
+def example(root: Path) -> str:
+    """The full example of the how-to page."""
+    page = (root / "docs" / "how-to" / "budget.md").read_text(encoding="utf-8")
+    return page.split("```toml\n", 1)[1].split("```", 1)[0]
+
+
+def test_the_documented_example_loads(root: Path, tmp_path: Path) -> None:
+    found = load_budget_file(written(tmp_path, example(root)))
+    assert len(found.requirements) == 3 and found.title.startswith("Star tracker")
+    assert {row.name for row in found.contributors} - {entry.name for entry in FROM_FILE} == {"polishing residual"}
+    expected = {entry.name: entry for entry in FROM_FILE}
+    for row in found.contributors:
+        if row.name in expected:
+            assert row.ecss_class == expected[row.name].ecss_class
+
+
+def test_the_documented_keys_are_all_there_are(root: Path) -> None:
+    from starcal_uq.budget_file import _CONTRIBUTOR_KEYS, _REQUIREMENT_KEYS
+
+    page = (root / "docs" / "how-to" / "budget.md").read_text(encoding="utf-8")
+    for heading, keys in (("Keys of a contributor", _CONTRIBUTOR_KEYS), ("Keys of a requirement", _REQUIREMENT_KEYS)):
+        table = page.split(f"## {heading}", 1)[1].split("##", 1)[0]
+        listed = [line.split("`")[1] for line in table.splitlines() if line.startswith("| `")]
+        assert sorted(listed) == sorted(keys)
