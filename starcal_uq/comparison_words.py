@@ -28,7 +28,8 @@ def p_words(p: float) -> str:
 def headline(found: CameraComparison) -> str:
     """The verdict in one short sentence."""
     a, b = found.labels
-    a = a[:1].upper() + a[1:]
+    # A phrase begins the sentence with a capital; the name of a run stays what it is.
+    a = a[:1].upper() + a[1:] if " " in a else a
     size = f"{_size(found.rms_arcsec)} arcsec rms"
     if not found.tested:
         return f"{a} and {b} differ by {size} over the detector; whether chance explains it was not tested."

@@ -128,6 +128,8 @@ def load_results(run: RunFolder, truth: Camera | None = None) -> Results:
     if diagnosis is None:
         what = "The tests for misfit, the jackknife and the comparison of distortion models"
         missing.append(Missing(what, f"starcal-uq diagnose {run.path}"))
+    if posterior is not None and attitude is not None and not run.budget.exists():
+        missing.append(Missing("The error budget", f"starcal-uq budget {run.path}"))
     if truth is None and "truth" in observations.meta:
         truth = Camera.from_dict(observations.meta["truth"])
     return Results(

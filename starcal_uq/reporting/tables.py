@@ -128,7 +128,7 @@ def attitude_rows(error: AttitudeError) -> list[Row]:
     for (contributor, group), note in zip(table.groupby("contributor", sort=False), _ATTITUDE_NOTES, strict=True):
         shown = _small if contributor == INTERACTION else significant
         columns = {
-            column: ["–" if np.isnan(v) else shown(float(v)) for v in group[f"{column}_arcsec"]]
+            column: [shown(float(v)) for v in group[f"{column}_arcsec"]]
             for column in ("sigma", "p95", "p997", "first_order")
         }
         text = str(contributor)
