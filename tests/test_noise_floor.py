@@ -42,6 +42,21 @@ def _pulls(cal: sc.Calibration, obs: sc.Observations, chosen: np.ndarray) -> flo
     return float(np.mean(found.t[chosen]) / (2.0 * cal.sigma**2))
 
 
+@pytest.mark.slow
+def test_errors_are_what_the_covariance_says_once_the_floor_is_known() -> None:
+    truth, with_floor, without = camera().theta, [], []
+    for seed in range(200):
+        obs = measured(0.04, seed=seed, n_frames=30)
+        plain = sc.calibrate(obs, nominal(camera()))
+        settled = sc.calibrate(settle_noise(obs, plain), nominal(camera()))
+        for cal, squares in ((settled, with_floor), (plain, without)):
+            off = cal.theta - truth
+            squares.append(off @ np.linalg.solve(cal.covariance, off) / len(off))
+    # A thousand squared errors: one sigma of their mean is 4.5 %. The control is the same stars without a floor.
+    assert np.mean(with_floor) == pytest.approx(1.0, abs=0.15)
+    assert np.mean(without) > 2.0
+
+
 def test_noise_as_stated_has_no_floor() -> None:
     p_values = []
     for seed in range(40):
