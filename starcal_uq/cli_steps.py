@@ -134,6 +134,8 @@ def simulate_command(
         print(f"{len(paths)} images: {images}")
     obs.save(out, force=force)
     print(f"{obs.n_stars} stars in {obs.n_frames} frames: {out}")
+    if out.suffix.lower() == ".csv":
+        print("CSV holds no metadata: say --directions apparent when you calibrate it (.ecsv and .parquet know).")
 
 
 def calibrate_command(
