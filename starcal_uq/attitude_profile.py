@@ -24,6 +24,8 @@ _UNIT = 1e-6
 _NEARLY_UNIT = 1e-3
 # Between two samples farther apart than this, the shortest turn need not be the one that was flown.
 _FAR_DEG = 30.0
+# A step so many times the usual one is told.
+_GAP = 10.0
 _MAX_FRAMES = 1_000_000
 Sense = Literal["icrs_to_camera", "camera_to_icrs"]
 Scalar = Literal["first", "last"]
@@ -73,6 +75,14 @@ class AttitudeProfile:
             messages += (
                 f"{plural(int(far.sum()), 'step')} of the profile turn the camera by more than {_FAR_DEG:g} degrees: "
                 "attitudes in between are taken on the shortest arc; give more samples if the camera went otherwise.",
+            )
+        steps = np.diff(time)
+        longest = int(np.argmax(steps))
+        if steps[longest] > _GAP * float(np.median(steps)):
+            messages += (
+                f"the profile has no attitude between {time[longest]:g} and {time[longest + 1]:g} s, "
+                f"{significant(steps[longest] / float(np.median(steps)), 2)} times its usual step: what lies in "
+                "between is on the shortest arc.",
             )
         object.__setattr__(self, "messages", tuple(dict.fromkeys(messages)))
 

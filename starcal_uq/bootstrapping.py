@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from starcal_uq.errors import IdentificationError
+from starcal_uq.errors import CalibrationError, IdentificationError
 from starcal_uq.formatting import plural
 from starcal_uq.identification import identify
 from starcal_uq.image_record import identified_pairs
@@ -117,7 +117,15 @@ def bootstrap(
         if not found.n_identified:
             raise IdentificationError(f"no frame is identified: {found.summary}")
         obs = found.observations if prepare is None else prepare(found.observations)
-        known = calibrate(obs, found.nominal if number == 0 else rounds[0][0].nominal, **(method or {}))
+        try:
+            known = calibrate(obs, found.nominal if number == 0 else rounds[0][0].nominal, **(method or {}))
+        except CalibrationError as error:
+            stars_words, frames_words = plural(obs.n_stars, "star"), plural(found.n_identified, "frame")
+            raise CalibrationError(
+                f"{stars_words} in {frames_words} were identified, but they do not determine the camera ({error}) Give "
+                "more frames, fainter stars (max_mag), or a distortion model with fewer terms in the camera file.",
+                error.status,
+            ) from error
         rounds.append((found, obs, known))
         if number == 0:
             found = _again(centroids, found, obs, known, stars, to_catalogue, options)
@@ -140,6 +148,8 @@ def _again(
     if to_catalogue is not None and obs.meta["directions"] == "apparent":
         moved = undisplaced(table, obs, known.camera, to_catalogue)
     found = identify(moved, known.camera, stars, calibration=known, **options)
+    # What follows is said against the data sheet.
+    found = replace(found, nominal=first.nominal)
     if found.n_identified:
         found = replace(found, observations=as_measured(found.observations, moved, table))
     return replace(found, parity="mirrored") if flipped else found

@@ -31,6 +31,7 @@ from starcal_uq.budget_rows import (
     SCOPES,
     TOTAL_AXES,
     Contributor,
+    confidence_text,
 )
 from starcal_uq.budget_shapes import deviates, half_width, mixture_spread, one_axis_factor, two_axis_radius
 from starcal_uq.budget_words import explain
@@ -38,6 +39,8 @@ from starcal_uq.budget_words import explain
 N_SAMPLES = 200_000
 # Two standard errors of a quantile, as order statistics.
 _SPREAD = 2.0
+# Samples beyond a quantile with fewer say little about it: its standard error is unknown, or the samples end before it.
+_RESOLVED = 20.0
 _DOMINANT = 0.5
 
 
@@ -60,7 +63,8 @@ class Total:
     worst_arcsec : float
         What does not count as random, by its half-width.
     rule_arcsec, sampled_arcsec : float
-        Bound by the rule, and quantile of the sampled error; NaN if no row is assessed.
+        Bound by the rule, and quantile of the sampled error; NaN if no row is assessed. The sampled one is NaN too if
+        fewer than 20 samples lie beyond it.
     sampled_se_arcsec : float
         Standard error of the sampled bound.
     not_assessed : tuple of str
@@ -96,8 +100,13 @@ class Total:
 
     @property
     def larger_arcsec(self) -> float:
-        """The larger of the two bounds."""
-        return max(self.rule_arcsec, self.sampled_arcsec)
+        """The larger of the two bounds; NaN if one is not known."""
+        return math.nan if math.isnan(self.sampled_arcsec) else max(self.rule_arcsec, self.sampled_arcsec)
+
+    @property
+    def unresolved(self) -> bool:
+        """True if rows are assessed, but the samples do not reach as far as the confidence."""
+        return math.isnan(self.sampled_arcsec) and not math.isnan(self.rule_arcsec)
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,6 +186,10 @@ def total(
         dominant=dominant.name if share > _DOMINANT else "",
         dominant_share=share,
     )
+    if result.unresolved:
+        n = len(samples.sums[scope, interpretation if interpretation != "mixed" else INTERPRETATIONS[0]])
+        text = f"{n} samples do not resolve a confidence of {confidence_text(confidence)}: there is no sampled bound."
+        return replace(result, explanation=text)
     return replace(result, explanation=explain(result, counted, random, dominant))
 
 
@@ -231,12 +244,16 @@ def _sampled(
     confidence: float,
     worst: float,
 ) -> tuple[float, float]:
-    """Quantile of the sampled error beyond the worst case of the rest, and its standard error."""
+    """Quantile of the sampled error beyond the worst case of the rest, and its standard error; NaN if unresolved."""
     kinds = INTERPRETATIONS if interpretation == "mixed" else (interpretation,)
     columns = [AXES.index(name) for name in axes]
     errors = mean + np.sum([samples.sums[scope, kind][:, columns] for kind in kinds], axis=0)
     size = np.sort(np.linalg.norm(errors, axis=1))
     n = len(size)
+    if size[0] == size[-1]:
+        return float(size[0]) + worst, 0.0
+    if n * min(confidence, 1.0 - confidence) < _RESOLVED * (1.0 - 1e-9):
+        return math.nan, math.nan
     step = _SPREAD * math.sqrt(n * confidence * (1.0 - confidence))
     low, here, high = (
         float(size[min(max(math.ceil(confidence * n + shift) - 1, 0), n - 1)]) for shift in (-step, 0.0, step)

@@ -37,6 +37,12 @@ _AXIS_NAMES = {
     "all": AXES,
 }
 _REQUIREMENT_AXES = {key: names for key, names in _AXIS_NAMES.items() if key != "all"}
+# A full turn; no error is larger.
+_FULL_TURN_ARCSEC = 1_296_000.0
+# What the starter's names bring along, and nobody can guess for others.
+_OWN_KEYS = ("ecss_class", "time_class", "interpretation", "absorbed_by_alignment")
+# Names as similar as this are one name mistyped.
+_SAME_NAME = 0.9
 JUDGED_BY = ("both", "rule", "sampling")
 _CONTRIBUTOR_KEYS = (
     *("name", "ecss_class", "axis", "mean_arcsec", "sigma_arcsec", "half_width_arcsec", "distribution", "time_class"),
@@ -136,8 +142,14 @@ class _Table:
         value = self.data.get(key, default)
         if value is None:
             raise BudgetError(f"{self.where}: key {key} is missing; write a number of arcsec.")
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or value != value or abs(value) == math.inf:
             raise BudgetError(f"{self.where}: key {key} is {value!r}; write a finite number.")
+        # Before anything is made of it: an integer may be too large for a float.
+        if abs(value) > _FULL_TURN_ARCSEC:
+            much = (
+                f"more than {_FULL_TURN_ARCSEC:.0f} arcsec, a full turn" if key.endswith("arcsec") else "far too large"
+            )
+            raise BudgetError(f"{self.where}: key {key} is {much}; correct the number.")
         if value < least:
             raise BudgetError(f"{self.where}: key {key} is {value!r}; write a number of at least {least:g}.")
         return float(value)
@@ -182,6 +194,8 @@ def load_budget_file(path: str | os.PathLike[str]) -> BudgetFile:
         raise BudgetError(f"{path}: the budget file is not UTF-8 text; save it as TOML in UTF-8.") from None
     except tomllib.TOMLDecodeError as error:
         raise BudgetError(f"{path}: the budget file is not valid TOML: {error}; correct that line.") from None
+    except ValueError:
+        raise BudgetError(f"{path}: the budget file holds a number with too many digits; correct it.") from None
     for key in content:
         if key not in ("budget", "contributor", "requirement"):
             raise BudgetError(
@@ -218,14 +232,18 @@ def _no_doubles(names: Sequence[tuple[str, ...]], where: str) -> None:
 
 
 def _contributor(table: _Table) -> list[Contributor]:
-    name = table.text("name")
-    table.where += f" ({name!r})"
+    written = table.text("name")
+    table.where += f" ({written!r})"
+    name, close = _known_name(written)
     if name in {entry.name for entry in (*FROM_POSTERIOR, INTERACTING)}:
         raise BudgetError(
             f"{table.where}: key name: this row is filled by the posterior; give yours another name, or propagate "
             "over other frames."
         )
-    known = {entry.name: entry for entry in FROM_FILE}.get(name, _own(name))
+    starter = {entry.name: entry for entry in FROM_FILE}.get(name)
+    if starter is None:
+        _check_own(table, name, close)
+    known = starter or _own(name)
     axes = _AXIS_NAMES[table.choice("axis", tuple(_AXIS_NAMES)).lower()]
     distribution = table.choice("distribution", DISTRIBUTIONS, known.distribution)
     applies = table.flag("applies", True)
@@ -254,6 +272,32 @@ def _contributor(table: _Table) -> list[Contributor]:
         )
         for axis in axes
     ]
+
+
+def _known_name(written: str) -> tuple[str, str]:
+    """The name as the starter has it, whatever its case; else as written, with the most similar one of the starter."""
+    names = {entry.name.lower(): entry.name for entry in (*FROM_FILE, *FROM_POSTERIOR, INTERACTING)}
+    plain = " ".join(written.lower().split())
+    if plain in names:
+        return names[plain], ""
+    close = difflib.get_close_matches(plain, names, n=1)
+    return written, names[close[0]] if close else ""
+
+
+def _check_own(table: _Table, name: str, close: str) -> None:
+    """Refuse a mistyped name of the starter, and a contributor of the user's own that leaves out what it is."""
+    similar = difflib.SequenceMatcher(None, close.lower(), " ".join(name.lower().split())).ratio() if close else 0.0
+    if similar >= _SAME_NAME:
+        raise BudgetError(
+            f"{table.where}: key name: did you mean {close!r}? Write that, or a name of your own that differs more."
+        )
+    missing = [key for key in _OWN_KEYS if key not in table]
+    if missing and table.flag("applies", True):
+        hint = f"did you mean {close!r}? " if close else ""
+        raise BudgetError(
+            f"{table.where}: {hint}The starter has no such name, and a contributor of your own must state "
+            f"{', '.join(missing)} as well."
+        )
 
 
 def _own(name: str) -> Expected:

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 from starcal_uq.budget_combination import Total
 from starcal_uq.budget_result import Budget
-from starcal_uq.budget_rows import AXIS_LABELS
-from starcal_uq.budget_tables import NOT_ASSESSED, budget_context, headline, tables
+from starcal_uq.budget_rows import AXIS_LABELS, confidence_text
+from starcal_uq.budget_tables import NOT_ASSESSED, NOT_RESOLVED, budget_context, headline, tables
 from starcal_uq.formatting import MINUS
 from starcal_uq.html_pages import template_environment
 from starcal_uq.runfolder import atomic_path, atomic_write_text
@@ -169,7 +169,8 @@ def _totals(sheet: Worksheet, budget: Budget) -> None:
 
 def _numbers(entry: Total) -> list[Any]:
     values = (entry.mean_arcsec, entry.sigma_arcsec, entry.rule_arcsec, entry.sampled_arcsec)
-    return [NOT_ASSESSED if math.isnan(value) else value for value in values]
+    missing = NOT_RESOLVED if entry.unresolved else NOT_ASSESSED
+    return [missing if math.isnan(value) else value for value in values]
 
 
 def _requirements(sheet: Worksheet, budget: Budget) -> None:
@@ -219,7 +220,8 @@ def _table(
             if colour:
                 cell.fill = PatternFill("solid", fgColor=colour)
             if not text and cell.value is not None:
-                cell.number_format = "0.0##%" if header[cell.column - 1] == "Confidence" else _format(cell.value)
+                share = header[cell.column - 1] == "Confidence"
+                cell.number_format = _share_format(cell.value) if share else _format(cell.value)
     for index, width in enumerate(widths, start=1):
         sheet.column_dimensions[get_column_letter(index)].width = width
     sheet.freeze_panes = "B2" if len(header) > 1 else "A2"
@@ -234,6 +236,12 @@ def _table(
 def _cell(value: Any) -> Any:
     # A name that begins like a formula is text, not a formula.
     return f"'{value}" if isinstance(value, str) and value[:1] in "=+@" and value else value
+
+
+def _share_format(value: float) -> str:
+    """Per cent with as many decimals as the confidence has."""
+    decimals = len(confidence_text(value).partition(".")[2].removesuffix("\N{NO-BREAK SPACE}%"))
+    return f"0.{'0' * max(decimals, 1)}%"
 
 
 def _format(value: float) -> str:

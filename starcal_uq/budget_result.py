@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from starcal_uq._types import AnyDict
 from starcal_uq.budget_combination import Samples, Total, total
 from starcal_uq.budget_file import Requirement
-from starcal_uq.budget_rows import AXES, AXIS_LABELS, Contributor, confidence_text
+from starcal_uq.budget_rows import AXES, AXIS_LABELS, CROSS_BORESIGHT, SCOPES, Contributor, confidence_text
 from starcal_uq.errors import BudgetError
 from starcal_uq.formatting import significant
 
@@ -20,6 +20,12 @@ if TYPE_CHECKING:
     import pandas as pd
 
 FORMATS = (".csv", ".xlsx", ".tex", ".html")
+# All that people may call an axis: its name, its letter, its label in the tables.
+_AXIS_NAMES = {
+    **{name: name for name in AXIS_LABELS},
+    **{label.lower(): name for name, label in AXIS_LABELS.items()},
+    **dict(zip("xyz", AXES, strict=True)),
+}
 
 
 @dataclass(frozen=True)
@@ -39,9 +45,15 @@ class Outcome:
 
     @property
     def bound_arcsec(self) -> float:
-        """What is held against the limit: by the rule, by sampling, or the larger of both."""
-        chosen = {"rule": self.total.rule_arcsec, "sampling": self.total.sampled_arcsec}
-        return chosen.get(self.requirement.judged_by, self.total.larger_arcsec)
+        """What is held against the limit: by the rule, by sampling, or the larger of both.
+
+        NaN if it is not known. The larger of both is at least the rule, which is enough where that violates the limit.
+        """
+        found, asked = self.total, self.requirement
+        if asked.judged_by == "both" and found.unresolved and found.rule_arcsec > asked.limit_arcsec:
+            return found.rule_arcsec
+        chosen = {"rule": found.rule_arcsec, "sampling": found.sampled_arcsec}
+        return chosen.get(asked.judged_by, found.larger_arcsec)
 
     @property
     def margin_arcsec(self) -> float:
@@ -50,11 +62,16 @@ class Outcome:
 
     @property
     def verdict(self) -> str:
-        """``violated``; ``open`` while contributors are missing; ``met``."""
+        """``violated``; ``open`` while contributors are missing or samples do not resolve the confidence; ``met``."""
         if self.margin_arcsec < 0.0:
             return "violated"
-        # No row at all is assessed: the margin is not a number.
+        # No row at all is assessed, or the samples end too early: the margin is not a number.
         return "open" if self.total.at_least or math.isnan(self.margin_arcsec) else "met"
+
+    @property
+    def unresolved(self) -> bool:
+        """True if it is open because the samples do not resolve its confidence."""
+        return self.total.unresolved and math.isnan(self.bound_arcsec)
 
     @property
     def sentence(self) -> str:
@@ -62,6 +79,13 @@ class Outcome:
         asked = self.requirement
         what = f"{AXIS_LABELS[asked.axis]}, {confidence_text(asked.confidence)}, {asked.scope}, {asked.interpretation}"
         numbers = f"{significant(self.bound_arcsec, 3)} arcsec against a limit of {significant(asked.limit_arcsec, 3)}"
+        if self.unresolved:
+            least = "at least " if self.total.at_least else ""
+            return (
+                f"{asked.name!r} ({what}) is open: {self.total.explanation.removesuffix('.')}. The rule, which knows "
+                f"Gaussian tails only, says {least}{significant(self.total.rule_arcsec, 3)} arcsec against a limit of "
+                f"{significant(asked.limit_arcsec, 3)}; judged_by = 'rule' would let it judge alone."
+            )
         if math.isnan(self.bound_arcsec):
             return f"{asked.name!r} ({what}) is open: no contributor is assessed."
         least = "at least " if self.total.at_least else ""
@@ -112,8 +136,18 @@ class Budget:
 
     @property
     def open_requirements(self) -> tuple[Outcome, ...]:
-        """Requirements that are met so far, while contributors are missing."""
+        """Requirements that are neither violated nor met: contributors are missing, or samples resolve too little."""
         return tuple(outcome for outcome in self.outcomes if outcome.verdict == "open")
+
+    @property
+    def comparable(self) -> tuple[Outcome, ...]:
+        """Requirements at the budget's own confidence, mixed: those that its totals may be held against."""
+        return tuple(
+            outcome
+            for outcome in self.outcomes
+            if outcome.requirement.interpretation == "mixed"
+            and math.isclose(1.0 - outcome.requirement.confidence, 1.0 - self.confidence, rel_tol=1e-9)
+        )
 
     @property
     def not_assessed(self) -> tuple[str, ...]:
@@ -123,15 +157,30 @@ class Budget:
     def total(self, axis: str, scope: str = "after alignment", interpretation: str = "mixed") -> Total:
         """One of the totals.
 
+        Parameters
+        ----------
+        axis : str
+            ``pitch``, ``yaw``, ``roll``, ``cross-boresight``, or as tables show it: ``X``, ``X (pitch)``, ``X and Y
+            together``.
+        scope : str
+            ``before alignment`` or ``after alignment``.
+        interpretation : str
+            ``mixed``, ``ensemble`` or ``temporal``.
+
         Raises
         ------
         ValueError
             For an unknown axis, scope or interpretation.
         """
+        name = _AXIS_NAMES.get(axis.strip().lower(), axis)
         for found in self.totals:
-            if (found.axis, found.scope, found.interpretation) == (axis, scope, interpretation):
+            if (found.axis, found.scope, found.interpretation) == (name, scope, interpretation):
                 return found
-        raise ValueError(f"a budget has no total for {axis!r}, {scope!r}, {interpretation!r}")
+        raise ValueError(
+            f"a budget has no total for {axis!r}, {scope!r}, {interpretation!r}; the axis is one of X, Y, Z (pitch, "
+            f"yaw, roll) or {CROSS_BORESIGHT}, the scope {' or '.join(SCOPES)}, the interpretation mixed, ensemble or "
+            "temporal"
+        )
 
     def to_dataframe(self) -> pd.DataFrame:
         """One row per contributor and axis: the fields of `Contributor`, ``assessed`` and ``combination``."""

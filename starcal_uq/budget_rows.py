@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from decimal import Decimal
 
 AXES = ("pitch", "yaw", "roll")
 CROSS_BORESIGHT = "cross-boresight"
@@ -230,8 +231,12 @@ FROM_FILE = (
 
 
 def confidence_text(confidence: float) -> str:
-    """A confidence in per cent, with the digits it has: 99.7 %."""
-    return f"{100.0 * confidence:.6g}\N{NO-BREAK SPACE}%"
+    """A confidence in per cent, with the digits it has, all its nines included: 99.7 %, 99.99999 %."""
+    share = 100 * Decimal(repr(float(confidence)))
+    # Four decimals, and three digits of what misses to 0 or 100.
+    decimals = max([4, *(2 - part.adjusted() for part in (share, 100 - share) if part)])
+    shown = f"{share:.{decimals}f}"
+    return f"{shown.rstrip('0').rstrip('.')}\N{NO-BREAK SPACE}%"
 
 
 def not_assessed(expected: Expected, axis: str) -> Contributor:

@@ -31,7 +31,8 @@ def one_axis_factor(confidence: float) -> float:
     """Two-sided quantile of a standard Gaussian error: 2.968 for 99.7 %, 3 for 99.73 %."""
     from scipy.special import ndtri
 
-    return float(ndtri(0.5 * (1.0 + confidence)))
+    # From the side where the last digits of a high confidence count.
+    return -float(ndtri(0.5 * (1.0 - confidence)))
 
 
 @lru_cache(maxsize=1024)
@@ -62,6 +63,8 @@ def two_axis_radius(confidence: float, sigma_x: float, sigma_y: float, spread: f
 
     # Rounding must not move the root out of its bracket where the sigmas are equal; a mixture reaches further.
     reach = 1.001 * math.sqrt(-2.0 * math.log1p(-confidence)) + (60.0 if spread > 0.0 else 1e-9)
+    while excess(reach) > 0.0:
+        reach *= 2.0
     return large * float(brentq(excess, 0.0, reach, xtol=1e-13))
 
 
@@ -106,7 +109,10 @@ def half_width(distribution: str, confidence: float, tail_997: float = GAUSSIAN_
         return one_axis_factor(confidence)
     from scipy.optimize import brentq
 
-    return float(brentq(lambda x: _mixture_miss(x, spread) - (1.0 - confidence), 0.0, 60.0))
+    reach = 60.0
+    while _mixture_miss(reach, spread) > 1.0 - confidence:
+        reach *= 2.0
+    return float(brentq(lambda x: _mixture_miss(x, spread) - (1.0 - confidence), 0.0, reach))
 
 
 def deviates(distribution: str, uniform: FloatArray, log_scale: FloatArray, tail_997: float) -> FloatArray:

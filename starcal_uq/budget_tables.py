@@ -14,6 +14,7 @@ from starcal_uq.html_pages import embedded_image
 Row = dict[str, Any]
 
 NOT_ASSESSED = "not assessed"
+NOT_RESOLVED = "not resolved"
 # Above what rounding makes of 2.968.
 _GAUSSIAN_TAIL = 2.98
 _MIXED, *_OTHERS = ("mixed", "ensemble", "temporal")
@@ -45,8 +46,9 @@ def tables(budget: Budget) -> dict[str, Any]:
         "interpretations": [{"name": name, "meaning": text} for name, text in _MEANING.items()],
         "requirements": [_requirement_row(outcome) for outcome in budget.outcomes],
         "headline": headline(budget),
+        "not_drawn": len(budget.outcomes) - len(budget.comparable),
         "violated": bool(budget.violations),
-        "open": bool(budget.not_assessed),
+        "open": bool(budget.not_assessed or budget.open_requirements),
         "explanations": explanations(budget),
         "notes": list(budget.notes),
         "factors": factor_sentence(budget),
@@ -63,8 +65,12 @@ def headline(budget: Budget) -> str:
     met = [outcome for outcome in budget.outcomes if outcome.verdict == "met"]
     if met:
         parts.append(f"{plural(len(met), 'requirement')} met.")
-    if budget.open_requirements:
-        parts.append(f"{plural(len(budget.open_requirements), 'requirement')} open: contributors are missing.")
+    unresolved = [outcome for outcome in budget.open_requirements if outcome.unresolved]
+    missing = len(budget.open_requirements) - len(unresolved)
+    if missing:
+        parts.append(f"{plural(missing, 'requirement')} open: contributors are missing.")
+    if unresolved:
+        parts.append(f"{plural(len(unresolved), 'requirement')} open: the samples do not resolve so high a confidence.")
     if budget.not_assessed:
         every = len(by_contributor(budget.rows))
         parts.append(
@@ -167,6 +173,8 @@ def total_rows(budget: Budget) -> list[Row]:
 
 
 def _sampled(total: Total) -> str:
+    if total.unresolved:
+        return NOT_RESOLVED
     if math.isnan(total.sampled_arcsec):
         return NOT_ASSESSED
     digits = max(decimals_for(total.sampled_se_arcsec, 1), decimals_for(total.sampled_arcsec, 2))

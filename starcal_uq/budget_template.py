@@ -28,6 +28,8 @@ _HEADER = f"""\
 # Remove the "# " in front of the lines of a contributor that you have assessed, and put your number in. What stays
 # commented out reads "not assessed" in the budget, never zero, and the totals read "at least".
 # What does not exist for your sensor: applies = false, with the reason as provenance.
+# A contributor of your own has a name that is not listed here, and states ecss_class, time_class, interpretation and
+# absorbed_by_alignment too. On an axis that it leaves out it is not assessed, unless applies = false is stated there.
 #
 # Keys of a contributor (values that are left out are those shown here for it):
 #   axis                   X (pitch), Y (yaw), Z (roll, about the boresight), cross-boresight (X and Y, each), all

@@ -7,13 +7,16 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from starcal_uq.budget_rows import CROSS_BORESIGHT, GAUSSIAN_997, Contributor
-from starcal_uq.budget_shapes import HALF_WIDTHS, half_width
+from starcal_uq.budget_shapes import half_width
 from starcal_uq.formatting import join_words, percent, significant
 
 if TYPE_CHECKING:
     from starcal_uq.budget_combination import Total
 
 _AGREE = 0.02
+_BOUNDED = ("uniform", "arcsine")
+# A mean of this many sigmas moves the bounds apart.
+_MEAN_COUNTS = 0.05
 _TAILED = 1.01 * GAUSSIAN_997
 # Smaller ones, relative to the largest, are left out of a sentence.
 _WORTH_NAMING = 0.25
@@ -29,48 +32,74 @@ def explain(total: Total, counted: Sequence[Contributor], random: Sequence[Contr
         return f"Both bounds agree within {percent(max(_AGREE, within), 1)}."
     size = percent(abs(difference), 2)
     head = f"The rule is {size} {'above' if difference > 0 else 'below'} the sampled bound"
-    reasons = _reasons(total, counted, random, dominant, difference)
-    return f"{head}: {reasons}." if reasons else f"{head}."
+    reasons = (_below if difference < 0.0 else _above)(total, counted, random, dominant)
+    return f"{head}: {'; '.join(reasons) or 'the rows together are not Gaussian, as the rule takes them to be'}."
 
 
-def _reasons(
-    total: Total,
-    counted: Sequence[Contributor],
-    random: Sequence[Contributor],
-    dominant: Contributor,
-    difference: float,
-) -> str:
-    share = f"{dominant.name!r} has {percent(total.dominant_share, 2)} of the squared half-widths"
+def _below(
+    total: Total, counted: Sequence[Contributor], random: Sequence[Contributor], dominant: Contributor
+) -> list[str]:
+    """Why the rule says less."""
+    tailed = dominant if dominant.tail_997 > _TAILED else _heaviest(counted)
+    if tailed is not None:
+        return [
+            f"the sigma of {tailed.name!r} changes from frame to frame, so that 99.7 % of its errors reach "
+            f"{significant(tailed.tail_997, 3)} sigma where a Gaussian error reaches 2.97"
+        ]
+    if dominant.distribution == "rayleigh":
+        return [f"{_share(total, dominant)} and is one-sided (Rayleigh), with a longer tail than a Gaussian error"]
+    if _grouped(random):
+        return ["rows of a correlation group that are not Gaussian add to a longer tail than their sigmas say"]
+    if dominant.distribution in _BOUNDED and dominant in random:
+        return [
+            f"{_share(total, dominant)}; its distribution is {dominant.distribution}, and at this confidence reaches "
+            "further than a Gaussian error of the same sigma"
+        ]
+    return []
+
+
+def _above(
+    total: Total, counted: Sequence[Contributor], random: Sequence[Contributor], dominant: Contributor
+) -> list[str]:
+    """Why the rule says more; the first reason weighs most."""
     shape = dominant.distribution
-    if difference < 0.0:
-        tailed = dominant if dominant.tail_997 > _TAILED else _heaviest(counted)
-        if tailed is not None:
-            return (
-                f"the sigma of {tailed.name!r} changes from frame to frame, so that 99.7 % of its errors reach "
-                f"{significant(tailed.tail_997, 3)} sigma where a Gaussian error reaches 2.97"
-            )
-        if shape == "rayleigh":
-            return f"{share} and is one-sided (Rayleigh), with a longer tail than a Gaussian error"
-        if _grouped(random):
-            return "rows of a correlation group that are not Gaussian add to a longer tail than their sigmas say"
-        return f"{share}"
-    if shape in HALF_WIDTHS and shape != "constant" and dominant in random:
-        return (
-            f"{share}; its distribution is {shape} and ends at {significant(half_width(shape, total.confidence), 3)} "
-            f"sigma, where the rule takes {significant(total.factor, 3)}"
+    if shape in _BOUNDED and dominant in random:
+        return [
+            f"{_share(total, dominant)}; its distribution is {shape} and ends at "
+            f"{significant(half_width(shape, total.confidence), 3)} sigma, where the rule takes "
+            f"{significant(total.factor, 3)}"
+        ]
+    reasons = []
+    if abs(total.mean_arcsec) > _MEAN_COUNTS * total.sigma_arcsec:
+        reasons.append(
+            "the rule adds the whole mean to the spread, as if both always pointed the same way"
+            if total.axis == CROSS_BORESIGHT
+            else "a mean shifts the errors to one side, where fewer sigmas hold the same share than on both sides"
         )
-    if abs(total.mean_arcsec) > total.sigma_arcsec:
-        return "a mean shifts the errors to one side, where fewer sigmas hold the same share than on both sides"
-    if total.axis == CROSS_BORESIGHT and any(row.distribution in HALF_WIDTHS for row in random):
-        return "bounded distributions on two axes leave less in the corners than Gaussian errors do"
-    bounded = [row for row in random if row.distribution in ("uniform", "arcsine")]
-    if bounded:
-        least = _WORTH_NAMING * max(row.sigma_arcsec for row in bounded)
-        names = list(dict.fromkeys(repr(row.name) for row in bounded if row.sigma_arcsec >= least))
-        each = "" if len(names) == 1 else " of each"
-        factor = significant(total.factor, 3)
-        return f"{join_words(names)} cannot exceed a fixed size, while the rule takes {factor} sigma{each}"
-    return share
+        if abs(total.mean_arcsec) > total.sigma_arcsec:
+            return reasons
+    # Small bounded rows explain nothing.
+    bounded = [row for row in random if row.distribution in _BOUNDED]
+    bounded = [row for row in bounded if row.sigma_arcsec >= _WORTH_NAMING * max(r.sigma_arcsec for r in bounded)]
+    if math.hypot(*(row.sigma_arcsec for row in bounded)) >= _WORTH_NAMING * total.sigma_arcsec > 0.0:
+        if total.axis == CROSS_BORESIGHT:
+            reasons.append("bounded distributions on two axes leave less in the corners than Gaussian errors do")
+        else:
+            names = list(dict.fromkeys(repr(row.name) for row in bounded))
+            each = "" if len(names) == 1 else " of each"
+            factor = significant(total.factor, 3)
+            reasons.append(f"{join_words(names)} cannot exceed a fixed size, while the rule takes {factor} sigma{each}")
+    tailed = _heaviest(random)
+    if not reasons and tailed is not None:
+        reasons.append(
+            f"the sigma of {tailed.name!r} changes from frame to frame, so that at this confidence more of its errors "
+            "are small than of a Gaussian error"
+        )
+    return reasons
+
+
+def _share(total: Total, dominant: Contributor) -> str:
+    return f"{dominant.name!r} has {percent(total.dominant_share, 2)} of the squared half-widths"
 
 
 def _heaviest(rows: Sequence[Contributor]) -> Contributor | None:

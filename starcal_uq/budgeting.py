@@ -6,7 +6,9 @@ from the user's file, or read "not assessed": they are never taken for zero, and
 
 from __future__ import annotations
 
+import math
 import os
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from starcal_uq.budget_combination import N_SAMPLES, totals
@@ -94,7 +96,25 @@ def _from_file(stated: BudgetFile) -> tuple[Contributor, ...]:
     """Expected contributors as the file states them or not assessed, then the user's own; each on three axes."""
     given = {(row.name, row.axis): row for row in stated.contributors}
     rows = [given.pop((entry.name, axis), not_assessed(entry, axis)) for entry in FROM_FILE for axis in AXES]
-    return (*rows, *given.values())
+    for name in dict.fromkeys(name for name, _ in given):
+        first = next(row for row in given.values() if row.name == name)
+        rows += [given.get((name, axis), _silent(first, axis)) for axis in AXES]
+    return tuple(rows)
+
+
+def _silent(stated: Contributor, axis: str) -> Contributor:
+    """A contributor of the user's own on an axis that the file leaves out: not known, and so not zero."""
+    return replace(
+        stated,
+        axis=axis,
+        mean_arcsec=math.nan,
+        sigma_arcsec=math.nan,
+        correlation_group="",
+        conditions="",
+        provenance="",
+        source="not assessed",
+        applies=True,
+    )
 
 
 def _notes(rows: tuple[Contributor, ...]) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from starcal_uq._types import AnyDict
 from starcal_uq.centroids import COLUMNS, FRAME_COLUMNS, Centroids
 from starcal_uq.errors import ImageError
 from starcal_uq.formatting import plural
-from starcal_uq.image_files import IMAGE_ENDINGS, Image, read_image
+from starcal_uq.image_files import IMAGE_ENDINGS, Image, read_any_size
 from starcal_uq.pixel_phase import phase_error, without_phase_error
 from starcal_uq.star_detection import DetectionOptions, FrameStars, find_stars
 
@@ -133,7 +133,7 @@ class _Table:
         }
         self.frames.append(entry)
         try:
-            image = source if isinstance(source, Image) else read_image(source)
+            image = source if isinstance(source, Image) else read_any_size(source, camera)
             entry["time_utc"] = image.time_utc or ""
             self.digest.update(f"{image.data.dtype}{image.data.shape}".encode())
             self.digest.update(np.ascontiguousarray(image.data))
@@ -226,7 +226,10 @@ def _sources(images: Source | Iterable[Source]) -> list[Source]:
             continue
         inside = sorted(p for p in Path(source).iterdir() if p.name.lower().endswith(IMAGE_ENDINGS))
         if not inside:
-            raise ImageError(f"{source}: the folder holds no image; use {', '.join(IMAGE_ENDINGS)}.")
+            raise ImageError(
+                f"{source}: the folder holds no image ({', '.join(IMAGE_ENDINGS)}); name the folder that does, as "
+                "subfolders are not searched."
+            )
         sources += inside
     if not sources:
         raise ImageError("images: there is none; give files, a folder or Image objects.")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from starcal_uq.cli_options import CameraFile, Engine, Force, Json, TimeUtc, parse_engine
+from starcal_uq.cli_options import CameraFile, Engine, Force, Json, TimeUtc, check_same_sensor, parse_engine
 from starcal_uq.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -56,8 +56,11 @@ def centroid_command(
     from starcal_uq.console import print_json, records
     from starcal_uq.image_steps import counted, with_time
     from starcal_uq.runfolder import ensure_new
+    from starcal_uq.utc_times import utc_text
 
     ensure_new(out, force)
+    if time is not None:
+        time = utc_text(time)
     sensor = None if camera is None else Camera.load(camera)
     with progress_bar("images") as progress:
         found = extract_centroids(
@@ -114,6 +117,8 @@ def identify_command(
     table = Centroids.load(centroids)
     nominal = Camera.load(camera)
     known = None if calibration is None else best_calibration(RunFolder(calibration))
+    if calibration is not None and known is not None:
+        check_same_sensor(known.camera, calibration, nominal, camera)
     stars = load_catalogue(max_mag=max_mag, epoch=epoch_of(table) if epoch is None else epoch)
     _say_epoch(table, epoch)
     with progress_bar("frames") as progress:
@@ -155,7 +160,7 @@ def load_images(
     """Observations of images, and what is worth telling on the way."""
     from starcal_uq.camera import Camera
     from starcal_uq.console import err, warn_undeclared
-    from starcal_uq.image_steps import counted, observations_from_images
+    from starcal_uq.image_steps import observations_from_images
     from starcal_uq.site import Site
     from starcal_uq.steps import DIRECTIONS
 
@@ -175,23 +180,27 @@ def load_images(
             in_space=in_space,
             time_utc=time_utc,
             engine=parse_engine(engine),
+            tell=lambda message: err.print(message, style=_style(message), highlight=False, soft_wrap=True),
             progress=progress,
         )
-    _say(counted(centroids.messages))
     _say_epoch(centroids, epoch)
-    for words in (centroids.summary, found.identification.summary, found.summary):
+    for words in (found.identification.summary, found.summary):
         err.print(words, highlight=False, soft_wrap=True)
     left_out = obs.meta.get("disturbed_stars", 0)
     if left_out:
         err.print(f"{left_out} stars left out, because the light of a neighbour displaces them.", highlight=False)
     warn_undeclared(obs)
     # Of mirrored images x is counted from the right edge, and so is this camera's.
-    return obs, found.identification.nominal if found.identification.parity == "mirrored" else camera, centroids, found
+    return obs, found.rounds[0][0].nominal if found.identification.parity == "mirrored" else camera, centroids, found
 
 
 def _say_epoch(centroids: Centroids, epoch: float | None) -> None:
     if epoch is None and not (centroids.time_utc != "").any():
         _say(("the images have no time: the stars are taken where they were in 2016; --epoch says when it was.",))
+
+
+def _style(message: str) -> str | None:
+    return "yellow" if message.startswith("note:") else None
 
 
 def _say(messages: Sequence[str]) -> None:

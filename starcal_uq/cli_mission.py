@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcal_uq.cli_options import CameraFile, Force, Json, RunPath, Seed
+from starcal_uq.cli_options import FAINTEST, CameraFile, Force, Json, RunPath, Seed, check_same_sensor
 from starcal_uq.progress import progress_bar
 
 if TYPE_CHECKING:
     from starcal_uq.budget_result import Budget
     from starcal_uq.calibration import Calibration
+    from starcal_uq.camera import Camera
     from starcal_uq.frame_choice_result import FrameChoice
     from starcal_uq.plan_check import ForecastCheck
     from starcal_uq.plan_result import Plan
@@ -23,6 +24,19 @@ def register(app: typer.Typer) -> None:
     app.command("budget")(budget_command)
     app.command("compare")(compare_command)
     app.command("plan")(plan_command)
+
+
+def new_folder(out: Path | None, force: bool) -> None:
+    """Refuse a folder that holds something, and a run's own folder even with `force`: its results would be mixed."""
+    from starcal_uq.errors import RunFolderError
+    from starcal_uq.runfolder import RunFolder, check_new_run
+
+    if out is None:
+        return
+    run = RunFolder(out)
+    if run.calibration.exists():
+        raise RunFolderError(f"{out}: is the folder of a run, whose files would be mixed with these; name another.")
+    check_new_run(run, force)
 
 
 def budget_command(
@@ -52,6 +66,8 @@ def budget_command(
     from starcal_uq.console import print_json
     from starcal_uq.runfolder import ensure_new
 
+    if template is not None and file is not None and template.resolve() == file.resolve():
+        raise typer.BadParameter(f"--template would write over {file}: name another file.")
     for path in out or []:
         if path.suffix.lower() not in FORMATS:
             raise typer.BadParameter(f"{path}: the ending names the format; use one of {', '.join(FORMATS)}.")
@@ -77,6 +93,7 @@ def show_budget(found: Budget) -> None:
     """Contributors, totals, requirements and what must be read with them, in the terminal."""
     import pandas as pd
 
+    from starcal_uq.budget_rows import confidence_text
     from starcal_uq.budget_tables import NOT_ASSESSED, contributor_rows, explanations, headline, total_rows
     from starcal_uq.console import out, show_table
 
@@ -93,7 +110,7 @@ def show_budget(found: Budget) -> None:
     ]
     show_table(pd.DataFrame(contributors), f"{found.title}: contributors, 1 sigma, arcsec")
     totals = [{name: row[name] for name in ("scope", "axis", "sigma", "rule", "sampled")} for row in total_rows(found)]
-    show_table(pd.DataFrame(totals), f"Totals at {100.0 * found.confidence:g} %, mixed interpretation, arcsec")
+    show_table(pd.DataFrame(totals), f"Totals at {confidence_text(found.confidence)}, mixed interpretation, arcsec")
     for sentence in (*explanations(found), *found.notes):
         out.print(sentence, highlight=False, soft_wrap=True)
     for outcome in found.outcomes:
@@ -140,7 +157,6 @@ def compare_command(
     from starcal_uq.console import out as console
     from starcal_uq.console import print_json, show_table
     from starcal_uq.run_comparison import compare_runs, compare_split
-    from starcal_uq.runfolder import RunFolder, check_new_run
 
     if len(runs) != (2 if split is None else 1):
         raise typer.BadParameter(
@@ -148,8 +164,7 @@ def compare_command(
             if split is None
             else f"--split compares parts of one run: leave out {runs[-1]}."
         )
-    if out is not None:
-        check_new_run(RunFolder(out), force)
+    new_folder(out, force)
     options: dict[str, Any] = {"level": level, "seed": seed}
     names = _two_labels(labels)
     if split is None:
@@ -170,8 +185,8 @@ def _two_labels(text: str | None) -> tuple[str, str] | None:
     if text is None:
         return None
     first, comma, second = (part.strip() for part in text.partition(","))
-    if not (first and comma and second):
-        raise typer.BadParameter(f"--labels {text!r} is not two names such as cold,hot.")
+    if not (first and comma and second) or first == second:
+        raise typer.BadParameter(f"--labels {text!r} is not two different names such as cold,hot.")
     return first, second
 
 
@@ -184,7 +199,9 @@ def plan_command(
     scope: Annotated[
         str, typer.Option(help="Part of the error the target is for: common, rest, calibration, or total.")
     ] = "common",
-    sigma: Annotated[float, typer.Option(help="Centroid noise, px per axis.")] = 0.05,
+    sigma: Annotated[
+        float | None, typer.Option(help="Centroid noise, px per axis; 0.05, or that of the run of --after, by default.")
+    ] = None,
     max_mag: Annotated[float, typer.Option(help="Magnitude limit of the sensor, Gaia G.")] = 6.0,
     min_stars: Annotated[int, typer.Option(min=3, help="Frames with fewer stars are not used.")] = 10,
     frames: Annotated[
@@ -195,7 +212,10 @@ def plan_command(
         int | None, typer.Option(min=1, metavar="N", help="Also choose the N frames that help most.")
     ] = None,
     criterion: Annotated[str, typer.Option(help="What the choice is for: A (attitude error) or D (parameters).")] = "A",
-    after: Annotated[Path | None, typer.Option(metavar="RUN", help="Count the data of this run first.")] = None,
+    after: Annotated[
+        Path | None,
+        typer.Option(metavar="RUN", help="Count the data of this run first, and take its calibrated camera."),
+    ] = None,
     check: Annotated[
         int | None, typer.Option(min=10, metavar="N", help="Also simulate N campaigns of each size and compare.")
     ] = None,
@@ -210,21 +230,24 @@ def plan_command(
     """What a calibration of this camera will give, and the frames it needs, before any data."""
     from starcal_uq.camera import Camera
     from starcal_uq.catalogue import load_catalogue
-    from starcal_uq.console import print_json
+    from starcal_uq.console import print_json, records
     from starcal_uq.frame_choice import choose_frames
     from starcal_uq.plan_check import check_forecast
     from starcal_uq.plan_page import plan_record
     from starcal_uq.planning import N_FRAMES, plan
-    from starcal_uq.runfolder import RunFolder, check_new_run
 
-    if out is not None:
-        check_new_run(RunFolder(out), force)
-    sheet, known = Camera.load(camera), None
+    new_folder(out, force)
+    if after is not None and check is not None:
+        raise typer.BadParameter("--check simulates campaigns from nothing: leave it out with --after.")
+    sheet, known, noise = Camera.load(camera), None, 0.05
     if after is not None:
-        known, noise = _known(after)
-        sheet, sigma = known.camera, noise
+        known, noise = _known(after, sheet, camera)
+        sheet = known.camera
+    sigma = noise if sigma is None else sigma
+    if max_mag > FAINTEST:
+        raise typer.BadParameter(f"--max-mag {max_mag:g}: the embedded catalogue ends at G = {FAINTEST:g}.")
     # Deeper than the sensor, so that the sweep over the magnitude limit has somewhere to go.
-    deep = load_catalogue(max_mag=max_mag + 1.0, epoch=epoch)
+    deep = load_catalogue(max_mag=min(max_mag + 1.0, FAINTEST), epoch=epoch)
     stars = deep.select(deep.mag <= max_mag)
     sizes = tuple(frames or N_FRAMES)
     found = plan(
@@ -267,7 +290,12 @@ def plan_command(
             )
     page = None if out is None else found.save(out, choice=choice, check=simulated)
     if json:
-        print_json(plan_record(found))
+        document = plan_record(found)
+        if choice is not None:
+            document |= {"choice": {"verdict": choice.verdict, "frames": records(choice.to_dataframe())}}
+        if simulated is not None:
+            document |= {"check": {"verdict": simulated.verdict, "table": records(simulated.to_dataframe())}}
+        print_json(document)
     else:
         _show_plan(found, choice, simulated)
         if page is not None:
@@ -290,14 +318,15 @@ def _show_plan(found: Plan, choice: FrameChoice | None, simulated: ForecastCheck
         out.print(sentence, highlight=False, soft_wrap=True)
 
 
-def _known(run: Path) -> tuple[Calibration, float]:
-    """Calibration of a run, and its noise in px: the median where stars state their own."""
+def _known(run: Path, sheet: Camera, path: Path) -> tuple[Calibration, float]:
+    """Calibration of a run of this sensor, and its noise in px: the median where stars state their own."""
     import numpy as np
 
     from starcal_uq.runfolder import RunFolder
     from starcal_uq.steps import load_run
 
     obs, calibration = load_run(RunFolder(run))
+    check_same_sensor(calibration.camera, run, sheet, path)
     stated = 1.0 if obs.sigma_px is None or calibration.sigma_name == "sigma" else float(np.median(obs.sigma_px))
     return calibration, float(calibration.sigma) * stated
 

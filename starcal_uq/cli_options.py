@@ -9,7 +9,11 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import typer
 
 if TYPE_CHECKING:
+    from starcal_uq.camera import Camera
     from starcal_uq.identification_engines import Engine as EngineName
+
+# Gaia G; where the embedded catalogue ends.
+FAINTEST = 10.0
 
 ChoiceT = TypeVar("ChoiceT", bound=str)
 
@@ -76,6 +80,10 @@ TimeUtc = Annotated[
     ),
 ]
 Engine = Annotated[str, typer.Option(help="What finds attitudes: pyramid, or tetra3rs (extra of that name).")]
+EngineChoice = Annotated[
+    str | None,
+    typer.Option("--engine", help="Images: what finds attitudes: pyramid, or tetra3rs (extra of that name)."),
+]
 Ensembles = Annotated[int, typer.Option(min=2, help="Separately seeded ensembles of walkers.")]
 Walkers = Annotated[int, typer.Option(min=14, help="Walkers in each ensemble.")]
 Steps = Annotated[int, typer.Option(min=20, help="Steps kept of each walker.")]
@@ -136,3 +144,16 @@ def parse_velocity(text: str | None) -> tuple[float, float, float] | None:
     except ValueError:
         raise typer.BadParameter(f"{text!r} is not three numbers in km/s, such as 7.5,0.0,0.0.") from None
     return x, y, z
+
+
+def check_same_sensor(calibrated: Camera, run: Path, sheet: Camera, path: Path) -> None:
+    """Refuse a run whose camera cannot be that of the file: another detector, or a focal length 10 % off."""
+    same = (calibrated.width_px, calibrated.height_px) == (sheet.width_px, sheet.height_px)
+    pixels = abs(calibrated.pixel_um / sheet.pixel_um - 1.0)
+    focal = abs(calibrated.focal_px / sheet.focal_px - 1.0)
+    if not same or pixels > 1e-6 or focal > 0.1:
+        raise typer.BadParameter(
+            f"{run}: its camera ({calibrated.width_px} x {calibrated.height_px} px, f = {calibrated.focal_mm:.4g} mm) "
+            f"is not that of {path} ({sheet.width_px} x {sheet.height_px} px, f = {sheet.focal_mm:.4g} mm): give the "
+            "file and the run of one sensor."
+        )

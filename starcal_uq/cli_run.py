@@ -14,7 +14,7 @@ from starcal_uq.cli_options import (
     Columns,
     Directions,
     Draws,
-    Engine,
+    EngineChoice,
     Ensembles,
     Evaluation,
     Force,
@@ -96,13 +96,15 @@ def run_command(
     observer_velocity: Velocity = None,
     site: SiteFile = None,
     in_space: InSpace = False,
-    max_mag: Annotated[float, typer.Option(help="Images: magnitude limit of the catalogue, Gaia G.")] = 7.0,
+    max_mag: Annotated[
+        float | None, typer.Option(help="Images: magnitude limit of the catalogue, Gaia G; 7 by default.")
+    ] = None,
     epoch: Annotated[
         float | None, typer.Option(help="Images: Julian year of the star positions; the images' own by default.")
     ] = None,
     gain: Annotated[float | None, typer.Option(help="Images: electrons per count, where they do not say it.")] = None,
     time: TimeUtc = None,
-    engine: Engine = "pyramid",
+    engine: EngineChoice = None,
     seed: Seed = 0,
     sigma: Sigma = None,
     priors: PriorFile = None,
@@ -131,18 +133,23 @@ def run_command(
         # A mistake in it should not show after the work.
         load_budget_file(budget)
     images = are_images(inputs)
+    _refuse_others(
+        images,
+        {"--column": column, "--observer-velocity": observer_velocity},
+        {"--max-mag": max_mag, "--epoch": epoch, "--gain": gain, "--time": time, "--engine": engine},
+    )
     if images:
         obs, nominal, centroids, found = load_images(
             inputs,
             camera,
-            max_mag=max_mag,
+            max_mag=7.0 if max_mag is None else max_mag,
             epoch=epoch,
             gain=gain,
             directions=directions,
             site=site,
             in_space=in_space,
             time_utc=time,
-            engine=engine,
+            engine=engine or "pyramid",
         )
     elif len(inputs) == 1:
         obs, nominal = load_table(inputs[0], camera, column, directions, observer_velocity, site, in_space)
@@ -171,6 +178,14 @@ def run_command(
         likelihood=likelihood,
         evaluation=evaluation,
     )
+
+
+def _refuse_others(images: bool, of_tables: dict[str, Any], of_images: dict[str, Any]) -> None:
+    """An option that would be ignored is a mistake of the user's that should show."""
+    for option, value in (of_tables if images else of_images).items():
+        if value not in (None, []):
+            kind = "tables of stars, not to images" if images else "images, not to a table of stars"
+            raise typer.BadParameter(f"{option} belongs to {kind}: leave it out.")
 
 
 def _after_calibration(

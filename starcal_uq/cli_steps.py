@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from starcal_uq.cli_options import (
+    FAINTEST,
     CameraFile,
     Columns,
     Directions,
@@ -290,8 +291,8 @@ def propagate_command(
     json: Json = False,
 ) -> None:
     """Attitude error that the calibration contributes, through QUEST: common rotation, the rest, and centroid noise."""
+    from starcal_uq.console import err, print_json, records, show_attitude
     from starcal_uq.console import out as console
-    from starcal_uq.console import print_json, records, show_attitude
     from starcal_uq.runfolder import RunFolder
     from starcal_uq.steps import MissionSky, propagate_step
 
@@ -307,7 +308,15 @@ def propagate_command(
             scalar=parse_choice("--scalar", scalar, ("first", "last")),
             sense=parse_choice("--sense", sense, ("icrs_to_camera", "camera_to_icrs")) or "icrs_to_camera",
         )
-    error, _, spectrum = propagate_step(RunFolder(run), n_draws=draws, seed=seed, sky=sky)
+    if sky is not None and max_mag > FAINTEST:
+        raise typer.BadParameter(f"--max-mag {max_mag:g}: the embedded catalogue ends at G = {FAINTEST:g}.")
+    if sky is None and (rate is not None or scalar is not None):
+        raise typer.BadParameter("--rate and --scalar belong to an attitude profile: give --attitudes FILE.")
+
+    def tell(message: str) -> None:
+        err.print(f"note: {message}", style="yellow", highlight=False, soft_wrap=True)
+
+    error, _, spectrum = propagate_step(RunFolder(run), n_draws=draws, seed=seed, sky=sky, tell=tell)
     if json:
         document = {"frames": error.frames, "attitude_error": records(error.to_dataframe())}
         print_json(document if spectrum is None else document | {"spectrum": spectrum.sentence})

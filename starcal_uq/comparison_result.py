@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 AXES = ("pitch", "yaw", "roll")
-FILES = ("comparison.html", "comparison.csv", "comparison.json", "difference_map.csv", "difference_map.png")
+FILES = ("comparison.html", "difference.csv", "comparison.json", "difference_map.csv", "difference_map.png")
 _TUPLES = ("labels", "models", "parameter_names", "parameter_units", "messages")
 
 
@@ -245,7 +245,7 @@ class CameraComparison:
             ) from error
         image = png_bytes(self.plot_difference())
         atomic_write_text(folder / "comparison.json", json.dumps(self.to_dict(), indent=1) + "\n")
-        atomic_write_text(folder / "comparison.csv", self.to_dataframe().to_csv(index=False))
+        atomic_write_text(folder / "difference.csv", self.to_dataframe().to_csv(index=False))
         atomic_write_text(folder / "difference_map.csv", self.field_dataframe().to_csv(index=False))
         atomic_write_bytes(folder / "difference_map.png", image)
         page = folder / "comparison.html"

@@ -32,8 +32,9 @@ if TYPE_CHECKING:
 _WIDTH = None if sys.stdout.isatty() else 110
 AXES = ("pitch", "yaw", "roll")
 
-out = Console(width=_WIDTH)
-err = Console(stderr=True)
+# Names of files, runs and requirements may hold square brackets, which are no markup.
+out = Console(width=_WIDTH, markup=False)
+err = Console(stderr=True, markup=False)
 
 UNDECLARED = (
     "Neither time nor observer velocity was declared: annual aberration stretches a 10 degree field by up to "

@@ -171,7 +171,8 @@ def diagnose(
     step(3, 5)
     starts = multi_start(obs, cal, n_starts, seed) if n_starts > 0 else None
     step(4, 5)
-    comparison = compare_models(obs, cal, models, seed=seed) if models else None
+    # A single frame cannot be left out.
+    comparison = compare_models(obs, cal, models, seed=seed) if models and obs.n_frames > 1 else None
     step(5, 5)
     settings = {"models": list(models), "n_starts": n_starts}
     return Diagnosis(

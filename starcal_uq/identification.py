@@ -267,7 +267,10 @@ def _result(
             "parity": parity,
         },
     )
-    return Identification(observations, tuple(records), camera, field.camera, parity)
+    # Not every table says which frames were left out.
+    problems = getattr(table, "problem", [""] * len(records))
+    n_left_out = sum(bool(problems[k]) and record.status == "too few stars" for k, record in enumerate(records))
+    return Identification(observations, tuple(records), camera, field.camera, parity, n_left_out)
 
 
 def _check(

@@ -87,6 +87,8 @@ class Identification:
         The camera of the search, counted likewise.
     parity : str
         "normal", or "mirrored" where the images are mirror images of the sky.
+    n_left_out : int
+        Frames whose images had been left out before, when the centroids were measured; `summary` is of the others.
     """
 
     observations: Observations
@@ -94,6 +96,7 @@ class Identification:
     camera: Camera
     nominal: Camera
     parity: Parity
+    n_left_out: int = 0
 
     @property
     def n_identified(self) -> int:
@@ -103,10 +106,13 @@ class Identification:
     @property
     def summary(self) -> str:
         """The result in a few sentences."""
-        if not self.frames:
+        n_frames = len(self.frames) - self.n_left_out
+        if not n_frames:
             return "There are no frames."
         counts = Counter(frame.status for frame in self.frames)
-        words = f"{self.n_identified} of {len(self.frames)} frames are identified"
+        counts["too few stars"] -= self.n_left_out
+        be = "is" if 1 in (self.n_identified, n_frames) else "are"
+        words = f"{self.n_identified} of {plural(n_frames, 'frame')} {be} identified"
         if self.n_identified:
             stars = [frame.n_identified for frame in self.frames if frame.status == "identified"]
             words += f", with {np.mean(stars):.1f} stars on average"

@@ -10,7 +10,7 @@ import warnings
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,7 @@ import numpy as np
 from starcal_uq._types import AnyDict
 from starcal_uq.errors import ImageError
 from starcal_uq.formatting import plural
-from starcal_uq.utc_times import FIRST_YEAR, LAST_YEAR
+from starcal_uq.utc_times import FIRST_YEAR, LAST_YEAR, utc_of_scale
 
 if TYPE_CHECKING:
     from starcal_uq.camera import Camera
@@ -119,7 +119,8 @@ def read_image(path: str | os.PathLike[str], camera: Camera | None = None) -> Im
     """Read one frame (``.fits``, ``.fit``, ``.fits.gz``, ``.tiff``, ``.png``, ``.jpg``).
 
     The rows are kept in the order of the file, so the first row is y = 0. A colour image becomes its luminance; of a
-    file with several images the first is taken; without a time in the header, one in the file's name is taken (such as
+    file with several planes the first is taken, of a FITS file with several images the first of the camera's size, or
+    the largest; without a time in the header, one in the file's name is taken (such as
     2019-07-29T204726); `messages` of the result say so.
 
     Parameters
@@ -134,14 +135,20 @@ def read_image(path: str | os.PathLike[str], camera: Camera | None = None) -> Im
     ImageError
         If the file is missing, truncated, no image, or of the wrong size.
     """
+    image = read_any_size(path, camera)
+    if camera is not None:
+        image.check_size(camera)
+    return image
+
+
+def read_any_size(path: str | os.PathLike[str], camera: Camera | None = None) -> Image:
+    """`read_image`, which prefers an image of the camera's size but takes another where there is none."""
     path = Path(path)
     data = _read_bytes(path)
     name = path.name.lower()
     if not name.endswith(IMAGE_ENDINGS):
         raise ImageError(f"{path}: the ending {path.suffix or '(none)'} is unknown; use {', '.join(IMAGE_ENDINGS)}.")
-    image = _read_fits(path, data) if name.endswith(FITS_ENDINGS) else _read_picture(path, data)
-    if camera is not None:
-        image.check_size(camera)
+    image = _read_fits(path, data, camera) if name.endswith(FITS_ENDINGS) else _read_picture(path, data)
     time = time_in_name(path.name)
     if image.time_utc is None and time is not None:
         image = replace(image, time_utc=time, messages=(*image.messages, time_in_name_message(path.name)))
@@ -196,7 +203,7 @@ def _broken(path: Path) -> ImageError:
     return ImageError(f"{path}: the file is truncated or damaged; copy it again or leave it out.")
 
 
-def _read_fits(path: Path, data: bytes) -> Image:
+def _read_fits(path: Path, data: bytes, camera: Camera | None) -> Image:
     from astropy.io import fits
 
     if data.startswith(b"\x1f\x8b"):
@@ -213,20 +220,25 @@ def _read_fits(path: Path, data: bytes) -> Image:
         warnings.filterwarnings("error", message=".*(truncated|Error validating header).*")
         try:
             with fits.open(io.BytesIO(data), memmap=False) as hdus:
-                for hdu in hdus:
-                    if hdu.is_image and hdu.header.get("NAXIS", 0) >= 2:
-                        pixels = np.array(hdu.data)
-                        header = {k: v for k, v in hdu.header.items() if k and k not in ("COMMENT", "HISTORY")}
-                        header = {k: v for k, v in header.items() if isinstance(v, str | bool | int | float)}
-                        break
-                else:
+                chosen, n_images = _science_image(hdus, camera)
+                if chosen is None:
                     raise ImageError(f"{path}: the FITS file holds no image; leave it out.")
+                hdu = hdus[chosen]
+                pixels, header = np.array(hdu.data), _plain(hdu.header)
+                if chosen and header.get("INHERIT", True):
+                    # Exposures of several images say in the first header what is common to them.
+                    header = _plain(hdus[0].header) | header
         except ImageError:
             raise
         except Exception as error:  # astropy raises whatever the broken bytes lead to
             raise _broken(path) from error
     if not pixels.size:
         raise ImageError(f"{path}: the image has no pixels; leave it out.")
+    if n_images > 1:
+        messages.append(
+            f"{path.name}: of {n_images} images in the file, the one of {pixels.shape[-1]} x {pixels.shape[-2]} px in "
+            f"HDU {chosen} was taken."
+        )
     if pixels.ndim > 2:
         planes = int(np.prod(pixels.shape[:-2]))
         pixels = pixels.reshape(-1, *pixels.shape[-2:])[0]
@@ -234,16 +246,40 @@ def _read_fits(path: Path, data: bytes) -> Image:
             messages.append(f"{path.name}: the first of {planes} planes was taken.")
     pixels = np.ascontiguousarray(pixels, dtype=pixels.dtype.newbyteorder("="))
     exposure = _positive(header, "EXPTIME", "EXPOSURE")
+    time, words = _middle(header, exposure)
+    messages += [f"{path.name}: {words}"] if words else []
     return Image(
         _checked(path, pixels, messages),
         path.name,
-        time_utc=_middle(header, exposure),
+        time_utc=time,
         exposure_s=exposure,
         saturation=_positive(header, "SATURATE", "SATLEVEL") or _full_scale(pixels),
         header=header,
         gain_e_per_count=_positive(header, "EGAIN", "GAIN"),
         messages=tuple(messages),
     )
+
+
+def _science_image(hdus: Any, camera: Camera | None) -> tuple[int | None, int]:
+    """The place of the first image of the camera's size, or else of the largest; the number of images."""
+    shapes: dict[int, tuple[int, ...]] = {}
+    size = None if camera is None else (camera.height_px, camera.width_px)
+    try:
+        for place, hdu in enumerate(hdus):
+            if hdu.is_image and len(hdu.shape) >= 2:
+                shapes[place] = hdu.shape[-2:]
+    except Exception as error:
+        # Bytes after the last image do no harm, nor does a damaged one after that of the camera.
+        if not shapes or ("truncated" in str(error) and size not in shapes.values()):
+            raise
+    if not shapes:
+        return None, 0
+    return max(shapes, key=lambda place: (shapes[place] == size, np.prod(shapes[place]))), len(shapes)
+
+
+def _plain(header: Any) -> AnyDict:
+    plain = {k: v for k, v in header.items() if k and k not in ("COMMENT", "HISTORY")}
+    return {k: v for k, v in plain.items() if isinstance(v, str | bool | int | float)}
 
 
 def _read_picture(path: Path, data: bytes) -> Image:
@@ -330,8 +366,9 @@ def _positive(header: Mapping[str, Any], *keys: str) -> float | None:
     return None
 
 
-def _middle(header: Mapping[str, Any], exposure_s: float | None) -> str | None:
-    """Middle of the exposure: DATE-AVG, or DATE-OBS (its start) plus half the exposure."""
+def _middle(header: Mapping[str, Any], exposure_s: float | None) -> tuple[str | None, str]:
+    """Middle of the exposure, UTC: DATE-AVG, or DATE-OBS (its start) plus half the exposure; why a time is not used."""
+    problem = ""
     for key, delay in (("DATE-AVG", 0.0), ("DATE-OBS", 0.5 * (exposure_s or 0.0))):
         text = str(header.get(key, "")).strip().rstrip("Z")
         if key == "DATE-OBS" and "T" not in text and header.get("TIME-OBS"):
@@ -341,6 +378,22 @@ def _middle(header: Mapping[str, Any], exposure_s: float | None) -> str | None:
         except ValueError:
             continue
         # A date alone is no time of day.
-        if "T" in text:
-            return (time.replace(tzinfo=None) + timedelta(seconds=delay)).isoformat(timespec="microseconds")
-    return None
+        if "T" not in text:
+            continue
+        if not FIRST_YEAR <= time.year <= LAST_YEAR:
+            problem = f"{key} is of the year {time.year}, not of {FIRST_YEAR} to {LAST_YEAR}, and was not used."
+            continue
+        if time.tzinfo is not None:
+            time = time.astimezone(UTC).replace(tzinfo=None)
+        scale = str(header.get("TIMESYS", "")).partition("(")[0].strip().upper() or "UTC"
+        try:
+            utc = utc_of_scale(time, scale) + timedelta(seconds=delay)
+        except OverflowError:
+            continue
+        except ValueError:
+            problem = f"{key} is in {scale} by TIMESYS, which is not known here, and was not used."
+            continue
+        if not FIRST_YEAR <= utc.year <= LAST_YEAR:
+            continue
+        return utc.isoformat(timespec="microseconds"), ""
+    return None, problem

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +17,7 @@ from starcal_uq.image_record import IMAGES, record_images
 from starcal_uq.noise_floor import settle_noise
 from starcal_uq.runfolder import RunFolder, atomic_path
 from starcal_uq.site import check_sky
-from starcal_uq.utc_times import julian_year
+from starcal_uq.utc_times import julian_year, utc_text
 
 if TYPE_CHECKING:
     from starcal_uq._types import FloatArray, StrArray
@@ -88,6 +88,7 @@ def observations_from_images(
     in_space: bool = False,
     time_utc: str | None = None,
     engine: Engine = "pyramid",
+    tell: Callable[[str], None] | None = None,
     progress: Progress | None = None,
 ) -> tuple[Observations, Centroids, Bootstrap]:
     """Find, identify and calibrate with the nominal camera, then identify again with what was learnt.
@@ -116,6 +117,8 @@ def observations_from_images(
         Middle of the exposure of all images whose files do not say it; it goes before a time in a file's name.
     engine : {"pyramid", "tetra3rs"}
         What finds attitudes.
+    tell : callable, optional
+        Gets what a user should know of the images, one sentence each, before anything is made of them.
     progress : callable, optional
         Called with (images done, images in all).
 
@@ -135,9 +138,13 @@ def observations_from_images(
 
     check_sky(directions, site, in_space)
     if time_utc is not None:
-        julian_year(time_utc)
+        time_utc = utc_text(time_utc)
     centroids = extract_centroids(list(images), camera=camera, gain_e_per_count=gain_e_per_count, progress=progress)
     centroids = with_time(centroids, time_utc)
+    if tell is not None:
+        for message in counted(centroids.messages):
+            tell(f"note: {message}")
+        tell(centroids.summary)
     if site is not None:
         _check_times(centroids)
     year = epoch_of(centroids) if epoch is None else epoch
@@ -182,12 +189,18 @@ def with_time(centroids: Centroids, time_utc: str | None) -> Centroids:
     centroids : Centroids
         Times from the names of files give way.
     time_utc : str or None
-        Middle of the exposure; None leaves all as it is.
+        Middle of the exposure; None leaves all as it is. An offset such as "+02:00" is taken out.
+
+    Raises
+    ------
+    CatalogueError
+        When the time is not readable, or a date alone.
     """
     from starcal_uq.image_files import time_in_name_message
 
     if time_utc is None:
         return centroids
+    time_utc = utc_text(time_utc)
     named = {time_in_name_message(str(name)) for name in centroids.image}
     said = named & set(centroids.messages)
     times = [

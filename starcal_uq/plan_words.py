@@ -67,7 +67,9 @@ def _others(plan: Plan) -> str:
     if plan.scope != "common":
         return ""
     rest = next(need for need in plan.needs if need.scope == "rest")
-    return f" If alignment is calibrated with the same parameters, only the rest counts: {frames(rest.frames)}."
+    return (
+        f" If alignment is calibrated with the same parameters, only the rest counts: {need_words(rest, rest.frames)}."
+    )
 
 
 def _largest(plan: Plan) -> str:

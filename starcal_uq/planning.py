@@ -33,6 +33,8 @@ SWEEP_FRAMES = 1000
 _SWEEP_GEOMETRIES, _SWEEP_CAMPAIGNS, _TRIED_ATTITUDES = 1000, 64, 1000
 # With fewer attitudes than this that show enough stars, a magnitude limit is left out of the sweep.
 _LEAST_SKY = 0.02
+# More noise than this is a mistake in the units.
+_WORST_NOISE_PX = 20.0
 _MAG_STEPS = (-2.0, -1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5, 2.0)
 _NOISE_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
 _FIELD_PARTS = (0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
@@ -106,6 +108,10 @@ def plan(
         When the field is too narrow for the catalogue to show `min_stars`.
     """
     _check(n_frames, min_stars, target_arcsec, n_geometries, n_campaigns)
+    if isinstance(sigma_px, (int, float)) and not 0.0 < sigma_px <= _WORST_NOISE_PX:
+        raise PlanningError(
+            f"the centroid noise is {sigma_px:g} px: give a number above 0 and up to {_WORST_NOISE_PX:g} px per axis."
+        )
     start = start_information(after, camera)
     limit = float(np.max(stars.mag, initial=-np.inf)) if max_mag is None else float(max_mag)
     seen = stars.select(stars.mag <= limit)

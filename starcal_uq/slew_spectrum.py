@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from starcal_uq.posterior import Posterior
 
 _ARCSEC = 648_000.0 / np.pi
-_MIN_FRAMES = 16
+MIN_SPECTRUM_FRAMES = 16
 _MAX_GAPS = 0.2
 # Times of a uniform series may be rounded, to milliseconds say; more than this share of a step is another series.
 _UNEVEN = 0.05
@@ -119,8 +119,11 @@ def _series(obs: Observations, times_s: FloatArray | None) -> tuple[FloatArray, 
         raise AttitudeProfileError(
             f"times_s has shape {time.shape}, but there are {obs.n_frames} frames; give one time for each."
         )
-    if len(time) < _MIN_FRAMES:
-        raise AttitudeProfileError(f"a spectrum needs at least {_MIN_FRAMES} frames, not {len(time)}: raise the rate.")
+    if len(time) < MIN_SPECTRUM_FRAMES:
+        raise AttitudeProfileError(
+            f"a spectrum needs at least {MIN_SPECTRUM_FRAMES} frames, not {len(time)}: raise the rate, or propagate without "
+            "a spectrum."
+        )
     steps = np.diff(time)
     step = float(np.median(steps))
     if not (np.all(np.isfinite(time)) and np.all(steps > 0.0)):
@@ -134,8 +137,9 @@ def _series(obs: Observations, times_s: FloatArray | None) -> tuple[FloatArray, 
     size = int(place[-1]) + 1
     if len(time) < (1.0 - _MAX_GAPS) * size:
         raise AttitudeProfileError(
-            f"{size - len(time)} of {size} instants show too few stars, more than a spectrum can bridge: raise "
-            "max_mag, or lower min_stars."
+            f"{size - len(time)} of {size} evenly spaced instants have no frame, more than a spectrum can bridge (the "
+            f"longest gap begins at {time[int(np.argmax(steps))]:g} s): where frames show too few stars, raise max_mag or "
+            "lower min_stars; where the profile has no attitudes, cut it there."
         )
     return time[0] + step * np.arange(size), place.astype(np.int64)
 

@@ -6,7 +6,7 @@ report) are removed when a step they depend on is done again, so that a folder n
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -269,11 +269,17 @@ class MissionSky:
 
 
 def propagate_step(
-    run: RunFolder, *, n_draws: int, seed: int, sky: MissionSky | None = None
+    run: RunFolder,
+    *,
+    n_draws: int,
+    seed: int,
+    sky: MissionSky | None = None,
+    tell: Callable[[str], None] | None = None,
 ) -> tuple[AttitudeError, FieldMap, ErrorSpectrum | None]:
     """Carry the posterior through QUEST on the observed frames or a mission's, and over the field; write all of it.
 
-    Along an attitude profile the spectrum of the frame-dependent part is written as well.
+    Along an attitude profile the spectrum of the frame-dependent part is written as well. `tell` gets what a user
+    should know, one sentence each.
     """
     posterior = load_posterior(run)
     if not _has_observations(Calibration.load(run.require("calibration"))) and not run.observations.exists():
@@ -289,16 +295,25 @@ def propagate_step(
     error = propagate(posterior, frames, n_draws=n_draws, seed=seed)
     fields = field_map(posterior, obs)
     spectrum = None
+    told = [str(message) for message in frames.meta.get("messages", ())]
     if sky is not None and sky.profile is not None:
-        from starcal_uq.slew_spectrum import error_spectrum
+        from starcal_uq.slew_spectrum import MIN_SPECTRUM_FRAMES, error_spectrum
 
-        spectrum = error_spectrum(posterior, frames, n_draws=min(n_draws, 100), seed=seed)
+        if frames.n_frames >= MIN_SPECTRUM_FRAMES:
+            spectrum = error_spectrum(posterior, frames, n_draws=min(n_draws, 100), seed=seed)
+        else:
+            told.append(f"the profile has {frames.n_frames} frames, too few for a spectrum ({MIN_SPECTRUM_FRAMES}).")
+    if run.budget.exists():
+        told.append(f"the budget rested on the numbers of before and was removed: run `starcal-uq budget {run.path}`.")
     # What rests on the attitude error of before goes with it.
     _remove(run, ("spectrum", "budget"))
     error.save(run.attitude)
     fields.save(run.field_map)
     if spectrum is not None:
         spectrum.save(run.spectrum)
+    if tell is not None:
+        for message in told:
+            tell(message)
     return error, fields, spectrum
 
 

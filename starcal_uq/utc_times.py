@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from datetime import datetime, timedelta
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,11 @@ from starcal_uq._types import FloatArray, IntArray
 from starcal_uq.errors import CatalogueError
 
 FIRST_YEAR, LAST_YEAR = 1960, 2100
+_EXAMPLE = "2026-11-21T03:04:05.6"
+
+# Scales that are UTC within 0.9 s, and seconds by which others are ahead of TAI; barycentric time is TT within 2 ms.
+_UTC_NAMES = ("UTC", "UT", "UT1", "GMT")
+_AHEAD_OF_TAI_S = {"TAI": 0.0, "IAT": 0.0, "GPS": -19.0, "TT": 32.184, "TDT": 32.184, "ET": 32.184, "TDB": 32.184}
 
 _ISO = re.compile(
     r"(\d{4})-(\d\d)-(\d\d)(?:[T ](\d\d):(\d\d)(?::(\d\d(?:\.\d*)?))?)?\s*(Z|UTC|[+-]\d\d:?\d\d)?", re.ASCII
@@ -40,7 +46,7 @@ def julian_days(time_utc: Any, ut1_minus_utc_s: float = 0.0) -> tuple[FloatArray
     Raises
     ------
     CatalogueError
-        A time is not readable; the message quotes it and gives its place in the sequence, from 1.
+        A time is not readable; the message quotes it and gives its place among several, from 1.
     """
     times = np.atleast_1d(np.asarray(time_utc)).astype(str)
     unique, inverse = np.unique(times, return_inverse=True)
@@ -65,6 +71,70 @@ def julian_year(time_utc: Any) -> float:
     return float(2000.0 + (np.mean(tt.sum(axis=1)[inverse]) - 2451545.0) / 365.25)
 
 
+def utc_text(time: str) -> str:
+    """One UTC time as tables hold it, YYYY-MM-DDTHH:MM:SS[.f]; an offset such as "+02:00" is taken out.
+
+    Parameters
+    ----------
+    time
+        ISO 8601 text with a time of day; without an offset it is UTC.
+
+    Raises
+    ------
+    CatalogueError
+        The time is not readable, or a date alone; the message quotes it.
+    """
+    match = _ISO.fullmatch(time.strip())
+    if match is not None and match[4] is None and match[7] is None:
+        # Dates that do not exist are named as such.
+        julian_days(time)
+        raise CatalogueError(f"The time {time!r} is a date without a time of day; write it as {_EXAMPLE}.")
+    try:
+        if match is None or match[4] is None:
+            raise ValueError("not ISO 8601")
+        # Seconds stay text: a leap second is none to datetime.
+        minute = datetime(*(int(group) for group in match.groups()[:5]))  # type: ignore[arg-type]
+        minute -= timedelta(days=_offset_days(match[7]))
+    except (ValueError, OverflowError) as error:
+        raise _unreadable(time) from error
+    text = f"{minute.isoformat(timespec='minutes')}:{(match[6] or '00').rstrip('.')}"
+    try:
+        julian_days(text)
+    except CatalogueError as error:
+        raise _unreadable(time) from error
+    return text
+
+
+def utc_of_scale(time: datetime, scale: str) -> datetime:
+    """UTC of a time without zone in another scale, such as TAI or TT.
+
+    Raises
+    ------
+    ValueError
+        The scale is unknown.
+    """
+    import erfa
+
+    if scale in _UTC_NAMES:
+        return time
+    if scale not in _AHEAD_OF_TAI_S:
+        raise ValueError(scale)
+    tai = time - timedelta(seconds=_AHEAD_OF_TAI_S[scale])
+    second = tai.second + 1e-6 * tai.microsecond
+    days = erfa.dtf2d("TAI", tai.year, tai.month, tai.day, tai.hour, tai.minute, second)
+    with warnings.catch_warnings():
+        # Leap seconds of the future are not known.
+        warnings.simplefilter("ignore", erfa.ErfaWarning)
+        utc = erfa.taiutc(*days)
+    return tai - timedelta(seconds=round(86400.0 * float(np.subtract(days, utc).sum()), 3))
+
+
+def _unreadable(text: str, place: str = "") -> CatalogueError:
+    return CatalogueError(
+        f"The time {text!r}{place} is not a UTC time between {FIRST_YEAR} and {LAST_YEAR}; write it as {_EXAMPLE}."
+    )
+
+
 def _days(text: str, times: Any, ut1_minus_utc_s: float) -> tuple[tuple[float, float], tuple[float, float]]:
     """Two-part Julian dates, TT and UT1, of one UTC time."""
     import erfa
@@ -87,10 +157,7 @@ def _days(text: str, times: Any, ut1_minus_utc_s: float) -> tuple[tuple[float, f
             ut1, ut2 = erfa.utcut1(*utc, ut1_minus_utc_s)
     except (ValueError, erfa.ErfaError, erfa.ErfaWarning) as error:
         place = int(np.flatnonzero(times == text)[0]) + 1
-        raise CatalogueError(
-            f"The time {text!r} (number {place}) is not a UTC time between {FIRST_YEAR} and {LAST_YEAR}; "
-            "write it as 2026-11-21T03:04:05.6."
-        ) from error
+        raise _unreadable(text, f" (number {place})" if len(times) > 1 else "") from error
     offset = _offset_days(match[7])
     return (float(tt1), float(tt2) - offset), (float(ut1), float(ut2) - offset)
 

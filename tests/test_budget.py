@@ -59,6 +59,10 @@ name = "=my own"
 axis = "X"
 mean_arcsec = 0.25
 sigma_arcsec = 0.1
+ecss_class = "other"
+time_class = "constant"
+interpretation = "ensemble"
+absorbed_by_alignment = "no"
 provenance = "note"
 
 [[requirement]]
@@ -172,7 +176,7 @@ def test_rows_of_the_file_replace_what_is_not_assessed(stated: Path) -> None:
     assert not rows["thermo-elastic distortion", "roll"].assessed
     assert "thermo-elastic distortion (about Z (roll))" in found.notes[-1]
     assert "measurement date error" not in found.not_assessed
-    assert rows["=my own", "pitch"].ecss_class == "other" and ("=my own", "yaw") not in rows
+    assert rows["=my own", "pitch"].ecss_class == "other" and not rows["=my own", "yaw"].assessed
 
 
 # --- inflation -------------------------------------------------------------------------------------------------------
@@ -274,6 +278,80 @@ def test_what_judges_decides_where_rule_and_sampling_disagree(tmp_path: Path, ju
     path = tmp_path / "complete.toml"
     path.write_text(complete(20.2, judged_by), encoding="utf-8")
     assert made(path, n_samples=200_000).outcomes[0].verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("limit", "judged_by", "verdict"),
+    [
+        (60.0, "both", "open"),
+        (60.0, "sampling", "open"),
+        (60.0, "rule", "met"),
+        (20.0, "both", "violated"),
+        (20.0, "sampling", "open"),
+    ],
+)
+def test_a_confidence_beyond_the_samples_is_not_judged_by_them(
+    tmp_path: Path, limit: float, judged_by: str, verdict: str
+) -> None:
+    path = tmp_path / "complete.toml"
+    path.write_text(complete(limit, judged_by).replace("0.997", "0.9999999"), encoding="utf-8")
+    found = made(path, n_samples=200_000)
+    outcome = found.outcomes[0]
+    assert outcome.verdict == verdict
+    assert math.isnan(outcome.total.sampled_arcsec) and math.isnan(outcome.total.sampled_se_arcsec)
+    assert "99.99999\N{NO-BREAK SPACE}%" in outcome.sentence
+    if verdict == "open":
+        assert "200000 samples do not resolve a confidence of 99.99999" in outcome.sentence
+        assert "which knows Gaussian tails only, says 35.2 arcsec" in outcome.sentence
+        assert "1 requirement open: the samples do not resolve" in budget_context(found)["budget"]["headline"]
+    found.save(tmp_path / "budget.csv")
+    assert [entry.verdict for entry in Budget.load(tmp_path / "budget.csv").outcomes] == [verdict]
+    for ending in ("html", "tex"):
+        found.save(tmp_path / f"budget.{ending}")
+        assert "not resolved" in (tmp_path / f"budget.{ending}").read_text(encoding="utf-8")
+    # Negative control: a confidence that the samples just resolve.
+    path.write_text(complete(60.0).replace("0.997", "0.9999"), encoding="utf-8")
+    resolved = made(path, n_samples=200_000).outcomes[0]
+    assert resolved.verdict == "met" and resolved.total.sampled_se_arcsec > 0.0
+
+
+def test_a_budget_beyond_the_samples_is_whole(stated: Path, tmp_path: Path) -> None:
+    from openpyxl import load_workbook
+
+    found = made(stated, confidence=0.999999)
+    assert math.isnan(found.total("roll").larger_arcsec)
+    found.save(tmp_path / "budget.xlsx")
+    sheet = load_workbook(tmp_path / "budget.xlsx")["Totals"]
+    assert sheet["J2"].value == "not resolved" and sheet["D2"].number_format == "0.0000%"
+    json.dumps(found.to_dict(), allow_nan=False)
+    found.plot_budget()
+    assert "not resolved" in found._repr_html_()
+
+
+def test_a_contributor_of_the_users_own_is_not_zero_on_axes_that_the_file_leaves_out(tmp_path: Path) -> None:
+    own = FILE.split("[[contributor]]")[4].split("[[requirement]]")[0]
+    path = tmp_path / "own.toml"
+    path.write_text("[[contributor]]" + own, encoding="utf-8")
+    found = made(path)
+    rows = {row.axis: row for row in found.rows if row.name == "=my own"}
+    assert [rows[axis].assessed for axis in AXES] == [True, False, False]
+    assert "=my own" in found.not_assessed and "=my own" in found.total("Z").not_assessed
+    assert "=my own (about Y (yaw) and Z (roll))" in " ".join(found.notes)
+    path.write_text(
+        "[[contributor]]" + own + "[[contributor]]\nname = '=my own'\naxis = 'Z'\napplies = false\nprovenance = 'p'\n",
+        encoding="utf-8",
+    )
+    assert "=my own" not in made(path).total("Z").not_assessed
+
+
+@pytest.mark.parametrize(
+    ("label", "axis"), [("X", "pitch"), ("z", "roll"), ("Y (yaw)", "yaw"), ("X and Y together", "cross-boresight")]
+)
+def test_totals_answer_to_the_labels_of_the_tables(label: str, axis: str) -> None:
+    found = made()
+    assert found.total(label) is found.total(axis)
+    with pytest.raises(ValueError, match=r"one of X, Y, Z .*cross-boresight"):
+        found.total("W")
 
 
 # --- formats ---------------------------------------------------------------------------------------------------------
@@ -392,11 +470,23 @@ def test_the_figure_names_what_is_not_assessed_and_colours_the_limits(stated: Pa
     labels = [text.get_text() for text in left.get_yticklabels()]
     assert labels[-2:] == ["total before alignment", "total after alignment"] and "star catalogue" in labels
     texts = [text.get_text() for text in left.texts]
-    assert texts.count("not assessed") == len(FROM_FILE) - 3 and "does not apply" in texts
-    assert [text.get_text() for text in right.texts].count("not assessed") == len(FROM_FILE) - 2
+    assert texts.count("not assessed") == len(FROM_FILE) - 2 and "does not apply" in texts
+    assert [text.get_text() for text in right.texts].count("not assessed") == len(FROM_FILE) - 1
     shown = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
     assert "limit, violated" in shown
     assert "limit" not in {text.get_text() for legend in made().plot_budget().legends for text in legend.get_texts()}
+
+
+@pytest.mark.parametrize(("line", "drawn"), [("", 1), ("confidence = 0.95\n", 0), ('interpretation = "ensemble"\n', 0)])
+def test_the_figure_draws_limits_of_its_own_confidence_only(tmp_path: Path, line: str, drawn: int) -> None:
+    path = tmp_path / "limit.toml"
+    path.write_text('[[requirement]]\nname = "R"\naxis = "Z"\nlimit_arcsec = 7654.0\n' + line, encoding="utf-8")
+    found = made(path)
+    right = found.plot_budget().axes[1]
+    assert sum(list(curve.get_xdata()) == [7654.0, 7654.0] for curve in right.lines) == drawn
+    page = found._repr_html_()
+    assert "Limits are drawn of requirements at this confidence in the mixed interpretation only" in page
+    assert ("1 of 1 are of another" in page) is (drawn == 0)
 
 
 # --- a run folder ----------------------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 
 from starcal_uq.budget_combination import Total, draw, grouped_sigma, total
-from starcal_uq.budget_rows import DISTRIBUTIONS, GAUSSIAN_997, Contributor
+from starcal_uq.budget_rows import DISTRIBUTIONS, GAUSSIAN_997, Contributor, confidence_text
 from starcal_uq.budget_shapes import (
     deviates,
     half_width,
@@ -229,3 +229,60 @@ def test_the_seed_decides() -> None:
     rows = [row("a", 1.0)]
     first, again, other = (draw(rows, 1000, seed).sums["before alignment", "ensemble"] for seed in (1, 1, 2))
     assert np.array_equal(first, again) and not np.array_equal(first, other)
+
+
+@pytest.mark.parametrize(
+    ("confidence", "text"),
+    [
+        (0.997, "99.7"),
+        (0.95, "95"),
+        (math.erf(3.0 / math.sqrt(2.0)), "99.73"),
+        (0.9999999, "99.99999"),
+        (0.999999999999, "99.9999999999"),
+        (0.0001, "0.01"),
+        (1e-9, "0.0000001"),
+    ],
+)
+def test_a_confidence_keeps_its_nines(confidence: float, text: str) -> None:
+    assert confidence_text(confidence) == f"{text}\N{NO-BREAK SPACE}%"
+
+
+def test_a_quantile_beyond_the_samples_is_not_known() -> None:
+    rows = [row("noise", 6.6, tail_997=3.9)]
+    found = combined(rows, confidence=0.9999999)
+    assert math.isnan(found.sampled_arcsec) and found.unresolved and math.isnan(found.larger_arcsec)
+    assert "200000 samples do not resolve" in found.explanation
+    # Negative control: the largest of so many samples is far below the quantile, and known where 20 lie beyond.
+    true = 6.6 * half_width("gaussian", 0.9999999, 3.9)
+    assert np.abs(draw(rows, 200_000, 3).sums["before alignment", "ensemble"]).max() < 0.9 * true
+    resolved = combined(rows, confidence=0.9999)
+    assert abs(resolved.sampled_arcsec - 6.6 * half_width("gaussian", 0.9999, 3.9)) < 4.0 * resolved.sampled_se_arcsec
+    # What has no spread needs no samples.
+    assert combined([row("shift", 0.0, mean_arcsec=2.0)], confidence=0.9999999).sampled_arcsec == 2.0
+
+
+@pytest.mark.parametrize("confidence", [0.9999999, 1.0 - 1e-12])
+def test_quantiles_of_the_heaviest_tails_are_found(confidence: float) -> None:
+    assert one_axis_factor(confidence) == pytest.approx(stats.norm.isf(0.5 * (1.0 - confidence)), rel=1e-12)
+    spread = mixture_spread(50.0)
+    reach = half_width("gaussian", confidence, 50.0)
+    assert math.isfinite(reach) and two_axis_radius(confidence, 1.0, 1.0, spread) >= reach
+
+
+@pytest.mark.parametrize(("axis", "words"), [("pitch", "a mean shifts"), ("cross-boresight", "adds the whole mean")])
+def test_a_mean_smaller_than_sigma_is_given_as_the_reason(axis: str, words: str) -> None:
+    found = combined([*both("noise", 1.0, mean_arcsec=0.6)], axis=axis)
+    assert words in found.explanation and "100 %" not in found.explanation
+    # Negative control: without a mean both agree.
+    assert "agree" in combined([*both("noise", 1.0)], axis=axis).explanation
+
+
+def test_no_reason_is_a_bare_share() -> None:
+    cases = [
+        ([row("noise", 1.0, tail_997=3.9)], 0.6, "more of its errors are small"),
+        ([row("step", 1.0, distribution="uniform")], 0.6, "reaches further"),
+        ([row("noise", 1.0), row("tiny", 0.001, distribution="uniform", mean_arcsec=0.5)], 0.997, "a mean shifts"),
+    ]
+    for rows, confidence, words in cases:
+        found = combined(rows, confidence=confidence)
+        assert words in found.explanation and "'tiny'" not in found.explanation

@@ -19,6 +19,12 @@ axis = "all"
 sigma_arcsec = 0.2
 provenance = "catalogue note"
 """
+OWN = """
+ecss_class = "other"
+time_class = "field"
+interpretation = "mixed"
+absorbed_by_alignment = "no"
+"""
 LIMIT = """
 [[requirement]]
 name = "R-1"
@@ -72,6 +78,18 @@ def test_moments(tmp_path: Path, lines: str, sigma: float, mean: float) -> None:
     assert row.applies is ("applies" not in lines)
 
 
+@pytest.mark.parametrize("name", ["Star Catalogue", "STAR  catalogue"])
+def test_names_of_the_starter_may_be_in_any_case(tmp_path: Path, name: str) -> None:
+    row = load_budget_file(written(tmp_path, ROW.replace("star catalogue", name))).contributors[0]
+    assert (row.name, row.ecss_class) == ("star catalogue", "FOV spatial")
+
+
+@pytest.mark.parametrize("name", ["polishing residual", "star sensor cable", "launch lock"])
+def test_a_name_of_ones_own_is_taken_with_what_it_states(tmp_path: Path, name: str) -> None:
+    row = load_budget_file(written(tmp_path, ROW.replace("star catalogue", name) + OWN)).contributors[0]
+    assert (row.name, row.time_class, row.distribution) == (name, "field", "gaussian")
+
+
 def test_requirements_take_the_confidence_of_the_file(tmp_path: Path) -> None:
     text = "[budget]\ntitle = 'T'\nconfidence = 0.95\n" + LIMIT + LIMIT.replace("R-1", "R-2") + "confidence = 0.5\n"
     found = load_budget_file(written(tmp_path, text))
@@ -117,6 +135,20 @@ BAD = {
     "axis of a limit": (LIMIT.replace("cross-boresight", "all"), "key axis is 'all'"),
     "scope": (LIMIT + 'scope = "later"\n', "key scope is 'later'; write one of 'before alignment'"),
     "limits twice": (LIMIT + LIMIT, "requirement R-1 is stated twice"),
+    "mistyped": (ROW.replace("star catalogue", "star catalog"), "did you mean 'star catalogue'?"),
+    "mistyped, of a uniform error": (
+        ROW.replace("star catalogue", "launch and setling shift").replace("sigma_arcsec", "half_width_arcsec"),
+        "did you mean 'launch and settling shift'?",
+    ),
+    "mistyped, everything stated": (ROW.replace("star catalogue", "star catalogues") + OWN, "did you mean"),
+    "posterior's, in capitals": (ROW.replace("star catalogue", "Centroid Noise (NEA)"), "filled by the posterior"),
+    "own without class": (ROW.replace("star catalogue", "polish"), "must state ecss_class, time_class, interpretation"),
+    "too large": (ROW.replace("0.2", "1e308"), "more than 1296000 arcsec, a full turn"),
+    "too large for a float": (ROW.replace("0.2", "1" + 400 * "0"), "more than 1296000 arcsec, a full turn"),
+    "too large to be read": (ROW.replace("0.2", "1" + 5000 * "0"), "too many digits"),
+    "mean too large": (ROW + "mean_arcsec = -1.3e6\n", "key mean_arcsec is more than"),
+    "limit too large": (LIMIT.replace("10.0", "1e9"), "key limit_arcsec is more than"),
+    "confidence too large": ("[budget]\nconfidence = 1" + 400 * "0", "key confidence is far too large"),
     "no toml": ("[[contributor]\n", "is not valid TOML"),
     "no table": ("contributor = [1]\n", "is no table"),
 }

@@ -17,6 +17,7 @@ from starcal_uq.camera import Camera
 from starcal_uq.centroiding import extract_centroids
 from starcal_uq.centroids import COLUMNS, FRAME_COLUMNS, Centroids
 from starcal_uq.errors import ImageError, ObservationError, RunFolderError
+from starcal_uq.identification_result import FrameIdentification, Identification
 from starcal_uq.image_files import Image, read_image
 
 BACKGROUND_E, READ_NOISE_E = 50.0, 5.0
@@ -494,3 +495,94 @@ def test_coarse_counts_give_no_false_stars():
         data = np.round(60.0 + rng.poisson(25.0, (1024, 1024)) / 4.0 + rng.normal(0.0, 0.9, (1024, 1024)))
         n += extract_centroids(Image(data=data.astype(np.uint16), name="dark")).n_stars
     assert n <= 6
+
+
+# ---- what headers and folders may do -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("header", "time", "words"),
+    [
+        ({"DATE-OBS": "2019-07-29T22:47:26+02:00"}, "2019-07-29T20:47:26.000000", None),
+        ({"DATE-OBS": "2019-07-29T22:47:26+02:00", "EXPTIME": 3.0}, "2019-07-29T20:47:27.500000", None),
+        ({"DATE-OBS": "2019-07-29", "TIME-OBS": "20:47:26"}, "2019-07-29T20:47:26.000000", None),
+        ({"DATE-OBS": "2019-07-29T20:47:26", "TIMESYS": "UTC"}, "2019-07-29T20:47:26.000000", None),
+        # 37 leap seconds since 2017, 10 before 1972-07-01.
+        ({"DATE-OBS": "2019-07-29T20:48:03", "TIMESYS": "TAI"}, "2019-07-29T20:47:26.000000", None),
+        ({"DATE-OBS": "1972-01-02T00:00:10", "TIMESYS": "tai"}, "1972-01-02T00:00:00.000000", None),
+        ({"DATE-OBS": "2019-07-29T20:47:44", "TIMESYS": "GPS"}, "2019-07-29T20:47:26.000000", None),
+        ({"DATE-AVG": "2019-07-29T20:48:35.184", "TIMESYS": "TT(BIPM)"}, "2019-07-29T20:47:26.000000", None),
+        ({"DATE-OBS": "2019-07-29T20:47:26", "TIMESYS": "LOCAL"}, None, "a.fits: DATE-OBS is in LOCAL by TIMESYS"),
+        ({"DATE-OBS": "1858-11-17T00:00:00"}, None, "a.fits: DATE-OBS is of the year 1858, not of 1960 to 2100"),
+        ({"DATE-OBS": "0001-01-01T00:00:00+02:00"}, None, "a.fits: DATE-OBS is of the year 1,"),
+        ({"DATE-OBS": "2019-07-29T20:47:26", "EXPTIME": 1e300}, None, None),
+        ({"DATE-OBS": "29/07/19"}, None, None),
+    ],
+)
+def test_times_of_headers_become_utc(tmp_path, header, time, words):
+    fits.writeto(tmp_path / "a.fits", np.ones((4, 5), np.int16), fits.Header(header))
+    image = read_image(tmp_path / "a.fits")
+    assert image.time_utc == time
+    assert len(image.messages) == (words is not None)
+    assert all(message.startswith(words) for message in image.messages)
+
+
+def test_the_time_in_a_name_replaces_an_impossible_one(tmp_path):
+    path = tmp_path / "2019-07-29T204726.fits"
+    fits.writeto(path, np.ones((4, 5), np.int16), fits.Header({"DATE-OBS": "1858-11-17T00:00:00"}))
+    assert read_image(path).time_utc == "2019-07-29T20:47:26"
+
+
+def test_the_science_image_is_taken_rather_than_its_preview(tmp_path):
+    science = np.arange(48 * 64, dtype=np.int16).reshape(48, 64)
+    preview, first, big = fits.ImageHDU(science[::8, ::8]), fits.PrimaryHDU(), fits.ImageHDU(np.ones((99, 99)))
+    first.header["DATE-OBS"] = "2019-07-29T20:47:26"
+    path = tmp_path / "a.fits"
+    fits.HDUList([first, preview, fits.ImageHDU(science), fits.ImageHDU(science + 1)]).writeto(path)
+    camera = Camera(64, 48, 10.0, 50.0, 31.5, 23.5)
+    for image in (read_image(path), read_image(path, camera)):
+        np.testing.assert_array_equal(image.data, science)
+        assert image.messages == ("a.fits: of 3 images in the file, the one of 64 x 48 px in HDU 2 was taken.",)
+        # The first header holds for all images.
+        assert image.time_utc == "2019-07-29T20:47:26.000000" and image.header["NAXIS1"] == 64
+    fits.HDUList([first, preview, fits.ImageHDU(science), big]).writeto(path, overwrite=True)
+    assert read_image(path).data.shape == (99, 99)
+    np.testing.assert_array_equal(read_image(path, camera).data, science)
+    assert extract_centroids(path, camera=camera).problem[0] != "the image is 99 x 99 px"
+    # Bytes after the images do no harm; an image that is cut short is not replaced by its preview.
+    fits.writeto(path, science, overwrite=True)
+    path.write_bytes(path.read_bytes() + 2880 * b"x")
+    np.testing.assert_array_equal(read_image(path).data, science)
+    fits.HDUList([first, preview, fits.ImageHDU(science)]).writeto(path, overwrite=True)
+    path.write_bytes(path.read_bytes()[:-4000])
+    with pytest.raises(ImageError, match="truncated"):
+        read_image(path)
+
+
+def test_a_folder_of_subfolders_says_that_they_are_not_searched(tmp_path):
+    (tmp_path / "inner").mkdir()
+    fits.writeto(tmp_path / "inner" / "a.fits", np.ones((4, 5), np.int16))
+    with pytest.raises(ImageError, match=r"holds no image .* subfolders are not searched"):
+        extract_centroids(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("statuses", "n_left_out", "words"),
+    [
+        (["identified"], 0, "1 of 1 frame is identified, with 5.0 stars on average."),
+        (["identified", "too few stars"], 1, "1 of 1 frame is identified, with 5.0 stars on average."),
+        (["identified"] * 2 + ["too few stars"] * 3, 1, "Left out: 2 with fewer than four centroids."),
+        (["identified"] * 2 + ["ambiguous"], 0, "2 of 3 frames are identified"),
+        (["not identified"], 0, "0 of 1 frame is identified. Left out: 1 in which"),
+        (["not identified"] * 2, 0, "0 of 2 frames are identified. Left out: 2 in which"),
+    ],
+)
+def test_frames_left_out_before_are_not_counted_again(statuses, n_left_out, words):
+    frames = tuple(
+        FrameIdentification(k, "", status, 5, 5 * (status == "identified"), 0, 0, np.nan, None, 1.0, 1.0, 1.0, 1.0)
+        for k, status in enumerate(statuses)
+    )
+    camera = Camera(64, 48, 10.0, 50.0, 31.5, 23.5)
+    found = Identification(None, frames, camera, camera, "normal", n_left_out)
+    assert words in found.summary
+    assert n_left_out == 0 or len(statuses) > 2 or "Left out" not in found.summary

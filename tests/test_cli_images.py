@@ -65,6 +65,45 @@ def test_run_from_images_to_report(cli, frames, tmp_path):
     assert cal.sigma == pytest.approx(1.0, abs=0.1)
 
 
+def test_options_of_the_other_kind_are_refused(cli, frames, tmp_path):
+    sc.paper_start().save(tmp_path / "camera.toml")
+    status, _, err = cli("run", frames, "camera.toml", "-o", "run", "--observer-velocity", "7,0,0")
+    assert status == 2
+    assert "--observer-velocity belongs to tables" in err
+    (tmp_path / "obs.csv").write_text("frame,x_px,y_px,ra_deg,dec_deg\n")
+    for option in (("--time", "2026-11-21T00:00:00"), ("--max-mag", 3), ("--gain", 1), ("--engine", "pyramid")):
+        status, _, err = cli("run", "obs.csv", "camera.toml", "-o", "run", *option)
+        assert status == 2
+        assert f"{option[0]} belongs to images" in err
+    assert not (tmp_path / "run").exists()
+
+
+def test_identify_refuses_the_calibration_of_another_sensor(cli, frames, tmp_path):
+    from starcal_uq.steps import calibrate_step
+
+    obs = sc.simulate(sc.load_catalogue(max_mag=6.0, epoch=2026.9), sc.paper_camera(), n_frames=20, seed=1)
+    calibrate_step(sc.RunFolder(tmp_path / "run"), obs, sc.paper_start(), force=True)
+    sc.paper_start().replace(focal_mm=50.0).save(tmp_path / "other.toml")
+    assert cli("centroid", frames, "-o", "c.parquet")[0] == 0
+    status, _, err = cli("identify", "c.parquet", "other.toml", "-o", "o.csv", "--calibration", "run")
+    assert status == 2
+    assert "one sensor" in err
+
+
+def test_too_few_stars_say_what_was_identified(cli, frames, tmp_path, monkeypatch):
+    def stuck(*_arguments, **_options):
+        raise sc.CalibrationError("it went nowhere.")
+
+    monkeypatch.setattr("starcal_uq.estimation.calibrate", stuck)
+    sc.paper_start().save(tmp_path / "camera.toml")
+    status, _, err = cli("run", frames, "camera.toml", "-o", "run", "--max-mag", 6, "--in-space")
+    assert status == 2
+    assert "stars in 25 frames were identified, but they do not determine the camera (it went nowhere.)" in err
+    # What was found in the images was said before.
+    assert "stars in 25 frames.\n" in err
+    assert not (tmp_path / "run").exists()
+
+
 def test_bootstrap_says_what_changed(frames):
     table = sc.extract_centroids(frames)
     stars = sc.load_catalogue(max_mag=6.0, epoch=epoch_of(table))
@@ -73,6 +112,9 @@ def test_bootstrap_says_what_changed(frames):
     assert found.identification.n_identified == 25
     assert "new" in found.summary
     assert "standard deviations" in found.summary
+    # The focal length is compared with the data sheet's, not with that of the first calibration.
+    change = 100.0 * abs(found.calibration.camera.focal_px / sc.paper_start().focal_px - 1.0)
+    assert f"{change:.2f} % shorter" in found.identification.summary
     none = table.select_frames([])
     with pytest.raises(sc.IdentificationError, match="no frame is identified"):
         bootstrap(none, sc.paper_start(), stars)

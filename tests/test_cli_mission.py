@@ -181,3 +181,100 @@ def test_plan_before_any_data(cli, run, tmp_path):
         status, _, err = cli("plan", "camera.toml", *wrong)
         assert status == 2, wrong
         assert err.strip()
+
+
+def test_square_brackets_are_no_markup(cli, run, tmp_path):
+    (tmp_path / "b.toml").write_text(REQUIREMENTS.replace("R-1 impossible", "R-1 [/x] rev [b]"))
+    status, out, err = cli("budget", "run", "--file", "b.toml")
+    assert status == 1
+    assert "R-1 [/x] rev [b]" in out
+    assert "R-1 [/x] rev [b]" in err
+    status, out, _ = cli("compare", "run", "--split", "halves", "--labels", "a[/x],b [red]")
+    assert status == 0
+    assert "a[/x] and b [red] agree" in out
+
+
+def test_a_runs_own_files_are_not_mixed_with_others(cli, run, tmp_path):
+    sc.paper_start().save(tmp_path / "camera.toml")
+    before = {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
+    for arguments in (
+        ("compare", "run", "--split", "halves", "-o", "run", "--force"),
+        ("plan", "camera.toml", "--frames", 30, "-o", "run", "--force"),
+    ):
+        status, _, err = cli(*arguments)
+        assert status == 2
+        assert "is the folder of a run" in err
+    assert {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
+    status, _, err = cli("budget", "run", "--file", "b.toml", "--template", "./b.toml", "--force")
+    assert status == 2
+    assert "write over" in err
+    status, _, err = cli("compare", "run", "--split", "halves", "--labels", "a,a")
+    assert status == 2
+
+
+def test_plan_after_a_run_of_another_sensor_is_refused(cli, run, tmp_path):
+    sc.paper_start().replace(width_px=512, height_px=512, x0_px=255.5, y0_px=255.5).save(tmp_path / "other.toml")
+    status, _, err = cli("plan", "other.toml", "--after", "run")
+    assert status == 2
+    assert "give the file and the run of one sensor" in err
+    # A stated noise is not overruled by that of the run.
+    sc.paper_start().save(tmp_path / "camera.toml")
+    found = []
+    for sigma in ((), ("--sigma", 0.5)):
+        status, out, _ = cli("plan", "camera.toml", "--after", "run", "--frames", 100, "--json", *sigma)
+        assert status == 0
+        found.append(json.loads(out)["sigma_px"])
+    assert found[0] == pytest.approx(0.05, rel=0.1)
+    assert found[1] == 0.5
+
+
+def test_plan_refuses_what_it_cannot_mean(cli, run, tmp_path):
+    sc.paper_start().save(tmp_path / "camera.toml")
+    for wrong, word in (
+        (("--after", "run", "--check", 10), "--check"),
+        (("--max-mag", 30), "ends at G = 10"),
+        (("--sigma", 300), "px per axis"),
+    ):
+        status, _, err = cli("plan", "camera.toml", "--frames", 30, *wrong)
+        assert status == 2
+        assert word in err
+    status, _, err = cli("propagate", "run", "--attitudes", "random", "--max-mag", 99)
+    assert status == 2
+    assert "ends at G = 10" in err
+    # What was asked for is in the document.
+    options = ("--frames", 30, "--target-arcsec", 1e-9, "--choose", 3, "--check", 10, "--json")
+    status, out, _ = cli("plan", "camera.toml", *options)
+    document = json.loads(out)
+    assert status == 1
+    assert len(document["choice"]["frames"]) == 3
+    assert document["check"]["table"]
+    assert "only the rest counts: more than ten million" in document["verdict"]
+
+
+def test_a_gap_in_a_profile_is_told(cli, run, tmp_path):
+    time = np.r_[np.arange(20.0), 5020.0 + np.arange(20.0)]
+    half = np.radians(0.01 * time) / 2
+    turn = {"time_s": time, "qx": np.sin(half), "qy": 0.0, "qz": 0.0, "qw": np.cos(half)}
+    pd.DataFrame(turn).to_csv(tmp_path / "gap.csv", index=False)
+    status, _, err = cli("propagate", "run", "--attitudes", "gap.csv", "--draws", 60)
+    assert status == 2
+    assert "the longest gap begins at 19 s" in err
+    status, _, err = cli("propagate", "run", "--attitudes", "gap.csv", "--rate", 0.1, "--draws", 60)
+    assert status == 0
+    assert "no attitude between 19 and 5020 s" in err
+
+
+def test_propagate_tells_what_it_found_odd(cli, run, tmp_path):
+    cli("budget", "run")
+    half = np.radians(np.arange(10.0)) / 2
+    pointings = {"time_s": np.arange(10.0), "qx": np.sin(half), "qy": 0.0, "qz": 0.0, "qw": 1.001 * np.cos(half)}
+    pd.DataFrame(pointings).to_csv(tmp_path / "ten.csv", index=False)
+    status, _, err = cli("propagate", "run", "--attitudes", "ten.csv", "--draws", 60)
+    assert status == 0
+    assert "normalised" in err
+    assert "too few for a spectrum" in err
+    assert "the budget rested on the numbers of before" in err
+    assert not (run / "error_spectrum.npz").exists()
+    status, _, err = cli("propagate", "run", "--rate", 2)
+    assert status == 2
+    assert "belong to an attitude profile" in err

@@ -29,6 +29,7 @@ from starcal_uq.image_files import read_image, time_in_name
 from starcal_uq.image_steps import observations_from_images, with_time
 from starcal_uq.site import Site
 from starcal_uq.sky_displacement import as_measured, mirrored, undisplaced
+from starcal_uq.utc_times import utc_text
 from starcal_uq.verdict import corrected_words
 from tests.ground_scenes import CAMERA, NOMINAL, SITE, as_centroids, ground_frames, night
 
@@ -530,6 +531,45 @@ def test_an_images_own_time_wins(tmp_path):
     assert given.time_utc.tolist() == ["2020-01-02T03:04:06.000000"] + 2 * ["2021-05-06T07:08:09"]
     assert not any("name of the file" in message for message in given.messages)
     assert with_time(table, None) is table
+    # Tables hold UTC without an offset.
+    assert with_time(table, "2019-07-29T22:47:26+02:00").time_utc[2] == TIME
+    with pytest.raises(sc.CatalogueError, match="a date without a time of day"):
+        with_time(table, "2019-07-29")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("2019-07-29T20:47:26", TIME),
+        (" 2019-07-29 20:47:26Z", TIME),
+        ("2019-07-29T22:47:26+02:00", TIME),
+        ("2019-07-29T20:47", "2019-07-29T20:47:00"),
+        ("2019-07-30T00:17:26.250+0330", "2019-07-29T20:47:26.250"),
+        ("2017-01-01T01:59:60.5+02:00", "2016-12-31T23:59:60.5"),
+        ("2019-12-31T23:00:00.-02:00", "2020-01-01T01:00:00"),
+    ],
+)
+def test_times_as_tables_hold_them(text, expected):
+    assert utc_text(text) == expected
+
+
+@pytest.mark.parametrize(
+    "text", ["2019-07-29", "2019-02-30", "noon", "", "2019-07-29T25:00", "1858-11-17T00:00:00", "2019-07-29T20:47:61"]
+)
+def test_other_times_are_refused_in_one_sentence(text):
+    with pytest.raises(sc.CatalogueError, match=f"^The time '{text}' is .*; write it as") as caught:
+        utc_text(text)
+    assert "number 1" not in str(caught.value)
+
+
+def test_a_missing_image_is_left_out_once(stars, tmp_path):
+    """With the centroids, not as a frame without them; the control is an image without stars."""
+    dark = sc.Image(np.random.default_rng(0).normal(100.0, 3.0, (768, 1024)), "dark")
+    table = sc.extract_centroids([tmp_path / "missing.png", dark], camera=NOMINAL)
+    assert (table.problem != "").tolist() == [True, False]
+    found = sc.identify(table, NOMINAL, stars)
+    assert found.n_left_out == 1 and len(found.frames) == 2
+    assert found.summary == "0 of 1 frame is identified. Left out: 1 with fewer than four centroids."
 
 
 def test_rendered_images_shine_through_no_air(stars, tmp_path):

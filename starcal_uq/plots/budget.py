@@ -26,7 +26,8 @@ _TALL = 0.31
 def plot_budget(budget: Budget) -> Figure:
     """What each contributor reaches at the budget's confidence, and the totals (mixed interpretation), in two panels.
 
-    Contributors that nobody assessed stand in the figure by name: an empty place is not a zero.
+    Contributors that nobody assessed stand in the figure by name: an empty place is not a zero. Limits are drawn of
+    requirements that the totals may be held against: at the budget's confidence, and mixed.
     """
     names = list(dict.fromkeys(row.name for row in budget.rows))
     figure = style.new_figure(11.5, 1.6 + _TALL * (len(names) + 3))
@@ -44,7 +45,7 @@ def _panel(ax: Axes, budget: Budget, names: list[str], axis: str) -> None:
     by_name = {name: [row for row in budget.rows if row.name == name] for name in names}
     reaches = {name: _reach(rows, axis, budget.confidence) for name, rows in by_name.items()}
     sums = [budget.total(axis, scope) for scope in SCOPES]
-    limits = [outcome for outcome in budget.outcomes if outcome.requirement.axis == axis]
+    limits = [outcome for outcome in budget.comparable if outcome.requirement.axis == axis]
     shown = [value for value in reaches.values() if value] + [s.rule_arcsec for s in sums if s.rule_arcsec > 0.0]
     shown += [outcome.requirement.limit_arcsec for outcome in limits]
     low, high = (min(shown), max(shown)) if shown else (0.1, 1.0)
@@ -77,8 +78,8 @@ def _panel(ax: Axes, budget: Budget, names: list[str], axis: str) -> None:
         ax.plot(entry.sampled_arcsec, at, "D", color="white", markeredgecolor=style.INK, markersize=4.2)
         least = "≥ " if entry.at_least else ""
         mine = [outcome.requirement.limit_arcsec for outcome in limits if outcome.total.scope == entry.scope]
-        right = max(entry.larger_arcsec, *mine, 0.0)
-        _write(ax, right, at, f"{least}{significant(entry.larger_arcsec, 3)}″", style.INK, shift=8)
+        larger = entry.rule_arcsec if entry.unresolved else entry.larger_arcsec
+        _write(ax, max(larger, *mine, 0.0), at, f"{least}{significant(larger, 3)}″", style.INK, shift=8)
     for outcome in limits:
         at = len(names) + 0.7 + SCOPES.index(outcome.requirement.scope)
         colour = style.VERMILLION if outcome.verdict == "violated" else style.GREEN
@@ -142,8 +143,8 @@ def _handles(budget: Budget) -> list[object]:
             label="total by sampling",
         ),
     ]
-    if budget.outcomes:
+    if budget.comparable:
         handles.append(Line2D([], [], color=style.GREEN, linewidth=2.4, label="limit"))
-    if budget.violations:
+    if any(outcome.verdict == "violated" for outcome in budget.comparable):
         handles.append(Line2D([], [], color=style.VERMILLION, linewidth=2.4, label="limit, violated"))
     return handles
