@@ -121,8 +121,8 @@ def _series(obs: Observations, times_s: FloatArray | None) -> tuple[FloatArray, 
         )
     if len(time) < MIN_SPECTRUM_FRAMES:
         raise AttitudeProfileError(
-            f"a spectrum needs at least {MIN_SPECTRUM_FRAMES} frames, not {len(time)}: raise the rate, or propagate without "
-            "a spectrum."
+            f"a spectrum needs at least {MIN_SPECTRUM_FRAMES} frames, not {len(time)}: raise the rate, or propagate "
+            "without a spectrum."
         )
     steps = np.diff(time)
     step = float(np.median(steps))
@@ -138,8 +138,8 @@ def _series(obs: Observations, times_s: FloatArray | None) -> tuple[FloatArray, 
     if len(time) < (1.0 - _MAX_GAPS) * size:
         raise AttitudeProfileError(
             f"{size - len(time)} of {size} evenly spaced instants have no frame, more than a spectrum can bridge (the "
-            f"longest gap begins at {time[int(np.argmax(steps))]:g} s): where frames show too few stars, raise max_mag or "
-            "lower min_stars; where the profile has no attitudes, cut it there."
+            f"longest gap begins at {time[int(np.argmax(steps))]:g} s): where frames show too few stars, raise max_mag "
+            "or lower min_stars; where the profile has no attitudes, cut it there."
         )
     return time[0] + step * np.arange(size), place.astype(np.int64)
 
