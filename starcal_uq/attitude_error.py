@@ -34,6 +34,7 @@ _ABSORBED = ("no", "yes", "no", "in part", "no")
 _REQUIRED = CONTRIBUTORS[:4]
 # A ratio of sigmas below a microarcsecond means nothing.
 _SMALLEST_ARCSEC = 1e-6
+_ROUNDING_ARCSEC = 1e-9
 _AGREE = 0.02
 
 
@@ -167,7 +168,8 @@ class AttitudeError:
     def one_number_sentence(self) -> str:
         """What a single number for the calibration would hide."""
         common, rest = with_cross(self.common_arcsec)[3], with_cross(self.rest_arcsec)[3]
-        if not rest > 0.0:
+        # Below this it is rounding: frames that all show the same stars have no part that changes.
+        if not rest > _ROUNDING_ARCSEC:
             return f"Across the boresight the calibration is a common rotation of {significant(float(common))} arcsec."
         words = f"{significant(float(np.hypot(common, rest)))} arcsec per axis across the boresight"
         ratio = float(common / rest)

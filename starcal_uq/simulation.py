@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 # Attitudes drawn at once; also how many are tried before a camera is declared too narrow for its catalogue.
 _BATCH = 256
 _MAX_TRIES_PER_FRAME = 2000
+# More attitudes than this take minutes: refused as soon as the first tries say that so many would be needed.
+_MAX_TRIES = 500_000
 # Stars nearer to the edge than this many sigma are left out, so that noise does not decide which stars are seen.
 EDGE_SIGMAS = 6.0
 
@@ -180,7 +182,8 @@ def choose_attitudes(
         frames += [views[number] for number in enough]
         chosen.append(rotations[enough])
         tries += _BATCH
-        if tries > _MAX_TRIES_PER_FRAME * (len(frames) + 1):
+        hopeless = tries >= _MAX_TRIES_PER_FRAME and n_frames * tries > _MAX_TRIES * (len(frames) + 1)
+        if hopeless or tries > _MAX_TRIES_PER_FRAME * (len(frames) + 1):
             raise CatalogueError(
                 f"only {len(frames)} of {tries} random attitudes show {min_stars} stars of the catalogue: "
                 "raise max_mag, or lower min_stars."

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 _KIND = "starcal_uq error spectrum 1"
 _AVERAGES = 60
+# Smaller is rounding.
+_ROUNDING_ARCSEC = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,8 +140,8 @@ class ErrorSpectrum:
         """The spectrum in words."""
         rest, tau, nyquist = self.rest_arcsec, self.correlation_time_s, float(self.frequency_hz[-1])
         share = self.share_below(0.1 * nyquist)
-        if not np.all(rest > 0.0):
-            return "The calibration has no frame-dependent part along this profile."
+        if not np.all(rest > _ROUNDING_ARCSEC):
+            return "The calibration has no frame-dependent part along this profile: its frames all show the same stars."
         words = (
             f"Along {self.frames}, the frame-dependent part of the calibration error is {_listed(rest)} arcsec "
             f"({', '.join(AXES)}), beside {_listed(self.nea_arcsec)} arcsec of centroid noise in each frame. It keeps "
@@ -147,7 +149,7 @@ class ErrorSpectrum:
             f"below a tenth of the highest frequency ({significant(0.1 * nyquist)} Hz). {self._averaging_words()}"
         )
         if self.gap_share > 0.0:
-            words += f" {percent(self.gap_share)} of the instants show too few stars and were interpolated."
+            words += f" {percent(self.gap_share)} of the instants have no frame and were interpolated."
         return words
 
     def _averaging_words(self) -> str:

@@ -172,7 +172,11 @@ def test_times_that_are_no_series_are_refused() -> None:
         (obs, np.arange(601.0)[::-1], "increase from frame to frame"),
         (obs, uneven, "not evenly spaced in time: interpolate the profile"),
         (obs.select(obs.frame < 9), np.arange(9.0), "at least 16 frames, not 9"),
-        (sparse, sparse.frame_ids.astype(float), "show too few stars, more than a spectrum can bridge"),
+        (
+            sparse,
+            sparse.frame_ids.astype(float),
+            "evenly spaced instants have no frame, more than a spectrum can bridge",
+        ),
     ):
         with pytest.raises(AttitudeProfileError, match=message):
             error_spectrum(post, table, times)

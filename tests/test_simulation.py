@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from time import perf_counter
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -79,3 +81,14 @@ def test_impossible_requests_are_named():
         sc.simulate(stars, camera(), attitudes=np.eye(3)[None], min_stars=12)
     with pytest.raises(ValueError, match="at least 3 stars"):
         sc.simulate(stars, camera(), min_stars=2)
+
+
+def test_a_field_that_hardly_ever_shows_enough_stars_is_refused_at_once() -> None:
+    stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
+    # About one attitude in some hundred: each by itself is found, but a thousand would take minutes.
+    narrow = sc.paper_camera().replace(focal_mm=350.0)
+    clock = perf_counter()
+    with pytest.raises(sc.CatalogueError, match="raise max_mag, or lower min_stars"):
+        sc.simulate(stars, narrow, n_frames=3000, min_stars=5, seed=1)
+    assert perf_counter() - clock < 20.0
+    assert sc.simulate(stars, narrow, n_frames=3, min_stars=4, seed=1).n_frames == 3
