@@ -110,7 +110,7 @@ def plan(
     _check(n_frames, min_stars, target_arcsec, n_geometries, n_campaigns)
     if isinstance(sigma_px, (int, float)) and not 0.0 < sigma_px <= _WORST_NOISE_PX:
         raise PlanningError(
-            f"the centroid noise is {sigma_px:g} px: give a number above zero and up to {_WORST_NOISE_PX:g} px per axis."
+            f"the centroid noise is {sigma_px:g} px: give a number above zero, at most {_WORST_NOISE_PX:g} px per axis."
         )
     start = start_information(after, camera)
     limit = float(np.max(stars.mag, initial=-np.inf)) if max_mag is None else float(max_mag)
