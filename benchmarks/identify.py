@@ -21,11 +21,11 @@ from rich.console import Console
 from rich.table import Table
 
 import starcal_uq as sc
-from starcal_uq.attitude import random_rotations
-from starcal_uq.directions import unit_vectors
-from starcal_uq.identification import identify
-from starcal_uq.identification_engines import ENGINES
-from starcal_uq.simulation import Sky
+from starcal_uq.attitude.rotations import random_rotations
+from starcal_uq.identification.engine import identify
+from starcal_uq.identification.proposers import ENGINES
+from starcal_uq.simulation.frames import Sky
+from starcal_uq.sky.positions import unit_vectors
 
 SIZE_PX, SIGMA_PX, EPOCH = 1024, 0.3, 2026.0
 

@@ -20,14 +20,14 @@ from rich.console import Console
 from rich.table import Table
 
 import starcal_uq as sc
-from starcal_uq.estimation import calibrate
-from starcal_uq.frame_streams import stream_frames
-from starcal_uq.frames import StarFrames
-from starcal_uq.likelihood import MarginalLikelihood
-from starcal_uq.pair_innovations import frame_normals
-from starcal_uq.pairs import PairObjective
-from starcal_uq.projection import forward_kernel, forward_root
-from starcal_uq.recursion_options import RecursionOptions
+from starcal_uq.camera.projection import forward_kernel, forward_root
+from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.pairs import PairObjective
+from starcal_uq.estimation.recursive.innovations import frame_normals
+from starcal_uq.estimation.recursive.recursion_options import RecursionOptions
+from starcal_uq.observations.frames import StarFrames
+from starcal_uq.observations.streams import stream_frames
 
 
 def seconds(run: Callable[[], object], repeats: int) -> float:
@@ -48,7 +48,7 @@ def explicit_pairs(obs: sc.Observations) -> np.ndarray:
     """
     from scipy.optimize import least_squares
 
-    from starcal_uq.stages import distortion_stage
+    from starcal_uq.estimation.stages import distortion_stage
 
     frames, start = StarFrames.from_observations(obs), sc.paper_start()
     theta = np.array(start.theta)
@@ -150,7 +150,7 @@ def quest_rates(obs: sc.Observations) -> tuple[float, float]:
     """12-star attitudes per second: batch QUEST, and SciPy's align_vectors called per frame."""
     from scipy.spatial.transform import Rotation
 
-    from starcal_uq.attitude import random_rotations
+    from starcal_uq.attitude.rotations import random_rotations
 
     rng = np.random.default_rng(0)
     k, m = 4000, 12
@@ -268,7 +268,7 @@ def main() -> None:
 
 def _three_stages(obs: sc.Observations) -> tuple[np.ndarray, np.ndarray]:
     """The paper's three stages and their sandwich covariance, without the refinement."""
-    from starcal_uq.stages import distortion_stage, joint_stage, optics_stage
+    from starcal_uq.estimation.stages import distortion_stage, joint_stage, optics_stage
 
     frames, start = StarFrames.from_observations(obs), sc.paper_start()
     optics = optics_stage(frames, start, "lm", 200)

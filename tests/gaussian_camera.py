@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from starcal_uq.camera import Camera
-from starcal_uq.importance import scaled_inverse
-from starcal_uq.status import Status
+from starcal_uq.camera.camera import Camera
+from starcal_uq.core.status import Status
+from starcal_uq.inference.target import scaled_inverse
 
 SD = np.array([0.15, 0.15, 0.028, 0.39e-10, 0.073e-15])
 CORRELATION = np.eye(5)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 import starcal_uq as sc
-from starcal_uq.apparent import apparent_directions
-from starcal_uq.centroids import Centroids
-from starcal_uq.directions import ra_dec_deg
-from starcal_uq.ground_sky import site_among_stars
-from starcal_uq.observations import Observations
-from starcal_uq.projection import project
-from starcal_uq.site import Site
+from starcal_uq.camera.projection import project
+from starcal_uq.images.centroids import Centroids
+from starcal_uq.observations.table import Observations
+from starcal_uq.sky.apparent import apparent_directions
+from starcal_uq.sky.positions import ra_dec_deg
+from starcal_uq.sky.refraction import site_among_stars
+from starcal_uq.sky.site import Site
 
 SITE = Site(latitude_deg=-24.6, longitude_deg=-70.4, height_m=2635.0, pressure_hpa=743.0, temperature_c=12.0)
 CAMERA = sc.Camera(1024, 768, 6.9, 35.3, 517.0, 390.0, "brown", (3e-9, 1e-15))

@@ -6,10 +6,10 @@ from functools import lru_cache
 
 import numpy as np
 
-from starcal_uq.camera import Camera
-from starcal_uq.catalogue import load_catalogue
-from starcal_uq.observations import Observations
-from starcal_uq.simulation import paper_camera, simulate
+from starcal_uq.camera.camera import Camera
+from starcal_uq.observations.table import Observations
+from starcal_uq.simulation.frames import paper_camera, simulate
+from starcal_uq.sky.catalogue import load_catalogue
 
 COEFFICIENTS: dict[str, tuple[float, ...]] = {
     "none": (),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from starcal_uq import arviz_compat
+from starcal_uq.inference import arviz as arviz_compat
 
 
 @pytest.mark.parametrize("k", [0.3, 0.9])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from starcal_uq import attitude
+from starcal_uq.attitude import rotations as attitude
 
 Rotation = pytest.importorskip("scipy.spatial.transform").Rotation
 

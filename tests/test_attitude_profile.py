@@ -8,13 +8,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from starcal_uq.attitude import left_error, quaternion_to_rotation
-from starcal_uq.attitude_profile import AttitudeProfile, load_attitude_profile
-from starcal_uq.catalogue import load_catalogue
-from starcal_uq.errors import AttitudeProfileError, CatalogueError, ObservationError
-from starcal_uq.mission_geometry import mission_frames, profile_frames
-from starcal_uq.projection import project
-from starcal_uq.wahba import quest
+from starcal_uq.attitude.profile import AttitudeProfile, load_attitude_profile
+from starcal_uq.attitude.rotations import left_error, quaternion_to_rotation
+from starcal_uq.attitude.wahba import quest
+from starcal_uq.camera.projection import project
+from starcal_uq.core.errors import AttitudeProfileError, CatalogueError, ObservationError
+from starcal_uq.simulation.mission import mission_frames, profile_frames
+from starcal_uq.sky.catalogue import load_catalogue
 from tests.scenes import camera, observations, with_sigmas
 
 Rotation = pytest.importorskip("scipy.spatial.transform").Rotation
@@ -234,7 +234,7 @@ def test_random_frames_repeat_and_are_free_of_noise() -> None:
     one, again, other = (mission_frames(stars, camera(), n_frames=30, min_stars=7, seed=s) for s in (1, 1, 2))
     assert one.data_hash == again.data_hash != other.data_hash
     assert np.diff(one.frame_starts).min() >= 7
-    from starcal_uq.projection import unproject
+    from starcal_uq.camera.projection import unproject
 
     sigma = np.radians(1e-6 / 3600.0)
     found = quest(unproject(camera(), one.xy), one.directions_icrs, one.frame_starts, sigma_rad=sigma)

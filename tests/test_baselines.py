@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.distortion import model_names
-from starcal_uq.errors import CalibrationError
-from starcal_uq.estimation import METHODS
-from starcal_uq.recursion_options import RecursionOptions
-from starcal_uq.recursive_calibration import RecursiveCalibration
-from starcal_uq.status import Status
+from starcal_uq.camera.distortion import model_names
+from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.status import Status
+from starcal_uq.estimation.calibrate import METHODS
+from starcal_uq.estimation.recursive.recursion_options import RecursionOptions
+from starcal_uq.estimation.recursive.stream import RecursiveCalibration
 from tests.scenes import camera, nominal, observations, with_sigmas
 
 ALL = RecursionOptions(parameters="all")

@@ -15,19 +15,19 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.attitude_error import AttitudeError
-from starcal_uq.budget_csv import read_csv
-from starcal_uq.budget_file import load_budget_file
-from starcal_uq.budget_output import tex
-from starcal_uq.budget_posterior import inflation
-from starcal_uq.budget_result import Budget
-from starcal_uq.budget_rows import AXES, COMMON, FROM_FILE, GAUSSIAN_997, INTERACTION, NEA, REST, TOTAL_AXES
-from starcal_uq.budget_shapes import one_axis_factor
-from starcal_uq.budgeting import budget, budget_run
-from starcal_uq.diagnosis import diagnose_run
-from starcal_uq.errors import BudgetError, RunFolderError
-from starcal_uq.misfit import Misfit, MisfitTest
-from starcal_uq.reporting.budget_tables import budget_context
+from starcal_uq.budgeting.budget import budget, budget_run
+from starcal_uq.budgeting.budget_csv import read_csv
+from starcal_uq.budgeting.file import load_budget_file
+from starcal_uq.budgeting.posterior import inflation
+from starcal_uq.budgeting.result import Budget
+from starcal_uq.budgeting.rows import AXES, COMMON, FROM_FILE, GAUSSIAN_997, INTERACTION, NEA, REST, TOTAL_AXES
+from starcal_uq.budgeting.shapes import one_axis_factor
+from starcal_uq.core.errors import BudgetError, RunFolderError
+from starcal_uq.diagnostics.diagnose import diagnose_run
+from starcal_uq.diagnostics.misfit import Misfit, MisfitTest
+from starcal_uq.presentation.pages.budget_tables_part import budget_context
+from starcal_uq.presentation.pages.budgeting import tex
+from starcal_uq.propagation.attitude_error import AttitudeError
 from tests.scenes import observations
 
 FILE = """

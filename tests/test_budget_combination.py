@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from starcal_uq.budget_combination import Total, draw, grouped_sigma, total
-from starcal_uq.budget_rows import DISTRIBUTIONS, GAUSSIAN_997, Contributor, confidence_text
-from starcal_uq.budget_shapes import (
+from starcal_uq.budgeting.rows import DISTRIBUTIONS, GAUSSIAN_997, Contributor, confidence_text
+from starcal_uq.budgeting.shapes import (
     deviates,
     half_width,
     mixture_spread,
     one_axis_factor,
     two_axis_radius,
 )
+from starcal_uq.budgeting.totals import Total, draw, grouped_sigma, total
 
 
 def row(name: str, sigma: float, axis: str = "pitch", **changes: object) -> Contributor:

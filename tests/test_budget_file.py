@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from starcal_uq.budget_file import load_budget_file
-from starcal_uq.budget_rows import AXES, FROM_FILE, Contributor, not_assessed
-from starcal_uq.budget_template import template_text, write_budget_template
-from starcal_uq.errors import BudgetError, RunFolderError
+from starcal_uq.budgeting.budget_template import template_text, write_budget_template
+from starcal_uq.budgeting.file import load_budget_file
+from starcal_uq.budgeting.rows import AXES, FROM_FILE, Contributor, not_assessed
+from starcal_uq.core.errors import BudgetError, RunFolderError
 
 ROW = """
 [[contributor]]
@@ -240,7 +240,7 @@ def test_the_documented_example_loads(root: Path, tmp_path: Path) -> None:
 
 
 def test_the_documented_keys_are_all_there_are(root: Path) -> None:
-    from starcal_uq.budget_file import _CONTRIBUTOR_KEYS, _REQUIREMENT_KEYS
+    from starcal_uq.budgeting.file import _CONTRIBUTOR_KEYS, _REQUIREMENT_KEYS
 
     page = (root / "docs" / "how-to" / "budget.md").read_text(encoding="utf-8")
     for heading, keys in (("Keys of a contributor", _CONTRIBUTOR_KEYS), ("Keys of a requirement", _REQUIREMENT_KEYS)):

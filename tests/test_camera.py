@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from starcal_uq.camera import Camera
-from starcal_uq.distortion import get_model, model_names
-from starcal_uq.errors import CameraError, RunFolderError
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import get_model, model_names
+from starcal_uq.core.errors import CameraError, RunFolderError
 
 PAPER = Camera(1024, 1024, 12.0, 70.2262, 500.0, 530.0, "brown", (2.0e-10, -3.5e-15))
 TABLE = {

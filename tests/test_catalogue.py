@@ -11,15 +11,15 @@ import erfa
 import numpy as np
 import pytest
 
-from starcal_uq.catalogue import StarCatalogue, load_catalogue
-from starcal_uq.directions import ra_dec_deg, unit_vectors
-from starcal_uq.errors import CatalogueError
-from starcal_uq.gaia_records import completed_proper_motion, holds_proper_motion, read_gaia_records
-from starcal_uq.proper_motion import propagate_proper_motion
+from starcal_uq.core.errors import CatalogueError
+from starcal_uq.sky.catalogue import StarCatalogue, load_catalogue
+from starcal_uq.sky.gaia import completed_proper_motion, holds_proper_motion, read_gaia_records
+from starcal_uq.sky.positions import ra_dec_deg, unit_vectors
+from starcal_uq.sky.proper_motion import propagate_proper_motion
 
 REFERENCE = Path(__file__).resolve().parents[2] / "shared" / "data" / "bright_star_pm.csv"
 OBSERVED = REFERENCE.with_name("esa_tetra3_observations.csv")
-TABLE = Path(__file__).resolve().parents[1] / "starcal_uq" / "data" / "bright_star_pm.csv"
+TABLE = Path(__file__).resolve().parents[1] / "starcal_uq" / "sky" / "data" / "bright_star_pm.csv"
 MAS = np.pi / (180.0 * 3600.0 * 1000.0)
 
 

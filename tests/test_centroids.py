@@ -13,12 +13,12 @@ from astropy.io import fits
 from scipy.spatial import cKDTree
 from scipy.special import erf
 
-from starcal_uq.camera import Camera
-from starcal_uq.centroiding import extract_centroids
-from starcal_uq.centroids import COLUMNS, FRAME_COLUMNS, Centroids
-from starcal_uq.errors import ImageError, ObservationError, RunFolderError
-from starcal_uq.identification_result import FrameIdentification, Identification
-from starcal_uq.image_files import Image, read_image
+from starcal_uq.camera.camera import Camera
+from starcal_uq.core.errors import ImageError, ObservationError, RunFolderError
+from starcal_uq.identification.result import FrameIdentification, Identification
+from starcal_uq.images.centroids import COLUMNS, FRAME_COLUMNS, Centroids
+from starcal_uq.images.extract import extract_centroids
+from starcal_uq.images.image import Image, read_image
 
 BACKGROUND_E, READ_NOISE_E = 50.0, 5.0
 

@@ -12,11 +12,12 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
-from starcal_uq import photon_transfer, psf_measurement, windowed_centroids
-from starcal_uq.centroiding import extract_centroids
-from starcal_uq.image_files import Image
-from starcal_uq.photon_transfer import counts_per_electron
-from starcal_uq.pixel_phase import phase_error, without_phase_error
+from starcal_uq.images import photon_transfer, windowed_centroids
+from starcal_uq.images import psf as psf_measurement
+from starcal_uq.images.extract import extract_centroids
+from starcal_uq.images.image import Image
+from starcal_uq.images.photon_transfer import counts_per_electron
+from starcal_uq.images.pixel_phase import phase_error, without_phase_error
 
 BACKGROUND_E, READ_NOISE_E, HALF, SUB = 50.0, 5.0, 12, 11
 STEPS = np.arange(-HALF, HALF + 1)

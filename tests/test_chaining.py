@@ -10,18 +10,18 @@ import pytest
 import scenes
 from scipy import stats
 
-from starcal_uq.calibration import Calibration
-from starcal_uq.camera import Camera
-from starcal_uq.catalogue import load_catalogue
-from starcal_uq.chaining import AllowedShift, check_chain, load_priors, prior_from, shift_test
-from starcal_uq.errors import PriorError
-from starcal_uq.estimation import calibrate
-from starcal_uq.gaussian_priors import GaussianPriors
-from starcal_uq.merging import merge
-from starcal_uq.posterior import Posterior
-from starcal_uq.priors import Priors
-from starcal_uq.sampler import sample
-from starcal_uq.simulation import simulate
+from starcal_uq.camera.camera import Camera
+from starcal_uq.core.errors import PriorError
+from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.merging import merge
+from starcal_uq.inference.gaussian_priors import GaussianPriors
+from starcal_uq.inference.posterior import Posterior
+from starcal_uq.inference.priors import Priors
+from starcal_uq.inference.sample import sample
+from starcal_uq.inference.update import AllowedShift, check_chain, load_priors, prior_from, shift_test
+from starcal_uq.simulation.frames import simulate
+from starcal_uq.sky.catalogue import load_catalogue
 
 NOMINAL = scenes.nominal(scenes.camera())
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.cli import main
+from starcal_uq.cli.app import main
 from tests.scenes import observations
 
 SMALL = ["--walkers", "32", "--steps", "80"]

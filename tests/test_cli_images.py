@@ -11,9 +11,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 import starcal_uq as sc
-from starcal_uq.bootstrapping import bootstrap
-from starcal_uq.double_stars import disturbed_stars, without_disturbed
-from starcal_uq.image_steps import counted, epoch_of
+from starcal_uq.pipeline.images import counted, epoch_of
+from starcal_uq.pipeline.refine import bootstrap
+from starcal_uq.sky.neighbours import disturbed_stars, without_disturbed
 from tests.test_cli import cli, inputs
 
 __all__ = ["cli", "inputs"]
@@ -79,7 +79,7 @@ def test_options_of_the_other_kind_are_refused(cli, frames, tmp_path):
 
 
 def test_identify_refuses_the_calibration_of_another_sensor(cli, frames, tmp_path):
-    from starcal_uq.steps import calibrate_step
+    from starcal_uq.runs.steps import calibrate_step
 
     obs = sc.simulate(sc.load_catalogue(max_mag=6.0, epoch=2026.9), sc.paper_camera(), n_frames=20, seed=1)
     calibrate_step(sc.RunFolder(tmp_path / "run"), obs, sc.paper_start(), force=True)
@@ -94,7 +94,7 @@ def test_too_few_stars_say_what_was_identified(cli, frames, tmp_path, monkeypatc
     def stuck(*_arguments, **_options):
         raise sc.CalibrationError("it went nowhere.")
 
-    monkeypatch.setattr("starcal_uq.estimation.calibrate", stuck)
+    monkeypatch.setattr("starcal_uq.estimation.calibrate.calibrate", stuck)
     sc.paper_start().save(tmp_path / "camera.toml")
     status, _, err = cli("run", frames, "camera.toml", "-o", "run", "--max-mag", 6, "--in-space")
     assert status == 2

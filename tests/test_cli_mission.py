@@ -31,7 +31,7 @@ limit_arcsec = 1000.0
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with everything but the questions to the model, which take long."""
-    from starcal_uq.steps import calibrate_step, propagate_step, sample_step
+    from starcal_uq.runs.steps import calibrate_step, propagate_step, sample_step
 
     run = sc.RunFolder(tmp_path_factory.mktemp("mission") / "run")
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)

@@ -13,19 +13,19 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
-from starcal_uq.attitude import exp_rotation
-from starcal_uq.calibration import Calibration
-from starcal_uq.comparing import compare, compare_halves
-from starcal_uq.comparison_result import FILES, CameraComparison
-from starcal_uq.difference_covariance import difference_rule
-from starcal_uq.errors import CalibrationError, ComparisonError, DistortionError, RunFolderError
-from starcal_uq.estimation import calibrate
-from starcal_uq.frame_splits import shared_frames, split_frames
-from starcal_uq.gaussian_priors import GaussianPriors
-from starcal_uq.projection import unproject
-from starcal_uq.run_comparison import compare_runs, compare_split
-from starcal_uq.runfolder import RunFolder
-from starcal_uq.status import Status
+from starcal_uq.attitude.rotations import exp_rotation
+from starcal_uq.camera.projection import unproject
+from starcal_uq.comparison.compare import compare, compare_halves
+from starcal_uq.comparison.covariance import difference_rule
+from starcal_uq.comparison.result import FILES, CameraComparison
+from starcal_uq.core.errors import CalibrationError, ComparisonError, DistortionError, RunFolderError
+from starcal_uq.core.status import Status
+from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.inference.gaussian_priors import GaussianPriors
+from starcal_uq.observations.splits import shared_frames, split_frames
+from starcal_uq.runs.compare import compare_runs, compare_split
+from starcal_uq.runs.folder import RunFolder
 from tests.gaussian_camera import COVARIANCE
 from tests.scenes import camera, nominal, observations
 
@@ -460,7 +460,7 @@ def test_posteriors_are_compared_by_their_means() -> None:
 
 
 def test_tables_of_false_alarms_and_power(capsys: pytest.CaptureFixture[str]) -> None:
-    from starcal_uq.comparison_power import main
+    from benchmarks.comparison_power import main
 
     main(["--replicates", "2", "--power", "1", "--frames", "25"])
     lines = capsys.readouterr().out.splitlines()
@@ -477,8 +477,8 @@ def test_tables_of_false_alarms_and_power(capsys: pytest.CaptureFixture[str]) ->
 @pytest.mark.slow
 def test_p_values_of_whole_campaigns_are_uniform() -> None:
     """200 pairs of simulated and calibrated campaigns; and a richer model on the same data."""
-    from starcal_uq.catalogue import load_catalogue
-    from starcal_uq.simulation import simulate
+    from starcal_uq.simulation.frames import simulate
+    from starcal_uq.sky.catalogue import load_catalogue
 
     stars, truth = load_catalogue(max_mag=6.0, epoch=2026.9), camera("brown")
     start, richer = nominal(truth), nominal(truth).replace(distortion="brown3", coefficients=(0.0, 0.0, 0.0))

@@ -51,8 +51,8 @@ def test_principal_point_and_boresight_are_one_near_gauge(found):
 
 def test_common_rotation_is_what_a_wrong_principal_point_does():
     """The analytic response against attitudes solved again with a shifted principal point."""
-    from starcal_uq.attitude import quaternion_to_rotation, rotation_vector
-    from starcal_uq.likelihood import MarginalLikelihood
+    from starcal_uq.attitude.rotations import quaternion_to_rotation, rotation_vector
+    from starcal_uq.estimation.marginal import MarginalLikelihood
 
     obs = observations(n_frames=40)
     cal = sc.calibrate(obs, sc.paper_start())

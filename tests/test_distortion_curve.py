@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from starcal_uq.distortion_bands import DistortionCurve, distortion_curve
-from starcal_uq.errors import DistortionError
+from starcal_uq.core.errors import DistortionError
+from starcal_uq.propagation.distortion import DistortionCurve, distortion_curve
 from tests.gaussian_camera import COVARIANCE
 from tests.scenes import camera, observations
 

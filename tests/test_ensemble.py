@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from starcal_uq import arviz_compat
-from starcal_uq.ensemble import EnsembleSettings, make_moves, run_ensembles, student_t_proposal
-from starcal_uq.posterior_checks import chain_order, step_order
+from starcal_uq.inference import arviz as arviz_compat
+from starcal_uq.inference.checks import chain_order, step_order
+from starcal_uq.inference.ensemble import EnsembleSettings, make_moves, run_ensembles, student_t_proposal
 
 
 def _variance_z(moves: list[tuple[Any, float]] | None) -> float:

@@ -9,17 +9,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from starcal_uq.attitude import left_error
-from starcal_uq.catalogue import load_catalogue
-from starcal_uq.errors import AttitudeProfileError, RunFolderError, SamplingError
-from starcal_uq.estimation import calibrate
-from starcal_uq.mission_geometry import profile_frames
-from starcal_uq.observations import Observations
-from starcal_uq.projection import unproject_theta
-from starcal_uq.propagation import propagate
-from starcal_uq.slew_spectrum import error_spectrum
-from starcal_uq.spectrum_result import ErrorSpectrum
-from starcal_uq.wahba import quest
+from starcal_uq.attitude.rotations import left_error
+from starcal_uq.attitude.wahba import quest
+from starcal_uq.camera.projection import unproject_theta
+from starcal_uq.core.errors import AttitudeProfileError, RunFolderError, SamplingError
+from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.observations.table import Observations
+from starcal_uq.propagation.propagate import propagate
+from starcal_uq.propagation.spectrum import error_spectrum
+from starcal_uq.propagation.spectrum_result import ErrorSpectrum
+from starcal_uq.simulation.mission import profile_frames
+from starcal_uq.sky.catalogue import load_catalogue
 from tests.scenes import camera, nominal, observations
 from tests.test_attitude_profile import slew
 from tests.test_propagation import gaussian_posterior

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.distortion import model_names
-from starcal_uq.errors import CalibrationError, RunFolderError
-from starcal_uq.status import Status
+from starcal_uq.camera.distortion import model_names
+from starcal_uq.core.errors import CalibrationError, RunFolderError
+from starcal_uq.core.status import Status
 from tests.scenes import camera, nominal, observations, with_sigmas
 
 
@@ -61,7 +61,7 @@ def test_distortion_ignored_moves_the_focal_length_below_the_truth():
 def test_residuals_and_attitudes_are_those_of_the_estimate():
     obs = observations()
     cal = sc.calibrate(obs, sc.paper_start())
-    from starcal_uq.attitude import quaternion_to_rotation
+    from starcal_uq.attitude.rotations import quaternion_to_rotation
 
     rotations = np.repeat(quaternion_to_rotation(cal.quaternions), obs.stars_per_frame, axis=0)
     b = np.einsum("nij,nj->ni", rotations, obs.directions_icrs)
@@ -167,9 +167,9 @@ def test_shuffled_identifications_are_not_called_a_calibration():
 
 def test_ipopt_keeps_the_principal_point_on_the_detector():
     """A handful of stars lets the optics run away; IPOPT's constraints hold."""
-    from starcal_uq.frames import StarFrames
-    from starcal_uq.pairs import PairObjective
-    from starcal_uq.stages import constraints_for, joint_stage
+    from starcal_uq.estimation.pairs import PairObjective
+    from starcal_uq.estimation.stages import constraints_for, joint_stage
+    from starcal_uq.observations.frames import StarFrames
 
     obs = observations(n_frames=60, sigma_px=3.0)
     few = obs.select_frames(obs.frame_ids[:3])

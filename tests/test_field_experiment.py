@@ -10,13 +10,13 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from starcal_uq.attitude import exp_rotation, random_rotations, rotation_to_quaternion
-from starcal_uq.errors import CalibrationError, RunFolderError
-from starcal_uq.projection import fold_radius_px, project, unproject
-from starcal_uq.reproduction.field_attitudes import FieldStars, attitude_errors, single_faults
-from starcal_uq.reproduction.field_command import field_experiment
-from starcal_uq.reproduction.field_identification import true_pixels
-from starcal_uq.reproduction.field_published import (
+from starcal_uq.attitude.rotations import exp_rotation, random_rotations, rotation_to_quaternion
+from starcal_uq.camera.projection import fold_radius_px, project, unproject
+from starcal_uq.core.errors import CalibrationError, RunFolderError
+from starcal_uq.paper.field.attitudes import FieldStars, attitude_errors, single_faults
+from starcal_uq.paper.field.experiment import field_experiment
+from starcal_uq.paper.field.identification import true_pixels
+from starcal_uq.paper.field.published import (
     AXES,
     FIELD_CAMERAS,
     FIELD_DEG,
@@ -30,7 +30,7 @@ from starcal_uq.reproduction.field_published import (
     Y0_PX,
     printed_field,
 )
-from starcal_uq.reproduction.field_result import ALIGNED, AS_IT_STANDS, BOTH, NEITHER
+from starcal_uq.paper.field.result import ALIGNED, AS_IT_STANDS, BOTH, NEITHER
 
 ARCSEC = np.degrees(1.0) * 3600.0
 

@@ -10,10 +10,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from starcal_uq.errors import DistortionError, RunFolderError
-from starcal_uq.fieldmap import FieldMap, field_map
-from starcal_uq.projection import unproject_theta
-from starcal_uq.wahba import quest
+from starcal_uq.attitude.wahba import quest
+from starcal_uq.camera.projection import unproject_theta
+from starcal_uq.core.errors import DistortionError, RunFolderError
+from starcal_uq.propagation.field import FieldMap, field_map
 from tests.gaussian_camera import COVARIANCE
 from tests.scenes import camera, observations
 

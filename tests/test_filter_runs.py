@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 
 import starcal_uq as sc
-from starcal_uq import filter_runs
-from starcal_uq.filter_runs import HISTORY, STATE, filter_run
-from starcal_uq.steps import coupling_step, propagate_step, sample_step
+from starcal_uq.runs import streams as filter_runs
+from starcal_uq.runs.steps import coupling_step, propagate_step, sample_step
+from starcal_uq.runs.streams import HISTORY, STATE, filter_run
 from tests.scenes import camera, nominal, observations
 
 ALL = sc.RecursionOptions(parameters="all")

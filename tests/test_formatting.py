@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from starcal_uq.formatting import (
+from starcal_uq.core.formatting import (
     count,
     decimals_for,
     fixed,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.errors import ObservationError
-from starcal_uq.frame_streams import stream_frames
+from starcal_uq.core.errors import ObservationError
+from starcal_uq.observations.streams import stream_frames
 from tests.scenes import camera, observations, with_sigmas
 
 COLUMNS = ("frame", "x_px", "y_px", "ra_deg", "dec_deg", "sigma_px")

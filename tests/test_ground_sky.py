@@ -13,7 +13,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import starcal_uq as sc
-from starcal_uq.apparent import (
+from starcal_uq.core.errors import ObservationError, SiteError
+from starcal_uq.core.times import utc_text
+from starcal_uq.diagnostics.verdict.air import corrected_words
+from starcal_uq.images.image import read_image, time_in_name
+from starcal_uq.pipeline.displacement import as_measured, mirrored, undisplaced
+from starcal_uq.pipeline.images import observations_from_images, with_time
+from starcal_uq.pipeline.refine import bootstrap
+from starcal_uq.sky.apparent import (
     aberrate,
     apparent_directions,
     catalogue_directions,
@@ -21,16 +28,9 @@ from starcal_uq.apparent import (
     make_apparent,
     without_low_stars,
 )
-from starcal_uq.bootstrapping import bootstrap
-from starcal_uq.directions import unit_vectors
-from starcal_uq.errors import ObservationError, SiteError
-from starcal_uq.ground_sky import altitude_deg, refract, refraction_constants, shrinking, site_among_stars
-from starcal_uq.image_files import read_image, time_in_name
-from starcal_uq.image_steps import observations_from_images, with_time
-from starcal_uq.site import Site
-from starcal_uq.sky_displacement import as_measured, mirrored, undisplaced
-from starcal_uq.utc_times import utc_text
-from starcal_uq.verdict import corrected_words
+from starcal_uq.sky.positions import unit_vectors
+from starcal_uq.sky.refraction import altitude_deg, refract, refraction_constants, shrinking, site_among_stars
+from starcal_uq.sky.site import Site
 from tests.ground_scenes import CAMERA, NOMINAL, SITE, as_centroids, ground_frames, night
 
 TIME = "2019-07-29T20:47:26"
@@ -425,9 +425,9 @@ def test_night_is_night():
 
 
 def _first_paragraph(obs, **meta):
-    from starcal_uq.reporting.loading import Results
-    from starcal_uq.reporting.words import data_sentence
-    from starcal_uq.verdict import judge
+    from starcal_uq.diagnostics.verdict.judge import judge
+    from starcal_uq.presentation.report.words import data_sentence
+    from starcal_uq.runs.run import Results
 
     obs = obs.with_meta(**meta)
     cal = sc.calibrate(obs, NOMINAL)

@@ -14,18 +14,18 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq import matching
-from starcal_uq.attitude import quaternion_to_rotation, random_rotations
-from starcal_uq.centroiding import extract_centroids
-from starcal_uq.directions import ra_dec_deg, unit_vectors
-from starcal_uq.errors import IdentificationError
-from starcal_uq.identification import calibrated_tolerance, identify
-from starcal_uq.identification_engines import ENGINES
-from starcal_uq.projection import unproject
-from starcal_uq.pyramid import CameraTolerance, first_order, mortari_order, remaining_order
-from starcal_uq.simulation import Sky
-from starcal_uq.star_brightness import instrumental_mag, unlike_brightness
-from starcal_uq.star_pairs import angle_between, cached_star_pairs, default_cache_dir, find_star_pairs
+from starcal_uq.attitude.rotations import quaternion_to_rotation, random_rotations
+from starcal_uq.camera.projection import unproject
+from starcal_uq.core.errors import IdentificationError
+from starcal_uq.identification import match as matching
+from starcal_uq.identification.brightness import instrumental_mag, unlike_brightness
+from starcal_uq.identification.engine import calibrated_tolerance, identify
+from starcal_uq.identification.pairs import angle_between, cached_star_pairs, default_cache_dir, find_star_pairs
+from starcal_uq.identification.proposers import ENGINES
+from starcal_uq.identification.pyramid import CameraTolerance, first_order, mortari_order, remaining_order
+from starcal_uq.images.extract import extract_centroids
+from starcal_uq.simulation.frames import Sky
+from starcal_uq.sky.positions import ra_dec_deg, unit_vectors
 
 SIGMA = 0.3
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"

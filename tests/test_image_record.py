@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.image_record import ImageRecord, ImageRow, RoundRecord, identified_pairs
-from starcal_uq.reporting.image_tables import image_context
+from starcal_uq.pipeline.record import ImageRecord, ImageRow, RoundRecord, identified_pairs
+from starcal_uq.presentation.report.image_tables import image_context
 
 
 @pytest.fixture(scope="module")

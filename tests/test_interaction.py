@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.errors import RunFolderError, SamplingError
-from starcal_uq.recursion_options import RecursionOptions
-from starcal_uq.reproduction.interaction import estimates, interaction_study
-from starcal_uq.reproduction.interaction_points import Condition, deep_catalogue, solid_angle_sr, study_points
-from starcal_uq.reproduction.interaction_result import AXES, HANDLING, OPTICS, InteractionStudy, crossing
+from starcal_uq.core.errors import RunFolderError, SamplingError
+from starcal_uq.estimation.recursive.recursion_options import RecursionOptions
+from starcal_uq.paper.interaction import estimates, interaction_study
+from starcal_uq.paper.interaction_points import Condition, deep_catalogue, solid_angle_sr, study_points
+from starcal_uq.paper.interaction_result import AXES, HANDLING, OPTICS, InteractionStudy, crossing
 from tests.scenes import camera, observations
 
 SMALL = {
@@ -98,7 +98,7 @@ def test_each_axis_varies_what_it_says_and_nothing_else():
 
 def test_a_field_beyond_the_catalogue_says_so(monkeypatch):
     shallow = sc.load_catalogue(max_mag=6.0)
-    monkeypatch.setattr("starcal_uq.catalogue.load_catalogue", lambda max_mag: shallow)
+    monkeypatch.setattr("starcal_uq.sky.catalogue.load_catalogue", lambda max_mag: shallow)
     with pytest.raises(SamplingError, match="too few for a field of 5 deg"):
         deep_catalogue(sc.paper_camera(), 6.0, 6.0, (5.0,))
 
@@ -164,7 +164,7 @@ def test_interrupt_before_the_first_result_is_an_interrupt(monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("starcal_uq.reproduction.interaction.run_one", stop)
+    monkeypatch.setattr("starcal_uq.paper.interaction.run_one", stop)
     with pytest.raises(KeyboardInterrupt):
         interaction_study(workers=0, **SMALL)
 
@@ -175,7 +175,7 @@ def test_a_method_that_fails_is_counted(monkeypatch):
             raise sc.CalibrationError("the stars do not suffice: add some.")
         return sc.calibrate(obs, start, method=method, **options)
 
-    monkeypatch.setattr("starcal_uq.reproduction.interaction.calibrate", fail)
+    monkeypatch.setattr("starcal_uq.paper.interaction.calibrate", fail)
     settings = SMALL | {"frames": (), "max_mags": (), "fields_deg": (), "n_replicates": 2}
     found = interaction_study(workers=0, **settings)
     rows = found.table.set_index("method")

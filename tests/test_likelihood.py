@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from starcal_uq.attitude import exp_rotation
-from starcal_uq.compressed import CompressedLikelihood, compress
-from starcal_uq.distortion import model_names
-from starcal_uq.likelihood import MarginalLikelihood
-from starcal_uq.projection import project
+from starcal_uq.attitude.rotations import exp_rotation
+from starcal_uq.camera.distortion import model_names
+from starcal_uq.camera.projection import project
+from starcal_uq.estimation.compressed import CompressedLikelihood, compress
+from starcal_uq.estimation.marginal import MarginalLikelihood
 from tests.scenes import camera, observations, with_sigmas
 
 
@@ -70,7 +70,7 @@ def test_compressed_equals_exact_for_few_frames_and_stated_noise(n_frames):
 
 
 def _estimate(obs, model):
-    from starcal_uq.estimation import calibrate
+    from starcal_uq.estimation.calibrate import calibrate
     from tests.scenes import nominal
 
     return calibrate(obs, nominal(camera(model)))

@@ -11,20 +11,20 @@ import pytest
 import scenes
 from scipy import stats
 
-from starcal_uq.calibration import Calibration
-from starcal_uq.camera import Camera
-from starcal_uq.catalogue import load_catalogue
-from starcal_uq.consistency import Consistency, consistency_of
-from starcal_uq.couplings import coupling
-from starcal_uq.errors import CalibrationError, RunFolderError
-from starcal_uq.estimation import calibrate
-from starcal_uq.expansion import moved, optimum, scaled, total
-from starcal_uq.likelihood import MarginalLikelihood
-from starcal_uq.merging import data_hashes, merge
-from starcal_uq.observations import Observations, load_observations
-from starcal_uq.run_merging import join_observations, merge_runs
-from starcal_uq.sampler import sample
-from starcal_uq.simulation import simulate
+from starcal_uq.camera.camera import Camera
+from starcal_uq.core.errors import CalibrationError, RunFolderError
+from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.consistency import Consistency, consistency_of
+from starcal_uq.estimation.expansion import moved, optimum, scaled, total
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.merging import data_hashes, merge
+from starcal_uq.inference.sample import sample
+from starcal_uq.observations.table import Observations, load_observations
+from starcal_uq.propagation.coupling import coupling
+from starcal_uq.runs.merge import join_observations, merge_runs
+from starcal_uq.simulation.frames import simulate
+from starcal_uq.sky.catalogue import load_catalogue
 
 NOMINAL = scenes.nominal(scenes.camera())
 

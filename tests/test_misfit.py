@@ -10,11 +10,11 @@ import pytest
 from scipy import stats
 
 import starcal_uq as sc
-from starcal_uq.frames import StarFrames
-from starcal_uq.likelihood import MarginalLikelihood
-from starcal_uq.misfit import Misfit, holm, misfit_tests
-from starcal_uq.misfit_power import SCENARIOS, main, power
-from starcal_uq.misfit_shapes import View, shapes
+from benchmarks.misfit_power import SCENARIOS, main, power
+from starcal_uq.diagnostics.misfit import Misfit, holm, misfit_tests
+from starcal_uq.diagnostics.shapes import View, shapes
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.observations.frames import StarFrames
 from tests.scenes import COEFFICIENTS, camera, nominal, observations, with_sigmas
 
 N_NULL = 100
@@ -194,7 +194,7 @@ def test_parts_of_the_table_give_the_same_sums(monkeypatch):
     obs = observations(n_frames=60)
     cal = sc.calibrate(obs, sc.paper_start())
     whole = misfit_tests(obs, cal)
-    monkeypatch.setattr("starcal_uq.misfit._STARS_AT_ONCE", 100)
+    monkeypatch.setattr("starcal_uq.diagnostics.misfit._STARS_AT_ONCE", 100)
     parts = misfit_tests(obs, cal)
     assert len(StarFrames.from_observations(obs).parts(100)) > 5
     for a, b in zip(whole.tests, parts.tests, strict=True):

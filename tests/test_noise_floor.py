@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.frames import StarFrames
-from starcal_uq.noise_floor import LEAST_P_VALUE, noise_floor, settle_noise, with_noise_floor
-from starcal_uq.star_tests import star_residuals
+from starcal_uq.estimation.noise_floor import LEAST_P_VALUE, noise_floor, settle_noise, with_noise_floor
+from starcal_uq.estimation.screening.outliers import star_residuals
+from starcal_uq.observations.frames import StarFrames
 from tests.scenes import camera, nominal, observations
 
 

@@ -8,21 +8,21 @@ from typing import Any
 import numpy as np
 import pytest
 
-from starcal_uq import pair_likelihood as module
-from starcal_uq.catalogue import load_catalogue
-from starcal_uq.distortion import model_names
-from starcal_uq.errors import SamplingError
-from starcal_uq.estimation import calibrate
-from starcal_uq.frames import StarFrames
-from starcal_uq.importance import laplace_approximation, scaled_inverse, start_target
-from starcal_uq.likelihood import MarginalLikelihood
-from starcal_uq.likelihoods import NaivePairsWarning
-from starcal_uq.pair_likelihood import PairLikelihood, expected_godambe, pair_likelihood
-from starcal_uq.pairs import PairObjective
-from starcal_uq.priors import Priors
-from starcal_uq.projection import backward_kernel, backward_root, backward_second_kernel, project, second_index
-from starcal_uq.sampler import sample
-from starcal_uq.simulation import simulate
+from starcal_uq.camera.distortion import model_names
+from starcal_uq.camera.projection import backward_kernel, backward_root, backward_second_kernel, project, second_index
+from starcal_uq.core.errors import SamplingError
+from starcal_uq.estimation import composite as module
+from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.estimation.composite import PairLikelihood, expected_godambe, pair_likelihood
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.pairs import PairObjective
+from starcal_uq.inference.named import NaivePairsWarning
+from starcal_uq.inference.priors import Priors
+from starcal_uq.inference.sample import sample
+from starcal_uq.inference.target import laplace_approximation, scaled_inverse, start_target
+from starcal_uq.observations.frames import StarFrames
+from starcal_uq.simulation.frames import simulate
+from starcal_uq.sky.catalogue import load_catalogue
 from tests.scenes import camera, nominal, observations, with_sigmas
 
 QUICK: dict[str, Any] = {"n_ensembles": 2, "n_walkers": 32, "n_steps": 60, "n_burn": 10, "seed": 3}

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from starcal_uq.distortion import model_names
-from starcal_uq.frames import StarFrames
-from starcal_uq.pairs import PairObjective
+from starcal_uq.camera.distortion import model_names
+from starcal_uq.estimation.pairs import PairObjective
+from starcal_uq.observations.frames import StarFrames
 from tests.scenes import camera, observations
 
 

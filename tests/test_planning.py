@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.budget_shapes import two_axis_radius
-from starcal_uq.errors import PlanningError
-from starcal_uq.forecast import Forecaster, inverses, nea_arcsec, quantities, spreads, student_factor
-from starcal_uq.frame_choice import choose_frames
-from starcal_uq.frame_information import FrameSet, look_at, random_frames
-from starcal_uq.likelihood import MarginalLikelihood
-from starcal_uq.plan_check import ForecastCheck, check_forecast
-from starcal_uq.plan_result import Plan
-from starcal_uq.plan_words import frames as frames_words
-from starcal_uq.planning import plan
-from starcal_uq.two_axis import mixture_radius
+from starcal_uq.budgeting.shapes import two_axis_radius
+from starcal_uq.core.errors import PlanningError
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.maths.circular import mixture_radius
+from starcal_uq.planning.check import ForecastCheck, check_forecast
+from starcal_uq.planning.design import choose_frames
+from starcal_uq.planning.forecast import Forecaster, inverses, nea_arcsec, quantities, spreads, student_factor
+from starcal_uq.planning.information import FrameSet, look_at, random_frames
+from starcal_uq.planning.plan import plan
+from starcal_uq.planning.plan_result import Plan
+from starcal_uq.presentation.words.planning import frames as frames_words
 from tests.scenes import COEFFICIENTS, camera, observations
 
 ARCSEC = 648_000.0 / np.pi
@@ -95,7 +95,7 @@ def test_information_is_that_of_a_calibration(model):
 
 
 def _rotations(cal: sc.Calibration) -> np.ndarray:
-    from starcal_uq.attitude import quaternion_to_rotation
+    from starcal_uq.attitude.rotations import quaternion_to_rotation
 
     return quaternion_to_rotation(cal.quaternions)
 
@@ -114,7 +114,7 @@ def test_response_of_the_attitude_is_that_of_quest():
     step = np.array([0.5, 0.0, 0.2, 0.0, 0.0])
     b = sc.unproject(cam.with_theta(cam.theta + step), found.frames.pixel.T)
     turned = sc.quest(b, found.frames.r.T, found.frames.starts).rotations
-    from starcal_uq.attitude import rotation_vector
+    from starcal_uq.attitude.rotations import rotation_vector
 
     phi = rotation_vector(turned @ np.swapaxes(found.rotations, 1, 2))
     assert phi.mean(axis=0)[:2] == pytest.approx((found.common @ step)[:2], rel=0.01, abs=1e-7)

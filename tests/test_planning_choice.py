@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.attitude import quaternion_to_rotation, random_rotations
-from starcal_uq.errors import PlanningError
-from starcal_uq.frame_choice import choose_frames
-from starcal_uq.frame_choice_result import FrameChoice
+from starcal_uq.attitude.rotations import quaternion_to_rotation, random_rotations
+from starcal_uq.core.errors import PlanningError
+from starcal_uq.planning.design import choose_frames
+from starcal_uq.planning.frame_choice_result import FrameChoice
 from tests.scenes import camera, observations
 
 
@@ -58,8 +58,8 @@ def test_greedy_with_exchange_finds_the_best_of_all_sets():
     """Few enough candidates to try every set."""
     from itertools import combinations
 
-    from starcal_uq.forecast import inverses, quantities, spreads
-    from starcal_uq.frame_information import look_at, random_frames
+    from starcal_uq.planning.forecast import inverses, quantities, spreads
+    from starcal_uq.planning.information import look_at, random_frames
 
     rotations = random_rotations(16, np.random.default_rng(4))
     found = choose_frames(camera(), sky(), n_frames=4, candidates=rotations, min_stars=6, n_geometries=100)

@@ -11,11 +11,26 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq import plots
-from starcal_uq.distortion import parameters
-from starcal_uq.plots.corner import CONTOUR_MASSES, mass_levels
-from starcal_uq.plots.matrix import correlation_text
-from starcal_uq.plots.scales import axis_scale
+from starcal_uq.camera.distortion import parameters
+from starcal_uq.presentation.figures.coupling import (
+    correlation_text,
+    plot_correlation,
+    plot_correlations,
+    plot_couplings,
+)
+from starcal_uq.presentation.figures.estimation import plot_convergence
+from starcal_uq.presentation.figures.field_map import plot_field_map
+from starcal_uq.presentation.figures.inference import CONTOUR_MASSES, mass_levels, plot_corner
+from starcal_uq.presentation.figures.prior import plot_prior_posterior
+from starcal_uq.presentation.figures.propagation import plot_attitude
+from starcal_uq.presentation.figures.residuals import (
+    plot_residual_histogram,
+    plot_residual_map,
+    plot_residual_radius,
+    plot_residuals,
+)
+from starcal_uq.presentation.figures.scales import axis_scale
+from starcal_uq.presentation.figures.style import figure_of, png_bytes
 from tests.scenes import camera, nominal, observations
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -59,8 +74,8 @@ def errors():
 
 
 def drawn(result):
-    figure = plots.figure_of(result) if hasattr(result, "plot") else result
-    assert plots.png_bytes(figure, dpi=50).startswith(PNG)
+    figure = figure_of(result) if hasattr(result, "plot") else result
+    assert png_bytes(figure, dpi=50).startswith(PNG)
     return figure
 
 
@@ -82,7 +97,7 @@ def overlapping(figure):
 
 
 def test_corner_shows_every_sampled_parameter(run):
-    figure = drawn(plots.plot_corner(run.post, run.cal, run.truth))
+    figure = drawn(plot_corner(run.post, run.cal, run.truth))
     n = len(run.post.sampled)
     assert len(figure.axes) == n * (n + 1) // 2
     titles = [ax.get_title() for ax in figure.axes if ax.get_title()]
@@ -91,7 +106,7 @@ def test_corner_shows_every_sampled_parameter(run):
 
 
 def test_prior_and_posterior(run):
-    figure = drawn(plots.plot_prior_posterior(run.post, run.truth))
+    figure = drawn(plot_prior_posterior(run.post, run.truth))
     assert len(figure.axes) == 2 * len(run.post.sampled)
     assert overlapping(figure) == []
 
@@ -118,13 +133,13 @@ def test_axis_is_value_minus_the_printed_number():
 
 @pytest.mark.parametrize("extended", [False, True])
 def test_heat_map_prints_its_numbers(run, extended):
-    ax = plots.plot_correlation(run.coupling, extended=extended)
+    ax = plot_correlation(run.coupling, extended=extended)
     matrix = run.coupling.extended_correlation if extended else run.coupling.correlation
     texts = [text.get_text() for text in ax.texts]
     wanted = [correlation_text(v, i == j) for (i, j), v in np.ndenumerate(matrix)]
     assert texts == wanted
     drawn(ax)
-    drawn(plots.plot_correlations(run.coupling))
+    drawn(plot_correlations(run.coupling))
 
 
 def test_correlations_near_one_keep_their_digits():
@@ -140,14 +155,14 @@ def test_correlations_near_one_keep_their_digits():
 
 
 def test_price_of_coupling(run):
-    ax = plots.plot_couplings(run.coupling)
+    ax = plot_couplings(run.coupling)
     ratio = run.coupling.sigma_marginal / run.coupling.sigma_conditional
     assert [bar.get_width() for bar in ax.patches] == pytest.approx(ratio)
     drawn(ax)
 
 
 def test_convergence_draws_the_trajectories(run):
-    figure = drawn(plots.plot_convergence(run.cal, run.truth))
+    figure = drawn(plot_convergence(run.cal, run.truth))
     p = len(run.cal.parameter_names)
     assert len(figure.axes) == 2 * p
     trajectory = np.concatenate([stage.trajectory for stage in run.cal.stages])
@@ -156,22 +171,22 @@ def test_convergence_draws_the_trajectories(run):
     error = figure.axes[p].lines[-1].get_ydata()
     assert error == pytest.approx((trajectory[:, 0] - run.truth.theta[0]) / run.cal.sigmas[0])
     assert overlapping(figure) == []
-    drawn(plots.plot_convergence(run.cal))
+    drawn(plot_convergence(run.cal))
 
 
 def test_a_truth_of_another_model_is_not_compared(run):
     other = camera("brown3")
-    figure = plots.plot_convergence(run.cal, other)
+    figure = plot_convergence(run.cal, other)
     assert "final estimate" in figure.axes[len(run.cal.parameter_names)].get_ylabel()
 
 
 def test_residuals(run):
-    figure = drawn(plots.plot_residuals(run.cal, run.obs))
+    figure = drawn(plot_residuals(run.cal, run.obs))
     assert len(figure.axes) == 3
     assert overlapping(figure) == []
     few = run.obs.select_frames(run.obs.frame_ids[:3])
     cal = sc.calibrate(few, run.cal.camera)
-    drawn(plots.plot_residuals(cal, few))
+    drawn(plot_residuals(cal, few))
 
 
 def test_panels_draw_on_the_axes_they_are_given(run, errors):
@@ -179,31 +194,31 @@ def test_panels_draw_on_the_axes_they_are_given(run, errors):
 
     figure = Figure()
     axes = figure.subplots(2, 3).ravel()
-    assert plots.plot_residual_map(run.cal, run.obs, axes[0]) is axes[0]
-    assert plots.plot_residual_radius(run.cal, run.obs, axes[1]) is axes[1]
-    assert plots.plot_residual_histogram(run.cal, run.obs, axes[2]) is axes[2]
-    assert plots.plot_correlation(run.coupling, axes[3]) is axes[3]
-    assert plots.plot_couplings(run.coupling, axes[4]) is axes[4]
-    assert plots.plot_attitude(errors[0], axes[5]) is axes[5]
-    for panel in (plots.plot_residual_map, plots.plot_residual_radius, plots.plot_residual_histogram):
+    assert plot_residual_map(run.cal, run.obs, axes[0]) is axes[0]
+    assert plot_residual_radius(run.cal, run.obs, axes[1]) is axes[1]
+    assert plot_residual_histogram(run.cal, run.obs, axes[2]) is axes[2]
+    assert plot_correlation(run.coupling, axes[3]) is axes[3]
+    assert plot_couplings(run.coupling, axes[4]) is axes[4]
+    assert plot_attitude(errors[0], axes[5]) is axes[5]
+    for panel in (plot_residual_map, plot_residual_radius, plot_residual_histogram):
         drawn(panel(run.cal, run.obs))
 
 
 def test_attitude_bars(errors):
     attitude, _ = errors
-    ax = plots.plot_attitude(attitude)
+    ax = plot_attitude(attitude)
     heights = [bar.get_height() for bar in ax.patches]
     wanted = np.concatenate([attitude.nea_arcsec, attitude.common_arcsec, attitude.rest_arcsec])
     assert heights == pytest.approx(wanted)
     assert ax.get_yscale() == "log"
     drawn(ax)
     attitude.rest_arcsec = np.zeros(3)
-    drawn(plots.plot_attitude(attitude))
+    drawn(plot_attitude(attitude))
 
 
 def test_field_map_has_a_colour_bar_for_each_panel(errors):
     _, field = errors
-    figure = drawn(plots.plot_field_map(field))
+    figure = drawn(plot_field_map(field))
     assert len(figure.axes) == 4
     assert figure.axes[0].get_ylim()[0] > figure.axes[0].get_ylim()[1]
     assert overlapping(figure) == []
@@ -214,12 +229,12 @@ def test_field_map_has_a_colour_bar_for_each_panel(errors):
     field.sigma_absolute_arcsec = np.full_like(field.sigma_absolute_arcsec, 5.0)
     field.sigma_compensated_arcsec = np.zeros_like(field.sigma_absolute_arcsec)
     field.covariance_compensated_arcsec2 = np.zeros_like(field.covariance_absolute_arcsec2)
-    drawn(plots.plot_field_map(field))
+    drawn(plot_field_map(field))
 
 
 def test_ellipses_of_the_field_map_lie_within_their_cells(errors):
     _, field = errors
-    figure = drawn(plots.plot_field_map(field))
+    figure = drawn(plot_field_map(field))
     ellipses = figure.axes[0].collections[-1]
     places = ellipses.get_offsets()
     step = min(np.diff(np.unique(places[:, i])).min() for i in (0, 1))
@@ -230,21 +245,21 @@ def test_ellipses_of_the_field_map_lie_within_their_cells(errors):
     assert "semi-axis 5″" in [text.get_text() for text in figure.axes[0].texts]
     # A map of an earlier version has no ellipses and is drawn all the same.
     field.covariance_absolute_arcsec2 = field.covariance_compensated_arcsec2 = None
-    assert not drawn(plots.plot_field_map(field)).axes[0].texts
+    assert not drawn(plot_field_map(field)).axes[0].texts
 
 
 def test_figures_are_repeatable_and_show_themselves(run):
-    first, second = (plots.png_bytes(plots.figure_of(plots.plot_couplings(run.coupling)), dpi=40) for _ in range(2))
+    first, second = (png_bytes(figure_of(plot_couplings(run.coupling)), dpi=40) for _ in range(2))
     assert first == second
-    assert plots.plot_correlations(run.coupling)._repr_png_().startswith(PNG)
+    assert plot_correlations(run.coupling)._repr_png_().startswith(PNG)
 
 
 def test_settings_of_the_user_stay_untouched(run):
     import matplotlib
 
     before = dict(matplotlib.rcParams)
-    plots.plot_residuals(run.cal, run.obs)
-    plots.plot_correlation(run.coupling)
+    plot_residuals(run.cal, run.obs)
+    plot_correlation(run.coupling)
     assert dict(matplotlib.rcParams) == before
 
 

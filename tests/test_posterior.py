@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from starcal_uq import arviz_compat
-from starcal_uq.errors import RunFolderError
-from starcal_uq.posterior import DRAW_ORDER, Posterior
-from starcal_uq.sampler import sample
+from starcal_uq.core.errors import RunFolderError
+from starcal_uq.inference import arviz as arviz_compat
+from starcal_uq.inference.posterior import DRAW_ORDER, Posterior
+from starcal_uq.inference.sample import sample
 from tests.gaussian_camera import gaussian_calibration
 
 
@@ -59,7 +59,7 @@ def test_opening_a_file_needs_no_heavy_library(post: Posterior, tmp_path: Path) 
     path = tmp_path / "posterior.nc"
     post.save(path)
     code = (
-        "import sys; from starcal_uq.posterior import Posterior; "
+        "import sys; from starcal_uq.inference.posterior import Posterior; "
         f"p = Posterior.load({str(path)!r}); p.mean, p.covariance, p.sd, p.thin(5, 1); "
         "heavy = {'casadi', 'emcee', 'matplotlib', 'arviz', 'arviz_stats', 'scipy', 'pandas'} & set(sys.modules); "
         "sys.exit(f'imported {heavy}' if heavy else 0)"

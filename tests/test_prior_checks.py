@@ -10,15 +10,15 @@ import scenes
 from gaussian_camera import gaussian_calibration
 from scipy import stats
 
-from starcal_uq.arviz_compat import is_legacy
-from starcal_uq.catalogue import load_catalogue
-from starcal_uq.errors import PriorError
-from starcal_uq.posterior import Posterior
-from starcal_uq.power_scaling import CONFLICT, FINE, WEAK, cjs_distance, prior_sensitivity
-from starcal_uq.prior_draws import prior_predictive
-from starcal_uq.priors import Priors
-from starcal_uq.sampler import sample
-from starcal_uq.simulation import simulate
+from starcal_uq.core.errors import PriorError
+from starcal_uq.inference.arviz import is_legacy
+from starcal_uq.inference.posterior import Posterior
+from starcal_uq.inference.power_scaling import CONFLICT, FINE, WEAK, cjs_distance, prior_sensitivity
+from starcal_uq.inference.prior_draws import prior_predictive
+from starcal_uq.inference.priors import Priors
+from starcal_uq.inference.sample import sample
+from starcal_uq.simulation.frames import simulate
+from starcal_uq.sky.catalogue import load_catalogue
 
 NOMINAL = scenes.nominal(scenes.camera())
 DEFAULT = Priors.default(NOMINAL)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from starcal_uq.camera import Camera
-from starcal_uq.distortion import model_names, parameter_names
-from starcal_uq.errors import PriorError
-from starcal_uq.priors import Priors
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import model_names, parameter_names
+from starcal_uq.core.errors import PriorError
+from starcal_uq.inference.priors import Priors
 
 CAMERA = Camera(1024, 1024, 12.0, 72.0, 511.5, 511.5)
 

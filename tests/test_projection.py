@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from starcal_uq import projection
-from starcal_uq.attitude import exp_rotation
-from starcal_uq.camera import Camera
-from starcal_uq.distortion import get_model, model_names
-from starcal_uq.errors import DistortionError
+from starcal_uq.attitude.rotations import exp_rotation
+from starcal_uq.camera import projection
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import get_model, model_names
+from starcal_uq.core.errors import DistortionError
 from tests.scenes import camera
 
 RNG = np.random.default_rng(5)

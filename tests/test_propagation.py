@@ -11,18 +11,18 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.attitude import left_error, rotation_to_quaternion, rotation_vector
-from starcal_uq.attitude_error import AXES, CONTRIBUTORS, AttitudeError
-from starcal_uq.calibration import Calibration
-from starcal_uq.catalogue import load_catalogue
-from starcal_uq.errors import DistortionError, ObservationError, RunFolderError, SamplingError
-from starcal_uq.estimation import calibrate
-from starcal_uq.mission_geometry import mission_frames, noise_by_magnitude
-from starcal_uq.observations import Observations
-from starcal_uq.projection import unproject_theta
-from starcal_uq.propagation import propagate
-from starcal_uq.simulation import paper_start
-from starcal_uq.wahba import quest
+from starcal_uq.attitude.rotations import left_error, rotation_to_quaternion, rotation_vector
+from starcal_uq.attitude.wahba import quest
+from starcal_uq.camera.projection import unproject_theta
+from starcal_uq.core.errors import DistortionError, ObservationError, RunFolderError, SamplingError
+from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.observations.table import Observations
+from starcal_uq.propagation.attitude_error import AXES, CONTRIBUTORS, AttitudeError
+from starcal_uq.propagation.propagate import propagate
+from starcal_uq.simulation.frames import paper_start
+from starcal_uq.simulation.mission import mission_frames, noise_by_magnitude
+from starcal_uq.sky.catalogue import load_catalogue
 from tests.attitude_campaigns import clean_frames, failures, fly, linear_estimator, with_noise
 from tests.scenes import camera, nominal, observations, with_sigmas
 
@@ -276,7 +276,7 @@ def test_batches_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> No
     obs, cal = scene()
     post = gaussian_posterior(cal)
     whole = propagate(post, obs, n_draws=10)
-    monkeypatch.setattr("starcal_uq.propagation._STARS_AT_ONCE", 3 * obs.n_stars)
+    monkeypatch.setattr("starcal_uq.propagation.propagate._STARS_AT_ONCE", 3 * obs.n_stars)
     parts = propagate(post, obs, n_draws=10)
     np.testing.assert_array_equal(whole.common_draws_arcsec, parts.common_draws_arcsec)
     np.testing.assert_allclose(whole.rest_arcsec, parts.rest_arcsec, rtol=1e-10)
@@ -327,7 +327,7 @@ def test_file_keeps_every_digit(tmp_path: Path) -> None:
 def test_file_of_an_earlier_version_is_read_and_the_interaction_not_known(tmp_path: Path) -> None:
     import pandas as pd
 
-    from starcal_uq.reporting.tables import attitude_rows
+    from starcal_uq.presentation.report.tables import attitude_rows
 
     found, path = error(), tmp_path / "attitude.csv"
     found.save(path)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, f
 
-from starcal_uq.quadratic_forms import weighted_chi_square_tail
+from starcal_uq.maths.quadratic_forms import weighted_chi_square_tail
 
 
 @pytest.mark.parametrize("count", [1, 2, 5, 9])

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from starcal_uq.attitude import (
+from starcal_uq.attitude.rotations import (
     exp_rotation,
     left_error,
     quaternion_to_rotation,
@@ -16,7 +16,7 @@ from starcal_uq.attitude import (
     rotation_to_quaternion,
     rotation_vector,
 )
-from starcal_uq.wahba import DegenerateFrameError, quest
+from starcal_uq.attitude.wahba import DegenerateFrameError, quest
 
 stats = pytest.importorskip("scipy.stats")
 Rotation = pytest.importorskip("scipy.spatial.transform").Rotation
@@ -117,7 +117,7 @@ def test_draws_give_the_same_as_one_call_each(monkeypatch: pytest.MonkeyPatch) -
     sigma = np.random.default_rng(2).uniform(1e-5, 2e-5, len(b))
     single = [quest(d, r, starts, sigma_rad=sigma) for d in draws]
     for block in (1, 100, 300, 10**6):
-        monkeypatch.setattr("starcal_uq.wahba._BLOCK", block)
+        monkeypatch.setattr("starcal_uq.attitude.wahba._BLOCK", block)
         for references in (r, np.broadcast_to(r, draws.shape)):
             batch = quest(draws, references, starts, sigma_rad=sigma)
             assert batch.rotations.shape == (5, 60, 3, 3)

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from starcal_uq.directions import unit_vectors
-from starcal_uq.errors import CatalogueError
-from starcal_uq.readers import read_catalogue
+from starcal_uq.core.errors import CatalogueError
+from starcal_uq.sky.positions import unit_vectors
+from starcal_uq.sky.tables import read_catalogue
 
 EPOCH = {"file_epoch": 2000.0}
 CSV = """name,ra,dec,Vmag,pmRA,pmDE

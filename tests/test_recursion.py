@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq import recursion as recursion_module
-from starcal_uq import recursion_sums
-from starcal_uq.distortion import model_names
-from starcal_uq.errors import CalibrationError, RunFolderError
-from starcal_uq.frames import StarFrames
-from starcal_uq.likelihood import MarginalLikelihood
-from starcal_uq.pair_innovations import FrameNormals, frame_normals
-from starcal_uq.pairs import PairObjective
-from starcal_uq.recursion import Recursion
-from starcal_uq.recursion_options import RecursionOptions
-from starcal_uq.recursion_sums import FrameSums
-from starcal_uq.recursive_calibration import RecursiveCalibration
-from starcal_uq.solvers import levenberg_marquardt
-from starcal_uq.status import Status
+from starcal_uq.camera.distortion import model_names
+from starcal_uq.core.errors import CalibrationError, RunFolderError
+from starcal_uq.core.status import Status
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.pairs import PairObjective
+from starcal_uq.estimation.recursive import filter as recursion_module
+from starcal_uq.estimation.recursive import recursion_sums
+from starcal_uq.estimation.recursive.filter import Recursion
+from starcal_uq.estimation.recursive.innovations import FrameNormals, frame_normals
+from starcal_uq.estimation.recursive.recursion_options import RecursionOptions
+from starcal_uq.estimation.recursive.recursion_sums import FrameSums
+from starcal_uq.estimation.recursive.stream import RecursiveCalibration
+from starcal_uq.estimation.solvers import levenberg_marquardt
+from starcal_uq.observations.frames import StarFrames
 from tests.scenes import camera, nominal, observations, with_sigmas
 
 SCALES = {"f": 1.0, "k1": 1e-9, "k2": 1e-14, "k3": 1e-20, "p1": 1e-6, "p2": 1e-6, "x0": 1.0, "y0": 1.0}

@@ -11,21 +11,21 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from starcal_uq.attitude import exp_rotation, random_rotations, rotation_vector
-from starcal_uq.camera import Camera
-from starcal_uq.catalogue import StarCatalogue, load_catalogue
-from starcal_uq.directions import ra_dec_deg
-from starcal_uq.errors import CatalogueError, ImageError, RunFolderError, SensorError
-from starcal_uq.image_files import read_image
-from starcal_uq.projection import project, unproject
-from starcal_uq.psf import profiles
-from starcal_uq.rendered_files import read_truth, truth_table, write_frame
-from starcal_uq.rendered_frame import RenderedFrame
-from starcal_uq.rendering import Scene, render
-from starcal_uq.rendering_runs import render_frames
-from starcal_uq.sensor import Sensor
-from starcal_uq.shot_noise import uniform_shot_noise
-from starcal_uq.simulation import paper_camera, simulate
+from starcal_uq.attitude.rotations import exp_rotation, random_rotations, rotation_vector
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.projection import project, unproject
+from starcal_uq.core.errors import CatalogueError, ImageError, RunFolderError, SensorError
+from starcal_uq.images.image import read_image
+from starcal_uq.simulation.campaign import render_frames
+from starcal_uq.simulation.frames import paper_camera, simulate
+from starcal_uq.simulation.psf import profiles
+from starcal_uq.simulation.rendered_files import read_truth, truth_table, write_frame
+from starcal_uq.simulation.rendering import Scene, render
+from starcal_uq.simulation.sensor import Sensor
+from starcal_uq.simulation.shot_noise import uniform_shot_noise
+from starcal_uq.simulation.truth import RenderedFrame
+from starcal_uq.sky.catalogue import StarCatalogue, load_catalogue
+from starcal_uq.sky.positions import ra_dec_deg
 
 # Light and nothing else, in electrons.
 LIGHT = Sensor(

@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.errors import CalibrationError, CatalogueError, RunFolderError, SamplingError
-from starcal_uq.frames import StarFrames
-from starcal_uq.likelihood import MarginalLikelihood
-from starcal_uq.pairs import PairObjective
-from starcal_uq.reproduction.methods import METHODS, Method
-from starcal_uq.reproduction.replicates import replicate
-from starcal_uq.reproduction.replicates_methods import solve_all
-from starcal_uq.reproduction.replicates_result import Replicates
-from starcal_uq.reproduction.replicates_statistics import (
+from starcal_uq.core.errors import CalibrationError, CatalogueError, RunFolderError, SamplingError
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.pairs import PairObjective
+from starcal_uq.observations.frames import StarFrames
+from starcal_uq.paper.methods import METHODS, Method
+from starcal_uq.paper.replicates import replicate
+from starcal_uq.paper.replicates_methods import solve_all
+from starcal_uq.paper.replicates_result import Replicates
+from starcal_uq.paper.statistics import (
     HONEST,
     TOO_FEW,
     chi_interval,
@@ -307,7 +307,7 @@ def test_interrupt_before_the_first_result_is_an_interrupt(monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("starcal_uq.reproduction.replicates.run_replicate", stop)
+    monkeypatch.setattr("starcal_uq.paper.replicates.run_replicate", stop)
     with pytest.raises(KeyboardInterrupt):
         replicate(n_replicates=3, workers=0, **SMALL)
 
@@ -315,7 +315,7 @@ def test_interrupt_before_the_first_result_is_an_interrupt(monkeypatch):
 def test_a_script_without_a_guard_ends_with_the_remedy(tmp_path, root):
     script = tmp_path / "script.py"
     script.write_text(
-        "from starcal_uq.reproduction.replicates import replicate\nreplicate(n_replicates=9, n_frames=8, workers=2)\n"
+        "from starcal_uq.paper.replicates import replicate\nreplicate(n_replicates=9, n_frames=8, workers=2)\n"
     )
     environment = {**os.environ, "PYTHONPATH": str(root)}
     done = subprocess.run(

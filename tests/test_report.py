@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.diagnosis import FILE, diagnose_run
-from starcal_uq.formatting import significant
-from starcal_uq.reporting import load_results, render
-from starcal_uq.reporting.tables import attitude_rows, parameter_rows, symbol, weak_directions
+from starcal_uq.core.formatting import significant
+from starcal_uq.diagnostics.diagnose import FILE, diagnose_run
+from starcal_uq.presentation.report.page import render
+from starcal_uq.presentation.report.tables import attitude_rows, parameter_rows, symbol, weak_directions
+from starcal_uq.runs.run import load_results
 from tests.scenes import camera, nominal, observations
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
@@ -271,8 +272,8 @@ def test_mixed_runs_are_refused_and_nothing_is_touched(run):
 def test_a_report_that_fails_leaves_the_old_one(run, monkeypatch):
     before = run.report.read_bytes()
     figures = {path: path.stat().st_mtime_ns for path in run.figures.iterdir()}
-    monkeypatch.setattr("starcal_uq.reporting.figures.draw_figures", lambda _: {"corner": b"new"})
-    monkeypatch.setattr("starcal_uq.reporting.render", lambda *_: 1 / 0)
+    monkeypatch.setattr("starcal_uq.presentation.report.figures.draw_figures", lambda _: {"corner": b"new"})
+    monkeypatch.setattr("starcal_uq.presentation.report.report.render", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         sc.report(run.path)
     assert run.report.read_bytes() == before

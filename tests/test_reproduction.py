@@ -13,13 +13,14 @@ from scipy.optimize import brentq, least_squares
 from scipy.stats import kstest, norm
 
 import starcal_uq as sc
-from starcal_uq.attitude import exp_rotation, rotation_vector
-from starcal_uq.projection import unproject
-from starcal_uq.reproduction import command, published
-from starcal_uq.reproduction.angles import fit_angles
-from starcal_uq.reproduction.comparison import row_tests
-from starcal_uq.reproduction.error_readings import MAXIMUM, REPROJECTION, error_sizes
-from starcal_uq.reproduction.errors_px import (
+from starcal_uq.attitude.rotations import exp_rotation, rotation_vector
+from starcal_uq.camera.projection import unproject
+from starcal_uq.paper import published
+from starcal_uq.paper import reproduction as command
+from starcal_uq.paper.angles import fit_angles
+from starcal_uq.paper.checks import NO, WITHIN_NOISE, paper_checks, printed_camera
+from starcal_uq.paper.error_readings import MAXIMUM, REPROJECTION, error_sizes
+from starcal_uq.paper.errors import (
     OPTICS,
     UNDISTORTIONS,
     aligned,
@@ -28,16 +29,16 @@ from starcal_uq.reproduction.errors_px import (
     reprojection_error_px,
     undistorted,
 )
-from starcal_uq.reproduction.judgement import MAX_CHANCE, Judged, Outcome, trial
-from starcal_uq.reproduction.methods import METHODS
-from starcal_uq.reproduction.paper_checks import NO, WITHIN_NOISE, paper_checks, printed_camera
-from starcal_uq.reproduction.published import LEAST_SQUARES, PAPER_METHODS, PROPOSED, SAMAAN, Printed, printed
-from starcal_uq.reproduction.reading_draws import AS_PRINTED, OTHER_EQUATION, READINGS
-from starcal_uq.reproduction.readings import run_readings
-from starcal_uq.reproduction.replicates import replicate
-from starcal_uq.reproduction.result import Reproduction
-from starcal_uq.reproduction.shared_replicates import is_slow, joined, replicate_shared
-from starcal_uq.simulation import paper_camera, paper_start, simulate
+from starcal_uq.paper.judgement import MAX_CHANCE, Judged, Outcome, trial
+from starcal_uq.paper.methods import METHODS
+from starcal_uq.paper.published import LEAST_SQUARES, PAPER_METHODS, PROPOSED, SAMAAN, Printed, printed
+from starcal_uq.paper.reading_draws import AS_PRINTED, OTHER_EQUATION, READINGS
+from starcal_uq.paper.readings import run_readings
+from starcal_uq.paper.replicates import replicate
+from starcal_uq.paper.result import Reproduction
+from starcal_uq.paper.shared_replicates import is_slow, joined, replicate_shared
+from starcal_uq.paper.table_2 import row_tests
+from starcal_uq.simulation.frames import paper_camera, paper_start, simulate
 from tests.scenes import observations
 
 TRUTH = paper_camera()

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from starcal_uq.errors import RunFolderError
-from starcal_uq.runfolder import (
+from starcal_uq.core.errors import RunFolderError
+from starcal_uq.runs.folder import (
     RunFolder,
     atomic_path,
     atomic_write_bytes,

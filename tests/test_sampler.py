@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from starcal_uq.errors import SamplingError
-from starcal_uq.estimation import calibrate
-from starcal_uq.importance import importance_check, laplace_approximation, scaled_inverse, start_target
-from starcal_uq.posterior_checks import check_compression
-from starcal_uq.priors import Priors
-from starcal_uq.sampler import sample
-from starcal_uq.status import Status
+from starcal_uq.core.errors import SamplingError
+from starcal_uq.core.status import Status
+from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.inference.checks import check_compression
+from starcal_uq.inference.priors import Priors
+from starcal_uq.inference.sample import sample
+from starcal_uq.inference.target import importance_check, laplace_approximation, scaled_inverse, start_target
 from tests.gaussian_camera import COVARIANCE, SD, GaussianLikelihood, gaussian_calibration
 from tests.scenes import camera, nominal, observations, with_sigmas
 

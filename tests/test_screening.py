@@ -13,13 +13,13 @@ import scenes
 from scipy import stats
 
 import starcal_uq as sc
-from starcal_uq.consensus import focal_ratio, pre_screen
-from starcal_uq.frames import StarFrames
-from starcal_uq.likelihood import MarginalLikelihood
-from starcal_uq.screening import screen
-from starcal_uq.screening_result import COLUMNS, REASONS
-from starcal_uq.star_tests import star_residuals, star_threshold, truncated_variance
-from starcal_uq.wrong_identifications import contaminate
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.screening.consensus import focal_ratio, pre_screen
+from starcal_uq.estimation.screening.outliers import star_residuals, star_threshold, truncated_variance
+from starcal_uq.estimation.screening.result import COLUMNS, REASONS
+from starcal_uq.estimation.screening.screening import screen
+from starcal_uq.observations.frames import StarFrames
+from starcal_uq.simulation.contamination import contaminate
 
 TRUTH = scenes.camera()
 
@@ -302,7 +302,7 @@ def test_heavy_tails_are_not_called_wrong_stars() -> None:
 
 def test_a_poor_model_is_not_hidden_by_screening() -> None:
     """Right stars at the edge, rejected for a distortion that the model lacks, raise a warning; inner ones do not."""
-    from starcal_uq.screening_result import warnings_about
+    from starcal_uq.estimation.screening.result import warnings_about
 
     obs = scenes.observations()
     radius = np.hypot(obs.x_px - TRUTH.x0_px, obs.y_px - TRUTH.y0_px)

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 import starcal_uq as sc
-from starcal_uq.attitude import random_rotations
+from starcal_uq.attitude.rotations import random_rotations
 from tests.scenes import camera, observations
 
 

@@ -9,22 +9,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from starcal_uq.attitude import exp_rotation
-from starcal_uq.catalogue import load_catalogue
-from starcal_uq.errors import CalibrationError, SamplingError
-from starcal_uq.estimation import calibrate
-from starcal_uq.frames import StarFrames
-from starcal_uq.importance import Target
-from starcal_uq.likelihood import MarginalLikelihood
-from starcal_uq.observations import Observations
-from starcal_uq.posterior import Posterior
-from starcal_uq.priors import Priors
-from starcal_uq.projection import project
-from starcal_uq.robust import star_scores, subset
-from starcal_uq.sampler import sample
-from starcal_uq.simulation import simulate
-from starcal_uq.student import StudentLikelihood
-from starcal_uq.surrogate import fit_polynomial
+from starcal_uq.attitude.rotations import exp_rotation
+from starcal_uq.camera.projection import project
+from starcal_uq.core.errors import CalibrationError, SamplingError
+from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.robust import star_scores, subset
+from starcal_uq.estimation.student import StudentLikelihood
+from starcal_uq.inference.posterior import Posterior
+from starcal_uq.inference.priors import Priors
+from starcal_uq.inference.sample import sample
+from starcal_uq.inference.surrogate import fit_polynomial
+from starcal_uq.inference.target import Target
+from starcal_uq.observations.frames import StarFrames
+from starcal_uq.observations.table import Observations
+from starcal_uq.simulation.frames import simulate
+from starcal_uq.sky.catalogue import load_catalogue
 from tests.scenes import camera, nominal, observations, with_sigmas
 
 QUICK: dict[str, Any] = {"n_ensembles": 2, "n_walkers": 32, "n_steps": 60, "n_burn": 10, "seed": 3}

@@ -13,20 +13,21 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq import plots
-from starcal_uq.attitude import left_error
-from starcal_uq.errors import CatalogueError, PriorError, RunFolderError, SamplingError
-from starcal_uq.projection import unproject_theta
-from starcal_uq.uniformity import (
+from starcal_uq.attitude.rotations import left_error
+from starcal_uq.camera.projection import unproject_theta
+from starcal_uq.core.errors import CatalogueError, PriorError, RunFolderError, SamplingError
+from starcal_uq.diagnostics.validation.replicates import ARCSEC, LOG_LIKELIHOOD, Study, run_replicate
+from starcal_uq.diagnostics.validation.result import Validation
+from starcal_uq.diagnostics.validation.validate import narrow_priors, validate, validate_study
+from starcal_uq.maths.ranks import (
     binomial_interval,
     counts_below,
     evaluation_points,
     uniformity_band,
     uniformity_p_value,
 )
-from starcal_uq.validation import narrow_priors, validate, validate_study
-from starcal_uq.validation_replicates import ARCSEC, LOG_LIKELIHOOD, Study, run_replicate
-from starcal_uq.validation_result import Validation
+from starcal_uq.presentation.figures.style import png_bytes
+from starcal_uq.presentation.figures.validation import plot_validation
 from tests import validation_controls as controls
 from tests.scenes import camera, nominal
 
@@ -233,7 +234,7 @@ def test_when_nothing_works_the_reason_is_given(stars, monkeypatch):
     def fail(*_):
         raise sc.CalibrationError("the stars do not suffice: add some.")
 
-    monkeypatch.setattr("starcal_uq.validation_replicates.calibrate", fail)
+    monkeypatch.setattr("starcal_uq.diagnostics.validation.replicates.calibrate", fail)
     with pytest.raises(sc.CalibrationError, match="no replicate gave a result; the commonest reason: the stars do not"):
         validate_study(study(), stars, 3, workers=0)
 
@@ -247,7 +248,7 @@ def test_some_failures_leave_the_other_replicates(stars, monkeypatch):
             raise sc.CalibrationError("the stars do not suffice: add some.")
         return sc.calibrate(*arguments)
 
-    monkeypatch.setattr("starcal_uq.validation_replicates.calibrate", fail_once)
+    monkeypatch.setattr("starcal_uq.diagnostics.validation.replicates.calibrate", fail_once)
     found = validate_study(study(), stars, 4, workers=0)
     assert found.replicate.tolist() == [0, 2, 3]
     assert found.failures == ("the stars do not suffice: add some.",)
@@ -293,7 +294,7 @@ def test_interrupt_before_the_first_result_is_an_interrupt(stars, monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("starcal_uq.validation_pool.run_replicate", stop)
+    monkeypatch.setattr("starcal_uq.diagnostics.validation.validation_pool.run_replicate", stop)
     with pytest.raises(KeyboardInterrupt):
         validate_study(study(), stars, 3, workers=0)
 
@@ -308,7 +309,7 @@ def test_a_script_without_a_guard_ends_with_the_remedy(tmp_path, root):
     script = tmp_path / "script.py"
     script.write_text(
         "import starcal_uq as sc\n"
-        "from starcal_uq.validation import validate\n"
+        "from starcal_uq.diagnostics.validation.validate import validate\n"
         "validate(sc.paper_camera(), n_replicates=20, n_frames=8, workers=2)\n"
     )
     environment = {**os.environ, "PYTHONPATH": str(root)}
@@ -406,8 +407,8 @@ def test_table_and_html(good):
 
 
 def test_figure_shows_curves_bands_and_coverage(good):
-    figure = plots.plot_validation(good)
-    assert plots.png_bytes(figure, dpi=50).startswith(b"\x89PNG")
+    figure = plot_validation(good)
+    assert png_bytes(figure, dpi=50).startswith(b"\x89PNG")
     panels = [ax for ax in figure.axes if ax.axison]
     assert len(panels) == len(QUANTITIES) + 2
     curve = panels[0].lines[1].get_ydata()

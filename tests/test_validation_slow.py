@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.validation import validate, validate_study
-from starcal_uq.validation_replicates import Study
+from starcal_uq.diagnostics.validation.replicates import Study
+from starcal_uq.diagnostics.validation.validate import validate, validate_study
 from tests import validation_controls as controls
 
 pytestmark = pytest.mark.slow

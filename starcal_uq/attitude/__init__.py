@@ -1,0 +1,1 @@
+"""Rotations, QUEST, and attitudes over time."""

@@ -1,0 +1,209 @@
+"""Attitudes over time from a file: a slew, an orbit, a scan law.
+
+The file is CSV, ECSV or Parquet with a time (``time_s``, or ``time_utc``) and a quaternion in each row. Quaternions are
+those of R_cam_icrs, scalar last: they turn ICRS vectors into the camera frame, b = R r, with the sense of
+``scipy.spatial.transform.Rotation``. Columns ``qx, qy, qz, qw`` say which component is which; numbered ones do not, and
+are refused unless the order is stated.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from starcal_uq.attitude.attitude_profile_files import read_profile
+from starcal_uq.attitude.rotations import left_error
+from starcal_uq.core.errors import AttitudeProfileError
+from starcal_uq.core.formatting import plural, significant
+from starcal_uq.core.types import FloatArray, IntArray
+
+_UNIT = 1e-6
+_NEARLY_UNIT = 1e-3
+# Between two samples farther apart than this, the shortest turn need not be the one that was flown.
+_FAR_DEG = 30.0
+# A step so many times the usual one is told.
+_GAP = 10.0
+_MAX_FRAMES = 1_000_000
+Sense = Literal["icrs_to_camera", "camera_to_icrs"]
+Scalar = Literal["first", "last"]
+
+
+@dataclass(frozen=True, eq=False)
+class AttitudeProfile:
+    """Attitudes of the camera over time.
+
+    Attributes
+    ----------
+    time_s : (K,) array
+        Strictly increasing times, s.
+    quaternions : (K, 4) array
+        Scalar-last unit quaternions of R_cam_icrs, with signs such that neighbours lie in one half.
+    name : str
+        Where it comes from.
+    messages : tuple of str
+        What was mended or looks doubtful.
+    """
+
+    time_s: FloatArray
+    quaternions: FloatArray
+    name: str = ""
+    messages: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        time, q = np.array(self.time_s, dtype=float), np.array(self.quaternions, dtype=float)
+        where = f"{self.name or 'attitude profile'}: "
+        if time.ndim != 1 or q.shape != (len(time), 4):
+            raise AttitudeProfileError(
+                f"{where}times have shape {time.shape} and quaternions {q.shape}; give (K,) and (K, 4)."
+            )
+        if len(time) < 2:
+            raise AttitudeProfileError(f"{where}holds {plural(len(time), 'attitude')}; give at least two.")
+        rows = np.arange(1, len(time) + 1)
+        messages = (*self.messages, *check_samples(where, "row", rows, time, q))
+        q /= np.linalg.norm(q, axis=1, keepdims=True)
+        flips = np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0))
+        q[1:] *= flips[:, None]
+        for array in (time, q):
+            array.setflags(write=False)
+        object.__setattr__(self, "time_s", time)
+        object.__setattr__(self, "quaternions", q)
+        far = np.degrees(np.linalg.norm(left_error(q[1:], q[:-1]), axis=1)) > _FAR_DEG
+        if far.any():
+            messages += (
+                f"{plural(int(far.sum()), 'step')} of the profile turn the camera by more than {_FAR_DEG:g} degrees: "
+                "attitudes in between are taken on the shortest arc; give more samples if the camera went otherwise.",
+            )
+        steps = np.diff(time)
+        longest = int(np.argmax(steps))
+        if steps[longest] > _GAP * float(np.median(steps)):
+            messages += (
+                f"the profile has no attitude between {time[longest]:g} and {time[longest + 1]:g} s, "
+                f"{significant(steps[longest] / float(np.median(steps)), 2)} times its usual step: what lies in "
+                "between is on the shortest arc.",
+            )
+        object.__setattr__(self, "messages", tuple(dict.fromkeys(messages)))
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first to the last attitude, s."""
+        return float(self.time_s[-1] - self.time_s[0])
+
+    @property
+    def rate_deg_s(self) -> FloatArray:
+        """Speed of the turn between neighbouring samples (K-1,), degrees per second."""
+        angle = np.linalg.norm(left_error(self.quaternions[1:], self.quaternions[:-1]), axis=1)
+        rate: FloatArray = np.degrees(angle) / np.diff(self.time_s)
+        return rate
+
+    def at(self, time_s: FloatArray) -> FloatArray:
+        """Attitudes (n, 4) at some times (n,), s, on the shortest arc between neighbouring samples (slerp).
+
+        Raises
+        ------
+        AttitudeProfileError
+            For times outside the profile.
+        """
+        from scipy.spatial.transform import Rotation, Slerp
+
+        wanted = np.asarray(time_s, dtype=float)
+        slack = 1e-9 * self.duration_s
+        if np.any((wanted < self.time_s[0] - slack) | (wanted > self.time_s[-1] + slack)):
+            raise AttitudeProfileError(
+                f"{self.name or 'attitude profile'}: covers {self.time_s[0]:g} s to {self.time_s[-1]:g} s; it is not "
+                "continued beyond."
+            )
+        wanted = np.clip(wanted, self.time_s[0], self.time_s[-1])
+        q: FloatArray = Slerp(self.time_s, Rotation.from_quat(self.quaternions))(wanted).as_quat()
+        return q
+
+    def at_rate(self, rate_hz: float) -> AttitudeProfile:
+        """The profile with `rate_hz` attitudes per second from its first instant on.
+
+        Raises
+        ------
+        AttitudeProfileError
+            When that gives fewer than two attitudes, or more than a million.
+        """
+        n = int(np.floor(self.duration_s * rate_hz * (1.0 + 1e-12))) + 1 if rate_hz > 0.0 else 0
+        if not 2 <= n <= _MAX_FRAMES:
+            raise AttitudeProfileError(
+                f"a rate of {rate_hz:g} Hz over {significant(self.duration_s, 3)} s gives {n} frames; choose one that "
+                f"gives 2 to {_MAX_FRAMES}."
+            )
+        time = self.time_s[0] + np.arange(n) / rate_hz
+        return AttitudeProfile(time, self.at(time), self.name, self.messages)
+
+    def to_dataframe(self) -> Any:
+        """Columns ``time_s``, ``qx``, ``qy``, ``qz``, ``qw``, one row per instant."""
+        import pandas as pd
+
+        components = dict(zip(("qx", "qy", "qz", "qw"), self.quaternions.T, strict=True))
+        return pd.DataFrame({"time_s": self.time_s, **components})
+
+    def _repr_html_(self) -> str:
+        speed = self.rate_deg_s
+        notes = "".join(f"<li>{message}</li>" for message in self.messages)
+        return (
+            f"<p><b>Attitude profile</b> {self.name}: {len(self.time_s)} attitudes over "
+            f"{significant(self.duration_s, 3)} s, turning at {significant(float(np.median(speed)), 3)} (median) to "
+            f"{significant(float(speed.max()), 3)} degrees per second.</p>{f'<ul>{notes}</ul>' if notes else ''}"
+        )
+
+
+def load_attitude_profile(
+    path: str | os.PathLike[str], *, scalar: Scalar | None = None, sense: Sense = "icrs_to_camera"
+) -> AttitudeProfile:
+    """Read an attitude profile (``.csv``, ``.ecsv`` or ``.parquet``).
+
+    Parameters
+    ----------
+    path
+        A table with ``time_s`` (seconds) or ``time_utc`` (ISO 8601) and ``qx, qy, qz, qw``. Comments start with ``#``.
+    scalar : {"first", "last"}, optional
+        Which of numbered columns (``q0`` to ``q3``, or ``q1`` to ``q4``) is the scalar part; refused if not stated.
+    sense : {"icrs_to_camera", "camera_to_icrs"}
+        What the quaternions turn into what. The default is b = R r, ICRS vectors into the camera frame.
+
+    Raises
+    ------
+    AttitudeProfileError
+        When the file cannot be read, times do not increase, or a quaternion is far from unit length.
+    """
+    table = read_profile(path, scalar)
+    q = table.quaternions
+    messages = check_samples(f"{path}: ", table.word, table.numbers, table.time_s, q)
+    if sense == "camera_to_icrs":
+        q = q * np.array([-1.0, -1.0, -1.0, 1.0])
+    q = q / np.linalg.norm(q, axis=1, keepdims=True)
+    return AttitudeProfile(table.time_s, q, os.path.basename(os.fspath(path)), messages)
+
+
+def check_samples(where: str, word: str, numbers: IntArray, time_s: FloatArray, q: FloatArray) -> tuple[str, ...]:
+    """Refuse times that do not increase and quaternions far from unit length; say which were normalised."""
+    bad = ~(np.isfinite(q).all(axis=1) & np.isfinite(time_s))
+    if bad.any():
+        raise AttitudeProfileError(f"{where}{word} {numbers[bad][0]} holds a value that is not finite; repair it.")
+    back = np.flatnonzero(np.diff(time_s) <= 0.0)
+    if back.size:
+        i = back[0] + 1
+        raise AttitudeProfileError(
+            f"{where}{word} {numbers[i]}: the time {time_s[i]:.9g} s does not come after {time_s[i - 1]:.9g} s; "
+            "sort the rows by time and remove repeated ones."
+        )
+    off = np.abs(np.linalg.norm(q, axis=1) - 1.0)
+    if np.any(off > _NEARLY_UNIT):
+        i = int(np.argmax(off > _NEARLY_UNIT))
+        raise AttitudeProfileError(
+            f"{where}{word} {numbers[i]}: the quaternion has the length {np.linalg.norm(q[i]):.6g}, not 1; "
+            "check its columns."
+        )
+    uneven = int(np.sum(off > _UNIT))
+    if not uneven:
+        return ()
+    return (
+        f"{plural(uneven, 'quaternion')} differed from unit length by up to {significant(float(off.max()))} and "
+        f"{'was' if uneven == 1 else 'were'} normalised.",
+    )

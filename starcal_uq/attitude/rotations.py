@@ -1,0 +1,137 @@
+"""Rotations as arrays: matrices, scalar-last quaternions and small left rotation vectors.
+
+Conventions: ``R_cam_icrs`` maps ICRS vectors to the camera frame, b = R r. Quaternions are (x, y, z, w) with the
+sense of ``scipy.spatial.transform.Rotation``. An attitude error is the *left* (camera-frame) rotation vector phi
+in R' = exp([phi]x) R: phi_x is pitch, phi_y yaw and phi_z roll about the boresight. Every function takes any
+number of leading axes.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from starcal_uq.core.types import FloatArray
+
+
+def rotation_to_quaternion(rotation: FloatArray) -> FloatArray:
+    """Quaternions of rotation matrices.
+
+    Of the four algebraically equal formulas the one with the largest divisor is used, matrix by matrix (Shepperd
+    1978), so that half turns lose no digits.
+
+    Parameters
+    ----------
+    rotation : (..., 3, 3) array
+        Proper rotation matrices.
+
+    Returns
+    -------
+    (..., 4) array
+        Scalar-last unit quaternions with a scalar part that is not negative.
+    """
+    m = np.asarray(rotation, dtype=float)
+    if m.shape[-2:] != (3, 3):
+        raise ValueError(f"rotation matrices have shape (..., 3, 3), not {m.shape}.")
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
+    xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
+    # Four times q q^T: each row is parallel to the quaternion.
+    rows = np.stack(
+        (
+            np.stack((1.0 + xx - yy - zz, xy, xz, wx), axis=-1),
+            np.stack((xy, 1.0 - xx + yy - zz, yz, wy), axis=-1),
+            np.stack((xz, yz, 1.0 - xx - yy + zz, wz), axis=-1),
+            np.stack((wx, wy, wz, 1.0 + xx + yy + zz), axis=-1),
+        ),
+        axis=-2,
+    )
+    best = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
+    q: FloatArray = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
+    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
+    return np.where(q[..., 3:] < 0.0, -q, q)
+
+
+def quaternion_to_rotation(quaternion: FloatArray) -> FloatArray:
+    """Rotation matrices of quaternions, which need not be normalised.
+
+    Parameters
+    ----------
+    quaternion : (..., 4) array
+        Scalar-last quaternions.
+
+    Returns
+    -------
+    (..., 3, 3) array
+
+    Raises
+    ------
+    ValueError
+        For a quaternion of norm zero.
+    """
+    q = np.asarray(quaternion, dtype=float)
+    if q.shape[-1:] != (4,):
+        raise ValueError(f"quaternions have shape (..., 4), not {q.shape}.")
+    norm2 = np.sum(q * q, axis=-1)
+    if np.any(norm2 == 0.0):
+        raise ValueError("a quaternion of norm zero is not a rotation.")
+    x, y, z, w = np.moveaxis(q, -1, 0)
+    s = 2.0 / norm2
+    matrix = np.empty((*q.shape[:-1], 3, 3))
+    matrix[..., 0, 0] = 1.0 - s * (y * y + z * z)
+    matrix[..., 1, 1] = 1.0 - s * (x * x + z * z)
+    matrix[..., 2, 2] = 1.0 - s * (x * x + y * y)
+    matrix[..., 0, 1], matrix[..., 1, 0] = s * (x * y - z * w), s * (x * y + z * w)
+    matrix[..., 0, 2], matrix[..., 2, 0] = s * (x * z + y * w), s * (x * z - y * w)
+    matrix[..., 1, 2], matrix[..., 2, 1] = s * (y * z - x * w), s * (y * z + x * w)
+    return matrix
+
+
+def quaternion_multiply(left: FloatArray, right: FloatArray) -> FloatArray:
+    """Hamilton product: the rotation `right` followed by the rotation `left`; both (..., 4), scalar last."""
+    x1, y1, z1, w1 = np.moveaxis(np.asarray(left, dtype=float), -1, 0)
+    x2, y2, z2, w2 = np.moveaxis(np.asarray(right, dtype=float), -1, 0)
+    return np.stack(
+        (
+            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+        ),
+        axis=-1,
+    )
+
+
+def quaternion_vector(quaternion: FloatArray) -> FloatArray:
+    """Rotation vectors (..., 3) in rad, of length at most pi, of unit quaternions (..., 4)."""
+    q = np.asarray(quaternion, dtype=float)
+    q = np.where(q[..., 3:] < 0.0, -q, q)
+    sine = np.linalg.norm(q[..., :3], axis=-1)
+    # angle / sin(angle / 2) tends to 2: written through sinc, it needs no special case at zero.
+    half = np.arctan2(sine, q[..., 3])
+    vector: FloatArray = q[..., :3] * (2.0 / np.sinc(half / np.pi))[..., None]
+    return vector
+
+
+def left_error(quaternion: FloatArray, reference: FloatArray) -> FloatArray:
+    """Camera-frame rotation vectors phi (..., 3) rad, R(quaternion) = exp([phi]x) R(reference)."""
+    conjugate = np.asarray(reference, dtype=float) * np.array([-1.0, -1.0, -1.0, 1.0])
+    return quaternion_vector(quaternion_multiply(quaternion, conjugate))
+
+
+def rotation_vector(rotation: FloatArray) -> FloatArray:
+    """Rotation vectors (..., 3) in rad, of length at most pi, of matrices (..., 3, 3)."""
+    return quaternion_vector(rotation_to_quaternion(rotation))
+
+
+def exp_rotation(phi: FloatArray) -> FloatArray:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3) in rad (Rodrigues' formula)."""
+    v = np.asarray(phi, dtype=float)
+    if v.shape[-1:] != (3,):
+        raise ValueError(f"rotation vectors have shape (..., 3), not {v.shape}.")
+    half = 0.5 * np.linalg.norm(v, axis=-1, keepdims=True)
+    return quaternion_to_rotation(np.concatenate((0.5 * v * np.sinc(half / np.pi), np.cos(half)), axis=-1))
+
+
+def random_rotations(n: int, rng: np.random.Generator) -> FloatArray:
+    """Draw `n` rotation matrices (n, 3, 3) uniformly on SO(3): normalised Gaussian quaternions."""
+    return quaternion_to_rotation(rng.standard_normal((n, 4)))

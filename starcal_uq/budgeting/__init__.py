@@ -1,0 +1,1 @@
+"""The mission's attitude error budget."""

@@ -1,0 +1,189 @@
+"""The mission error budget: what the calibration contributes, what the user knows, and what nobody has assessed.
+
+Rows that the posterior knows are filled from it, and inflated where the tests of the model demand it. The others come
+from the user's file, or read "not assessed": they are never taken for zero, and the totals then say "at least".
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from starcal_uq.budgeting.file import BudgetFile, checked_confidence, load_budget_file
+from starcal_uq.budgeting.posterior import inflation, posterior_rows
+from starcal_uq.budgeting.result import Budget, by_contributor, judge
+from starcal_uq.budgeting.rows import AXES, AXIS_LABELS, FROM_FILE, Contributor, not_assessed
+from starcal_uq.budgeting.totals import N_SAMPLES, totals
+from starcal_uq.core.errors import BudgetError, RunFolderError
+from starcal_uq.core.formatting import join_words
+from starcal_uq.runs.folder import RunFolder, provenance
+
+if TYPE_CHECKING:
+    from starcal_uq.diagnostics.diagnose import Diagnosis
+    from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.observations.table import Observations
+    from starcal_uq.propagation.attitude_error import AttitudeError
+
+_CONFIDENCE = 0.997
+
+
+def budget(
+    post: Posterior,
+    obs: Observations,
+    attitude: AttitudeError | None = None,
+    *,
+    file: BudgetFile | str | os.PathLike[str] | None = None,
+    confidence: float | None = None,
+    misfit: Diagnosis | None = None,
+    n_samples: int = N_SAMPLES,
+    seed: int = 0,
+) -> Budget:
+    """Attitude error budget in the terms of ECSS-E-ST-60-20C, combined after ECSS-E-ST-60-10C and by sampling.
+
+    Parameters
+    ----------
+    post : Posterior
+        Of the calibration.
+    obs : Observations
+        The frames it was made from.
+    attitude : AttitudeError, optional
+        The propagated posterior, over the mission's frames if they differ; over `obs` if it is left out.
+    file : BudgetFile or path, optional
+        The user's contributors and requirements.
+    confidence : float, optional
+        Of the totals; that of the file, or 0.997. Requirements have their own.
+    misfit : Diagnosis, optional
+        The tests of the model (`starcal_uq.diagnostics.diagnose.diagnose`), which decide about inflation.
+    n_samples, seed : int
+        Of the sampled totals.
+
+    Returns
+    -------
+    Budget
+
+    Raises
+    ------
+    BudgetError
+        If the file is wrong, or the confidence is not between 0 and 1.
+    """
+    if attitude is None:
+        from starcal_uq.propagation.propagate import propagate
+
+        attitude = propagate(post, obs)
+    stated = file if isinstance(file, BudgetFile) else BudgetFile() if file is None else load_budget_file(file)
+    chosen = confidence if confidence is not None else stated.confidence
+    chosen = checked_confidence(_CONFIDENCE if chosen is None else chosen, "the confidence of the budget")
+    if n_samples < 10_000:
+        raise BudgetError(f"n_samples is {n_samples}, too few for the tails of an error; use at least 10000.")
+    added = inflation(attitude, misfit, post, obs)
+    rows = (*posterior_rows(attitude, post, obs, added), *_from_file(stated))
+    found, samples = totals(rows, chosen, n_samples=n_samples, seed=seed)
+    settings = {"confidence": chosen, "n_samples": n_samples, "file": stated.path}
+    return Budget(
+        rows=rows,
+        totals=found,
+        outcomes=judge(stated.requirements, rows, samples),
+        confidence=chosen,
+        title=stated.title or "Attitude error budget",
+        notes=(*added.notes, *_notes(rows)),
+        provenance=provenance(seed, settings, post.provenance.get("data_sha256")),
+    )
+
+
+def _from_file(stated: BudgetFile) -> tuple[Contributor, ...]:
+    """Expected contributors as the file states them or not assessed, then the user's own; each on three axes."""
+    given = {(row.name, row.axis): row for row in stated.contributors}
+    rows = [given.pop((entry.name, axis), not_assessed(entry, axis)) for entry in FROM_FILE for axis in AXES]
+    for name in dict.fromkeys(name for name, _ in given):
+        first = next(row for row in given.values() if row.name == name)
+        rows += [given.get((name, axis), _silent(first, axis)) for axis in AXES]
+    return tuple(rows)
+
+
+def _silent(stated: Contributor, axis: str) -> Contributor:
+    """A contributor of the user's own on an axis that the file leaves out: not known, and so not zero."""
+    return replace(
+        stated,
+        axis=axis,
+        mean_arcsec=math.nan,
+        sigma_arcsec=math.nan,
+        correlation_group="",
+        conditions="",
+        provenance="",
+        source="not assessed",
+        applies=True,
+    )
+
+
+def _notes(rows: tuple[Contributor, ...]) -> tuple[str, ...]:
+    notes = []
+    missing = _missing(rows)
+    if missing:
+        notes.append(
+            f"Not assessed, and in no total: {join_words(missing)}. The totals say at least how large the error is."
+        )
+    part = tuple(dict.fromkeys(row.name for row in rows if row.absorbed_by_alignment == "in part" and row.assessed))
+    if part:
+        notes.append(f"Absorbed by alignment in part, and counted in full after it: {join_words(part)}.")
+    return tuple(notes)
+
+
+def _missing(rows: tuple[Contributor, ...]) -> tuple[str, ...]:
+    """Contributors that are not assessed, with the axes where they are so on some only."""
+    names = []
+    for name, axes in by_contributor(rows).items():
+        absent = [axis for axis, row in axes.items() if not row.assessed]
+        if absent:
+            some = "" if len(absent) == len(axes) else f" (about {join_words([AXIS_LABELS[axis] for axis in absent])})"
+            names.append(name + some)
+    return tuple(names)
+
+
+def budget_run(
+    run_path: str | os.PathLike[str],
+    *,
+    file: BudgetFile | str | os.PathLike[str] | None = None,
+    confidence: float | None = None,
+    seed: int = 0,
+) -> Budget:
+    """The budget of a run folder, written to its ``budget.csv``.
+
+    The attitude errors are those of ``attitude.csv``, and the tests of the model those of ``diagnosis.json`` if the run
+    was diagnosed.
+
+    Parameters
+    ----------
+    run_path : path
+        Folder of a run that holds a posterior and its attitude errors.
+    file, confidence, seed
+        As for `budget`.
+
+    Raises
+    ------
+    RunFolderError
+        If a part is missing, or the data are not those of the run.
+    BudgetError
+        If the file is wrong.
+    """
+    from starcal_uq.diagnostics.diagnose import load_diagnosis
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.observations.table import load_observations
+    from starcal_uq.propagation.attitude_error import AttitudeError
+
+    run = RunFolder(run_path)
+    stated = file if isinstance(file, BudgetFile) or file is None else load_budget_file(file)
+    cal = Calibration.load(run.require("calibration"))
+    post = Posterior.load(run.require("posterior"))
+    attitude = AttitudeError.load(run.require("attitude"))
+    obs = load_observations(run.require("observations"))
+    if obs.data_hash != cal.provenance.get("data_sha256"):
+        raise RunFolderError(
+            f"{run.path}: the calibration was made from other observations than {run.observations.name} holds; run "
+            "`starcal-uq calibrate` again."
+        )
+    found = budget(post, obs, attitude, file=stated, confidence=confidence, misfit=load_diagnosis(run, cal), seed=seed)
+    found.save(run.budget)
+    return found

@@ -1,0 +1,343 @@
+"""The user's part of a budget: contributors that no calibration knows, and requirements, from a TOML file."""
+
+from __future__ import annotations
+
+import difflib
+import math
+import os
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from starcal_uq.budgeting.rows import (
+    ABSORBED,
+    AXES,
+    CROSS_BORESIGHT,
+    DISTRIBUTIONS,
+    ECSS_CLASSES,
+    FROM_FILE,
+    FROM_POSTERIOR,
+    INTERACTING,
+    INTERPRETATIONS,
+    SCOPES,
+    TIME_CLASSES,
+    Contributor,
+    Expected,
+)
+from starcal_uq.budgeting.shapes import HALF_WIDTHS, RAYLEIGH_MEAN
+from starcal_uq.core.errors import BudgetError
+
+# As people write them: X and Y are across the boresight, Z is along it.
+_AXIS_NAMES = {
+    **{name: (name,) for name in AXES},
+    **{letter: (name,) for letter, name in zip("xyz", AXES, strict=True)},
+    CROSS_BORESIGHT: AXES[:2],
+    "all": AXES,
+}
+_REQUIREMENT_AXES = {key: names for key, names in _AXIS_NAMES.items() if key != "all"}
+# A full turn; no error is larger.
+_FULL_TURN_ARCSEC = 1_296_000.0
+# What the starter's names bring along, and nobody can guess for others.
+_OWN_KEYS = ("ecss_class", "time_class", "interpretation", "absorbed_by_alignment")
+# Names as similar as this are one name mistyped.
+_SAME_NAME = 0.9
+JUDGED_BY = ("both", "rule", "sampling")
+_CONTRIBUTOR_KEYS = (
+    *("name", "ecss_class", "axis", "mean_arcsec", "sigma_arcsec", "half_width_arcsec", "distribution", "time_class"),
+    *("interpretation", "absorbed_by_alignment", "correlation_group", "conditions", "provenance", "applies"),
+)
+_REQUIREMENT_KEYS = ("name", "axis", "limit_arcsec", "confidence", "scope", "interpretation", "judged_by")
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """A limit for a total.
+
+    Attributes
+    ----------
+    name : str
+        Its number or title.
+    axis : str
+        ``pitch``, ``yaw``, ``roll`` or ``cross-boresight`` (the angle of both axes together).
+    limit_arcsec : float
+        What the error has to stay below.
+    confidence : float
+        For this share of all cases.
+    scope : str
+        ``before alignment`` or ``after alignment`` calibration.
+    interpretation : str
+        Cases of what: ``mixed``, ``ensemble`` or ``temporal``.
+    judged_by : str
+        ``rule``, ``sampling``, or ``both``: the larger of the two bounds.
+    """
+
+    name: str
+    axis: str
+    limit_arcsec: float
+    confidence: float
+    scope: str = SCOPES[1]
+    interpretation: str = "mixed"
+    judged_by: str = "both"
+
+
+@dataclass(frozen=True)
+class BudgetFile:
+    """What a budget file states.
+
+    Attributes
+    ----------
+    contributors : tuple of Contributor
+        One per contributor and axis.
+    requirements : tuple of Requirement
+        In the order of the file.
+    title : str
+        Of the budget.
+    confidence : float or None
+        Of the totals; None to leave it to the caller.
+    path : str
+        Where it was read from.
+    """
+
+    contributors: tuple[Contributor, ...] = field(default=())
+    requirements: tuple[Requirement, ...] = field(default=())
+    title: str = ""
+    confidence: float | None = None
+    path: str = ""
+
+
+class _Table:
+    """One table of the file, whose keys are taken with their type checked."""
+
+    def __init__(self, data: Any, where: str, known: Sequence[str]) -> None:
+        if not isinstance(data, Mapping):
+            raise BudgetError(f"{where}: is no table; write [[contributor]] or [[requirement]] above its keys.")
+        self.data, self.where = data, where
+        for key in data:
+            if key not in known:
+                close = difflib.get_close_matches(str(key), known, n=1)
+                hint = f"did you mean {close[0]}" if close else f"remove it; known keys are {', '.join(known)}"
+                raise BudgetError(f"{where}: key {key} is not known; {hint}.")
+
+    def __contains__(self, key: str) -> bool:
+        return key in self.data
+
+    def text(self, key: str, default: str | None = None) -> str:
+        value = self.data.get(key, default)
+        if value is None:
+            raise BudgetError(f"{self.where}: key {key} is missing; write it as text in quotes.")
+        if not isinstance(value, str) or (default is None and not value.strip()):
+            raise BudgetError(f"{self.where}: key {key} is {value!r}; write text in quotes.")
+        return value.strip()
+
+    def choice(self, key: str, allowed: Sequence[str], default: str | None = None) -> str:
+        value = self.text(key, default)
+        found = {entry.lower(): entry for entry in allowed}.get(value.lower())
+        if found is None:
+            raise BudgetError(f"{self.where}: key {key} is {value!r}; write one of {', '.join(map(repr, allowed))}.")
+        return found
+
+    def number(self, key: str, default: float | None = None, *, least: float = -math.inf) -> float:
+        value = self.data.get(key, default)
+        if value is None:
+            raise BudgetError(f"{self.where}: key {key} is missing; write a number of arcsec.")
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or value != value or abs(value) == math.inf:
+            raise BudgetError(f"{self.where}: key {key} is {value!r}; write a finite number.")
+        # Before anything is made of it: an integer may be too large for a float.
+        if abs(value) > _FULL_TURN_ARCSEC:
+            much = (
+                f"more than {_FULL_TURN_ARCSEC:.0f} arcsec, a full turn" if key.endswith("arcsec") else "far too large"
+            )
+            raise BudgetError(f"{self.where}: key {key} is {much}; correct the number.")
+        if value < least:
+            raise BudgetError(f"{self.where}: key {key} is {value!r}; write a number of at least {least:g}.")
+        return float(value)
+
+    def flag(self, key: str, default: bool) -> bool:
+        value = self.data.get(key, default)
+        if not isinstance(value, bool):
+            raise BudgetError(f"{self.where}: key {key} is {value!r}; write true or false, without quotes.")
+        return value
+
+    def confidence(self, key: str, default: float | None = None) -> float:
+        return checked_confidence(self.number(key, default), f"{self.where}: key {key}")
+
+
+def checked_confidence(value: float, where: str) -> float:
+    """A confidence between 0 and 1, or a `BudgetError`."""
+    if not 0.0 < value < 1.0:
+        hint = f"; write {value / 100:g} for {value:g} %" if 1.0 < value < 100.0 else ""
+        raise BudgetError(f"{where} is {value!r}, but a confidence lies between 0 and 1, such as 0.997{hint}.")
+    return value
+
+
+def load_budget_file(path: str | os.PathLike[str]) -> BudgetFile:
+    """Read and check a budget file.
+
+    Raises
+    ------
+    BudgetError
+        If it cannot be read, or a key is unknown, missing or wrong; the sentence names file, table and key.
+    """
+    path = Path(path)
+    try:
+        content = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
+    except FileNotFoundError:
+        raise BudgetError(
+            f"{path}: the budget file does not exist; check the path, or write a starter with "
+            "`starcal-uq budget RUN --template FILE`."
+        ) from None
+    except OSError as error:
+        raise BudgetError(f"{path}: the budget file cannot be read ({error.strerror}); check the path.") from error
+    except UnicodeDecodeError:
+        raise BudgetError(f"{path}: the budget file is not UTF-8 text; save it as TOML in UTF-8.") from None
+    except tomllib.TOMLDecodeError as error:
+        raise BudgetError(f"{path}: the budget file is not valid TOML: {error}; correct that line.") from None
+    except ValueError:
+        raise BudgetError(f"{path}: the budget file holds a number with too many digits; correct it.") from None
+    for key in content:
+        if key not in ("budget", "contributor", "requirement"):
+            raise BudgetError(
+                f"{path}: {key} is not known; write [budget], [[contributor]] and [[requirement]] tables only."
+            )
+    head = _Table(content.get("budget", {}), f"{path}, [budget]", ("title", "confidence"))
+    confidence = head.confidence("confidence") if "confidence" in head else None
+    rows: list[Contributor] = []
+    for number, table in enumerate(_tables(content, "contributor", path), start=1):
+        rows += _contributor(_Table(table, f"{path}, [[contributor]] {number}", _CONTRIBUTOR_KEYS))
+    _no_doubles([(row.name, row.axis) for row in rows], f"{path}: contributor")
+    requirements = tuple(
+        _requirement(_Table(table, f"{path}, [[requirement]] {number}", _REQUIREMENT_KEYS), confidence)
+        for number, table in enumerate(_tables(content, "requirement", path), start=1)
+    )
+    _no_doubles([(requirement.name,) for requirement in requirements], f"{path}: requirement")
+    return BudgetFile(tuple(rows), requirements, head.text("title", ""), confidence, str(path))
+
+
+def _tables(content: Mapping[str, Any], key: str, path: Path) -> list[Any]:
+    found = content.get(key, [])
+    if not isinstance(found, list):
+        raise BudgetError(
+            f"{path}: [{key}] must be written with two brackets, [[{key}]], because there may be several."
+        )
+    return found
+
+
+def _no_doubles(names: Sequence[tuple[str, ...]], where: str) -> None:
+    for index, name in enumerate(names):
+        if name in names[:index]:
+            shown = ", axis ".join(name)
+            raise BudgetError(f"{where} {shown} is stated twice; keep one, or give them different names.")
+
+
+def _contributor(table: _Table) -> list[Contributor]:
+    written = table.text("name")
+    table.where += f" ({written!r})"
+    name, close = _known_name(written)
+    if name in {entry.name for entry in (*FROM_POSTERIOR, INTERACTING)}:
+        raise BudgetError(
+            f"{table.where}: key name: this row is filled by the posterior; give yours another name, or propagate "
+            "over other frames."
+        )
+    starter = {entry.name: entry for entry in FROM_FILE}.get(name)
+    if starter is None:
+        _check_own(table, name, close)
+    known = starter or _own(name)
+    axes = _AXIS_NAMES[table.choice("axis", tuple(_AXIS_NAMES)).lower()]
+    distribution = table.choice("distribution", DISTRIBUTIONS, known.distribution)
+    applies = table.flag("applies", True)
+    mean, sigma = (0.0, 0.0) if not applies else _moments(table, distribution)
+    provenance = table.text("provenance", "")
+    if not provenance:
+        raise BudgetError(
+            f"{table.where}: key provenance is missing; write where the number is from, because a budget is signed."
+        )
+    return [
+        Contributor(
+            name=name,
+            ecss_class=table.choice("ecss_class", ECSS_CLASSES, known.ecss_class),
+            axis=axis,
+            mean_arcsec=mean,
+            sigma_arcsec=sigma,
+            distribution=distribution,
+            time_class=table.choice("time_class", TIME_CLASSES, known.time_class),
+            interpretation=table.choice("interpretation", INTERPRETATIONS, known.interpretation),
+            absorbed_by_alignment=table.choice("absorbed_by_alignment", ABSORBED, known.absorbed_by_alignment),
+            correlation_group=table.text("correlation_group", ""),
+            conditions=table.text("conditions", ""),
+            provenance=provenance,
+            source="file",
+            applies=applies,
+        )
+        for axis in axes
+    ]
+
+
+def _known_name(written: str) -> tuple[str, str]:
+    """The name as the starter has it, whatever its case; else as written, with the most similar one of the starter."""
+    names = {entry.name.lower(): entry.name for entry in (*FROM_FILE, *FROM_POSTERIOR, INTERACTING)}
+    plain = " ".join(written.lower().split())
+    if plain in names:
+        return names[plain], ""
+    close = difflib.get_close_matches(plain, names, n=1)
+    return written, names[close[0]] if close else ""
+
+
+def _check_own(table: _Table, name: str, close: str) -> None:
+    """Refuse a mistyped name of the starter, and a contributor of the user's own that leaves out what it is."""
+    similar = difflib.SequenceMatcher(None, close.lower(), " ".join(name.lower().split())).ratio() if close else 0.0
+    if similar >= _SAME_NAME:
+        raise BudgetError(
+            f"{table.where}: key name: did you mean {close!r}? Write that, or a name of your own that differs more."
+        )
+    missing = [key for key in _OWN_KEYS if key not in table]
+    if missing and table.flag("applies", True):
+        hint = f"did you mean {close!r}? " if close else ""
+        raise BudgetError(
+            f"{table.where}: {hint}The starter has no such name, and a contributor of your own must state "
+            f"{', '.join(missing)} as well."
+        )
+
+
+def _own(name: str) -> Expected:
+    return Expected(name, "other", "constant", "ensemble", "no", "gaussian", "")
+
+
+def _moments(table: _Table, distribution: str) -> tuple[float, float]:
+    """Mean and standard deviation as the file states them."""
+    stated = [key for key in ("sigma_arcsec", "half_width_arcsec") if key in table]
+    if distribution == "constant":
+        if stated:
+            raise BudgetError(f"{table.where}: key {stated[0]}: a constant has no spread; give mean_arcsec alone.")
+        return table.number("mean_arcsec"), 0.0
+    if len(stated) != 1:
+        what = "is missing" if not stated else "and half_width_arcsec are both given"
+        raise BudgetError(f"{table.where}: key sigma_arcsec {what}; write either sigma_arcsec or half_width_arcsec.")
+    value = table.number(stated[0], least=0.0)
+    if stated[0] == "half_width_arcsec":
+        if distribution not in HALF_WIDTHS:
+            raise BudgetError(
+                f"{table.where}: key half_width_arcsec: a {distribution} error has no end; write sigma_arcsec, or "
+                "distribution = 'uniform' or 'arcsine'."
+            )
+        value /= HALF_WIDTHS[distribution]
+    return table.number("mean_arcsec", RAYLEIGH_MEAN * value if distribution == "rayleigh" else 0.0), value
+
+
+def _requirement(table: _Table, confidence: float | None) -> Requirement:
+    name = table.text("name")
+    table.where += f" ({name!r})"
+    axis = table.choice("axis", tuple(_REQUIREMENT_AXES)).lower()
+    limit = table.number("limit_arcsec")
+    if not limit > 0.0:
+        raise BudgetError(f"{table.where}: key limit_arcsec is {limit!r}; write a positive number of arcsec.")
+    return Requirement(
+        name=name,
+        axis=axis if axis == CROSS_BORESIGHT else _REQUIREMENT_AXES[axis][0],
+        limit_arcsec=limit,
+        confidence=table.confidence("confidence", 0.997 if confidence is None else confidence),
+        scope=table.choice("scope", SCOPES, SCOPES[1]),
+        interpretation=table.choice("interpretation", INTERPRETATIONS, "mixed"),
+        judged_by=table.choice("judged_by", JUDGED_BY, "both"),
+    )

@@ -1,0 +1,318 @@
+"""The budget as a result: rows, totals, margins; saved in the format that the file ending names."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from starcal_uq.budgeting.file import Requirement
+from starcal_uq.budgeting.rows import AXES, AXIS_LABELS, CROSS_BORESIGHT, SCOPES, Contributor, confidence_text
+from starcal_uq.budgeting.totals import Samples, Total, total
+from starcal_uq.core.errors import BudgetError
+from starcal_uq.core.formatting import significant
+from starcal_uq.core.types import AnyDict
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FORMATS = (".csv", ".xlsx", ".tex", ".html")
+# All that people may call an axis: its name, its letter, its label in the tables.
+_AXIS_NAMES = {
+    **{name: name for name in AXIS_LABELS},
+    **{label.lower(): name for name, label in AXIS_LABELS.items()},
+    **dict(zip("xyz", AXES, strict=True)),
+}
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A requirement against the total that it is about.
+
+    Attributes
+    ----------
+    requirement : Requirement
+        What is asked.
+    total : Total
+        The total at the requirement's confidence.
+    """
+
+    requirement: Requirement
+    total: Total
+
+    @property
+    def bound_arcsec(self) -> float:
+        """What is held against the limit: by the rule, by sampling, or the larger of both.
+
+        NaN if it is not known. The larger of both is at least the rule, which is enough where that violates the limit.
+        """
+        found, asked = self.total, self.requirement
+        if asked.judged_by == "both" and found.unresolved and found.rule_arcsec > asked.limit_arcsec:
+            return found.rule_arcsec
+        chosen = {"rule": found.rule_arcsec, "sampling": found.sampled_arcsec}
+        return chosen.get(asked.judged_by, found.larger_arcsec)
+
+    @property
+    def margin_arcsec(self) -> float:
+        """Limit minus bound; negative if violated."""
+        return self.requirement.limit_arcsec - self.bound_arcsec
+
+    @property
+    def verdict(self) -> str:
+        """``violated``; ``open`` while contributors are missing or samples do not resolve the confidence; ``met``."""
+        if self.margin_arcsec < 0.0:
+            return "violated"
+        # No row at all is assessed, or the samples end too early: the margin is not a number.
+        return "open" if self.total.at_least or math.isnan(self.margin_arcsec) else "met"
+
+    @property
+    def unresolved(self) -> bool:
+        """True if it is open because the samples do not resolve its confidence."""
+        return self.total.unresolved and math.isnan(self.bound_arcsec)
+
+    @property
+    def sentence(self) -> str:
+        """The outcome in one sentence."""
+        asked = self.requirement
+        what = f"{AXIS_LABELS[asked.axis]}, {confidence_text(asked.confidence)}, {asked.scope}, {asked.interpretation}"
+        numbers = f"{significant(self.bound_arcsec, 3)} arcsec against a limit of {significant(asked.limit_arcsec, 3)}"
+        if self.unresolved:
+            least = "at least " if self.total.at_least else ""
+            return (
+                f"{asked.name!r} ({what}) is open: {self.total.explanation.removesuffix('.')}. The rule, which knows "
+                f"Gaussian tails only, says {least}{significant(self.total.rule_arcsec, 3)} arcsec against a limit of "
+                f"{significant(asked.limit_arcsec, 3)}; judged_by = 'rule' would let it judge alone."
+            )
+        if math.isnan(self.bound_arcsec):
+            return f"{asked.name!r} ({what}) is open: no contributor is assessed."
+        least = "at least " if self.total.at_least else ""
+        if self.verdict == "violated":
+            cause = f"; {self.total.dominant!r} dominates" if self.total.dominant else ""
+            return f"{asked.name!r} ({what}) is violated: {least}{numbers}{cause}."
+        if self.verdict == "open":
+            count = len(self.total.not_assessed)
+            missing = f"{count} contributors are" if count > 1 else "1 contributor is"
+            return f"{asked.name!r} ({what}) is open: {numbers} so far, but {missing} not assessed."
+        return f"{asked.name!r} ({what}) is met: {numbers}, margin {significant(self.margin_arcsec, 3)} arcsec."
+
+
+@dataclass(frozen=True, eq=False)
+class Budget:
+    """The attitude error budget of a star sensor.
+
+    Attributes
+    ----------
+    rows : tuple of Contributor
+        One per contributor and axis, those not assessed included.
+    totals : tuple of Total
+        Both scopes, three axes and the two across the boresight together, three interpretations.
+    outcomes : tuple of Outcome
+        Requirements against their totals.
+    confidence : float
+        Of the totals.
+    title : str
+        Title.
+    notes : tuple of str
+        What the reader has to know: inflations, what stays open.
+    provenance : dict
+        Seed, settings, versions, time and data hash.
+    """
+
+    rows: tuple[Contributor, ...]
+    totals: tuple[Total, ...]
+    outcomes: tuple[Outcome, ...]
+    confidence: float
+    title: str
+    notes: tuple[str, ...]
+    provenance: AnyDict
+
+    @property
+    def violations(self) -> tuple[Outcome, ...]:
+        """Requirements that are violated, by what is assessed alone."""
+        return tuple(outcome for outcome in self.outcomes if outcome.verdict == "violated")
+
+    @property
+    def open_requirements(self) -> tuple[Outcome, ...]:
+        """Requirements that are neither violated nor met: contributors are missing, or samples resolve too little."""
+        return tuple(outcome for outcome in self.outcomes if outcome.verdict == "open")
+
+    @property
+    def comparable(self) -> tuple[Outcome, ...]:
+        """Requirements at the budget's own confidence, mixed: those that its totals may be held against."""
+        return tuple(
+            outcome
+            for outcome in self.outcomes
+            if outcome.requirement.interpretation == "mixed"
+            and math.isclose(1.0 - outcome.requirement.confidence, 1.0 - self.confidence, rel_tol=1e-9)
+        )
+
+    @property
+    def not_assessed(self) -> tuple[str, ...]:
+        """Contributors that are not assessed on some axis."""
+        return tuple(dict.fromkeys(row.name for row in self.rows if not row.assessed))
+
+    def total(self, axis: str, scope: str = "after alignment", interpretation: str = "mixed") -> Total:
+        """One of the totals.
+
+        Parameters
+        ----------
+        axis : str
+            ``pitch``, ``yaw``, ``roll``, ``cross-boresight``, or as tables show it: ``X``, ``X (pitch)``, ``X and Y
+            together``.
+        scope : str
+            ``before alignment`` or ``after alignment``.
+        interpretation : str
+            ``mixed``, ``ensemble`` or ``temporal``.
+
+        Raises
+        ------
+        ValueError
+            For an unknown axis, scope or interpretation.
+        """
+        name = _AXIS_NAMES.get(axis.strip().lower(), axis)
+        for found in self.totals:
+            if (found.axis, found.scope, found.interpretation) == (name, scope, interpretation):
+                return found
+        raise ValueError(
+            f"a budget has no total for {axis!r}, {scope!r}, {interpretation!r}; the axis is one of X, Y, Z (pitch, "
+            f"yaw, roll) or {CROSS_BORESIGHT}, the scope {' or '.join(SCOPES)}, the interpretation mixed, ensemble or "
+            "temporal"
+        )
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """One row per contributor and axis: the fields of `Contributor`, ``assessed`` and ``combination``."""
+        import pandas as pd
+
+        names = [f.name for f in fields(Contributor)]
+        rows = [
+            {**{name: getattr(row, name) for name in names}, "assessed": row.assessed, "combination": row.combination}
+            for row in self.rows
+        ]
+        return pd.DataFrame(rows)
+
+    def totals_dataframe(self) -> pd.DataFrame:
+        """One row per total: the fields of `Total`, and ``at_least``."""
+        import pandas as pd
+
+        rows = [
+            {**{f.name: getattr(entry, f.name) for f in fields(Total)}, "at_least": entry.at_least}
+            for entry in self.totals
+        ]
+        return pd.DataFrame(rows).assign(not_assessed=["; ".join(entry.not_assessed) for entry in self.totals])
+
+    def requirements_dataframe(self) -> pd.DataFrame:
+        """One row per requirement: its fields, ``rule_arcsec``, ``sampled_arcsec``, ``margin_arcsec``, ``verdict``."""
+        import pandas as pd
+
+        names = [f.name for f in fields(Requirement)]
+        columns = [*names, "rule_arcsec", "sampled_arcsec", "bound_arcsec", "margin_arcsec", "verdict", "at_least"]
+        rows = [
+            (
+                *(getattr(outcome.requirement, name) for name in names),
+                *(outcome.total.rule_arcsec, outcome.total.sampled_arcsec, outcome.bound_arcsec),
+                *(outcome.margin_arcsec, outcome.verdict, outcome.total.at_least),
+            )
+            for outcome in self.outcomes
+        ]
+        return pd.DataFrame(rows, columns=columns)
+
+    def to_dict(self) -> AnyDict:
+        """Plain values for JSON; what is not known is None, never zero and never NaN."""
+
+        def plain(table: pd.DataFrame) -> list[AnyDict]:
+            records = table.to_dict("records")
+            return [{key: None if _unknown(value) else value for key, value in record.items()} for record in records]
+
+        return {
+            "title": self.title,
+            "confidence": self.confidence,
+            "contributors": plain(self.to_dataframe()),
+            "totals": plain(self.totals_dataframe()),
+            "requirements": plain(self.requirements_dataframe()),
+            "violations": [outcome.requirement.name for outcome in self.violations],
+            "not_assessed": list(self.not_assessed),
+            "notes": list(self.notes),
+            "provenance": self.provenance,
+        }
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the budget, atomically; overwritten. The ending names the format.
+
+        ``.csv`` holds everything to the last digit and is what `load` reads; ``.xlsx``, ``.tex`` and ``.html`` are
+        for people.
+
+        Raises
+        ------
+        BudgetError
+            For another ending.
+        RunFolderError
+            If it cannot be written.
+        """
+        from starcal_uq.budgeting import budget_csv
+        from starcal_uq.presentation.pages import budgeting as budget_output
+
+        ending = Path(path).suffix.lower()
+        if ending not in FORMATS:
+            raise BudgetError(f"{path}: the ending names the format; use one of {', '.join(FORMATS)}.")
+        if ending == ".csv":
+            budget_csv.write_csv(self, path)
+        else:
+            budget_output.WRITERS[ending](self, path)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Budget:
+        """Read what `save` wrote as CSV, without loss.
+
+        Raises
+        ------
+        RunFolderError
+            If the file is missing or is not a budget.
+        """
+        from starcal_uq.budgeting.budget_csv import read_csv
+
+        return read_csv(path)
+
+    def plot_budget(self, **options: Any) -> Any:
+        """Contributions and totals; options as for `starcal_uq.presentation.figures.budgeting.plot_budget`."""
+        from starcal_uq.presentation.figures.budgeting import plot_budget
+
+        return plot_budget(self, **options)
+
+    def _repr_html_(self) -> str:
+        from starcal_uq.presentation.pages.budgeting import section_html
+
+        return section_html(self)
+
+
+def _unknown(value: Any) -> bool:
+    return isinstance(value, float) and math.isnan(value)
+
+
+def judge(requirements: Sequence[Requirement], rows: Sequence[Contributor], samples: Samples) -> tuple[Outcome, ...]:
+    """Every requirement against the total at its own confidence."""
+    return tuple(
+        Outcome(
+            asked,
+            total(
+                rows,
+                samples,
+                scope=asked.scope,
+                axis=asked.axis,
+                interpretation=asked.interpretation,
+                confidence=asked.confidence,
+            ),
+        )
+        for asked in requirements
+    )
+
+
+def by_contributor(rows: Sequence[Contributor]) -> dict[str, dict[str, Contributor]]:
+    """Rows by name, then by axis, in the order of the budget."""
+    found: dict[str, dict[str, Contributor]] = {}
+    for row in rows:
+        found.setdefault(row.name, {})[row.axis] = row
+    order = {axis: index for index, axis in enumerate(AXES)}
+    return {name: dict(sorted(axes.items(), key=lambda item: order[item[0]])) for name, axes in found.items()}

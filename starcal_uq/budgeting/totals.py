@@ -1,0 +1,287 @@
+"""Totals of a budget: by the rule of ECSS-E-ST-60-10C, and by sampling the same rows.
+
+By the rule, means add with their signs, sigmas of rows that err together add, everything else adds in squares, and the
+bound at a confidence is |mean| + n sigma, with n the Gaussian quantile of that confidence: two-sided for one axis, that
+of a two-axis Gaussian error for the angle across the boresight.
+
+What counts as random depends on what the confidence is about:
+
+- *mixed*: a sensor and a moment taken at random. All rows spread.
+- *ensemble*: a sensor taken at random, at its worst moment. Rows that are random in time enter with their half-width at
+  the confidence, added linearly.
+- *temporal*: the worst sensor, at a moment taken at random. Rows that are random over the ensemble enter so.
+
+A row that is random over both enters the last two by its half-width, which is more than is needed, never less.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from starcal_uq.budgeting.rows import (
+    AXES,
+    CROSS_BORESIGHT,
+    GAUSSIAN_997,
+    INTERPRETATIONS,
+    SCOPES,
+    TOTAL_AXES,
+    Contributor,
+    confidence_text,
+)
+from starcal_uq.budgeting.shapes import deviates, half_width, mixture_spread, one_axis_factor, two_axis_radius
+from starcal_uq.core.types import FloatArray
+from starcal_uq.presentation.words.budgeting import explain
+
+N_SAMPLES = 200_000
+# Two standard errors of a quantile, as order statistics.
+_SPREAD = 2.0
+# Samples beyond a quantile with fewer say little about it: its standard error is unknown, or the samples end before it.
+_RESOLVED = 20.0
+_DOMINANT = 0.5
+
+
+@dataclass(frozen=True)
+class Total:
+    """The total of a budget in one scope, on one axis, in one interpretation.
+
+    Attributes
+    ----------
+    scope, axis, interpretation : str
+        One of `SCOPES`, `TOTAL_AXES`, `INTERPRETATIONS`.
+    confidence : float
+        What the bounds hold, as a fraction.
+    mean_arcsec : float
+        Sum of the means; for both axes together the length of their vector.
+    sigma_arcsec : float
+        Standard deviation of what counts as random; for both axes, root mean square of the two.
+    factor : float
+        n: sigmas that the bound takes, NaN if nothing is random.
+    worst_arcsec : float
+        What does not count as random, by its half-width.
+    rule_arcsec, sampled_arcsec : float
+        Bound by the rule, and quantile of the sampled error; NaN if no row is assessed. The sampled one is NaN too if
+        fewer than 20 samples lie beyond it.
+    sampled_se_arcsec : float
+        Standard error of the sampled bound.
+    not_assessed : tuple of str
+        Contributors that are missing: with any, the bounds are "at least".
+    dominant : str
+        Row with more than half of the squared half-widths, or empty.
+    dominant_share : float
+        Its share; of the largest row if none has more than half.
+    explanation : str
+        Why the two bounds differ, or that they agree.
+    """
+
+    scope: str
+    axis: str
+    interpretation: str
+    confidence: float
+    mean_arcsec: float
+    sigma_arcsec: float
+    factor: float
+    worst_arcsec: float
+    rule_arcsec: float
+    sampled_arcsec: float
+    sampled_se_arcsec: float
+    not_assessed: tuple[str, ...] = field(default=())
+    dominant: str = ""
+    dominant_share: float = math.nan
+    explanation: str = ""
+
+    @property
+    def at_least(self) -> bool:
+        """True while contributors are missing."""
+        return bool(self.not_assessed)
+
+    @property
+    def larger_arcsec(self) -> float:
+        """The larger of the two bounds; NaN if one is not known."""
+        return math.nan if math.isnan(self.sampled_arcsec) else max(self.rule_arcsec, self.sampled_arcsec)
+
+    @property
+    def unresolved(self) -> bool:
+        """True if rows are assessed, but the samples do not reach as far as the confidence."""
+        return math.isnan(self.sampled_arcsec) and not math.isnan(self.rule_arcsec)
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Sums of sampled rows per scope and kind of randomness, arcsec: ``sums[scope, interpretation]`` is (n, 3)."""
+
+    sums: dict[tuple[str, str], FloatArray]
+
+
+def draw(rows: Sequence[Contributor], n_samples: int = N_SAMPLES, seed: int = 0) -> Samples:
+    """Sample every assessed row around its mean and add up what has the same kind of randomness.
+
+    Rows of one correlation group share their probabilities on each axis. A sigma that changes from frame to frame is
+    the same for all axes of a contributor.
+    """
+    sums = {(scope, kind): np.zeros((n_samples, 3)) for scope in SCOPES for kind in INTERPRETATIONS}
+    shared: dict[tuple[str, str], FloatArray] = {}
+    scales: dict[str, FloatArray] = {}
+    for index, row in enumerate(rows):
+        if not (row.assessed and row.applies and row.sigma_arcsec > 0.0):
+            continue
+        uniform = np.random.default_rng((seed, 1, index)).random(n_samples)
+        if row.correlation_group:
+            uniform = shared.setdefault((row.correlation_group, row.axis), uniform)
+        if row.tail_997 > GAUSSIAN_997 and row.name not in scales:
+            scales[row.name] = np.random.default_rng((seed, 2, index)).standard_normal(n_samples)
+        log_scale = scales.get(row.name, uniform)
+        errors = row.sigma_arcsec * deviates(row.distribution, uniform, log_scale, row.tail_997)
+        for scope in SCOPES:
+            if row.counts(scope):
+                sums[scope, row.interpretation][:, AXES.index(row.axis)] += errors
+    return Samples(sums)
+
+
+def total(
+    rows: Sequence[Contributor],
+    samples: Samples,
+    *,
+    scope: str,
+    axis: str,
+    interpretation: str,
+    confidence: float,
+) -> Total:
+    """One total, by the rule and from the samples, with their difference explained."""
+    axes = (CROSS_BORESIGHT, AXES[:2]) if axis == CROSS_BORESIGHT else (axis, (axis,))
+    chosen = [row for row in rows if row.axis in axes[1] and row.counts(scope)]
+    missing = tuple(dict.fromkeys(row.name for row in chosen if not row.assessed))
+    counted = [row for row in chosen if row.assessed and row.applies]
+    if not counted:
+        nan = math.nan
+        return Total(scope, axis, interpretation, confidence, nan, nan, nan, nan, nan, nan, nan, missing)
+    random = [row for row in counted if interpretation in ("mixed", row.interpretation)]
+    worst = [row for row in counted if row not in random]
+    mean = np.array([sum(row.mean_arcsec for row in counted if row.axis == name) for name in axes[1]])
+    sigma = np.array([grouped_sigma([row for row in random if row.axis == name]) for name in axes[1]])
+    radius = _radius(confidence, sigma)
+    gaussian = _worst(worst, axes[1], confidence, by_shape=False)
+    length, rms = float(np.linalg.norm(mean)), float(np.sqrt(np.mean(sigma**2)))
+    rule = length + radius + gaussian
+    sampled, error = _sampled(
+        samples, scope, interpretation, mean, axes[1], confidence, _worst(worst, axes[1], confidence, by_shape=True)
+    )
+    dominant, share = _dominant(counted, axes[1], confidence)
+    result = Total(
+        scope=scope,
+        axis=axis,
+        interpretation=interpretation,
+        confidence=confidence,
+        mean_arcsec=length if len(mean) > 1 else float(mean[0]),
+        sigma_arcsec=rms,
+        factor=radius / rms if rms > 0.0 else math.nan,
+        worst_arcsec=gaussian,
+        rule_arcsec=rule,
+        sampled_arcsec=sampled,
+        sampled_se_arcsec=error,
+        not_assessed=missing,
+        dominant=dominant.name if share > _DOMINANT else "",
+        dominant_share=share,
+    )
+    if result.unresolved:
+        n = len(samples.sums[scope, interpretation if interpretation != "mixed" else INTERPRETATIONS[0]])
+        text = f"{n} samples do not resolve a confidence of {confidence_text(confidence)}: there is no sampled bound."
+        return replace(result, explanation=text)
+    return replace(result, explanation=explain(result, counted, random, dominant))
+
+
+def grouped_sigma(rows: Sequence[Contributor]) -> float:
+    """Standard deviation of the sum of rows on one axis: linear within groups, in squares otherwise."""
+    groups: dict[str, float] = {}
+    for index, row in enumerate(rows):
+        key = f"group {row.correlation_group}" if row.correlation_group else f"row {index}"
+        groups[key] = groups.get(key, 0.0) + row.sigma_arcsec
+    return math.sqrt(sum(value * value for value in groups.values()))
+
+
+def _radius(confidence: float, sigma: FloatArray) -> float:
+    if len(sigma) == 1:
+        return one_axis_factor(confidence) * float(sigma[0])
+    return two_axis_radius(confidence, float(sigma[0]), float(sigma[1]))
+
+
+def _worst(rows: Sequence[Contributor], axes: Sequence[str], confidence: float, *, by_shape: bool) -> float:
+    """Sum of half-widths: of the distributions themselves, or with the rule's Gaussian factor for unbounded ones."""
+    by_name: dict[str, list[Contributor]] = {}
+    for row in rows:
+        by_name.setdefault(row.name, []).append(row)
+    return sum((_reach(members, axes, confidence, by_shape=by_shape) for members in by_name.values()), start=0.0)
+
+
+def _reach(rows: Sequence[Contributor], axes: Sequence[str], confidence: float, *, by_shape: bool) -> float:
+    """Half-width of one contributor on the axis, or on both axes together."""
+    sigma = np.zeros(len(axes))
+    bounded = np.zeros(len(axes))
+    tail = GAUSSIAN_997
+    for row in rows:
+        place = axes.index(row.axis)
+        if row.distribution == "gaussian":
+            sigma[place] = row.sigma_arcsec
+            tail = max(tail, row.tail_997) if by_shape else tail
+        else:
+            bounded[place] = half_width(row.distribution, confidence) * row.sigma_arcsec
+    if len(axes) == 1:
+        spread = half_width("gaussian", confidence, tail) * float(sigma[0])
+    else:
+        spread = two_axis_radius(confidence, float(sigma[0]), float(sigma[1]), mixture_spread(tail))
+    return spread + float(np.linalg.norm(bounded))
+
+
+def _sampled(
+    samples: Samples,
+    scope: str,
+    interpretation: str,
+    mean: FloatArray,
+    axes: Sequence[str],
+    confidence: float,
+    worst: float,
+) -> tuple[float, float]:
+    """Quantile of the sampled error beyond the worst case of the rest, and its standard error; NaN if unresolved."""
+    kinds = INTERPRETATIONS if interpretation == "mixed" else (interpretation,)
+    columns = [AXES.index(name) for name in axes]
+    errors = mean + np.sum([samples.sums[scope, kind][:, columns] for kind in kinds], axis=0)
+    size = np.sort(np.linalg.norm(errors, axis=1))
+    n = len(size)
+    if size[0] == size[-1]:
+        return float(size[0]) + worst, 0.0
+    if n * min(confidence, 1.0 - confidence) < _RESOLVED * (1.0 - 1e-9):
+        return math.nan, math.nan
+    step = _SPREAD * math.sqrt(n * confidence * (1.0 - confidence))
+    low, here, high = (
+        float(size[min(max(math.ceil(confidence * n + shift) - 1, 0), n - 1)]) for shift in (-step, 0.0, step)
+    )
+    return here + worst, (high - low) / (2.0 * _SPREAD)
+
+
+def _dominant(rows: Sequence[Contributor], axes: Sequence[str], confidence: float) -> tuple[Contributor, float]:
+    """The row that matters most, and its share of the squares of means and half-widths."""
+    weight: dict[str, float] = {}
+    for row in rows:
+        size = abs(row.mean_arcsec) + half_width(row.distribution, confidence, row.tail_997) * row.sigma_arcsec
+        weight[row.name] = weight.get(row.name, 0.0) + size * size
+    whole = sum(weight.values())
+    name = max(weight, key=lambda key: weight[key])
+    first = max((row for row in rows if row.name == name), key=lambda row: row.sigma_arcsec)
+    return first, weight[name] / whole if whole > 0.0 else 0.0
+
+
+def totals(
+    rows: Sequence[Contributor], confidence: float, *, n_samples: int = N_SAMPLES, seed: int = 0
+) -> tuple[tuple[Total, ...], Samples]:
+    """All totals: both scopes, three axes and the two across the boresight together, three interpretations."""
+    samples = draw(rows, n_samples, seed)
+    found = tuple(
+        total(rows, samples, scope=scope, axis=axis, interpretation=kind, confidence=confidence)
+        for scope in SCOPES
+        for axis in TOTAL_AXES
+        for kind in ("mixed", "ensemble", "temporal")
+    )
+    return found, samples

@@ -1,0 +1,318 @@
+"""The camera: detector, optics and distortion, with units in every name.
+
+Pixels: x to the right, y down, (0, 0) is the *centre* of the first pixel; the detector therefore spans
+[-0.5, width_px - 0.5] x [-0.5, height_px - 0.5].
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import html
+import math
+import operator
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from starcal_uq.camera.camera_files import camera_text, parse_table, read_camera
+from starcal_uq.camera.distortion import get_model, parameter_names
+from starcal_uq.camera.opencv import from_opencv, to_opencv
+from starcal_uq.core.errors import CameraError, DistortionError
+from starcal_uq.core.types import BoolArray, FloatArray
+from starcal_uq.runs.folder import atomic_write_text, ensure_new
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A star camera with square pixels.
+
+    Attributes
+    ----------
+    width_px, height_px : int
+        Size of the detector, pixels.
+    pixel_um : float
+        Pixel pitch, micrometres.
+    focal_mm : float
+        Focal length, millimetres.
+    x0_px, y0_px : float
+        Principal point, pixels; it may lie outside the detector.
+    distortion : str
+        Name of the distortion model (`starcal_uq.camera.distortion.model_names`).
+    coefficients : tuple of float
+        Coefficients of that model in its order, on offsets in pixels; zeros by default.
+    name : str
+        Free text.
+
+    Raises
+    ------
+    CameraError
+        If a value is not finite, a size is not positive, or the coefficients do not fit the distortion model.
+    """
+
+    width_px: int
+    height_px: int
+    pixel_um: float
+    focal_mm: float
+    x0_px: float
+    y0_px: float
+    distortion: str = "brown"
+    coefficients: tuple[float, ...] = ()
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        try:
+            model = get_model(self.distortion)
+        except DistortionError as error:
+            raise CameraError(f"camera: {error}") from None
+        for key in ("width_px", "height_px"):
+            self._set(key, _whole(key, getattr(self, key)))
+        for key in ("pixel_um", "focal_mm", "x0_px", "y0_px"):
+            self._set(key, _finite(key, getattr(self, key)))
+        for key in ("width_px", "height_px", "pixel_um", "focal_mm"):
+            if getattr(self, key) <= 0:
+                raise CameraError(f"camera: {key} is {getattr(self, key)!r}; it must be above 0.")
+        names = [c.name for c in model.coefficients]
+        given = tuple(self.coefficients) or (0.0,) * len(names)
+        if len(given) != len(names):
+            raise CameraError(
+                f"camera: {len(given)} coefficients for distortion {model.name!r}; "
+                f"give {len(names)} ({', '.join(names) or 'none'}), or leave them out for zeros."
+            )
+        self._set("coefficients", tuple(_finite(n, k) for n, k in zip(names, given, strict=True)))
+
+    def _set(self, key: str, value: object) -> None:
+        object.__setattr__(self, key, value)
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length, pixels."""
+        return self.focal_mm * 1000.0 / self.pixel_um
+
+    @property
+    def theta(self) -> FloatArray:
+        """Parameters x0, y0, f, k... in pixels, shape (p,)."""
+        return np.array([self.x0_px, self.y0_px, self.focal_px, *self.coefficients])
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of `theta`."""
+        return parameter_names(self.distortion)
+
+    @property
+    def fov_deg(self) -> tuple[float, float]:
+        """Full horizontal and vertical field of an ideal pinhole centred on the detector, degrees."""
+        f = self.focal_px
+        return (
+            math.degrees(2.0 * math.atan(self.width_px / (2.0 * f))),
+            math.degrees(2.0 * math.atan(self.height_px / (2.0 * f))),
+        )
+
+    @property
+    def centre_px(self) -> tuple[float, float]:
+        """Centre of the detector (x, y), pixels."""
+        return (self.width_px - 1) / 2.0, (self.height_px - 1) / 2.0
+
+    @property
+    def corner_radius_px(self) -> float:
+        """Distance of the principal point from the farthest corner of the detector, pixels."""
+        dx = max(abs(-0.5 - self.x0_px), abs(self.width_px - 0.5 - self.x0_px))
+        dy = max(abs(-0.5 - self.y0_px), abs(self.height_px - 0.5 - self.y0_px))
+        return math.hypot(dx, dy)
+
+    def contains(self, xy: ArrayLike) -> BoolArray:
+        """Whether each point lies on the detector, edges included.
+
+        Parameters
+        ----------
+        xy
+            Points, shape (..., 2), pixels; a point that is not finite is not on the detector.
+
+        Returns
+        -------
+        array of bool, shape (...)
+        """
+        points = np.asarray(xy, dtype=np.float64)
+        limit = np.array([self.width_px - 0.5, self.height_px - 0.5])
+        inside: BoolArray = np.all((points >= -0.5) & (points <= limit), axis=-1)
+        return inside
+
+    def with_theta(self, theta: ArrayLike) -> Camera:
+        """The same detector with other parameters.
+
+        Parameters
+        ----------
+        theta
+            x0, y0, f, k... in pixels, shape (p,), in the order of `parameter_names`.
+        """
+        values = np.asarray(theta, dtype=np.float64)
+        if values.shape != (len(self.parameter_names),):
+            raise CameraError(
+                f"camera: theta has shape {values.shape}; give {len(self.parameter_names)} values "
+                f"({', '.join(self.parameter_names)})."
+            )
+        x0, y0, f, *coefficients = values.tolist()
+        focal_mm = f * self.pixel_um / 1000.0
+        return self.replace(x0_px=x0, y0_px=y0, focal_mm=focal_mm, coefficients=tuple(coefficients))
+
+    def replace(self, **changes: Any) -> Camera:
+        """A copy with some attributes changed.
+
+        With another `distortion` and no `coefficients`, those of the same name are kept and the others are
+        zero; between a forward and an inverse model nothing can be kept.
+        """
+        if "distortion" in changes and "coefficients" not in changes:
+            try:
+                new = get_model(changes["distortion"])
+            except DistortionError as error:
+                raise CameraError(f"camera: {error}") from None
+            old = get_model(self.distortion)
+            kept: dict[str, float] = {}
+            if new.direction == old.direction:
+                kept = dict(zip((c.name for c in old.coefficients), self.coefficients, strict=True))
+            changes["coefficients"] = tuple(kept.get(c.name, 0.0) for c in new.coefficients)
+        known = {field.name for field in dataclasses.fields(self)}
+        if unknown := sorted(set(changes) - known):
+            raise CameraError(f"camera: no attribute {unknown[0]!r}; use one of {', '.join(sorted(known))}.")
+        return dataclasses.replace(self, **changes)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The [camera] table: plain values, coefficients under their own names."""
+        table = dataclasses.asdict(self)
+        del table["coefficients"]
+        name = table.pop("name")
+        names = (c.name for c in get_model(self.distortion).coefficients)
+        table.update(zip(names, self.coefficients, strict=True))
+        return {"name": name, **table} if name else table
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> Camera:
+        """A camera from the [camera] table; distortion (brown), coefficients (zero) and name may be left out.
+
+        Raises
+        ------
+        CameraError
+            For an unknown or missing key or a value that does not fit.
+        """
+        return cls(**parse_table(table, "camera"))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Camera:
+        """Read a camera from a TOML file.
+
+        Raises
+        ------
+        CameraError
+            If the file cannot be read or its content does not fit; the message names file, key and remedy.
+        """
+        return cls(**read_camera(path))
+
+    def save(self, path: str | os.PathLike[str], force: bool = False) -> None:
+        """Write the camera to a TOML file without loss of digits.
+
+        Raises
+        ------
+        RunFolderError
+            If the file exists and `force` is false, or cannot be written.
+        """
+        ensure_new(path, force)
+        atomic_write_text(path, camera_text(self.to_dict()))
+
+    def to_opencv(self) -> tuple[FloatArray, FloatArray]:
+        """The same camera for OpenCV, whose pixel origin is ours.
+
+        OpenCV distorts normalised coordinates: k1_cv = k1 f^2, k2_cv = k2 f^4, k3_cv = k3 f^6, p_cv = p f.
+
+        Returns
+        -------
+        camera_matrix : array, shape (3, 3)
+            Pixels.
+        dist_coeffs : array, shape (5,)
+            k1, k2, p1, p2, k3, dimensionless.
+
+        Raises
+        ------
+        CameraError
+            For an inverse distortion model, which OpenCV has not.
+        """
+        return to_opencv(self.distortion, self.theta)
+
+    @classmethod
+    def from_opencv(
+        cls,
+        camera_matrix: ArrayLike,
+        dist_coeffs: ArrayLike | None,
+        width_px: int,
+        height_px: int,
+        pixel_um: float,
+        *,
+        distortion: str | None = None,
+        name: str = "",
+    ) -> Camera:
+        """A camera from OpenCV's matrix and coefficients.
+
+        Parameters
+        ----------
+        camera_matrix
+            Shape (3, 3), pixels.
+        dist_coeffs
+            k1, k2[, p1, p2[, k3]], any shape; None or empty for none. Further coefficients must be zero.
+        width_px, height_px, pixel_um
+            The detector, of which OpenCV keeps no record.
+        distortion
+            Distortion model to use; by default the smallest of brown, brown3 and brown_tangential that
+            holds the coefficients.
+
+        Raises
+        ------
+        CameraError
+            For fx != fy, skew, or coefficients that the distortion model cannot hold.
+        """
+        model, theta = from_opencv(camera_matrix, dist_coeffs, distortion)
+        return cls(
+            width_px=width_px,
+            height_px=height_px,
+            pixel_um=pixel_um,
+            focal_mm=theta[2] * pixel_um / 1000.0,
+            x0_px=theta[0],
+            y0_px=theta[1],
+            distortion=model,
+            coefficients=tuple(theta[3:]),
+            name=name,
+        )
+
+    def _repr_html_(self) -> str:
+        horizontal, vertical = self.fov_deg
+        rows = [
+            ("detector", f"{self.width_px} x {self.height_px} px of {self.pixel_um:g} &micro;m"),
+            ("field", f"{horizontal:.3f} x {vertical:.3f} deg"),
+            ("focal length", f"{self.focal_mm:.6g} mm = {self.focal_px:.3f} px"),
+            ("principal point", f"({self.x0_px:.3f}, {self.y0_px:.3f}) px"),
+            ("distortion", html.escape(self.distortion)),
+        ]
+        coefficients = get_model(self.distortion).coefficients
+        rows += [(c.name, f"{k:.6g} {c.unit}") for c, k in zip(coefficients, self.coefficients, strict=True)]
+        body = "".join(f"<tr><th>{key}</th><td>{value}</td></tr>" for key, value in rows)
+        return f"<table><caption>{html.escape(self.name or 'Camera')}</caption>{body}</table>"
+
+
+def _whole(key: str, value: Any) -> int:
+    try:
+        if isinstance(value, bool):
+            raise TypeError
+        return operator.index(value)
+    except TypeError:
+        raise CameraError(f"camera: {key} is {value!r}; give a whole number.") from None
+
+
+def _finite(key: str, value: Any) -> float:
+    try:
+        number = float(value)
+    except (TypeError, ValueError, OverflowError):
+        raise CameraError(f"camera: {key} is {value!r}; give a number.") from None
+    if not math.isfinite(number):
+        raise CameraError(f"camera: {key} is {number!r}; give a finite number.")
+    return number

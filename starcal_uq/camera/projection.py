@@ -1,0 +1,383 @@
+"""The camera model: one symbolic formula, and the vectorised kernels generated from it.
+
+A direction ``b`` in the camera frame falls on the ideal point ``(u, v) = f (b_x, b_y) / b_z`` relative to the principal
+point; a distortion model of the registry moves it (``forward``) or moves the measured point back (``inverse``). The
+direction in which a model is not explicit is found by Newton's method, and its derivatives by taking further Newton
+steps symbolically from the root: one step carries exact first derivatives, two carry exact second derivatives.
+
+Arrays inside have the star axis last (structure of arrays), the layout in which sums over stars are matrix products.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.kernels import Kernel, build_kernel
+from starcal_uq.core.errors import DistortionError
+from starcal_uq.core.types import FloatArray, IntArray
+
+_NEWTON_STEPS = 60
+# The kernels take one more Newton step from the root, which squares the error of the root.
+_NEWTON_TOLERANCE_PX = 1e-8
+
+
+@dataclass(frozen=True)
+class Symbols:
+    """Symbols shared by the expressions of one model."""
+
+    theta: Any
+    b: Any
+    phi: Any
+    pixel: Any
+    root: Any
+
+
+def _symbols(model_name: str) -> Symbols:
+    import casadi as ca
+
+    n_parameters = 3 + len(get_model(model_name).coefficients)
+    return Symbols(*(ca.SX.sym(n, k) for n, k in zip("tbpxr", (n_parameters, 3, 3, 2, 2), strict=True)))
+
+
+def _displaced(model_name: str, point: Any, theta: Any) -> Any:
+    import casadi as ca
+
+    model = get_model(model_name)
+    k = [theta[3 + j] for j in range(len(model.coefficients))]
+    du, dv = model.displacement(point[0], point[1], k)
+    return ca.vertcat(point[0] + du, point[1] + dv)
+
+
+def _newton_step(model_name: str, point: Any, target: Any, theta: Any) -> tuple[Any, Any]:
+    """One symbolic Newton step for ``displaced(point) = target``; also the Jacobian determinant."""
+    import casadi as ca
+
+    free = ca.SX.sym("q", 2)
+    displaced = _displaced(model_name, free, theta)
+    jacobian = ca.substitute(ca.jacobian(displaced, free), free, point)
+    residual = ca.substitute(displaced, free, point) - target
+    a, b, c, d = jacobian[0, 0], jacobian[0, 1], jacobian[1, 0], jacobian[1, 1]
+    determinant = a * d - b * c
+    step = ca.vertcat(d * residual[0] - b * residual[1], a * residual[1] - c * residual[0]) / determinant
+    return point - step, determinant
+
+
+def _rotated(b: Any, phi: Any) -> Any:
+    """``exp([phi]x) b`` to second order, which is exact for derivatives of up to second order at phi = 0."""
+    import casadi as ca
+
+    first = ca.cross(phi, b)
+    return b + first + 0.5 * ca.cross(phi, first)
+
+
+def forward_expression(model_name: str, s: Symbols, newton_steps: int) -> Any:
+    """Pixel position of the direction ``exp([phi]x) b`` (casadi.SX, 2)."""
+    import casadi as ca
+
+    direction = _rotated(s.b, s.phi)
+    ideal = s.theta[2] * direction[:2] / direction[2]
+    if get_model(model_name).direction == "forward":
+        return s.theta[:2] + _displaced(model_name, ideal, s.theta)
+    point = s.root
+    for _ in range(newton_steps):
+        point, _ = _newton_step(model_name, point, ideal, s.theta)
+    return s.theta[:2] + ca.vertcat(point[0], point[1])
+
+
+def backward_expression(model_name: str, s: Symbols, newton_steps: int) -> Any:
+    """Unit vector in the camera frame of a measured pixel position (casadi.SX, 3)."""
+    import casadi as ca
+
+    offset = s.pixel - s.theta[:2]
+    if get_model(model_name).direction == "forward":
+        point = s.root
+        for _ in range(newton_steps):
+            point, _ = _newton_step(model_name, point, offset, s.theta)
+    else:
+        point = _displaced(model_name, offset, s.theta)
+    direction = ca.vertcat(point[0], point[1], s.theta[2])
+    return direction / ca.sqrt(ca.sumsqr(direction))
+
+
+def second_index(n: int) -> tuple[IntArray, IntArray]:
+    """Row and column of every unique second derivative of n variables, in kernel order."""
+    rows, columns = np.triu_indices(n)
+    return rows.astype(np.int64), columns.astype(np.int64)
+
+
+@lru_cache(maxsize=64)
+def forward_kernel(model_name: str, order: str) -> Kernel:
+    """Kernel of the forward model at phi = 0.
+
+    Parameters
+    ----------
+    model_name : str
+        Registry name.
+    order : {"value", "attitude", "first", "second"}
+        Outputs: value (2,); with ``attitude`` also d/dphi (3, 2); with ``first`` also d/dtheta (p, 2) before it; with
+        ``second`` also the unique second derivatives over (theta, phi), ((p + 3)(p + 4) / 2, 2).
+    """
+    import casadi as ca
+
+    s = _symbols(model_name)
+    p = s.theta.numel()
+    xy = forward_expression(model_name, s, newton_steps=2 if order == "second" else 1)
+    outputs: list[Any] = [xy]
+    shapes: list[tuple[int, ...]] = [(2,)]
+    if order in ("first", "second"):
+        # casadi.vec is column-major, so the Jacobian (2, p) becomes rows of (p, 2).
+        outputs.append(ca.jacobian(xy, s.theta))
+        shapes.append((p, 2))
+    if order != "value":
+        outputs.append(ca.jacobian(xy, s.phi))
+        shapes.append((3, 2))
+    if order == "second":
+        variables = ca.vertcat(s.theta, s.phi)
+        hessians = [ca.hessian(xy[axis], variables)[0] for axis in range(2)]
+        rows, columns = second_index(p + 3)
+        entries = [hessians[axis][int(i), int(j)] for i, j in zip(rows, columns, strict=True) for axis in range(2)]
+        outputs.append(ca.vertcat(*entries))
+        shapes.append((len(rows), 2))
+    outputs = [ca.substitute(ca.densify(output), s.phi, ca.SX.zeros(3)) for output in outputs]
+    return build_kernel(f"forward_{model_name}_{order}", [s.theta, s.b, s.root], outputs, shapes)
+
+
+@lru_cache(maxsize=32)
+def backward_kernel(model_name: str, derivatives: bool) -> Kernel:
+    """Kernel from pixels to unit vectors: value (3,), with `derivatives` also d/dtheta (p, 3)."""
+    import casadi as ca
+
+    s = _symbols(model_name)
+    direction = backward_expression(model_name, s, newton_steps=1)
+    outputs: list[Any] = [direction]
+    shapes: list[tuple[int, ...]] = [(3,)]
+    if derivatives:
+        outputs.append(ca.jacobian(direction, s.theta))
+        shapes.append((s.theta.numel(), 3))
+    return build_kernel(f"backward_{model_name}_{derivatives}", [s.theta, s.pixel, s.root], outputs, shapes)
+
+
+@lru_cache(maxsize=32)
+def backward_second_kernel(model_name: str) -> Kernel:
+    """Kernel from pixels to unit vectors (3,), d/dtheta (p, 3), and unique second derivatives (p (p + 1) / 2, 3)."""
+    import casadi as ca
+
+    s = _symbols(model_name)
+    p = s.theta.numel()
+    direction = backward_expression(model_name, s, newton_steps=2)
+    hessians = [ca.hessian(direction[axis], s.theta)[0] for axis in range(3)]
+    rows, columns = second_index(p)
+    entries = [hessians[axis][int(i), int(j)] for i, j in zip(rows, columns, strict=True) for axis in range(3)]
+    outputs = [direction, ca.jacobian(direction, s.theta), ca.vertcat(*entries)]
+    shapes = [(3,), (p, 3), (len(rows), 3)]
+    return build_kernel(f"backward_second_{model_name}", [s.theta, s.pixel, s.root], outputs, shapes)
+
+
+@lru_cache(maxsize=32)
+def _newton_kernel(model_name: str) -> Kernel:
+    """Kernel of one Newton step: next point (2,) and Jacobian determinant at the present one (1,)."""
+    s = _symbols(model_name)
+    point, determinant = _newton_step(model_name, s.root, s.pixel, s.theta)
+    return build_kernel(f"newton_{model_name}", [s.theta, s.pixel, s.root], [point, determinant], [(2,), (1,)])
+
+
+def solve_displacement(
+    model_name: str, theta: FloatArray, target: FloatArray, start: FloatArray | None = None
+) -> FloatArray:
+    """Solve ``point + displacement(point) = target``.
+
+    Parameters
+    ----------
+    model_name : str
+        Registry name.
+    theta : (p,) array
+        Parameters x0, y0, f, k... in px units.
+    target : (2, n) array
+        Offsets from the principal point, px.
+    start : (2, n) array, optional
+        Where to start; the target itself by default, from which Newton's method converges monotonically for radial
+        distortion that does not fold.
+
+    Returns
+    -------
+    (2, n) array
+        Offsets in px; not finite where there is no solution before the distortion folds over.
+    """
+    kernel = _newton_kernel(model_name)
+    n = target.shape[1]
+    point = target if start is None else start
+    if not get_model(model_name).coefficients or n == 0 or not np.any(theta[3:]):
+        return np.array(target)
+    with np.errstate(all="ignore"):
+        for _ in range(_NEWTON_STEPS):
+            moved, determinant = kernel(n, theta, target, point)
+            # Past a fold the determinant changes sign: that branch is not an image of the field.
+            moved[:, determinant[0] <= 0.0] = np.nan
+            change = np.nanmax(np.abs(moved - point), initial=0.0)
+            point = moved
+            if change < _NEWTON_TOLERANCE_PX:
+                return point
+        settled = np.abs(point - kernel(n, theta, target, point)[0]).max(axis=0) < _NEWTON_TOLERANCE_PX
+    return np.where(settled, point, np.nan)
+
+
+def forward_root(model_name: str, theta: FloatArray, b: FloatArray) -> FloatArray:
+    """The `root` input of a forward kernel for directions b (3, n): (2,) zeros where the model is explicit."""
+    if get_model(model_name).direction == "forward":
+        return np.zeros(2)
+    return solve_displacement(model_name, theta, theta[2] * b[:2] / b[2])
+
+
+def backward_root(model_name: str, theta: FloatArray, pixel: FloatArray) -> FloatArray:
+    """The `root` input of a backward kernel for pixels (2, n): (2,) zeros where the model is explicit."""
+    if get_model(model_name).direction == "inverse":
+        return np.zeros(2)
+    return solve_displacement(model_name, theta, pixel - theta[:2, None])
+
+
+def unproject_theta(model_name: str, theta: FloatArray, xy: FloatArray) -> FloatArray:
+    """Unit vectors (N, 3) in the camera frame of pixels xy (N, 2) for parameters theta (p,)."""
+    pixel = np.ascontiguousarray(np.asarray(xy, dtype=np.float64).T)
+    theta = np.asarray(theta, dtype=np.float64)
+    (b,) = backward_kernel(model_name, False)(pixel.shape[1], theta, pixel, backward_root(model_name, theta, pixel))
+    return b.T
+
+
+def unproject_jacobian(model_name: str, theta: FloatArray, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unit vectors b (N, 3) of pixels xy (N, 2), and their derivatives db/dtheta (N, 3, p)."""
+    pixel = np.ascontiguousarray(np.asarray(xy, dtype=np.float64).T)
+    theta = np.asarray(theta, dtype=np.float64)
+    b, db = backward_kernel(model_name, True)(pixel.shape[1], theta, pixel, backward_root(model_name, theta, pixel))
+    return b.T, db.transpose(2, 1, 0)
+
+
+def fold_radius_px(model_name: str, theta: FloatArray, max_radius_px: float) -> float:
+    """Smallest radius up to `max_radius_px` at which the distortion folds over; infinity when it does not.
+
+    The map folds where the determinant of its Jacobian is not positive; it is sampled every 0.2 % of the range along
+    36 directions (radial models are the same in all of them).
+    """
+    radius = np.linspace(0.0, max_radius_px, 501)[1:]
+    angle = np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
+    points = np.stack([np.outer(np.cos(angle), radius).ravel(), np.outer(np.sin(angle), radius).ravel()])
+    _, determinant = _newton_kernel(model_name)(points.shape[1], theta, points, points)
+    # det <= 0 marks a fold; a second crossing can make it positive again, so the first one counts.
+    folded = (determinant[0].reshape(angle.size, radius.size) <= 0.0).any(axis=0)
+    return float(radius[np.argmax(folded)]) if folded.any() else float("inf")
+
+
+def project(camera: Camera, b_cam: FloatArray) -> FloatArray:
+    """Pixel positions of directions in the camera frame.
+
+    Parameters
+    ----------
+    camera : Camera
+        Optics and distortion.
+    b_cam : (N, 3) array
+        Directions in the camera frame (need not be unit vectors).
+
+    Returns
+    -------
+    (N, 2) array
+        Pixels; NaN for a direction at or behind the image plane's horizon (b_z <= 0).
+
+    Raises
+    ------
+    DistortionError
+        When a direction lies where the distortion has folded over, so that the image is not unique.
+    """
+    b = np.asarray(b_cam, dtype=np.float64).reshape(-1, 3).T
+    theta = camera.theta
+    xy = np.full((2, b.shape[1]), np.nan)
+    front = b[2] > 0.0
+    if not front.any():
+        return xy.T
+    seen = np.ascontiguousarray(b[:, front])
+    root = forward_root(camera.distortion, theta, seen)
+    if get_model(camera.distortion).direction == "forward":
+        radius = float(np.max(np.hypot(seen[0] / seen[2], seen[1] / seen[2]))) * theta[2]
+        fold = fold_radius_px(camera.distortion, theta, radius) if np.any(theta[3:]) else float("inf")
+        if fold <= radius:
+            raise DistortionError(
+                f"the distortion {camera.distortion!r} folds over {fold:.0f} px from the principal point, inside the "
+                f"{radius:.0f} px asked for: use smaller coefficients or stay within that radius."
+            )
+    elif not np.isfinite(root).all():
+        raise _no_inverse(camera)
+    (xy[:, front],) = forward_kernel(camera.distortion, "value")(seen.shape[1], theta, seen, root)
+    return xy.T
+
+
+def unproject(camera: Camera, xy_px: FloatArray) -> FloatArray:
+    """Unit vectors in the camera frame of pixel positions.
+
+    Parameters
+    ----------
+    camera : Camera
+        Optics and distortion.
+    xy_px : (N, 2) array
+        Pixels.
+
+    Returns
+    -------
+    (N, 3) array
+        Unit vectors.
+
+    Raises
+    ------
+    DistortionError
+        When a pixel has no ideal point before the distortion folds over.
+    """
+    xy = np.asarray(xy_px, dtype=np.float64).reshape(-1, 2)
+    theta = camera.theta
+    if not np.isfinite(xy).all():
+        raise DistortionError("a pixel position is not finite: pass finite x and y in px.")
+    b = unproject_theta(camera.distortion, theta, xy)
+    if not np.isfinite(b).all():
+        raise _no_inverse(camera)
+    if np.any(theta[3:]) and len(xy):
+        # The registry's displacement acts on ideal points (forward) or on measured ones (inverse).
+        forward = get_model(camera.distortion).direction == "forward"
+        points = theta[2] * b[:, :2] / b[:, 2:] if forward else xy - theta[:2]
+        radius = float(np.max(np.hypot(*points.T)))
+        if fold_radius_px(camera.distortion, theta, radius) <= radius:
+            raise _no_inverse(camera)
+    return b
+
+
+def _no_inverse(camera: Camera) -> DistortionError:
+    fold = fold_radius_px(camera.distortion, camera.theta, 4.0 * camera.corner_radius_px)
+    return DistortionError(
+        f"the distortion {camera.distortion!r} folds over {fold:.0f} px from the principal point and cannot be "
+        "inverted beyond: use smaller coefficients or stay within that radius."
+    )
+
+
+def monotonic_expression(model_name: str, theta: Any, max_radius_px: float) -> Any:
+    """Jacobian determinants of the distortion over the field, as a CasADi vector that is positive without folds.
+
+    Parameters
+    ----------
+    model_name : str
+        Registry name.
+    theta : casadi.SX, (p,)
+        Parameters, px units.
+    max_radius_px : float
+        Radius of the field around the principal point.
+    """
+    import casadi as ca
+
+    if not get_model(model_name).coefficients:
+        return ca.SX.zeros(0, 1)
+    values = []
+    for radius in np.linspace(0.25, 1.0, 4) * max_radius_px:
+        for angle in np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False):
+            point = ca.SX([radius * np.cos(angle), radius * np.sin(angle)])
+            values.append(_newton_step(model_name, point, point, theta)[1])
+    return ca.vertcat(*values)

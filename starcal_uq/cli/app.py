@@ -1,0 +1,84 @@
+"""The command line: the only place where the steps are wired together and printed.
+
+Exit status 0 when all is well, 1 when a result is there but should not be trusted or the work was interrupted, 2 for
+bad input, always with one sentence that says what to do.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated
+
+import typer
+
+from starcal_uq.cli import filter as cli_filter
+from starcal_uq.cli import images as cli_images
+from starcal_uq.cli import mission as cli_mission
+from starcal_uq.cli import paper as cli_paper
+from starcal_uq.cli import run as cli_run
+from starcal_uq.cli import statistics as cli_statistics
+from starcal_uq.cli import steps as cli_steps
+from starcal_uq.core.errors import StarcalError
+
+app = typer.Typer(
+    name="starcal-uq",
+    help="Probabilistic calibration of star sensors: from identified stars to a posterior and its attitude error.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
+    epilog="Start with `starcal-uq demo`: the experiment of Ye & Yang 2017, from a star catalogue to a report.",
+)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from starcal_uq import __version__
+
+        print(f"starcal-uq {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def common(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Probabilistic calibration of star sensors: from identified stars to a posterior and its attitude error."""
+
+
+for module in (cli_run, cli_steps, cli_mission, cli_images, cli_filter, cli_statistics, cli_paper):
+    module.register(app)
+
+
+def main() -> None:
+    """Entry point: every error a user can make is one sentence on standard error, never a traceback."""
+    from typer.exceptions import TyperException
+
+    try:
+        code = app(standalone_mode=False)
+        sys.exit(code if isinstance(code, int) else 0)
+    except typer.Exit as stop:
+        sys.exit(stop.exit_code)
+    except TyperException as error:
+        _fail(_usage_sentence(error), 2)
+    except StarcalError as error:
+        _fail(str(error), 2)
+    except (typer.Abort, KeyboardInterrupt):
+        _fail("interrupted; what was complete is kept, and `sample` and `filter` go on where they stopped.", 1)
+    except OSError as error:
+        place = f"{error.filename}: " if error.filename else ""
+        _fail(f"{place}{error.strerror or error}; check the path, its permissions and the space on the disk.", 2)
+
+
+def _usage_sentence(error: Exception) -> str:
+    """What is wrong with a call, and where to look."""
+    words = getattr(error, "format_message", None)
+    message = words() if callable(words) else str(error)
+    return f"{message.strip().rstrip('.')}; see `starcal-uq --help`."
+
+
+def _fail(message: str, status: int) -> None:
+    print(f"error: {message}", file=sys.stderr)
+    sys.exit(status)

@@ -1,0 +1,247 @@
+"""Results as tables in the terminal and as JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import parameters
+from starcal_uq.core.formatting import decimals_for, fixed, plural, pretty_unit, significant
+from starcal_uq.core.types import AnyDict
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from starcal_uq.diagnostics.verdict.judge import Verdict
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.screening.result import Screening
+    from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.observations.table import Observations
+    from starcal_uq.propagation.coupling import Coupling
+    from starcal_uq.propagation.propagate import AttitudeError
+
+# Where the output is not a terminal it has no width of its own; tables then get the room they need.
+_WIDTH = None if sys.stdout.isatty() else 110
+AXES = ("pitch", "yaw", "roll")
+
+# Names of files, runs and requirements may hold square brackets, which are no markup.
+out = Console(width=_WIDTH, markup=False)
+err = Console(stderr=True, markup=False)
+
+UNDECLARED = (
+    "Neither time nor observer velocity was declared: annual aberration stretches a 10 degree field by up to "
+    "3.6 arcsec, which can move f by many sigma. Declare --directions apparent, or --directions catalogue with a "
+    "time_utc column."
+)
+
+
+def print_json(value: Any) -> None:
+    """Plain JSON on standard output, nothing else."""
+    print(json.dumps(_plain(value), indent=1, allow_nan=False))
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [_plain(v) for v in value]
+    if isinstance(value, (float, np.floating)):
+        # JSON has no NaN or infinity; null says "not known" to every reader.
+        return float(value) if np.isfinite(value) else None
+    if isinstance(value, np.integer):
+        return int(value)
+    if isinstance(value, np.bool_):
+        return bool(value)
+    return value
+
+
+def records(frame: pd.DataFrame) -> list[AnyDict]:
+    """A data frame as a list of rows."""
+    rows: list[AnyDict] = frame.to_dict(orient="records")
+    return rows
+
+
+def show_calibration(calibration: Calibration, truth: Camera | None = None) -> None:
+    """Table of start, estimate and sigma; with a truth, also truth and z."""
+    table = Table(
+        title=f"Calibration: {calibration.n_stars} stars in {calibration.n_frames} frames", title_justify="left"
+    )
+    table.add_column("parameter", style="bold")
+    for heading in ("start", "estimate", "sigma"):
+        table.add_column(heading, justify="right")
+    if truth is not None:
+        table.add_column("truth", justify="right")
+        table.add_column("z", justify="right")
+    table.add_column("unit")
+    specs = parameters(calibration.camera.distortion)
+    for index, (spec, value, sigma) in enumerate(zip(specs, calibration.theta, calibration.sigmas, strict=True)):
+        decimals = decimals_for(sigma / spec.scale)
+        cells = [fixed(number / spec.scale, decimals) for number in (calibration.nominal.theta[index], value, sigma)]
+        if truth is not None:
+            known = truth.theta[index]
+            cells += [fixed(known / spec.scale, decimals), fixed((value - known) / sigma, 2)]
+        table.add_row(spec.name, *cells, pretty_unit(spec.scaled_unit))
+    blank = ["", ""] if truth is not None else []
+    decimals = decimals_for(calibration.sigma_std)
+    table.add_row(
+        calibration.sigma_name,
+        "",
+        fixed(calibration.sigma, decimals),
+        fixed(calibration.sigma_std, decimals),
+        *blank,
+        "px per axis" if calibration.sigma_name == "sigma" else "times the stated noise",
+    )
+    out.print(table)
+    focal_sigma = calibration.sigmas[2] * calibration.camera.pixel_um * 1e-3
+    decimals = decimals_for(focal_sigma)
+    out.print(
+        f"Focal length {fixed(calibration.camera.focal_mm, decimals)} +- {fixed(focal_sigma, decimals)} mm. "
+        f"Status: {calibration.status.name.lower()}."
+    )
+
+
+def show_posterior(posterior: Posterior) -> None:
+    """Table of posterior means, intervals and diagnostics."""
+    table = Table(title=f"Posterior: {len(posterior.draws)} draws", title_justify="left")
+    table.add_column("parameter", style="bold")
+    for heading in ("mean", "sd", "2.5 %", "97.5 %", "R-hat", "ESS bulk", "ESS tail"):
+        table.add_column(heading, justify="right")
+    table.add_column("unit")
+    specs = {spec.name: spec for spec in parameters(posterior.camera.distortion)}
+    diagnostics = posterior.diagnostics
+    low, high = np.quantile(posterior.draws, [0.025, 0.975], axis=0)
+    for index, name in enumerate(posterior.parameter_names):
+        spec = specs.get(name)
+        scale = 1.0 if spec is None else spec.scale
+        column = posterior.draws[:, index] / scale
+        decimals = decimals_for(float(np.std(column)))
+        numbers = (float(np.mean(column)), float(np.std(column)), low[index] / scale, high[index] / scale)
+        unit = pretty_unit(spec.scaled_unit) if spec is not None else ("px" if name == "sigma" else "")
+        table.add_row(
+            name,
+            *(fixed(number, decimals) for number in numbers),
+            fixed(float(diagnostics.rhat[index]), 4),
+            f"{diagnostics.ess_bulk[index]:.0f}",
+            f"{diagnostics.ess_tail[index]:.0f}",
+            unit,
+        )
+    out.print(table)
+    for message in diagnostics.messages:
+        out.print(message, style=None if diagnostics.ok else "yellow", highlight=False, soft_wrap=True)
+
+
+def show_coupling(found: Coupling) -> None:
+    """Sigmas and their inflation, correlations, and the weak directions in words."""
+    table = Table(title="Coupling: what not knowing the others costs", title_justify="left")
+    table.add_column("parameter", style="bold")
+    for heading in ("sigma", "others known", "variance inflation"):
+        table.add_column(heading, justify="right")
+    table.add_column("unit")
+    for index, name in enumerate(found.parameter_names):
+        table.add_row(
+            name,
+            significant(float(found.sigma_marginal[index]), 3),
+            significant(float(found.sigma_conditional[index]), 3),
+            significant(float(found.variance_inflation[index]), 3),
+            pretty_unit(found.units[index]),
+        )
+    out.print(table)
+    table = Table(title="Correlations, with the rotation common to all frames", title_justify="left")
+    table.add_column("", style="bold")
+    for name in found.extended_names:
+        table.add_column(name, justify="right")
+    for name, row in zip(found.extended_names, found.extended_correlation, strict=True):
+        table.add_row(name, *(fixed(float(value), 2) for value in row))
+    out.print(table)
+    for direction in found.weak_directions:
+        out.print(f"- {direction.words}", highlight=False, soft_wrap=True)
+
+
+def show_attitude(error: AttitudeError) -> None:
+    """Attitude error by contributor and axis, 1 sigma, with the 95 % half-widths in brackets."""
+    frame = error.to_dataframe()
+    table = Table(title="Attitude error, arcsec, 1 sigma", title_justify="left")
+    table.add_column("contributor", style="bold", no_wrap=True)
+    for axis in AXES:
+        table.add_column(axis, justify="right")
+    table.add_column("two-axis 95 %", justify="right")
+    table.add_column("absorbed by alignment")
+    for contributor, rows in frame.groupby("contributor", sort=False):
+        cells = rows.set_index("axis")
+        shown = [significant(float(cells.at[axis, "sigma_arcsec"]), 2) for axis in AXES]
+        across = [float(row.p95_arcsec) for row in rows.itertuples() if row.axis not in AXES]
+        shown.append(significant(across[0], 2) if across else "")
+        table.add_row(str(contributor), *shown, _word(rows["absorbed_by_alignment"].iloc[0]))
+    out.print(table)
+
+
+def _word(value: Any) -> str:
+    return ("yes" if value else "no") if isinstance(value, (bool, np.bool_)) else str(value)
+
+
+def _cell(value: Any) -> str:
+    """A number with three digits, a dash where there is none."""
+    if not isinstance(value, float):
+        return str(value)
+    return "–" if math.isnan(value) else significant(value, 3)
+
+
+def show_table(frame: pd.DataFrame, title: str, columns: Sequence[str] | None = None) -> None:
+    """Chosen columns of a data frame, numbers with three digits; files and JSON have the rest."""
+    frame = frame if columns is None else frame[list(columns)]
+    table = Table(title=title, title_justify="left")
+    for column in frame.columns:
+        numbers = np.issubdtype(np.asarray(frame[column]).dtype, np.number)
+        table.add_column(str(column).replace("_", " "), justify="right" if numbers else "left")
+    for row in records(frame):
+        table.add_row(*(_cell(value) for value in row.values()))
+    out.print(table)
+
+
+def show_screening(screening: Screening) -> None:
+    """What was left out, by reason, and what a user should look at."""
+    out.print(screening.summary(), highlight=False, soft_wrap=True)
+
+
+def show_verdict(verdict: Verdict) -> None:
+    """The headline, and every check that did not pass."""
+    style = {"pass": "green", "warning": "yellow", "fail": "red"}[verdict.level.value]
+    out.print(f"Verdict ({verdict.level.value}): {verdict.headline}", style=style, highlight=False, soft_wrap=True)
+    for check in verdict.checks:
+        if check.level.value != "pass":
+            out.print(f"- {check.level.value}: {check.sentence}", highlight=False, soft_wrap=True)
+
+
+def warn_air(obs: Observations, cal: Calibration) -> None:
+    """Say what refraction does to the focal length where nothing is known of the air."""
+    from starcal_uq.diagnostics.verdict.air import REMEDY, air, conditional_words
+
+    if air(obs) == "unknown":
+        err.print(f"warning: {conditional_words(cal)} {REMEDY}", style="yellow", highlight=False, soft_wrap=True)
+
+
+def warn_undeclared(obs: Observations) -> None:
+    """Say what follows when nothing is known of the observer's motion, and what was left out."""
+    if not obs.directions_declared:
+        err.print(f"warning: {UNDECLARED}", style="yellow", highlight=False, soft_wrap=True)
+    floor = obs.meta.get("noise_floor_px")
+    if floor:
+        words = (
+            f"note: even bright stars scatter by {significant(floor)} px; this was added to the noise of every star."
+        )
+        err.print(words, highlight=False, soft_wrap=True)
+    low = obs.meta.get("low_stars", 0)
+    if low:
+        words = f"note: {plural(int(low), 'star')} left out, because they stood lower than 10 degrees."
+        err.print(words, highlight=False, soft_wrap=True)
+    ignored = obs.meta.get("ignored_columns")
+    if ignored:
+        err.print(f"note: columns not used: {', '.join(ignored)}", highlight=False, soft_wrap=True)

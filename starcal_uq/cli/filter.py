@@ -1,0 +1,77 @@
+"""The command for tables that do not fit into memory: filter."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from starcal_uq.cli.options import CameraFile, Columns, Force, Json, NewRun, parse_columns
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the command line."""
+    app.command("filter")(filter_command)
+
+
+def filter_command(
+    observations: Annotated[
+        Path,
+        typer.Argument(metavar="OBS", help="Stars in pixels, the frames in order: CSV, Parquet, or a folder of them."),
+    ],
+    camera: CameraFile,
+    out: NewRun,
+    method: Annotated[
+        str, typer.Option(help="griffith (recursive least squares) or samaan (Kalman filter, distortion afterwards).")
+    ] = "griffith",
+    parameters: Annotated[
+        str,
+        typer.Option(help="optics (x0, y0, f; the distortion is ignored, as in the source) or all (griffith only)."),
+    ] = "all",
+    pair_covariance: Annotated[
+        str, typer.Option(help="full, or diagonal: pairs that share a star taken as independent, as filters used to.")
+    ] = "full",
+    forgetting: Annotated[
+        float, typer.Option(help="Weight of all earlier frames against the next, above 0 and up to 1 (griffith).")
+    ] = 1.0,
+    process_noise: Annotated[
+        float | None, typer.Option(help="Random walk of the optics, px per frame; needs --sigma (samaan).")
+    ] = None,
+    sigma: Annotated[float | None, typer.Option(help="Stated centroid noise, px per axis.")] = None,
+    column: Columns = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Calibrate frame by frame, with an estimate after each; stars may exceed memory, an interrupted call goes on."""
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.cli.console import print_json, records, show_calibration
+    from starcal_uq.estimation.recursive.innovations import PAIR_COVARIANCES
+    from starcal_uq.estimation.recursive.recursion_options import RecursionOptions
+    from starcal_uq.runs.streams import HISTORY, filter_run
+
+    if pair_covariance not in PAIR_COVARIANCES:
+        raise typer.BadParameter(
+            f"--pair-covariance {pair_covariance!r} is unknown: use one of {', '.join(PAIR_COVARIANCES)}."
+        )
+    options = RecursionOptions(
+        pair_covariance=pair_covariance,
+        parameters="optics" if method == "samaan" else parameters,
+        forgetting=forgetting,
+        process_noise=process_noise,
+        sigma_px=sigma,
+    )
+    calibration = filter_run(
+        observations,
+        Camera.load(camera),
+        out,
+        method=method,
+        options=options,
+        columns=parse_columns(column),
+        force=force,
+    )
+    if json:
+        print_json({"status": calibration.status.name, "parameters": records(calibration.to_dataframe())})
+    else:
+        show_calibration(calibration, None)
+        print(f"Run folder: {out}; estimates after every frame: {out / HISTORY}. Next: starcal-uq sample {out}")

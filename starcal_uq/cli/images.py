@@ -1,0 +1,210 @@
+"""Commands from images to observations: centroid, identify."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from starcal_uq.cli.options import CameraFile, Engine, Force, Json, TimeUtc, check_same_sensor, parse_engine
+from starcal_uq.cli.progress import progress_bar
+
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.images.centroids import Centroids
+    from starcal_uq.observations.table import Observations
+    from starcal_uq.pipeline.refine import Bootstrap
+
+_CENTROIDED = ("frame", "image", "n_stars", "n_saturated", "n_blended", "background", "noise")
+_IDENTIFIED = ("frame", "image", "status", "n_centroids", "n_identified", "log10_expected_false", "milliseconds")
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the command line."""
+    app.command("centroid")(centroid_command)
+    app.command("identify")(identify_command)
+
+
+def centroid_command(
+    images: Annotated[
+        list[Path], typer.Argument(metavar="IMAGES...", help="FITS, TIFF, PNG or JPEG files, or folders of them.")
+    ],
+    out: Annotated[
+        Path, typer.Option("-o", "--out", metavar="CENTROIDS", help="Table to write (.csv, .ecsv, .parquet).")
+    ],
+    camera: Annotated[
+        Path | None, typer.Option("--camera", help="Camera (TOML): images of another size are left out.")
+    ] = None,
+    gain: Annotated[float | None, typer.Option(help="Electrons per count, where the files do not say it.")] = None,
+    read_noise: Annotated[float | None, typer.Option(help="Read noise, electrons per pixel (needs the gain).")] = None,
+    saturation: Annotated[float | None, typer.Option(help="Counts at which a pixel is saturated.")] = None,
+    threshold: Annotated[float, typer.Option(help="Detection threshold, standard deviations.")] = 5.0,
+    psf_sigma: Annotated[float | None, typer.Option(help="Width of the star images, px; measured by default.")] = None,
+    max_stars: Annotated[int | None, typer.Option(min=1, help="Keep the brightest so many per frame.")] = None,
+    pixel_phase: Annotated[
+        bool, typer.Option(help="Take out errors that repeat with the place within a pixel, where images show them.")
+    ] = True,
+    time: TimeUtc = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Find the stars in images, with a covariance for each; a frame that cannot be used is named and left out."""
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.cli.console import print_json, records
+    from starcal_uq.core.times import utc_text
+    from starcal_uq.images.extract import extract_centroids
+    from starcal_uq.pipeline.images import counted, with_time
+    from starcal_uq.runs.folder import ensure_new
+
+    ensure_new(out, force)
+    if time is not None:
+        time = utc_text(time)
+    sensor = None if camera is None else Camera.load(camera)
+    with progress_bar("images") as progress:
+        found = extract_centroids(
+            images,
+            camera=sensor,
+            gain_e_per_count=gain,
+            read_noise_e=read_noise,
+            saturation=saturation,
+            threshold_sigma=threshold,
+            psf_sigma_px=psf_sigma,
+            max_stars=max_stars,
+            correct_pixel_phase=pixel_phase,
+            progress=progress,
+        )
+    found = with_time(found, time)
+    found.save(out, force=force)
+    if json:
+        print_json({"summary": found.summary, "frames": records(found.frames_dataframe())})
+    else:
+        _say(counted(found.messages))
+        print(f"{found.summary} Table: {out}")
+    if found.n_left_out == found.n_frames:
+        raise typer.Exit(1)
+
+
+def identify_command(
+    centroids: Annotated[Path, typer.Argument(metavar="CENTROIDS", help="Table made by `starcal-uq centroid`.")],
+    camera: CameraFile,
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="OBS", help="Table to write (.csv, .ecsv, .parquet).")],
+    max_mag: Annotated[float, typer.Option(help="Magnitude limit of the catalogue, Gaia G.")] = 7.0,
+    epoch: Annotated[
+        float | None, typer.Option(help="Julian year of the star positions; the images' own by default.")
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(help="Run folder of this camera: its uncertainty takes the tolerances' place.")
+    ] = None,
+    focal_tolerance: Annotated[float, typer.Option(help="Relative error of the nominal focal length.")] = 0.03,
+    centre_tolerance: Annotated[float, typer.Option(help="Error of the nominal principal point, px.")] = 20.0,
+    engine: Engine = "pyramid",
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Identify the stars of every frame without knowing where the camera pointed; frames that do not fit are named."""
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.cli.console import print_json, records, show_table
+    from starcal_uq.identification.engine import identify
+    from starcal_uq.images.centroids import Centroids
+    from starcal_uq.pipeline.images import epoch_of
+    from starcal_uq.runs.folder import RunFolder, ensure_new
+    from starcal_uq.runs.steps import best_calibration
+    from starcal_uq.sky.catalogue import load_catalogue
+
+    ensure_new(out, force)
+    table = Centroids.load(centroids)
+    nominal = Camera.load(camera)
+    known = None if calibration is None else best_calibration(RunFolder(calibration))
+    if calibration is not None and known is not None:
+        check_same_sensor(known.camera, calibration, nominal, camera)
+    stars = load_catalogue(max_mag=max_mag, epoch=epoch_of(table) if epoch is None else epoch)
+    _say_epoch(table, epoch)
+    with progress_bar("frames") as progress:
+        found = identify(
+            table,
+            nominal,
+            stars,
+            calibration=known,
+            focal_tolerance=focal_tolerance,
+            centre_tolerance_px=centre_tolerance,
+            engine=parse_engine(engine),
+            progress=progress,
+        )
+    if found.n_identified:
+        found.observations.save(out, force=force)
+    if json:
+        print_json({"summary": found.summary, "frames": records(found.to_dataframe())})
+    else:
+        if len(found.frames) <= 40:
+            show_table(found.to_dataframe(), "Identification", _IDENTIFIED)
+        print(f"{found.summary}{f' Table: {out}' if found.n_identified else ''}")
+    if not found.n_identified:
+        raise typer.Exit(1)
+
+
+def load_images(
+    images: list[Path],
+    camera_path: Path,
+    *,
+    max_mag: float,
+    epoch: float | None,
+    gain: float | None,
+    directions: str | None,
+    site: Path | None,
+    in_space: bool,
+    time_utc: str | None,
+    engine: str,
+) -> tuple[Observations, Camera, Centroids, Bootstrap]:
+    """Observations of images, and what is worth telling on the way."""
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.cli.console import err, warn_undeclared
+    from starcal_uq.pipeline.images import observations_from_images
+    from starcal_uq.runs.steps import DIRECTIONS
+    from starcal_uq.sky.site import Site
+
+    if directions is not None and directions not in DIRECTIONS:
+        raise typer.BadParameter(f"--directions {directions!r} is unknown: use one of {', '.join(DIRECTIONS)}.")
+    camera = Camera.load(camera_path)
+    place = None if site is None else Site.load(site)
+    with progress_bar("images") as progress:
+        obs, centroids, found = observations_from_images(
+            images,
+            camera,
+            max_mag=max_mag,
+            epoch=epoch,
+            gain_e_per_count=gain,
+            directions=directions,
+            site=place,
+            in_space=in_space,
+            time_utc=time_utc,
+            engine=parse_engine(engine),
+            tell=lambda message: err.print(message, style=_style(message), highlight=False, soft_wrap=True),
+            progress=progress,
+        )
+    _say_epoch(centroids, epoch)
+    for words in (found.identification.summary, found.summary):
+        err.print(words, highlight=False, soft_wrap=True)
+    left_out = obs.meta.get("disturbed_stars", 0)
+    if left_out:
+        err.print(f"{left_out} stars left out, because the light of a neighbour displaces them.", highlight=False)
+    warn_undeclared(obs)
+    # Of mirrored images x is counted from the right edge, and so is this camera's.
+    return obs, found.rounds[0][0].nominal if found.identification.parity == "mirrored" else camera, centroids, found
+
+
+def _say_epoch(centroids: Centroids, epoch: float | None) -> None:
+    if epoch is None and not (centroids.time_utc != "").any():
+        _say(("the images have no time: the stars are taken where they were in 2016; --epoch says when it was.",))
+
+
+def _style(message: str) -> str | None:
+    return "yellow" if message.startswith("note:") else None
+
+
+def _say(messages: Sequence[str]) -> None:
+    from starcal_uq.cli.console import err
+
+    for message in messages:
+        err.print(f"note: {message}", style="yellow", highlight=False, soft_wrap=True)

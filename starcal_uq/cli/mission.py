@@ -1,0 +1,350 @@
+"""What an analyst asks after the calibration: budget, compare, plan."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from starcal_uq.cli.options import FAINTEST, CameraFile, Force, Json, RunPath, Seed, check_same_sensor
+from starcal_uq.cli.progress import progress_bar
+
+if TYPE_CHECKING:
+    from starcal_uq.budgeting.result import Budget
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.planning.check import ForecastCheck
+    from starcal_uq.planning.frame_choice_result import FrameChoice
+    from starcal_uq.planning.plan_result import Plan
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the command line."""
+    app.command("budget")(budget_command)
+    app.command("compare")(compare_command)
+    app.command("plan")(plan_command)
+
+
+def new_folder(out: Path | None, force: bool) -> None:
+    """Refuse a folder that holds something, and a run's own folder even with `force`: its results would be mixed."""
+    from starcal_uq.core.errors import RunFolderError
+    from starcal_uq.runs.folder import RunFolder, check_new_run
+
+    if out is None:
+        return
+    run = RunFolder(out)
+    if run.calibration.exists():
+        raise RunFolderError(f"{out}: is the folder of a run, whose files would be mixed with these; name another.")
+    check_new_run(run, force)
+
+
+def budget_command(
+    run: RunPath,
+    file: Annotated[
+        Path | None,
+        typer.Option("--file", metavar="TOML", help="Contributors that the data cannot know, and requirements."),
+    ] = None,
+    out: Annotated[
+        list[Path] | None,
+        typer.Option("-o", "--out", metavar="FILE", help="Also write .csv, .xlsx, .tex or .html; repeatable."),
+    ] = None,
+    template: Annotated[
+        Path | None,
+        typer.Option(metavar="TOML", help="Write a starter file that lists what is not assessed, and stop."),
+    ] = None,
+    confidence: Annotated[
+        float | None, typer.Option(help="Confidence of the totals; that of the file, or 0.997.")
+    ] = None,
+    seed: Seed = 0,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Attitude error budget in the terms of ECSS; status 1 when a requirement is violated."""
+    from starcal_uq.budgeting.budget import budget_run
+    from starcal_uq.budgeting.result import FORMATS
+    from starcal_uq.cli.console import print_json
+    from starcal_uq.runs.folder import ensure_new
+
+    if template is not None and file is not None and template.resolve() == file.resolve():
+        raise typer.BadParameter(f"--template would write over {file}: name another file.")
+    for path in out or []:
+        if path.suffix.lower() not in FORMATS:
+            raise typer.BadParameter(f"{path}: the ending names the format; use one of {', '.join(FORMATS)}.")
+        ensure_new(path, force)
+    found = budget_run(run, file=file, confidence=confidence, seed=seed)
+    if template is not None:
+        from starcal_uq.budgeting.budget_template import write_budget_template
+
+        write_budget_template(template, found.rows, force=force)
+        print(f"Budget file to fill in: {template}. Next: starcal-uq budget {run} --file {template}")
+        return
+    for path in out or []:
+        found.save(path)
+    if json:
+        print_json(found.to_dict())
+    else:
+        show_budget(found)
+        print(f"Budget: {', '.join(str(path) for path in (run / 'budget.csv', *(out or [])))}")
+    fail_if_violated(found)
+
+
+def show_budget(found: Budget) -> None:
+    """Contributors, totals, requirements and what must be read with them, in the terminal."""
+    import pandas as pd
+
+    from starcal_uq.budgeting.rows import confidence_text
+    from starcal_uq.cli.console import out, show_table
+    from starcal_uq.presentation.pages.budget_tables import (
+        NOT_ASSESSED,
+        contributor_rows,
+        explanations,
+        headline,
+        total_rows,
+    )
+
+    contributors = [
+        {
+            "contributor": row["name"],
+            "class": row["ecss_class"],
+            # Said once where it holds for all axes.
+            **dict(zip(("X", "Y", "Z"), row["sigma"] if row["assessed"] else (NOT_ASSESSED, "", ""), strict=True)),
+            "random over": row["interpretation"],
+            "absorbed": row["absorbed"],
+        }
+        for row in contributor_rows(found)
+    ]
+    show_table(pd.DataFrame(contributors), f"{found.title}: contributors, 1 sigma, arcsec")
+    totals = [{name: row[name] for name in ("scope", "axis", "sigma", "rule", "sampled")} for row in total_rows(found)]
+    show_table(pd.DataFrame(totals), f"Totals at {confidence_text(found.confidence)}, mixed interpretation, arcsec")
+    for sentence in (*explanations(found), *found.notes):
+        out.print(sentence, highlight=False, soft_wrap=True)
+    for outcome in found.outcomes:
+        style = {"violated": "red", "met": "green"}.get(outcome.verdict, "yellow")
+        out.print(outcome.sentence, style=style, highlight=False, soft_wrap=True)
+    out.print(headline(found), highlight=False, soft_wrap=True)
+
+
+def fail_if_violated(found: Budget) -> None:
+    """Status 1, with the violated lines on standard error."""
+    from starcal_uq.cli.console import err
+
+    for outcome in found.violations:
+        err.print(f"violated: {outcome.sentence}", style="red", highlight=False, soft_wrap=True)
+    if found.violations:
+        raise typer.Exit(1)
+
+
+def compare_command(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(metavar="RUN_A RUN_B", help="Two run folders; one, with --split."),
+    ],
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Folder for the page, tables and figure.")
+    ] = None,
+    split: Annotated[
+        str | None,
+        typer.Option(help="Compare two parts of one run's frames: odd-even, halves, or random."),
+    ] = None,
+    labels: Annotated[
+        str | None, typer.Option(metavar="A,B", help="What to call them; the names of the folders by default.")
+    ] = None,
+    same_data: Annotated[
+        bool | None,
+        typer.Option("--same-data/--other-data", help="Whether both rest on the same frames, if files cannot tell."),
+    ] = None,
+    level: Annotated[float, typer.Option(help="Probability of a verdict 'differ' when nothing does.")] = 0.01,
+    seed: Seed = 0,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Do two calibrations differ by more than chance? The rotation between them is taken out and stated."""
+    from starcal_uq.cli.console import out as console
+    from starcal_uq.cli.console import print_json, show_table
+    from starcal_uq.runs.compare import compare_runs, compare_split
+
+    if len(runs) != (2 if split is None else 1):
+        raise typer.BadParameter(
+            "give two run folders, or one with --split odd-even."
+            if split is None
+            else f"--split compares parts of one run: leave out {runs[-1]}."
+        )
+    new_folder(out, force)
+    options: dict[str, Any] = {"level": level, "seed": seed}
+    names = _two_labels(labels)
+    if split is None:
+        found = compare_runs(*runs, labels=names, same_data=same_data, **options)
+    else:
+        found = compare_split(runs[0], split, **(options if names is None else options | {"labels": names}))
+    page = None if out is None else found.save(out)
+    if json:
+        print_json(found.to_dict())
+        return
+    show_table(found.to_dataframe(), f"{found.labels[1]} minus {found.labels[0]}")
+    console.print(found.words, highlight=False, soft_wrap=True)
+    if page is not None:
+        print(f"Page: {page.resolve()}")
+
+
+def _two_labels(text: str | None) -> tuple[str, str] | None:
+    if text is None:
+        return None
+    first, comma, second = (part.strip() for part in text.partition(","))
+    if not (first and comma and second) or first == second:
+        raise typer.BadParameter(f"--labels {text!r} is not two different names such as cold,hot.")
+    return first, second
+
+
+def plan_command(
+    camera: CameraFile,
+    target: Annotated[
+        float | None, typer.Option("--target-arcsec", metavar="T", help="Two-axis error across the boresight to keep.")
+    ] = None,
+    confidence: Annotated[float, typer.Option(help="Probability of keeping it (0.997, not 99.7).")] = 0.997,
+    scope: Annotated[
+        str, typer.Option(help="Part of the error the target is for: common, rest, calibration, or total.")
+    ] = "common",
+    sigma: Annotated[
+        float | None, typer.Option(help="Centroid noise, px per axis; 0.05, or that of the run of --after, by default.")
+    ] = None,
+    max_mag: Annotated[float, typer.Option(help="Magnitude limit of the sensor, Gaia G.")] = 6.0,
+    min_stars: Annotated[int, typer.Option(min=3, help="Frames with fewer stars are not used.")] = 10,
+    frames: Annotated[
+        list[int] | None,
+        typer.Option(help="Size of a campaign to forecast; repeatable (10, 30, 100, 300, 1000 and 3000 by default)."),
+    ] = None,
+    choose: Annotated[
+        int | None, typer.Option(min=1, metavar="N", help="Also choose the N frames that help most.")
+    ] = None,
+    criterion: Annotated[str, typer.Option(help="What the choice is for: A (attitude error) or D (parameters).")] = "A",
+    after: Annotated[
+        Path | None,
+        typer.Option(metavar="RUN", help="Count the data of this run first, and take its calibrated camera."),
+    ] = None,
+    check: Annotated[
+        int | None, typer.Option(min=10, metavar="N", help="Also simulate N campaigns of each size and compare.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Folder for the page, tables and figures.")
+    ] = None,
+    epoch: Annotated[float, typer.Option(help="Julian year of the star positions.")] = 2026.9,
+    seed: Seed = 0,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """What a calibration of this camera will give, and the frames it needs, before any data."""
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.cli.console import print_json, records
+    from starcal_uq.planning.check import check_forecast
+    from starcal_uq.planning.design import choose_frames
+    from starcal_uq.planning.plan import N_FRAMES, plan
+    from starcal_uq.presentation.pages.planning import plan_record
+    from starcal_uq.sky.catalogue import load_catalogue
+
+    new_folder(out, force)
+    if after is not None and check is not None:
+        raise typer.BadParameter("--check simulates campaigns from nothing: leave it out with --after.")
+    sheet, known, noise = Camera.load(camera), None, 0.05
+    if after is not None:
+        known, noise = _known(after, sheet, camera)
+        sheet = known.camera
+    sigma = noise if sigma is None else sigma
+    if max_mag > FAINTEST:
+        raise typer.BadParameter(f"--max-mag {max_mag:g}: the embedded catalogue ends at G = {FAINTEST:g}.")
+    # Deeper than the sensor, so that the sweep over the magnitude limit has somewhere to go.
+    deep = load_catalogue(max_mag=min(max_mag + 1.0, FAINTEST), epoch=epoch)
+    stars = deep.select(deep.mag <= max_mag)
+    sizes = tuple(frames or N_FRAMES)
+    found = plan(
+        sheet,
+        deep,
+        sigma_px=sigma,
+        n_frames=sizes,
+        min_stars=min_stars,
+        max_mag=max_mag,
+        target_arcsec=target,
+        confidence=confidence,
+        scope=scope,
+        after=known,
+        seed=seed,
+    )
+    choice = simulated = None
+    if choose is not None:
+        choice = choose_frames(
+            sheet,
+            stars,
+            n_frames=choose,
+            sigma_px=sigma,
+            min_stars=min_stars,
+            criterion=criterion,
+            scope="calibration" if scope == "total" else scope,
+            after=known,
+            seed=seed,
+        )
+    if check is not None:
+        with progress_bar("simulated campaigns") as progress:
+            simulated = check_forecast(
+                sheet,
+                stars,
+                sigma_px=sigma,
+                n_frames=sizes,
+                min_stars=min_stars,
+                n_campaigns=check,
+                seed=seed,
+                progress=progress,
+            )
+    page = None if out is None else found.save(out, choice=choice, check=simulated)
+    if json:
+        document = plan_record(found)
+        if choice is not None:
+            document |= {"choice": {"verdict": choice.verdict, "frames": records(choice.to_dataframe())}}
+        if simulated is not None:
+            document |= {"check": {"verdict": simulated.verdict, "table": records(simulated.to_dataframe())}}
+        print_json(document)
+    else:
+        _show_plan(found, choice, simulated)
+        if page is not None:
+            print(f"Page: {page.resolve()}")
+    if target is not None and found.frames_needed is None:
+        raise typer.Exit(1)
+
+
+def _show_plan(found: Plan, choice: FrameChoice | None, simulated: ForecastCheck | None) -> None:
+    from starcal_uq.cli.console import out, show_table
+
+    show_table(found.to_dataframe(), "Forecast, standard deviations; the radius holds the stated confidence", _FORECAST)
+    words = [found.verdict, *(f"{need.scope}: {need.words}" for need in found.needs)]
+    if choice is not None:
+        show_table(choice.to_dataframe().head(_SHOWN), f"The first {min(_SHOWN, len(choice.candidate))} frames to take")
+        words.append(choice.verdict)
+    if simulated is not None:
+        words.append(simulated.verdict)
+    for sentence in words:
+        out.print(sentence, highlight=False, soft_wrap=True)
+
+
+def _known(run: Path, sheet: Camera, path: Path) -> tuple[Calibration, float]:
+    """Calibration of a run of this sensor, and its noise in px: the median where stars state their own."""
+    import numpy as np
+
+    from starcal_uq.runs.folder import RunFolder
+    from starcal_uq.runs.steps import load_run
+
+    obs, calibration = load_run(RunFolder(run))
+    check_same_sensor(calibration.camera, run, sheet, path)
+    stated = 1.0 if obs.sigma_px is None or calibration.sigma_name == "sigma" else float(np.median(obs.sigma_px))
+    return calibration, float(calibration.sigma) * stated
+
+
+# Of the chosen frames, so many are shown; the others are in the tables.
+_SHOWN = 20
+_FORECAST = (
+    "n_frames",
+    "x0_px",
+    "f_mm",
+    "common_pitch_arcsec",
+    "rest_pitch_arcsec",
+    "nea_pitch_arcsec",
+    "radius_arcsec",
+)

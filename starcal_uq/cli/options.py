@@ -1,0 +1,159 @@
+"""Arguments and options that several commands share."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TypeVar
+
+import typer
+
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.identification.proposers import Engine as EngineName
+
+# Gaia G; where the embedded catalogue ends.
+FAINTEST = 10.0
+
+ChoiceT = TypeVar("ChoiceT", bound=str)
+
+ObsFile = Annotated[
+    Path,
+    typer.Argument(
+        metavar="OBS",
+        help="Stars in pixels: CSV, ECSV or Parquet with columns frame, x_px, y_px, ra_deg, dec_deg and optionally "
+        "sigma_px, star_id, mag, time_utc, temperature_c.",
+    ),
+]
+CameraFile = Annotated[
+    Path,
+    typer.Argument(
+        metavar="CAMERA", help="Nominal camera (TOML with a [camera] table): the start, and the prior's centre."
+    ),
+]
+RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder made by `starcal-uq calibrate`.")]
+NewRun = Annotated[Path, typer.Option("-o", "--out", metavar="RUN", help="Folder for the results.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace results that exist.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the table as JSON.")]
+Seed = Annotated[int, typer.Option(help="Seed; the same seed repeats the result bit for bit.")]
+Method = Annotated[
+    str,
+    typer.Option(
+        help="efficient (three stages, then the attitude-marginalised likelihood), three_stage (Ye & Yang 2017), or a "
+        "baseline: least_squares, samaan (Kalman filter), griffith (recursive least squares)."
+    ),
+]
+Solver = Annotated[str, typer.Option(help="lm, minpack, or ipopt (keeps the optics within physical bounds).")]
+Columns = Annotated[
+    list[str] | None,
+    typer.Option("--column", metavar="NAME=IN_FILE", help="A column that is called otherwise in the file; repeatable."),
+]
+Directions = Annotated[
+    str | None,
+    typer.Option(
+        help="What ra_deg and dec_deg are: apparent (as seen by the moving sensor), catalogue (aberration is then "
+        "applied at time_utc), or undeclared.",
+    ),
+]
+Velocity = Annotated[
+    str | None,
+    typer.Option(
+        "--observer-velocity", metavar="VX,VY,VZ", help="Velocity relative to the Earth's centre, km/s, ICRS axes."
+    ),
+]
+SiteFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--site",
+        metavar="SITE",
+        help="Where on the ground the camera stood (TOML with a [site] table): refraction and daily aberration are "
+        "applied.",
+    ),
+]
+InSpace = Annotated[bool, typer.Option("--in-space", help="The camera was above the air; refraction does not matter.")]
+TimeUtc = Annotated[
+    str | None,
+    typer.Option(
+        "--time",
+        metavar="UTC",
+        help="Images: middle of the exposure of files that do not say it; goes before a time in the file's name.",
+    ),
+]
+Engine = Annotated[str, typer.Option(help="What finds attitudes: pyramid, or tetra3rs (extra of that name).")]
+EngineChoice = Annotated[
+    str | None,
+    typer.Option("--engine", help="Images: what finds attitudes: pyramid, or tetra3rs (extra of that name)."),
+]
+Ensembles = Annotated[int, typer.Option(min=2, help="Separately seeded ensembles of walkers.")]
+Walkers = Annotated[int, typer.Option(min=14, help="Walkers in each ensemble.")]
+Steps = Annotated[int, typer.Option(min=20, help="Steps kept of each walker.")]
+Sigma = Annotated[float | None, typer.Option(help="Centroid noise in px per axis, if it is known; sampled otherwise.")]
+PriorFile = Annotated[
+    Path | None, typer.Option("--priors", help="TOML file with a [priors] table; wide defaults otherwise.")
+]
+Likelihood = Annotated[
+    str | None,
+    typer.Option(
+        help="marginal (Gaussian, attitudes marginalised), pairs (interstar angles, Godambe's curvature), "
+        "student_t (heavy tails, for wrong identifications), or pairs_naive (to see what goes wrong); by default that "
+        "of the calibration."
+    ),
+]
+Evaluation = Annotated[str, typer.Option(help="auto (compressed, checked against exact), compressed, or exact.")]
+Screen = Annotated[bool, typer.Option("--screen", help="Leave out wrong identifications first; they are listed.")]
+Robust = Annotated[
+    bool, typer.Option("--robust", help="Refine with Student-t tails, which wrong identifications hardly move.")
+]
+Draws = Annotated[int, typer.Option(min=50, help="Posterior draws that go through QUEST.")]
+
+
+def parse_choice(option: str, given: str | None, choices: Sequence[ChoiceT]) -> ChoiceT | None:
+    """The choice of that name; None where none was made."""
+    if given is None:
+        return None
+    for choice in choices:
+        if choice == given:
+            return choice
+    raise typer.BadParameter(f"{option} {given!r} is unknown: use one of {', '.join(choices)}.")
+
+
+def parse_engine(name: str) -> EngineName:
+    """The engine of that name."""
+    from starcal_uq.identification.proposers import ENGINES
+
+    return parse_choice("--engine", name, ENGINES) or "pyramid"
+
+
+def parse_columns(pairs: list[str] | None) -> dict[str, str]:
+    """``NAME=IN_FILE`` pairs as a mapping."""
+    found = {}
+    for pair in pairs or []:
+        name, separator, in_file = pair.partition("=")
+        if not (name and separator and in_file):
+            raise typer.BadParameter(f"{pair!r} is not NAME=IN_FILE, such as ra_deg=ra_apparent_deg.")
+        found[name] = in_file
+    return found
+
+
+def parse_velocity(text: str | None) -> tuple[float, float, float] | None:
+    """``VX,VY,VZ`` as numbers."""
+    if text is None:
+        return None
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"{text!r} is not three numbers in km/s, such as 7.5,0.0,0.0.") from None
+    return x, y, z
+
+
+def check_same_sensor(calibrated: Camera, run: Path, sheet: Camera, path: Path) -> None:
+    """Refuse a run whose camera cannot be that of the file: another detector, or a focal length 10 % off."""
+    same = (calibrated.width_px, calibrated.height_px) == (sheet.width_px, sheet.height_px)
+    pixels = abs(calibrated.pixel_um / sheet.pixel_um - 1.0)
+    focal = abs(calibrated.focal_px / sheet.focal_px - 1.0)
+    if not same or pixels > 1e-6 or focal > 0.1:
+        raise typer.BadParameter(
+            f"{run}: its camera ({calibrated.width_px} x {calibrated.height_px} px, f = {calibrated.focal_mm:.4g} mm) "
+            f"is not that of {path} ({sheet.width_px} x {sheet.height_px} px, f = {sheet.focal_mm:.4g} mm): give the "
+            "file and the run of one sensor."
+        )

@@ -1,0 +1,144 @@
+"""The commands that run the paper again: reproduce, reproduce-field."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from starcal_uq.cli.options import Force, Json, Seed
+from starcal_uq.cli.progress import progress_bar
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the command line."""
+    app.command("reproduce")(reproduce_command)
+    app.command("reproduce-field")(field_command)
+
+
+def reproduce_command(
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for report, tables and figures.")],
+    replicates: Annotated[
+        int, typer.Option(min=8, help="Repetitions of the experiment, each with its own seed.")
+    ] = 200,
+    frames: Annotated[int, typer.Option(min=20, help="Frames in each.")] = 1000,
+    convention: Annotated[
+        str, typer.Option(help="eq14 (ideal to distorted, as everybody's models) or eq6 (distorted to ideal).")
+    ] = "eq14",
+    study: Annotated[bool, typer.Option(help="Also study the interaction of optics and distortion.")] = True,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as processors by default.")] = None,
+    seed: Seed = 2017,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Run Ye & Yang 2017 again: each of its numbers beside ours, with the uncertainty that they lack."""
+    from starcal_uq.cli.console import out as console
+    from starcal_uq.cli.console import print_json, records, show_table
+    from starcal_uq.paper.reproduction import reproduce
+    from starcal_uq.simulation.frames import CONVENTIONS
+
+    if convention not in CONVENTIONS:
+        raise typer.BadParameter(f"--convention {convention!r} is unknown: use one of {', '.join(CONVENTIONS)}.")
+    with progress_bar("reproduction") as progress:
+        found = reproduce(
+            out,
+            n_replicates=replicates,
+            n_frames=frames,
+            seed=seed,
+            convention=convention,
+            workers=workers,
+            progress=progress,
+            study=study,
+            force=force,
+        )
+    published = found.published()
+    if json:
+        print_json({"verdict": found.verdict, "published": records(published)})
+    else:
+        show_table(_readable(published), "What the paper prints, and what comes out over seeds")
+        console.print(found.verdict, highlight=False, soft_wrap=True)
+        print(f"Report: {found.report.resolve()}")
+
+
+def field_command(
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for report, tables and figures.")],
+    frames: Annotated[int, typer.Option(min=20, help="Frames identified and solved; as many calibrate.")] = 200,
+    reading: Annotated[
+        str, typer.Option(help="window (the middle of a larger detector, 10.8 degrees) or full (all of it).")
+    ] = "window",
+    replicates: Annotated[int, typer.Option(min=20, help="Repetitions behind the ranges of the errors.")] = 100,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as processors by default.")] = None,
+    seed: Seed = 2017,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """The paper's Table 3 from rendered frames: identification and attitude with four cameras, and why they differ."""
+    from starcal_uq.cli.console import out as console
+    from starcal_uq.cli.console import print_json, records, show_table
+    from starcal_uq.paper.field.experiment import field_experiment
+    from starcal_uq.paper.field.published import READINGS
+
+    if reading not in READINGS:
+        raise typer.BadParameter(f"--reading {reading!r} is unknown: use one of {', '.join(READINGS)}.")
+    with progress_bar("field experiment") as progress:
+        found = field_experiment(
+            out,
+            n_frames=frames,
+            n_calibration_frames=frames,
+            reading=reading,
+            seed=seed,
+            n_replicates=replicates,
+            workers=workers,
+            progress=progress,
+            force=force,
+        )
+    table = found.table_3()
+    if json:
+        print_json({"verdict": found.verdict, "table_3": records(table)})
+    else:
+        show_table(_readable_table_3(table), "Table 3: rates in %, errors in arcsec, with 95 % ranges")
+        console.print(found.verdict, highlight=False, soft_wrap=True)
+        print(f"Report: {found.report.resolve()}")
+
+
+def _readable(published: pd.DataFrame) -> pd.DataFrame:
+    """The columns that fit a terminal, each number with the digits that its spread leaves it."""
+    from starcal_uq.core.formatting import significant, with_sigma
+
+    table = published[["place", "method", "quantity", "printed"]].copy()
+    table["ours"] = [
+        f"{with_sigma(mean, spread)} ± {significant(spread)}"
+        for mean, spread in zip(published["main_mean"], published["main_spread"], strict=True)
+    ]
+    table["z"] = published["main_z"]
+    table["outcome"] = published["outcome"]
+    return table
+
+
+def _readable_table_3(table: pd.DataFrame) -> pd.DataFrame:
+    """The columns that fit a terminal: printed, ours as it stands, ours after alignment, and which of them agrees."""
+    import pandas as pd
+
+    from starcal_uq.core.formatting import significant
+
+    def ranged(row: pd.Series, prefix: str, value: str) -> str:
+        if pd.isna(row[value]):
+            return ""
+        ends = " to ".join(significant(float(row[f"{prefix}{end}"]), 3) for end in ("low", "high"))
+        return f"{significant(float(row[value]), 3)} ({ends})"
+
+    words = {"rate_percent": "rate", "pitch_arcsec": "pitch", "yaw_arcsec": "yaw", "roll_arcsec": "roll"}
+    return pd.DataFrame(
+        {
+            "method": [method.replace("_", " ") for method in table["method"]],
+            "": [words[quantity] for quantity in table["quantity"]],
+            "printed": table["printed"],
+            "true attitude": [ranged(row, "", "ours") for _, row in table.iterrows()],
+            "after alignment": [ranged(row, "aligned_", "aligned") for _, row in table.iterrows()],
+            "print agrees": table["agrees"],
+        }
+    )

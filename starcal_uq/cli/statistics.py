@@ -1,0 +1,151 @@
+"""Commands that question results: validate, diagnose, merge."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from starcal_uq.cli.options import CameraFile, Force, Json, NewRun, RunPath, Seed
+from starcal_uq.cli.progress import progress_bar
+
+_VALIDATION = ("quantity", "unit", "coverage_95", "coverage_low", "coverage_high", "coverage_p", "rank_p")
+_SHOWN = {
+    "Misfit": ("test", "against", "statistic", "p_value", "p_holm", "size_px"),
+    "Jackknife over frames": (
+        "parameter",
+        "formal_sigma",
+        "jackknife_sigma",
+        "ratio",
+        "expected_low",
+        "expected_high",
+        "p_value",
+    ),
+    "Distortion models": ("model", "n_parameters", "elpd", "difference", "difference_se", "rejected"),
+    "Predictive checks": ("name", "observed", "replicated_low", "replicated_high", "p_value"),
+}
+
+
+def register(app: typer.Typer) -> None:
+    """Add the commands to the command line."""
+    app.command("validate")(validate_command)
+    app.command("diagnose")(diagnose_command)
+    app.command("merge")(merge_command)
+
+
+def validate_command(
+    camera: CameraFile,
+    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for figure and table.")] = Path(
+        "validation"
+    ),
+    replicates: Annotated[int, typer.Option(min=20, help="Data sets to simulate, calibrate and sample.")] = 1000,
+    frames: Annotated[int, typer.Option(min=2, help="Frames in each.")] = 50,
+    min_stars: Annotated[int, typer.Option(min=3, help="Least stars in a frame.")] = 10,
+    sigma: Annotated[float, typer.Option(help="Centroid noise, px per axis.")] = 0.05,
+    max_mag: Annotated[float, typer.Option(help="Magnitude limit, Gaia G.")] = 6.0,
+    truth: Annotated[
+        str, typer.Option(help="fixed (this camera every time) or prior (drawn from narrow priors around it).")
+    ] = "fixed",
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as processors by default.")] = None,
+    seed: Seed = 0,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Show that the intervals are right for this sensor and this volume of data, by simulation-based calibration."""
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.cli.console import out as console
+    from starcal_uq.cli.console import print_json, records, show_table
+    from starcal_uq.diagnostics.validation.validate import TRUTHS, validate
+    from starcal_uq.runs.folder import RunFolder, atomic_write_bytes, check_new_run
+
+    if truth not in TRUTHS:
+        raise typer.BadParameter(f"--truth {truth!r} is unknown: use one of {', '.join(TRUTHS)}.")
+    sensor = Camera.load(camera)
+    folder = RunFolder(out)
+    check_new_run(folder, force)
+    with progress_bar("replicates") as progress:
+        found = validate(
+            sensor,
+            n_replicates=replicates,
+            n_frames=frames,
+            min_stars=min_stars,
+            sigma_px=sigma,
+            max_mag=max_mag,
+            seed=seed,
+            workers=workers,
+            truth=truth,  # type: ignore[arg-type]
+            progress=progress,
+        )
+    from starcal_uq.presentation.figures.style import png_bytes
+    from starcal_uq.runs.folder import atomic_path
+
+    folder.create()
+    found.save(out / "validation.npz")
+    table = found.to_dataframe()
+    with atomic_path(out / "validation.csv") as temporary:
+        table.to_csv(temporary, index=False)
+    atomic_write_bytes(out / "validation.png", png_bytes(found.plot()))
+    if json:
+        print_json({"ok": found.ok, "verdict": found.verdict, "quantities": records(table)})
+    else:
+        show_table(table, "Validation", _VALIDATION)
+        console.print(found.verdict, style="green" if found.ok else "red", highlight=False, soft_wrap=True)
+        print(f"Figure: {(out / 'validation.png').resolve()}")
+    if not found.ok:
+        raise typer.Exit(1)
+
+
+def diagnose_command(
+    run: RunPath,
+    starts: Annotated[int, typer.Option(min=0, help="Fits from other starts.")] = 5,
+    seed: Seed = 0,
+    json: Json = False,
+) -> None:
+    """Question the model: misfit, jackknife, other distortion models, predictive checks, other starts."""
+    from starcal_uq.cli.console import print_json, records, show_table
+    from starcal_uq.diagnostics.diagnose import diagnose_run
+
+    with progress_bar("diagnosis") as progress:
+        found = diagnose_run(run, n_starts=starts, seed=seed, progress=progress)
+    parts = {
+        "Misfit": found.misfit,
+        "Jackknife over frames": found.jackknife,
+        "Distortion models": found.comparison,
+        "Predictive checks": found.predictive,
+    }
+    tables = {title: part.to_dataframe() for title, part in parts.items() if part is not None}
+    if json:
+        print_json({title: records(table) for title, table in tables.items()})
+        return
+    for title, table in tables.items():
+        show_table(table, title, _SHOWN[title])
+    if found.comparison is not None:
+        print(found.comparison.statement)
+
+
+def merge_command(
+    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders of the same camera.")],
+    out: NewRun,
+    noise: Annotated[
+        str, typer.Option(help="common (one noise for all runs) or own (each run keeps its estimated noise).")
+    ] = "common",
+    allow_inconsistent: Annotated[
+        bool, typer.Option("--allow-inconsistent", help="Merge even where the runs disagree on the camera.")
+    ] = False,
+    force: Force = False,
+) -> None:
+    """Combine the likelihoods of several runs into one, without going back to the stars; tests that they agree."""
+    from starcal_uq.cli.console import out as console
+    from starcal_uq.cli.console import show_calibration, show_table
+    from starcal_uq.estimation.consistency import consistency_of
+    from starcal_uq.runs.merge import merge_runs
+
+    merged = merge_runs(runs, out, noise=noise, allow_inconsistent=allow_inconsistent, force=force)
+    agreement = consistency_of(merged)
+    if agreement is not None:
+        show_table(agreement.to_dataframe(), "Agreement of the runs")
+        words = agreement.messages or ("The runs agree.",)
+        console.print(f"{' '.join(words)} (p = {agreement.p_value:.2g})", highlight=False, soft_wrap=True)
+    show_calibration(merged)
+    print(f"Run folder: {out}. Next: starcal-uq sample {out}")

@@ -1,0 +1,1 @@
+"""Two calibrations held against each other."""

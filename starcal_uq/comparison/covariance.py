@@ -1,0 +1,157 @@
+"""Which covariance the difference of two estimates has, given what their data have in common.
+
+- Different data: the covariances add.
+- The same data, or data of which one set holds the other: if one estimator is efficient under the model of both, its
+  errors are uncorrelated with the difference, whose covariance is then that of the other estimator *minus* that of the
+  efficient one (Hausman 1978, Econometrica 46(6), 1251-1271).
+- Everything else: the correlation of the two estimates is not known from their covariances, and there is no p-value.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from starcal_uq.camera.distortion import get_model
+from starcal_uq.estimation.merging import data_hashes
+from starcal_uq.inference.gaussian_priors import GaussianPriors
+from starcal_uq.observations.splits import shared_frames
+
+if TYPE_CHECKING:
+    from starcal_uq.observations.table import Observations
+
+INDEPENDENT, SAME, A_IN_B, B_IN_A, OVERLAP = "independent", "same", "A within B", "B within A", "overlapping"
+
+
+@dataclass(frozen=True)
+class Rule:
+    """How the covariance of the difference follows from those of the two estimates.
+
+    Attributes
+    ----------
+    data : str
+        ``independent``, ``same``, ``A within B``, ``B within A`` or ``overlapping``.
+    signs : (float, float) or None
+        Covariance of the difference is the sum of both covariances with these signs; None where it is not known.
+    words : str
+        The rule, or why there is none.
+    """
+
+    data: str
+    signs: tuple[float, float] | None
+    words: str
+
+
+def difference_rule(
+    a: Any,
+    b: Any,
+    labels: tuple[str, str],
+    same_data: bool | None,
+    observations: tuple[Observations, Observations] | None,
+) -> Rule:
+    """The rule for two calibrations or posteriors.
+
+    Parameters
+    ----------
+    a, b : Calibration or Posterior
+        The estimates.
+    labels : (str, str)
+        Their names.
+    same_data : bool or None
+        True or False overrules what hashes and frames say.
+    observations : pair of Observations or None
+        The frames that each rests on, in which shared ones are then looked for.
+    """
+    data = _relation(a, b, same_data, observations)
+    if data == INDEPENDENT:
+        return Rule(data, (1.0, 1.0), "The data are independent, so the two covariances add.")
+    if data == OVERLAP:
+        why = "both rest in part on the same data, and how their errors correlate is not known"
+        return Rule(data, None, f"There is no p-value: {why}; compare runs that share all frames, or none.")
+    signs = _hausman(a, b, data)
+    if signs is None:
+        return Rule(data, None, f"There is no p-value: {_why_none(a, b, data)}.")
+    efficient, other = labels if signs == (-1.0, 1.0) else labels[::-1]
+    if data == SAME:
+        reason = "is the efficient estimate"
+        if is_efficient(a) and is_efficient(b):
+            reason = "has the simpler model and is efficient if that holds"
+        return Rule(
+            data,
+            signs,
+            f"Both rest on the same data. {efficient[:1].upper()}{efficient[1:]} {reason}, so the difference has the "
+            f"covariance of {other} minus that of {efficient} (Hausman 1978).",
+        )
+    return Rule(
+        data,
+        signs,
+        f"All data of {other} are in {efficient} too, which is efficient, so the difference has the covariance of "
+        f"{other} minus that of {efficient} (Hausman 1978).",
+    )
+
+
+def _relation(a: Any, b: Any, same_data: bool | None, observations: tuple[Observations, Observations] | None) -> str:
+    if same_data is not None:
+        return SAME if same_data else INDEPENDENT
+    first, second = data_hashes(a.provenance), data_hashes(b.provenance)
+    if _prior_hashes(a) & second or _prior_hashes(b) & first:
+        return OVERLAP
+    if first and first == second:
+        return SAME
+    if first & second:
+        return OVERLAP
+    if observations is None:
+        return INDEPENDENT
+    common, sizes = shared_frames(*observations), [obs.n_frames for obs in observations]
+    if common == 0:
+        return INDEPENDENT
+    if common == sizes[0]:
+        return SAME if common == sizes[1] else A_IN_B
+    return B_IN_A if common == sizes[1] else OVERLAP
+
+
+def _prior_hashes(result: Any) -> set[str]:
+    """Hashes of the data behind a prior that came from another run."""
+    priors = getattr(result, "priors", None)
+    return set(priors.source.get("data_sha256", ())) if isinstance(priors, GaussianPriors) else set()
+
+
+def _hausman(a: Any, b: Any, data: str) -> tuple[float, float] | None:
+    """Signs of the covariances, minus for the efficient estimate."""
+    a_first = data != A_IN_B and _efficient_beside(a, b)
+    b_first = data != B_IN_A and _efficient_beside(b, a)
+    if a_first == b_first:
+        return None
+    return (-1.0, 1.0) if a_first else (1.0, -1.0)
+
+
+def _efficient_beside(one: Any, other: Any) -> bool:
+    """True if `one` reaches the Cramer-Rao bound of a model that is within that of `other`."""
+    return is_efficient(one) and _within(one, other)
+
+
+def _within(one: Any, other: Any) -> bool:
+    """True if the distortion model of `one` is that of `other` with some coefficients zero, or none."""
+    small, large = get_model(one.camera.distortion), get_model(other.camera.distortion)
+    names = {c.name for c in large.coefficients}
+    nested = all(c.name in names for c in small.coefficients)
+    return nested and (small.direction == large.direction or not small.coefficients)
+
+
+def is_efficient(result: Any) -> bool:
+    """True for estimates by the attitude-marginalised Gaussian likelihood."""
+    diagnostics = getattr(result, "diagnostics", None)
+    if diagnostics is not None:
+        return bool(diagnostics.likelihood == "marginal")
+    settings = result.provenance.get("settings", {})
+    return bool(result.method == "efficient" and settings.get("likelihood", "marginal") == "marginal")
+
+
+def _why_none(a: Any, b: Any, data: str) -> str:
+    if not (is_efficient(a) or is_efficient(b)):
+        return "they share data, and neither estimate is efficient, so how their errors correlate is not known"
+    if not (_within(a, b) or _within(b, a)):
+        return "they share data, and neither distortion model is contained in the other"
+    if data == SAME and a.camera.distortion == b.camera.distortion:
+        return "both are the efficient estimate from the same data, so that no noise explains a difference"
+    return "they share data, and the efficient one of the two has the richer model or the fewer frames"

@@ -1,0 +1,1 @@
+"""What knows no star: types, errors, status, files, records, times, tasks."""

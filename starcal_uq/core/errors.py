@@ -1,0 +1,109 @@
+"""Errors that a user can act on.
+
+Every message is one complete sentence that names what is wrong, where, and the remedy; the command line prints it as it
+stands and exits with status 2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from starcal_uq.core.status import Status
+
+
+class StarcalError(Exception):
+    """Base of all errors that this package raises on purpose."""
+
+
+class CameraError(StarcalError):
+    """A camera description is incomplete, inconsistent or unreadable."""
+
+
+class SensorError(StarcalError):
+    """A sensor description is inconsistent or unreadable, or asks for an image that cannot be rendered."""
+
+
+class DistortionError(StarcalError):
+    """A distortion model is unknown, or cannot be inverted where it was asked for."""
+
+
+class ObservationError(StarcalError):
+    """An observations table has bad rows.
+
+    Parameters
+    ----------
+    message
+        The sentence shown to the user.
+    row
+        The first bad row: the line in a CSV or ECSV file (the header counts), the row number from 1 otherwise.
+    column
+        The column of the first problem.
+    problems
+        Every problem found, one sentence each.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        row: int | None = None,
+        column: str | None = None,
+        problems: Sequence[str] = (),
+    ) -> None:
+        super().__init__(message)
+        self.row = row
+        self.column = column
+        self.problems = tuple(problems)
+
+
+class AttitudeProfileError(StarcalError):
+    """An attitude profile is unreadable, or its times or quaternions cannot be used."""
+
+
+class CatalogueError(StarcalError):
+    """A star catalogue cannot be read or does not hold what was asked for."""
+
+
+class SiteError(StarcalError):
+    """A site on the ground is incomplete, out of range or unreadable."""
+
+
+class IdentificationError(StarcalError):
+    """Stars cannot be identified with what was given."""
+
+
+class CalibrationError(StarcalError):
+    """The estimate was not found; `status` says why and what to do."""
+
+    def __init__(self, message: str, status: Status | None = None) -> None:
+        super().__init__(message)
+        self.status = status
+
+
+class PriorError(StarcalError):
+    """A prior is improper or misspelt."""
+
+
+class SamplingError(StarcalError):
+    """The posterior could not be sampled from the given start."""
+
+
+class PlanningError(StarcalError):
+    """A calibration cannot be planned with what was given, or its aim cannot be reached."""
+
+
+class ComparisonError(StarcalError):
+    """Two calibrations cannot be compared, or a table of frames cannot be split."""
+
+
+class ImageError(StarcalError):
+    """An image file is missing, damaged, empty or of the wrong size."""
+
+
+class BudgetError(StarcalError):
+    """An error budget is incomplete, contradicts itself or is unreadable."""
+
+
+class RunFolderError(StarcalError):
+    """A run folder lacks a file, or holds one that would be overwritten."""

@@ -1,0 +1,180 @@
+"""Independent tasks over processes: the same results for any number of them, and Ctrl-C keeps what is done."""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import get_context
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, TypeVar
+
+from starcal_uq.core.errors import SamplingError
+from starcal_uq.core.interrupts import interrupt_between_steps
+
+Progress = Callable[[int, int], None]
+T = TypeVar("T")
+# Numbers of the tasks and their results.
+Numbered = list[tuple[int, T]]
+
+_WAIT_S = 0.2
+_THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+_shared: list[Callable[[int], Any]] = []
+
+
+def run_tasks(
+    task: Callable[[int], T],
+    n_tasks: int,
+    *,
+    caller: str,
+    chunk: int,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> tuple[list[T], bool]:
+    """Run task 0 .. n_tasks - 1.
+
+    Parameters
+    ----------
+    task : callable
+        From the number of a task to its result; sent once to every process. The result must depend on the number alone.
+    n_tasks : int
+        How many.
+    caller : str
+        Function that users call, for messages.
+    chunk : int
+        Tasks sent to a process at once: about a second's work, which is also what Ctrl-C waits for.
+    workers : int, optional
+        Processes; 0 stays in this one, None takes as many as there are processors.
+    progress : callable, optional
+        Called as ``progress(done, total)``.
+
+    Returns
+    -------
+    list
+        Results in order; all that were complete when Ctrl-C was pressed.
+    bool
+        True if it was.
+
+    Raises
+    ------
+    SamplingError
+        If processes cannot be used.
+    KeyboardInterrupt
+        If Ctrl-C was pressed before the first result.
+    """
+    n_chunks = -(-n_tasks // chunk)
+    workers = min(processors() if workers is None else workers, n_chunks)
+    results: Numbered[T] = []
+    interrupted = False
+
+    def keep(some: Numbered[T]) -> None:
+        results.extend(some)
+        if progress is not None:
+            progress(len(results), n_tasks)
+
+    try:
+        if workers == 0:
+            with interrupt_between_steps() as check:
+                for index in range(n_tasks):
+                    keep([(index, task(index))])
+                    check()
+        else:
+            _spread(task, n_tasks, workers, chunk, caller, keep)
+    except KeyboardInterrupt:
+        if not results:
+            raise
+        interrupted = True
+    results.sort(key=lambda numbered: numbered[0])
+    return [result for _, result in results], interrupted
+
+
+def processors() -> int:
+    """What this process may use, which in a container is less than what the machine has."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _spread(
+    task: Callable[[int], T], n_tasks: int, workers: int, chunk: int, caller: str, keep: Callable[[Numbered[T]], None]
+) -> None:
+    try:
+        content = pickle.dumps(task)
+    except (pickle.PicklingError, AttributeError, TypeError) as error:
+        raise SamplingError(
+            f"the settings cannot be sent to other processes ({error}): give functions that a module defines at its "
+            "top level, or use workers=0."
+        ) from error
+    chunks = [range(first, min(first + chunk, n_tasks)) for first in range(0, n_tasks, chunk)]
+    with TemporaryDirectory(prefix="starcal-uq-") as folder:
+        # A file, because a process that dies while it starts would leave this one waiting at a pipe that is full.
+        path = Path(folder) / "task.pickle"
+        path.write_bytes(content)
+        _submit(path, chunks, workers, caller, keep)
+
+
+def _submit(path: Path, chunks: list[range], workers: int, caller: str, keep: Callable[[Numbered[T]], None]) -> None:
+    # Forked processes would inherit the locks of threads that they do not have.
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_start, initargs=(path,))
+    try:
+        with interrupt_between_steps() as check, _one_thread_each():
+            pending: set[Future[Numbered[T]]] = {pool.submit(_run, numbers) for numbers in chunks}
+            try:
+                while pending:
+                    check()
+                    for future in wait(pending, _WAIT_S, FIRST_COMPLETED).done:
+                        pending.discard(future)
+                        keep(future.result())
+            except KeyboardInterrupt:
+                _keep_running(pool, pending, keep)
+                raise
+    except BrokenProcessPool as error:
+        raise SamplingError(
+            f"the worker processes ended unexpectedly: in a script, call {caller} below "
+            '`if __name__ == "__main__":`; if memory ran out, use fewer workers, or workers=0.'
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _keep_running(
+    pool: ProcessPoolExecutor, pending: set[Future[Numbered[T]]], keep: Callable[[Numbered[T]], None]
+) -> None:
+    """Drop what waits, and keep what was under way."""
+    pool.shutdown(cancel_futures=True)
+    for future in pending:
+        if not future.cancelled() and future.exception() is None:
+            keep(future.result())
+
+
+@contextmanager
+def _one_thread_each() -> Iterator[None]:
+    """Processes started here use one BLAS thread: many would fight for the cores, and could sum in another order."""
+    before = {name: os.environ.get(name) for name in _THREAD_COUNTS}
+    os.environ.update(dict.fromkeys(_THREAD_COUNTS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _start(path: Path) -> None:
+    # Ctrl-C reaches every process of a terminal; the first one decides what to do about it.
+    if hasattr(signal, "pthread_sigmask"):
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    else:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _shared[:] = [pickle.loads(path.read_bytes())]
+
+
+def _run(numbers: range) -> Numbered[Any]:
+    return [(number, _shared[0](number)) for number in numbers]

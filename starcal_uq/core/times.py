@@ -1,0 +1,171 @@
+"""UTC times as text to two-part Julian dates."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from datetime import datetime, timedelta
+from typing import Any
+
+import numpy as np
+
+from starcal_uq.core.errors import CatalogueError
+from starcal_uq.core.types import FloatArray, IntArray
+
+FIRST_YEAR, LAST_YEAR = 1960, 2100
+_EXAMPLE = "2026-11-21T03:04:05.6"
+
+# Scales that are UTC within 0.9 s, and seconds by which others are ahead of TAI; barycentric time is TT within 2 ms.
+_UTC_NAMES = ("UTC", "UT", "UT1", "GMT")
+_AHEAD_OF_TAI_S = {"TAI": 0.0, "IAT": 0.0, "GPS": -19.0, "TT": 32.184, "TDT": 32.184, "ET": 32.184, "TDB": 32.184}
+
+_ISO = re.compile(
+    r"(\d{4})-(\d\d)-(\d\d)(?:[T ](\d\d):(\d\d)(?::(\d\d(?:\.\d*)?))?)?\s*(Z|UTC|[+-]\d\d:?\d\d)?", re.ASCII
+)
+
+
+def julian_days(time_utc: Any, ut1_minus_utc_s: float = 0.0) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Julian dates of the different times among some UTC times.
+
+    Parameters
+    ----------
+    time_utc
+        One UTC time or a sequence of n: ISO 8601 text ("2026-11-21T03:04:05.6", a trailing "Z" or an offset such as
+        "+02:00" is understood), `datetime.datetime` or `numpy.datetime64`. A time without an offset is UTC.
+    ut1_minus_utc_s
+        UT1 - UTC, seconds.
+
+    Returns
+    -------
+    tt, ut1 : ndarray, shape (m, 2)
+        Two-part Julian dates of the m different times; a table of observations repeats one time for every star of a
+        frame.
+    inverse : ndarray, shape (n,)
+        Which of them each time is.
+
+    Raises
+    ------
+    CatalogueError
+        A time is not readable; the message quotes it and gives its place among several, from 1.
+    """
+    times = np.atleast_1d(np.asarray(time_utc)).astype(str)
+    unique, inverse = np.unique(times, return_inverse=True)
+    days = np.array([_days(str(text), times, ut1_minus_utc_s) for text in unique], dtype=np.float64).reshape(-1, 2, 2)
+    return days[:, 0], days[:, 1], inverse.reshape(-1).astype(np.int64)
+
+
+def julian_year(time_utc: Any) -> float:
+    """Mean of some UTC times as a Julian year, for the epoch of a catalogue.
+
+    Parameters
+    ----------
+    time_utc
+        As for `julian_days`.
+
+    Raises
+    ------
+    CatalogueError
+        As `julian_days`.
+    """
+    tt, _, inverse = julian_days(time_utc)
+    return float(2000.0 + (np.mean(tt.sum(axis=1)[inverse]) - 2451545.0) / 365.25)
+
+
+def utc_text(time: str) -> str:
+    """One UTC time as tables hold it, YYYY-MM-DDTHH:MM:SS[.f]; an offset such as "+02:00" is taken out.
+
+    Parameters
+    ----------
+    time
+        ISO 8601 text with a time of day; without an offset it is UTC.
+
+    Raises
+    ------
+    CatalogueError
+        The time is not readable, or a date alone; the message quotes it.
+    """
+    match = _ISO.fullmatch(time.strip())
+    if match is not None and match[4] is None and match[7] is None:
+        # Dates that do not exist are named as such.
+        julian_days(time)
+        raise CatalogueError(f"The time {time!r} is a date without a time of day; write it as {_EXAMPLE}.")
+    try:
+        if match is None or match[4] is None:
+            raise ValueError("not ISO 8601")
+        # Seconds stay text: a leap second is none to datetime.
+        minute = datetime(*(int(group) for group in match.groups()[:5]))  # type: ignore[arg-type]
+        minute -= timedelta(days=_offset_days(match[7]))
+    except (ValueError, OverflowError) as error:
+        raise _unreadable(time) from error
+    text = f"{minute.isoformat(timespec='minutes')}:{(match[6] or '00').rstrip('.')}"
+    try:
+        julian_days(text)
+    except CatalogueError as error:
+        raise _unreadable(time) from error
+    return text
+
+
+def utc_of_scale(time: datetime, scale: str) -> datetime:
+    """UTC of a time without zone in another scale, such as TAI or TT.
+
+    Raises
+    ------
+    ValueError
+        The scale is unknown.
+    """
+    import erfa
+
+    if scale in _UTC_NAMES:
+        return time
+    if scale not in _AHEAD_OF_TAI_S:
+        raise ValueError(scale)
+    tai = time - timedelta(seconds=_AHEAD_OF_TAI_S[scale])
+    second = tai.second + 1e-6 * tai.microsecond
+    days = erfa.dtf2d("TAI", tai.year, tai.month, tai.day, tai.hour, tai.minute, second)
+    with warnings.catch_warnings():
+        # Leap seconds of the future are not known.
+        warnings.simplefilter("ignore", erfa.ErfaWarning)
+        utc = erfa.taiutc(*days)
+    return tai - timedelta(seconds=round(86400.0 * float(np.subtract(days, utc).sum()), 3))
+
+
+def _unreadable(text: str, place: str = "") -> CatalogueError:
+    return CatalogueError(
+        f"The time {text!r}{place} is not a UTC time between {FIRST_YEAR} and {LAST_YEAR}; write it as {_EXAMPLE}."
+    )
+
+
+def _days(text: str, times: Any, ut1_minus_utc_s: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Two-part Julian dates, TT and UT1, of one UTC time."""
+    import erfa
+
+    match = _ISO.fullmatch(text.strip())
+    try:
+        if match is None:
+            raise ValueError("not ISO 8601")
+        if not FIRST_YEAR <= int(match[1]) <= LAST_YEAR:
+            raise ValueError("outside the years of UTC and of the Earth's ephemeris")
+        year, month, day, hour, minute = (int(group or 0) for group in match.groups()[:5])
+        second = float(match[6] or 0.0)
+        with warnings.catch_warnings():
+            # "Dubious year": leap seconds of the future are not known; ten of them change the Earth's velocity by
+            # 6e-5 km/s. "Time is after end of day" and the like are errors of the input.
+            warnings.simplefilter("error", erfa.ErfaWarning)
+            warnings.filterwarnings("ignore", message=".*dubious year", category=erfa.ErfaWarning)
+            utc = erfa.dtf2d("UTC", year, month, day, hour, minute, second)
+            tt1, tt2 = erfa.taitt(*erfa.utctai(*utc))
+            ut1, ut2 = erfa.utcut1(*utc, ut1_minus_utc_s)
+    except (ValueError, erfa.ErfaError, erfa.ErfaWarning) as error:
+        place = int(np.flatnonzero(times == text)[0]) + 1
+        raise _unreadable(text, f" (number {place})" if len(times) > 1 else "") from error
+    offset = _offset_days(match[7])
+    return (float(tt1), float(tt2) - offset), (float(ut1), float(ut2) - offset)
+
+
+def _offset_days(zone: str | None) -> float:
+    """Offset of a local time from UTC, days east positive."""
+    if zone is None or zone[0] not in "+-":
+        return 0.0
+    digits = zone[1:].replace(":", "")
+    minutes = 60 * int(digits[:2]) + int(digits[2:])
+    return (minutes if zone[0] == "+" else -minutes) / 1440.0

@@ -1,0 +1,301 @@
+"""Everything that questions the model of a run, in one result that is stored with it.
+
+The tests for misfit, the jackknife, the comparison of distortion models, the posterior predictive check and fits from
+other starts take seconds; the report reads what is stored, and leaves out what was made from another calibration.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.core.errors import RunFolderError, StarcalError
+from starcal_uq.core.types import AnyDict
+from starcal_uq.diagnostics.jackknife import Jackknife, jackknife_frames
+from starcal_uq.diagnostics.misfit import Misfit, misfit_tests
+from starcal_uq.diagnostics.models import MODELS, ModelComparison, compare_models
+from starcal_uq.diagnostics.predictive import PredictiveCheck, predictive_check
+from starcal_uq.estimation.calibrate import METHODS, calibrate
+from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.normals import FrameNormals
+from starcal_uq.observations.table import load_observations
+from starcal_uq.runs.folder import RunFolder, atomic_path, atomic_write_text, provenance
+
+if TYPE_CHECKING:
+    from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.observations.table import Observations
+
+FILE = "diagnosis.json"
+TABLES = {
+    "misfit": "misfit.csv",
+    "jackknife": "jackknife.csv",
+    "comparison": "comparison.csv",
+    "predictive": "predictive.csv",
+}
+# How far the other starts are from the nominal camera: of its focal length, and of the detector's longer side.
+_START_FOCAL, _START_CENTRE = 0.05, 0.1
+_SAME_SIGMA, _BETTER = 0.1, 1e-6
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class MultiStart:
+    """Fits from other starts.
+
+    Attributes
+    ----------
+    n : int
+        Starts.
+    same : int
+        Those that reached the same optimum, within a tenth of a standard deviation of every parameter.
+    better : int
+        Those that reached a better one.
+    failed : int
+        Those that did not converge.
+    largest_sigma : float
+        Largest difference among those that reached the same optimum, standard deviations.
+    """
+
+    n: int
+    same: int
+    better: int
+    failed: int
+    largest_sigma: float
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What questions the model of a run.
+
+    Attributes
+    ----------
+    misfit : Misfit
+        Tests for structure in the residuals.
+    predictive : PredictiveCheck
+        Statistics of the residuals against data that the model makes.
+    jackknife : Jackknife or None
+        None for fewer than three frames.
+    comparison : ModelComparison or None
+        None if it was not asked for.
+    starts : MultiStart or None
+        None if it was not asked for.
+    theta : tuple of float
+        The estimate that all this is about.
+    provenance : dict
+        Seed, settings, versions, time and data hash.
+    """
+
+    misfit: Misfit
+    predictive: PredictiveCheck
+    jackknife: Jackknife | None
+    comparison: ModelComparison | None
+    starts: MultiStart | None
+    theta: tuple[float, ...]
+    provenance: AnyDict
+
+    def is_of(self, cal: Calibration) -> bool:
+        """True if this calibration is the one that was diagnosed."""
+        same_data = self.provenance.get("data_sha256") == cal.provenance.get("data_sha256")
+        return same_data and list(self.theta) == cal.theta.tolist()
+
+    def to_dict(self) -> AnyDict:
+        """Plain values, for JSON."""
+        return {
+            "misfit": self.misfit.to_dict(),
+            "predictive": self.predictive.to_dict(),
+            "jackknife": None if self.jackknife is None else self.jackknife.to_dict(),
+            "comparison": None if self.comparison is None else self.comparison.to_dict(),
+            "starts": None if self.starts is None else asdict(self.starts),
+            "theta": list(self.theta),
+            "provenance": self.provenance,
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Diagnosis:
+        """Inverse of `to_dict`."""
+        return cls(
+            misfit=Misfit.from_dict(data["misfit"]),
+            predictive=PredictiveCheck.from_dict(data["predictive"]),
+            jackknife=None if data["jackknife"] is None else Jackknife.from_dict(data["jackknife"]),
+            comparison=None if data["comparison"] is None else ModelComparison.from_dict(data["comparison"]),
+            starts=None if data["starts"] is None else MultiStart(**data["starts"]),
+            theta=tuple(data["theta"]),
+            provenance=dict(data["provenance"]),
+        )
+
+    def _repr_html_(self) -> str:
+        parts = (self.misfit, self.jackknife, self.comparison, self.predictive)
+        return "".join(part._repr_html_() for part in parts if part is not None)
+
+
+def diagnose(
+    obs: Observations,
+    cal: Calibration,
+    post: Posterior | None = None,
+    *,
+    models: Sequence[str] = MODELS,
+    n_starts: int = 5,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Diagnosis:
+    """Question the model of a calibration in every way there is.
+
+    Parameters
+    ----------
+    obs, cal
+        The data and the estimate.
+    post : Posterior, optional
+        For the posterior predictive check; the calibration's normal approximation otherwise.
+    models : sequence of str
+        Distortion models to compare; none to leave the comparison out.
+    n_starts : int
+        Fits from other starts; 0 leaves them out.
+    seed : int
+        Of everything random.
+    progress : callable, optional
+        Called with the number of steps done and their total.
+    """
+    step = progress or (lambda done, total: None)
+    misfit = misfit_tests(obs, cal)
+    step(1, 5)
+    normals = FrameNormals.at(obs, cal)
+    found = _jackknife(obs, cal, normals)
+    step(2, 5)
+    predictive = predictive_check(obs, cal, post, seed=seed)
+    step(3, 5)
+    starts = multi_start(obs, cal, n_starts, seed) if n_starts > 0 else None
+    step(4, 5)
+    # A single frame cannot be left out.
+    comparison = compare_models(obs, cal, models, seed=seed) if models and obs.n_frames > 1 else None
+    step(5, 5)
+    settings = {"models": list(models), "n_starts": n_starts}
+    return Diagnosis(
+        misfit=misfit,
+        predictive=predictive,
+        jackknife=found,
+        comparison=comparison,
+        starts=starts,
+        theta=tuple(cal.theta.tolist()),
+        provenance=provenance(seed, settings, obs.data_hash),
+    )
+
+
+def _jackknife(obs: Observations, cal: Calibration, normals: FrameNormals) -> Jackknife | None:
+    try:
+        return jackknife_frames(obs, cal, normals)
+    except StarcalError:
+        # Too few frames: the report then says that there is none.
+        return None
+
+
+def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> MultiStart:
+    """Calibrate from starts scattered around the nominal camera, and count the optima.
+
+    Parameters
+    ----------
+    obs, cal
+        The data and the estimate.
+    n : int
+        Number of starts.
+    seed : int
+        Of the starts: focal length within 5 %, principal point within a tenth of the detector (standard deviations).
+    """
+    rng = np.random.default_rng((seed, 11))
+    nominal = cal.nominal
+    side = _START_CENTRE * max(nominal.width_px, nominal.height_px)
+    options: AnyDict = {"method": cal.method} if cal.method in METHODS else {}
+    likelihood = cal.provenance.get("settings", {}).get("likelihood", "marginal")
+    if likelihood != "marginal":
+        options["likelihood"] = likelihood
+    same = better = failed = 0
+    largest = 0.0
+    for _ in range(n):
+        shift = rng.standard_normal(3)
+        start = nominal.replace(
+            focal_mm=nominal.focal_mm * float(np.exp(_START_FOCAL * shift[0])),
+            x0_px=float(np.clip(nominal.x0_px + side * shift[1], 0.0, nominal.width_px - 1.0)),
+            y0_px=float(np.clip(nominal.y0_px + side * shift[2], 0.0, nominal.height_px - 1.0)),
+        )
+        try:
+            other = calibrate(obs, start, **options)
+        except StarcalError:
+            failed += 1
+            continue
+        difference = float(np.max(np.abs(other.theta - cal.theta) / cal.sigmas))
+        if difference < _SAME_SIGMA:
+            same += 1
+            largest = max(largest, difference)
+        elif other.chi2 < cal.chi2 * (1.0 - _BETTER):
+            better += 1
+    return MultiStart(n, same, better, failed, largest)
+
+
+def diagnose_run(
+    run_path: str | os.PathLike[str],
+    *,
+    models: Sequence[str] = MODELS,
+    n_starts: int = 5,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Diagnosis:
+    """Diagnose a run and write ``diagnosis.json`` into its folder, with the tables as CSV beside it.
+
+    Parameters
+    ----------
+    run_path : path
+        Folder of a run that holds a calibration at least.
+    models, n_starts, seed, progress
+        As for `diagnose`.
+
+    Raises
+    ------
+    RunFolderError
+        If there is no calibration, or its data are not those of the run.
+    """
+    run = RunFolder(run_path)
+    cal = Calibration.load(run.require("calibration"))
+    obs = load_observations(run.require("observations"))
+    if obs.data_hash != cal.provenance.get("data_sha256"):
+        raise RunFolderError(
+            f"{run.path}: the calibration was made from other observations than {run.observations.name} holds; run "
+            "`starcal-uq calibrate` again."
+        )
+    post = None
+    if run.posterior.exists():
+        from starcal_uq.inference.posterior import Posterior
+
+        post = Posterior.load(run.posterior)
+    found = diagnose(obs, cal, post, models=models, n_starts=n_starts, seed=seed, progress=progress)
+    for name, file_name in TABLES.items():
+        part = getattr(found, name)
+        if part is not None:
+            with atomic_path(run.path / file_name) as temporary:
+                part.to_dataframe().to_csv(temporary, index=False)
+    atomic_write_text(run.path / FILE, json.dumps(found.to_dict(), indent=1) + "\n")
+    return found
+
+
+def load_diagnosis(run: RunFolder, cal: Calibration) -> Diagnosis | None:
+    """The stored diagnosis of a calibration; None if there is none, or it is of another calibration.
+
+    Raises
+    ------
+    RunFolderError
+        If the file cannot be read.
+    """
+    path = run.path / FILE
+    if not path.exists():
+        return None
+    try:
+        found = Diagnosis.from_dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise RunFolderError(
+            f"{path}: cannot be read as a diagnosis ({type(error).__name__}: {error}): run `starcal-uq diagnose` again."
+        ) from error
+    return found if found.is_of(cal) else None

@@ -1,0 +1,204 @@
+"""Leave-one-frame-out jackknife: uncertainties from how the frames disagree, whatever the cause.
+
+Formal uncertainties hold if noise is Gaussian and independent from star to star. Whatever makes stars of one frame err
+together, and differently from frame to frame, shows in the scatter of estimates that leave one frame out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.formatting import fixed, plural
+from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.estimation.normals import FrameNormals
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.observations.table import Observations
+
+_ARRAYS = ("formal_covariance", "jackknife_covariance", "sandwich_covariance", "left_out", "effective_frames")
+
+
+@dataclass(frozen=True, eq=False)
+class Jackknife:
+    """Formal and frame-level uncertainties side by side.
+
+    Attributes
+    ----------
+    parameter_names : tuple of str
+        The p parameters.
+    formal_covariance : (p, p) array
+        Covariance if noise is Gaussian and independent.
+    jackknife_covariance : (p, p) array
+        ``(K - 1) / K`` times the scatter of the estimates that leave one of K frames out.
+    sandwich_covariance : (p, p) array
+        ``H^-1 (sum_k g_k g_k^T) H^-1`` over frames, times K / (K - 1): the cluster-robust one.
+    left_out : (K, p) array
+        Estimates without each frame, px units.
+    effective_frames : (p,) array
+        Frames of equal weight that would determine each parameter as unevenly as these K do (Satterthwaite): fewer
+        than K where some frames say more than others.
+    n_frames : int
+        K.
+    """
+
+    parameter_names: tuple[str, ...]
+    formal_covariance: FloatArray
+    jackknife_covariance: FloatArray
+    sandwich_covariance: FloatArray
+    left_out: FloatArray
+    effective_frames: FloatArray
+    n_frames: int
+
+    @property
+    def ratio(self) -> FloatArray:
+        """Jackknife standard deviation over the formal one, (p,)."""
+        return np.sqrt(np.diag(self.jackknife_covariance) / np.diag(self.formal_covariance))
+
+    @property
+    def sandwich_ratio(self) -> FloatArray:
+        """Cluster-robust standard deviation over the formal one, (p,)."""
+        return np.sqrt(np.diag(self.sandwich_covariance) / np.diag(self.formal_covariance))
+
+    def expected(self, probability: float = 0.95) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper end (p,) of the ratios that chance alone gives: of root chi-square over its freedom."""
+        from scipy.special import chdtri
+
+        tail = 0.5 * (1.0 - probability)
+        low, high = (np.sqrt(chdtri(self._dof, q) / self._dof) for q in (1.0 - tail, tail))
+        return low, high
+
+    @property
+    def _dof(self) -> FloatArray:
+        return np.maximum(self.effective_frames - 1.0, 1.0)
+
+    @property
+    def p_values(self) -> FloatArray:
+        """Probability (p,) of a ratio at least this large if the formal errors hold (chi-square)."""
+        from scipy.special import chdtrc
+
+        return np.asarray(chdtrc(self._dof, self._dof * self.ratio**2), dtype=np.float64)
+
+    @property
+    def factors(self) -> FloatArray:
+        """Factors (p,) by which the formal standard deviations grow if the inflation is accepted; at least 1."""
+        return np.maximum(self.ratio, 1.0)
+
+    @property
+    def inflated_covariance(self) -> FloatArray:
+        """Formal covariance (p, p) with its standard deviations times `factors` and its correlations as they are.
+
+        The jackknife's own matrix has rank K - 1 at most and noisy correlations; this one stays positive definite.
+        """
+        return self.formal_covariance * np.outer(self.factors, self.factors)
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """One row per parameter: formal, jackknife and cluster-robust sigma, their ratios, the factor."""
+        import pandas as pd
+
+        low, high = self.expected()
+        return pd.DataFrame(
+            {
+                "parameter": list(self.parameter_names),
+                "formal_sigma": np.sqrt(np.diag(self.formal_covariance)),
+                "jackknife_sigma": np.sqrt(np.diag(self.jackknife_covariance)),
+                "sandwich_sigma": np.sqrt(np.diag(self.sandwich_covariance)),
+                "ratio": self.ratio,
+                "sandwich_ratio": self.sandwich_ratio,
+                "expected_low": low,
+                "expected_high": high,
+                "p_value": self.p_values,
+                "factor": self.factors,
+            }
+        )
+
+    def to_dict(self) -> AnyDict:
+        """Plain values, for JSON."""
+        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(self).items()}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Jackknife:
+        """Inverse of `to_dict`."""
+        arrays = {name: np.asarray(data[name], dtype=np.float64) for name in _ARRAYS}
+        return cls(tuple(data["parameter_names"]), **arrays, n_frames=int(data["n_frames"]))
+
+    def _repr_html_(self) -> str:
+        numbers = (self.ratio, self.sandwich_ratio, *self.expected())
+        cells = "".join(
+            f"<tr><th>{name}</th><td>{fixed(float(a), 2)}</td><td>{fixed(float(b), 2)}</td>"
+            f"<td>{fixed(float(low), 2)} to {fixed(float(high), 2)}</td></tr>"
+            for name, a, b, low, high in zip(self.parameter_names, *numbers, strict=True)
+        )
+        return (
+            f"<p><b>Jackknife</b> over {plural(self.n_frames, 'frame')}: ratio to the formal sigma</p><table><thead>"
+            "<tr><th>parameter</th><th>jackknife</th><th>cluster-robust</th><th>by chance (95 %)</th></tr></thead>"
+            f"<tbody>{cells}</tbody></table>"
+        )
+
+
+def jackknife_frames(obs: Observations, cal: Calibration, normals: FrameNormals | None = None) -> Jackknife:
+    """Leave each frame out in turn, by one Gauss-Newton step from the estimate.
+
+    Parameters
+    ----------
+    obs, cal
+        The data and the estimate made from them.
+    normals : FrameNormals, optional
+        The frames' normal equations, where they are at hand.
+
+    Raises
+    ------
+    CalibrationError
+        For fewer than three frames, or when the parameters are not determined without one of the frames.
+    """
+    if obs.n_frames < 3:
+        raise CalibrationError(f"a jackknife over {plural(obs.n_frames, 'frame')} says nothing: use three or more.")
+    found = FrameNormals.at(obs, cal) if normals is None else normals
+    z, _ = found.left_out()
+    if not np.isfinite(z).all():
+        frame = obs.frame_ids[int(np.argmin(np.isfinite(z).all(axis=1)))]
+        raise CalibrationError(
+            f"without frame {frame} the parameters are not determined: a jackknife needs more frames like it."
+        )
+    k = obs.n_frames
+    unit = np.outer(found.scale, found.scale)
+    inverse = np.linalg.inv(found.matrix)
+    spread = z - z.mean(axis=0)
+    slopes = found.slopes - found.slopes.mean(axis=0)
+    # Variance of each frame's pull on each parameter, per unit of noise.
+    pull = np.einsum("ja,kab,bj->kj", inverse, found.matrices, inverse)
+    return Jackknife(
+        parameter_names=cal.parameter_names,
+        formal_covariance=inverse * found.variance * unit,
+        jackknife_covariance=spread.T @ spread * (k - 1.0) / k * unit,
+        sandwich_covariance=inverse @ (slopes.T @ slopes) @ inverse * k / (k - 1.0) * unit,
+        left_out=found.theta + z * found.scale,
+        effective_frames=pull.sum(axis=0) ** 2 / np.sum(pull**2, axis=0),
+        n_frames=k,
+    )
+
+
+def accept_inflation(cal: Calibration, found: Jackknife) -> Calibration:
+    """The calibration with the inflated covariance; provenance says so.
+
+    Raises
+    ------
+    CalibrationError
+        When the jackknife is of another model.
+    """
+    if found.parameter_names != cal.parameter_names:
+        raise CalibrationError(
+            f"the jackknife is of the parameters {', '.join(found.parameter_names)}, the calibration of "
+            f"{', '.join(cal.parameter_names)}: make both from the same run."
+        )
+    factors = dict(zip(found.parameter_names, found.factors.tolist(), strict=True))
+    settings = {**cal.provenance.get("settings", {}), "inflation": factors}
+    covariance = cal.covariance * np.outer(found.factors, found.factors)
+    return replace(cal, covariance=covariance, provenance={**cal.provenance, "settings": settings})

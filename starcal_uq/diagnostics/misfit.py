@@ -1,0 +1,362 @@
+"""Calibrated tests for structure in the residuals: model error is in no posterior, so it must be looked for.
+
+Residuals after the fit are ``e = (I - P) epsilon`` with P the projector on what the attitudes and the parameters can
+reproduce. A family of shapes C (pixel shifts that some model error would cause) is projected the same way; the part of
+the sum of squares that the remainder explains then follows an F distribution exactly, whatever the geometry:
+
+    F = (e^T Q e / q) / (e^T (I - Q) e / (d - q)),   Q the projector on (I - P) C, of rank q.
+
+It is the Lagrange-multiplier (score) test of the model extended by these shapes: nothing is fitted again. Tests for
+unequal noise compare the residuals' weighted and unweighted sums of squares with their exact mean and variance.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import quaternion_to_rotation
+from starcal_uq.core.formatting import plural, significant
+from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.diagnostics.misfit_noise import NoiseSums, noise_weights
+from starcal_uq.diagnostics.shapes import Shape, View, shapes
+from starcal_uq.estimation.marginal import MarginalLikelihood
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.observations.table import Observations
+
+# Directions of which the fit absorbs all but this share of the square are not there to be tested.
+_ABSORBED = 1e-8
+_STARS_AT_ONCE = 10_000
+_LEAST_DOF = 10
+ALPHA = 0.05
+
+
+@dataclass(frozen=True)
+class Amplitude:
+    """The amplitude of one shape that the residuals ask for.
+
+    Attributes
+    ----------
+    name, unit : str
+        What it is.
+    value, sigma : float
+        Estimate and standard error.
+    """
+
+    name: str
+    unit: str
+    value: float
+    sigma: float
+
+    def __str__(self) -> str:
+        return f"{self.name} {significant(self.value)} ± {significant(self.sigma)} {self.unit}"
+
+
+@dataclass(frozen=True)
+class MisfitTest:
+    """One test.
+
+    Attributes
+    ----------
+    name, against : str
+        What it looks for, and what the residuals are held against.
+    statistic : float
+        F, or the standard normal z of a test for unequal noise.
+    dof, dof_residual : int
+        Degrees of freedom of F; `dof` is 0 for z.
+    p_value : float
+        Probability of a statistic at least this large if the model holds.
+    p_holm : float
+        The same, corrected for the number of tests (Holm 1979).
+    size_px : float
+        Root mean square per axis of the pattern found, its noise taken off, px; NaN for unequal noise.
+    visible : float
+        Share of the squared shapes that attitudes and parameters do not absorb; NaN for unequal noise.
+    amplitudes : tuple of Amplitude
+        Where they mean something by themselves.
+    """
+
+    name: str
+    against: str
+    statistic: float
+    dof: int
+    dof_residual: int
+    p_value: float
+    p_holm: float
+    size_px: float
+    visible: float
+    amplitudes: tuple[Amplitude, ...] = ()
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """All tests for unexplained structure.
+
+    Attributes
+    ----------
+    tests : tuple of MisfitTest
+        In reading order.
+    sigma : float
+        Noise that the tests are relative to, in units of the calibration's.
+    n_stars, n_frames : int
+        Size of the data.
+    """
+
+    tests: tuple[MisfitTest, ...]
+    sigma: float
+    n_stars: int
+    n_frames: int
+
+    @property
+    def p_value(self) -> float:
+        """Overall p-value: the smallest after Holm's correction. Overlap of the tests makes it err to the safe side."""
+        return min((test.p_holm for test in self.tests), default=1.0)
+
+    def found(self, alpha: float = ALPHA) -> tuple[MisfitTest, ...]:
+        """Tests that reject at this level after correction, the strongest first."""
+        return tuple(sorted((t for t in self.tests if t.p_holm < alpha), key=lambda t: (t.p_holm, -t.size_px)))
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """One row per test; amplitudes as text."""
+        import pandas as pd
+
+        rows = [{**asdict(t), "amplitudes": "; ".join(str(a) for a in t.amplitudes)} for t in self.tests]
+        return pd.DataFrame(rows).rename(columns={"name": "test"})
+
+    def to_dict(self) -> AnyDict:
+        """Plain values, for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Misfit:
+        """Inverse of `to_dict`."""
+        tests = tuple(
+            MisfitTest(**{**test, "amplitudes": tuple(Amplitude(**a) for a in test["amplitudes"])})
+            for test in data["tests"]
+        )
+        return cls(**{**data, "tests": tests})
+
+    def plot_misfit(self, **options: Any) -> Any:
+        """Corrected p-values of all tests; options as for `starcal_uq.presentation.figures.diagnostics.plot_misfit`."""
+        from starcal_uq.presentation.figures.diagnostics import plot_misfit
+
+        return plot_misfit(self, **options)
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><th>{html.escape(t.name)}</th><td>{significant(t.p_value)}</td><td>{significant(t.p_holm)}</td>"
+            f"<td>{'' if np.isnan(t.size_px) else significant(t.size_px)}</td>"
+            f"<td>{html.escape('; '.join(str(a) for a in t.amplitudes))}</td></tr>"
+            for t in self.tests
+        )
+        return (
+            f"<p><b>Misfit</b>: {plural(len(self.tests), 'test')}, overall p = {significant(self.p_value)}</p><table>"
+            "<thead><tr><th>looks for</th><th>p</th><th>p (Holm)</th><th>size [px]</th><th>amplitudes</th></tr></thead>"
+            f"<tbody>{rows}</tbody></table>"
+        )
+
+
+def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = 8) -> Misfit:
+    """Test the residuals of a calibration for unexplained structure.
+
+    Parameters
+    ----------
+    obs, cal
+        The data and the estimate made from them (by the marginal likelihood: the residuals of stage 3 alone are not
+        at its optimum, and the tests then include that).
+    max_cells : int
+        Largest number of field cells along the longer side.
+
+    Returns
+    -------
+    Misfit
+        With a false-alarm rate that is the nominal one for each test, and at most that for all of them together.
+    """
+    families = shapes(obs, cal.camera, max_cells=max_cells)
+    sums = _Sums.over(obs, cal, families)
+    tests = [test for test in (sums.family(index) for index in range(len(families))) if test is not None]
+    if (test := sums.frame_by_frame()) is not None:
+        tests.append(test)
+    tests += [
+        MisfitTest(f"noise that changes with {name}", name, z, 0, sums.dof, p, 1.0, float("nan"), float("nan"))
+        for name, z, p in sums.noise.tests(sums.parameters, sums.projection, sums.rss, sums.dof)
+    ]
+    corrected = holm([test.p_value for test in tests])
+    tests = [replace(test, p_holm=float(p)) for test, p in zip(tests, corrected, strict=True)]
+    return Misfit(tuple(tests), float(np.sqrt(sums.rss / sums.dof)), obs.n_stars, obs.n_frames)
+
+
+def holm(p_values: Sequence[float]) -> FloatArray:
+    """Holm's step-down correction for several tests."""
+    p = np.asarray(p_values, dtype=np.float64)
+    order = np.argsort(p)
+    stepped = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
+    corrected = np.empty_like(p)
+    corrected[order] = np.minimum(stepped, 1.0)
+    return corrected
+
+
+@dataclass
+class _Sums:
+    """Sums over all stars from which every test follows; the table is visited once, some frames at a time."""
+
+    families: tuple[Shape, ...]
+    noise: NoiseSums
+    p: int
+    dof: int
+    n_stars: int
+    noise_px: float
+    gram: FloatArray
+    raw: FloatArray
+    block_matrix: FloatArray
+    block_slope: FloatArray
+    block_square: float = 0.0
+    block_rank: int = 0
+
+    @classmethod
+    def over(cls, obs: Observations, cal: Calibration, families: tuple[Shape, ...]) -> _Sums:
+        likelihood = MarginalLikelihood(obs, cal.camera.distortion)
+        p, theta = len(cal.theta), cal.theta
+        size = p + 1 + sum(family.size for family in families)
+        found = cls(
+            families=families,
+            noise=NoiseSums(noise_weights(obs, cal.camera), p),
+            p=p,
+            dof=likelihood.dof - p,
+            n_stars=obs.n_stars,
+            noise_px=1.0 if obs.sigma_px is None else float(np.sqrt(np.mean(obs.sigma_px**2))),
+            gram=np.zeros((size, size)),
+            raw=np.zeros(size),
+            block_matrix=np.zeros((p, p)),
+            block_slope=np.zeros(p),
+        )
+        rotations = quaternion_to_rotation(cal.quaternions)
+        starts = likelihood.frames.starts
+        for first, last in likelihood.frames.parts(_STARS_AT_ONCE):
+            part = MarginalLikelihood(likelihood.frames.part(first, last), cal.camera.distortion)
+            state, _ = part.profile(theta, rotations[first:last])
+            found._add(part, state, theta, slice(int(starts[first]), int(starts[last])))
+        return found
+
+    def _add(self, part: MarginalLikelihood, state: Any, theta: FloatArray, rows: slice) -> None:
+        weight = part.frames.weight
+        h = part.derivatives(theta, state)
+        pixels = part.frames.pixel - (state.e if weight is None else state.e / weight)
+        plain = h if weight is None else h / weight
+        view = View(rows, part, state, plain, pixels - theta[:2, None])
+        columns = np.concatenate([family.columns(view) for family in self.families])
+        if weight is not None:
+            columns = columns * weight
+        everything = np.concatenate([h, state.e[None], columns])
+        self.raw += np.sum(everything**2, axis=(1, 2))
+        projected = part.project_out(state, everything)
+        flat = projected.reshape(len(projected), -1)
+        self.gram += flat @ flat.T
+        h, e = projected[: self.p], projected[self.p]
+        self._add_blocks(part, state, view, h, e)
+        self.noise.add(part.frames, state, h, e, rows)
+
+    def _add_blocks(self, part: MarginalLikelihood, state: Any, view: View, h: FloatArray, e: FloatArray) -> None:
+        """Scale and quadrupole of every frame by itself: three columns per frame, which no other frame sees."""
+        frames, (u, v) = part.frames, view.uv
+        columns = np.stack([view.parameter_columns[2], np.stack([u, -v]), np.stack([v, u])])
+        if frames.weight is not None:
+            columns = columns * frames.weight
+        raw = np.sqrt(frames.sum(np.sum(columns**2, axis=1)))
+        columns = part.project_out(state, columns / frames.spread(raw)[:, None])
+        gram = np.moveaxis(frames.sum(np.einsum("axn,bxn->abn", columns, columns)), 2, 0)
+        values, vectors = np.linalg.eigh(gram)
+        kept = values > _ABSORBED
+        root = vectors * np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)[:, None, :]
+        with_h = np.moveaxis(frames.sum(np.einsum("axn,bxn->abn", columns, h)), 2, 0)
+        with_e = frames.sum(np.sum(columns * e, axis=1)).T
+        q_h = np.einsum("kab,kac->kbc", root, with_h)
+        q_e = np.einsum("kab,ka->kb", root, with_e)
+        self.block_matrix += np.einsum("kab,kac->bc", q_h, q_h)
+        self.block_slope += np.einsum("kab,ka->b", q_h, q_e)
+        self.block_square += float(np.sum(q_e**2))
+        self.block_rank += int(np.count_nonzero(kept))
+
+    @property
+    def parameters(self) -> FloatArray:
+        """Gram matrix of the parameters, attitudes removed."""
+        return self.gram[: self.p, : self.p]
+
+    @property
+    def projection(self) -> FloatArray:
+        """Inverse of `parameters`."""
+        scale = 1.0 / np.sqrt(np.diag(self.parameters))
+        inverse: FloatArray = np.linalg.inv(self.parameters * np.outer(scale, scale)) * np.outer(scale, scale)
+        return inverse
+
+    @property
+    def rss(self) -> float:
+        """Sum of squared residuals, what little the parameters could still explain taken off."""
+        slope = self.gram[: self.p, self.p]
+        return float(self.gram[self.p, self.p] - slope @ self.projection @ slope)
+
+    def family(self, index: int) -> MisfitTest | None:
+        """The test of one family; None where nothing of it is left, or too few data."""
+        family = self.families[index]
+        first = self.p + 1 + sum(f.size for f in self.families[:index])
+        chosen = slice(first, first + family.size)
+        norm = np.sqrt(self.raw[chosen])
+        present = norm > 0.0
+        norm = np.where(present, norm, 1.0)
+        cross, inner = self.gram[chosen, : self.p], self.gram[chosen, chosen]
+        slope = self.gram[chosen, self.p] - cross @ self.projection @ self.gram[: self.p, self.p]
+        left = (inner - cross @ self.projection @ cross.T) / np.outer(norm, norm)
+        values, vectors = np.linalg.eigh(0.5 * (left + left.T))
+        kept = values > _ABSORBED
+        rank = int(np.count_nonzero(kept))
+        if rank == 0 or self.dof - rank < _LEAST_DOF:
+            return None
+        scores = (vectors.T @ (slope / norm))[kept]
+        explained = float(np.sum(scores**2 / values[kept]))
+        test = self._f_test(family.name, family.against, explained, rank)
+        visible = float(np.trace(left) / max(np.count_nonzero(present), 1))
+        amplitudes: tuple[Amplitude, ...] = ()
+        if family.labels and rank == family.size:
+            inverse = (vectors / values) @ vectors.T
+            variance = (self.rss - explained) / (self.dof - rank)
+            unit = np.array(family.per_amplitude) / norm
+            best, error = inverse @ (slope / norm) * unit, np.sqrt(variance * np.diag(inverse)) * unit
+            amplitudes = tuple(
+                Amplitude(name, u, float(value), float(sigma))
+                for (name, u), value, sigma in zip(family.labels, best, error, strict=True)
+            )
+        return replace(test, visible=visible, amplitudes=amplitudes)
+
+    def frame_by_frame(self) -> MisfitTest | None:
+        """Does scale or shape change from frame to frame?"""
+        scale = 1.0 / np.sqrt(np.diag(self.parameters))
+        left = (self.parameters - self.block_matrix) * np.outer(scale, scale)
+        slope = (self.gram[: self.p, self.p] - self.block_slope) * scale
+        values, vectors = np.linalg.eigh(0.5 * (left + left.T))
+        kept = values > _ABSORBED
+        full = self.gram[self.p, self.p] - self.block_square
+        full -= float(np.sum((vectors.T @ slope)[kept] ** 2 / values[kept]))
+        rank = self.block_rank + int(np.count_nonzero(kept)) - self.p
+        if rank <= 0 or self.dof - rank < _LEAST_DOF:
+            return None
+        return self._f_test("scale and shape that change from frame to frame", "frame", self.rss - full, rank)
+
+    def _f_test(self, name: str, against: str, explained: float, rank: int) -> MisfitTest:
+        from scipy.special import fdtrc
+
+        rest = self.dof - rank
+        variance = (self.rss - explained) / rest
+        statistic = float(max(explained, 0.0) / rank / variance)
+        excess = max(explained - rank * variance, 0.0) / (2.0 * self.n_stars)
+        p = float(fdtrc(rank, rest, statistic))
+        return MisfitTest(
+            name, against, statistic, rank, rest, p, 1.0, float(np.sqrt(excess)) * self.noise_px, float("nan")
+        )

@@ -1,0 +1,347 @@
+"""Which distortion model the data ask for: expected log predictive density, leaving one frame out at a time.
+
+A frame is the unit, because its stars share an attitude. The log likelihood of a frame has its attitude integrated out;
+the posterior of the parameters and the noise is that of the linearised model under the reference prior (flat in the
+parameters, 1 / sigma): normal times scaled inverse chi-square. Two estimates of each frame's density without itself:
+
+- Pareto-smoothed importance sampling over posterior draws (Vehtari, Gelman & Gabry 2017), the default, and
+- the closed form, a multivariate t, exact for the linearised model, which stands in where k-hat exceeds 0.7.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import left_error, rotation_to_quaternion
+from starcal_uq.camera.distortion import get_model
+from starcal_uq.core.errors import StarcalError
+from starcal_uq.core.formatting import fixed, join_words, significant
+from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.estimation.normals import FrameNormals
+from starcal_uq.inference.arviz import psis
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.observations.table import Observations
+
+MODELS = ("none", "k1", "brown", "brown3", "brown_tangential")
+KHAT_BOUND = 0.7
+# A model is rejected when another one predicts better by this many standard errors, and by more than chance between
+# equal models (Sivula et al. 2020: below four, a difference of elpd says nothing).
+REJECT_SE, REJECT_ELPD = 2.0, 4.0
+_ARCSEC = 648_000.0 / np.pi
+_DRAWS = 1000
+
+
+@dataclass(frozen=True)
+class ModelScore:
+    """One model in a comparison.
+
+    Attributes
+    ----------
+    model : str
+        Name of the distortion model.
+    n_parameters : int
+        p.
+    sigma : float
+        Estimated noise.
+    elpd : float
+        Expected log predictive density of a left-out frame, summed over frames, nat; up to a common constant.
+    difference, difference_se : float
+        `elpd` minus that of the best model, and its standard error over frames.
+    effective_parameters : float
+        How much the frames predict themselves better than left out, nat.
+    closed_form : float
+        `elpd` in closed form.
+    max_khat : float
+        Largest Pareto shape over frames.
+    n_replaced : int
+        Frames whose importance weights could not be trusted, taken in closed form.
+    common_arcsec : tuple of float
+        Mean rotation over frames from the calibration's attitudes to this model's: pitch, yaw, roll.
+    rest_arcsec : tuple of float
+        Root mean square over frames of what is left of the rotation.
+    rejected : bool
+        True if another model predicts better beyond doubt.
+    """
+
+    model: str
+    n_parameters: int
+    sigma: float
+    elpd: float
+    difference: float
+    difference_se: float
+    effective_parameters: float
+    closed_form: float
+    max_khat: float
+    n_replaced: int
+    common_arcsec: tuple[float, float, float]
+    rest_arcsec: tuple[float, float, float]
+    rejected: bool
+
+
+@dataclass(frozen=True)
+class ModelComparison:
+    """Models side by side.
+
+    Attributes
+    ----------
+    scores : tuple of ModelScore
+        The best first.
+    fitted : str
+        The model of the calibration that was compared.
+    failed : dict
+        Models that could not be calibrated, and why.
+    """
+
+    scores: tuple[ModelScore, ...]
+    fitted: str
+    failed: dict[str, str]
+
+    @property
+    def accepted(self) -> tuple[ModelScore, ...]:
+        """Models that are not rejected, the best first."""
+        return tuple(score for score in self.scores if not score.rejected)
+
+    @property
+    def simplest(self) -> ModelScore:
+        """The model with the fewest parameters that is not rejected."""
+        return min(self.accepted, key=lambda score: (score.n_parameters, -score.elpd))
+
+    def of(self, model: str) -> ModelScore | None:
+        """The score of one model."""
+        return next((score for score in self.scores if score.model == model), None)
+
+    @property
+    def statement(self) -> str:
+        """What follows, in sentences."""
+        mine, simplest = self.of(self.fitted), self.simplest
+        if mine is not None and mine.rejected:
+            best = self.scores[0]
+            first = (
+                f"The model {self.fitted!r} predicts left-out frames worse than {best.model!r} by "
+                f"{fixed(-mine.difference, 1)} ± {fixed(mine.difference_se, 1)} nat: use {simplest.model!r}."
+            )
+        elif mine is not None and simplest.n_parameters < mine.n_parameters:
+            extra = [c for c in _names(self.fitted) if c not in _names(simplest.model)]
+            verb = "is" if len(extra) == 1 else "are"
+            first = (
+                f"{join_words(extra)} {verb} not needed: {simplest.model!r} predicts left-out frames no worse than "
+                f"{self.fitted!r}."
+            )
+        else:
+            first = f"No other model predicts left-out frames better than {self.fitted!r} beyond doubt."
+        others = [score for score in self.accepted if score.model != self.fitted]
+        if not others:
+            return first + " All other models are rejected."
+        common = max(float(np.hypot(*score.common_arcsec[:2])) for score in others)
+        rest = max(float(np.hypot(*score.rest_arcsec[:2])) for score in others)
+        return (
+            f"{first} Under the other models that the data do not reject "
+            f"({join_words([score.model for score in others])}), attitudes across the boresight would move by up to "
+            f"{significant(common)} arcsec in common and {significant(rest)} arcsec (rms) frame by frame."
+        )
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """One row per model, the best first."""
+        import pandas as pd
+
+        rows = []
+        for score in self.scores:
+            row = asdict(score)
+            for part in ("common", "rest"):
+                values = row.pop(f"{part}_arcsec")
+                row |= {f"{part}_{axis}_arcsec": v for axis, v in zip(("pitch", "yaw", "roll"), values, strict=True)}
+            rows.append(row)
+        return pd.DataFrame(rows)
+
+    def to_dict(self) -> AnyDict:
+        """Plain values, for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> ModelComparison:
+        """Inverse of `to_dict`."""
+        scores = tuple(
+            ModelScore(**{**s, "common_arcsec": tuple(s["common_arcsec"]), "rest_arcsec": tuple(s["rest_arcsec"])})
+            for s in data["scores"]
+        )
+        return cls(scores, str(data["fitted"]), dict(data["failed"]))
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><th>{html.escape(s.model)}</th><td>{fixed(s.difference, 1)} ± {fixed(s.difference_se, 1)}</td>"
+            f"<td>{'rejected' if s.rejected else 'not rejected'}</td><td>{fixed(s.max_khat, 2)}</td></tr>"
+            for s in self.scores
+        )
+        return (
+            f"<p><b>Models</b>: {html.escape(self.statement)}</p><table><thead><tr><th>model</th>"
+            f"<th>elpd − best [nat]</th><th></th><th>k-hat</th></tr></thead><tbody>{rows}</tbody></table>"
+        )
+
+
+def compare_models(
+    obs: Observations,
+    cal: Calibration,
+    models: Sequence[str] = MODELS,
+    *,
+    n_draws: int = _DRAWS,
+    seed: int = 0,
+) -> ModelComparison:
+    """Compare distortion models by how well they predict frames that were left out.
+
+    Parameters
+    ----------
+    obs, cal
+        The data and the calibration whose model is in question; its own model is always among those compared.
+    models : sequence of str
+        Names of the registry.
+    n_draws : int
+        Posterior draws of each model.
+    seed : int
+        Of the draws.
+
+    Raises
+    ------
+    StarcalError
+        When no model can be calibrated.
+    """
+    names = tuple(dict.fromkeys((cal.camera.distortion, *models)))
+    fits, failed = {}, {}
+    for name in names:
+        try:
+            fits[name] = FrameNormals.at(obs, found := _fit(obs, cal, name)), found
+        except StarcalError as error:
+            failed[name] = str(error)
+    if not fits:
+        raise StarcalError(f"no distortion model could be calibrated: {next(iter(failed.values()))}")
+    rng = np.random.default_rng(seed)
+    found_scores = {name: _leave_out(normals, n_draws, rng) for name, (normals, _) in fits.items()}
+    best = max(found_scores, key=lambda name: float(np.sum(found_scores[name].pointwise)))
+    reference = found_scores[best].pointwise
+    scores = []
+    for name, (normals, fit) in fits.items():
+        loo = found_scores[name]
+        difference = loo.pointwise - reference
+        spread = float(np.sqrt(len(difference)) * np.std(difference, ddof=1))
+        total = float(np.sum(difference))
+        common, rest = _moved(cal, normals)
+        scores.append(
+            ModelScore(
+                model=name,
+                n_parameters=len(fit.theta),
+                sigma=fit.sigma,
+                elpd=float(np.sum(loo.pointwise)),
+                difference=total,
+                difference_se=spread,
+                effective_parameters=float(np.sum(loo.in_sample - loo.pointwise)),
+                closed_form=float(np.sum(loo.closed_form)),
+                max_khat=loo.max_khat,
+                n_replaced=loo.n_replaced,
+                common_arcsec=common,
+                rest_arcsec=rest,
+                rejected=bool(-total > max(REJECT_SE * spread, REJECT_ELPD)),
+            )
+        )
+    scores.sort(key=lambda score: -score.elpd)
+    return ModelComparison(tuple(scores), cal.camera.distortion, failed)
+
+
+def _names(model: str) -> tuple[str, ...]:
+    return tuple(c.name for c in get_model(model).coefficients)
+
+
+def _fit(obs: Observations, cal: Calibration, name: str) -> Calibration:
+    if name == cal.camera.distortion:
+        return cal
+    start = cal.nominal.replace(distortion=name, coefficients=(0.0,) * len(_names(name)))
+    return calibrate(obs, start)
+
+
+def _moved(cal: Calibration, normals: FrameNormals) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
+    phi = left_error(rotation_to_quaternion(normals.rotations), cal.quaternions) * _ARCSEC
+    common = phi.mean(axis=0)
+    rest = np.sqrt(np.mean((phi - common) ** 2, axis=0))
+    c, r = common.tolist(), rest.tolist()
+    return (c[0], c[1], c[2]), (r[0], r[1], r[2])
+
+
+@dataclass(frozen=True)
+class _LeftOut:
+    """Log densities per frame (K,): predictive without it, the same in closed form, and with it."""
+
+    pointwise: FloatArray
+    closed_form: FloatArray
+    in_sample: FloatArray
+    max_khat: float
+    n_replaced: int
+
+
+def _leave_out(normals: FrameNormals, n_draws: int, rng: np.random.Generator) -> _LeftOut:
+    closed = closed_form(normals)
+    dof = int(np.sum(normals.dof)) - len(normals.theta)
+    factor = np.linalg.cholesky(np.linalg.inv(normals.matrix))
+    sigma = np.sqrt(np.sum(normals.squares) / rng.chisquare(dof, n_draws))
+    centre = np.linalg.solve(normals.matrix, normals.slopes.sum(axis=0))
+    z = centre + sigma[:, None] * (rng.standard_normal((n_draws, len(factor))) @ factor.T)
+    squares = (
+        normals.squares - 2.0 * z @ normals.slopes.T + np.einsum("sa,kab,sb->sk", z, normals.matrices, z, optimize=True)
+    )
+    log_density = -0.5 * squares / sigma[:, None] ** 2 - np.outer(np.log(sigma), normals.dof)
+    log_density += -0.5 * normals.log_determinant - 0.5 * normals.dof * np.log(2.0 * np.pi)
+    pointwise, khats = np.empty(len(closed)), np.empty(len(closed))
+    for k, column in enumerate(log_density.T):
+        weights, khats[k] = psis(-column)
+        pointwise[k] = _log_mean_exp(weights + column) + np.log(n_draws)
+    bad = ~(khats <= KHAT_BOUND)
+    pointwise[bad] = closed[bad]
+    in_sample = np.array([_log_mean_exp(column) for column in log_density.T])
+    return _LeftOut(pointwise, closed, in_sample, float(np.max(khats)), int(np.count_nonzero(bad)))
+
+
+def closed_form(normals: FrameNormals) -> FloatArray:
+    """Log predictive density (K,) of every frame given the others, for the linearised model.
+
+    A frame's projected residuals, given the others, are multivariate t with ``nu = d - d_k - p`` degrees of freedom,
+    location ``h_k z_(k)`` and scale ``s_(k)^2 (I + h_k H_(k)^-1 h_k^T)``; determinant and inverse need matrices of
+    size p only.
+    """
+    from scipy.special import gammaln
+
+    z, rest = normals.left_out()
+    matrices, slopes, dof = normals.matrices, normals.slopes, normals.dof
+
+    def square(step: FloatArray, c: FloatArray, g: FloatArray, h: FloatArray) -> FloatArray:
+        quadratic = np.einsum("ka,kab,kb->k", step, h, step)
+        return np.asarray(c - 2.0 * np.sum(g * step, axis=1) + quadratic)
+
+    others = square(z, normals.squares.sum() - normals.squares, slopes.sum(axis=0) - slopes, rest)
+    own = square(z, normals.squares, slopes, matrices)
+    nu = dof.sum() - dof - len(normals.theta)
+    variance = others / nu
+    # What the frame's residuals and its own pull on the parameters leave, by the Woodbury identity.
+    pull = slopes - np.einsum("kab,kb->ka", matrices, z)
+    own = own - np.einsum("ka,ab,kb->k", pull, np.linalg.inv(normals.matrix), pull)
+    growth = np.linalg.slogdet(normals.matrix)[1] - np.linalg.slogdet(rest)[1]
+    density: FloatArray = (
+        gammaln(0.5 * (nu + dof))
+        - gammaln(0.5 * nu)
+        - 0.5 * dof * np.log(nu * np.pi * variance)
+        - 0.5 * growth
+        - 0.5 * (nu + dof) * np.log1p(own / (nu * variance))
+        - 0.5 * normals.log_determinant
+    )
+    return density
+
+
+def _log_mean_exp(values: FloatArray) -> float:
+    top = float(np.max(values))
+    return top + float(np.log(np.mean(np.exp(values - top))))

@@ -1,0 +1,196 @@
+"""Posterior predictive check: would data that the model makes look like those that were measured?
+
+Each draw of camera and noise makes replicated residuals on the observed frames, with their attitudes fitted again. The
+same statistics of the measured residuals at the same draw are set against them.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import quaternion_to_rotation
+from starcal_uq.core.formatting import significant
+from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.estimation.marginal import MarginalLikelihood
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.observations.table import Observations
+
+_RINGS = 10
+_MAX_STARS = 40_000
+
+
+@dataclass(frozen=True)
+class PredictiveStatistic:
+    """One statistic of measured and replicated residuals.
+
+    Attributes
+    ----------
+    name : str
+        What it is.
+    observed : float
+        Its mean over draws for the data.
+    replicated_low, replicated_median, replicated_high : float
+        Quantiles (2.5 %, 50 %, 97.5 %) for replicated data.
+    p_value : float
+        Share of draws whose replicate is at least as large as the data's.
+    """
+
+    name: str
+    observed: float
+    replicated_low: float
+    replicated_median: float
+    replicated_high: float
+    p_value: float
+
+    @property
+    def extreme(self) -> bool:
+        """True if hardly a replicate is as large, or as small."""
+        return not 0.001 <= self.p_value <= 0.999
+
+
+@dataclass(frozen=True)
+class PredictiveCheck:
+    """Statistics of measured residuals against replicated ones.
+
+    Attributes
+    ----------
+    statistics : tuple of PredictiveStatistic
+        In reading order.
+    n_draws : int
+        Draws of the posterior.
+    n_frames : int
+        Frames that were used: all, unless there are very many stars.
+    """
+
+    statistics: tuple[PredictiveStatistic, ...]
+    n_draws: int
+    n_frames: int
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """One row per statistic."""
+        import pandas as pd
+
+        return pd.DataFrame([asdict(s) for s in self.statistics])
+
+    def to_dict(self) -> AnyDict:
+        """Plain values, for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> PredictiveCheck:
+        """Inverse of `to_dict`."""
+        statistics = tuple(PredictiveStatistic(**s) for s in data["statistics"])
+        return cls(statistics, int(data["n_draws"]), int(data["n_frames"]))
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><th>{html.escape(s.name)}</th><td>{significant(s.observed, 3)}</td>"
+            f"<td>{significant(s.replicated_low, 3)} to {significant(s.replicated_high, 3)}</td>"
+            f"<td>{significant(s.p_value)}</td></tr>"
+            for s in self.statistics
+        )
+        return (
+            f"<p><b>Posterior predictive check</b>: {self.n_draws} draws</p><table><thead><tr><th></th><th>data</th>"
+            f"<th>replicates (95 %)</th><th>p</th></tr></thead><tbody>{rows}</tbody></table>"
+        )
+
+
+def predictive_check(
+    obs: Observations, cal: Calibration, post: Posterior | None = None, *, n_draws: int = 500, seed: int = 0
+) -> PredictiveCheck:
+    """Compare statistics of the residuals with those of data that the posterior predicts.
+
+    Parameters
+    ----------
+    obs, cal
+        The data and the estimate.
+    post : Posterior, optional
+        The posterior; the normal approximation of the calibration otherwise.
+    n_draws : int
+        Draws, and replicates.
+    seed : int
+        Of the draws and the replicates.
+    """
+    rng = np.random.default_rng(seed)
+    likelihood = MarginalLikelihood(obs, cal.camera.distortion)
+    frames = likelihood.frames
+    # The statistics settle long before: of very many stars, the first frames do.
+    last = min(frames.n_frames, max(1, int(np.searchsorted(frames.starts, _MAX_STARS, side="right")) - 1))
+    part = MarginalLikelihood(frames.part(0, last), cal.camera.distortion)
+    frames = part.frames
+    state, _ = part.profile(cal.theta, quaternion_to_rotation(cal.quaternions[:last]))
+    h = part.project_out(state, part.derivatives(cal.theta, state))
+    theta, sigma = _draws(cal, post, n_draws, rng)
+    summary = _Summary(part, cal)
+    measured, replicated = [], []
+    for shift, noise in zip(theta - cal.theta, sigma, strict=True):
+        measured.append(summary((state.e - np.tensordot(shift, h, axes=1)) / noise))
+        replicated.append(summary(part.project_out(state, rng.standard_normal((1, 2, frames.n_stars)))[0]))
+    data, fake = np.array(measured), np.array(replicated)
+    low, middle, high = np.quantile(fake, (0.025, 0.5, 0.975), axis=0)
+    p = np.mean(fake >= data, axis=0)
+    rows = zip(_NAMES, data.mean(axis=0), low, middle, high, p, strict=True)
+    statistics = tuple(PredictiveStatistic(name, *(float(v) for v in values)) for name, *values in rows)
+    return PredictiveCheck(statistics, len(sigma), last)
+
+
+def _draws(
+    cal: Calibration, post: Posterior | None, n_draws: int, rng: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    if post is not None:
+        chosen = post.draws[rng.permutation(len(post.draws))[:n_draws]]
+        return chosen[:, :-1], chosen[:, -1]
+    noise = np.sqrt(cal.chi2 / rng.chisquare(cal.dof, n_draws))
+    scale = cal.sigmas
+    factor = np.linalg.cholesky(cal.correlation) * scale[:, None]
+    steps = rng.standard_normal((n_draws, len(scale))) @ factor.T
+    return cal.theta + steps * (noise / cal.sigma)[:, None], noise
+
+
+_NAMES = (
+    "sum of squares per degree of freedom",
+    "largest residual [σ]",
+    "excess kurtosis",
+    "radial pattern: mean square of ring means",
+    "tangential pattern: mean square of ring means",
+    "worst frame: standardised sum of squares",
+)
+
+
+class _Summary:
+    """The statistics of residuals (2, N) in units of the noise."""
+
+    def __init__(self, part: MarginalLikelihood, cal: Calibration) -> None:
+        self.frames = part.frames
+        offset = part.frames.pixel - cal.theta[:2, None]
+        radius = np.maximum(np.hypot(*offset), 1e-9)
+        self.out = offset / radius
+        edges = np.quantile(radius, np.linspace(0.0, 1.0, _RINGS + 1)[1:-1])
+        self.ring = np.searchsorted(edges, radius)
+        self.counts = np.maximum(np.bincount(self.ring, minlength=_RINGS), 1)
+        self.dof = 2.0 * part.frames.sizes - 3.0
+
+    def __call__(self, z: FloatArray) -> list[float]:
+        squares = self.frames.sum(np.sum(z * z, axis=0))
+        radial = np.sum(z * self.out, axis=0)
+        across = self.out[0] * z[1] - self.out[1] * z[0]
+        patterns = [
+            float(np.mean(np.bincount(self.ring, values, _RINGS) ** 2 / self.counts)) for values in (radial, across)
+        ]
+        return [
+            float(squares.sum() / self.dof.sum()),
+            float(np.abs(z).max()),
+            float(np.mean(z**4) / np.mean(z**2) ** 2 - 3.0),
+            *patterns,
+            float(np.max((squares - self.dof) / np.sqrt(2.0 * self.dof))),
+        ]

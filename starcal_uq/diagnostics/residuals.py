@@ -1,0 +1,196 @@
+"""What the model leaves over: residuals in cells of the detector, and whether their pattern is more than noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.core.types import FloatArray
+
+if TYPE_CHECKING:
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.observations.table import Observations
+
+_MIN_STARS = 5
+_STARS_PER_CELL = 25.0
+
+
+@dataclass(frozen=True)
+class BinnedResiduals:
+    """Mean residual vectors in square cells of the detector.
+
+    Cells with fewer than five stars are left out; n is the number of the others.
+
+    Attributes
+    ----------
+    centres : (n, 2) array
+        Cell centres, px.
+    means : (n, 2) array
+        Mean residuals, px.
+    counts : (n,) array
+        Stars in the cell.
+    chi2 : (n,) array
+        |mean|^2 over its variance per axis if residuals are noise alone; two degrees of freedom each.
+    noise_px : (n,) array
+        Standard deviation per axis of a mean that is noise alone, px.
+    cell_px : float
+        Side of a cell.
+    n_empty : int
+        Cells left out.
+    """
+
+    centres: FloatArray
+    means: FloatArray
+    counts: FloatArray
+    chi2: FloatArray
+    noise_px: FloatArray
+    cell_px: float
+    n_empty: int
+
+    @property
+    def p_value(self) -> float:
+        """Probability of cell means at least this large from noise alone.
+
+        A little too large in general, which is the safe side for an alarm: the attitude of each frame takes up part of
+        a pattern, and of the noise in the means.
+        """
+        from scipy.special import gammaincc
+
+        if len(self.counts) == 0:
+            return 1.0
+        return float(gammaincc(len(self.counts), 0.5 * np.sum(self.chi2)))
+
+    @property
+    def pattern_px(self) -> float:
+        """Root mean square per axis of the pattern over the field, the noise of the cell means taken off; px."""
+        if len(self.counts) == 0:
+            return 0.0
+        excess = np.mean(np.sum(self.means**2, axis=1) / 2.0 - self.noise_px**2)
+        return float(np.sqrt(max(excess, 0.0)))
+
+
+def bin_residuals(cal: Calibration, obs: Observations) -> BinnedResiduals:
+    """Mean residual vectors in cells that hold about 25 stars each (4 to 12 cells along the longer side)."""
+    width, height = cal.camera.width_px, cal.camera.height_px
+    longer = max(width, height)
+    along = int(np.clip(np.sqrt(obs.n_stars / _STARS_PER_CELL * longer / min(width, height)), 4, 12))
+    cell = longer / along
+    nx, ny = int(np.ceil(width / cell - 1e-9)), int(np.ceil(height / cell - 1e-9))
+    column = np.clip(((obs.x_px + 0.5) / cell).astype(int), 0, nx - 1)
+    row = np.clip(((obs.y_px + 0.5) / cell).astype(int), 0, ny - 1)
+    index = row * nx + column
+    residuals = np.asarray(cal.residuals_px)
+    counts = np.bincount(index, minlength=nx * ny).astype(np.float64)
+    keep = counts >= _MIN_STARS
+    sums = np.stack([np.bincount(index, residuals[:, i], nx * ny) for i in (0, 1)], axis=1)[keep]
+    variance = np.bincount(index, residual_scale(cal, obs) ** 2, nx * ny)[keep]
+    flat = np.flatnonzero(keep)
+    centres = np.stack([(flat % nx + 0.5) * cell - 0.5, (flat // nx + 0.5) * cell - 0.5], axis=1)
+    return BinnedResiduals(
+        centres=np.minimum(centres, [width - 0.5, height - 0.5]),
+        means=sums / counts[keep, None],
+        counts=counts[keep],
+        chi2=np.sum(sums**2, axis=1) / variance,
+        noise_px=np.sqrt(variance) / counts[keep],
+        cell_px=cell,
+        n_empty=int(np.count_nonzero(~keep)),
+    )
+
+
+def residual_scale(cal: Calibration, obs: Observations) -> FloatArray:
+    """Expected standard deviation of each residual per axis, px, shape (N,).
+
+    The fit takes up part of the noise: with d degrees of freedom in 2N numbers, residuals are smaller than the noise by
+    sqrt(d / 2N) on average.
+    """
+    shrink = np.sqrt(max(cal.dof, 1) / (2.0 * obs.n_stars))
+    stated = np.ones(obs.n_stars) if obs.sigma_px is None else np.asarray(obs.sigma_px)
+    return np.asarray(cal.sigma * shrink * stated, dtype=np.float64)
+
+
+def normalised_residuals(cal: Calibration, obs: Observations) -> FloatArray:
+    """Residuals in units of their expected standard deviation, shape (N, 2)."""
+    return np.asarray(cal.residuals_px / residual_scale(cal, obs)[:, None], dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Profile1D:
+    """Mean residuals in bins of one quantity, for two components.
+
+    Attributes
+    ----------
+    title, label : str
+        What they are held against, and the axis label with its unit.
+    names : tuple of str
+        The two components.
+    centres : (n,) array
+        Mean of the quantity in each bin.
+    means : (2, n) array
+        Mean residuals, px.
+    errors : (n,) array
+        Standard error of a mean from noise alone, px.
+    """
+
+    title: str
+    label: str
+    names: tuple[str, str]
+    centres: FloatArray
+    means: FloatArray
+    errors: FloatArray
+
+
+_XY, _POLAR = ("x", "y"), ("radial", "tangential")
+
+
+def residual_profiles(cal: Calibration, obs: Observations) -> tuple[Profile1D, ...]:
+    """Residuals against azimuth, pixel phase in x and y, order of frames, magnitude and temperature, in bins.
+
+    The phase is that of the predicted position, from -0.5 to 0.5 px around the centre of a pixel. Quantities that the
+    table lacks, or that do not vary, are left out.
+    """
+    residuals = np.asarray(cal.residuals_px).T
+    predicted = obs.xy.T - residuals
+    offset = predicted - cal.theta[:2, None]
+    unit = offset / np.maximum(np.hypot(*offset), 1e-9)
+    polar = np.stack([np.sum(residuals * unit, axis=0), unit[0] * residuals[1] - unit[1] * residuals[0]])
+    phase = predicted - np.round(predicted)
+    order = np.searchsorted(obs.frame_ids, obs.frame).astype(np.float64)
+    wanted: list[tuple[str, str, tuple[str, str], FloatArray | None, FloatArray]] = [
+        ("Azimuth", "azimuth in the field [°]", _POLAR, np.degrees(np.arctan2(offset[1], offset[0])), polar),
+        ("Pixel phase in x", "phase in x [px]", _XY, phase[0], residuals),
+        ("Pixel phase in y", "phase in y [px]", _XY, phase[1], residuals),
+        ("Order of frames", "frame, in order", _POLAR, order, polar),
+        ("Magnitude", "magnitude", _XY, obs.mag, residuals),
+        ("Temperature", "temperature [°C]", _POLAR, obs.temperature_c, polar),
+    ]
+    scale2 = residual_scale(cal, obs) ** 2
+    found = []
+    for title, label, names, values, parts in wanted:
+        if values is not None and np.nanstd(values) > 1e-9:
+            found.append(_profile(title, label, names, values, parts, scale2))
+    return tuple(found)
+
+
+def _profile(
+    title: str, label: str, names: tuple[str, str], values: FloatArray, parts: FloatArray, scale2: FloatArray
+) -> Profile1D:
+    known = np.isfinite(values)
+    values, parts, scale2 = values[known], parts[:, known], scale2[known]
+    n_bins = int(np.clip(len(values) // 30, 3, 16))
+    # Bins of equal number, so that all error bars mean the same; equal values stay in one bin.
+    edges = np.unique(np.quantile(values, np.linspace(0.0, 1.0, n_bins + 1)))
+    index = np.clip(np.searchsorted(edges, values, side="right") - 1, 0, max(len(edges) - 2, 0))
+    counts = np.bincount(index)
+    kept = counts > 0
+    counts = counts[kept].astype(np.float64)
+    sums = np.stack([np.bincount(index, part)[kept] for part in parts])
+    return Profile1D(
+        title=title,
+        label=label,
+        names=names,
+        centres=np.bincount(index, values)[kept] / counts,
+        means=sums / counts,
+        errors=np.sqrt(np.bincount(index, scale2)[kept]) / counts,
+    )

@@ -1,0 +1,321 @@
+"""Shapes that residuals take when the model is wrong, as columns of pixel shifts.
+
+Every column is a displacement (observed minus predicted) for every star and both axes. Positions are predicted ones:
+with measured ones, the noise of a star would enter its own shape. What the attitudes and the fitted parameters absorb
+of a shape is removed where the shapes are used, so their scale and their overlap do not matter here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.camera.distortion import get_model, model_names
+from starcal_uq.core.types import FloatArray, StrArray
+from starcal_uq.estimation.marginal import MarginalLikelihood, Profile
+
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.observations.table import Observations
+
+LIGHT_SPEED_KM_S = 299792.458
+_HARMONICS = 2
+_AZIMUTH_ORDERS = 3
+_RADIAL_DEGREE, _TWIST_DEGREE = 6, 3
+_TIME_DEGREE = 3
+_STARS_PER_CELL = 25.0
+_MAX_CELLS = 8
+_LEAST_SPREAD = 1e-9
+
+
+@dataclass(frozen=True)
+class View:
+    """Some frames, as the shapes see them.
+
+    Attributes
+    ----------
+    rows : slice
+        Their rows in the table.
+    part : MarginalLikelihood
+        Their likelihood.
+    state : Profile
+        The model at the best attitudes.
+    parameter_columns : (p, 2, n) array
+        Derivatives by the fitted parameters, not divided by the noise.
+    uv : (2, n) array
+        Predicted positions relative to the principal point, px.
+    """
+
+    rows: slice
+    part: MarginalLikelihood
+    state: Profile
+    parameter_columns: FloatArray
+    uv: FloatArray
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A family of shapes that one test looks for.
+
+    Attributes
+    ----------
+    name, against : str
+        Short name, and what the residuals are held against.
+    size : int
+        Number of columns.
+    columns : callable
+        ``View -> (size, 2, n)`` shifts in px.
+    labels : tuple of (str, str)
+        Name and unit of each column's amplitude, where amplitudes mean something by themselves.
+    per_amplitude : tuple of float
+        Amplitude in that unit of a column as it stands.
+    """
+
+    name: str
+    against: str
+    size: int
+    columns: Callable[[View], FloatArray]
+    labels: tuple[tuple[str, str], ...] = ()
+    per_amplitude: tuple[float, ...] = ()
+
+
+def shapes(obs: Observations, camera: Camera, *, max_cells: int = _MAX_CELLS) -> tuple[Shape, ...]:
+    """Every family of shapes that the table allows.
+
+    Parameters
+    ----------
+    obs : Observations
+        The data; magnitude, time and temperature are used where they vary.
+    camera : Camera
+        The estimate.
+    max_cells : int
+        Largest number of field cells along the longer side.
+    """
+    found = [*_missing_terms(camera), _axes(camera), _aberration()]
+    clock, called = run_clock(obs)
+    if clock is not None:
+        found.append(_drift(clock, called))
+    if obs.temperature_c is not None and (warmth := _standardised(obs.temperature_c)) is not None:
+        spread = float(np.nanstd(obs.temperature_c))
+        found.append(_focal_against(warmth, "focal length with temperature", "temperature", ("df/dT", "px/K"), spread))
+    found += [_radius(camera), _azimuth(camera), _phase(0), _phase(1)]
+    if obs.mag is not None and (magnitude := _standardised(obs.mag)) is not None:
+        found.append(_magnitude(magnitude, camera))
+    if clock is not None:
+        found.append(_over_time(clock, called))
+    return (*found, _cells(obs, camera, max_cells))
+
+
+def run_clock(obs: Observations) -> tuple[FloatArray | None, str]:
+    """Time of every star from -1 to 1 over the run, or the order of frames where there is no time; and its name."""
+    seconds = None if obs.time_utc is None else _seconds(obs.time_utc)
+    called = "time"
+    if seconds is None or np.ptp(seconds) <= 0.0:
+        seconds = np.searchsorted(obs.frame_ids, obs.frame).astype(np.float64)
+        called = "order of frames"
+    if np.ptp(seconds) <= 0.0:
+        return None, called
+    clock: FloatArray = 2.0 * (seconds - seconds.min()) / np.ptp(seconds) - 1.0
+    return clock, called
+
+
+def _seconds(times: StrArray) -> FloatArray | None:
+    unique, inverse = np.unique(times, return_inverse=True)
+    try:
+        parsed = [datetime.fromisoformat(str(text)) for text in unique]
+    except ValueError:
+        return None
+    stamps = [(t if t.tzinfo is not None else t.replace(tzinfo=UTC)).timestamp() for t in parsed]
+    return np.asarray(stamps, dtype=np.float64)[inverse.reshape(-1)]
+
+
+def _standardised(values: FloatArray) -> FloatArray | None:
+    """Zero mean and unit spread; zero where unknown; None where nothing varies."""
+    spread = float(np.nanstd(values))
+    if not spread > _LEAST_SPREAD:
+        return None
+    z: FloatArray = np.nan_to_num((values - np.nanmean(values)) / spread)
+    return z
+
+
+def _missing_terms(camera: Camera) -> list[Shape]:
+    """Terms of the other registered models that the fitted one lacks: radial ones, and the rest."""
+    fitted = set(camera.parameter_names)
+    lacking: dict[str, tuple[str, int]] = {}
+    for name in model_names():
+        model = get_model(name)
+        if model.direction == "forward":
+            for index, coefficient in enumerate(model.coefficients):
+                if coefficient.name not in fitted:
+                    lacking.setdefault(coefficient.name, (name, index))
+    orders = {c.name: c.order for name in model_names() for c in get_model(name).coefficients}
+    found = []
+    for title, radial in (("radial distortion beyond the model", True), ("decentring distortion", False)):
+        names = [name for name in lacking if name.startswith("k") is radial]
+        if names:
+            found.append(
+                Shape(
+                    f"{title} ({', '.join(names)})",
+                    "radius" if radial else "field",
+                    len(names),
+                    _TermColumns(camera, tuple(lacking[name] for name in names)),
+                    tuple((f"{name} at the corner", "px") for name in names),
+                    tuple(float(camera.corner_radius_px ** orders[name]) for name in names),
+                )
+            )
+    return found
+
+
+@dataclass(frozen=True)
+class _TermColumns:
+    """Derivatives by coefficients of richer models, where those are zero."""
+
+    camera: Camera
+    terms: tuple[tuple[str, int], ...]
+
+    def __call__(self, view: View) -> FloatArray:
+        own = dict(zip(self.camera.parameter_names, self.camera.theta.tolist(), strict=True))
+        if get_model(self.camera.distortion).direction == "inverse":
+            own = {name: own[name] for name in ("x0", "y0", "f")}
+        columns = []
+        for model_name, index in self.terms:
+            names = ("x0", "y0", "f", *(c.name for c in get_model(model_name).coefficients))
+            theta = np.array([own.get(name, 0.0) for name in names])
+            richer = MarginalLikelihood(view.part.frames, model_name)
+            columns.append(richer.derivatives(theta, view.state)[3 + index])
+        stacked = np.stack(columns)
+        return stacked if view.part.frames.weight is None else stacked / view.part.frames.weight
+
+
+def _axes(camera: Camera) -> Shape:
+    radius = camera.corner_radius_px
+
+    def columns(view: View) -> FloatArray:
+        u, v = view.uv / radius
+        return np.stack([np.stack([u, -v]), np.stack([v, u])])
+
+    labels = (("scale x against y, at the corner", "px"), ("skew of the axes, at the corner", "px"))
+    return Shape("scale and skew of the axes", "field", 2, columns, labels, (1.0, 1.0))
+
+
+def _aberration() -> Shape:
+    def columns(view: View) -> FloatArray:
+        # A velocity V/c moves b by the rotation b x V/c, whose effect on pixels is that of an attitude error.
+        frames, state = view.part.frames, view.state
+        b = state.b
+        found = np.empty((3, 2, frames.n_stars))
+        for axis in range(3):
+            towards = frames.spread(np.ascontiguousarray(state.rotations[:, :, axis].T))
+            found[axis] = np.einsum("ixn,in->xn", state.attitude, np.cross(b, towards, axis=0))
+        return found if frames.weight is None else found / frames.weight
+
+    labels = tuple((f"velocity along {axis}", "km/s") for axis in ("ICRS x", "ICRS y", "ICRS z"))
+    return Shape("aberration of a constant velocity", "direction", 3, columns, labels, (LIGHT_SPEED_KM_S,) * 3)
+
+
+def _focal_against(clock: FloatArray, name: str, against: str, label: tuple[str, str], spread: float) -> Shape:
+    def columns(view: View) -> FloatArray:
+        return view.parameter_columns[2:3] * clock[view.rows]
+
+    return Shape(name, against, 1, columns, (label,), (1.0 / spread,))
+
+
+def _drift(clock: FloatArray, called: str) -> Shape:
+    # The clock runs from -1 to 1: twice the amplitude is the change over the run.
+    return _focal_against(clock, "linear drift of f", called, ("change of f over the run", "px"), 0.5)
+
+
+def _radius(camera: Camera) -> Shape:
+    radius = camera.corner_radius_px
+
+    def columns(view: View) -> FloatArray:
+        from numpy.polynomial.chebyshev import chebvander
+
+        rho = np.hypot(*view.uv) / radius
+        out = view.uv / radius
+        across = np.stack([-out[1], out[0]])
+        powers = chebvander(2.0 * rho - 1.0, _RADIAL_DEGREE - 1).T
+        return np.concatenate([powers[:, None] * out, powers[:_TWIST_DEGREE, None] * across])
+
+    return Shape("smooth pattern over radius", "radius", _RADIAL_DEGREE + _TWIST_DEGREE, columns)
+
+
+def _azimuth(camera: Camera) -> Shape:
+    radius = camera.corner_radius_px
+
+    def columns(view: View) -> FloatArray:
+        angle = np.arctan2(view.uv[1], view.uv[0])
+        out = view.uv / radius
+        across = np.stack([-out[1], out[0]])
+        waves = [f(m * angle) for m in range(1, _AZIMUTH_ORDERS + 1) for f in (np.cos, np.sin)]
+        return np.stack([wave * direction for wave in waves for direction in (out, across)])
+
+    return Shape("smooth pattern over azimuth", "azimuth", 4 * _AZIMUTH_ORDERS, columns)
+
+
+def _phase(axis: int) -> Shape:
+    name = "xy"[axis]
+
+    def columns(view: View) -> FloatArray:
+        # Whole pixels drop out of the waves, so the position on the detector stands for its fraction.
+        centre = view.part.frames.pixel[axis] - _residual(view)[axis]
+        waves = [f(2.0 * np.pi * h * centre) for h in range(1, _HARMONICS + 1) for f in (np.sin, np.cos)]
+        found = np.zeros((len(waves), 2, len(centre)))
+        found[:, axis] = waves
+        return found
+
+    labels = tuple((f"{wave}({2 * h}π{name})", "px") for h in range(1, _HARMONICS + 1) for wave in ("sin", "cos"))
+    size = 2 * _HARMONICS
+    against = f"pixel phase in {name}"
+    return Shape(f"error with the pixel phase in {name}", against, size, columns, labels, (1.0,) * size)
+
+
+def _residual(view: View) -> FloatArray:
+    weight = view.part.frames.weight
+    return view.state.e if weight is None else view.state.e / weight
+
+
+def _magnitude(z: FloatArray, camera: Camera) -> Shape:
+    radius = camera.corner_radius_px
+
+    def columns(view: View) -> FloatArray:
+        own = z[view.rows]
+        one, zero = np.ones_like(own), np.zeros_like(own)
+        shifts = np.stack([np.stack([one, zero]), np.stack([zero, one]), view.uv / radius])
+        return np.concatenate([shifts * own, shifts * own**2])
+
+    return Shape("shift and scale with magnitude", "magnitude", 6, columns)
+
+
+def _over_time(clock: FloatArray, called: str) -> Shape:
+    def columns(view: View) -> FloatArray:
+        from numpy.polynomial.legendre import legvander
+
+        powers = legvander(clock[view.rows], _TIME_DEGREE).T[1:]
+        moving = view.parameter_columns[:3]
+        return np.concatenate([moving[i] * powers[:, None] for i in range(3)])
+
+    return Shape(f"smooth change of x0, y0 and f over the {called}", called, 3 * _TIME_DEGREE, columns)
+
+
+def _cells(obs: Observations, camera: Camera, max_cells: int) -> Shape:
+    longer = max(camera.width_px, camera.height_px)
+    per_area = obs.n_stars / _STARS_PER_CELL * longer / min(camera.width_px, camera.height_px)
+    cell = longer / int(np.clip(np.sqrt(per_area), 2, max_cells))
+    nx, ny = (int(np.ceil(side / cell - 1e-9)) for side in (camera.width_px, camera.height_px))
+
+    def columns(view: View) -> FloatArray:
+        x, y = view.part.frames.pixel - _residual(view)
+        column = np.clip(((x + 0.5) / cell).astype(int), 0, nx - 1)
+        row = np.clip(((y + 0.5) / cell).astype(int), 0, ny - 1)
+        inside = (row * nx + column)[None] == np.arange(nx * ny)[:, None]
+        found = np.zeros((nx * ny, 2, 2, len(x)))
+        found[:, 0, 0] = inside
+        found[:, 1, 1] = inside
+        return found.reshape(2 * nx * ny, 2, len(x))
+
+    return Shape(f"mean shift in {nx} × {ny} cells of the field", "field cells", 2 * nx * ny, columns)

@@ -1,0 +1,273 @@
+"""One replicate of a validation: simulate, calibrate, sample, and ask where the truth lies among the draws.
+
+Likelihood, target, Laplace approximation, moves and ensembles are those of `starcal_uq.sample`; what is left out is the
+number of ensembles, and diagnostics that a single run needs and a thousand replicates do not.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+from starcal_uq.camera.distortion import parameters, sigma_parameter
+from starcal_uq.camera.projection import fold_radius_px
+from starcal_uq.core.errors import CatalogueError, PriorError, SamplingError, StarcalError
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.inference.ensemble import EnsembleSettings, run_ensembles
+from starcal_uq.inference.named import NaivePairsWarning, find_source
+from starcal_uq.inference.target import Likelihood, LogLikelihood, laplace_approximation, scaled_inverse, start_target
+from starcal_uq.simulation.frames import simulate
+
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.inference.priors import Priors
+    from starcal_uq.observations.table import Observations
+    from starcal_uq.sky.catalogue import StarCatalogue
+
+Truth = Literal["fixed", "prior"]
+LikelihoodMaker = Callable[["Observations", "Calibration"], Likelihood]
+
+MARGINAL = "marginal"
+LOG_LIKELIHOOD = "log_likelihood"
+AXES = ("pitch", "yaw", "roll")
+ARCSEC = 648_000.0 / np.pi
+INTERVAL = 0.95
+_MAX_TRUTHS = 1000
+
+
+@dataclass(frozen=True)
+class Study:
+    """What all replicates share; sent once to every process.
+
+    Attributes
+    ----------
+    camera : Camera
+        The truth, or the centre of what it is drawn around.
+    nominal : Camera
+        Start of every calibration.
+    priors : Priors
+        Sampled with; with ``truth="prior"`` the truth is drawn from them as well.
+    truth : {"fixed", "prior"}
+        The same truth in every replicate, or a new one.
+    n_frames, min_stars : int
+        As in `simulate`.
+    sigma_px : float
+        True centroid noise, unless it is drawn from the prior.
+    seed : int
+        Replicate i depends on the seed and on i alone.
+    assumed_sigma_px : float or None
+        Noise that the sampler is told; None lets it sample the noise.
+    likelihood : str or callable
+        Name of a likelihood, or ``(obs, cal) -> Likelihood``.
+    moves : callable, optional
+        ``() -> list of (emcee move, weight)`` to sample with instead of the usual ones.
+    n_walkers, n_steps, n_burn : int
+        One ensemble.
+    thin : int
+        Every `thin`-th step is ranked: walkers of one step are independent of each other, steps nearly so after ten.
+    """
+
+    camera: Camera
+    nominal: Camera
+    priors: Priors
+    truth: Truth
+    n_frames: int
+    min_stars: int
+    sigma_px: float
+    seed: int
+    assumed_sigma_px: float | None = None
+    likelihood: str | LikelihoodMaker = MARGINAL
+    moves: Callable[[], list[tuple[Any, float]]] | None = None
+    n_walkers: int = 64
+    n_steps: int = 200
+    n_burn: int = 20
+    thin: int = 10
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """Names of what is ranked: parameters, noise if sampled, log likelihood, attitude errors."""
+        noise = self.priors.names[-1:] if self.assumed_sigma_px is None else ()
+        return (*self.priors.names[:-1], *noise, LOG_LIKELIHOOD, *AXES)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Their units."""
+        noise = (sigma_parameter(False).unit,) if self.assumed_sigma_px is None else ()
+        return (*(p.unit for p in parameters(self.priors.distortion)), *noise, "nat", *("arcsec",) * 3)
+
+    @property
+    def n_ranked(self) -> int:
+        """Draws that the truth is ranked among; one is left out, so that the number of ranks has many divisors."""
+        return self.n_walkers * (self.n_steps // self.thin) - 1
+
+
+class Outcome(NamedTuple):
+    """One replicate, over Q quantities and p parameters.
+
+    Attributes
+    ----------
+    replicate : int
+        Its number.
+    failure : str
+        Why there is no result; empty otherwise.
+    truth : (p+1,) array
+        Camera parameters and noise.
+    ranks : (Q,) array of int
+        Draws below the truth, of `Study.n_ranked`.
+    covered : (Q,) array of bool
+        The truth lies between the 2.5 % and 97.5 % quantiles of all draws.
+    error : (Q,) array
+        Mean of the draws minus truth.
+    sd : (Q,) array
+        Standard deviation of the draws.
+    nees : float
+        Normalised squared error of the parameters with mean and covariance of the draws.
+    nees_calibration : float
+        The same with the estimate and covariance of the calibration.
+    compression_error : float
+        Compressed minus exact log likelihood at the truth, nat.
+    dof : int
+        Degrees of freedom of the calibration.
+    """
+
+    replicate: int
+    failure: str
+    truth: FloatArray
+    ranks: IntArray
+    covered: BoolArray
+    error: FloatArray
+    sd: FloatArray
+    nees: float
+    nees_calibration: float
+    compression_error: float
+    dof: int
+
+
+def run_replicate(study: Study, stars: StarCatalogue, index: int) -> Outcome:
+    """Replicate number `index`; a calibration or posterior that fails is an outcome, a sky without stars an error."""
+    truths, noise, sampler = np.random.SeedSequence(study.seed, spawn_key=(index,)).spawn(3)
+    camera, sigma_px = _truth(study, np.random.default_rng(truths))
+    truth = np.append(camera.theta, sigma_px)
+    try:
+        obs = simulate(
+            stars,
+            camera,
+            n_frames=study.n_frames,
+            min_stars=study.min_stars,
+            sigma_px=sigma_px,
+            seed=int(noise.generate_state(1, np.uint64)[0]),
+        )
+        cal = calibrate(obs, study.nominal)
+        draws, likelihood = _sample(study, obs, cal, sampler)
+    except CatalogueError:
+        raise
+    except StarcalError as error:
+        return _no_result(study, truth, index, str(error))
+    return _compare(study, obs, cal, draws, likelihood, truth, index)
+
+
+def _truth(study: Study, rng: np.random.Generator) -> tuple[Camera, float]:
+    """A camera and its noise; draws that are not cameras are drawn again.
+
+    The prior is then cut off where no camera is; so is the posterior in effect, because stars that were seen leave no
+    probability there.
+    """
+    if study.truth == "fixed":
+        return study.camera, study.sigma_px
+    for _ in range(_MAX_TRUTHS):
+        draw = study.priors.draw(1, rng)[0]
+        theta, sigma_px = draw[:-1], float(draw[-1])
+        if not theta[2] > 0.0:
+            continue
+        camera = study.camera.with_theta(theta)
+        inside = -0.5 < theta[0] < camera.width_px - 0.5 and -0.5 < theta[1] < camera.height_px - 0.5
+        if inside and fold_radius_px(camera.distortion, theta, camera.corner_radius_px) > camera.corner_radius_px:
+            return camera, sigma_px
+    raise PriorError(
+        f"none of {_MAX_TRUTHS} draws of the prior is a camera whose principal point is on the detector and whose "
+        "distortion does not fold over: narrow the prior."
+    )
+
+
+def _sample(
+    study: Study, obs: Observations, cal: Calibration, seed: np.random.SeedSequence
+) -> tuple[FloatArray, LogLikelihood]:
+    """Draws (n_steps, n_walkers, p+1) and the likelihood that they are of."""
+    made = study.likelihood if isinstance(study.likelihood, str) else study.likelihood(obs, cal)
+    with warnings.catch_warnings():
+        # That pairs are not independent is what a validation of them shows.
+        warnings.simplefilter("ignore", NaivePairsWarning)
+        source = find_source(made, obs, cal, None)
+    log_likelihood = source.exact if source.fast is None else source.fast
+    if log_likelihood is None:
+        raise SamplingError(f"the likelihood {source.name!r} cannot be evaluated: give another.")
+    given = study.assumed_sigma_px
+    sigma = source.sigma if given is None else given
+    information = source.information * (source.sigma / sigma) ** 2
+    start = start_target(log_likelihood, study.priors, source.theta, information, sigma, source.dof, given is not None)
+    target, _ = laplace_approximation(start)
+    chains = run_ensembles(
+        target.log_density,
+        target.dim,
+        [seed],
+        EnsembleSettings(study.n_walkers, study.n_steps, study.n_burn, "mixture"),
+        moves=None if study.moves is None else study.moves(),
+    )
+    draws = target.natural(chains.u[0].reshape(-1, target.dim))
+    return draws.reshape(study.n_steps, study.n_walkers, -1), log_likelihood
+
+
+def _compare(
+    study: Study,
+    obs: Observations,
+    cal: Calibration,
+    draws: FloatArray,
+    log_likelihood: LogLikelihood,
+    truth: FloatArray,
+    index: int,
+) -> Outcome:
+    p = len(truth) - 1
+    flat = draws.reshape(-1, p + 1)
+    believed = truth if study.assumed_sigma_px is None else np.append(truth[:-1], study.assumed_sigma_px)
+    points = np.vstack([flat, believed])
+    level = log_likelihood(points[:, :-1], points[:, -1])
+    noise = flat[:, -1:] - truth[-1] if study.assumed_sigma_px is None else np.empty((len(flat), 0))
+    # The attitude error of a draw: the common rotation that its parameters cause, to first order.
+    shift = flat[:, :-1] - truth[:-1]
+    rotation = ARCSEC * shift @ cal.rotation_per_theta.T
+    above = np.column_stack([shift, noise, level[:-1] - level[-1], rotation])
+    low, high = np.quantile(above, [0.5 - 0.5 * INTERVAL, 0.5 + 0.5 * INTERVAL], axis=0)
+    ranked = above.reshape(study.n_steps, study.n_walkers, -1)[study.thin - 1 :: study.thin].reshape(-1, above.shape[1])
+    exact = np.nan
+    if study.likelihood == MARGINAL:
+        exact = MarginalLikelihood(obs, cal.camera.distortion).log_likelihood(believed[:-1], float(believed[-1]))
+    return Outcome(
+        replicate=index,
+        failure="",
+        truth=truth,
+        ranks=np.sum(ranked[: study.n_ranked] < 0.0, axis=0),
+        covered=(low <= 0.0) & (high >= 0.0),
+        error=above.mean(axis=0),
+        sd=above.std(axis=0, ddof=1),
+        nees=_nees(shift.mean(axis=0), np.cov(shift, rowvar=False)),
+        nees_calibration=_nees(cal.theta - truth[:-1], cal.covariance),
+        compression_error=float(level[-1]) - exact,
+        dof=cal.dof,
+    )
+
+
+def _no_result(study: Study, truth: FloatArray, index: int, reason: str) -> Outcome:
+    q = len(study.quantities)
+    nothing, nowhere = np.full(q, np.nan), np.zeros(q, dtype=np.int64)
+    return Outcome(index, reason, truth, nowhere, nowhere > 0, nothing, nothing, np.nan, np.nan, np.nan, 0)
+
+
+def _nees(error: FloatArray, covariance: FloatArray) -> float:
+    return float(error @ scaled_inverse(covariance) @ error)

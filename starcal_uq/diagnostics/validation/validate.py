@@ -1,0 +1,230 @@
+"""Are the intervals right? Simulation-based calibration, coverage and squared errors for one's own sensor.
+
+Observations are simulated again and again as the sensor would make them, calibrated and sampled, and the truth is
+compared with its posterior. If the posterior is right, then
+
+- the rank of the truth among posterior draws is uniform, for every parameter and for any function of parameters and
+  data (Talts et al. 2018, arXiv:1804.06788; Modrak et al. 2023, arXiv:2211.02383, for the joint log likelihood);
+- a 95 % interval holds the truth 95 times in a hundred;
+- the normalised estimation error squared, e^T C^-1 e, is the number of parameters on average.
+
+With the truth drawn from the prior (``truth="prior"``) this holds exactly, for any prior. With one fixed truth it is
+the claim that a user makes in the end, that the intervals cover at *this* camera; it holds as far as the data, and not
+the prior, decide.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.core.errors import CalibrationError, PriorError, SamplingError
+from starcal_uq.core.types import AnyDict
+from starcal_uq.diagnostics.validation.replicates import MARGINAL, LikelihoodMaker, Study, Truth
+from starcal_uq.diagnostics.validation.result import Validation
+from starcal_uq.diagnostics.validation.validation_pool import Progress, run_replicates
+from starcal_uq.inference.priors import Priors
+from starcal_uq.runs.folder import provenance
+
+if TYPE_CHECKING:
+    from starcal_uq.sky.catalogue import StarCatalogue
+
+TRUTHS = ("fixed", "prior")
+# Student t is for stars that are not where they should be; its sigma is not the noise that is simulated here.
+LIKELIHOODS = (MARGINAL, "pairs", "pairs_naive")
+# What truth="prior" draws from by default: narrow enough that every draw is a camera that sees the same sky.
+_PRIOR_POINT_PX = 5.0
+_PRIOR_FOCAL = 1e-3
+_PRIOR_CORNER_PX = 1.0
+_PRIOR_LOG_SIGMA = 0.2
+
+
+def validate(
+    camera: Camera,
+    *,
+    n_replicates: int = 1000,
+    n_frames: int = 50,
+    min_stars: int = 10,
+    sigma_px: float = 0.05,
+    max_mag: float = 6.0,
+    seed: int = 0,
+    workers: int | None = None,
+    truth: Truth = "fixed",
+    progress: Progress | None = None,
+    priors: Priors | None = None,
+    stars: StarCatalogue | None = None,
+    assumed_sigma_px: float | None = None,
+    likelihood: str | LikelihoodMaker = MARGINAL,
+) -> Validation:
+    """Check intervals, ranks and errors of calibration and posterior for a sensor and its volume of data.
+
+    Parameters
+    ----------
+    camera : Camera
+        The sensor, with the optics and distortion that it is thought to have. Every calibration starts as from its
+        data sheet: principal point in the centre, no distortion.
+    n_replicates : int
+        Data sets to simulate; 1000 know a coverage to 1.4 %.
+    n_frames, min_stars, sigma_px, max_mag
+        Data of one calibration: frames, least stars in each, centroid noise in px per axis, and limiting magnitude.
+    seed : int
+        The same seed gives the same result, bit for bit, for any number of processes; the first replicates of a longer
+        validation are those of a shorter one.
+    workers : int, optional
+        Processes; as many as there are processors by default. With 0, everything happens in this process, where a BLAS
+        with several threads can change the last digits.
+    truth : {"fixed", "prior"}
+        ``fixed``: the truth is `camera` in every replicate, sampled with the default priors, which are nearly flat
+        there. ``prior``: the truth is drawn from the priors.
+    progress : callable, optional
+        Called as ``progress(done, total)``.
+    priors : Priors, optional
+        Instead of ``Priors.default`` of the data-sheet camera, or, with ``truth="prior"``, instead of narrow ones
+        around `camera` (`narrow_priors`).
+    stars : StarCatalogue, optional
+        The sky, instead of the embedded catalogue to `max_mag`.
+    assumed_sigma_px : float, optional
+        Tell the sampler this noise instead of letting it sample the noise.
+    likelihood : {"marginal", "pairs", "pairs_naive"} or callable
+        As in `sample`; or ``(obs, cal) -> object with log_likelihood(theta (n, p), sigma (n,)) -> (n,)``, to validate
+        one's own, which with several workers must be a function at the top level of a module.
+
+    Returns
+    -------
+    Validation
+        After Ctrl-C, with the replicates that were complete by then.
+
+    Raises
+    ------
+    SamplingError
+        For settings that cannot work, or processes that cannot be started.
+    CatalogueError
+        When the field is too narrow for the catalogue to show `min_stars`.
+    CalibrationError
+        When no replicate gave a result.
+    """
+    from starcal_uq.sky.catalogue import load_catalogue
+
+    nominal = _data_sheet(camera)
+    if priors is None:
+        priors = narrow_priors(camera, sigma_px) if truth == "prior" else Priors.default(nominal)
+    study = Study(camera, nominal, priors, truth, n_frames, min_stars, sigma_px, seed, assumed_sigma_px, likelihood)
+    _check(study, n_replicates, workers)
+    settings: AnyDict = {
+        "truth": truth,
+        "n_frames": n_frames,
+        "min_stars": min_stars,
+        "sigma_px": sigma_px,
+        "max_mag": max_mag,
+        "stars": "embedded" if stars is None else stars.source,
+        "assumed_sigma_px": assumed_sigma_px,
+        "likelihood": likelihood if isinstance(likelihood, str) else getattr(likelihood, "__name__", repr(likelihood)),
+    }
+    sky = load_catalogue(max_mag=max_mag) if stars is None else stars
+    return validate_study(study, sky, n_replicates, workers=workers, progress=progress, settings=settings)
+
+
+def validate_study(
+    study: Study,
+    stars: StarCatalogue,
+    n_replicates: int,
+    *,
+    workers: int | None = None,
+    progress: Progress | None = None,
+    settings: AnyDict | None = None,
+) -> Validation:
+    """Run the replicates of a study, whose settings may be any, and collect them.
+
+    Raises
+    ------
+    CalibrationError
+        When no replicate gave a result.
+    """
+    outcomes, interrupted = run_replicates(study, stars, n_replicates, workers, progress)
+    good = [o for o in outcomes if not o.failure]
+    failures = tuple(o.failure for o in outcomes if o.failure)
+    if not good:
+        raise CalibrationError(f"no replicate gave a result; the commonest reason: {_commonest(failures)}")
+    sampling = {name: getattr(study, name) for name in ("n_walkers", "n_steps", "n_burn", "thin")}
+    return Validation(
+        quantities=study.quantities,
+        units=study.units,
+        camera=study.camera,
+        nominal=study.nominal,
+        priors=study.priors,
+        replicate=np.array([o.replicate for o in good]),
+        truth=np.array([o.truth for o in good]),
+        ranks=np.array([o.ranks for o in good]),
+        n_ranked=study.n_ranked,
+        covered=np.array([o.covered for o in good]),
+        error=np.array([o.error for o in good]),
+        sd=np.array([o.sd for o in good]),
+        nees=np.array([o.nees for o in good]),
+        nees_calibration=np.array([o.nees_calibration for o in good]),
+        compression_error=np.array([o.compression_error for o in good]),
+        dof=np.array([o.dof for o in good]),
+        failures=failures,
+        n_requested=n_replicates,
+        interrupted=interrupted,
+        provenance=provenance(study.seed, {**(settings or {}), "n_replicates": n_replicates, **sampling}, None),
+    )
+
+
+def narrow_priors(camera: Camera, sigma_px: float) -> Priors:
+    """Priors around a camera from which truths can be drawn.
+
+    Principal point within 5 px, focal length within 0.1 %, noise within 20 %, and each distortion term within what the
+    camera's largest one displaces at the corner, at least 1 px, around zero (one standard deviation each).
+    """
+    from starcal_uq.camera.distortion import get_model
+
+    radius = camera.corner_radius_px
+    terms = zip(camera.coefficients, get_model(camera.distortion).coefficients, strict=True)
+    displacements = [abs(value) * radius**term.order for value, term in terms]
+    return Priors.default(camera).replace(
+        principal_point_px=_PRIOR_POINT_PX,
+        principal_point_centre_px=(camera.x0_px, camera.y0_px),
+        focal_fraction=_PRIOR_FOCAL,
+        distortion_corner_px=max([_PRIOR_CORNER_PX, *displacements]),
+        sigma_median=sigma_px,
+        sigma_log_sd=_PRIOR_LOG_SIGMA,
+    )
+
+
+def _data_sheet(camera: Camera) -> Camera:
+    x0, y0 = camera.centre_px
+    zeros = (0.0,) * len(camera.coefficients)
+    return camera.replace(x0_px=x0, y0_px=y0, coefficients=zeros)
+
+
+def _check(study: Study, n_replicates: int, workers: int | None) -> None:
+    assumed = study.assumed_sigma_px
+    for good, text in (
+        (study.truth in TRUTHS, f"truth {study.truth!r} is unknown: use one of {', '.join(TRUTHS)}."),
+        (n_replicates >= 1, f"n_replicates is {n_replicates}: give at least 1, and at least 100 for a verdict."),
+        (study.n_frames >= 1, f"n_frames is {study.n_frames}: give at least 1."),
+        (study.min_stars >= 3, f"min_stars is {study.min_stars}: an attitude needs at least 3."),
+        (workers is None or workers >= 0, f"workers is {workers}: give at least 1, or 0 for this process."),
+        (0.0 < study.sigma_px < np.inf, f"sigma_px is {study.sigma_px:g}: give a noise above zero."),
+        (assumed is None or 0.0 < assumed < np.inf, f"assumed_sigma_px is {assumed}: give a noise above zero."),
+    ):
+        if not good:
+            raise SamplingError(text)
+    if isinstance(study.likelihood, str) and study.likelihood not in LIKELIHOODS:
+        raise SamplingError(
+            f"the likelihood {study.likelihood!r} cannot be validated: use one of {', '.join(LIKELIHOODS)}, or give a "
+            "function that makes one."
+        )
+    if study.priors.names != (*study.camera.parameter_names, "sigma"):
+        raise PriorError(
+            f"the priors are on {', '.join(study.priors.names)}, but the camera has "
+            f"{', '.join(study.camera.parameter_names)} and sigma: make them with Priors.default of this camera."
+        )
+
+
+def _commonest(reasons: Sequence[str]) -> str:
+    return Counter(reasons).most_common(1)[0][0]

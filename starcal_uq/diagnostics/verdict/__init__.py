@@ -1,0 +1,1 @@
+"""Every check of a run, and what follows from them."""

@@ -1,0 +1,139 @@
+"""The verdict on a run: did it converge, can it be trusted, and what limits it; every check with its number and bound.
+
+Pure functions of result objects. A check that fails means that the numbers must not be used; a warning means that they
+may be used by someone who has read it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from starcal_uq.core.formatting import join_words
+from starcal_uq.diagnostics.verdict import draws as sampling
+from starcal_uq.diagnostics.verdict import estimate, model, observed
+from starcal_uq.diagnostics.verdict.air import air, conditional_words, corrected_words
+from starcal_uq.diagnostics.verdict.draws import propagation_difference
+from starcal_uq.diagnostics.verdict.estimate import truth_z
+from starcal_uq.diagnostics.verdict.levels import Check, Level, Question
+from starcal_uq.diagnostics.verdict.limits import limits
+from starcal_uq.diagnostics.verdict.observed import aberration_words
+
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.diagnostics.diagnose import Diagnosis
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.observations.table import Observations
+    from starcal_uq.propagation.propagate import AttitudeError
+
+__all__ = [
+    "Check",
+    "Level",
+    "Question",
+    "Verdict",
+    "aberration_words",
+    "air",
+    "conditional_words",
+    "corrected_words",
+    "judge",
+    "limits",
+    "propagation_difference",
+    "truth_z",
+    "worst",
+]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """All checks and what follows from them.
+
+    Attributes
+    ----------
+    checks : tuple of Check
+        In reading order.
+    headline : str
+        The verdict in one sentence.
+    """
+
+    checks: tuple[Check, ...]
+    headline: str
+
+    @property
+    def level(self) -> Level:
+        """The worst outcome."""
+        return worst(self.checks)
+
+    def of(self, question: Question) -> tuple[Check, ...]:
+        """The checks that answer one question."""
+        return tuple(check for check in self.checks if check.question is question)
+
+    def at(self, level: Level) -> tuple[Check, ...]:
+        """The checks with this outcome."""
+        return tuple(check for check in self.checks if check.level is level)
+
+
+def worst(checks: tuple[Check, ...]) -> Level:
+    """The worst outcome among checks."""
+    return max((check.level for check in checks), key=lambda level: level.rank, default=Level.PASS)
+
+
+def judge(
+    obs: Observations,
+    cal: Calibration,
+    post: Posterior | None = None,
+    truth: Camera | None = None,
+    attitude: AttitudeError | None = None,
+    diagnosis: Diagnosis | None = None,
+) -> Verdict:
+    """Check a run.
+
+    Parameters
+    ----------
+    obs, cal
+        The data and the estimate made from them.
+    post
+        The posterior, if there is one.
+    truth
+        The camera of a simulation, if it is known.
+    attitude
+        The propagated attitude error, if there is one.
+    diagnosis
+        What questions the model, if it was made.
+    """
+    checks: list[Check | None] = [estimate.estimation(cal), estimate.estimators_agree(cal)]
+    if diagnosis is not None and diagnosis.starts is not None:
+        checks += [model.starts(diagnosis.starts)]
+    if post is not None:
+        from starcal_uq.inference.derived import derived_quantities
+
+        checks += [sampling.same_data(post, obs)]
+        checks += [sampling.chains_agree(post), sampling.effective_draws(post), sampling.acceptance(post)]
+        checks += [sampling.derived_converged(derived_quantities(post)), sampling.digits(post), sampling.bounds(post)]
+        checks += [sampling.independent_posterior(post), sampling.likelihood_exact(post)]
+        checks += [sampling.likelihood_kind(post)]
+    checks += [observed.directions(obs, cal), observed.residual_pattern(obs, cal), observed.outliers(obs, cal)]
+    checks += [observed.noise(cal), observed.coverage(obs, cal)]
+    if diagnosis is not None:
+        checks += model.model_checks(diagnosis)
+    if post is not None:
+        checks += [sampling.prior_influence(post)]
+    if attitude is not None:
+        checks += [sampling.propagation(attitude)]
+    if truth is not None and truth.parameter_names == cal.parameter_names:
+        checks += [estimate.against_truth(cal, truth, post)]
+    found = tuple(check for check in checks if check is not None)
+    return Verdict(found, _headline(found, post is not None))
+
+
+def _headline(checks: tuple[Check, ...], sampled: bool) -> str:
+    failed = [c.phrase for c in checks if c.level is Level.FAIL]
+    warned = [c.phrase for c in checks if c.level is Level.WARN]
+    if failed:
+        return f"Do not use these numbers: {join_words(failed)} failed."
+    if warned:
+        start = "Converged; usable once " + ("this warning is" if len(warned) == 1 else "these warnings are")
+        return f"{start} resolved or accepted: {join_words(warned)}."
+    if not sampled:
+        return "The estimate converged and passed every check; the posterior has not been sampled yet."
+    return "Converged, and every check passed: the stated uncertainties can be used."

@@ -1,0 +1,127 @@
+"""What limits the result, in sentences: the largest term of the attitude error, the coupling, the systematics."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.core.formatting import significant
+from starcal_uq.diagnostics.residuals import bin_residuals
+from starcal_uq.diagnostics.verdict.air import air
+from starcal_uq.diagnostics.verdict.model import MISFIT_P
+from starcal_uq.diagnostics.verdict.observed import ARCSEC_PER_RAD, PATTERN_P
+
+if TYPE_CHECKING:
+    from starcal_uq.diagnostics.diagnose import Diagnosis
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.observations.table import Observations
+    from starcal_uq.propagation.coupling import Coupling
+    from starcal_uq.propagation.propagate import AttitudeError
+
+_STRONG = 0.7
+# A shift within two standard deviations is what noise in the further parameters gives.
+_MODEL_SIGMAS = 2.0
+_CROSS = slice(0, 2)
+
+
+def limits(
+    obs: Observations,
+    cal: Calibration,
+    coupling: Coupling | None = None,
+    attitude: AttitudeError | None = None,
+    diagnosis: Diagnosis | None = None,
+) -> tuple[str, ...]:
+    """What limits the result, the most important first; one sentence each.
+
+    Parameters
+    ----------
+    obs, cal
+        The data and the estimate.
+    coupling, attitude
+        Results of `starcal_uq.coupling` and `starcal_uq.propagate`, where they exist.
+    diagnosis
+        Tests for misfit and the comparison of models, where they exist.
+    """
+    found = [_systematic(obs, cal)]
+    found += [_structure(cal, diagnosis), _model_choice(cal, diagnosis)] if diagnosis is not None else []
+    found += [_attitude(attitude)] if attitude is not None else []
+    found += [_coupled(coupling)] if coupling is not None else []
+    return tuple(sentence for sentence in found if sentence)
+
+
+def _systematic(obs: Observations, cal: Calibration) -> str:
+    binned = bin_residuals(cal, obs)
+    if binned.p_value < PATTERN_P:
+        arcsec = binned.pattern_px / cal.camera.focal_px * ARCSEC_PER_RAD
+        return (
+            f"The model: residuals keep a pattern of {significant(arcsec)} arcsec, which more frames will not remove."
+        )
+    if obs.meta.get("directions") != "apparent":
+        return "Knowledge of the directions: until they are known to be apparent, f is conditional on that."
+    if air(obs) == "unknown":
+        return "Refraction: until the site is stated, or that the camera was in space, f is conditional on it."
+    return ""
+
+
+def _structure(cal: Calibration, diagnosis: Diagnosis) -> str:
+    """The largest pattern among those that the tests found."""
+    sized = [test for test in diagnosis.misfit.found(MISFIT_P) if test.size_px > 0.0]
+    if not sized:
+        return ""
+    worst = max(sized, key=lambda test: test.size_px)
+    arcsec = worst.size_px / cal.camera.focal_px * ARCSEC_PER_RAD
+    return (
+        f"The model: the largest structure that it leaves in the residuals is {worst.name}, "
+        f"{significant(worst.size_px)} px ({significant(arcsec)} arcsec) per star."
+    )
+
+
+def _model_choice(cal: Calibration, diagnosis: Diagnosis) -> str:
+    """How far attitudes move under models that fit as well, where that is more than the uncertainty within one."""
+    if diagnosis.comparison is None:
+        return ""
+    others = [score for score in diagnosis.comparison.accepted if score.model != diagnosis.comparison.fitted]
+    if not others:
+        return ""
+    score = max(others, key=lambda s: float(np.hypot(*s.common_arcsec[:2])))
+    moved = float(np.hypot(*score.common_arcsec[:2]))
+    covariance = cal.rotation_per_theta @ cal.covariance @ cal.rotation_per_theta.T
+    within = float(np.sqrt(np.trace(covariance[:2, :2]))) * ARCSEC_PER_RAD
+    if moved <= _MODEL_SIGMAS * within:
+        return ""
+    return (
+        f"The choice of the distortion model: {score.model!r} fits as well and moves attitudes by {significant(moved)} "
+        f"arcsec in common across the boresight; the uncertainty within {cal.camera.distortion!r} is "
+        f"{significant(within)} arcsec."
+    )
+
+
+def _attitude(error: AttitudeError) -> str:
+    """Compare the terms across the boresight, where missions state their requirement."""
+    names = ("centroid noise of a single frame", "the calibration's common rotation", "the calibration's rest")
+    values = [
+        float(np.sqrt(np.mean(np.asarray(v)[_CROSS] ** 2)))
+        for v in (error.nea_arcsec, error.common_arcsec, error.rest_arcsec)
+    ]
+    noise, common, rest = (f"{significant(v)} arcsec" for v in values)
+    largest = names[int(np.argmax(values))]
+    if values[1] == max(values):
+        return (
+            f"Attitude across the boresight: {largest} ({common}, one constant) exceeds centroid noise ({noise}, per "
+            f"frame). Alignment calibration with these parameters absorbs it; {rest} remains."
+        )
+    return f"Attitude across the boresight: {largest} dominates (noise {noise}, common rotation {common}, rest {rest})."
+
+
+def _coupled(coupling: Coupling) -> str:
+    pairs = coupling.pairs(_STRONG)
+    if not pairs:
+        return "Coupling: no two parameters are strongly coupled; every sigma falls as one over the root of the frames."
+    first, second, value = pairs[0]
+    ratio = coupling.sigma_marginal / coupling.sigma_conditional
+    worst = int(np.argmax(ratio))
+    return (
+        f"Coupling: {first} trades against {second} (correlation {value:.2f}); with the other parameters known, "
+        f"{coupling.parameter_names[worst]} would be {significant(float(ratio[worst]))} times better determined."
+    ).replace("-", "−")

@@ -1,0 +1,156 @@
+"""Checks of the data and of what the model leaves over."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.core.formatting import fixed, percent, plural, significant
+from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals
+from starcal_uq.diagnostics.verdict.air import REMEDY, air, conditional_words
+from starcal_uq.diagnostics.verdict.levels import Check, Level, Question, pass_or_warn
+from starcal_uq.sky.site import Site
+
+if TYPE_CHECKING:
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.observations.table import Observations
+
+# Earth's orbital speed over that of light: the constant of annual aberration, rad.
+ABERRATION_RAD = 9.94e-5
+ARCSEC_PER_RAD = 648000.0 / np.pi
+PLAUSIBLE_NOISE_PX = (0.003, 0.5)
+PLAUSIBLE_SCALE = (0.7, 1.5)
+PATTERN_P, OUTLIER_P = 1e-3, 1e-3
+PATTERN_FAIL_SIGMA = 0.5
+OUTLIER_SIGMA = 4.5
+COVERED_SHARE = 0.85
+MIN_FRAMES = 5
+
+
+def directions(obs: Observations, cal: Calibration) -> Check:
+    """Is annual aberration in the directions, and refraction where there is air?"""
+    declared = str(obs.meta.get("directions", "undeclared"))
+    name, threshold = "Catalogue directions", "apparent"
+    seen = air(obs)
+    if declared == "apparent" and seen == "unknown":
+        sentence = f"Aberration is in the directions, refraction is not. {conditional_words(cal)} {REMEDY}"
+        return Check(name, Question.TRUSTWORTHY, Level.WARN, "without refraction", threshold, sentence)
+    if declared == "apparent":
+        sentence = "The directions are declared as apparent: aberration is in them."
+        if obs.meta.get("observer") == "space":
+            sentence = "Aberration is in the directions; the camera was in space."
+        if seen == "corrected":
+            sentence = (
+                f"Aberration and refraction at the site ({Site.from_dict(obs.meta['site'])}) are in the directions."
+            )
+        return Check(name, Question.TRUSTWORTHY, Level.PASS, declared, threshold, sentence)
+    sentence = f"{_undeclared(obs)} {aberration_words(cal)}"
+    if seen == "unknown":
+        sentence += f" {conditional_words(cal)} {REMEDY}"
+    return Check(name, Question.TRUSTWORTHY, Level.WARN, declared, threshold, sentence)
+
+
+def aberration_words(cal: Calibration) -> str:
+    """What annual aberration can do to this camera if it is not in the directions."""
+    camera = cal.camera
+    diagonal_rad = 2.0 * np.arctan(np.hypot(camera.width_px, camera.height_px) / 2.0 / camera.focal_px)
+    angle = fixed(ABERRATION_RAD * diagonal_rad * ARCSEC_PER_RAD, 1)
+    shift_px = ABERRATION_RAD * camera.focal_px
+    ratio = significant(shift_px / float(cal.sigmas[2]))
+    return (
+        f"Annual aberration changes angles by up to {angle} arcsec from corner to corner of this field and can move f "
+        f"by up to {significant(shift_px)} px, {ratio} times its sigma."
+    )
+
+
+def residual_pattern(obs: Observations, cal: Calibration) -> Check:
+    """Do mean residuals over the field show more than noise?"""
+    binned = bin_residuals(cal, obs)
+    p_value, pattern = binned.p_value, binned.pattern_px
+    share = pattern / _noise_px(obs, cal)
+    cells = len(binned.counts)
+    if p_value >= PATTERN_P:
+        level, sentence = Level.PASS, f"Mean residuals in {plural(cells, 'cell')} of the field are what noise gives."
+    else:
+        level = Level.FAIL if share > PATTERN_FAIL_SIGMA else Level.WARN
+        arcsec = pattern / cal.camera.focal_px * ARCSEC_PER_RAD
+        sentence = (
+            f"The residuals show a pattern of {significant(pattern)} px per axis ({significant(arcsec)} arcsec) that "
+            "the model does not explain; it is not in any interval of this report."
+        )
+    value = f"p = {significant(p_value)}" + (f", pattern {significant(pattern)} px" if pattern > 0.0 else "")
+    return Check("Pattern in the residuals", Question.TRUSTWORTHY, level, value, f"p ≥ {PATTERN_P:g}", sentence)
+
+
+def outliers(obs: Observations, cal: Calibration) -> Check:
+    """Are there more large residuals than Gaussian noise gives?"""
+    from scipy.special import erfc, pdtrc
+
+    z = np.abs(normalised_residuals(cal, obs))
+    found = int(np.count_nonzero(np.any(z > OUTLIER_SIGMA, axis=1)))
+    expected = obs.n_stars * 2.0 * float(erfc(OUTLIER_SIGMA / np.sqrt(2.0)))
+    # Probability of at least `found` where `expected` are expected (Poisson).
+    p_value = 1.0 if found == 0 else float(pdtrc(found - 1, expected))
+    good = p_value >= OUTLIER_P
+    worst_row = int(np.argmax(z.max(axis=1)))
+    place = f"largest {fixed(float(z.max()), 1)} sigma, in frame {obs.frame[worst_row]}"
+    sentence = (
+        f"As many as Gaussian noise gives ({place})."
+        if good
+        else f"More than Gaussian noise gives ({place}): look for wrong identifications and disturbed centroids."
+    )
+    value = f"{plural(found, 'star')} beyond {OUTLIER_SIGMA:g} sigma"
+    threshold = f"about {significant(expected)} expected"
+    return Check("Outliers", Question.TRUSTWORTHY, pass_or_warn(good), value, threshold, sentence)
+
+
+def noise(cal: Calibration) -> Check:
+    """Is the estimated noise that of star centroids?"""
+    scaled = cal.sigma_name == "sigma_scale"
+    low, high = PLAUSIBLE_SCALE if scaled else PLAUSIBLE_NOISE_PX
+    good = low <= cal.sigma <= high
+    unit = "" if scaled else " px"
+    value = f"{significant(cal.sigma, 3)}{unit}"
+    if good:
+        sentence = "The stated noise of the stars is confirmed." if scaled else "Usual for star centroids."
+    elif cal.sigma > high:
+        sentence = (
+            "Far more scatter than centroids have: identifications, camera file or distortion model may be wrong."
+        )
+    else:
+        sentence = "Less scatter than centroids have: the stated noise is too large, or the data are not measurements."
+    name = "Factor on the stated noise" if scaled else "Centroid noise per axis"
+    threshold = f"{low:g} to {high:g}{unit}"
+    return Check(name, Question.TRUSTWORTHY, pass_or_warn(good), value, threshold, sentence)
+
+
+def coverage(obs: Observations, cal: Calibration) -> Check:
+    """Did the stars cover the field, and how many frames were there?"""
+    binned = bin_residuals(cal, obs)
+    share = len(binned.counts) / max(len(binned.counts) + binned.n_empty, 1)
+    value = f"{percent(share, 3)} of the field, {plural(obs.n_frames, 'frame')}"
+    threshold = f"≥ {percent(COVERED_SHARE)}, ≥ {MIN_FRAMES} frames"
+    if share < COVERED_SHARE:
+        level, sentence = Level.WARN, "Parts of the field hold no stars: the distortion is extrapolated there."
+    elif obs.n_frames < MIN_FRAMES:
+        level, sentence = Level.WARN, "Few frames: errors common to a whole frame cannot be told from the camera."
+    else:
+        level, sentence = Level.PASS, "Stars covered the field, so that no part of it is extrapolated."
+    return Check("Coverage of the field", Question.TRUSTWORTHY, level, value, threshold, sentence)
+
+
+def _noise_px(obs: Observations, cal: Calibration) -> float:
+    stated = 1.0 if obs.sigma_px is None else float(np.sqrt(np.mean(obs.sigma_px**2)))
+    return cal.sigma * stated
+
+
+def _undeclared(obs: Observations) -> str:
+    if obs.directions_declared:
+        return "The directions come straight from a catalogue."
+    if obs.time_utc is None:
+        return (
+            "Neither time nor observer velocity was declared, so it is not known whether aberration is in the "
+            "directions."
+        )
+    return "The table has times, but it was not declared whether aberration is in the directions."

@@ -1,0 +1,224 @@
+"""From observations to a calibration: three stages, then refinement on the attitude-marginalised likelihood."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import rotation_to_quaternion
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import sigma_parameter
+from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.status import Status
+from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, assemble, check_camera, noise_px
+from starcal_uq.estimation.baselines import check_count, least_squares, recursive
+from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.pairs import PairObjective
+from starcal_uq.estimation.recursive.recursion_options import RECURSIVE_METHODS, RecursionOptions
+from starcal_uq.estimation.recursive.stream import raise_unless_good
+from starcal_uq.estimation.robust import compress_reweighted, refine, robust_start
+from starcal_uq.estimation.solvers import is_singular
+from starcal_uq.estimation.stages import Stage, distortion_stage, joint_stage, optics_stage, refinement_stage
+from starcal_uq.estimation.student import parse_dof
+from starcal_uq.observations.frames import StarFrames
+from starcal_uq.observations.table import Observations
+from starcal_uq.runs.folder import provenance
+
+METHODS = ("efficient", "three_stage", "least_squares", "samaan", "griffith")
+LIKELIHOODS = ("marginal", "student_t")
+SOLVERS = ("lm", "minpack", "ipopt")
+# Stage 1 that moves the principal point by more than this fraction of the width has met strong distortion.
+_FAR = 0.05
+
+
+def calibrate(
+    obs: Observations | Iterable[Observations],
+    camera: Camera,
+    *,
+    method: str = "efficient",
+    solver: str = "lm",
+    max_iterations: int = 200,
+    throw: bool = True,
+    likelihood: str = "marginal",
+    dof: float | str | None = None,
+    recursion: RecursionOptions | None = None,
+) -> Calibration:
+    """Estimate optics and distortion from identified stars.
+
+    Parameters
+    ----------
+    obs : Observations or iterable of Observations
+        Stars with pixel positions and catalogue directions; at least three per frame. The recursive methods also take
+        a stream: any iterable of Observations of one or several frames, such as `stream_frames`. They keep none of
+        them, so that the result has no residuals and attitudes.
+    camera : Camera
+        Start values; its `distortion` names the model. The coefficients start from zero, as in the paper.
+    method : {"efficient", "three_stage", "least_squares", "samaan", "griffith"}
+        ``three_stage`` is Ye & Yang 2017: interstar angles without distortion, linear distortion, interstar angles with
+        both; its covariance is the sandwich of composite likelihood. ``efficient`` goes on to the
+        attitude-marginalised likelihood, whose covariance is the Cramer-Rao bound. The others are what the paper
+        compares itself with: ``least_squares`` fits the optics to interstar angles as if there were no distortion, and
+        its result's model is ``none``; ``samaan`` filters the optics frame by frame from the least-squares solution of
+        the first frames, and fits the distortion linearly afterwards; ``griffith`` is recursive least squares from the
+        start values, for the optics alone (model ``none``) unless `recursion` says otherwise. Their covariances are the
+        spread over repeated data sets; the bias from the distortion that they ignore is not in them.
+    solver : {"lm", "minpack", "ipopt"}
+        Levenberg-Marquardt on normal equations, MINPACK on explicit pairs (where there are at most 500,000 of them), or
+        IPOPT with the principal point kept on the detector, f > 0 and the distortion monotonic. The refinement always
+        uses the first; the recursive methods use none.
+    max_iterations : int
+        Limit for each stage.
+    throw : bool
+        Raise when the estimate is not good; otherwise `Calibration.status` says so, as long as there is an estimate.
+    likelihood : {"marginal", "student_t"}
+        What the refinement maximises: Gaussian noise, or a Student t per star for tables with wrong identifications.
+        With ``student_t`` the stages see only stars whose angles agree with those of their frame, the refinement sees
+        all that can be in the field, `covariance` is the sandwich one, `information` the observed one, `sigma` the
+        scale of the t, `chi2` is summed with the stars' weights, and `compressed` is the Gaussian likelihood of the
+        reweighted stars.
+    dof : float or "free", optional
+        Degrees of freedom of ``student_t``, 2 to 200, by default 4; "free" estimates them, with the gamma prior of
+        Juarez & Steel (2010) on what exceeds 2.
+    recursion : RecursionOptions, optional
+        Options of ``samaan`` and ``griffith``.
+
+    Returns
+    -------
+    Calibration
+        With estimate, covariance, residuals, attitudes and the trajectory of every stage.
+
+    Raises
+    ------
+    CalibrationError
+        When there are too few stars, or, with `throw`, when the status is not CONVERGED.
+    """
+    if method not in METHODS:
+        raise CalibrationError(f"method {method!r} is unknown: use one of {', '.join(METHODS)}.")
+    if solver not in SOLVERS:
+        raise CalibrationError(f"solver {solver!r} is unknown: use one of {', '.join(SOLVERS)}.")
+    if likelihood not in LIKELIHOODS:
+        raise CalibrationError(f"likelihood {likelihood!r} is unknown: use one of {', '.join(LIKELIHOODS)}.")
+    nu = parse_dof(dof, CalibrationError)
+    if likelihood == "marginal" and dof is not None:
+        raise CalibrationError("degrees of freedom (dof) belong to likelihood='student_t': leave dof out, or use that.")
+    if likelihood == "student_t" and method != "efficient":
+        raise CalibrationError(
+            f"method {method!r} has no Student-t likelihood: use method='efficient', or likelihood='marginal'."
+        )
+    if recursion is not None and method not in RECURSIVE_METHODS:
+        raise CalibrationError(f"method {method!r} is not recursive: leave recursion out, or use samaan or griffith.")
+    if method in RECURSIVE_METHODS:
+        calibration = recursive(obs, camera, method, recursion)
+    elif not isinstance(obs, Observations):
+        raise CalibrationError(
+            f"method {method!r} needs all frames at once, as Observations: load them, or use samaan or griffith."
+        )
+    elif method == "least_squares":
+        calibration = least_squares(obs, camera, solver, max_iterations)
+    else:
+        frames = StarFrames.from_observations(obs)
+        gaussian = MarginalLikelihood(frames, camera.distortion)
+        check_count(gaussian, camera)
+        if likelihood == "student_t":
+            calibration = _robust(obs, camera, frames, solver, max_iterations, nu)
+        else:
+            calibration = _gaussian(obs, camera, gaussian, method, solver, max_iterations)
+    if throw:
+        raise_unless_good(calibration.status)
+    return calibration
+
+
+def _gaussian(
+    obs: Observations, camera: Camera, likelihood: MarginalLikelihood, method: str, solver: str, max_iterations: int
+) -> Calibration:
+    pairs = PairObjective(likelihood.frames, camera.distortion)
+    stages = _pair_stages(pairs, camera, solver, max_iterations)
+    pair_theta = stages[-1].theta
+    pair_covariance = pairs.godambe(pair_theta)
+    status = stages[-1].status
+    if status.ok:
+        likelihood.use_rotations(likelihood.start_rotations(pair_theta))
+        if noise_px(likelihood, pair_theta) > IMPLAUSIBLE_NOISE * camera.width_px:
+            # Interstar angles do not see a mirror, nor does their noise show a few wrong stars; positions do.
+            status = Status.INCONSISTENT
+        elif method == "efficient":
+            stages.append(refinement_stage(likelihood, pair_theta, max_iterations))
+            status = stages[-1].status
+    return assemble(obs, camera, method, solver, likelihood, stages, status, pair_theta, pair_covariance)
+
+
+def _robust(
+    obs: Observations, camera: Camera, frames: StarFrames, solver: str, max_iterations: int, nu: float | None
+) -> Calibration:
+    model = camera.distortion
+
+    def fit(trusted: StarFrames, all_parameters: bool) -> list[Stage]:
+        if all_parameters:
+            return _pair_stages(PairObjective(trusted, model), camera, solver, max_iterations)
+        return [optics_stage(trusted, camera, solver, max_iterations)]
+
+    start = robust_start(frames, model, camera.theta, fit)
+    pair_theta = start.stages[-1].theta
+    found = refine(frames, model, pair_theta, start.rotations, nu, max_iterations)
+    theta, sigma, state, information = found.stage.theta, found.sigma, found.state, found.information
+    status = found.stage.status
+    if not np.isfinite(state.value) or is_singular(information.matrix):
+        reason = status if not status.ok else Status.SINGULAR
+        raise CalibrationError(f"the calibration failed ({reason.name}): {reason.remedy}.", reason)
+    weight = frames.weight
+    result = camera.with_theta(theta)
+    residuals = state.e if weight is None else state.e / weight
+    settings: dict[str, object] = {"method": "efficient", "solver": solver, "distortion": model}
+    settings |= {"likelihood": "student_t", "dof": "free" if nu is None else nu}
+    record = provenance(None, settings, obs.data_hash)
+    record["student_t"] = {"dof": found.nu, "dof_std": found.nu_std, "stars_out_of_field": int(np.sum(~state.seen))}
+    return Calibration(
+        camera=result,
+        nominal=camera,
+        method="efficient",
+        solver=solver,
+        theta=theta,
+        covariance=found.covariance,
+        sigma=sigma,
+        sigma_std=found.sigma_std,
+        sigma_name=sigma_parameter(weight is not None).name,
+        stages=(*start.stages, found.stage),
+        status=check_camera(result, status),
+        frame_ids=obs.frame_ids,
+        quaternions=rotation_to_quaternion(state.rotations),
+        residuals_px=residuals.T,
+        chi2=float(np.sum(state.weight * state.e**2)),
+        dof=state.dof - len(theta),
+        information=information.matrix,
+        rotation_per_theta=information.rotation_per_theta,
+        attitude_noise=information.attitude_noise,
+        pair_theta=pair_theta,
+        pair_covariance=PairObjective(start.frames, model).godambe(pair_theta),
+        compressed=compress_reweighted(found),
+        provenance=record,
+    )
+
+
+def _pair_stages(pairs: PairObjective, camera: Camera, solver: str, max_iterations: int) -> list[Stage]:
+    frames = pairs.frames
+    stages = [optics_stage(frames, camera, solver, max_iterations)]
+    # Without an optical axis there is nothing to attach the distortion to; later stages would only hide it.
+    if len(camera.theta) > 3 and stages[0].status is not Status.NOT_FINITE:
+        stages.append(distortion_stage(frames, camera, stages[0].theta))
+        stages.append(joint_stage(pairs, camera, stages[1].theta, solver, max_iterations))
+        moved = float(np.max(np.abs(stages[0].theta[:2] - camera.theta[:2])))
+        if not stages[-1].status.ok or moved > _FAR * camera.width_px:
+            # Distortion of tens of pixels pulls the undistorted fit far from the axis, and the linear stage may then
+            # lead to another minimum or into a fold; the nominal optics without distortion are the safer start.
+            start = np.concatenate([camera.theta[:3], np.zeros(len(camera.theta) - 3)])
+            again = joint_stage(pairs, camera, start, solver, max_iterations)
+            stages[-1] = min(stages[-1], again, key=_badness)
+    return stages
+
+
+def _badness(stage: Stage) -> tuple[bool, float]:
+    """Converged before not, then by cost."""
+    cost = float(stage.cost[-1])
+    return not stage.status.ok, cost if np.isfinite(cost) else float("inf")

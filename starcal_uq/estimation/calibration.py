@@ -1,0 +1,297 @@
+"""The result of a calibration: estimate, uncertainty and how it was reached; saves itself without loss."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import parameters
+from starcal_uq.core.errors import CalibrationError, RunFolderError
+from starcal_uq.core.formatting import decimals_for, fixed
+from starcal_uq.core.status import Status
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray
+from starcal_uq.estimation.compressed import CompressedLikelihood
+from starcal_uq.estimation.stages import Stage
+from starcal_uq.runs.folder import atomic_path, atomic_write_text
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from starcal_uq.observations.table import Observations
+
+_ARRAYS = (
+    "theta",
+    "covariance",
+    "frame_ids",
+    "quaternions",
+    "residuals_px",
+    "information",
+    "rotation_per_theta",
+    "attitude_noise",
+    "pair_theta",
+    "pair_covariance",
+)
+_SCALARS = ("method", "solver", "sigma", "sigma_std", "sigma_name", "chi2", "dof", "provenance")
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Optics and distortion estimated from star observations.
+
+    p is the number of parameters, K of frames, N of stars. A recursive method that was given a stream of frames has
+    kept none of them: its `frame_ids`, `quaternions` and `residuals_px` are empty, `chi2` and `compressed` are those of
+    the linearised frames, and `n_stars` and `n_frames` count what went by.
+
+    Attributes
+    ----------
+    camera : Camera
+        The estimate.
+    nominal : Camera
+        The start.
+    method : str
+        ``efficient``, ``three_stage``, ``least_squares``, ``samaan`` or ``griffith``.
+    solver : str
+        ``lm``, ``minpack``, ``ipopt``, or ``filter`` for the recursive methods.
+    theta : (p,) array
+        Estimate in px units, order x0, y0, f, k...
+    covariance : (p, p) array
+        Its covariance at the estimated noise.
+    sigma : float
+        Estimated noise: px per axis, or a factor on the stated noise of the stars.
+    sigma_std : float
+        Its standard error.
+    sigma_name : str
+        ``sigma`` or ``sigma_scale``.
+    stages : tuple of Stage
+        Trajectories of the stages.
+    status : Status
+        Converged, or why not.
+    frame_ids : (K,) array of int
+        Frames.
+    quaternions : (K, 4) array
+        Scalar-last R_cam_icrs at the estimate.
+    residuals_px : (N, 2) array
+        Observed minus predicted, px, rows as in the observations.
+    chi2 : float
+        Sum of squared residuals, px^2 (or in units of the stated noise).
+    dof : int
+        Degrees of freedom: ``sum_k (2 m_k - 3) - p``.
+    information : (p, p) array
+        Fisher information of the likelihood with the attitudes eliminated, at `sigma`.
+    rotation_per_theta : (3, p) array
+        Mean over frames of d(attitude, rad)/d(theta): the common rotation that a wrong parameter causes.
+    attitude_noise : (3, 3) array
+        Mean over frames of the attitude covariance due to centroid noise, rad^2.
+    pair_theta : (p,) array
+        Estimate from interstar angles: that of stage 3, the paper's, or of the method itself where it has no other.
+    pair_covariance : (p, p) array
+        Its sandwich (Godambe) covariance.
+    compressed : CompressedLikelihood
+        The whole data set's likelihood around the estimate.
+    provenance : dict
+        Versions, settings, time and the hash of the data.
+    """
+
+    camera: Camera
+    nominal: Camera
+    method: str
+    solver: str
+    theta: FloatArray
+    covariance: FloatArray
+    sigma: float
+    sigma_std: float
+    sigma_name: str
+    stages: tuple[Stage, ...]
+    status: Status
+    frame_ids: IntArray
+    quaternions: FloatArray
+    residuals_px: FloatArray
+    chi2: float
+    dof: int
+    information: FloatArray
+    rotation_per_theta: FloatArray
+    attitude_noise: FloatArray
+    pair_theta: FloatArray
+    pair_covariance: FloatArray
+    compressed: CompressedLikelihood
+    provenance: AnyDict
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Names of the parameters, in order."""
+        return self.camera.parameter_names
+
+    @property
+    def sigmas(self) -> FloatArray:
+        """Standard deviation of each parameter, (p,)."""
+        return np.sqrt(np.diag(self.covariance))
+
+    @property
+    def correlation(self) -> FloatArray:
+        """Correlation matrix, (p, p)."""
+        correlation: FloatArray = self.covariance / np.outer(self.sigmas, self.sigmas)
+        return correlation
+
+    @property
+    def n_stars(self) -> int:
+        """Number of stars."""
+        return len(self.residuals_px) or self.compressed.n_stars
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+        return len(self.frame_ids) or self.compressed.n_frames
+
+    @property
+    def has_residuals(self) -> bool:
+        """False for the result of a stream, whose stars are gone."""
+        return len(self.residuals_px) > 0
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """One row per parameter: start, estimate, sigma and unit; the noise is the last row."""
+        import pandas as pd
+
+        rows = [
+            {"parameter": p.name, "start": start, "estimate": value, "sigma": sigma, "unit": p.unit}
+            for p, start, value, sigma in zip(
+                parameters(self.camera.distortion), self.nominal.theta, self.theta, self.sigmas, strict=True
+            )
+        ]
+        unit = "px" if self.sigma_name == "sigma" else "1"
+        rows.append(
+            {
+                "parameter": self.sigma_name,
+                "start": np.nan,
+                "estimate": self.sigma,
+                "sigma": self.sigma_std,
+                "unit": unit,
+            }
+        )
+        return pd.DataFrame(rows)
+
+    def _repr_html_(self) -> str:
+        rows = []
+        for parameter, value, sigma in zip(parameters(self.camera.distortion), self.theta, self.sigmas, strict=True):
+            scaled, error = value / parameter.scale, sigma / parameter.scale
+            decimals = decimals_for(error)
+            rows.append(
+                f"<tr><th>{parameter.name}</th><td>{fixed(scaled, decimals)}</td><td>{fixed(error, decimals)}</td>"
+                f"<td>{parameter.scaled_unit}</td></tr>"
+            )
+        decimals = decimals_for(self.sigma_std)
+        rows.append(
+            f"<tr><th>{self.sigma_name}</th><td>{fixed(self.sigma, decimals)}</td>"
+            f"<td>{fixed(self.sigma_std, decimals)}</td><td>{'px' if self.sigma_name == 'sigma' else ''}</td></tr>"
+        )
+        return (
+            f"<p><b>Calibration</b> ({self.method}, {self.solver}): {self.status.name.lower().replace('_', ' ')}; "
+            f"{self.n_stars} stars in {self.n_frames} frames; focal length {self.camera.focal_mm:.5f} mm</p>"
+            "<table><thead><tr><th>parameter</th><th>estimate</th><th>sigma</th><th>unit</th></tr></thead>"
+            f"<tbody>{''.join(rows)}</tbody></table>"
+        )
+
+    def plot_convergence(self, **options: Any) -> Any:
+        """Estimates against iteration through the stages (the paper's Fig. 3); returns the matplotlib Figure."""
+        from starcal_uq.presentation.figures.estimation import plot_convergence
+
+        return plot_convergence(self, **options)
+
+    def plot_residuals(self, obs: Observations, **options: Any) -> Any:
+        """Residuals over the field, against radius, and against a Gaussian; returns the matplotlib Figure."""
+        if not self.has_residuals:
+            raise CalibrationError(
+                "this calibration comes from a stream of frames and kept no residuals: calibrate loaded observations."
+            )
+        from starcal_uq.presentation.figures.residuals import plot_residuals
+
+        return plot_residuals(self, obs, **options)
+
+    def __repr__(self) -> str:
+        values = ", ".join(
+            f"{name}={value:.8g}+-{sigma:.2g}"
+            for name, value, sigma in zip(self.parameter_names, self.theta, self.sigmas, strict=True)
+        )
+        return f"Calibration({values}, {self.sigma_name}={self.sigma:.4g}, {self.status.name})"
+
+    def save(self, path: str | Path) -> None:
+        """Write ``path`` (JSON) and, beside it, the large arrays as ``.npz``; each file atomically.
+
+        Parameters
+        ----------
+        path : str or Path
+            File ending in ``.json``; overwritten.
+        """
+        path = Path(path)
+        arrays: dict[str, FloatArray] = {}
+        stages = []
+        for index, stage in enumerate(self.stages):
+            arrays[f"stage{index}_trajectory"], arrays[f"stage{index}_cost"] = stage.trajectory, stage.cost
+            if stage.sigmas is not None:
+                arrays[f"stage{index}_sigmas"] = stage.sigmas
+            stages.append(
+                {
+                    "name": stage.name,
+                    "status": stage.status.name,
+                    "iterations": len(stage.trajectory) - 1,
+                    "evaluations": stage.evaluations,
+                    "seconds": stage.seconds,
+                    "theta": stage.theta.tolist(),
+                }
+            )
+        large = ("frame_ids", "quaternions", "residuals_px")
+        arrays |= {name: getattr(self, name) for name in large}
+        document: AnyDict = {"status": self.status.name, "parameter_names": list(self.parameter_names)}
+        document |= {name: getattr(self, name) for name in _SCALARS}
+        document |= {name: getattr(self, name).tolist() for name in _ARRAYS if name not in large}
+        document["camera"], document["nominal"] = self.camera.to_dict(), self.nominal.to_dict()
+        document["stages"], document["compressed"] = stages, self.compressed.to_dict()
+        with atomic_path(path.with_suffix(".npz")) as temporary, temporary.open("wb") as stream:
+            # The archive's writer is typed for arrays only by name.
+            np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
+        atomic_write_text(path, json.dumps(document, indent=1) + "\n")
+
+    @classmethod
+    def load(cls, path: str | Path) -> Calibration:
+        """Inverse of `save`.
+
+        Raises
+        ------
+        RunFolderError
+            When a file is missing or not a calibration.
+        """
+        path = Path(path)
+        try:
+            document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+            with np.load(path.with_suffix(".npz")) as archive:
+                arrays = {name: archive[name] for name in archive.files}
+            stages = tuple(
+                Stage(
+                    name=stage["name"],
+                    trajectory=arrays[f"stage{index}_trajectory"],
+                    cost=arrays[f"stage{index}_cost"],
+                    status=Status[stage["status"]],
+                    evaluations=stage["evaluations"],
+                    seconds=stage["seconds"],
+                    sigmas=arrays.get(f"stage{index}_sigmas"),
+                )
+                for index, stage in enumerate(document["stages"])
+            )
+            values: AnyDict = {name: arrays[name] if name in arrays else np.asarray(document[name]) for name in _ARRAYS}
+            return cls(
+                camera=Camera.from_dict(document["camera"]),
+                nominal=Camera.from_dict(document["nominal"]),
+                stages=stages,
+                status=Status[document["status"]],
+                compressed=CompressedLikelihood.from_dict(document["compressed"]),
+                **(values | {name: document[name] for name in _SCALARS}),
+            )
+        except (OSError, KeyError, ValueError, TypeError) as error:
+            raise RunFolderError(
+                f"{path}: cannot be read as a calibration ({type(error).__name__}: {error}): "
+                "run `starcal-uq calibrate` again."
+            ) from error

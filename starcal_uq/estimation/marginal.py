@@ -1,0 +1,187 @@
+"""The attitude-marginalised Gaussian likelihood of star positions.
+
+Each frame's attitude has a flat prior on rotations and is integrated out by Laplace's method around its best value:
+
+    log L(theta, sigma) = sum_k [ -S_k(theta) / (2 sigma^2) - (2 m_k - 3) log sigma - 1/2 log |A_k^T A_k| ],
+
+where S_k is the sum of squared (whitened) residuals at the frame's best attitude and A_k the derivative of its pixels
+with respect to that attitude. The information on theta is the Schur complement of the attitudes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import exp_rotation
+from starcal_uq.attitude.wahba import quest
+from starcal_uq.camera.projection import forward_kernel, forward_root, unproject_theta
+from starcal_uq.core.types import FloatArray
+from starcal_uq.estimation.solvers import Normal
+from starcal_uq.maths.linear import COLUMNS, ROWS, inverse_symmetric
+from starcal_uq.observations.frames import StarFrames
+
+if TYPE_CHECKING:
+    from starcal_uq.observations.table import Observations
+
+_ATTITUDE_STEPS = 12
+_ATTITUDE_TOLERANCE_RAD = 1e-9
+
+
+@dataclass(frozen=True)
+class Profile:
+    """The model at the best attitude of every frame.
+
+    Attributes
+    ----------
+    rotations : (K, 3, 3) array
+        R_cam_icrs.
+    b : (3, N) array
+        Catalogue directions in the camera frame.
+    e : (2, N) array
+        Residuals, observed minus predicted, divided by the stated noise where there is one.
+    attitude : (3, 2, N) array
+        Derivative of the (whitened) prediction with respect to the frame's rotation vector.
+    inverse : (3, 3, K) array
+        Inverse of A^T A per frame.
+    log_determinant : (K,) array
+        log |A^T A|.
+    """
+
+    rotations: FloatArray
+    b: FloatArray
+    e: FloatArray
+    attitude: FloatArray
+    inverse: FloatArray
+    log_determinant: FloatArray
+
+
+class MarginalLikelihood:
+    """Exact attitude-marginalised likelihood of a table of observations.
+
+    Parameters
+    ----------
+    obs : Observations or StarFrames
+        Data.
+    model_name : str
+        Distortion model.
+    """
+
+    def __init__(self, obs: Observations | StarFrames, model_name: str) -> None:
+        self.frames = obs if isinstance(obs, StarFrames) else StarFrames.from_observations(obs)
+        self.model_name = model_name
+        self._rotations: FloatArray | None = None
+
+    @property
+    def dof(self) -> int:
+        """Independent numbers in the data after the attitudes: ``sum_k (2 m_k - 3)``."""
+        return 2 * self.frames.n_stars - 3 * self.frames.n_frames
+
+    def start_rotations(self, theta: FloatArray) -> FloatArray:
+        """Attitudes (K, 3, 3) by QUEST at theta."""
+        b = unproject_theta(self.model_name, theta, self.frames.pixel.T)
+        return quest(b, self.frames.r.T, self.frames.starts, self._quest_weights(), on_degenerate="flag").rotations
+
+    def _quest_weights(self) -> FloatArray | None:
+        return None if self.frames.weight is None else self.frames.weight**2
+
+    def _attitude_step(self, theta: FloatArray, rotations: FloatArray) -> tuple[Profile, FloatArray, FloatArray]:
+        """The model at given attitudes, the Gauss-Newton step (3, K), and the cost (K,) predicted after it."""
+        frames = self.frames
+        b = frames.rotated(rotations)
+        xy, a = forward_kernel(self.model_name, "attitude")(
+            frames.n_stars, theta, b, forward_root(self.model_name, theta, b)
+        )
+        e = frames.pixel - xy
+        if frames.weight is not None:
+            e *= frames.weight
+            a *= frames.weight
+        packed = frames.sum(np.stack([np.sum(a[i] * a[j], axis=0) for i, j in zip(ROWS, COLUMNS, strict=True)]))
+        inverse, determinant = inverse_symmetric(packed)
+        slope = frames.sum(np.sum(a * e[None], axis=1))
+        step = np.einsum("ijk,jk->ik", inverse, slope)
+        cost = frames.sum(np.sum(e * e, axis=0)) - np.sum(step * slope, axis=0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            log_determinant = np.log(determinant)
+        return Profile(rotations, b, e, a, inverse, log_determinant), step, cost
+
+    def profile(self, theta: FloatArray, rotations: FloatArray | None = None) -> tuple[Profile, float]:
+        """Find the best attitudes at theta.
+
+        Parameters
+        ----------
+        theta : (p,) array
+            Parameters in px units.
+        rotations : (K, 3, 3) array, optional
+            Where to start; QUEST otherwise.
+
+        Returns
+        -------
+        Profile
+            The model at the best attitudes.
+        float
+            Sum of squared whitened residuals S(theta); infinite when the model is not finite.
+        """
+        theta = np.asarray(theta, dtype=np.float64)
+        with np.errstate(all="ignore"):
+            if rotations is None:
+                rotations = self.start_rotations(theta)
+            for _ in range(_ATTITUDE_STEPS):
+                state, step, cost = self._attitude_step(theta, rotations)
+                total = float(np.sum(cost))
+                if not np.isfinite(total):
+                    return state, float("inf")
+                if np.max(np.abs(step)) < _ATTITUDE_TOLERANCE_RAD:
+                    # Noise-free data leave rounding, of either sign.
+                    return state, max(total, 0.0)
+                rotations = exp_rotation(step.T) @ rotations
+        # Stars that fit no attitude: nothing here is a minimum.
+        return state, float("inf")
+
+    def rotations_at(self, theta: FloatArray) -> FloatArray:
+        """Best attitudes (K, 3, 3) at theta."""
+        return self.profile(theta)[0].rotations
+
+    def use_rotations(self, rotations: FloatArray) -> None:
+        """Start later attitude searches here, which saves QUEST when theta moves little."""
+        self._rotations = rotations
+
+    def log_likelihood(self, theta: FloatArray, sigma: float) -> float:
+        """Log likelihood at theta (p,) and sigma (px, or the common factor on stated noise)."""
+        state, cost = self.profile(theta, self._rotations)
+        if not np.isfinite(cost):
+            return -np.inf
+        return float(-0.5 * cost / sigma**2 - self.dof * np.log(sigma) - 0.5 * np.sum(state.log_determinant))
+
+    def derivatives(self, theta: FloatArray, state: Profile) -> FloatArray:
+        """Derivative (p, 2, N) of the whitened prediction with respect to theta at fixed attitudes."""
+        _, h, _ = forward_kernel(self.model_name, "first")(
+            self.frames.n_stars, theta, state.b, forward_root(self.model_name, theta, state.b)
+        )
+        return h if self.frames.weight is None else h * self.frames.weight
+
+    def attitude_response(self, state: Profile, columns: FloatArray) -> FloatArray:
+        """Least-squares rotation vectors (q, 3, K) that reproduce columns (q, 2, N) of pixel shifts."""
+        products = [np.sum(a * columns, axis=1) for a in state.attitude]
+        x, y, z = (self.frames.sum(product)[:, None, :] for product in products)
+        response: FloatArray = x * state.inverse[0] + y * state.inverse[1] + z * state.inverse[2]
+        return response
+
+    def project_out(self, state: Profile, columns: FloatArray) -> FloatArray:
+        """Remove from columns (q, 2, N) what a rotation of each frame can reproduce."""
+        response = self.frames.spread(self.attitude_response(state, columns))
+        a = state.attitude
+        remainder: FloatArray = columns - sum(response[:, i, None, :] * a[i] for i in range(3))
+        return remainder
+
+    def evaluate(self, theta: FloatArray) -> Normal:
+        """Cost S, gradient and Gauss-Newton matrix with the attitudes eliminated (variable projection)."""
+        state, cost = self.profile(theta, self._rotations)
+        p = len(theta)
+        if not np.isfinite(cost):
+            return Normal(float("inf"), np.full(p, np.nan), np.full((p, p), np.nan))
+        h = self.project_out(state, self.derivatives(theta, state)).reshape(p, -1)
+        e = self.project_out(state, state.e[None]).reshape(-1)
+        return Normal(cost, -(h @ e), h @ h.T)

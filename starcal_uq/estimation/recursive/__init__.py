@@ -1,0 +1,1 @@
+"""Calibration frame by frame: Samaan's filter and Griffith's recursion."""

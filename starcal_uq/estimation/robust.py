@@ -1,0 +1,359 @@
+"""Estimation with a Student-t likelihood: a start that wrong stars do not spoil, and the refinement from there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+import numpy as np
+
+from starcal_uq.attitude.wahba import quest
+from starcal_uq.camera.projection import backward_kernel, backward_root
+from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.status import Status
+from starcal_uq.core.types import BoolArray, FloatArray
+from starcal_uq.estimation.compressed import CompressedLikelihood, compress
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.solvers import is_singular
+from starcal_uq.estimation.stages import Stage
+from starcal_uq.estimation.student import (
+    DEFAULT_DOF,
+    DOF_RANGE,
+    Information,
+    StudentLikelihood,
+    StudentState,
+    log_excess_prior,
+)
+from starcal_uq.observations.frames import StarFrames
+
+# A star whose angles to the others are this many times worse than the typical star's is left out of the start.
+_DISTRUST = 5.0
+_ROUNDS = 8
+# Fits of the optics alone come first: distortion is a fraction of a pixel, wrong stars are not.
+_OPTICS_ROUNDS = 2
+_TRUSTED_SHARE = 0.5
+_NEGLIGIBLE_WEIGHT = 1e-9
+_MAX_STEPS = 60
+# Gains, nat, that are worth no further round: a thousandth of a standard deviation, and a two hundredth for the noise.
+_GAIN = 1e-7
+_SHAPE_GAIN = 1e-5
+_STEP = 0.02
+_LEAST_EXCESS = 1e-3
+# Median length of a vector with two standard normal components.
+_RAYLEIGH_MEDIAN = 1.1774
+
+FitStages = Callable[[StarFrames, bool], list[Stage]]
+
+
+@dataclass(frozen=True)
+class RobustStart:
+    """Where the refinement starts.
+
+    Attributes
+    ----------
+    stages : list of Stage
+        The paper's stages on the trusted stars.
+    trusted : (N,) array of bool
+        Stars whose interstar angles agree with those of their frame.
+    frames : StarFrames
+        The trusted stars, without frames that hold fewer than three of them.
+    rotations : (K, 3, 3) array
+        Attitudes from the trusted stars.
+    """
+
+    stages: list[Stage]
+    trusted: BoolArray
+    frames: StarFrames
+    rotations: FloatArray
+
+
+def star_scores(frames: StarFrames, model_name: str, theta: FloatArray) -> FloatArray:
+    """Median over the other stars of its frame of the error of the angle to them, px, for every star (N,).
+
+    More than half of a frame's angles to a right star are right where more than half of its stars are, whatever the
+    rest is: no attitude is needed, and no single star decides.
+    """
+    root = backward_root(model_name, theta, frames.pixel)
+    (b,) = backward_kernel(model_name, False)(frames.n_stars, theta, frames.pixel, root)
+    scores = np.empty(frames.n_stars)
+    for start, stop in zip(frames.starts[:-1], frames.starts[1:], strict=True):
+        mine = slice(int(start), int(stop))
+        # Chords, not cosines: their error is that of the angle at any distance.
+        seen = np.linalg.norm(b[:, mine, None] - b[:, None, mine], axis=0)
+        known = np.linalg.norm(frames.r[:, mine, None] - frames.r[:, None, mine], axis=0)
+        error = np.abs(seen - known)
+        np.fill_diagonal(error, np.nan)
+        scores[mine] = np.nanmedian(error, axis=1)
+    return np.where(np.isfinite(scores), scores * theta[2], np.inf)
+
+
+def usable_stars(frames: StarFrames, model_name: str, theta: FloatArray) -> BoolArray:
+    """Stars of frames in which at least three agree with the others, so that there is an attitude to speak of."""
+    scores = star_scores(frames, model_name, theta)
+    agreeing = (scores <= _DISTRUST * np.median(scores)).astype(np.float64)
+    return np.asarray(frames.spread(frames.sum(agreeing)) >= 3.0)
+
+
+def subset(frames: StarFrames, kept: BoolArray) -> StarFrames:
+    """Some of the stars, without frames that keep fewer than three."""
+    enough = frames.spread(frames.sum(kept.astype(np.float64))) >= 3.0
+    return frames.select(kept & enough)
+
+
+def robust_start(frames: StarFrames, model_name: str, theta: FloatArray, fit: FitStages) -> RobustStart:
+    """Alternate between the paper's stages and leaving out stars that do not fit their frame.
+
+    Parameters
+    ----------
+    frames : StarFrames
+        All stars.
+    model_name : str
+        Distortion model.
+    theta : (p,) array
+        Nominal camera, px units.
+    fit : callable
+        ``(frames, all_parameters) -> stages``: the stages of Ye & Yang 2017, the first one only, or all.
+
+    Raises
+    ------
+    CalibrationError
+        When most stars fit neither their frame nor each other.
+    """
+    trusted = np.zeros(frames.n_stars, dtype=np.bool_)
+    # Coefficients start from zero, as in the paper: a nominal distortion is a guess.
+    at = np.concatenate([theta[:3], np.zeros(len(theta) - 3)])
+    stages: list[Stage] = []
+    for round_ in range(_ROUNDS):
+        scores = star_scores(frames, model_name, at)
+        kept = scores <= _DISTRUST * np.median(scores)
+        if round_ > _OPTICS_ROUNDS and np.array_equal(kept, trusted):
+            break
+        trusted = kept
+        used = subset(frames, trusted)
+        if used.n_stars < _TRUSTED_SHARE * frames.n_stars:
+            raise CalibrationError(
+                f"only {used.n_stars} of {frames.n_stars} stars agree with the others of their frame: "
+                f"{Status.INCONSISTENT.remedy}.",
+                Status.INCONSISTENT,
+            )
+        stages = fit(used, round_ >= _OPTICS_ROUNDS)
+        at = stages[-1].theta
+        if not stages[-1].status.ok:
+            raise CalibrationError(
+                f"the calibration did not end well ({stages[-1].status.name}): {stages[-1].status.remedy}.",
+                stages[-1].status,
+            )
+    root = backward_root(model_name, at, frames.pixel)
+    (b,) = backward_kernel(model_name, False)(frames.n_stars, at, frames.pixel, root)
+    enough = frames.spread(frames.sum(trusted.astype(np.float64))) >= 3.0
+    weight = np.where(trusted | ~enough, 1.0, _NEGLIGIBLE_WEIGHT)
+    if frames.weight is not None:
+        weight = weight * frames.weight**2
+    rotations = quest(b.T, frames.r.T, frames.starts, weight, covariance=False, on_degenerate="flag").rotations
+    return RobustStart(stages, trusted, subset(frames, trusted), rotations)
+
+
+@dataclass(frozen=True)
+class RobustFit:
+    """Maximum of the Student-t likelihood.
+
+    Attributes
+    ----------
+    stage : Stage
+        Trajectory; its cost is -2 log likelihood.
+    likelihood : StudentLikelihood
+        Started at the attitudes found.
+    state : StudentState
+        The model there.
+    sigma, nu : float
+        Scale and degrees of freedom.
+    sigma_std, nu_std : float
+        Their standard errors; `nu_std` is 0 where nu was given, and not finite at a bound.
+    information : Information
+        Derivatives at the maximum.
+    """
+
+    stage: Stage
+    likelihood: StudentLikelihood
+    state: StudentState
+    sigma: float
+    nu: float
+    sigma_std: float
+    nu_std: float
+    information: Information
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Sandwich covariance (p, p): observed information around the scatter of the stars' scores."""
+        p = len(self.information.score)
+        n = 2 * int(np.sum(self.state.seen))
+        scale = 1.0 / np.sqrt(np.diag(self.information.matrix))
+        inverse = np.linalg.inv(self.information.matrix * np.outer(scale, scale))
+        middle = self.information.variability * np.outer(scale, scale) * n / (self.state.dof - p)
+        covariance: FloatArray = (inverse @ middle @ inverse) * np.outer(scale, scale)
+        return covariance
+
+
+def refine(
+    frames: StarFrames, model_name: str, theta: FloatArray, rotations: FloatArray, nu: float | None, max_iterations: int
+) -> RobustFit:
+    """Maximise the Student-t likelihood over theta, sigma and, unless given, nu.
+
+    Camera and shape of the noise are nearly independent (one is odd in the residuals, the other even), so that
+    Newton's method on one and the other in turn converges in a few rounds. A free nu has the prior of
+    `starcal_uq.estimation.student.log_excess_prior`, without which clean data would send it to infinity.
+
+    Parameters
+    ----------
+    frames : StarFrames
+        Data.
+    model_name : str
+        Distortion model.
+    theta : (p,) array
+        Start, px units.
+    rotations : (K, 3, 3) array
+        Start of the attitudes.
+    nu : float or None
+        Degrees of freedom; estimated if None.
+    max_iterations : int
+        Most rounds.
+    """
+    began = perf_counter()
+    theta = np.array(theta, dtype=np.float64)
+    likelihood = StudentLikelihood(frames, model_name, theta, rotations, usable_stars(frames, model_name, theta))
+    free = nu is None
+    nu = DEFAULT_DOF if nu is None else nu
+    # The scale from the middle of the residuals; the state's sigma enters only through the weights.
+    sigma = 1.0 if frames.weight is not None else 0.1
+    for _ in range(3):
+        e = likelihood.state(theta, sigma, nu).e
+        sigma = float(np.median(np.hypot(e[0], e[1]))) / _RAYLEIGH_MEDIAN
+    trajectory, costs, status, evaluations = [theta], [], Status.MAX_ITERATIONS, 3
+    shape = np.zeros((1 + free, 1 + free))
+    for _ in range(min(max_iterations, _MAX_STEPS)):
+        state = likelihood.state(theta, sigma, nu)
+        if not np.isfinite(state.value):
+            status = Status.NOT_FINITE
+            break
+        costs.append(-2.0 * state.value)
+        likelihood.rotations = state.rotations
+        found = likelihood.information(theta, state, sigma)
+        if is_singular(found.reweighted):
+            status = Status.SINGULAR
+            break
+        theta, gain = _step(likelihood, theta, sigma, nu, state, found)
+        sigma, nu, shape, shape_gain = _shape_step(likelihood, theta, sigma, nu, free)
+        evaluations += 2 + len(shape) ** 2 * 2
+        trajectory.append(theta)
+        if gain < _GAIN and shape_gain < _SHAPE_GAIN:
+            status = Status.CONVERGED
+            break
+    if status.ok:
+        theta = _volume_step(likelihood, theta, sigma, nu)
+        trajectory[-1] = theta
+    state = likelihood.state(theta, sigma, nu)
+    costs.append(-2.0 * state.value)
+    trajectory, costs = trajectory[: len(costs)], costs[: len(trajectory)]
+    stage = Stage("refinement", np.array(trajectory), np.array(costs), status, evaluations, perf_counter() - began)
+    with np.errstate(all="ignore"):
+        errors = np.sqrt(np.diag(np.linalg.inv(-shape))) if np.any(shape) else np.full(1 + free, np.nan)
+    return RobustFit(
+        stage=stage,
+        likelihood=likelihood,
+        state=state,
+        sigma=sigma,
+        nu=nu,
+        sigma_std=float(sigma * errors[0]),
+        nu_std=float((nu - DOF_RANGE[0]) * errors[1]) if free else 0.0,
+        information=likelihood.information(theta, state, sigma),
+    )
+
+
+def _step(
+    likelihood: StudentLikelihood, theta: FloatArray, sigma: float, nu: float, state: StudentState, found: Information
+) -> tuple[FloatArray, float]:
+    """Newton's step where the observed information allows it, the reweighted one elsewhere; halved until it gains."""
+    scale = 1.0 / np.sqrt(np.diag(found.reweighted))
+    observed = found.matrix * np.outer(scale, scale)
+    reweighted = found.reweighted * np.outer(scale, scale)
+    slope = found.score * scale
+    sound = np.linalg.eigvalsh(observed)[0] > 0.1 * np.linalg.eigvalsh(reweighted)[0]
+    step = np.linalg.solve(observed if sound else reweighted, slope)
+    gain = 0.5 * float(step @ slope)
+    for _ in range(12):
+        trial = theta + scale * step
+        there = likelihood.state(trial, sigma, nu)
+        # The scores leave out the volume of the attitudes, which comes last.
+        if gain < 1e-6 or there.value - there.log_volume >= state.value - state.log_volume:
+            return trial, gain
+        step = 0.5 * step
+    return theta, 0.0
+
+
+def _volume_step(likelihood: StudentLikelihood, theta: FloatArray, sigma: float, nu: float) -> FloatArray:
+    """One Newton step for the volume of the attitudes, which the scores leave out: a few tenths of a sigma."""
+    information = likelihood.information(theta, likelihood.state(theta, sigma, nu), sigma)
+    sd = 1.0 / np.sqrt(np.diag(information.matrix))
+    ends = [[likelihood.log_likelihood(theta + s * e, sigma, nu) for e in _STEP * np.diag(sd)] for s in (1.0, -1.0)]
+    slope = (np.array(ends[0]) - np.array(ends[1])) / (2.0 * _STEP)
+    moved: FloatArray = theta + sd * np.linalg.solve(information.matrix * np.outer(sd, sd), slope)
+    return moved if np.isfinite(moved).all() else theta
+
+
+def _shape_step(
+    likelihood: StudentLikelihood, theta: FloatArray, sigma: float, nu: float, free: bool
+) -> tuple[float, float, FloatArray, float]:
+    """One Newton step in log sigma and, if free, log(nu - 2); also the Hessian and the gain that was promised."""
+    bound, highest = DOF_RANGE
+    start = np.log([sigma, max(nu - bound, _LEAST_EXCESS)]) if free else np.log([sigma])
+    d = len(start)
+
+    def density(point: FloatArray) -> float:
+        at = bound + float(np.exp(point[1])) if free else nu
+        prior = float(log_excess_prior(point[1:])[0]) if free else 0.0
+        return likelihood.log_likelihood(theta, float(np.exp(point[0])), at) + prior
+
+    unit = _STEP * np.eye(d)
+    value = density(start)
+    plus, minus = (np.array([density(start + sign * u) for u in unit]) for sign in (1.0, -1.0))
+    if not np.isfinite([value, *plus, *minus]).all():
+        return sigma, nu, np.full((d, d), np.nan), float("inf")
+    slope = (plus - minus) / (2.0 * _STEP)
+    hessian = np.diag((plus + minus - 2.0 * value) / _STEP**2)
+    if free:
+        both, neither = (density(start + sign * unit.sum(axis=0)) for sign in (1.0, -1.0))
+        mixed = both + neither - plus.sum() - minus.sum() + 2.0 * value
+        hessian[0, 1] = hessian[1, 0] = mixed / (2.0 * _STEP**2)
+    if not np.isfinite(hessian).all():
+        return sigma, nu, hessian, float("inf")
+    values, vectors = np.linalg.eigh(-hessian)
+    # Away from the maximum the density need not be concave: go uphill all the same.
+    step = vectors @ ((vectors.T @ slope) / np.maximum(np.abs(values), 1e-3))
+    step *= min(1.0, 1.0 / max(float(np.max(np.abs(step))), 1e-300))
+    for _ in range(12):
+        trial = start + step
+        if free:
+            trial[1] = np.clip(trial[1], np.log(_LEAST_EXCESS), np.log(highest - bound))
+        if density(trial) >= value - 1e-9:
+            moved = trial - start
+            gain = 0.5 * abs(float(moved @ hessian @ moved))
+            return float(np.exp(trial[0])), bound + float(np.exp(trial[1])) if free else nu, hessian, gain
+        step = 0.5 * step
+    return sigma, nu, hessian, 0.0
+
+
+def compress_reweighted(fit: RobustFit) -> CompressedLikelihood:
+    """The Gaussian likelihood whose stars have the weights of the fit, compressed around it.
+
+    Its maximum is that of the Student t; it treats the weights as known. Stars without weight are left out.
+    """
+    frames, theta = fit.likelihood.frames, fit.stage.theta
+    kept = fit.state.weight > _NEGLIGIBLE_WEIGHT
+    used = subset(frames, kept)
+    remaining = kept & (frames.spread(frames.sum(kept.astype(np.float64))) >= 3.0)
+    stated = np.ones(frames.n_stars) if frames.weight is None else frames.weight
+    weight = (stated * np.sqrt(fit.state.weight))[remaining]
+    rotations = fit.state.rotations[frames.sum(remaining.astype(np.float64)) > 0.0]
+    likelihood = MarginalLikelihood(replace(used, weight=weight), fit.likelihood.model_name)
+    return compress(likelihood, theta, fit.covariance, rotations)

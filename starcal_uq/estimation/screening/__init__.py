@@ -1,0 +1,1 @@
+"""Wrong identifications, found before they do harm."""

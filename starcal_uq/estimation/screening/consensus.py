@@ -1,0 +1,222 @@
+"""Stars of a frame that agree on one attitude, found without trusting any of them.
+
+Two stars fix an attitude, and the other stars of the frame vote on it (random sample consensus, Fischler & Bolles 1981,
+Comm. ACM 24(6), 381-395, scored by the truncated sum of squares of Torr & Zisserman 2000, MSAC). Before any calibration
+the focal length may be several per cent off, which bends every attitude; it is the same for all frames, so that it is
+found first, as the mode of the ratios of catalogue angle to measured angle over pairs of all frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from starcal_uq.attitude.wahba import quest
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.projection import unproject_theta
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+from starcal_uq.observations.frames import StarFrames
+
+# Pairs tried per frame; with a third of all stars wrong, none of 32 pairs is right in one frame of a hundred million.
+_TRIALS = 32
+_SEED = 20170925
+MIN_STARS = 3
+# First tolerance of the pre-screen as a fraction of the detector: distortion and a wrong principal point stay below.
+_WIDE_FRACTION = 0.02
+_NARROWEST_PX = 2.0
+_NARROW_MADS = 6.0
+
+
+@dataclass(frozen=True)
+class Consensus:
+    """What the stars of each frame agree on.
+
+    Attributes
+    ----------
+    agree : (N,) bool array
+        Stars within the tolerance of their frame's best attitude; all false in a frame without three such stars.
+    offset_rad : (N,) array
+        Angle between measurement and catalogue direction at that attitude, approximately; NaN without an attitude.
+    """
+
+    agree: BoolArray
+    offset_rad: FloatArray
+
+
+def consensus(b: FloatArray, r: FloatArray, starts: IntArray, tolerance_rad: FloatArray | float) -> Consensus:
+    """Find the largest set of stars in each frame that one attitude explains.
+
+    Parameters
+    ----------
+    b : (3, N) array
+        Measured unit vectors, camera frame; a star with NaN never agrees.
+    r : (3, N) array
+        Catalogue unit vectors.
+    starts : (K + 1,) array
+        Frame k holds the stars ``starts[k]:starts[k + 1]``.
+    tolerance_rad : float or (N,) array
+        Distance within which a star agrees.
+    """
+    sizes = np.diff(starts)
+    tolerance = np.broadcast_to(np.asarray(tolerance_rad, dtype=np.float64), b.shape[1:])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        best, rotations = np.full(len(sizes), np.inf), np.full((len(sizes), 3, 3), np.nan)
+        for first, second in pair_trials(starts):
+            candidate = _two_star_attitude(b, r, first, second)
+            share = np.minimum((_offset(b, r, candidate, sizes) / tolerance) ** 2, 1.0)
+            # A star that cannot be compared disagrees.
+            score = np.add.reduceat(np.where(np.isnan(share), 1.0, share), starts[:-1])
+            score[np.isnan(candidate[:, 0, 0])] = np.inf
+            better = score < best
+            best[better], rotations[better] = score[better], candidate[better]
+        # The least-squares attitude of all that agree is better than that of two.
+        for _ in range(2):
+            agree, offset = _agreeing(b, r, rotations, starts, tolerance)
+            rotations = _refined(b, r, agree, starts, rotations)
+        agree, offset = _agreeing(b, r, rotations, starts, tolerance)
+    return Consensus(agree, offset)
+
+
+def pair_trials(starts: IntArray) -> list[tuple[IntArray, IntArray]]:
+    """Pairs of stars to try, one per frame and trial, as two arrays (K,) of rows; the same on every call.
+
+    Frames with few stars have all their pairs tried. A frame with a single star is given it twice.
+    """
+    sizes = np.diff(starts)
+    n_pairs = np.maximum(sizes * (sizes - 1) // 2, 1)
+    rng = np.random.default_rng(_SEED)
+    trials = []
+    for trial in range(_TRIALS):
+        random = (rng.random(len(sizes)) * n_pairs).astype(np.int64)
+        number = np.where(n_pairs <= _TRIALS, trial % n_pairs, random)
+        # Pairs (i, j), i < j, counted 0-1, 0-2, 1-2, 0-3 ...
+        j = ((1.0 + np.sqrt(1.0 + 8.0 * number)) / 2.0).astype(np.int64)
+        i = number - j * (j - 1) // 2
+        trials.append((starts[:-1] + i, np.minimum(starts[:-1] + j, starts[1:] - 1)))
+    return trials
+
+
+def _triad(u: FloatArray, v: FloatArray) -> FloatArray:
+    """Orthonormal axes (K, 3, 3) of two directions each, as columns: their middle, their normal and the third."""
+    middle, normal = u + v, np.cross(u, v, axis=0)
+    middle = middle / np.linalg.norm(middle, axis=0)
+    normal = normal / np.linalg.norm(normal, axis=0)
+    return np.stack([middle, normal, np.cross(middle, normal, axis=0)], axis=-1).transpose(1, 0, 2)
+
+
+def _two_star_attitude(b: FloatArray, r: FloatArray, first: IntArray, second: IntArray) -> FloatArray:
+    """Rotations (K, 3, 3) that take two catalogue directions to two measured ones, the misfit shared equally."""
+    rotation: FloatArray = _triad(b[:, first], b[:, second]) @ _triad(r[:, first], r[:, second]).transpose(0, 2, 1)
+    return rotation
+
+
+def _offset(b: FloatArray, r: FloatArray, rotations: FloatArray, sizes: IntArray) -> FloatArray:
+    """Chord |b - R r| of every star, (N,)."""
+    total = np.zeros(b.shape[1])
+    for i in range(3):
+        x, y, z = (np.repeat(rotations[:, i, j], sizes) for j in range(3))
+        total += (b[i] - x * r[0] - y * r[1] - z * r[2]) ** 2
+    return np.sqrt(total)
+
+
+def _agreeing(
+    b: FloatArray, r: FloatArray, rotations: FloatArray, starts: IntArray, tolerance: FloatArray
+) -> tuple[BoolArray, FloatArray]:
+    sizes = np.diff(starts)
+    offset = _offset(b, r, rotations, sizes)
+    agree = offset <= tolerance
+    enough = np.add.reduceat(agree.astype(np.int64), starts[:-1]) >= MIN_STARS
+    return agree & np.repeat(enough, sizes), 2.0 * np.arcsin(np.minimum(offset / 2.0, 1.0))
+
+
+def _refined(b: FloatArray, r: FloatArray, agree: BoolArray, starts: IntArray, rotations: FloatArray) -> FloatArray:
+    """QUEST on the stars that agree; the given rotations where there are none."""
+    counts = np.add.reduceat(agree.astype(np.int64), starts[:-1])
+    some = counts > 0
+    refined = np.array(rotations)
+    if some.any():
+        offsets = np.concatenate([[0], np.cumsum(counts[some])])
+        found = quest(b[:, agree].T, r[:, agree].T, offsets, covariance=False, on_degenerate="flag")
+        where = np.flatnonzero(some)[found.ok]
+        refined[where] = found.rotations[found.ok]
+    return refined
+
+
+def measured_directions(camera: Camera, frames: StarFrames) -> FloatArray:
+    """Unit vectors (3, N) of the measured pixels; NaN where the distortion cannot be inverted."""
+    return unproject_theta(camera.distortion, camera.theta, frames.pixel.T).T
+
+
+def focal_ratio(camera: Camera, frames: StarFrames) -> float:
+    """Focal length that the interstar angles ask for over that of the camera, wrong identifications or not.
+
+    The mode over pairs of the ratio of measured to catalogue angle: at least a quarter of the pairs must be right, so
+    that half of the stars may be wrong.
+    """
+    pairs = np.array(pair_trials(frames.starts))
+    first, second = pairs[:, 0].ravel(), pairs[:, 1].ravel()
+    catalogue = _angle(frames.r, first, second)
+    ratio = 1.0
+    for _ in range(3):
+        scaled = camera.replace(focal_mm=camera.focal_mm * ratio)
+        measured = _angle(measured_directions(scaled, frames), first, second)
+        usable = np.isfinite(measured) & (measured > 0.0) & (catalogue > 0.0)
+        if not usable.any():
+            return ratio
+        # Close pairs say little about scale.
+        usable[usable] = measured[usable] >= np.median(measured[usable])
+        ratio *= float(np.exp(_mode(np.log(measured[usable] / catalogue[usable]))))
+    return ratio
+
+
+def _angle(vectors: FloatArray, first: IntArray, second: IntArray) -> FloatArray:
+    chord = np.linalg.norm(vectors[:, first] - vectors[:, second], axis=0)
+    angle: FloatArray = 2.0 * np.arcsin(np.minimum(chord / 2.0, 1.0))
+    return angle
+
+
+def _mode(values: FloatArray) -> float:
+    """Median of what lies around the shortest interval that holds a quarter of the values."""
+    ordered = np.sort(values)
+    n = max(len(ordered) // 4, 1)
+    widths = ordered[n:] - ordered[: len(ordered) - n]
+    if not len(widths):
+        return float(np.median(ordered))
+    start = int(np.argmin(widths))
+    middle, half = ordered[start] + widths[start] / 2.0, widths[start] / 2.0
+    return float(np.median(ordered[np.abs(ordered - middle) <= 4.0 * half]))
+
+
+def pre_screen(camera: Camera, frames: StarFrames) -> tuple[BoolArray, Camera]:
+    """Stars that can be calibrated on, found with a camera that has not been calibrated.
+
+    Parameters
+    ----------
+    camera : Camera
+        Nominal camera; its focal length may be tens of per cent off.
+    frames : StarFrames
+        Data.
+
+    Returns
+    -------
+    (N,) bool array
+        Stars that agree on their frame's attitude within what the uncalibrated camera allows.
+    Camera
+        The camera with the focal length of `focal_ratio`.
+    """
+    if not np.isfinite(measured_directions(camera, frames)).all():
+        camera = camera.replace(coefficients=(0.0,) * len(camera.coefficients))
+    camera = camera.replace(focal_mm=camera.focal_mm * focal_ratio(camera, frames))
+    b = measured_directions(camera, frames)
+    wide_rad = _WIDE_FRACTION * max(camera.width_px, camera.height_px) / camera.focal_px
+    wide = consensus(b, frames.r, frames.starts, wide_rad)
+    if not wide.agree.any():
+        return wide.agree, camera
+    spread = 1.4826 * float(np.median(wide.offset_rad[wide.agree]))
+    narrow_rad = np.clip(_NARROW_MADS * spread, min(_NARROWEST_PX / camera.focal_px, wide_rad), wide_rad)
+    stated = 0.0 if frames.weight is None else 10.0 / frames.weight / camera.focal_px
+    narrow = consensus(b, frames.r, frames.starts, np.maximum(narrow_rad, stated))
+    # A frame that falls apart within the narrow tolerance is judged after the calibration.
+    whole = np.repeat(frames.sum(narrow.agree.astype(np.int64)) >= MIN_STARS, frames.sizes)
+    return np.where(whole, narrow.agree, wide.agree), camera

@@ -1,0 +1,153 @@
+"""The steps of a calibration: the three stages of Ye & Yang 2017, and the refinement on the marginal likelihood."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+
+from starcal_uq.attitude.wahba import quest
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.projection import monotonic_expression
+from starcal_uq.core.status import Status
+from starcal_uq.core.types import FloatArray
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.pairs import PairObjective
+from starcal_uq.estimation.solvers import Constraints, Solution, ipopt, levenberg_marquardt, minpack
+from starcal_uq.observations.frames import StarFrames
+
+# Predicted gain of a pair stage that is not worth an evaluation: 1e-4 sigma or less for 30,000 residuals.
+_PAIR_TOLERANCE = 1e-13
+# The estimate itself is taken to rounding, so that every start ends in the same digits.
+_REFINEMENT_TOLERANCE = 1e-18
+# Explicit pairs need about 100 bytes each and parameter; beyond this the normal equations serve.
+MAX_EXPLICIT_PAIRS = 500_000
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One stage of a calibration.
+
+    Attributes
+    ----------
+    name : str
+        ``optics``, ``distortion``, ``all`` (the paper's three), ``refinement``, or ``filter`` (recursive methods).
+    trajectory : (n, p) array
+        Estimates after each iteration, px units, the start first; of a filter, after each frame.
+    cost : (n,) array
+        The stage's own cost along the trajectory: rad^2 over pairs, px^2 in the linear stage and the refinement; of a
+        filter, the sum of its whitened innovations so far, px^2 (or in units of the stated noise).
+    status : Status
+        How it ended.
+    evaluations : int
+        Evaluations of the model.
+    seconds : float
+        Wall time.
+    sigmas : (n, p) array or None
+        Of a filter, the standard deviations that it claims after each frame, px units; zero where a parameter is not
+        estimated.
+    """
+
+    name: str
+    trajectory: FloatArray
+    cost: FloatArray
+    status: Status
+    evaluations: int
+    seconds: float
+    sigmas: FloatArray | None = None
+
+    @property
+    def theta(self) -> FloatArray:
+        """The stage's result, (p,)."""
+        last: FloatArray = self.trajectory[-1]
+        return last
+
+
+def constraints_for(camera: Camera, n_parameters: int) -> Constraints:
+    """Principal point on the detector, positive focal length and monotonic distortion over the field."""
+    p = len(camera.theta)
+    lower, upper = np.full(p, -np.inf), np.full(p, np.inf)
+    lower[:3] = (0.0, 0.0, 0.01 * camera.focal_px)
+    upper[:3] = (camera.width_px - 1.0, camera.height_px - 1.0, 100.0 * camera.focal_px)
+    if n_parameters < p:
+        return Constraints(lower[:n_parameters], upper[:n_parameters])
+    radius = float(np.hypot(camera.width_px, camera.height_px)) / 2.0
+    return Constraints(lower, upper, lambda theta: monotonic_expression(camera.distortion, theta, radius))
+
+
+def _solve(objective: PairObjective, start: FloatArray, camera: Camera, solver: str, max_iterations: int) -> Solution:
+    if solver == "ipopt":
+        constraints = constraints_for(camera, objective.n_parameters)
+        return ipopt(objective.evaluate, start, constraints, max_iterations=max_iterations)
+    if solver == "minpack" and objective.n_pairs <= MAX_EXPLICIT_PAIRS:
+        return minpack(objective.residuals, objective.evaluate, start, max_iterations=max_iterations)
+    return levenberg_marquardt(objective.evaluate, start, max_iterations=max_iterations, tolerance=_PAIR_TOLERANCE)
+
+
+def _timed(name: str, run: Callable[[], Solution], tail: FloatArray) -> Stage:
+    began = perf_counter()
+    solution = run()
+    padding = np.tile(tail, (len(solution.trajectory), 1))
+    return Stage(
+        name=name,
+        trajectory=np.hstack([solution.trajectory, padding]),
+        cost=solution.costs,
+        status=solution.status,
+        evaluations=solution.evaluations,
+        seconds=perf_counter() - began,
+    )
+
+
+def optics_stage(frames: StarFrames, camera: Camera, solver: str, max_iterations: int) -> Stage:
+    """Stage 1: x0, y0 and f on interstar angles, distortion ignored (the paper's section 2.1)."""
+    objective = PairObjective(frames, "none")
+    start = np.array(camera.theta[:3])
+    zeros = np.zeros(len(camera.theta) - 3)
+    return _timed("optics", lambda: _solve(objective, start, camera, solver, max_iterations), zeros)
+
+
+def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> Stage:
+    """Stage 2: the coefficients by linear least squares at fixed optics (the paper's section 2.2).
+
+    Ideal points need attitudes, which come from QUEST with the stage-1 optics. The attitudes and f have absorbed much
+    of the distortion by then, so that this is a start value and nothing else.
+    """
+    began = perf_counter()
+    model = get_model(camera.distortion)
+    f = theta[2]
+    offset = frames.pixel - theta[:2, None]
+    direction = np.vstack([offset, np.full(frames.n_stars, f)])
+    b = (direction / np.linalg.norm(direction, axis=0)).T
+    rotations = quest(b, frames.r.T, frames.starts, covariance=False).rotations
+    b = frames.rotated(rotations)
+    ideal = f * b[:2] / b[2]
+    # Every model is linear in its coefficients; forward models act on ideal points, inverse ones on measured points.
+    forward = model.direction == "forward"
+    at, target = (ideal, offset - ideal) if forward else (offset, ideal - offset)
+    n = len(model.coefficients)
+    columns = [np.concatenate(model.displacement(at[0], at[1], tuple(unit))) for unit in np.eye(n)]
+    design = np.stack(columns, axis=1)
+    scale = np.linalg.norm(design, axis=0)
+    k = np.linalg.lstsq(design / scale, target.ravel(), rcond=None)[0] / scale
+    cost = [float(np.sum(target**2)), float(np.sum((target.ravel() - design @ k) ** 2))]
+    trajectory = np.array([np.concatenate([theta[:3], np.zeros(n)]), np.concatenate([theta[:3], k])])
+    return Stage("distortion", trajectory, np.array(cost), Status.CONVERGED, 1, perf_counter() - began)
+
+
+def joint_stage(objective: PairObjective, camera: Camera, theta: FloatArray, solver: str, max_iterations: int) -> Stage:
+    """Stage 3: all parameters on interstar angles (the paper's section 2.3)."""
+    return _timed("all", lambda: _solve(objective, theta, camera, solver, max_iterations), np.zeros(0))
+
+
+def refinement_stage(likelihood: MarginalLikelihood, theta: FloatArray, max_iterations: int) -> Stage:
+    """Stage 4: all parameters on the attitude-marginalised likelihood, which reaches the Cramer-Rao bound."""
+    return _timed(
+        "refinement",
+        lambda: levenberg_marquardt(
+            likelihood.evaluate, theta, max_iterations=max_iterations, tolerance=_REFINEMENT_TOLERANCE
+        ),
+        np.zeros(0),
+    )

@@ -1,0 +1,298 @@
+"""Star identification, lost in space: which catalogue star is each centroid?
+
+Frame by frame, patterns give hypotheses (`pyramid`), each is matched with all stars of the field and refined
+(`matching`), and it is accepted when the number of wrong attitudes expected to match as well is small. What the frames
+say together about the camera narrows the tolerances for a second pass over all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from os import PathLike
+from typing import Protocol
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import rotation_to_quaternion
+from starcal_uq.attitude.wahba import quest
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.projection import unproject
+from starcal_uq.core.errors import IdentificationError
+from starcal_uq.core.types import FloatArray
+from starcal_uq.identification.proposers import Engine, prepare_engine
+from starcal_uq.identification.pyramid import CameraTolerance
+from starcal_uq.identification.result import FrameIdentification, Identification, Parity
+from starcal_uq.identification.search import (
+    LEAST_SIGMA_PX,
+    MIN_STARS,
+    CentroidTable,
+    Found,
+    FrameTable,
+    Search,
+    field_geometry,
+    has_radial,
+)
+from starcal_uq.observations.table import Observations
+from starcal_uq.sky.catalogue import StarCatalogue
+
+# Where few frames are found, the others are tried with a lens this much worse.
+_WORSE_LENS = 4.0
+# This many frames with most stars decide whether another way of searching is worth the time.
+_PROBES = 10
+# Frames with fewer stars say nothing about the common camera.
+_CAMERA_STARS = 7
+
+
+class CalibratedCamera(Protocol):
+    """A `Calibration` or a `Posterior`: a camera with the covariance of its parameters."""
+
+    @property
+    def camera(self) -> Camera: ...
+    @property
+    def covariance(self) -> FloatArray: ...
+
+
+def identify(
+    centroids: CentroidTable,
+    camera: Camera,
+    stars: StarCatalogue,
+    *,
+    calibration: CalibratedCamera | None = None,
+    focal_tolerance: float = 0.03,
+    centre_tolerance_px: float = 20.0,
+    distortion_tolerance_px: float = 1.0,
+    engine: Engine = "pyramid",
+    share_camera: bool = True,
+    cache: bool = True,
+    cache_dir: str | PathLike[str] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Identification:
+    """Identify the stars of every frame, knowing nothing about where the camera pointed.
+
+    Parameters
+    ----------
+    centroids
+        Measured stars: arrays `frame`, `x_px`, `y_px`, `flux`, `sigma_px` with a row for each, and `frame_ids`,
+        `image`, `time_utc` with a row for each frame. Frames without stars keep their place. Flux is compared with the
+        catalogue's magnitudes frame by frame (`star_brightness`), except where `saturated`, if there, says otherwise;
+        equal fluxes say nothing.
+    camera
+        The nominal camera.
+    stars
+        Catalogue; it may be deeper than the sensor. Its directions are those of the result.
+    calibration
+        A `Calibration` or `Posterior`: its camera takes the place of `camera`, and four standard deviations the place
+        of the tolerances. A better known camera identifies more.
+    focal_tolerance
+        Relative error of the focal length; 0.03 is three per cent.
+    centre_tolerance_px
+        Error of the principal point per axis, px.
+    distortion_tolerance_px
+        Displacement at the detector's corner by distortion that the nominal camera does not have, px. Where less than
+        half of the frames are found, the others are tried with four times as much, and as mirror images.
+    engine
+        What finds attitudes: "pyramid", this package's pattern search, or "tetra3rs", a solver in Rust, which needs
+        the package of that name (extra `tetra3rs`). Matching and acceptance are the same.
+    share_camera
+        Whether all frames come from one camera, so that those that are found help to find the others. The result does
+        not depend on the order of the frames.
+    cache
+        Whether the catalogue's pairs are kept on disk, which saves about 0.1 s to 1 s.
+    cache_dir
+        Where; by default the platform's folder for caches (`$XDG_CACHE_HOME/starcal_uq`).
+    progress
+        Called with the number of frames done and to be done.
+
+    Returns
+    -------
+    Identification
+        A frame that is not identified has a status word and no stars; it is no error.
+
+    Raises
+    ------
+    IdentificationError
+        A centroid is not finite or off the detector, a tolerance makes no sense, the catalogue is too small, or the
+        engine is not installed.
+    """
+    _check(centroids, camera, stars, focal_tolerance, centre_tolerance_px, distortion_tolerance_px)
+    tolerance = CameraTolerance(focal_tolerance, centre_tolerance_px, distortion_tolerance_px)
+    if calibration is not None:
+        camera, tolerance = calibration.camera, calibrated_tolerance(calibration, tolerance)
+    field = FrameTable(centroids, camera)
+    proposer = prepare_engine(engine, stars, field_geometry(camera), tolerance, cache, cache_dir)
+    search = Search(camera, stars, tolerance, proposer=proposer)
+    n = len(field.ids)
+    found = []
+    for k in range(n):
+        found.append(search.frame(field, k))
+        if progress is not None:
+            progress(k + 1, n)
+    failed = _failed(found, field)
+    parity: Parity = "normal"
+    if len(failed) > _solved(found):
+        # Every frame of a camera has one handedness: the one that more frames have.
+        flipped = FrameTable(centroids, camera, mirrored=True)
+        mirror = Search(flipped.camera, stars, tolerance, proposer=proposer)
+        other = _retry(mirror, flipped, failed)
+        if _solved(other.values()) > _solved(found):
+            parity, field, search = "mirrored", flipped, mirror
+            found = [other[k] if k in other else mirror.frame(flipped, k) for k in range(n)]
+    failed = _failed(found, field)
+    if len(failed) > _solved(found):
+        worse = search.widened(_WORSE_LENS)
+        other = _retry(worse, field, failed)
+        found = [other.get(k, found[k]) for k in range(n)]
+        search = worse if _solved(other.values()) else search
+    useful = [f.match for f in found if f.match is not None and len(f.match) >= _CAMERA_STARS]
+    refined = field.camera
+    if useful:
+        shared, covariance = search.common_camera(useful)
+        refined = _moved(field.camera, shared)
+        if share_camera and len(useful) > 1:
+            second = search.narrowed(refined, covariance)
+            again = field.seen_by(refined)
+            found = [second.again(again, k, found[k], shared) for k in range(n)]
+            useful = [f.match for f in found if f.match is not None and len(f.match) >= _CAMERA_STARS]
+            if useful:
+                refined = _moved(refined, second.common_camera(useful)[0])
+    return _result(field, found, refined, stars, parity, centroids)
+
+
+def calibrated_tolerance(calibration: CalibratedCamera, largest: CameraTolerance) -> CameraTolerance:
+    """Four standard deviations of a calibration, at most the given tolerances."""
+    camera = calibration.camera
+    p = len(camera.parameter_names)
+    covariance = np.asarray(calibration.covariance, dtype=np.float64)[:p, :p]
+    sd = 4.0 * np.sqrt(np.diag(covariance))
+    orders = [c.order for c in get_model(camera.distortion).coefficients]
+    corner = camera.corner_radius_px ** np.array(orders, dtype=np.float64)
+    bend = 4.0 * float(np.sqrt(corner @ covariance[3:, 3:] @ corner)) if orders else 0.0
+    return CameraTolerance(
+        focal=min(max(float(sd[2]) / camera.focal_px, 1e-5), largest.focal),
+        centre_px=min(max(float(sd[0]), float(sd[1]), 0.05), largest.centre_px),
+        distortion_px=min(max(bend, 0.05), largest.distortion_px),
+    )
+
+
+def _failed(found: Iterable[Found], field: FrameTable) -> list[int]:
+    """Frames with enough stars that are not identified, those with most stars first."""
+    frames = [k for k, f in enumerate(found) if f.match is None and len(field.xy[k]) >= MIN_STARS]
+    return sorted(frames, key=lambda k: -len(field.xy[k]))
+
+
+def _solved(found: Iterable[Found]) -> int:
+    return sum(f.match is not None for f in found)
+
+
+def _retry(search: Search, field: FrameTable, frames: list[int]) -> dict[int, Found]:
+    """Frames searched in another way: all of them, if one of the first few is found so."""
+    result = {k: search.frame(field, k) for k in frames[:_PROBES]}
+    if _solved(result.values()):
+        result |= {k: search.frame(field, k) for k in frames[_PROBES:]}
+    return result
+
+
+def _moved(camera: Camera, shared: FloatArray) -> Camera:
+    """The camera with shared parameters (ln f, d, kappa) added."""
+    log_scale, dx, dy, kappa = (float(v) for v in shared)
+    coefficients = list(camera.coefficients)
+    if has_radial(camera):
+        names = [c.name for c in get_model(camera.distortion).coefficients]
+        coefficients[names.index("k1")] += kappa / camera.corner_radius_px**3
+    return camera.replace(
+        focal_mm=camera.focal_mm * float(np.exp(log_scale)),
+        x0_px=camera.x0_px + dx,
+        y0_px=camera.y0_px + dy,
+        coefficients=tuple(coefficients),
+    )
+
+
+def _result(
+    field: FrameTable, found: list[Found], camera: Camera, stars: StarCatalogue, parity: Parity, table: CentroidTable
+) -> Identification:
+    """Attitudes and TASTE with the common camera, and the tables."""
+    from scipy.special import chdtrc
+
+    solved = [k for k, f in enumerate(found) if f.match is not None]
+    matches = [m for f in found if (m := f.match) is not None]
+    records, star = [], np.concatenate([m.star for m in matches]) if matches else np.empty(0, dtype=np.int64)
+    rows = np.concatenate([field.rows[k][m.centroid] for k, m in zip(solved, matches, strict=True)] or [star])
+    xy = np.concatenate([field.xy[k][m.centroid] for k, m in zip(solved, matches, strict=True)] or [np.empty((0, 2))])
+    sigma = np.asarray(table.sigma_px, dtype=np.float64)[rows]
+    taste, p_value = np.empty((2, 0))
+    if matches:
+        starts = np.concatenate([[0], np.cumsum([len(m) for m in matches])])
+        floor = np.hypot(sigma, LEAST_SIGMA_PX)
+        b, r = unproject(camera, xy), stars.directions_icrs[star]
+        wahba = quest(b, r, starts, sigma_rad=floor / camera.focal_px, covariance=False)
+        taste = np.asarray(wahba.taste)
+        p_value = chdtrc(wahba.dof, taste)
+        rotations = wahba.rotations
+    place = {k: i for i, k in enumerate(solved)}
+    for k, f in enumerate(found):
+        i = place.get(k)
+        records.append(
+            FrameIdentification(
+                frame=field.ids[k],
+                image=str(table.image[k]),
+                status=f.status,
+                n_centroids=len(field.xy[k]),
+                n_identified=0 if f.match is None else len(f.match),
+                n_ambiguous=0 if f.match is None else f.match.n_ambiguous,
+                n_unlike_brightness=0 if f.match is None else f.match.n_unlike_brightness,
+                log10_expected_false=float("nan") if f.match is None else f.match.log10_false,
+                quaternion=None if i is None else rotation_to_quaternion(rotations[i]),
+                noise_scale=float("nan") if f.match is None else f.match.noise_scale,
+                taste=float("nan") if i is None else float(taste[i]),
+                taste_p_value=float("nan") if i is None else float(p_value[i]),
+                milliseconds=1e3 * f.seconds,
+            )
+        )
+    times = [table.time_utc[k] for k, m in zip(solved, matches, strict=True) for _ in range(len(m))]
+    observations = Observations(
+        frame=np.repeat([field.ids[k] for k in solved], [len(m) for m in matches]).astype(np.int64),
+        x_px=xy[:, 0],
+        y_px=xy[:, 1],
+        ra_deg=stars.ra_deg[star],
+        dec_deg=stars.dec_deg[star],
+        sigma_px=sigma,
+        star_id=stars.star_id[star],
+        mag=stars.mag[star],
+        time_utc=np.array([str(t) for t in times]) if times and all(times) else None,
+        meta={
+            "source": f"identified in {stars.source}",
+            "directions": "apparent" if stars.apparent else "catalogue",
+            "epoch": float(stars.epoch),
+            "parity": parity,
+        },
+    )
+    # Not every table says which frames were left out.
+    problems = getattr(table, "problem", [""] * len(records))
+    n_left_out = sum(bool(problems[k]) and record.status == "too few stars" for k, record in enumerate(records))
+    return Identification(observations, tuple(records), camera, field.camera, parity, n_left_out)
+
+
+def _check(
+    table: CentroidTable, camera: Camera, stars: StarCatalogue, focal: float, centre_px: float, distortion_px: float
+) -> None:
+    if not (0.0 < focal <= 0.3 and centre_px >= 0.0 and distortion_px >= 0.0):
+        raise IdentificationError(
+            f"tolerances of {focal:g} of the focal length, {centre_px:g} px and {distortion_px:g} px cannot be used: "
+            "give a share above 0 and up to 0.3, and pixels that are not negative."
+        )
+    if len(stars) < 100:
+        raise IdentificationError(
+            f"the catalogue has {len(stars)} stars, too few to find patterns in: raise its magnitude limit."
+        )
+    xy = np.column_stack([np.asarray(table.x_px, dtype=np.float64), np.asarray(table.y_px, dtype=np.float64)])
+    outside = np.flatnonzero(~camera.contains(xy))
+    if outside.size:
+        row = int(outside[0])
+        raise IdentificationError(
+            f"centroid {row + 1} (frame {int(table.frame[row])}) at ({xy[row, 0]:g}, {xy[row, 1]:g}) px is not on the "
+            f"{camera.width_px} x {camera.height_px} detector of the camera: give the camera that took the images."
+        )
+    sigma = np.asarray(table.sigma_px, dtype=np.float64)
+    if not np.all(np.isfinite(sigma) & (sigma >= 0.0)) or not np.isfinite(np.asarray(table.flux)).all():
+        raise IdentificationError("a centroid has noise or flux that is no finite number: leave such centroids out.")

@@ -1,0 +1,346 @@
+"""From a hypothesis to matched stars: the rest of the stars, refined camera and attitude, and the odds of chance.
+
+In ideal pixels u (offsets from the nominal principal point, nominal distortion removed) a star at direction r is at
+
+    u = F p (1 + kappa |p|^2 / |p_c|^2 / (F |p_c|)) + d,    p = (q_x, q_y) / q_z,    q = exp([phi]x) R r
+
+with F the focal length, d the shift of the principal point, and kappa px of radial displacement at the corner p_c. The
+parameters (phi, ln F, d, kappa) follow from damped least squares, the damping being the stated tolerances.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import lgamma, log, pi
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import exp_rotation
+from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.identification.brightness import unlike_brightness
+from starcal_uq.identification.nearby import Sky
+from starcal_uq.identification.pyramid import SIGMAS, CameraTolerance, FieldGeometry, Hypothesis
+
+# Parameters after the three of the attitude: ln F, d_x, d_y, kappa.
+N_SHARED = 4
+# Catalogue and lens have errors of their own: no gate is narrower than for this noise.
+_LEAST_GATE_SIGMA_PX = 0.1
+# A star is ambiguous if the next one, on the sky or on the detector, is not this much farther in sigma^2: exp(-14).
+_DISTINCT = 28.0
+
+
+@dataclass(frozen=True, eq=False)
+class CameraState:
+    """Attitude and camera relative to the nominal one.
+
+    Attributes
+    ----------
+    rotation : (3, 3) array
+        b = R r.
+    shared : (4,) array
+        ln of the focal length over its nominal value, shift of the principal point (px), kappa (px).
+    """
+
+    rotation: FloatArray
+    shared: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """Stars of one frame.
+
+    Attributes
+    ----------
+    state : CameraState
+        Attitude and camera.
+    centroid, star : (m,) arrays of int
+        Rows of the frame's centroids and of the catalogue.
+    residual_px : (m, 2) array
+        Measured minus predicted.
+    gate_px : float
+        Largest distance accepted, for the centroid of median noise.
+    noise_scale : float
+        Noise found over noise stated, at least 1.
+    log10_false : float
+        Decimal logarithm of the expected number of wrong attitudes on the whole sky that match as well.
+    n_ambiguous : int
+        Centroids that more than one star fits.
+    n_unlike_brightness : int
+        Centroids left out because they are farther from their star, and less of its brightness, than chance explains.
+    information : (4, 4) array, gradient : (4,) array
+        What the frame says about the shared parameters, attitude eliminated: information times their best value is
+        ``gradient``.
+    """
+
+    state: CameraState
+    centroid: IntArray
+    star: IntArray
+    residual_px: FloatArray
+    gate_px: float
+    noise_scale: float
+    log10_false: float
+    n_ambiguous: int
+    n_unlike_brightness: int
+    information: FloatArray
+    gradient: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.star)
+
+
+def start_state(hypothesis: Hypothesis) -> CameraState:
+    """The state that a hypothesis stands for."""
+    return CameraState(hypothesis.rotation, np.array([np.log(hypothesis.scale), 0.0, 0.0, 0.0]))
+
+
+def match_frame(
+    u: FloatArray,
+    sigma_px: FloatArray,
+    sky: Sky,
+    start: CameraState,
+    tolerance: CameraTolerance,
+    *,
+    mag: FloatArray | None = None,
+    radial: bool = True,
+    polished: bool = False,
+) -> Match | None:
+    """Match all centroids of a frame and refine, with a gate that shrinks to the noise.
+
+    Parameters
+    ----------
+    u : (n, 2) array
+        Ideal pixels.
+    sigma_px : (n,) array
+        Noise per axis.
+    sky : Sky
+        The catalogue.
+    start : CameraState
+        A first state.
+    tolerance : CameraTolerance
+        How far the camera may be from its nominal values.
+    mag : (n,) array, optional
+        Instrumental magnitudes, NaN where not known: doubtful matches of unlike brightness are left out.
+    radial : bool
+        Whether kappa is fitted.
+    polished : bool
+        Whether `start` is good to the noise already, so that the gate starts small.
+
+    Returns
+    -------
+    Match or None
+        None where fewer than four stars are matched.
+    """
+    g = sky.geometry
+    focal = g.focal_px * float(np.exp(start.shared[0]))
+    radius = float(np.arctan(1.03 * g.corner_px / focal)) + 1e-3
+    depth = sky.depth(len(u))
+    ranks = sky.around(start.rotation[2], radius, depth)
+    if len(ranks) < 4:
+        return None
+    r = sky.directions[ranks]
+    prior = _prior(tolerance, radial)
+    bias = g.relative_bias(tolerance)
+    # Each centroid has its own gate: a faint star may be farther off than a bright one.
+    final = SIGMAS * np.maximum(sigma_px, _LEAST_GATE_SIGMA_PX)
+    typical = float(np.median(final))
+    wide = 2.0 * typical + 0.5 * bias * g.corner_px
+    gates = (1.5 * final, final) if polished else (wide + 0.0 * final, 0.5 * (wide + final), 1.5 * final, final)
+    state, noise_scale = start, 1.0
+    centroid = star = np.empty(0, dtype=np.int64)
+    for number, gate in enumerate(gates):
+        predicted, _ = _predict(state, r, g)
+        limit = np.maximum(gate, final * noise_scale)
+        centroid, star, _ = _mutual(u, predicted, limit)
+        if len(star) < 4:
+            return None
+        state, e = _fit(state, u, sigma_px, r, centroid, star, g, prior)
+        if number >= len(gates) - 2:
+            noise_scale = _noise_scale(e, sigma_px[centroid])
+    predicted, _ = _predict(state, r, g)
+    limit = final * noise_scale
+    centroid, star, ambiguous = _mutual(u, predicted, limit, (sigma_px * noise_scale) ** 2 * _DISTINCT)
+    if len(star) < 4:
+        return None
+    e = u[centroid] - predicted[star]
+    refused = np.zeros(len(star), dtype=np.bool_)
+    if mag is not None:
+        misfit = np.sum(e * e, axis=1) / (np.maximum(sigma_px[centroid], _LEAST_GATE_SIGMA_PX) * noise_scale) ** 2
+        refused = unlike_brightness(mag[centroid] - sky.mag[ranks[star]], misfit)
+    if refused.any():
+        centroid, star = centroid[~refused], star[~refused]
+        if len(star) < 4:
+            return None
+        state, e = _fit(state, u, sigma_px, r, centroid, star, g, prior)
+    information, gradient = _information(state, u, sigma_px * noise_scale, r, centroid, star, g)
+    on_detector = np.all(np.abs(predicted) < 0.5 * np.array([g.width_px, g.height_px]) + 30.0, axis=1)
+    density = max(int(on_detector.sum()), 4) / (g.width_px * g.height_px)
+    expected = log10_false_matches(len(u), len(star), density, depth, typical * noise_scale, g, tolerance)
+    return Match(
+        state,
+        centroid,
+        sky.rows[ranks[star]],
+        e,
+        typical * noise_scale,
+        noise_scale,
+        expected,
+        int(ambiguous),
+        int(refused.sum()),
+        information,
+        gradient,
+    )
+
+
+def log10_false_matches(
+    n: int,
+    m: int,
+    density_px2: float,
+    n_sky: int,
+    gate_px: float,
+    geometry: FieldGeometry,
+    tolerance: CameraTolerance,
+) -> float:
+    """Expected number of wrong attitudes, on the whole sky, at which m of n centroids have a star within the gate.
+
+    A first centroid is any of the `n_sky` stars, a second one any star at its distance within the tolerance of the
+    focal length; each of the other m - 2 has a star within the gate with probability ``density pi gate^2``. What the
+    free principal point and distortion can take up widens the gate.
+
+    Returns
+    -------
+    float
+        Decimal logarithm.
+    """
+    length = 0.4 * max(geometry.width_px, geometry.height_px)
+    bias = geometry.relative_bias(tolerance)
+    area = pi * (gate_px**2 + (0.5 * bias * length) ** 2)
+    ring = 2.0 * pi * length**2 * 2.0 * (tolerance.focal + bias + gate_px / length)
+    choices = lgamma(n + 1) - lgamma(m + 1) - lgamma(n - m + 1)
+    hit = min(density_px2 * area, 1.0)
+    return (log(n_sky) + log(density_px2 * ring) + choices + (m - 2) * log(hit)) / log(10.0)
+
+
+def _prior(tolerance: CameraTolerance, radial: bool) -> FloatArray:
+    """Information (7,) of the tolerances, read as two standard deviations; none about the attitude."""
+    sd = np.array(
+        [tolerance.focal / 2.0, tolerance.centre_px / 2.0, tolerance.centre_px / 2.0, tolerance.distortion_px / 2.0]
+    )
+    if not radial:
+        sd[3] = 1e-6
+    return np.concatenate([np.zeros(3), np.maximum(sd, 1e-9) ** -2.0])
+
+
+def _predict(state: CameraState, r: FloatArray, g: FieldGeometry) -> tuple[FloatArray, FloatArray]:
+    """Ideal pixels (n, 2) of directions (n, 3), and tangent-plane coordinates (n, 2)."""
+    q = r @ state.rotation.T
+    p = q[:, :2] / q[:, 2:]
+    log_scale, dx, dy, kappa = state.shared
+    focal = g.focal_px * np.exp(log_scale)
+    u = focal * p
+    if kappa:
+        u = u * (1.0 + kappa / g.corner_px**3 * np.einsum("ni,ni->n", u, u))[:, None]
+    return u + np.array([dx, dy]), p
+
+
+def _jacobian(state: CameraState, r: FloatArray, g: FieldGeometry) -> tuple[FloatArray, FloatArray]:
+    """Predictions (n, 2) and derivatives (2, n, 7) with respect to phi, ln F, d and kappa."""
+    u, p = _predict(state, r, g)
+    x, y = p.T
+    focal = g.focal_px * float(np.exp(state.shared[0]))
+    j = np.zeros((2, len(r), 3 + N_SHARED))
+    j[0, :, 0], j[0, :, 1], j[0, :, 2] = -x * y, 1.0 + x * x, -y
+    j[1, :, 0], j[1, :, 1], j[1, :, 2] = -(1.0 + y * y), x * y, x
+    j[:, :, :3] *= focal
+    j[:, :, 3] = focal * p.T
+    j[0, :, 4] = j[1, :, 5] = 1.0
+    j[:, :, 6] = focal * p.T * (np.einsum("ni,ni->n", p, p) * (focal / g.corner_px) ** 2 / g.corner_px)
+    return u, j
+
+
+def _linearised(
+    state: CameraState,
+    u: FloatArray,
+    sigma_px: FloatArray,
+    r: FloatArray,
+    centroid: IntArray,
+    star: IntArray,
+    g: FieldGeometry,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Residuals (2, m), their derivatives (2, m, q), weights (m,), and the weighted derivatives as rows (2 m, q)."""
+    predicted, j = _jacobian(state, r[star], g)
+    weight = 1.0 / sigma_px[centroid]
+    return (u[centroid] - predicted).T, j, weight, (j * weight[:, None]).reshape(-1, j.shape[2])
+
+
+def _fit(
+    state: CameraState,
+    u: FloatArray,
+    sigma_px: FloatArray,
+    r: FloatArray,
+    centroid: IntArray,
+    star: IntArray,
+    g: FieldGeometry,
+    prior: FloatArray,
+) -> tuple[CameraState, FloatArray]:
+    """One damped Gauss-Newton step, and the residuals (m, 2) that it predicts."""
+    e, j, weight, a = _linearised(state, u, sigma_px, r, centroid, star, g)
+    normal = a.T @ a
+    normal[np.diag_indices(len(normal))] += prior
+    gradient = a.T @ (e * weight).ravel()
+    gradient[3:] -= prior[3:] * state.shared
+    scale = 1.0 / np.sqrt(np.diag(normal))
+    step = scale * np.linalg.solve(normal * np.outer(scale, scale), gradient * scale)
+    left = e - j @ step
+    return CameraState(exp_rotation(step[:3]) @ state.rotation, state.shared + step[3:]), left.T
+
+
+def _information(
+    state: CameraState,
+    u: FloatArray,
+    sigma_px: FloatArray,
+    r: FloatArray,
+    centroid: IntArray,
+    star: IntArray,
+    g: FieldGeometry,
+) -> tuple[FloatArray, FloatArray]:
+    """Normal equations of the shared parameters with the attitude eliminated."""
+    e, _, weight, a = _linearised(state, u, sigma_px, r, centroid, star, g)
+    attitude, shared = a[:, :3], a[:, 3:]
+    e = (e * weight).ravel()
+    onto = np.linalg.solve(attitude.T @ attitude, attitude.T @ np.column_stack([shared, e]))
+    rest = shared - attitude @ onto[:, :-1]
+    information = rest.T @ rest
+    return information, rest.T @ (e - attitude @ onto[:, -1]) + information @ state.shared
+
+
+def _noise_scale(e: FloatArray, sigma_px: FloatArray) -> float:
+    """Noise found over noise stated, from the median of the squared residuals; between 1 and 4.
+
+    Less one standard deviation of that, so that chance does not widen the gates: false stars come with their area.
+    """
+    m = len(e)
+    squared = np.sum(e * e, axis=1) / sigma_px**2
+    # Chi-square with two degrees of freedom has the median 2 ln 2; seven parameters were fitted, damped.
+    share = max(1.0 - 5.0 / (2.0 * m), 0.3)
+    found = float(np.sqrt(np.median(squared) / (2.0 * np.log(2.0) * share)))
+    found /= 1.0 + 0.5 / (np.log(2.0) * np.sqrt(m))
+    return min(max(found, 1.0), 4.0) if m >= 6 else 1.0
+
+
+def _mutual(
+    u: FloatArray, predicted: FloatArray, limit_px: FloatArray, distinct_px2: FloatArray | None = None
+) -> tuple[IntArray, IntArray, int]:
+    """Nearest mutual neighbours within limits (n,): centroids, stars, and how many were left out as ambiguous."""
+    dx = u[:, None, 0] - predicted[None, :, 0]
+    dy = u[:, None, 1] - predicted[None, :, 1]
+    d2 = dx * dx + dy * dy
+    star = np.argmin(d2, axis=1)
+    rows = np.arange(len(u))
+    nearest = d2[rows, star]
+    mutual = (np.argmin(d2, axis=0)[star] == rows) & (nearest <= limit_px**2)
+    ambiguous = np.zeros(len(u), dtype=np.bool_)
+    if distinct_px2 is not None:
+        next_star = np.partition(d2, 1, axis=1)[:, 1] if d2.shape[1] > 1 else np.full(len(u), np.inf)
+        next_centroid = np.partition(d2, 1, axis=0)[1][star] if d2.shape[0] > 1 else np.full(len(u), np.inf)
+        ambiguous = mutual & (np.minimum(next_star, next_centroid) - nearest < distinct_px2)
+    keep = np.flatnonzero(mutual & ~ambiguous)
+    return keep.astype(np.int64), star[keep].astype(np.int64), int(ambiguous.sum())

@@ -1,0 +1,64 @@
+"""The catalogue's stars around a direction, to the depth that suits a frame."""
+
+from __future__ import annotations
+
+from math import pi
+from typing import Any
+
+import numpy as np
+
+from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.identification.pyramid import FieldGeometry
+
+# Centroids are compared with the catalogue down to where a field holds this many stars for each, and some more.
+_STARS_PER_CENTROID, _STARS_MORE = 2.0, 20
+
+
+class Sky:
+    """A catalogue, searched to the depth that suits a frame.
+
+    Parameters
+    ----------
+    directions : (N, 3) array
+        Unit vectors.
+    mag : (N,) array
+        Magnitudes.
+    geometry : FieldGeometry
+        The field of view.
+    """
+
+    def __init__(self, directions: FloatArray, mag: FloatArray, geometry: FieldGeometry) -> None:
+        self.rows: IntArray = np.argsort(mag, kind="stable").astype(np.int64)
+        self.directions = np.ascontiguousarray(directions[self.rows])
+        self.mag = mag[self.rows]
+        self.geometry = geometry
+        self._trees: dict[int, Any] = {}
+
+    def depth(self, n_centroids: int) -> int:
+        """Number of stars on the whole sky that a frame with so many centroids is compared with."""
+        g = self.geometry
+        field_sr = g.width_px * g.height_px / g.focal_px**2
+        wanted = (_STARS_PER_CENTROID * n_centroids + _STARS_MORE) * 4.0 * pi / field_sr
+        return min(len(self.rows), _step(wanted))
+
+    def seen_by(self, geometry: FieldGeometry) -> Sky:
+        """The same catalogue for another camera."""
+        other = object.__new__(Sky)
+        other.__dict__.update(self.__dict__)
+        other.geometry = geometry
+        return other
+
+    def around(self, boresight: FloatArray, radius_rad: float, depth: int) -> IntArray:
+        """Stars, by brightness rank, within an angle of a direction."""
+        from scipy.spatial import cKDTree
+
+        if depth not in self._trees:
+            self._trees[depth] = cKDTree(self.directions[:depth])
+        chord = 2.0 * np.sin(0.5 * min(radius_rad, pi))
+        found = self._trees[depth].query_ball_point(boresight, chord, return_sorted=True)
+        return np.asarray(found, dtype=np.int64)
+
+
+def _step(wanted: float) -> int:
+    """The next power of the square root of two: few different depths, because each has its own tree."""
+    return int(np.ceil(2.0 ** (np.ceil(2.0 * np.log2(wanted)) / 2.0)))

@@ -1,0 +1,226 @@
+"""Pairs of catalogue stars sorted by angle: what a pattern search looks things up in, kept on disk.
+
+Patterns are made of the brightest stars of each neighbourhood only, so that a field holds about as many of them
+everywhere on the sky. A range of angles is a slice of the sorted pairs (the purpose of the k-vector of Mortari et al.
+2004, reached by binary search). The neighbours of each star are sorted by angle too, and a table of equal steps says
+where each step begins: thousands of questions "which stars are at this angle from that star" are one look-up.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import sys
+import zipfile
+from dataclasses import dataclass, fields
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.runs.folder import atomic_path
+
+# Stars a field should hold; a star with this many brighter ones within a field's area around it is no pattern star.
+PATTERN_STARS = 18
+# Steps of angle in the table of neighbours.
+_STEPS = 256
+# Part of the key of every cache file: to be raised when the content or its meaning changes.
+_VERSION = 1
+
+
+@dataclass(frozen=True, eq=False)
+class StarPairs:
+    """Pattern stars and the angles between them; n stars, P pairs.
+
+    Attributes
+    ----------
+    star : (n,) array of int
+        Rows of the catalogue.
+    directions : (n, 3) array
+        Unit vectors.
+    first, second : (P,) arrays of int
+        Pattern stars (0 to n - 1) of each pair, sorted by angle.
+    angle : (P,) array
+        Angle of each pair, rad, increasing.
+    neighbour : (2 P,) array of int
+        Partners of pattern star 0, then of star 1 and so on; those of one star by increasing angle.
+    neighbour_angle : (2 P,) array
+        Their angles, rad.
+    neighbour_start : (n + 1,) array of int
+        Where the partners of each star begin.
+    """
+
+    star: IntArray
+    directions: FloatArray
+    first: IntArray
+    second: IntArray
+    angle: FloatArray
+    neighbour: IntArray
+    neighbour_angle: FloatArray
+    neighbour_start: IntArray
+
+    def __len__(self) -> int:
+        return len(self.star)
+
+    def near_angle(self, star: IntArray, angle_rad: FloatArray, tolerance_rad: float) -> tuple[IntArray, IntArray]:
+        """Pattern stars at given angles from given stars.
+
+        Parameters
+        ----------
+        star : (m,) array of int
+            Pattern stars.
+        angle_rad : (m,) array
+            An angle for each.
+        tolerance_rad : float
+            Half the width of the range.
+
+        Returns
+        -------
+        question : (h,) array of int
+            Index into `star`, of each hit.
+        partner : (h,) array of int
+            The pattern star.
+        """
+        edges, per_rad = self._steps
+        place = star * _STEPS
+        # NumPy's `clip` takes longer than these arrays of some thousand numbers deserve.
+        first = np.maximum((angle_rad - tolerance_rad) * per_rad, 0.0).astype(np.int64)
+        last = np.minimum((angle_rad + tolerance_rad) * per_rad, _STEPS - 1.0).astype(np.int64)
+        start = edges[place + np.minimum(first, _STEPS - 1)]
+        count = edges[place + last + 1] - start
+        # A range beyond the largest angle is the last step, which the comparison below empties.
+        some = np.flatnonzero(count > 0)
+        start, count = start[some], count[some]
+        total = np.cumsum(count)
+        n = int(total[-1]) if len(total) else 0
+        question = np.repeat(some, count)
+        row = np.arange(n) + np.repeat(start - (total - count), count)
+        inside = np.flatnonzero(np.abs(self.neighbour_angle[row] - angle_rad[question]) <= tolerance_rad)
+        return question[inside], self.neighbour[row[inside]]
+
+    @cached_property
+    def _steps(self) -> tuple[IntArray, float]:
+        """Where each step of each star's neighbours begins, (n * steps + 1,), and the steps per rad."""
+        width = (float(self.angle[-1]) if len(self.angle) else 1.0) / _STEPS * (1.0 + 1e-12)
+        star = np.repeat(np.arange(len(self)), np.diff(self.neighbour_start))
+        step = np.clip((self.neighbour_angle * (1.0 / width)).astype(np.int64), 0, _STEPS - 1)
+        counts = np.bincount(star * _STEPS + step, minlength=len(self) * _STEPS)
+        return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), 1.0 / width
+
+
+def find_star_pairs(
+    directions: FloatArray, mag: FloatArray, field_sr: float, max_angle_rad: float, per_field: int = PATTERN_STARS
+) -> StarPairs:
+    """Choose pattern stars and list their pairs.
+
+    Parameters
+    ----------
+    directions : (N, 3) array
+        Unit vectors of the catalogue.
+    mag : (N,) array
+        Magnitudes.
+    field_sr : float
+        Solid angle of the field of view, sr.
+    max_angle_rad : float
+        Largest angle of a pair.
+    per_field : int
+        Pattern stars that a field should hold.
+    """
+    from scipy.spatial import cKDTree
+
+    order = np.argsort(mag, kind="stable")
+    # Twice as many as needed on average leaves enough far from the Milky Way.
+    order = order[: int(np.ceil(2.5 * per_field * 4.0 * np.pi / field_sr))]
+    near = cKDTree(directions[order]).query_pairs(_chord(np.sqrt(field_sr / np.pi)), output_type="ndarray")
+    brighter = np.bincount(near.max(axis=1), minlength=len(order)) if len(near) else np.zeros(len(order))
+    star = order[brighter < per_field].astype(np.int64)
+    chosen = np.ascontiguousarray(directions[star])
+    pairs = cKDTree(chosen).query_pairs(_chord(max_angle_rad), output_type="ndarray").reshape(-1, 2).astype(np.int64)
+    angle = angle_between(chosen[pairs[:, 0]], chosen[pairs[:, 1]])
+    # Ties are broken by the stars' numbers, so that the order does not depend on the library's.
+    rank = np.lexsort((pairs[:, 1], pairs[:, 0], angle))
+    first, second, angle = pairs[rank, 0], pairs[rank, 1], angle[rank]
+    star_of = np.concatenate([first, second])
+    by_star = np.lexsort((np.concatenate([angle, angle]), star_of))
+    start = np.concatenate([[0], np.cumsum(np.bincount(star_of, minlength=len(star)))]).astype(np.int64)
+    neighbour = np.concatenate([second, first])[by_star]
+    return StarPairs(star, chosen, first, second, angle, neighbour, np.concatenate([angle, angle])[by_star], start)
+
+
+def angle_between(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Angles (...) in rad between unit vectors (..., 3), from the chord, which keeps its digits at small angles."""
+    difference = a - b
+    chord = np.sqrt(np.einsum("...i,...i->...", difference, difference))
+    angle: FloatArray = 2.0 * np.arcsin(np.minimum(0.5 * chord, 1.0))
+    return angle
+
+
+def cached_star_pairs(
+    directions: FloatArray,
+    mag: FloatArray,
+    field_sr: float,
+    max_angle_rad: float,
+    cache_dir: str | os.PathLike[str] | None = None,
+    per_field: int = PATTERN_STARS,
+) -> StarPairs:
+    """`find_star_pairs`, from a file of the cache folder where there is one, leaving one there where there is none.
+
+    The file's name is a hash of the catalogue and of all parameters. A damaged file is replaced; a folder that cannot
+    be written to does no harm.
+
+    Parameters
+    ----------
+    directions, mag, field_sr, max_angle_rad, per_field
+        As for `find_star_pairs`.
+    cache_dir : path, optional
+        The folder, made when it is missing; `default_cache_dir()` if not given.
+    """
+    digest = hashlib.sha256(repr((_VERSION, field_sr, max_angle_rad, per_field)).encode())
+    for array in (directions, mag):
+        digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
+    folder = default_cache_dir() if cache_dir is None else Path(cache_dir)
+    path = folder / f"star-pairs-{digest.hexdigest()[:24]}.npz"
+    stored = _read(path)
+    if stored is not None:
+        return stored
+    pairs = find_star_pairs(directions, mag, field_sr, max_angle_rad, per_field)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with atomic_path(path) as temporary:
+            np.savez(temporary, **{field.name: getattr(pairs, field.name) for field in fields(StarPairs)})
+    except (OSError, RunFolderError):
+        # The cache only saves time: without it everything works.
+        return pairs
+    return pairs
+
+
+def default_cache_dir() -> Path:
+    """The platform's folder for files that can be made again, with this package's name."""
+    if base := os.environ.get("XDG_CACHE_HOME"):
+        return Path(base) / "starcal_uq"
+    if sys.platform == "win32":  # pragma: no cover
+        return Path(os.environ.get("LOCALAPPDATA", Path.home() / "AppData" / "Local")) / "starcal_uq" / "Cache"
+    if sys.platform == "darwin":  # pragma: no cover
+        return Path.home() / "Library" / "Caches" / "starcal_uq"
+    return Path.home() / ".cache" / "starcal_uq"
+
+
+def _read(path: Path) -> StarPairs | None:
+    """The pairs in a file; None where it is missing, damaged or does not fit together."""
+    names = [field.name for field in fields(StarPairs)]
+    try:
+        # Opened here, because NumPy leaves a damaged archive open.
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            pairs = StarPairs(**{name: archive[name] for name in names})
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        return None
+    n, p = len(pairs.star), len(pairs.angle)
+    sizes = (len(pairs.first), len(pairs.second), len(pairs.neighbour) / 2, len(pairs.neighbour_angle) / 2)
+    fits = pairs.directions.shape == (n, 3) and len(pairs.neighbour_start) == n + 1 and all(s == p for s in sizes)
+    return pairs if fits else None
+
+
+def _chord(angle_rad: float) -> float:
+    return 2.0 * float(np.sin(0.5 * min(angle_rad, np.pi)))

@@ -1,0 +1,281 @@
+"""The pyramid search: from bare centroids to hypotheses about attitude and focal length.
+
+After Mortari, Samaan, Bruccoleri & Junkins 2004, Navigation 51(3), 171-183: triangles of centroids, in an order that
+does not stay with one centroid, so that a false one costs little; a triangle is looked up in the catalogue by its
+sides, and a fourth star confirms it. Here the focal length is only known within a tolerance. Each catalogue pair that
+may be the first side fixes it, and the other sides are compared after dividing by it: their tolerance holds only noise,
+the shift of the principal point and distortion.
+
+Points are *ideal pixels*: offsets from the principal point, with the distortion of the nominal camera removed, shape
+(n, 2); the direction is (x, y, f).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.identification.pairs import StarPairs, angle_between
+
+# Tolerances hold this many standard deviations.
+SIGMAS = 3.5
+# Triangles of this many successive ones in Mortari's order are taken by size, small ones first.
+_GROUP = 10
+# A base shorter than this share of the detector's width fixes the focal length badly.
+_LEAST_BASE = 0.12
+# Hypotheses of one triangle that are handed on, those with most support.
+_HANDED_ON = 6
+
+
+@dataclass(frozen=True)
+class CameraTolerance:
+    """How far the camera may be from its nominal values.
+
+    Attributes
+    ----------
+    focal : float
+        Relative error of the focal length.
+    centre_px : float
+        Error of the principal point per axis, px.
+    distortion_px : float
+        Unknown displacement at the farthest corner, px.
+    """
+
+    focal: float
+    centre_px: float
+    distortion_px: float
+
+
+@dataclass(frozen=True)
+class FieldGeometry:
+    """The nominal camera as the search sees it.
+
+    Attributes
+    ----------
+    focal_px : float
+        Nominal focal length, px.
+    width_px, height_px : float
+        Detector.
+    corner_px : float
+        Distance of the farthest corner from the principal point, px.
+    """
+
+    focal_px: float
+    width_px: float
+    height_px: float
+    corner_px: float
+
+    def relative_bias(self, tolerance: CameraTolerance) -> float:
+        """By how much the scale may vary over the field, from principal point and distortion."""
+        shift = tolerance.centre_px * max(self.width_px, self.height_px) / self.focal_px**2
+        return shift + 2.0 * tolerance.distortion_px / self.corner_px
+
+
+@dataclass(frozen=True, eq=False)
+class Hypothesis:
+    """An attitude to be verified: rotation (3, 3), b = R r, and the focal length over its nominal value."""
+
+    rotation: FloatArray
+    scale: float
+
+
+def mortari_order(n: int) -> IntArray:
+    """Triangles of n centroids, (n choose 3, 3), in Mortari's order: neighbours in the list first, and none twice."""
+    triangles = [
+        (i, i + dj, i + dj + dk) for dj in range(1, n - 1) for dk in range(1, n - dj) for i in range(n - dj - dk)
+    ]
+    return np.array(triangles, dtype=np.int64).reshape(-1, 3)
+
+
+def first_order(n: int, more: bool) -> IntArray:
+    """The triangles of a first search among n centroids: all of them, or the first half where there are more centroids.
+
+    Half of the triangles find what most of them would; the rest are better spent on other centroids.
+    """
+    triangles = mortari_order(n)
+    return triangles[: len(triangles) // 2] if more else triangles
+
+
+def remaining_order(n: int, searched: int) -> IntArray:
+    """Triangles of n centroids whose numbers are all even or all odd, without those of a first search.
+
+    A quarter of all triangles, and yet any five true stars have three of one parity among them.
+    """
+    triangles = mortari_order(n)
+    parity = triangles % 2
+    kept = triangles[np.all(parity == parity[:, :1], axis=1)]
+    done = {tuple(three) for three in first_order(searched, n > searched).tolist()}
+    return np.array([three for three in kept.tolist() if tuple(three) not in done], dtype=np.int64).reshape(-1, 3)
+
+
+def hypotheses(
+    points: FloatArray,
+    sigma_px: FloatArray,
+    pairs: StarPairs,
+    tree: object,
+    geometry: FieldGeometry,
+    tolerance: CameraTolerance,
+    max_centroids: int = 12,
+    searched: int = 0,
+) -> Iterator[list[Hypothesis]]:
+    """For each triangle, the hypotheses that a fourth star supports, best first.
+
+    Parameters
+    ----------
+    points : (n, 2) array
+        Ideal pixels, brightest first.
+    sigma_px : (n,) array
+        Noise per axis.
+    pairs : StarPairs
+        Pattern stars.
+    tree : scipy.spatial.cKDTree
+        Of ``pairs.directions``.
+    geometry, tolerance
+        The nominal camera, and how far it may be off.
+    max_centroids : int
+        Triangles are made of so many centroids, the brightest.
+    searched : int
+        So many centroids were searched before: only triangles that this has left are made (`remaining_order`).
+    """
+    n = min(len(points), max_centroids)
+    if n < 4:
+        return
+    triangles = remaining_order(n, searched) if searched else first_order(n, len(points) > n)
+    u, sigma = points[:n], sigma_px[:n]
+    b = _directions(u, np.array([geometry.focal_px]))[0]
+    angle = angle_between(b[:, None], b[None])
+    length = np.hypot(*(u[:, None] - u[None]).transpose(2, 0, 1))
+    bases: dict[tuple[int, int], tuple[IntArray, IntArray, FloatArray]] = {}
+    for triangle in _sorted_triangles(triangles, length, geometry):
+        found = _look_up(triangle, b, angle, sigma, pairs, geometry, tolerance, bases)
+        if len(found):
+            yield _supported(triangle, found, u, sigma, angle, length, pairs, tree, geometry, tolerance)
+
+
+def _sorted_triangles(triangles: IntArray, length: FloatArray, geometry: FieldGeometry) -> list[tuple[int, int, int]]:
+    """Triangles as (i, j, k) with the base i-j: the shortest side that is long enough, otherwise the longest.
+
+    Star k is nearer to i than to j, which leaves the fewest stars to look at.
+    """
+    sides = np.array([(0, 1, 2), (1, 2, 0), (2, 0, 1)])
+    options = triangles[:, sides]
+    size = length[options[..., 0], options[..., 1]]
+    enough = size >= _LEAST_BASE * geometry.width_px
+    rank = np.where(enough, size, np.where(enough.any(axis=1, keepdims=True), np.inf, -size))
+    best = np.argmin(rank, axis=1)
+    rows = np.arange(len(triangles))
+    chosen, base = options[rows, best], size[rows, best]
+    order = np.lexsort((base, rows // _GROUP))
+    return [(i, j, k) if length[i, k] <= length[j, k] else (j, i, k) for i, j, k in chosen[order].tolist()]
+
+
+def _look_up(
+    triangle: tuple[int, int, int],
+    b: FloatArray,
+    angle: FloatArray,
+    sigma: FloatArray,
+    pairs: StarPairs,
+    geometry: FieldGeometry,
+    tolerance: CameraTolerance,
+    bases: dict[tuple[int, int], tuple[IntArray, IntArray, FloatArray]],
+) -> IntArray:
+    """Catalogue triangles (m, 3) with these sides and this handedness; `bases` keeps the pairs for each base."""
+    i, j, k = triangle
+    f, bias = geometry.focal_px, geometry.relative_bias(tolerance)
+    noise = SIGMAS * np.sqrt(2.0) * float(max(sigma[i], sigma[j], sigma[k])) / f
+    base = angle[i, j]
+    key = (min(i, j), max(i, j))
+    if key not in bases:
+        slack = base * (tolerance.focal + bias) + SIGMAS * np.hypot(sigma[i], sigma[j]) / f
+        low, high = np.searchsorted(pairs.angle, (base - slack, base + slack))
+        first, second, size = pairs.first[low:high], pairs.second[low:high], pairs.angle[low:high] / base
+        bases[key] = np.concatenate([first, second]), np.concatenate([second, first]), np.concatenate([size, size])
+    a, c, scale = bases[key]
+    near = angle[i, k]
+    near_tol = noise * np.hypot(1.0, near / base) + bias * near
+    row, third = pairs.near_angle(a, scale * near, near_tol)
+    far = angle[j, k]
+    far_tol = noise * np.hypot(1.0, far / base) + bias * far
+    second, expected = c[row], scale[row] * far
+    keep = np.abs(angle_between(pairs.directions[second], pairs.directions[third]) - expected) < far_tol
+    row, second, third = row[keep], second[keep], third[keep]
+    found = np.column_stack([a[row], second, third])
+    # A flat triangle has no handedness beyond the noise.
+    height = abs(float(np.linalg.det(b[[i, j, k]]))) / max(base, near, far)
+    if height > 2.0 * noise:
+        sign = np.sign(np.linalg.det(b[[i, j, k]]))
+        found = found[np.sign(_triple(pairs.directions, found)) == sign]
+    return found
+
+
+def _supported(
+    triangle: tuple[int, int, int],
+    found: IntArray,
+    u: FloatArray,
+    sigma: FloatArray,
+    angle: FloatArray,
+    length: FloatArray,
+    pairs: StarPairs,
+    tree: object,
+    geometry: FieldGeometry,
+    tolerance: CameraTolerance,
+) -> list[Hypothesis]:
+    """Hypotheses with a fourth star among the bright centroids, those with most of them first."""
+    i, j, k = corner = list(triangle)
+    r = pairs.directions[found]
+    perimeter = angle[i, j] + angle[j, k] + angle[k, i]
+    measured = (
+        angle_between(r[:, 0], r[:, 1]) + angle_between(r[:, 1], r[:, 2]) + angle_between(r[:, 2], r[:, 0])
+    ) / perimeter
+    scale = 1.0 / measured
+    b = _directions(u, geometry.focal_px * scale)
+    # Roll from the longest side.
+    p, q = max(((0, 1), (1, 2), (2, 0)), key=lambda side: length[corner[side[0]], corner[side[1]]])
+    camera_axes = _axes(b[:, corner], p, q)
+    rotation = camera_axes.transpose(0, 2, 1) @ _axes(r, p, q)
+    others = np.array([m for m in range(len(u)) if m not in corner])
+    sky = b[:, others] @ rotation
+    span = length[corner[p], corner[q]]
+    reach = np.hypot(*(u[others] - u[corner].mean(axis=0)).T)
+    noise = float(np.max(sigma[corner]))
+    gate_px = SIGMAS * np.hypot(sigma[others], noise * (1.0 + 1.5 * reach / span))
+    gate_px = gate_px + geometry.relative_bias(tolerance) * (reach + span)
+    gate = gate_px / geometry.focal_px
+    distance, _ = tree.query(sky.reshape(-1, 3), distance_upper_bound=float(gate.max()))  # type: ignore[attr-defined]
+    support = np.sum(distance.reshape(len(found), -1) < gate, axis=1)
+    best = np.argsort(-support, kind="stable")
+    best = best[support[best] > 0][:_HANDED_ON]
+    return [Hypothesis(rotation[m], float(scale[m])) for m in best]
+
+
+def _directions(u: FloatArray, focal_px: FloatArray) -> FloatArray:
+    """Unit vectors (m, n, 3) of ideal pixels (n, 2) for focal lengths (m,)."""
+    m, n = len(focal_px), len(u)
+    b = np.empty((m, n, 3))
+    b[..., :2] = u
+    b[..., 2] = focal_px[:, None]
+    b /= np.sqrt(np.einsum("mni,mni->mn", b, b))[..., None]
+    return b
+
+
+def _triple(directions: FloatArray, found: IntArray) -> FloatArray:
+    """Triple products (m,) of triangles (m, 3)."""
+    a, b, c = (directions[found[:, column]].T for column in range(3))
+    product: FloatArray = (
+        a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
+    )
+    return product
+
+
+def _axes(v: FloatArray, p: int, q: int) -> FloatArray:
+    """Orthonormal axes (m, 3 axes, 3) of triangles (m, 3, 3): towards the middle, and along one side."""
+    z = v.sum(axis=1)
+    z = z / np.sqrt(np.einsum("mi,mi->m", z, z))[:, None]
+    x = v[:, q] - v[:, p]
+    x = x - np.einsum("mi,mi->m", x, z)[:, None] * z
+    x = x / np.sqrt(np.einsum("mi,mi->m", x, x))[:, None]
+    y = z[:, [1, 2, 0]] * x[:, [2, 0, 1]] - z[:, [2, 0, 1]] * x[:, [1, 2, 0]]
+    return np.stack([x, y, z], axis=1)

@@ -1,0 +1,157 @@
+"""The result of star identification: observations, a record of every frame, the refined camera."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass
+from html import escape
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+import numpy as np
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.core.formatting import plural
+from starcal_uq.core.types import FloatArray
+from starcal_uq.observations.table import Observations
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Parity: TypeAlias = Literal["normal", "mirrored"]
+Status: TypeAlias = Literal["identified", "not identified", "ambiguous", "too few stars"]
+STATUSES: tuple[Status, ...] = ("identified", "not identified", "ambiguous", "too few stars")
+
+
+@dataclass(frozen=True, eq=False)
+class FrameIdentification:
+    """What became of one frame.
+
+    Attributes
+    ----------
+    frame : int
+        Its number.
+    image : str
+        Name of its image.
+    status : str
+        "identified"; "not identified": no attitude is accepted; "ambiguous": more than one is; "too few stars": fewer
+        than four centroids.
+    n_centroids, n_identified : int
+        Centroids, and those with a catalogue star.
+    n_ambiguous : int
+        Centroids left out because two stars, or two centroids, are too close to tell which is which.
+    n_unlike_brightness : int
+        Centroids left out because they are farther from their star, and less of its brightness, than chance explains.
+    log10_expected_false : float
+        Decimal logarithm of the number of wrong attitudes, on the whole sky, expected to match as well; NaN if not
+        identified.
+    quaternion : (4,) array or None
+        Scalar last, of R_cam_icrs (b = R r).
+    noise_scale : float
+        Noise found over noise stated, at least 1: the gate was widened by it.
+    taste, taste_p_value : float
+        Shuster's TASTE with the refined camera and the stated noise, chi-square with 2m - 3 degrees of freedom, and its
+        p-value.
+    milliseconds : float
+        Time spent on the frame.
+    """
+
+    frame: int
+    image: str
+    status: Status
+    n_centroids: int
+    n_identified: int
+    n_ambiguous: int
+    n_unlike_brightness: int
+    log10_expected_false: float
+    quaternion: FloatArray | None
+    noise_scale: float
+    taste: float
+    taste_p_value: float
+    milliseconds: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Identification:
+    """Identified stars of all frames.
+
+    Attributes
+    ----------
+    observations : Observations
+        The identified stars. In a mirrored set, `x_px` is counted from the right edge: width_px - 1 - x.
+    frames : tuple of FrameIdentification
+        Every frame that was given, identified or not.
+    camera : Camera
+        Refined from all identified frames, damped by the tolerances: for matching, not a calibration. Its principal
+        point is counted as the observations are.
+    nominal : Camera
+        The camera of the search, counted likewise.
+    parity : str
+        "normal", or "mirrored" where the images are mirror images of the sky.
+    n_left_out : int
+        Frames whose images had been left out before, when the centroids were measured; `summary` is of the others.
+    """
+
+    observations: Observations
+    frames: tuple[FrameIdentification, ...]
+    camera: Camera
+    nominal: Camera
+    parity: Parity
+    n_left_out: int = 0
+
+    @property
+    def n_identified(self) -> int:
+        """Frames identified."""
+        return sum(frame.status == "identified" for frame in self.frames)
+
+    @property
+    def summary(self) -> str:
+        """The result in a few sentences."""
+        n_frames = len(self.frames) - self.n_left_out
+        if not n_frames:
+            return "There are no frames."
+        counts = Counter(frame.status for frame in self.frames)
+        counts["too few stars"] -= self.n_left_out
+        be = "is" if 1 in (self.n_identified, n_frames) else "are"
+        words = f"{self.n_identified} of {plural(n_frames, 'frame')} {be} identified"
+        if self.n_identified:
+            stars = [frame.n_identified for frame in self.frames if frame.status == "identified"]
+            words += f", with {np.mean(stars):.1f} stars on average"
+        words += "."
+        rest = [f"{counts[status]} {_REASONS[status]}" for status in STATUSES[1:] if counts[status]]
+        if rest:
+            words += f" Left out: {'; '.join(rest)}."
+        unlike = sum(frame.n_unlike_brightness for frame in self.frames)
+        if unlike:
+            words += f" {plural(unlike, 'match', 'matches')} given up, because the brightness is unlike the star's."
+        if self.n_identified:
+            change = 100.0 * (self.camera.focal_px / self.nominal.focal_px - 1.0)
+            words += f" The focal length is {abs(change):.2f} % {'longer' if change >= 0 else 'shorter'} than nominal."
+        if self.parity == "mirrored":
+            words += " The images are mirror images of the sky: x is counted from the right edge."
+        return words
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """One row for each frame, with the fields of `FrameIdentification`; the quaternion in columns qx to qw."""
+        import pandas as pd
+
+        rows = []
+        for frame in self.frames:
+            row = {name: value for name, value in vars(frame).items() if name != "quaternion"}
+            q = np.full(4, np.nan) if frame.quaternion is None else frame.quaternion
+            rows.append(row | dict(zip(("qx", "qy", "qz", "qw"), q.tolist(), strict=True)))
+        return pd.DataFrame(rows)
+
+    def __repr__(self) -> str:
+        return f"<Identification: {self.summary}>"
+
+    def _repr_html_(self) -> str:
+        table: str = self.to_dataframe().to_html(index=False, border=0, max_rows=12)
+        return f"<p>{escape(self.summary)}</p>{table}"
+
+
+_REASONS: dict[Status, str] = {
+    "identified": "identified",
+    "not identified": "in which no attitude explains the centroids well enough",
+    "ambiguous": "that fit more than one attitude",
+    "too few stars": "with fewer than four centroids",
+}

@@ -1,0 +1,257 @@
+"""One camera, one catalogue, one set of tolerances: identify frames with them, one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from os import PathLike
+from time import perf_counter
+from typing import Protocol
+
+import numpy as np
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.projection import unproject
+from starcal_uq.core.types import FloatArray, IntArray, StrArray
+from starcal_uq.identification.brightness import instrumental_mag
+from starcal_uq.identification.match import CameraState, Match, match_frame, start_state
+from starcal_uq.identification.nearby import Sky
+from starcal_uq.identification.pairs import StarPairs
+from starcal_uq.identification.proposers import Proposer, PyramidProposer, prepare_pairs
+from starcal_uq.identification.pyramid import CameraTolerance, FieldGeometry
+from starcal_uq.identification.result import Status
+from starcal_uq.sky.catalogue import StarCatalogue
+
+# A frame is identified when fewer wrong attitudes than this are expected to match as well.
+MAX_EXPECTED_FALSE = 1e-4
+# Fewer stars than this are not identified: three have no redundancy beyond the focal length.
+MIN_STARS = 4
+# Centroids are not believed to be better than this: catalogue positions and the lens have errors of their own.
+LEAST_SIGMA_PX = 0.05
+# Above this expectation the search goes on after a first success, to see whether another attitude fits too.
+_BEYOND_DOUBT = 1e-8
+_OTHER_ATTITUDE_RAD = 2e-3
+# Triangles are made of so many centroids first, and then of so many.
+_CENTROIDS = (10, 16)
+_MAX_TRIANGLES = 200
+# A match with more than this noise, or with less than half of the centroids, is compared with those of more triangles.
+_POOR_FIT = 1.3
+_MORE_TRIANGLES = 5
+# Triangles of a frame that is tried once more with a worse lens, whose many hypotheses take long.
+_MAX_TRIANGLES_WIDE = 60
+
+
+class CentroidTable(Protocol):
+    """What `identify` reads of a table of centroids: N rows, K frames."""
+
+    @property
+    def frame(self) -> IntArray: ...
+    @property
+    def x_px(self) -> FloatArray: ...
+    @property
+    def y_px(self) -> FloatArray: ...
+    @property
+    def flux(self) -> FloatArray: ...
+    @property
+    def sigma_px(self) -> FloatArray: ...
+    @property
+    def frame_ids(self) -> IntArray: ...
+    @property
+    def image(self) -> StrArray: ...
+    @property
+    def time_utc(self) -> StrArray: ...
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What became of a frame."""
+
+    status: Status
+    match: Match | None
+    seconds: float
+
+
+class FrameTable:
+    """Centroids frame by frame, brightest first, as pixels and as ideal pixels of one camera."""
+
+    def __init__(self, table: CentroidTable, camera: Camera, mirrored: bool = False) -> None:
+        self.camera = camera.replace(x0_px=camera.width_px - 1 - camera.x0_px) if mirrored else camera
+        self.ids = [int(i) for i in table.frame_ids]
+        x = np.asarray(table.x_px, dtype=np.float64)
+        xy = np.column_stack([camera.width_px - 1 - x if mirrored else x, np.asarray(table.y_px, dtype=np.float64)])
+        frame = np.asarray(table.frame)
+        # lexsort is stable: centroids of equal brightness keep their order.
+        order = np.lexsort((-np.asarray(table.flux, dtype=np.float64), frame))
+        edges = np.searchsorted(frame[order], self.ids, side="left"), np.searchsorted(frame[order], self.ids, "right")
+        self.rows: list[IntArray] = [order[i:j].astype(np.int64) for i, j in zip(*edges, strict=True)]
+        self.xy: list[FloatArray] = [xy[rows] for rows in self.rows]
+        sigma = np.hypot(np.asarray(table.sigma_px, dtype=np.float64), LEAST_SIGMA_PX)
+        self.sigma: list[FloatArray] = [sigma[rows] for rows in self.rows]
+        flux = np.asarray(table.flux, dtype=np.float64)
+        if len(saturated := np.asarray(getattr(table, "saturated", ()), dtype=np.bool_)):
+            flux = np.where(saturated, np.nan, flux)
+        self.mag = [instrumental_mag(flux[rows]) for rows in self.rows]
+        self.points = self._ideal(self.camera)
+
+    def _ideal(self, camera: Camera) -> list[FloatArray]:
+        stacked = np.concatenate(self.xy) if self.xy else np.empty((0, 2))
+        if not len(stacked):
+            return [xy.copy() for xy in self.xy]
+        b = unproject(camera, stacked)
+        return np.split(camera.focal_px * b[:, :2] / b[:, 2:], np.cumsum([len(xy) for xy in self.xy])[:-1])
+
+    def seen_by(self, camera: Camera) -> FrameTable:
+        """The same frames in the ideal pixels of another camera."""
+        other = object.__new__(FrameTable)
+        other.__dict__.update(self.__dict__)
+        other.camera, other.points = camera, other._ideal(camera)
+        return other
+
+
+class Search:
+    """The catalogue prepared for one camera and its tolerances."""
+
+    def __init__(
+        self,
+        camera: Camera,
+        stars: StarCatalogue,
+        tolerance: CameraTolerance,
+        cache: bool = True,
+        cache_dir: str | PathLike[str] | None = None,
+        pairs: StarPairs | None = None,
+        *,
+        proposer: Proposer | None = None,
+    ) -> None:
+        self.geometry = field_geometry(camera)
+        self.tolerance, self.radial = tolerance, has_radial(camera)
+        self.centroids: tuple[int, ...] = _CENTROIDS
+        self.triangles = _MAX_TRIANGLES
+        if proposer is None:
+            proposer = PyramidProposer(pairs or prepare_pairs(stars, self.geometry, tolerance, cache, cache_dir))
+        self.proposer = proposer
+        self.sky = Sky(stars.directions_icrs, stars.mag, self.geometry)
+
+    @property
+    def pairs(self) -> StarPairs:
+        """The pattern stars, for another search in the same catalogue."""
+        if not isinstance(self.proposer, PyramidProposer):
+            raise AttributeError("only the engine `pyramid` has pairs of stars")
+        return self.proposer.pairs
+
+    def widened(self, factor: float) -> Search:
+        """The same for a lens with more distortion."""
+        other = object.__new__(Search)
+        other.__dict__.update(self.__dict__)
+        other.tolerance = replace(self.tolerance, distortion_px=self.tolerance.distortion_px * factor)
+        other.centroids, other.triangles = _CENTROIDS[:1], _MAX_TRIANGLES_WIDE
+        return other
+
+    def narrowed(self, camera: Camera, covariance: FloatArray) -> Search:
+        """The same for a camera known from the frames so far."""
+        other = object.__new__(Search)
+        other.__dict__.update(self.__dict__)
+        sd = 4.0 * np.sqrt(np.diag(covariance))
+        t = self.tolerance
+        # Not below what a lens model with few terms leaves over.
+        other.tolerance = CameraTolerance(
+            min(max(float(sd[0]), 2e-4), t.focal),
+            min(max(float(sd[1]), float(sd[2]), 1.0), t.centre_px),
+            min(max(float(sd[3]), 0.3), t.distortion_px),
+        )
+        other.geometry = replace(self.geometry, focal_px=camera.focal_px, corner_px=camera.corner_radius_px)
+        other.sky = self.sky.seen_by(other.geometry)
+        return other
+
+    def frame(self, field: FrameTable, k: int) -> Found:
+        """Identify one frame from nothing."""
+        clock = perf_counter()
+        if len(field.points[k]) < MIN_STARS:
+            return Found("too few stars", None, perf_counter() - clock)
+        status, match = self._look(field, k)
+        return Found(status, match, perf_counter() - clock)
+
+    def again(self, field: FrameTable, k: int, first: Found, shared: FloatArray) -> Found:
+        """The second pass: match anew with the common camera, or search once more."""
+        clock = perf_counter()
+        if first.match is None:
+            found = self.frame(field, k)
+            return replace(found, seconds=found.seconds + first.seconds)
+        state = first.match.state
+        start = CameraState(state.rotation, state.shared - shared)
+        match = self._matched(field, k, start, polished=True)
+        seconds = first.seconds + perf_counter() - clock
+        # A frame that fits by itself but not with the camera of the others is not trusted.
+        if match is None or match.log10_false > np.log10(MAX_EXPECTED_FALSE):
+            return Found("not identified", None, seconds)
+        return Found(first.status, match, seconds)
+
+    def _matched(self, field: FrameTable, k: int, start: CameraState, polished: bool = False) -> Match | None:
+        return match_frame(
+            field.points[k],
+            field.sigma[k],
+            self.sky,
+            start,
+            self.tolerance,
+            mag=field.mag[k],
+            radial=self.radial,
+            polished=polished,
+        )
+
+    def _look(self, field: FrameTable, k: int) -> tuple[Status, Match | None]:
+        searched = 0
+        for n_centroids in self.centroids:
+            if len(field.xy[k]) <= searched:
+                break
+            accepted = list(self._accepted(field, k, n_centroids, searched))
+            searched = n_centroids
+            if accepted:
+                best = min(accepted, key=lambda match: match.log10_false)
+                turn = best.state.rotation.T
+                # An attitude with far fewer matches is the same one caught on a neighbouring star, or chance.
+                rivals = [m for m in accepted if m.log10_false < 0.5 * best.log10_false]
+                far = any(np.abs(m.state.rotation @ turn - np.eye(3)).max() > _OTHER_ATTITUDE_RAD for m in rivals)
+                return ("ambiguous", None) if far else ("identified", best)
+        return "not identified", None
+
+    def _accepted(self, field: FrameTable, k: int, n_centroids: int, searched: int) -> Iterator[Match]:
+        """Acceptable matches, up to the first that is beyond doubt and complete, or some triangles more."""
+        points, sigma = field.points[k], field.sigma[k]
+        batches = self.proposer.hypotheses(points, sigma, self.geometry, self.tolerance, n_centroids, searched)
+        left = self.triangles
+        for batch in batches:
+            if left <= 0:
+                return
+            left -= 1
+            for hypothesis in batch:
+                match = self._matched(field, k, start_state(hypothesis))
+                if match is None or match.log10_false >= np.log10(MAX_EXPECTED_FALSE):
+                    continue
+                yield match
+                if match.log10_false < np.log10(_BEYOND_DOUBT):
+                    # A triangle with the wrong star of a close pair gives nearly the right attitude: it matches too
+                    # many stars for chance, but few of all, and badly.
+                    if match.noise_scale < _POOR_FIT and len(match) > 0.5 * len(points):
+                        return
+                    left = min(left, _MORE_TRIANGLES)
+
+    def common_camera(self, matches: list[Match]) -> tuple[FloatArray, FloatArray]:
+        """Shared parameters (4,) from all frames with the tolerances as prior, and their covariance (4, 4)."""
+        t = self.tolerance
+        last = t.distortion_px / 2.0 if self.radial else 1e-6
+        sd = np.array([t.focal / 2.0, t.centre_px / 2.0, t.centre_px / 2.0, last])
+        information = np.diag(sd**-2.0) + np.sum([m.information for m in matches], axis=0)
+        scale = 1.0 / np.sqrt(np.diag(information))
+        covariance = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
+        return covariance @ np.sum([m.gradient for m in matches], axis=0), covariance
+
+
+def field_geometry(camera: Camera) -> FieldGeometry:
+    """The camera as the search sees it."""
+    return FieldGeometry(camera.focal_px, camera.width_px, camera.height_px, camera.corner_radius_px)
+
+
+def has_radial(camera: Camera) -> bool:
+    """Whether the camera's model has a cubic radial term on ideal points, which takes up kappa."""
+    model = get_model(camera.distortion)
+    return model.direction == "forward" and any(c.name == "k1" for c in model.coefficients)

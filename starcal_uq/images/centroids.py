@@ -1,0 +1,267 @@
+"""The centroids table: star positions measured in images, frame by frame, before any star has a name.
+
+It is what passes from the images to the identification. Files are read and written in `centroid_files`.
+"""
+
+from __future__ import annotations
+
+import html
+import os
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from starcal_uq.core.errors import ObservationError
+from starcal_uq.core.formatting import plural
+from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, StrArray
+from starcal_uq.observations.rows import FrameRows, locked
+
+# Name -> (type, description), of one row per star and of one entry per frame.
+COLUMNS: dict[str, tuple[type, str]] = {
+    "frame": (np.int64, "frame number"),
+    "x_px": (np.float64, "centroid; 0 is the centre of the first pixel"),
+    "y_px": (np.float64, "centroid, y downwards; 0 as for x_px"),
+    "var_x_px2": (np.float64, "variance of x_px"),
+    "var_y_px2": (np.float64, "variance of y_px"),
+    "cov_xy_px2": (np.float64, "covariance of x_px and y_px"),
+    "flux": (np.float64, "electrons, or counts where the gain is unknown"),
+    "snr": (np.float64, "flux over its standard deviation"),
+    "peak": (np.float64, "highest pixel, counts with background"),
+    "saturated": (np.bool_, "a pixel of its core is saturated"),
+    "blended": (np.bool_, "another star is near"),
+    "edge": (np.bool_, "the image ends within its light"),
+}
+FRAME_COLUMNS: dict[str, tuple[type, str]] = {
+    "frame_ids": (np.int64, "frame number"),
+    "image": (np.str_, "name of the image"),
+    "time_utc": (np.str_, "middle of the exposure, UTC; empty where unknown"),
+    "background": (np.float64, "median background, counts"),
+    "noise": (np.float64, "noise of the background per pixel, counts"),
+    "psf_sigma_px": (np.float64, "width of the star images"),
+    "problem": (np.str_, "why the frame was left out; empty where it was used"),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Centroids(FrameRows):
+    """Star positions with their covariances; one row per star and frame, sorted by frame.
+
+    Rows given in another order are sorted by frame; within a frame they keep their order, which
+    `extract_centroids` makes brightest first. The arrays are copies and cannot be written to.
+
+    Attributes
+    ----------
+    frame : array of int64, shape (N,)
+        Frame number.
+    x_px, y_px : array, shape (N,)
+        Centroid, pixels; (0, 0) is the centre of the first pixel, y grows downwards.
+    var_x_px2, var_y_px2, cov_xy_px2 : array, shape (N,)
+        Covariance of the centroid, square pixels.
+    flux : array, shape (N,)
+        Electrons if the gain is known, else counts (``meta["flux_unit"]``).
+    snr : array, shape (N,)
+        Flux over its standard deviation.
+    peak : array, shape (N,)
+        Highest pixel of the star, counts, background included.
+    saturated, blended, edge : array of bool, shape (N,)
+        A pixel of its core is saturated; another star is near; the image ends within its light.
+    frame_ids : array of int64, shape (K,)
+        Frame numbers, ascending; a frame without stars keeps its place.
+    image, time_utc : array of str, shape (K,)
+        Name of the image; middle of the exposure, UTC, empty where unknown.
+    background, noise : array, shape (K,)
+        Median background and noise per pixel, counts; NaN for a frame that was left out.
+    psf_sigma_px : array, shape (K,)
+        Width of the star images before integration over pixels; NaN for a frame that was left out.
+    problem : array of str, shape (K,)
+        Why the frame was left out; empty where it was used.
+    messages : tuple of str
+        What a user should know, one sentence each.
+    meta : dict
+        Settings, gain, hash of the images.
+
+    Raises
+    ------
+    ObservationError
+        If columns differ in length, cannot be converted, or a row belongs to no frame.
+    """
+
+    frame: IntArray
+    x_px: FloatArray
+    y_px: FloatArray
+    var_x_px2: FloatArray
+    var_y_px2: FloatArray
+    cov_xy_px2: FloatArray
+    flux: FloatArray
+    snr: FloatArray
+    peak: FloatArray
+    saturated: BoolArray
+    blended: BoolArray
+    edge: BoolArray
+    frame_ids: IntArray
+    image: StrArray
+    time_utc: StrArray
+    background: FloatArray
+    noise: FloatArray
+    psf_sigma_px: FloatArray
+    problem: StrArray
+    messages: tuple[str, ...] = ()
+    meta: AnyDict = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for names, key in ((COLUMNS, "frame"), (FRAME_COLUMNS, "frame_ids")):
+            arrays = {name: _array(name, getattr(self, name), kind) for name, (kind, _) in names.items()}
+            for name, values in arrays.items():
+                if len(values) != len(arrays[key]):
+                    raise ObservationError(
+                        f"centroids: {name} has {len(values)} entries and {key} has {len(arrays[key])}; give equal "
+                        "lengths.",
+                        column=name,
+                    )
+            order = np.argsort(arrays[key], kind="stable")
+            for name, values in arrays.items():
+                object.__setattr__(self, name, locked(values[order]))
+        if np.any(self.frame_ids[1:] == self.frame_ids[:-1]):
+            raise ObservationError("centroids: frame_ids holds a number twice; number the frames differently.")
+        if len(stray := np.setdiff1d(self.frame, self.frame_ids)):
+            raise ObservationError(f"centroids: frame {stray[0]} is not among frame_ids; list every frame there.")
+        object.__setattr__(self, "messages", tuple(self.messages))
+        object.__setattr__(self, "meta", dict(self.meta))
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames K, those without stars and those left out included."""
+        return len(self.frame_ids)
+
+    @property
+    def n_left_out(self) -> int:
+        """Number of frames that could not be used."""
+        return int(np.count_nonzero(self.problem != ""))
+
+    @property
+    def covariance_px2(self) -> FloatArray:
+        """Covariance of each centroid, shape (N, 2, 2), square pixels."""
+        rows = [[self.var_x_px2, self.cov_xy_px2], [self.cov_xy_px2, self.var_y_px2]]
+        return np.moveaxis(np.array(rows), 2, 0)
+
+    @property
+    def sigma_px(self) -> FloatArray:
+        """Centroid noise per axis, shape (N,): the root of the mean of both variances, pixels."""
+        sigma: FloatArray = np.sqrt(0.5 * (self.var_x_px2 + self.var_y_px2))
+        return sigma
+
+    def select(self, mask: ArrayLike) -> Centroids:
+        """The rows where `mask` (bool, shape (N,)) is true; every frame keeps its place."""
+        chosen = self._mask(mask, "centroids")
+        return replace(self, **{name: getattr(self, name)[chosen] for name in COLUMNS})
+
+    def select_frames(self, ids: ArrayLike) -> Centroids:
+        """The frames with these numbers, and their rows.
+
+        Raises
+        ------
+        ObservationError
+            If there is no such frame.
+        """
+        wanted = self._frame_numbers(ids, "centroids")
+        kept = np.isin(self.frame_ids, wanted)
+        frames: AnyDict = {name: getattr(self, name)[kept] for name in FRAME_COLUMNS}
+        rows: AnyDict = {name: getattr(self, name)[np.isin(self.frame, wanted)] for name in COLUMNS}
+        return replace(self, **rows, **frames)
+
+    def brightest(self, n: int | None = None) -> Centroids:
+        """Each frame with its brightest stars first, and at most `n` of them."""
+        order = np.lexsort((-self.flux, self.frame))
+        if n is not None:
+            order = order[np.arange(len(order)) - self.frame_starts[np.searchsorted(self.frame_ids, self.frame)] < n]
+        return replace(self, **{name: getattr(self, name)[order] for name in COLUMNS})
+
+    def with_meta(self, **entries: Any) -> Centroids:
+        """The same table with entries of `meta` added or changed."""
+        return replace(self, meta={**self.meta, **entries})
+
+    def to_dataframe(self) -> Any:
+        """The rows as a pandas DataFrame; `meta` is in its ``attrs``."""
+        import pandas as pd
+
+        table = pd.DataFrame({name: getattr(self, name).copy() for name in COLUMNS})
+        table.attrs.update(self.meta)
+        return table
+
+    def frames_dataframe(self) -> Any:
+        """One row per frame as a pandas DataFrame, with ``n_stars``."""
+        import pandas as pd
+
+        table = pd.DataFrame({name: getattr(self, name).copy() for name in FRAME_COLUMNS})
+        table.insert(1, "n_stars", self.stars_per_frame)
+        return table.rename(columns={"frame_ids": "frame"})
+
+    def save(self, path: str | os.PathLike[str], force: bool = False) -> None:
+        """Write the table without loss; the ending decides: ``.csv``, ``.ecsv`` or ``.parquet``.
+
+        The frames, `messages` and `meta` go along: in CSV as comments at the top.
+
+        Raises
+        ------
+        ObservationError
+            If the ending is unknown.
+        RunFolderError
+            If the file exists and `force` is false, or cannot be written.
+        """
+        from starcal_uq.images.centroid_files import write_centroids
+
+        write_centroids(self, path, force)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Centroids:
+        """Read a table that `save` wrote.
+
+        Raises
+        ------
+        ObservationError
+            If the file cannot be read or is no table of centroids.
+        """
+        from starcal_uq.images.centroid_files import read_centroids
+
+        return read_centroids(path)
+
+    @property
+    def summary(self) -> str:
+        """One sentence: stars, frames, and how many frames were left out and why."""
+        text = f"{plural(self.n_stars, 'star')} in {plural(self.n_frames - self.n_left_out, 'frame')}"
+        if self.n_left_out:
+            # The reason follows the name of the image, which differs from frame to frame.
+            reasons, counts = np.unique(self.problem[self.problem != ""], return_counts=True)
+            named = [f"{c} because {r}" for r, c in zip(reasons.tolist(), counts.tolist(), strict=True)]
+            was = "was" if self.n_left_out == 1 else "were"
+            text += f"; {plural(self.n_left_out, 'frame')} {was} left out: {', '.join(named)}"
+        return text + "."
+
+    def _repr_html_(self) -> str:
+        table = self.frames_dataframe()
+        names = ["frame", "n_stars", "image", "background", "noise", "psf_sigma_px", "problem"]
+        head = "".join(f"<th>{name}</th>" for name in names)
+        body = "".join(
+            "<tr>" + "".join(f"<td>{html.escape(_shown(value))}</td>" for value in row) + "</tr>"
+            for row in table[names].head(10).itertuples(index=False)
+        )
+        return f"<table><caption>{html.escape(self.summary)}</caption><tr>{head}</tr>{body}</table>"
+
+    def __repr__(self) -> str:
+        return f"Centroids({self.n_stars} stars, {self.n_frames} frames, {self.n_left_out} left out)"
+
+
+def _shown(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _array(name: str, values: Any, kind: type) -> Any:
+    try:
+        array: Any = np.array(values, dtype=kind)
+    except (TypeError, ValueError) as error:
+        raise ObservationError(f"centroids: column {name} cannot be converted ({error}).", column=name) from None
+    if array.ndim != 1:
+        raise ObservationError(f"centroids: column {name} has shape {array.shape}; give one value each.", column=name)
+    return array

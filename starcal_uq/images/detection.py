@@ -1,0 +1,246 @@
+"""The stars of one image: background, detection, measured PSF, fit, and the rejection of what is no star."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from starcal_uq.core.errors import ImageError
+from starcal_uq.core.formatting import plural
+from starcal_uq.core.types import AnyDict, BoolArray, IntArray
+from starcal_uq.images.background import PreparedImage, prepare_image
+from starcal_uq.images.fits import Stamps, StarFit, cut_stamps, explained, fit_stars, near_pairs
+from starcal_uq.images.image import Image
+from starcal_uq.images.psf import FIRST_SIGMA_PX, half_stamp_px, measure_psf, moment_sigma_px, pixel_at
+from starcal_uq.images.windowed_centroids import windowed
+
+# Half the detection kernel: what lies farther out adds 1 % to the signal-to-noise ratio and doubles the time.
+_KERNEL_HALF_SIGMAS, _KERNEL_HALF_MAX = 2.5, 5
+_MAX_DETECTIONS = 5000
+# A width is preferred to that of the PSF if it lowers chi squared by this much.
+_CHI2_MARGIN = 9.0
+_BLOB_SIGMAS = 3.0
+
+
+@dataclass(frozen=True)
+class DetectionOptions:
+    """Options of `starcal_uq.images.extract.extract_centroids`, which describes them."""
+
+    gain_e_per_count: float | None = None
+    read_noise_e: float | None = None
+    saturation: float | None = None
+    threshold_sigma: float = 5.0
+    min_pixels: int = 1
+    psf_sigma_px: float | None = None
+    max_stars: int | None = None
+
+    def to_dict(self) -> AnyDict:
+        """The options as plain values."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class FrameStars:
+    """The stars of one image, brightest first.
+
+    Attributes
+    ----------
+    columns : dict
+        Name of a column of `Centroids` to array; ``frame`` is not among them.
+    background, noise, psf_sigma_px : float
+        Median background and noise, counts; width of the star images.
+    gain_e_per_count : float or None
+        The gain that was given, by which fluxes are in electrons.
+    measured_gain_e_per_count : float or None
+        The gain read off the noise of the background where none was given; it serves the noise of the stars only.
+    messages : list of str
+        What was left out, without the name of the image.
+    windowed : bool
+        Whether the centroids are windowed because the star images are no round Gaussians.
+    """
+
+    columns: dict[str, Any]
+    background: float
+    noise: float
+    psf_sigma_px: float
+    gain_e_per_count: float | None
+    messages: list[str]
+    measured_gain_e_per_count: float | None = None
+    windowed: bool = False
+
+
+def find_stars(image: Image, options: DetectionOptions) -> FrameStars:
+    """Find and measure the stars of one image.
+
+    Raises
+    ------
+    ImageError
+        If nothing can be measured: all pixels equal, or too many saturated.
+    """
+    name = image.name or "image"
+    gain = options.gain_e_per_count or image.gain_e_per_count
+    frame, background, noise = prepare_image(image, gain, options.read_noise_e, options.saturation)
+    start = options.psf_sigma_px or FIRST_SIGMA_PX
+    objects = _detect(frame, name, start, options)
+    messages: list[str] = []
+    objects, n_blobs = _without_blobs(objects, moment_sigma_px(objects, start))
+    measured = measure_psf(frame, objects)
+    sigma = start if measured is None else measured.sigma_px
+    if options.psf_sigma_px is not None:
+        sigma = options.psf_sigma_px
+    elif measured is None and len(objects):
+        messages.append(
+            f"the stars do not suffice to measure the width of their images, so {sigma:g} px was taken; "
+            "give psf_sigma_px."
+        )
+    stamps, fit = _fit(frame, objects, sigma)
+    kind = _classify(frame, objects, stamps, fit, measured is not None or options.psf_sigma_px is not None)
+    shape = "" if measured is None else measured.shape_words
+    if shape:
+        fit = windowed(frame, fit)
+        messages.append(
+            f"the star images are {shape}, so their centroids are windowed, and what their shape adds to the errors is "
+            "not in sigma."
+        )
+    counts = {word: int(np.count_nonzero(kind == code)) for code, word in enumerate(_KINDS)}
+    counts["extended"] += n_blobs
+    if any(list(counts.values())[1:]):
+        words = [f"{n} {word}" for word, n in list(counts.items())[1:] if n]
+        total = sum(list(counts.values())[1:])
+        were = "was" if total == 1 else "were"
+        messages.append(f"{plural(total, 'detection')} {were} left out as no star: {', '.join(words)}.")
+    keep = np.flatnonzero(kind == 0)
+    order = keep[np.argsort(-fit.flux[keep], kind="stable")][: options.max_stars]
+    columns = _columns(image, frame, fit, stamps, sigma, gain, order)
+    if not len(order):
+        messages.append("no star was found.")
+    measured_gain = 1.0 / frame.counts_per_e if frame.gain_is_measured else None
+    return FrameStars(columns, background, noise, float(sigma), gain, messages, measured_gain, bool(shape))
+
+
+def _detect(frame: PreparedImage, name: str, sigma: float, options: DetectionOptions) -> Any:
+    """SExtractor's detections in the image filtered by the PSF, the brightest first."""
+    import sep
+
+    half = int(np.clip(np.ceil(_KERNEL_HALF_SIGMAS * sigma), 1, _KERNEL_HALF_MAX))
+    line = np.exp(-0.5 * (np.arange(-half, half + 1) / sigma) ** 2)
+    kernel = np.outer(line, line)
+    # sep divides the kernel by its sum; this is the noise that is left of noise 1.
+    left = np.sqrt(np.sum(kernel**2)) / kernel.sum()
+    try:
+        objects = sep.extract(
+            frame.counts,
+            options.threshold_sigma * left,
+            err=frame.noise,
+            minarea=options.min_pixels,
+            filter_kernel=kernel.astype(np.float32),
+            filter_type="conv",
+        )
+    except Exception as error:  # sep raises bare exceptions when its buffers are full
+        raise ImageError(
+            f"{name}: there are too many bright pixels to tell stars apart; raise the threshold, or leave the image "
+            "out."
+        ) from error
+    objects = objects[np.isfinite(objects["x"]) & np.isfinite(objects["y"])]
+    return objects[np.argsort(-objects["cflux"], kind="stable")][:_MAX_DETECTIONS]
+
+
+def _without_blobs(objects: Any, sigma: float) -> tuple[Any, int]:
+    """Detections without those much larger than a star, such as the Moon, and without what lies on them."""
+    large = objects["a"] > _BLOB_SIGMAS * max(sigma, 1.0)
+    keep = ~large
+    for blob in objects[large]:
+        margin = 3.0 + 0.3 * float(blob["b"])
+        keep &= (
+            (objects["x"] < blob["xmin"] - margin)
+            | (objects["x"] > blob["xmax"] + margin)
+            | (objects["y"] < blob["ymin"] - margin)
+            | (objects["y"] > blob["ymax"] + margin)
+        )
+    return objects[keep], int(np.count_nonzero(~keep))
+
+
+def _fit(frame: PreparedImage, objects: Any, sigma: float) -> tuple[Stamps, StarFit]:
+    """Windowed centroids by sep as a start, then the fit of the pixel-integrated star image."""
+    import sep
+
+    half = half_stamp_px(sigma)
+    x, y = objects["x"].astype(np.float64), objects["y"].astype(np.float64)
+    mask = None if frame.usable is None else ~frame.usable
+    if len(objects):
+        xw, yw, flags = sep.winpos(frame.counts, x, y, np.hypot(sigma, 12.0**-0.5), mask=mask)
+        # In a crowd, and where its window is cut, the windowed position runs away.
+        good = (flags == 0) & (np.hypot(xw - x, yw - y) < 1.0)
+        x, y = np.where(good, xw, x), np.where(good, yw, y)
+    stamps = cut_stamps(frame.counts, frame.usable, x, y, half, frame.noise, frame.counts_per_e)
+    return stamps, fit_stars(stamps, x, y, sigma, pairs=near_pairs(x, y, 2.0 * half))
+
+
+_KINDS = ("star", "too sharp for a star (hot pixel or cosmic ray)", "extended", "not measurable")
+
+
+def _classify(frame: PreparedImage, objects: Any, stamps: Stamps, fit: StarFit, psf_known: bool) -> IntArray:
+    """Index into `_KINDS` of each detection."""
+    height, width = frame.counts.shape
+    kind = np.zeros(len(objects), dtype=np.int64)
+    at_psf = explained(stamps, fit, 1.0)
+    core = _core_is_whole(stamps, fit) & psf_known
+    kind[core & (explained(stamps, fit, 2.0) > at_psf + _CHI2_MARGIN)] = 2
+    kind[core & (explained(stamps, fit, 0.5) > at_psf + _CHI2_MARGIN)] = 1
+    inside = (np.abs(fit.x_px - 0.5 * (width - 1)) < 0.5 * width) & (
+        np.abs(fit.y_px - 0.5 * (height - 1)) < 0.5 * height
+    )
+    moved = np.hypot(fit.x_px - objects["x"], fit.y_px - objects["y"]) > 1.0 + 1.5 * fit.sigma_px
+    measured = inside & ~moved & (fit.flux > 0.0) & np.isfinite(fit.covariance).all((1, 2))
+    kind[(kind == 0) & ~measured] = 3
+    return kind
+
+
+def _core_is_whole(stamps: Stamps, fit: StarFit) -> BoolArray:
+    """Whether all pixels within two widths of the fitted position are used."""
+    m = stamps.counts.shape[1]
+    u, v = (fit.x_px - stamps.x0)[:, None, None], (fit.y_px - stamps.y0)[:, None, None]
+    grid = np.arange(m)
+    far = np.hypot(grid[None, None, :] - u, grid[None, :, None] - v) > 2.0 * fit.sigma_px[:, None, None]
+    whole: BoolArray = np.all(np.logical_or(stamps.good, far), axis=(1, 2))
+    return whole
+
+
+def _columns(
+    image: Image, frame: PreparedImage, fit: StarFit, stamps: Stamps, sigma: float, gain: float | None, order: IntArray
+) -> AnyDict:
+    """The columns of the table for the chosen stars."""
+    height, width = frame.counts.shape
+    x, y, flux, covariance = fit.x_px[order], fit.y_px[order], fit.flux[order], fit.covariance[order]
+    rows, columns = pixel_at(y, height), pixel_at(x, width)
+    steps = np.arange(-1, 2)
+    box = (
+        (rows[:, None] + steps).clip(0, height - 1)[:, :, None],
+        (columns[:, None] + steps).clip(0, width - 1)[:, None],
+    )
+    reach = max(1, int(np.ceil(2.0 * sigma)))
+    wide = np.arange(-reach, reach + 1)
+    core = (
+        (rows[:, None] + wide).clip(0, height - 1)[:, :, None],
+        (columns[:, None] + wide).clip(0, width - 1)[:, None],
+    )
+    margin = np.minimum.reduce([x, width - 1 - x, y, height - 1 - y]) + 0.5
+    blended = np.zeros(len(order), dtype=np.bool_)
+    near = near_pairs(x, y, 6.0 * sigma)
+    # A star a hundred times fainter moves its neighbour by less than the noise.
+    blended[near[flux[near[:, 1]] > 0.01 * flux[near[:, 0]], 0]] = True
+    return {
+        "x_px": x,
+        "y_px": y,
+        "var_x_px2": covariance[:, 0, 0],
+        "var_y_px2": covariance[:, 1, 1],
+        "cov_xy_px2": covariance[:, 0, 1],
+        "flux": flux * (gain or 1.0),
+        "snr": flux / np.sqrt(covariance[:, 2, 2]),
+        "peak": np.nanmax(image.data[box].astype(np.float64), axis=(1, 2), initial=-np.inf),
+        "saturated": np.zeros(len(order), np.bool_) if frame.saturated is None else frame.saturated[core].any((1, 2)),
+        "blended": blended,
+        "edge": margin < 3.0 * sigma,
+    }

@@ -1,0 +1,78 @@
+"""Errors of centroids by the place of the star in its pixel, found from the stars' places alone.
+
+Stars fall everywhere in their pixels alike. Where the light of a star is too sharp for the pixels, centroids are drawn
+to the pixels' centres, and measured places crowd there: a displacement by -A sin(2 pi x) makes the mean of cos(2 pi x)
+pi A. Neither a catalogue nor a model of the star image is needed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from starcal_uq.core.types import FloatArray
+
+_SIGNIFICANT, _FEWEST_PLACES = 4.0, 100
+# Stars in the same square of this size may be the same star again.
+_PLACE_PX = 4.0
+# Beyond, the places measured no longer tell the true ones apart.
+_LARGEST_PX = 0.12
+_ITERATIONS = 30
+
+
+@dataclass(frozen=True)
+class PhaseError:
+    """Displacement of centroids along one axis by -amplitude sin(2 pi x).
+
+    Attributes
+    ----------
+    amplitude_px, sigma_px : float
+        Amplitude, 0 where it is not significant, and its standard deviation, infinite with too few stars.
+    """
+
+    amplitude_px: float
+    sigma_px: float
+
+
+def phase_error(along_px: FloatArray, across_px: FloatArray) -> PhaseError:
+    """Measure the error along an axis from many positions.
+
+    Parameters
+    ----------
+    along_px, across_px : array, shape (n,)
+        Positions along the axis and along the other one. Stars that come back to the same place, as in a camera that
+        stares, count as one.
+    """
+    if len(along_px) < _FEWEST_PLACES:
+        return PhaseError(0.0, np.inf)
+    places = np.floor(np.column_stack([along_px, across_px]) / _PLACE_PX).astype(np.int64)
+    unique, index = np.unique(places, axis=0, return_inverse=True)
+    if len(unique) < _FEWEST_PLACES:
+        return PhaseError(0.0, np.inf)
+    cosine = np.cos(2.0 * np.pi * along_px)
+    mean = float(cosine.mean())
+    sums = np.bincount(index.reshape(-1), cosine - mean)
+    amplitude, error = mean / np.pi, float(np.sqrt(np.sum(sums**2))) / len(along_px) / np.pi
+    # Crowding away from the centres has other causes, such as sharp stars taken for hot pixels.
+    return PhaseError(min(amplitude, _LARGEST_PX) if amplitude > _SIGNIFICANT * error else 0.0, error)
+
+
+def without_phase_error(
+    along_px: FloatArray, variance_px2: FloatArray, amplitude_px: float
+) -> tuple[FloatArray, FloatArray]:
+    """Positions put back where they were, and what their standard deviations are multiplied by.
+
+    Parameters
+    ----------
+    along_px, variance_px2 : array, shape (n,)
+        Positions along the axis, with their variances. Noise blurs the phase, so noisy ones are moved less.
+    amplitude_px
+        The amplitude of `phase_error`.
+    """
+    amplitude = amplitude_px * np.exp(-2.0 * np.pi**2 * variance_px2)
+    turn = 2.0 * np.pi
+    true = along_px.copy()
+    for _ in range(_ITERATIONS):
+        true = along_px + amplitude * np.sin(turn * true)
+    return true, 1.0 / (1.0 - turn * amplitude * np.cos(turn * true))

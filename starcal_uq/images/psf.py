@@ -1,0 +1,168 @@
+"""The width of the star images, measured on the stars of one image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+from starcal_uq.images.background import PreparedImage
+from starcal_uq.images.fits import Stamps, StarFit, cut_stamps, explained, fit_stars
+
+FIRST_SIGMA_PX = 1.2
+_STAMP_HALF_SIGMAS = 4.0
+_PSF_STARS, _PSF_SNR, _MISFIT_SNR = 40, 15.0, 30.0
+_WIDTHS = (0.25, 15.0)
+# Star images with this part of their light beyond the Gaussian, or so much longer than wide, are no round Gaussians.
+_MISFIT, _ELONGATED = 0.1, 1.2
+_MOMENT_WINDOW_PX = 1.5
+
+
+@dataclass(frozen=True)
+class Psf:
+    """What the star images of a frame look like.
+
+    Attributes
+    ----------
+    sigma_px : float
+        Width before integration over pixels.
+    beyond : float
+        Light beyond the Gaussian as a part of it; 0 where it is not significant.
+    elongation : float
+        Length over width, with the pixel; 1 where it is not significant.
+    """
+
+    sigma_px: float
+    beyond: float = 0.0
+    elongation: float = 1.0
+
+    @property
+    def shape_words(self) -> str:
+        """What keeps the star images from being round Gaussians; empty where nothing does."""
+        words = []
+        if abs(self.beyond) > _MISFIT:
+            words.append(f"no Gaussians ({abs(100.0 * self.beyond):.0f} % of their light is elsewhere)")
+        if self.elongation > _ELONGATED:
+            words.append(f"elongated ({self.elongation:.1f} : 1)")
+        return " and ".join(words)
+
+
+def moment_sigma_px(objects: Any, default: float) -> float:
+    """Width of the typical detection by its moments, pixels."""
+    if not len(objects):
+        return default
+    moments: Any = np.sqrt(objects["a"] * objects["b"])[:_PSF_STARS]
+    return float(np.clip(np.nanmedian(moments), 0.4, 4.0 * default))
+
+
+def measure_psf(frame: PreparedImage, objects: Any) -> Psf | None:
+    """Width and shape of the star images; None where unknown.
+
+    The median over bright stars that stand alone; where there is none, the common width that suits the faint ones.
+    """
+    sigma = moment_sigma_px(objects, FIRST_SIGMA_PX)
+    noise = frame.noise[pixel_at(objects["y"], frame.counts.shape[0]), pixel_at(objects["x"], frame.counts.shape[1])]
+    snr = objects["flux"] / (noise * np.sqrt(4.0 * np.pi) * sigma)
+    alone = objects["flag"] == 0
+    bright = alone & (snr > _PSF_SNR)
+    if not bright.any():
+        return _common_width(frame, objects[alone], sigma)
+    chosen = objects[bright][: 10 * _PSF_STARS]
+    # The brightest of equally faint stars are those whose noise adds light and width: then more are taken.
+    clear = np.count_nonzero(snr[bright] > 4.0 * _PSF_SNR) >= _PSF_STARS
+    most = _PSF_STARS if clear else 5 * _PSF_STARS
+    for _ in range(2):
+        chosen, stamps = _clean_stamps(frame, chosen, sigma, most)
+        if not len(chosen):
+            return None
+        x, y = chosen["x"].astype(np.float64), chosen["y"].astype(np.float64)
+        fit = fit_stars(stamps, x, y, sigma, free_sigma=True)
+        good = (np.hypot(fit.x_px - x, fit.y_px - y) < 1.0 + sigma) & (fit.flux > 0.0)
+        if not good.any():
+            return None
+        sigma = float(np.clip(np.median(fit.sigma_px[good]), *_WIDTHS))
+    # All pixels with the same weight, so that what counts as core and wings does not hang on whether the gain is known.
+    stamps = cut_stamps(frame.counts, frame.usable, fit.x_px, fit.y_px, half_stamp_px(sigma), frame.noise, 0.0)
+    if frame.counts_per_e:
+        fit = fit_stars(stamps, fit.x_px, fit.y_px, sigma, free_sigma=True)
+        width = float(np.clip(np.median(fit.sigma_px[good]), *_WIDTHS))
+    else:
+        width = sigma
+    fit = fit_stars(stamps, fit.x_px, fit.y_px, width)
+    # Fainter stars that are found are those whose noise adds light.
+    good &= stamps.good.all((1, 2)) & (fit.flux > _MISFIT_SNR * np.sqrt(fit.covariance[:, 2, 2]))
+    if np.count_nonzero(good) <= 3:
+        return Psf(sigma)
+    return Psf(
+        sigma, _significant(stamps.counts[good].sum((1, 2)) / fit.flux[good] - 1.0), _elongation(stamps, fit, good)
+    )
+
+
+def _significant(values: FloatArray) -> float:
+    """Median of numbers, 0 where their scatter explains it."""
+    middle = float(np.median(values))
+    error = 1.9 * float(np.median(np.abs(values - middle))) / np.sqrt(len(values))
+    return middle if abs(middle) > 3.0 * error else 0.0
+
+
+def _elongation(stamps: Stamps, fit: StarFit, good: BoolArray) -> float:
+    """Length over width of the star images by their second moments in a window, whose part is taken out."""
+    window = max(_MOMENT_WINDOW_PX, 1.2 * float(np.median(fit.sigma_px)))
+    steps = np.arange(stamps.counts.shape[1])
+    u, v = (steps - (fit.x_px - stamps.x0)[good, None]), (steps - (fit.y_px - stamps.y0)[good, None])
+    light = stamps.counts[good] * np.exp(-0.5 * (v[:, :, None] ** 2 + u[:, None, :] ** 2) / window**2)
+    total = light.sum((1, 2))
+    xx, yy = np.sum(light.sum(1) * u**2, 1) / total, np.sum(light.sum(2) * v**2, 1) / total
+    xy = np.einsum("nhw,nh,nw->n", light, v, u) / total
+    mean, half, cross = 0.5 * float(np.median(xx + yy)), _significant(0.5 * (xx - yy)), _significant(xy)
+    apart = float(np.hypot(half, cross))
+    if not apart < mean < window**2 - apart:
+        return 1.0
+    long, wide = (1.0 / (1.0 / (mean + sign * apart) - window**-2) for sign in (1.0, -1.0))
+    return float(np.sqrt(long / wide))
+
+
+def _common_width(frame: PreparedImage, objects: Any, sigma: float) -> Psf | None:
+    """The one width that lowers chi squared most over all stars, found by parabolas in its logarithm."""
+    chosen = objects[: 5 * _PSF_STARS]
+    for _ in range(6):
+        chosen, stamps = _clean_stamps(frame, chosen, sigma, 5 * _PSF_STARS)
+        if len(chosen) < 3:
+            return None
+        fit = fit_stars(stamps, chosen["x"].astype(np.float64), chosen["y"].astype(np.float64), sigma)
+        low, here, high = (float(np.sum(explained(stamps, fit, scale))) for scale in (0.8, 1.0, 1.25))
+        bend = low - 2.0 * here + high
+        step = 0.5 * (low - high) / bend if bend < 0.0 else np.sign(high - low)
+        last, sigma = sigma, float(np.clip(sigma * 1.25 ** np.clip(step, -2.0, 2.0), *_WIDTHS))
+        if abs(sigma / last - 1.0) < 1e-3:
+            break
+    return Psf(sigma)
+
+
+def _clean_stamps(frame: PreparedImage, objects: Any, sigma: float, most: int) -> tuple[Any, Stamps]:
+    """Detections with all their pixels and no hot pixel, and their stamps."""
+    x, y = objects["x"].astype(np.float64), objects["y"].astype(np.float64)
+    stamps = cut_stamps(frame.counts, frame.usable, x, y, half_stamp_px(sigma), frame.noise, frame.counts_per_e)
+    clean = np.flatnonzero(stamps.good.all((1, 2)) & ~_single_pixels(stamps))[:most]
+    return objects[clean], stamps.subset(clean)
+
+
+def half_stamp_px(sigma: float) -> int:
+    return int(np.ceil(_STAMP_HALF_SIGMAS * sigma)) + 1
+
+
+def _single_pixels(stamps: Stamps) -> BoolArray:
+    """Stamps in which one pixel holds more than its eight neighbours together: hot pixels."""
+    c = stamps.counts.shape[1] // 2
+    core = stamps.counts[:, c - 1 : c + 2, c - 1 : c + 2]
+    highest = core.max((1, 2))
+    hot: BoolArray = highest > 0.6 * core.sum((1, 2))
+    return hot
+
+
+def pixel_at(position: Any, size: int) -> IntArray:
+    """The pixel of a position, inside the image."""
+    pixel: IntArray = np.rint(position).astype(np.int64).clip(0, size - 1)
+    return pixel

@@ -1,0 +1,1 @@
+"""From a calibration to a posterior: priors, sampling, and the checks of the draws."""

@@ -1,0 +1,83 @@
+"""Quantities that follow from the sampled parameters, with the same diagnostics as the parameters themselves.
+
+Convergence of every parameter does not imply that of their combinations: strongly coupled parameters can look settled
+while a difference of them is not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.camera.distortion import get_model
+from starcal_uq.core.types import FloatArray
+from starcal_uq.inference import arviz as arviz_compat
+
+if TYPE_CHECKING:
+    from starcal_uq.inference.posterior import Posterior
+
+_ARCSEC = 648_000.0 / np.pi
+
+
+@dataclass(frozen=True)
+class Derived:
+    """One quantity.
+
+    Attributes
+    ----------
+    name, unit : str
+        What it is.
+    mean, sd, mcse : float
+        Moments over the draws, and the Monte Carlo standard error of the mean.
+    rhat, ess_bulk, ess_tail : float
+        Convergence over separately seeded ensembles.
+    """
+
+    name: str
+    unit: str
+    mean: float
+    sd: float
+    mcse: float
+    rhat: float
+    ess_bulk: float
+    ess_tail: float
+
+
+def derived_quantities(post: Posterior) -> tuple[Derived, ...]:
+    """Focal length in mm, displacement by the distortion at the corner, and the common rotation about each axis."""
+    draws = post.theta_draws
+    rotation = (draws - post.mean) @ post.rotation_per_theta.T * _ARCSEC
+    values: dict[tuple[str, str], FloatArray] = {("focal length", "mm"): draws[:, 2] * post.camera.pixel_um / 1000.0}
+    if draws.shape[1] > 3:
+        values["distortion at the corner", "px"] = corner_displacement_px(post)
+    for i, axis in enumerate(("pitch", "yaw", "roll")):
+        values[f"common rotation, {axis}", "arcsec"] = rotation[:, i]
+    return tuple(_diagnosed(post, name, unit, v) for (name, unit), v in values.items())
+
+
+def corner_displacement_px(post: Posterior) -> FloatArray:
+    """Displacement (n,) of a star in the farthest corner by the distortion of each draw, along the radius, px."""
+    camera = post.camera
+    corners = np.array([(x, y) for x in (-0.5, camera.width_px - 0.5) for y in (-0.5, camera.height_px - 0.5)])
+    offsets = corners - camera.theta[:2]
+    far = offsets[int(np.argmax(np.hypot(*offsets.T)))]
+    du, dv = get_model(camera.distortion).displacement(far[0], far[1], list(post.theta_draws[:, 3:].T))
+    return np.asarray((du * far[0] + dv * far[1]) / np.hypot(*far), dtype=np.float64)
+
+
+def _diagnosed(post: Posterior, name: str, unit: str, values: FloatArray) -> Derived:
+    mean, sd = float(np.mean(values)), float(np.std(values, ddof=1))
+    # In standard units: tiny ranges mislead the diagnostics.
+    chains = ((values - mean) / (sd or 1.0)).reshape(post.n_ensembles, -1)
+    return Derived(
+        name=name,
+        unit=unit,
+        mean=mean,
+        sd=sd,
+        mcse=float(arviz_compat.mcse_mean(chains)) * sd,
+        rhat=arviz_compat.rhat(chains),
+        ess_bulk=arviz_compat.ess_bulk(chains),
+        ess_tail=arviz_compat.ess_tail(chains),
+    )

@@ -1,0 +1,260 @@
+"""Ensembles of emcee: separately seeded, in memory, interruptible and resumed bit for bit."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from starcal_uq.core.errors import SamplingError
+from starcal_uq.core.interrupts import interrupt_between_steps
+from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.inference.target import Density, student_t_log_density
+from starcal_uq.runs.folder import atomic_path
+
+Moves = Literal["mixture", "stretch"]
+Progress = Callable[[int, int], None]
+
+# Tails a little heavier than normal: most proposals are accepted, and no part of the posterior is out of reach.
+PROPOSAL_DF = 8.0
+_INDEPENDENCE_WEIGHT = 0.7
+_CHUNK_STEPS = 25
+_MAX_CHUNKS = 20
+
+
+@dataclass(frozen=True)
+class EnsembleSettings:
+    """How to sample.
+
+    Attributes
+    ----------
+    n_walkers, n_steps, n_burn : int
+        Per ensemble; burn-in steps come before and are not kept.
+    moves : {"mixture", "stretch"}
+        ``mixture`` is 0.7 of an independence proposal and 0.3 of differential evolution.
+    """
+
+    n_walkers: int
+    n_steps: int
+    n_burn: int
+    moves: Moves
+
+
+@dataclass(frozen=True)
+class Chains:
+    """Draws of all ensembles.
+
+    Attributes
+    ----------
+    u : array (n_ensembles, n_steps, n_walkers, d)
+        Whitened coordinates.
+    log_density : array (n_ensembles, n_steps, n_walkers)
+        Log posterior there.
+    accepted : array (n_ensembles,)
+        Number of accepted proposals after the burn-in.
+    """
+
+    u: FloatArray
+    log_density: FloatArray
+    accepted: IntArray
+
+
+def student_t_proposal(df: float) -> Callable[[FloatArray, Any], tuple[FloatArray, FloatArray]]:
+    """An independence proposal for `emcee.moves.MHMove`: a standard multivariate t, whatever the present point."""
+
+    def propose(u: FloatArray, random: Any) -> tuple[FloatArray, FloatArray]:
+        normal = random.standard_normal(u.shape)
+        new = normal / np.sqrt(random.chisquare(df, (len(u), 1)) / df)
+        # Hastings: log q(old | new) - log q(new | old), and q does not depend on where it comes from.
+        return new, student_t_log_density(u, df) - student_t_log_density(new, df)
+
+    return propose
+
+
+def make_moves(moves: Moves) -> list[tuple[Any, float]]:
+    """The weighted emcee moves of a name."""
+    import emcee
+
+    if moves == "stretch":
+        return [(emcee.moves.StretchMove(), 1.0)]
+    return [
+        (emcee.moves.MHMove(student_t_proposal(PROPOSAL_DF)), _INDEPENDENCE_WEIGHT),
+        (emcee.moves.DEMove(), 1.0 - _INDEPENDENCE_WEIGHT),
+    ]
+
+
+def run_ensembles(
+    density: Density,
+    dim: int,
+    seeds: Sequence[np.random.SeedSequence],
+    settings: EnsembleSettings,
+    *,
+    progress: Progress | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    fingerprint: str = "",
+    moves: list[tuple[Any, float]] | None = None,
+) -> Chains:
+    """Run one ensemble per seed, each from its own draws of the Laplace approximation.
+
+    Parameters
+    ----------
+    density : callable
+        Log density (n,) of points (n, dim), whitened: unit covariance around zero.
+    dim : int
+        Number of coordinates.
+    seeds : sequence of numpy.random.SeedSequence
+        One per ensemble.
+    settings : EnsembleSettings
+        Sizes and moves.
+    progress : callable, optional
+        Called as ``progress(steps_done, steps_total)`` after every step.
+    checkpoint : path, optional
+        File that is rewritten while sampling and read at the start. A resumed run gives the same draws, bit for bit, as
+        one that was not interrupted. It is left in place.
+    fingerprint : str
+        Identifies data and settings; a checkpoint of another one is refused.
+    moves : list of (emcee move, weight), optional
+        Instead of those of ``settings.moves``.
+
+    Raises
+    ------
+    SamplingError
+        If a start is not finite or the checkpoint belongs to another run.
+    """
+    import emcee
+
+    weighted = make_moves(settings.moves) if moves is None else moves
+    store = _Store(len(seeds), settings, dim, checkpoint, fingerprint)
+    per_ensemble = settings.n_burn + settings.n_steps
+    chunk = max(_CHUNK_STEPS, -(-settings.n_steps // _MAX_CHUNKS))
+    total = per_ensemble * len(seeds)
+    # emcee prints a page about any exception in the density, Ctrl-C included.
+    with interrupt_between_steps() as check_interrupt:
+        for index in range(store.ensemble, len(seeds)):
+            state = store.state or _start(density, dim, seeds[index], settings.n_walkers)
+            sampler = emcee.EnsembleSampler(settings.n_walkers, dim, density, moves=weighted, vectorize=True)
+            for first, last in _chunks(store.step, settings, chunk):
+                sampler.reset()
+                steps = sampler.sample(state, iterations=last - first, skip_initial_state_check=True)
+                for step, last_state in enumerate(steps, start=first + 1):
+                    state = last_state
+                    check_interrupt()
+                    if progress is not None:
+                        progress(index * per_ensemble + step, total)
+                store.add(index, first, last, sampler, state)
+            store.next_ensemble()
+    return store.chains()
+
+
+def autocorrelation(values: FloatArray) -> FloatArray:
+    """Integrated autocorrelation times (d,) in steps of draws (ensemble, step, walker, d), averaged over ensembles."""
+    from emcee.autocorr import integrated_time
+
+    return np.asarray(np.mean([integrated_time(chain, tol=0, quiet=True) for chain in values], axis=0))
+
+
+def _start(density: Density, dim: int, seed: np.random.SeedSequence, n_walkers: int) -> Any:
+    import emcee
+
+    random = np.random.RandomState(seed.generate_state(8))
+    u = random.standard_normal((n_walkers, dim))
+    # emcee accepts walkers of zero density and never moves them.
+    bad = int(np.sum(~np.isfinite(density(u))))
+    if bad:
+        raise SamplingError(
+            f"{bad} of {n_walkers} start points drawn around the calibrated camera have no posterior density: check "
+            "that the calibration converged, or use more stars."
+        )
+    return emcee.State(u, random_state=random.get_state())
+
+
+def _chunks(done: int, settings: EnsembleSettings, size: int) -> Iterator[tuple[int, int]]:
+    """Step ranges from `done` on; none of them contains both burn-in and kept steps."""
+    total = settings.n_burn + settings.n_steps
+    while done < total:
+        limit = settings.n_burn if done < settings.n_burn else total
+        last = min(done + size, limit)
+        yield done, last
+        done = last
+
+
+class _Store:
+    """Draws so far, where the run stands, and the checkpoint file."""
+
+    def __init__(
+        self,
+        n_ensembles: int,
+        settings: EnsembleSettings,
+        dim: int,
+        path: str | os.PathLike[str] | None,
+        fingerprint: str,
+    ) -> None:
+        shape = (n_ensembles, settings.n_steps, settings.n_walkers)
+        self._n_burn, self._path, self._fingerprint = settings.n_burn, path, fingerprint
+        self._u, self._log_density = np.zeros((*shape, dim)), np.zeros(shape)
+        self._accepted = np.zeros(n_ensembles, dtype=np.int64)
+        self.ensemble, self.step = 0, 0
+        self.state: Any = None
+        if path is not None and Path(path).exists():
+            self._read(path)
+
+    def add(self, index: int, first: int, last: int, sampler: Any, state: Any) -> None:
+        """Keep steps [first, last) of an ensemble unless they are burn-in, and write the checkpoint."""
+        if first >= self._n_burn:
+            kept = slice(first - self._n_burn, last - self._n_burn)
+            self._u[index, kept] = sampler.get_chain()
+            self._log_density[index, kept] = sampler.get_log_prob()
+            self._accepted[index] += int(np.sum(sampler.backend.accepted))
+        self.ensemble, self.step, self.state = index, last, state
+        if self._path is not None:
+            self._write(self._path)
+
+    def next_ensemble(self) -> None:
+        self.ensemble, self.step, self.state = self.ensemble + 1, 0, None
+
+    def chains(self) -> Chains:
+        return Chains(self._u, self._log_density, self._accepted)
+
+    def _write(self, path: str | os.PathLike[str]) -> None:
+        _, key, position, has_gauss, gauss = self.state.random_state
+        with atomic_path(path) as temporary, open(temporary, "wb") as file:
+            np.savez(
+                file,
+                fingerprint=np.array(self._fingerprint),
+                place=np.array([self.ensemble, self.step]),
+                coords=self.state.coords,
+                log_prob=self.state.log_prob,
+                key=key,
+                # A half-used pair of normals is part of the state.
+                rest=np.array([position, has_gauss]),
+                gauss=np.array(gauss),
+                u=self._u,
+                log_density=self._log_density,
+                accepted=self._accepted,
+            )
+
+    def _read(self, path: str | os.PathLike[str]) -> None:
+        import zipfile
+
+        import emcee
+
+        try:
+            with np.load(path, allow_pickle=False) as saved:
+                content = {name: saved[name] for name in saved.files}
+            same = str(content["fingerprint"]) == self._fingerprint
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            raise SamplingError(f"{path}: cannot be read as a checkpoint ({error}); delete it.") from error
+        if not same:
+            raise SamplingError(
+                f"{path}: the checkpoint was made with other data or settings; delete it, or repeat its settings."
+            )
+        self._u, self._log_density = content["u"], content["log_density"]
+        self._accepted = content["accepted"]
+        self.ensemble, self.step = (int(v) for v in content["place"])
+        position, has_gauss = (int(v) for v in content["rest"])
+        random_state = ("MT19937", content["key"], position, has_gauss, float(content["gauss"]))
+        self.state = emcee.State(content["coords"], log_prob=content["log_prob"], random_state=random_state)

@@ -1,0 +1,301 @@
+"""The likelihoods by name, each ready to be sampled.
+
+- ``marginal``: Gaussian centroids, attitudes marginalised. The default, and efficient.
+- ``pairs``: the paper's objective over interstar angles as a composite likelihood, with Godambe's curvature.
+- ``pairs_naive``: the same with all pairs taken as independent. It claims far too much, and is here to show that.
+- ``student_t``: heavy tails per star, attitudes marginalised, for tables with wrong identifications.
+"""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import quaternion_to_rotation
+from starcal_uq.core.errors import SamplingError
+from starcal_uq.core.types import FloatArray
+from starcal_uq.estimation.student import DOF_RANGE, log_excess_prior, parse_dof
+from starcal_uq.inference.target import Extra, Likelihood, LogLikelihood, scaled_cholesky, scaled_inverse
+from starcal_uq.observations.frames import StarFrames
+
+if TYPE_CHECKING:
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.observations.table import Observations
+
+LikelihoodName = Literal["marginal", "pairs", "pairs_naive", "student_t"]
+Evaluation = Literal["auto", "compressed", "exact"]
+LIKELIHOODS = ("marginal", "pairs", "pairs_naive", "student_t")
+EVALUATIONS = ("auto", "compressed", "exact")
+_MAX_REFINEMENT = 200
+
+
+class NaivePairsWarning(UserWarning):
+    """Pairs of stars are treated as independent, so that the intervals are far too narrow."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A likelihood, and where its maximum is.
+
+    Attributes
+    ----------
+    name : str
+        One of `LIKELIHOODS`, or the name of an object that was passed.
+    theta : (p,) array
+        Estimate, px units.
+    information : (p, p) array
+        Information about theta there.
+    sigma : float
+        Noise there.
+    dof : float
+        Half of the curvature in log sigma.
+    exact : callable or None
+        From all stars; None without observations.
+    fast : callable or None
+        At a cost independent of the number of stars; None where a polynomial has to be fitted first.
+    extra : Extra or None
+        A further parameter.
+    failures, notes : tuple of str
+        For the diagnostics.
+    """
+
+    name: str
+    theta: FloatArray
+    information: FloatArray
+    sigma: float
+    dof: float
+    exact: LogLikelihood | None
+    fast: LogLikelihood | None
+    extra: Extra | None = None
+    failures: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def check_names(likelihood: Any, evaluation: Any, dof: Any, has_observations: bool) -> None:
+    """Refuse settings that mean nothing.
+
+    Raises
+    ------
+    SamplingError
+        With the names that exist.
+    """
+    if not isinstance(likelihood, str):
+        if not callable(getattr(likelihood, "log_likelihood", None)):
+            raise SamplingError(
+                f"likelihood is a {type(likelihood).__name__}: give one of {', '.join(LIKELIHOODS)}, or an object with "
+                "a method log_likelihood(theta, sigma)."
+            )
+    elif likelihood in EVALUATIONS:
+        raise SamplingError(
+            f"likelihood={likelihood!r} says how a likelihood is evaluated, not which: use evaluation={likelihood!r}."
+        )
+    elif likelihood not in LIKELIHOODS:
+        raise SamplingError(f"likelihood {likelihood!r} is unknown: use one of {', '.join(LIKELIHOODS)}.")
+    if evaluation not in EVALUATIONS:
+        raise SamplingError(f"evaluation {evaluation!r} is unknown: use one of {', '.join(EVALUATIONS)}.")
+    if dof is not None and likelihood != "student_t":
+        raise SamplingError("degrees of freedom (dof) belong to likelihood='student_t': leave dof out, or use that.")
+    if has_observations or not isinstance(likelihood, str):
+        return
+    if likelihood != "marginal":
+        raise SamplingError(f"the likelihood {likelihood!r} needs the observations: give obs.")
+    if evaluation == "exact":
+        raise SamplingError("the exact likelihood needs the observations: give obs, or use evaluation='compressed'.")
+
+
+def label_of(likelihood: str | Likelihood) -> str:
+    """The name of a likelihood, for records."""
+    if isinstance(likelihood, str):
+        return likelihood
+    return str(getattr(likelihood, "name", type(likelihood).__name__))
+
+
+def find_source(
+    likelihood: str | Likelihood, obs: Observations | None, cal: Calibration, dof: float | str | None
+) -> Source:
+    """The likelihood of a name (see `LIKELIHOODS`), or the object that was passed, around a calibration.
+
+    Raises
+    ------
+    SamplingError
+        When calibration and likelihood do not go together.
+    """
+    if not isinstance(likelihood, str):
+        at = (cal.theta, cal.information, cal.sigma, float(cal.dof))
+        return Source(label_of(likelihood), *at, exact=likelihood.log_likelihood, fast=None)
+    source = _named_source(likelihood, obs, cal, dof)
+    if (ignored := _settings(cal).get("ignored_distortion")) is None:
+        return source
+    failure = (
+        f"The method {cal.method!r} ignores the distortion (model {ignored!r} was given): this posterior is that of a "
+        "camera without any, and neither its centre nor its width holds otherwise; use method='efficient'."
+    )
+    return replace(source, failures=(*source.failures, failure))
+
+
+def _named_source(likelihood: str, obs: Observations | None, cal: Calibration, dof: float | str | None) -> Source:
+    settings = _settings(cal)
+    if obs is None and settings.get("stream") and settings.get("method") == "samaan":
+        raise SamplingError(
+            "a stream leaves only the quadratic likelihood around the estimate, and samaan's is far from its maximum: "
+            "give obs, or calibrate with method='griffith' and parameters='all'."
+        )
+    if likelihood == "marginal":
+        return _marginal(obs, cal)
+    if obs is None:
+        raise SamplingError(f"the likelihood {likelihood!r} needs the observations: give obs.")
+    if not cal.has_residuals:
+        raise SamplingError(
+            f"the likelihood {likelihood!r} needs the attitudes and residuals of every frame, which a stream does not "
+            "keep: calibrate the table with method='efficient', or use likelihood='marginal'."
+        )
+    if likelihood != "student_t" and settings.get("method") in ("samaan", "griffith"):
+        raise SamplingError(
+            f"the likelihood {likelihood!r} has its maximum at the least-squares estimate over pairs, which method "
+            f"{settings['method']!r} does not find: calibrate with method='three_stage'."
+        )
+    if likelihood == "student_t":
+        return _student(obs, cal, dof)
+    return _pairs(obs, cal, adjusted=likelihood == "pairs")
+
+
+def _settings(cal: Calibration) -> dict[str, Any]:
+    settings: dict[str, Any] = cal.provenance.get("settings", {})
+    return settings
+
+
+def resolved_dof(cal: Calibration, dof: float | str | None) -> float | Literal["free"]:
+    """The setting for degrees of freedom: as given, else the calibration's, else the default.
+
+    Raises
+    ------
+    SamplingError
+        For anything but "free" or a number in range.
+    """
+    if dof is None and _settings(cal).get("likelihood") == "student_t":
+        dof = _settings(cal)["dof"]
+    nu = parse_dof(dof, SamplingError)
+    return "free" if nu is None else nu
+
+
+class _ExactMarginal:
+    """The exact Gaussian likelihood, point by point."""
+
+    def __init__(self, obs: Observations, cal: Calibration) -> None:
+        from starcal_uq.estimation.marginal import MarginalLikelihood
+
+        self._one = MarginalLikelihood(obs, cal.camera.distortion)
+        self._one.use_rotations(self._one.rotations_at(cal.theta))
+
+    def log_likelihood(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
+        return np.array([self._one.log_likelihood(t, float(s)) for t, s in zip(theta, sigma, strict=True)])
+
+
+def _marginal(obs: Observations | None, cal: Calibration) -> Source:
+    if _settings(cal).get("likelihood") == "student_t":
+        raise SamplingError(
+            "the calibration was made with likelihood='student_t': sample with the same, or calibrate again with "
+            "likelihood='marginal'."
+        )
+    exact = None if obs is None else _ExactMarginal(obs, cal).log_likelihood
+    at = (cal.theta, cal.information, cal.sigma, float(cal.dof))
+    return Source("marginal", *at, exact=exact, fast=cal.compressed.log_likelihood)
+
+
+def _pairs(obs: Observations, cal: Calibration, adjusted: bool) -> Source:
+    from starcal_uq.estimation.composite import pair_likelihood
+
+    found = pair_likelihood(
+        StarFrames.from_observations(obs),
+        cal.camera.distortion,
+        cal.pair_theta,
+        chi2=cal.chi2,
+        residual_dof=cal.dof,
+        adjusted=adjusted,
+    )
+    failures: tuple[str, ...] = ()
+    notes: tuple[str, ...] = (
+        "the likelihood is the composite one over pairs of stars, with Godambe's curvature; its variability comes from "
+        + ("the noise of every star." if found.variability == "expected" else "the scatter between frames."),
+        "sigma is estimated from the pixel residuals at the best attitudes; pairs have no say in it.",
+    )
+    sigma, dof = found.sigma, float(found.dof)
+    if not adjusted:
+        sigma, dof = found.tau / found.pair_noise, float(found.n_pairs)
+        failure = (
+            f"The {found.n_pairs} pairs of stars are treated as independent (pairs_naive): the intervals are about "
+            f"{found.narrowness:.1f} times too narrow and must not be used; use likelihood='pairs' or 'marginal'."
+        )
+        warnings.warn(failure, NaivePairsWarning, stacklevel=5)
+        failures, notes = (failure,), ()
+    return Source(
+        name="pairs" if adjusted else "pairs_naive",
+        theta=found.theta_hat,
+        information=scaled_inverse(found.covariance),
+        sigma=sigma,
+        dof=dof,
+        exact=found.exact_log_likelihood,
+        fast=found.log_likelihood,
+        failures=failures,
+        notes=notes,
+    )
+
+
+class _AdjustedStudent:
+    """Student-t log likelihood with the curvature that the stars' scores show.
+
+    Stars are a mixture of right and wrong ones and no t distribution, so that the curvature of its likelihood is not
+    the precision of its estimate. As for composite likelihoods, it is evaluated at
+    ``theta_hat + C (theta - theta_hat)``.
+    """
+
+    def __init__(self, fit: Any, nu: float | None) -> None:
+        self._fit, self._nu = fit, nu
+        self._theta = fit.stage.theta
+        self._narrow = scaled_cholesky(scaled_inverse(fit.information.matrix))
+        self._wide = scaled_cholesky(fit.covariance)
+
+    def log_likelihood(self, theta: FloatArray, sigma: FloatArray, *nu: FloatArray) -> FloatArray:
+        scale = np.diag(self._wide)
+        z = np.linalg.solve(self._wide / scale[:, None], ((theta - self._theta) / scale).T)
+        points = self._theta + (self._narrow @ z).T
+        dof = nu[0] if nu else np.full(len(points), self._nu)
+        value: FloatArray = self._fit.likelihood.many(points, sigma, dof)
+        return value
+
+
+def _student(obs: Observations, cal: Calibration, dof: float | str | None) -> Source:
+    from starcal_uq.estimation.robust import refine
+
+    nu = parse_dof(dof, SamplingError)
+    frames = StarFrames.from_observations(obs)
+    rotations = quaternion_to_rotation(cal.quaternions)
+    fit = refine(frames, cal.camera.distortion, cal.theta, rotations, nu, _MAX_REFINEMENT)
+    if not fit.stage.status.ok:
+        raise SamplingError(
+            f"the maximum of the Student-t likelihood was not found ({fit.stage.status.name}): calibrate with "
+            "likelihood='student_t' first."
+        )
+    extra = None
+    if nu is None:
+        low = DOF_RANGE[0]
+        log_sd = fit.nu_std / (fit.nu - low) if np.isfinite(fit.nu_std) and fit.nu_std > 0.0 else 1.0
+        extra = Extra("dof", log_excess_prior, fit.nu, min(log_sd, 1.0), low)
+    return Source(
+        name="student_t",
+        theta=fit.stage.theta,
+        information=scaled_inverse(fit.covariance),
+        sigma=fit.sigma,
+        dof=0.5 * (fit.sigma / fit.sigma_std) ** 2,
+        exact=_AdjustedStudent(fit, nu).log_likelihood,
+        fast=None,
+        extra=extra,
+        notes=(
+            "the likelihood is a bivariate Student t per star, with the curvature that the scatter of the stars' "
+            "scores shows.",
+            "sigma is the scale of the Student t, which is below the standard deviation of its residuals.",
+        ),
+    )

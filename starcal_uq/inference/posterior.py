@@ -1,0 +1,396 @@
+"""The posterior as a result: draws, what they rest on, and whether they can be trusted.
+
+Opening a saved posterior needs neither the sampler nor the symbolic model nor a plotting library.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import Parameter, parameters, sigma_parameter
+from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.inference.priors import SIGMA_NAMES, Priors
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+
+DRAW_ORDER = (
+    "chain is one separately seeded ensemble; within a chain, draws are ordered by half of the run, then walker, then "
+    "step in that half, so that split R-hat compares the two halves in time and all ensembles"
+)
+_QUANTILES = (0.025, 0.5, 0.975)
+_NUMBERS = ("prior_mean", "prior_sd", "mean", "sd", "q2.5", "q50", "q97.5", "mcse")
+
+
+@dataclass(frozen=True, eq=False)
+class Laplace:
+    """Gaussian approximation of the posterior at its mode.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Coordinates: the camera parameters, then ``log_sigma`` if the noise is sampled.
+    mode : array (d,)
+        Mode of the posterior density in these coordinates, px units.
+    covariance : array (d, d)
+        Inverse of the negative Hessian of the log posterior there.
+    transform : array (d, d)
+        Lower triangular square root of `covariance`; coordinates are ``mode + transform @ u``.
+    iterations : int
+        Newton steps taken.
+    converged : bool
+        True if the last step gained less than the tolerance.
+    """
+
+    names: tuple[str, ...]
+    mode: FloatArray
+    covariance: FloatArray
+    transform: FloatArray
+    iterations: int
+    converged: bool
+
+    @property
+    def mean(self) -> FloatArray:
+        """Means (d,) of the parameters; the noise is log-normal here."""
+        return self._moments()[0]
+
+    @property
+    def sd(self) -> FloatArray:
+        """Standard deviations (d,) of the parameters."""
+        return self._moments()[1]
+
+    def _moments(self) -> tuple[FloatArray, FloatArray]:
+        mean, variance = self.mode.copy(), np.diag(self.covariance).copy()
+        if self.names[-1] == "log_sigma":
+            growth = np.exp(variance[-1])
+            mean[-1] = np.exp(self.mode[-1]) * np.sqrt(growth)
+            variance[-1] = mean[-1] ** 2 * (growth - 1.0)
+        return mean, np.sqrt(variance)
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnostics:
+    """Evidence that the draws are draws from the posterior.
+
+    Arrays over parameters have the order of `Posterior.parameter_names` and hold NaN for a noise that was given.
+
+    Attributes
+    ----------
+    rhat : array (p+1,)
+        Rank-normalised split R-hat over ensembles.
+    ess_bulk, ess_tail : array (p+1,)
+        Effective numbers of draws for the centre and for the 5 % and 95 % quantiles.
+    mcse : array (p+1,)
+        Monte Carlo standard error of the mean, px units.
+    acceptance : array (n_ensembles,)
+        Fraction of accepted proposals after the burn-in.
+    autocorrelation : array (p+1,)
+        Integrated autocorrelation time, steps.
+    n_evaluations : int
+        Points at which the likelihood was evaluated while sampling, burn-in included.
+    psis_khat : float
+        Pareto shape of the importance weights of draws around the Laplace approximation; good below 0.7.
+    psis_mean, psis_sd : array (p+1,)
+        Moments by those weights, an estimate without a Markov chain.
+    laplace_mean, laplace_sd : array (p+1,)
+        Moments of the Laplace approximation.
+    agreement_mean : float
+        Largest difference between sampled and importance-weighted means, in standard deviations.
+    agreement_sd : float
+        Largest relative difference between their standard deviations.
+    agreement : str
+        The same in words.
+    compressed_max_difference : float
+        Largest difference between compressed and exact log likelihood over posterior draws within three standard
+        deviations of the mode, relative to the mode, nat; NaN where it was not checked.
+    compressed_khat : float
+        Pareto shape of the weights exact over compressed at all checked draws; 0 where all differences are below 0.1
+        nat, and no tail can matter.
+    likelihood_used : str
+        How it was evaluated: ``compressed``, ``exact``, or the name of the likelihood that was passed.
+    failures : tuple of str
+        Every criterion that was missed, one sentence each.
+    messages : tuple of str
+        `failures`, then what is worth knowing.
+    likelihood : str
+        ``marginal``, ``pairs``, ``pairs_naive``, ``student_t``, or the name of the likelihood that was passed.
+    """
+
+    rhat: FloatArray
+    ess_bulk: FloatArray
+    ess_tail: FloatArray
+    mcse: FloatArray
+    acceptance: FloatArray
+    autocorrelation: FloatArray
+    n_evaluations: int
+    psis_khat: float
+    psis_mean: FloatArray
+    psis_sd: FloatArray
+    laplace_mean: FloatArray
+    laplace_sd: FloatArray
+    agreement_mean: float
+    agreement_sd: float
+    agreement: str
+    compressed_max_difference: float
+    compressed_khat: float
+    likelihood_used: str
+    failures: tuple[str, ...]
+    messages: tuple[str, ...]
+    likelihood: str = "marginal"
+
+    @property
+    def ok(self) -> bool:
+        """True if no criterion was missed."""
+        return not self.failures
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Draws of the camera parameters and the noise, with their diagnostics.
+
+    Attributes
+    ----------
+    parameter_names : tuple of str
+        p camera parameters, then ``sigma`` (px) or ``sigma_scale`` (a factor on stated noises).
+    draws : array (n, p+1)
+        All draws in px units, one ensemble after the other, each in the order of `DRAW_ORDER`.
+    log_posterior : array (n,)
+        Log posterior density of (theta, log sigma), up to a constant.
+    n_ensembles, n_walkers, n_steps : int
+        ``n = n_ensembles * n_walkers * n_steps``.
+    sigma_sampled : bool
+        False if the noise was given; its column is then constant.
+    priors : Priors
+        What the draws rest on besides the data.
+    laplace : Laplace
+        Gaussian approximation at the mode.
+    diagnostics : Diagnostics
+        Convergence and independent checks.
+    information : array (p, p)
+        Fisher information of the data alone, at the calibration's estimate.
+    rotation_per_theta : array (3, p)
+        Mean over frames of d(attitude error) / d(theta), rad per px unit.
+    attitude_noise : array (3, 3)
+        Mean over frames of the attitude covariance due to centroid noise, rad^2.
+    camera : Camera
+        The calibrated camera around which everything is linearised.
+    provenance : dict
+        Seed, settings, versions, time and data hash.
+    dof_draws : array (n,) or None
+        Draws of the degrees of freedom of a Student-t likelihood where they were free.
+    """
+
+    parameter_names: tuple[str, ...]
+    draws: FloatArray
+    log_posterior: FloatArray
+    n_ensembles: int
+    n_walkers: int
+    n_steps: int
+    sigma_sampled: bool
+    priors: Priors
+    laplace: Laplace
+    diagnostics: Diagnostics
+    information: FloatArray
+    rotation_per_theta: FloatArray
+    attitude_noise: FloatArray
+    camera: Camera
+    provenance: AnyDict
+    dof_draws: FloatArray | None = None
+
+    @property
+    def camera_names(self) -> tuple[str, ...]:
+        """Names of the p camera parameters."""
+        return self.parameter_names[:-1]
+
+    @property
+    def sigma_name(self) -> str:
+        """``sigma`` or ``sigma_scale``."""
+        return self.parameter_names[-1]
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Units, scales and symbols of `parameter_names`."""
+        noise = sigma_parameter(self.sigma_name == SIGMA_NAMES[1])
+        return (*parameters(self.camera.distortion), noise)
+
+    @property
+    def theta_draws(self) -> FloatArray:
+        """Draws (n, p) of the camera parameters."""
+        return self.draws[:, :-1]
+
+    @property
+    def sigma_draws(self) -> FloatArray:
+        """Draws (n,) of the noise."""
+        return self.draws[:, -1]
+
+    @cached_property
+    def mean(self) -> FloatArray:
+        """Posterior mean (p,) of the camera parameters."""
+        return np.asarray(self.theta_draws.mean(axis=0))
+
+    @cached_property
+    def covariance(self) -> FloatArray:
+        """Posterior covariance (p, p) of the camera parameters."""
+        shift = self.theta_draws - self.mean
+        return np.asarray(shift.T @ shift / (len(shift) - 1))
+
+    @cached_property
+    def sd(self) -> FloatArray:
+        """Posterior standard deviations (p+1,), the noise last."""
+        return np.asarray(self.draws.std(axis=0, ddof=1))
+
+    @property
+    def sampled(self) -> tuple[int, ...]:
+        """Columns of `draws` that were sampled."""
+        return tuple(range(len(self.parameter_names) - (not self.sigma_sampled)))
+
+    @cached_property
+    def data(self) -> Any:
+        """Draws as ArviZ knows them: ``InferenceData`` (0.23) or ``DataTree`` (1.x).
+
+        Chain is the ensemble; coefficients are divided by `Parameter.scale` (k1 in 1e-10 px^-2), because ArviZ
+        reports a wrong effective sample size and prints zero for tiny numbers; units are attributes.
+        """
+        from starcal_uq.inference.arviz import to_arviz
+
+        return to_arviz(self.datasets())
+
+    def datasets(self) -> dict[str, xr.Dataset]:
+        """ArviZ's groups ``posterior`` and ``sample_stats`` as xarray datasets (chain, draw)."""
+        import xarray as xr
+
+        from starcal_uq.inference.posterior_files import to_json
+
+        shape = (self.n_ensembles, self.n_walkers * self.n_steps)
+        coords = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
+        shown = self.parameters
+        variables = {
+            shown[i].name: (
+                ("chain", "draw"),
+                (self.draws[:, i] / shown[i].scale).reshape(shape),
+                {"units": shown[i].scaled_unit, "long_name": shown[i].description, "scale": shown[i].scale},
+            )
+            for i in self.sampled
+        }
+        attrs = {
+            "inference_library": "emcee",
+            "inference_library_version": str(self.provenance.get("versions", {}).get("emcee")),
+            "draw_order": DRAW_ORDER,
+            "n_walkers": self.n_walkers,
+            "n_steps": self.n_steps,
+            "provenance": to_json(self.provenance),
+        }
+        if not self.sigma_sampled:
+            attrs[f"{self.sigma_name}_given"] = float(self.sigma_draws[0])
+        stats = {"lp": (("chain", "draw"), self.log_posterior.reshape(shape), {"units": "nat"})}
+        return {
+            "posterior": xr.Dataset(variables, coords, attrs),
+            "sample_stats": xr.Dataset(stats, coords, attrs),
+        }
+
+    def summary(self) -> pd.DataFrame:
+        """One row per parameter: prior, posterior and diagnostics, plain and divided by the parameter's scale.
+
+        Columns are ``parameter``, ``unit``, ``prior_mean``, ``prior_sd``, ``mean``, ``sd``, ``q2.5``, ``q50``,
+        ``q97.5``, ``mcse``, ``rhat``, ``ess_bulk``, ``ess_tail``, then ``scaled_unit`` and ``scaled_...`` of every
+        number that has the unit.
+        """
+        import pandas as pd
+
+        quantiles = np.quantile(self.draws, _QUANTILES, axis=0)
+        shown, d = self.parameters, self.diagnostics
+        columns: dict[str, Any] = {
+            "parameter": list(self.parameter_names),
+            "unit": [p.unit for p in shown],
+            "prior_mean": self.priors.mean(self.parameter_names),
+            "prior_sd": self.priors.sd(self.parameter_names),
+            "mean": self.draws.mean(axis=0),
+            "sd": self.sd,
+            **{f"q{100 * q:g}": quantiles[i] for i, q in enumerate(_QUANTILES)},
+            "mcse": d.mcse,
+            "rhat": d.rhat,
+            "ess_bulk": d.ess_bulk,
+            "ess_tail": d.ess_tail,
+            "scaled_unit": [p.scaled_unit for p in shown],
+        }
+        scale = np.array([p.scale for p in shown])
+        columns.update({f"scaled_{name}": columns[name] / scale for name in _NUMBERS})
+        return pd.DataFrame(columns)
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """All draws in px units, with columns ``ensemble``, ``walker`` and ``step`` before the parameters."""
+        import pandas as pd
+
+        half = self.n_steps // 2
+        ensemble, part, walker, step = np.indices((self.n_ensembles, 2, self.n_walkers, half)).reshape(4, -1)
+        place = {"ensemble": ensemble, "walker": walker, "step": part * half + step}
+        draws = dict(zip(self.parameter_names, self.draws.T, strict=True))
+        return pd.DataFrame({**place, **draws})
+
+    def thin(self, n: int, seed: int | np.random.SeedSequence | None = None) -> FloatArray:
+        """A random subset (n, p+1) of the draws without replacement; all of them if there are fewer than n."""
+        rng = np.random.default_rng(seed)
+        return self.draws[rng.permutation(len(self.draws))[:n]]
+
+    def save(self, path: str | os.PathLike[str], force: bool = False) -> None:
+        """Write everything to one netCDF file that ArviZ opens as well.
+
+        Raises
+        ------
+        RunFolderError
+            If the file exists and `force` is false, or cannot be written.
+        """
+        from starcal_uq.inference.posterior_files import save_posterior
+
+        save_posterior(self, path, force)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Posterior:
+        """Read what `save` wrote, without loss.
+
+        Raises
+        ------
+        RunFolderError
+            If the file is missing or is not a posterior.
+        """
+        from starcal_uq.inference.posterior_files import load_posterior
+
+        return load_posterior(path)
+
+    def plot_corner(self, **options: Any) -> Any:
+        """Corner plot of the draws; options as for `starcal_uq.presentation.figures.inference.plot_corner`."""
+        from starcal_uq.presentation.figures.inference import plot_corner
+
+        return plot_corner(self, **options)
+
+    def plot_prior_posterior(self, **options: Any) -> Any:
+        """Prior beside posterior; options as for `starcal_uq.presentation.figures.prior.plot_prior_posterior`."""
+        from starcal_uq.presentation.figures.prior import plot_prior_posterior
+
+        return plot_prior_posterior(self, **options)
+
+    def _repr_html_(self) -> str:
+        shown = ("mean", "sd", "q2.5", "q97.5", "prior_sd")
+        columns = ["parameter", "scaled_unit", *(f"scaled_{n}" for n in shown), "rhat", "ess_bulk"]
+        table = self.summary()[columns].rename(columns=lambda name: name.removeprefix("scaled_"))
+        formats = {"rhat": "{:.4f}".format, "ess_bulk": "{:.0f}".format}
+        html = table.to_html(index=False, float_format=lambda v: f"{v:.6g}", formatters=formats, border=0)
+        verdict = "passes every check" if self.diagnostics.ok else "must not be used as it is"
+        return (
+            f"<p><b>Posterior</b>: {len(self.draws)} draws of {self.n_ensembles} ensembles; {verdict}.</p>"
+            f"{html}{_listed(self.diagnostics.messages)}"
+        )
+
+
+def _listed(messages: Sequence[str]) -> str:
+    import html
+
+    return f"<ul>{''.join(f'<li>{html.escape(m)}</li>' for m in messages)}</ul>" if messages else ""

@@ -1,0 +1,397 @@
+"""Sample the posterior of a calibration with emcee."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import secrets
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from starcal_uq.camera.distortion import parameters, sigma_parameter
+from starcal_uq.core.errors import SamplingError
+from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.estimation.merging import data_hashes
+from starcal_uq.inference.checks import (
+    ESS_BOUND,
+    RHAT_BOUND,
+    CompressionCheck,
+    chain_order,
+    check_compression,
+    diagnose,
+)
+from starcal_uq.inference.ensemble import PROPOSAL_DF, Chains, EnsembleSettings, Moves, Progress, run_ensembles
+from starcal_uq.inference.named import (
+    Evaluation,
+    LikelihoodName,
+    Source,
+    check_names,
+    find_source,
+    label_of,
+    resolved_dof,
+)
+from starcal_uq.inference.posterior import Laplace, Posterior
+from starcal_uq.inference.posterior_files import to_json
+from starcal_uq.inference.priors import SIGMA_NAMES, Priors
+from starcal_uq.inference.surrogate import fit_polynomial
+from starcal_uq.inference.target import (
+    Likelihood,
+    LogLikelihood,
+    Target,
+    importance_check,
+    laplace_approximation,
+    start_target,
+)
+from starcal_uq.inference.update import check_chain
+from starcal_uq.runs.folder import provenance
+
+if TYPE_CHECKING:
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.observations.table import Observations
+
+# Starts are draws of the Laplace approximation, so the mixture, which forgets in two or three steps, needs a short
+# burn-in; the stretch move needs some autocorrelation times of about 60.
+_BURN = {"mixture": 20, "stretch": 300}
+_N_CHECKED = 300
+# An exact evaluation costs thousands of compressed ones.
+_N_IMPORTANCE = {"compressed": 20_000}
+_N_IMPORTANCE_SLOW = 2_000
+# Degrees of the polynomial that stands for a likelihood without a compressed form; the second is tried where the first
+# is not good enough.
+_DEGREES = (3, 4)
+
+
+def sample(
+    obs: Observations | None,
+    cal: Calibration,
+    priors: Priors | None = None,
+    *,
+    sigma: Literal["sampled"] | float = "sampled",
+    n_ensembles: int = 4,
+    n_walkers: int = 64,
+    n_steps: int = 200,
+    n_burn: int | None = None,
+    moves: Moves = "mixture",
+    seed: int | None = None,
+    likelihood: LikelihoodName | Likelihood = "marginal",
+    evaluation: Evaluation = "auto",
+    dof: float | Literal["free"] | None = None,
+    progress: Progress | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+) -> Posterior:
+    """Draw from the posterior of camera parameters and noise.
+
+    Parameters
+    ----------
+    obs : Observations or None
+        The stars of the calibration. None leaves the compressed likelihood unchecked.
+    cal : Calibration
+        Start, Fisher information and compressed likelihood.
+    priors : Priors, optional
+        ``Priors.default`` of the nominal camera otherwise.
+    sigma : "sampled" or float
+        Sample the noise, or take it as given: px, or a factor where the stars state their own noise.
+    n_ensembles : int
+        Separately seeded ensembles, at least 2.
+    n_walkers, n_steps : int
+        Walkers of one ensemble and kept steps; `n_steps` is even.
+    n_burn : int, optional
+        Steps before the kept ones; 20 for ``mixture`` and 300 for ``stretch``.
+    moves : {"mixture", "stretch"}
+        ``mixture``: independence proposals (multivariate t at the Laplace approximation) with weight 0.7, differential
+        evolution with 0.3. ``stretch``: emcee's own default, about twenty times slower here.
+    seed : int, optional
+        The same seed gives the same draws; without one, a new one is taken and recorded in the provenance.
+    likelihood : {"marginal", "pairs", "pairs_naive", "student_t"} or object
+        ``marginal``: Gaussian noise per pixel, attitudes marginalised. ``pairs``: the paper's interstar angles as a
+        composite likelihood with Godambe's curvature, around the pair estimate of the calibration; sigma comes from the
+        pixel residuals. ``pairs_naive`` takes pairs as independent, which is wrong: it warns, and its diagnostics are
+        never ok. ``student_t``: heavy tails, for wrong identifications. An object with a method
+        ``log_likelihood(theta (n, p), sigma (n,)) -> (n,)`` is used as it is.
+    evaluation : {"auto", "compressed", "exact"}
+        ``auto`` samples the compressed form (for ``student_t``, a polynomial fitted to a few hundred exact values),
+        compares it with the exact one at 300 draws and samples the exact one if they differ by more than 0.5 nat within
+        three standard deviations, or if the importance weights between them are not all within 0.1 nat and have k-hat
+        above 0.7.
+    dof : float or "free", optional
+        Degrees of freedom of ``student_t``: by default those of a calibration with that likelihood, otherwise 4; "free"
+        samples them, with the gamma prior of Juarez & Steel (2010) on what exceeds 2.
+    progress : callable, optional
+        Called as ``progress(steps_done, steps_total)``; starts again if the exact likelihood takes over.
+    checkpoint : path, optional
+        Written while sampling, read if it exists, removed at the end. A resumed run gives the draws of an uninterrupted
+        one, bit for bit.
+
+    Returns
+    -------
+    Posterior
+
+    Raises
+    ------
+    SamplingError
+        For settings that cannot work, a calibration that is not sound, or a checkpoint of another run.
+    """
+    settings = _settings(n_ensembles, n_walkers, n_steps, n_burn, moves, sigma, cal)
+    check_names(likelihood, evaluation, dof, obs is not None)
+    label = label_of(likelihood)
+    dof = resolved_dof(cal, dof) if likelihood == "student_t" else None
+    per_star = cal.sigma_name == SIGMA_NAMES[1]
+    priors = Priors.default(cal.nominal, per_star) if priors is None else priors
+    if priors.names != (*cal.parameter_names, cal.sigma_name):
+        raise SamplingError(
+            f"the priors are on {', '.join(priors.names)}, but the calibration has {', '.join(cal.parameter_names)} "
+            f"and {cal.sigma_name}: make the priors with Priors.default of the calibrated camera."
+        )
+    check_chain(priors, cal.nominal, data_hashes(cal.provenance))
+    seed = secrets.randbits(63) if seed is None else seed
+    chosen: AnyDict = {
+        "sigma": sigma,
+        "n_ensembles": n_ensembles,
+        **asdict(settings),
+        "proposal_df": PROPOSAL_DF,
+        "likelihood": label,
+        "evaluation": evaluation if isinstance(likelihood, str) else "exact",
+        **({"dof": dof} if dof is not None else {}),
+    }
+    data_hash = cal.provenance.get("data_sha256") if obs is None else obs.data_hash
+    source = find_source(likelihood, obs, cal, dof)
+    run = _Run(cal, source, priors, settings, n_ensembles, seed, sigma, progress, provenance(seed, chosen, data_hash))
+    if isinstance(likelihood, str):
+        outcome, compression = _with_fallback(run, evaluation, checkpoint)
+    else:
+        outcome, compression = run.sample(label, likelihood.log_likelihood, checkpoint), CompressionCheck()
+    return _assemble(run, outcome, compression, evaluation)
+
+
+class _Run:
+    """What stays the same when another likelihood takes over."""
+
+    def __init__(
+        self,
+        cal: Calibration,
+        source: Source,
+        priors: Priors,
+        settings: EnsembleSettings,
+        n_ensembles: int,
+        seed: int,
+        sigma: Literal["sampled"] | float,
+        progress: Progress | None,
+        provenance: AnyDict,
+    ) -> None:
+        self.cal, self.source, self.priors, self.settings, self.progress = cal, source, priors, settings, progress
+        self.n_ensembles, self.provenance = n_ensembles, provenance
+        self.given = None if sigma == "sampled" else float(sigma)
+        # The ensembles come last, so that their number changes neither the checks nor the ensembles before.
+        self.importance_seed, self.check_seed, *self.seeds = np.random.SeedSequence(seed).spawn(2 + n_ensembles)
+        (self.design_seed,) = self.check_seed.spawn(1)
+        self._mode: Target | None = None
+
+    def start(self, log_likelihood: LogLikelihood) -> Target:
+        source = self.source
+        sigma = source.sigma if self.given is None else self.given
+        information = source.information * (source.sigma / sigma) ** 2
+        given = self.given is not None
+        return start_target(
+            log_likelihood, self.priors, source.theta, information, sigma, source.dof, given, source.extra
+        )
+
+    def polynomial(self, exact: LogLikelihood, degree: int) -> LogLikelihood:
+        if self._mode is None:
+            self._mode, _ = laplace_approximation(self.start(exact))
+        return fit_polynomial(self._mode, degree, np.random.default_rng(self.design_seed)).log_likelihood
+
+    def fingerprint(self, target: Target, name: str) -> str:
+        identity = {k: v for k, v in self.provenance.items() if k != "created_utc"}
+        text = to_json([identity, self.priors.to_dict(), name, target.centre, target.transform])
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def sample(self, name: str, log_likelihood: LogLikelihood, checkpoint: str | os.PathLike[str] | None) -> _Outcome:
+        target, laplace = laplace_approximation(self.start(log_likelihood))
+        chains = run_ensembles(
+            target.log_density,
+            target.dim,
+            self.seeds,
+            self.settings,
+            progress=self.progress,
+            checkpoint=checkpoint,
+            fingerprint=self.fingerprint(target, name),
+        )
+        return _Outcome(name, target, laplace, chains, checkpoint)
+
+
+class _Outcome:
+    """Chains of one likelihood."""
+
+    def __init__(
+        self,
+        name: str,
+        target: Target,
+        laplace: Laplace,
+        chains: Chains,
+        checkpoint: str | os.PathLike[str] | None,
+    ) -> None:
+        self.name, self.target, self.laplace, self.chains, self.checkpoint = name, target, laplace, chains, checkpoint
+        ordered = chain_order(chains.u)
+        natural = target.natural(ordered.reshape(-1, target.dim))
+        self.draws = natural.reshape(*ordered.shape[:2], natural.shape[1])
+
+
+def _with_fallback(
+    run: _Run, evaluation: Evaluation, checkpoint: str | os.PathLike[str] | None
+) -> tuple[_Outcome, CompressionCheck]:
+    exact, fast = run.source.exact, run.source.fast
+    if exact is None:
+        # Without observations there is a compressed likelihood or nothing: names were checked before.
+        return run.sample("compressed", _present(fast), checkpoint), CompressionCheck()
+    if evaluation == "exact":
+        return run.sample("exact", exact, checkpoint), CompressionCheck()
+    files: list[str] = []
+    for degree in _DEGREES if fast is None else (0,):
+        compressed = run.polynomial(exact, degree) if fast is None else fast
+        # Each attempt has its own file: on resuming, the finished ones must still be found complete.
+        outcome = run.sample("compressed", compressed, _attempt(checkpoint, files))
+        compression = _compare(run, outcome, compressed, exact)
+        if compression.good:
+            break
+    if evaluation == "auto" and not compression.good:
+        outcome = run.sample("exact", exact, _attempt(checkpoint, files))
+    for path in files[:-1]:
+        Path(path).unlink(missing_ok=True)
+    return outcome, compression
+
+
+def _present(fast: LogLikelihood | None) -> LogLikelihood:
+    if fast is None:
+        raise SamplingError("this likelihood needs the observations: give obs.")
+    return fast
+
+
+def _attempt(checkpoint: str | os.PathLike[str] | None, files: list[str]) -> str | None:
+    """The checkpoint of the next attempt."""
+    if checkpoint is None:
+        return None
+    files.append(os.fspath(checkpoint) + (f".{len(files) + 1}" if files else ""))
+    return files[-1]
+
+
+def _compare(run: _Run, outcome: _Outcome, compressed: LogLikelihood, exact: LogLikelihood) -> CompressionCheck:
+    rng = np.random.default_rng(run.check_seed)
+    flat = outcome.draws.reshape(-1, outcome.draws.shape[-1])
+    picks = flat[rng.choice(len(flat), min(_N_CHECKED, len(flat)), replace=False)]
+    return check_compression(compressed, exact, outcome.target, picks, outcome.laplace)
+
+
+def _assemble(run: _Run, outcome: _Outcome, compression: CompressionCheck, evaluation: str) -> Posterior:
+    cal, settings, target, source = run.cal, run.settings, outcome.target, run.source
+    n = _N_IMPORTANCE.get(outcome.name, _N_IMPORTANCE_SLOW)
+    importance = importance_check(target, n, PROPOSAL_DF, np.random.default_rng(run.importance_seed))
+    shown = (*parameters(cal.camera.distortion), sigma_parameter(cal.sigma_name == SIGMA_NAMES[1]))
+    notes, failures = list(source.notes), list(source.failures)
+    if evaluation == "auto" and outcome.name == "exact":
+        notes.append(f"the exact likelihood was sampled, because {compression.words}.")
+    if outcome.name == "compressed" and source.exact is None:
+        notes.append("the compressed likelihood was not compared with the exact one: the observations were not given.")
+    draws, chains, laplace, extra = outcome.draws, outcome.chains, outcome.laplace, None
+    if target.extra is not None:
+        draws, chains, laplace, extra = _without_extra(outcome)
+        found, missed = _extra_words(target.extra.name, extra)
+        notes += found
+        failures += missed
+    diagnostics = diagnose(
+        chains,
+        draws,
+        shown,
+        laplace,
+        importance,
+        compression,
+        run.priors,
+        cal.camera,
+        outcome.name,
+        run.n_ensembles * settings.n_walkers * (settings.n_burn + settings.n_steps),
+        notes,
+    )
+    diagnostics = replace(
+        diagnostics,
+        likelihood=source.name,
+        failures=(*failures, *diagnostics.failures),
+        messages=(*failures, *diagnostics.messages),
+    )
+    posterior = Posterior(
+        parameter_names=tuple(p.name for p in shown),
+        draws=draws.reshape(-1, len(shown)),
+        log_posterior=chain_order(chains.log_density).reshape(-1),
+        n_ensembles=run.n_ensembles,
+        n_walkers=settings.n_walkers,
+        n_steps=settings.n_steps,
+        sigma_sampled=run.given is None,
+        priors=run.priors,
+        laplace=laplace,
+        diagnostics=diagnostics,
+        information=np.asarray(cal.information, dtype=np.float64),
+        rotation_per_theta=np.asarray(cal.rotation_per_theta, dtype=np.float64),
+        attitude_noise=np.asarray(cal.attitude_noise, dtype=np.float64),
+        camera=cal.camera,
+        provenance=run.provenance,
+        dof_draws=None if extra is None else extra.reshape(-1),
+    )
+    if outcome.checkpoint is not None:
+        Path(outcome.checkpoint).unlink(missing_ok=True)
+    return posterior
+
+
+def _without_extra(outcome: _Outcome) -> tuple[FloatArray, Chains, Laplace, FloatArray]:
+    """Draws, chains and Laplace approximation of camera and noise alone, and the further parameter's draws."""
+    chains, laplace = outcome.chains, outcome.laplace
+    # The factor is lower triangular, so that its leading block belongs to the leading coordinates.
+    inner = replace(
+        laplace,
+        names=laplace.names[:-1],
+        mode=laplace.mode[:-1],
+        covariance=laplace.covariance[:-1, :-1],
+        transform=laplace.transform[:-1, :-1],
+    )
+    return outcome.draws[..., :-1], replace(chains, u=chains.u[..., :-1]), inner, outcome.draws[..., -1]
+
+
+def _extra_words(name: str, draws: FloatArray) -> tuple[list[str], list[str]]:
+    """What is worth knowing of a further parameter's draws (ensemble, draw), and which criteria they miss."""
+    from starcal_uq.inference import arviz as arviz_compat
+
+    values = np.ascontiguousarray(draws)
+    rhat, ess = arviz_compat.rhat(values), arviz_compat.ess_bulk(values)
+    low, middle, high = np.quantile(values, (0.025, 0.5, 0.975))
+    words = f"{name} has the median {middle:.3g} and the 95 % interval {low:.3g} to {high:.3g}."
+    if rhat < RHAT_BOUND and ess > ESS_BOUND:
+        return [words], []
+    return [words], [f"The draws of {name} have not converged (R-hat {rhat:.4f}, {ess:.0f} effective): raise n_steps."]
+
+
+def _settings(
+    n_ensembles: int,
+    n_walkers: int,
+    n_steps: int,
+    n_burn: int | None,
+    moves: Moves,
+    sigma: Any,
+    cal: Calibration,
+) -> EnsembleSettings:
+    if moves not in _BURN:
+        raise SamplingError(f"moves {moves!r} is unknown: use one of {', '.join(_BURN)}.")
+    if sigma != "sampled" and not (isinstance(sigma, int | float) and np.isfinite(sigma) and sigma > 0.0):
+        raise SamplingError(f"sigma is {sigma!r}: use 'sampled' or a number above zero.")
+    n_burn = _BURN[moves] if n_burn is None else n_burn
+    dim = len(cal.theta) + 1
+    for good, text in (
+        (n_ensembles >= 2, f"n_ensembles is {n_ensembles}: at least 2 are needed, because R-hat compares ensembles."),
+        (n_walkers >= 2 * dim, f"n_walkers is {n_walkers}: {dim} parameters need at least {2 * dim}."),
+        (n_steps >= 8 and n_steps % 2 == 0, f"n_steps is {n_steps}: give an even number of at least 8."),
+        (n_burn >= 0, f"n_burn is {n_burn}: give zero or more steps."),
+    ):
+        if not good:
+            raise SamplingError(text)
+    if not cal.status.ok:
+        raise SamplingError(f"the calibration did not converge ({cal.status.name}): {cal.status.remedy}.")
+    return EnsembleSettings(n_walkers, n_steps, n_burn, moves)

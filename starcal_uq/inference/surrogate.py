@@ -1,0 +1,113 @@
+"""A polynomial in place of a log likelihood that costs milliseconds.
+
+Many stars make a log likelihood nearly quadratic within the posterior's reach, whatever its form; the third order (and
+the fourth, where the data are few) is what remains. A few hundred exact evaluations around the mode determine it, after
+which an evaluation costs microseconds for any number of stars. Every run compares it with the exact likelihood at
+posterior draws.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+
+import numpy as np
+
+from starcal_uq.core.errors import SamplingError
+from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.inference.target import Target
+
+# Points per coefficient, and their spread against the posterior's.
+_OVERSAMPLING = 2.5
+_SPREAD = 1.25
+# Beyond this radius (standard deviations, plus the root of the dimension) the higher orders stay what they are there:
+# a cubic has no business far from its points.
+_REACH = 2.0
+_CHUNK = 4096
+
+
+@dataclass(frozen=True)
+class PolynomialLikelihood:
+    """Log likelihood as a polynomial in the whitened coordinates of a target.
+
+    Attributes
+    ----------
+    target : Target
+        Coordinates; its origin is the mode.
+    exponents : tuple of (n_k, k) arrays of int
+        Coordinates multiplied in every monomial, by degree from 0 on.
+    coefficients : tuple of (n_k,) arrays
+        Of the monomials.
+    reach : float
+        Radius up to which degrees above two vary.
+    """
+
+    target: Target
+    exponents: tuple[IntArray, ...]
+    coefficients: tuple[FloatArray, ...]
+    reach: float
+
+    def log_likelihood(self, theta: FloatArray, sigma: FloatArray, *extra: FloatArray) -> FloatArray:
+        """Log likelihood (n,) at theta (n, p), sigma (n,) and a further parameter where there is one."""
+        columns = [theta] if self.target.sigma is not None else [theta, np.log(sigma)]
+        if self.target.extra is not None:
+            columns.append(np.log(extra[0] - self.target.extra.bound))
+        point = np.column_stack(columns)
+        scale = np.diag(self.target.transform)
+        shift = (point - self.target.centre) / scale
+        u: FloatArray = np.asarray(np.linalg.solve(self.target.transform / scale[:, None], shift.T).T, dtype=np.float64)
+        return np.concatenate([self._at(u[i : i + _CHUNK]) for i in range(0, len(u), _CHUNK)])
+
+    def _at(self, u: FloatArray) -> FloatArray:
+        radius = np.linalg.norm(u, axis=1, keepdims=True)
+        near = u * np.minimum(1.0, self.reach / np.maximum(radius, self.reach))
+        value = np.zeros(len(u))
+        for degree, (exponents, coefficients) in enumerate(zip(self.exponents, self.coefficients, strict=True)):
+            value += _monomials(u if degree <= 2 else near, exponents) @ coefficients
+        return value
+
+
+def _monomials(u: FloatArray, exponents: IntArray) -> FloatArray:
+    product: FloatArray = np.ones((len(u), len(exponents)))
+    for column in exponents.T:
+        product *= u[:, column]
+    return product
+
+
+def fit_polynomial(target: Target, degree: int, rng: np.random.Generator) -> PolynomialLikelihood:
+    """Fit a polynomial to a target's log likelihood around its mode.
+
+    Parameters
+    ----------
+    target : Target
+        Centred and whitened by `starcal_uq.inference.target.laplace_approximation`.
+    degree : int
+        Of the polynomial.
+    rng : numpy.random.Generator
+        Draws the points.
+
+    Raises
+    ------
+    SamplingError
+        When the likelihood is not finite around its mode.
+    """
+    d = target.dim
+    exponents = tuple(
+        np.array(list(combinations_with_replacement(range(d), k)), dtype=np.int64) for k in range(degree + 1)
+    )
+    sizes = [len(e) for e in exponents]
+    reach = float(np.sqrt(d)) + _REACH
+    u = _SPREAD * rng.standard_normal((round(_OVERSAMPLING * sum(sizes)), d))
+    u *= np.minimum(1.0, reach / np.linalg.norm(u, axis=1, keepdims=True))
+    u[0] = 0.0
+    values = target.likelihood_at(u)
+    if not np.isfinite(values).all():
+        raise SamplingError(
+            "the likelihood is not finite around its maximum: use evaluation='exact', or check the identifications."
+        )
+    columns = np.concatenate([_monomials(u, e) for e in exponents], axis=1)
+    # A large constant would cost digits of everything else.
+    solution = np.linalg.lstsq(columns, values - values[0], rcond=None)[0]
+    parts = np.split(solution, np.cumsum(sizes)[:-1])
+    parts[0] = parts[0] + values[0]
+    return PolynomialLikelihood(target, exponents, tuple(parts), reach)

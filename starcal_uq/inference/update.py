@@ -1,0 +1,373 @@
+"""A posterior as the prior of the next run, and whether the camera changed between two runs.
+
+Ground calibration to orbit is the case in mind: what the ground determined is worth keeping, but the launch may have
+moved it. So the prior can be widened by an allowed shift in physical terms, and the shift that did happen is tested.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import get_model, parameters
+from starcal_uq.core.errors import PriorError
+from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.estimation.merging import data_hashes
+from starcal_uq.inference.gaussian_priors import GaussianPriors
+from starcal_uq.inference.physical_priors import priors_from_table
+from starcal_uq.inference.posterior import Posterior
+from starcal_uq.inference.priors import SIGMA_NAMES, Priors, positive_number, read_priors_table
+from starcal_uq.runs.folder import RunFolder
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from starcal_uq.estimation.calibration import Calibration
+
+NOISES = ("default", "posterior")
+_SHIFT_KEYS = ("principal_point_px", "focal_fraction", "distortion_corner_px")
+_CHAIN_KEYS = ("prior_from", "inflation", "noise", "shift")
+ALPHA = 1e-3
+
+
+@dataclass(frozen=True)
+class AllowedShift:
+    """Standard deviations of what may have changed between two runs, in physical terms; zero is no change.
+
+    Attributes
+    ----------
+    principal_point_px : float
+        Of x0 and of y0, px.
+    focal_fraction : float
+        Of the focal length, relative.
+    distortion_corner_px : float
+        Of the displacement by each distortion term at the corner of the field, px.
+    """
+
+    principal_point_px: float = 0.0
+    focal_fraction: float = 0.0
+    distortion_corner_px: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in _SHIFT_KEYS:
+            value = float(getattr(self, name))
+            if not (np.isfinite(value) and value >= 0.0):
+                raise PriorError(f"the allowed shift {name!r} is {value:g}: it must be a finite number, zero or more.")
+
+    def covariance(self, camera: Camera) -> FloatArray:
+        """Diagonal covariance (p, p) for the parameters of a camera, px units."""
+        radius = float(camera.corner_radius_px)
+        sd = [self.principal_point_px, self.principal_point_px, self.focal_fraction * camera.focal_px]
+        sd += [self.distortion_corner_px / radius**c.order for c in get_model(camera.distortion).coefficients]
+        return np.diag(np.square(sd))
+
+
+def prior_from(
+    posterior: Posterior,
+    *,
+    inflation: float = 1.0,
+    shift: AllowedShift | None = None,
+    noise: str = "default",
+    per_star_sigma: bool | None = None,
+    name: str = "an earlier posterior",
+    data_sha256: Collection[str] = (),
+) -> GaussianPriors:
+    """Turn a posterior into a prior: normal with its mean and full covariance, log-normal for the noise.
+
+    Parameters
+    ----------
+    posterior : Posterior
+        Of the earlier run.
+    inflation : float
+        Factor on all standard deviations, at least 1.
+    shift : AllowedShift, optional
+        Added to the covariance: what may have changed since.
+    noise : {"default", "posterior"}
+        ``default``: the wide prior of `Priors.default`, because centroid noise belongs to the exposures and the sky and
+        not to the camera. ``posterior``: log-normal with the moments of the earlier noise's logarithm.
+    per_star_sigma : bool, optional
+        Whether the next run's stars state their noise; as in the earlier run by default.
+    name : str
+        What the earlier run is called in tables.
+    data_sha256 : collection of str
+        Hashes of the data behind the posterior besides the one it states.
+
+    Raises
+    ------
+    PriorError
+        For an inflation below 1, or a noise that means something else in the next run.
+    """
+    if noise not in NOISES:
+        raise PriorError(f"the prior's noise {noise!r} is unknown: use one of {', '.join(NOISES)}.")
+    if positive_number("inflation", inflation) < 1.0:
+        raise PriorError(
+            f"the prior's inflation is {inflation:g}: use 1 or more; less would claim what no data showed."
+        )
+    stated = posterior.sigma_name == SIGMA_NAMES[1]
+    per_star = stated if per_star_sigma is None else per_star_sigma
+    if noise == "posterior" and (per_star != stated or not posterior.sigma_sampled):
+        raise PriorError(
+            f"the noise of {name} cannot become a prior, because it was given or is of another kind: use noise "
+            "'default'."
+        )
+    shift = AllowedShift() if shift is None else shift
+    wide = Priors.default(posterior.camera, per_star)
+    median, log_sd = wide.sigma_median, wide.sigma_log_sd
+    if noise == "posterior":
+        log_sigma = np.log(posterior.sigma_draws)
+        median, log_sd = float(np.exp(log_sigma.mean())), float(log_sigma.std(ddof=1)) * inflation
+    hashes = data_hashes(posterior.provenance) | set(data_sha256)
+    inherited = getattr(posterior.priors, "source", {})
+    return GaussianPriors(
+        theta_mean=posterior.mean,
+        theta_covariance=posterior.covariance * inflation**2 + shift.covariance(posterior.camera),
+        sigma_median=median,
+        sigma_log_sd=log_sd,
+        distortion=posterior.camera.distortion,
+        per_star_sigma=per_star,
+        source={
+            "name": name,
+            "data_sha256": sorted(hashes | set(inherited.get("data_sha256", ()))),
+            "inflation": float(inflation),
+            "shift": dict(vars(shift)),
+            "noise": noise,
+            "detector": _detector(posterior.camera),
+        },
+    )
+
+
+def prior_from_run(run: str | Path, **options: Any) -> GaussianPriors:
+    """The posterior of a run folder as a prior; options as for `prior_from`."""
+    from starcal_uq.estimation.calibration import Calibration
+
+    folder = RunFolder(run)
+    posterior = Posterior.load(folder.require("posterior"))
+    hashes = data_hashes(Calibration.load(folder.calibration).provenance) if folder.calibration.exists() else set()
+    return prior_from(posterior, name=folder.path.resolve().name, data_sha256=hashes, **options)
+
+
+def load_priors(
+    path: str | Path, camera: Camera, per_star_sigma: bool = False, data_sha256: Collection[str] = ()
+) -> Priors:
+    """Read a ``[priors]`` table: physical terms, or ``prior_from = "RUN"`` for the posterior of an earlier run.
+
+    With ``prior_from`` (relative to the file), the table may hold ``inflation``, ``noise`` (``default``, ``posterior``)
+    and a table ``[priors.shift]`` with ``principal_point_px``, ``focal_fraction`` and ``distortion_corner_px``.
+
+    Parameters
+    ----------
+    path : path
+        TOML file.
+    camera : Camera
+        Nominal camera of the run that is to be sampled.
+    per_star_sigma : bool
+        Whether its stars state their noise.
+    data_sha256 : collection of str
+        Hashes of its data; an earlier posterior that holds them already is refused.
+
+    Raises
+    ------
+    PriorError
+        For a file that cannot be read, an unknown key, or an earlier run of another camera or of the same data.
+    """
+    table = read_priors_table(path)
+    if "prior_from" not in table:
+        return priors_from_table(path, table, camera, per_star_sigma)
+    for key in table:
+        if key not in _CHAIN_KEYS:
+            raise PriorError(
+                f"{path}: unknown key {key!r} in [priors] beside prior_from; use one of {', '.join(_CHAIN_KEYS)}."
+            )
+    try:
+        run = Path(path).parent / _text(table, "prior_from")
+        options: AnyDict = {"shift": AllowedShift(**_numbers(table.get("shift", {}), "shift", _SHIFT_KEYS))}
+        options |= _numbers({k: v for k, v in table.items() if k == "inflation"}, "priors", ("inflation",))
+        if "noise" in table:
+            options["noise"] = _text(table, "noise")
+        priors = prior_from_run(run, per_star_sigma=per_star_sigma, **options)
+        check_chain(priors, camera, data_sha256)
+    except PriorError as error:
+        raise PriorError(f"{path}: {error}") from None
+    return priors
+
+
+def check_chain(priors: Priors, camera: Camera, data_sha256: Collection[str] = ()) -> None:
+    """Refuse a chained prior of another camera, or one that the same data have shaped already.
+
+    Raises
+    ------
+    PriorError
+        In these cases.
+    """
+    source: Mapping[str, Any] = getattr(priors, "source", {})
+    name = source.get("name", "the prior")
+    if priors.distortion != camera.distortion:
+        raise PriorError(
+            f"{name} has the distortion model {priors.distortion!r}, this run {camera.distortion!r}: calibrate both "
+            "with the same model."
+        )
+    if "detector" in source and list(source["detector"]) != _detector(camera):
+        raise PriorError(f"{name} is of another detector (width, height in px, pixel in um): {source['detector']}.")
+    if set(data_sha256) & set(source.get("data_sha256", ())):
+        raise PriorError(
+            f"{name} rests on the observations of this run already, which would count twice: use other data."
+        )
+
+
+def _detector(camera: Camera) -> list[float]:
+    return [camera.width_px, camera.height_px, camera.pixel_um]
+
+
+def _text(table: Mapping[str, Any], key: str) -> str:
+    if not isinstance(table[key], str):
+        raise PriorError(f"key {key!r} in [priors] must be a text.")
+    return str(table[key])
+
+
+def _numbers(table: Any, where: str, keys: Collection[str]) -> dict[str, float]:
+    if not isinstance(table, Mapping):
+        raise PriorError(f"{where!r} in [priors] must be a table with {', '.join(keys)}.")
+    for key, value in table.items():
+        if key not in keys:
+            raise PriorError(f"unknown key {key!r} in [priors.{where}]; use one of {', '.join(keys)}.")
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise PriorError(f"key {key!r} of [priors] must be a number.")
+    return {key: float(value) for key, value in table.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class ShiftTest:
+    """Did the camera change between two runs?
+
+    Attributes
+    ----------
+    names : tuple of str
+        The p camera parameters.
+    units : tuple of str
+        Their units.
+    shift : array (p,)
+        After minus before, px units.
+    covariance : array (p, p)
+        Of the shift if nothing changed (or no more than was allowed for).
+    z : array (p,)
+        Shift in its standard deviations.
+    statistic : float
+        Squared Mahalanobis length of the shift; p on average if nothing changed.
+    dof : float
+        Degrees of freedom of the noise estimates behind the covariance; infinite where they are in the posteriors.
+    p_value : float
+        Probability of a larger statistic if nothing changed.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    shift: FloatArray
+    covariance: FloatArray
+    z: FloatArray
+    statistic: float
+    dof: float
+    p_value: float
+
+    @property
+    def significant(self) -> bool:
+        """True if chance is no explanation (p below 0.001)."""
+        return self.p_value < ALPHA
+
+    @property
+    def words(self) -> str:
+        """The result as a sentence."""
+        largest = int(np.argmax(np.abs(self.z)))
+        where = f"largest change {self.names[largest]}, {self.z[largest]:+.1f} sigma; p = {self.p_value:.2g}"
+        if self.significant:
+            return (
+                f"The camera changed between the runs ({where}): widen the prior by an allowed shift, or start afresh."
+            )
+        return f"Nothing shows that the camera changed between the runs ({where})."
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """One row per parameter: shift, its sigma, and their ratio."""
+        import pandas as pd
+
+        return pd.DataFrame(
+            {
+                "parameter": self.names,
+                "unit": self.units,
+                "shift": self.shift,
+                "sigma": np.sqrt(np.diag(self.covariance)),
+                "z": self.z,
+            }
+        )
+
+    def _repr_html_(self) -> str:
+        table = self.to_dataframe().to_html(index=False, float_format=lambda v: f"{v:.3g}", border=0)
+        return f"<p><b>Shift</b>: {self.words}</p>{table}"
+
+
+def shift_test(
+    before: Calibration | Posterior, after: Calibration | Posterior, allowed: AllowedShift | None = None
+) -> ShiftTest:
+    """Compare two estimates from different data.
+
+    The statistic is ``d^T (C_before + C_after + C_allowed)^-1 d``. Calibrations know the degrees of freedom of their
+    noise, so that its p-value is taken from F; the effective number for the sum of two covariances is Welch's.
+
+    Parameters
+    ----------
+    before, after : Calibration or Posterior
+        Of the same kind of camera, from different observations. A posterior whose own prior came from another run does
+        not stand on its data alone: give its calibration.
+    allowed : AllowedShift, optional
+        Change that would be no surprise.
+
+    Raises
+    ------
+    PriorError
+        For other cameras, the same data, or a posterior with a chained prior.
+    """
+    from scipy.special import chdtrc, fdtrc
+
+    for result in (before, after):
+        if isinstance(getattr(result, "priors", None), GaussianPriors):
+            raise PriorError(
+                "a posterior whose prior came from another run does not stand on its own data: test its calibration."
+            )
+    if before.camera.distortion != after.camera.distortion or _detector(before.camera) != _detector(after.camera):
+        raise PriorError(
+            "the two runs are of different detectors or distortion models: their parameters do not compare."
+        )
+    if data_hashes(before.provenance) & data_hashes(after.provenance):
+        raise PriorError("the two runs rest on the same observations: a shift can only be seen between different data.")
+    specs = parameters(after.camera.distortion)
+    shift = _estimate(after) - _estimate(before)
+    extra = (AllowedShift() if allowed is None else allowed).covariance(after.camera)
+    covariance = before.covariance + after.covariance + extra
+    sd = np.sqrt(np.diag(covariance))
+    inverse = np.linalg.inv(covariance / np.outer(sd, sd))
+    z, p = shift / sd, len(shift)
+    statistic = float(z @ inverse @ z)
+    # Share of each run's covariance in the sum, for the effective degrees of freedom.
+    loss = 0.0
+    for result in (before, after):
+        share = float(np.trace(inverse @ (result.covariance / np.outer(sd, sd)))) / p
+        loss += share**2 / float(getattr(result, "dof", np.inf))
+    dof = 1.0 / loss if loss > 0.0 else float("inf")
+    p_value = float(fdtrc(p, dof, statistic / p)) if np.isfinite(dof) else float(chdtrc(p, statistic))
+    return ShiftTest(
+        names=tuple(spec.name for spec in specs),
+        units=tuple(spec.unit for spec in specs),
+        shift=shift,
+        covariance=covariance,
+        z=z,
+        statistic=statistic,
+        dof=dof,
+        p_value=p_value,
+    )
+
+
+def _estimate(result: Calibration | Posterior) -> FloatArray:
+    return result.mean if isinstance(result, Posterior) else result.theta

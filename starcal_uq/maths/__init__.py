@@ -1,0 +1,1 @@
+"""Linear algebra of badly scaled matrices, tails, ranks and intervals."""

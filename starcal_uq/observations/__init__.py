@@ -1,0 +1,1 @@
+"""The waist: the table of identified stars, its files and checks."""

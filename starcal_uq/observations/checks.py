@@ -1,0 +1,263 @@
+"""Checks of every row of an observations table, and the sentence that reports them.
+
+All bad rows are found before any is reported: whoever repairs a file wants the whole list.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.core.errors import ObservationError
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray, StrArray
+from starcal_uq.observations.table import COLUMNS
+
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+
+_MIN_STARS = 3
+_REPAIR = "correct or remove the row"
+_TIME = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d)(:\d\d(?:\.\d+)?)?(?:Z|[+-]00:?00)?")
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One thing that is wrong.
+
+    Attributes
+    ----------
+    row : int
+        Row, from 0.
+    column : str or None
+        Column, None if the whole row is at fault.
+    reason, remedy : str
+        Clauses for the message.
+    other : int or None
+        Row that this one repeats.
+    """
+
+    row: int
+    column: str | None
+    reason: str
+    remedy: str = _REPAIR
+    other: int | None = None
+
+
+def _number(text: str) -> float:
+    # Python reads 1_000 as a number; in a table the underscore is a slip.
+    if "_" in text:
+        raise ValueError(text)
+    return float(text)
+
+
+def _whole(text: str) -> int:
+    try:
+        if "_" in text:
+            raise ValueError(text)
+        value = int(text)
+    except ValueError:
+        number = _number(text)
+        if not number.is_integer():
+            raise
+        value = int(number)
+    if abs(value) >= 2**63:
+        raise ValueError(text)
+    return value
+
+
+def _iso_utc(text: str) -> str:
+    """`text` as YYYY-MM-DDTHH:MM:SS[.f], all its digits kept."""
+    match = _TIME.fullmatch(text.strip())
+    if match is None:
+        raise ValueError(text)
+    day, minute, second = match[1], match[2], match[3] or ":00"
+    # datetime knows no leap second, UTC does.
+    whole_second = second[:3].replace(":60", ":59") if minute == "23:59" else second[:3]
+    datetime.fromisoformat(f"{day}T{minute}{whole_second}")
+    return f"{day}T{minute}{second}"
+
+
+def _parse(
+    name: str, cells: Iterable[str], convert: Callable[[str], Any], empty: Any, reason: str, remedy: str
+) -> tuple[list[Any], list[Problem]]:
+    """Convert cell by cell; a bad cell becomes `empty` and a problem."""
+    values, problems = [], []
+    for row, cell in enumerate(cells):
+        value = empty
+        if cell.strip():
+            try:
+                value = convert(cell)
+            except ValueError:
+                problems.append(Problem(row, name, f"{cell!r} {reason}", remedy))
+        elif not COLUMNS[name].gaps:
+            problems.append(Problem(row, name, "the value is missing", "fill it in or remove the row"))
+        values.append(value)
+    return values, problems
+
+
+def parse_numbers(name: str, cells: Sequence[str]) -> tuple[FloatArray, list[Problem]]:
+    """Numbers of a column of texts, shape (N,); NaN where a cell is bad."""
+    try:
+        # The common case, a clean column, at the speed of the interpreter's own loop.
+        return np.array(list(map(_number, cells)), dtype=np.float64), []
+    except ValueError:
+        values, problems = _parse(name, cells, _number, np.nan, "is not a number", _REPAIR)
+        return np.array(values, dtype=np.float64), problems
+
+
+def parse_whole(name: str, cells: Sequence[str]) -> tuple[IntArray, list[Problem]]:
+    """Whole numbers of a column of texts, shape (N,); 0 where a cell is bad."""
+    values, problems = _parse(name, cells, _whole, 0, "is not a whole number", _REPAIR)
+    return np.array(values, dtype=np.int64), problems
+
+
+def parse_times(name: str, cells: Sequence[str]) -> tuple[StrArray, list[Problem]]:
+    """Times of a column of texts as YYYY-MM-DDTHH:MM:SS[.f], shape (N,); empty where a cell is bad."""
+    known: dict[str, str] = {}
+
+    def convert(cell: str) -> str:
+        # All stars of a frame share their time.
+        if cell not in known:
+            known[cell] = _iso_utc(cell)
+        return known[cell]
+
+    remedy = "write UTC as in 2026-11-21T01:02:03.5"
+    values, problems = _parse(name, cells, convert, "", "is not an ISO 8601 time in UTC", remedy)
+    return np.array(values, dtype=np.str_), problems
+
+
+def check_columns(
+    columns: Mapping[str, Any], camera: Camera | None = None, unknown_frame: BoolArray | None = None
+) -> list[Problem]:
+    """Everything that is wrong with the values of a table.
+
+    Parameters
+    ----------
+    columns
+        Name to array of shape (N,), all required columns among them.
+    camera
+        If given, centroids must lie on its detector.
+    unknown_frame
+        Rows whose frame number could not be read, shape (N,).
+    """
+    problems: list[Problem] = []
+    for name, values in columns.items():
+        if COLUMNS[name].kind == "number":
+            wrong = np.isinf(values) if COLUMNS[name].gaps else ~np.isfinite(values)
+            problems += _each(name, values, wrong, "is not a finite number")
+    if "time_utc" in columns:
+        problems += parse_times("time_utc", columns["time_utc"].tolist())[1]
+    ra, dec = columns["ra_deg"], columns["dec_deg"]
+    # 360 is let pass: rounding to a few decimals turns 359.99999999 into it.
+    problems += _each("ra_deg", ra, (ra < 0.0) | (ra > 360.0), "is outside 0..360 deg")
+    problems += _each("dec_deg", dec, np.abs(dec) > 90.0, "is outside -90..90 deg")
+    if "sigma_px" in columns:
+        sigma = columns["sigma_px"]
+        problems += _each("sigma_px", sigma, sigma <= 0.0, "is not above 0")
+    if camera is not None:
+        for name, size in (("x_px", camera.width_px), ("y_px", camera.height_px)):
+            values = columns[name]
+            outside = (values < -0.5) | (values > size - 0.5)
+            reason = f"is outside the detector, -0.5..{size - 0.5} px"
+            problems += _each(name, values, outside, reason, "check the camera file, or " + _REPAIR)
+    rows = np.arange(len(ra))
+    if unknown_frame is not None and unknown_frame.any():
+        # Which frame has too few stars is not known while some rows belong to none.
+        return problems + _check_repeats(columns, rows[~unknown_frame])
+    return problems + _check_counts(columns["frame"]) + _check_repeats(columns, rows)
+
+
+def _each(name: str, values: Any, wrong: BoolArray, reason: str, remedy: str = _REPAIR) -> list[Problem]:
+    return [Problem(int(i), name, f"{values[i].item()!r} {reason}", remedy) for i in np.flatnonzero(wrong)]
+
+
+def _check_counts(frame: IntArray) -> list[Problem]:
+    ids, first, counts = np.unique(frame, return_index=True, return_counts=True)
+    return [
+        Problem(
+            int(first[i]),
+            "frame",
+            f"frame {ids[i]} has {counts[i]} star{'s' if counts[i] > 1 else ''}, and {_MIN_STARS} are needed",
+            "add stars or remove the frame",
+        )
+        for i in np.flatnonzero(counts < _MIN_STARS)
+    ]
+
+
+def _check_repeats(columns: Mapping[str, Any], rows: IntArray) -> list[Problem]:
+    """Stars that a frame holds twice, by name, direction or place, among `rows`."""
+    frame = columns["frame"]
+    searches: list[tuple[str, str, Any, tuple[Any, ...]]] = [
+        ("ra_deg", "the same direction", rows, (columns["ra_deg"], columns["dec_deg"])),
+        ("x_px", "the same pixel position", rows, (columns["x_px"], columns["y_px"])),
+    ]
+    if "star_id" in columns:
+        # Names as numbers, which sort faster; a star without a name repeats none.
+        codes = np.unique(columns["star_id"], return_inverse=True)[1]
+        named = rows[columns["star_id"][rows] != ""]
+        searches.insert(0, ("star_id", "the same star", named, (codes,)))
+    found: dict[int, Problem] = {}
+    for name, what, among, keys in searches:
+        for late, early in _repeats(frame[among], *(key[among] for key in keys)):
+            row, other = int(among[late]), int(among[early])
+            # A row pasted twice agrees in everything; one reason is enough.
+            reason = f"{what} occurs twice in frame {frame[row]}"
+            found.setdefault(row, Problem(row, name, reason, "remove one of them", other))
+    return list(found.values())
+
+
+def _repeats(*keys: Any) -> list[tuple[int, int]]:
+    """(row, earlier row) for each row that agrees with an earlier one in all keys."""
+    # A stable sort: equal rows stay in their order, so that the later one is called the duplicate.
+    order = np.lexsort(keys[::-1])
+    equal = np.ones(max(len(order) - 1, 0), dtype=np.bool_)
+    for key in keys:
+        equal &= key[order][1:] == key[order][:-1]
+    return [(int(order[i + 1]), int(order[i])) for i in np.flatnonzero(equal)]
+
+
+def raise_problems(source: str, word: str, numbers: IntArray, problems: Sequence[Problem]) -> None:
+    """Report problems, if there are any.
+
+    Parameters
+    ----------
+    source
+        The file, as the user named it.
+    word
+        ``"line"`` or ``"row"``.
+    numbers
+        Number of each row in the file, shape (N,).
+    problems
+        Of several for one cell the first is kept; one for a whole row replaces those of its cells.
+
+    Raises
+    ------
+    ObservationError
+        Its message names the first bad row and counts the others.
+    """
+    whole_rows = {p.row for p in problems if p.column is None}
+    kept: dict[tuple[int, str | None], Problem] = {}
+    for p in problems:
+        if p.column is None or p.row not in whole_rows:
+            kept.setdefault((p.row, p.column), p)
+    if not kept:
+        return
+    ordered = sorted(kept.values(), key=lambda p: p.row)
+    sentences = []
+    for p in ordered:
+        place = f"{source}, {word} {numbers[p.row]}" + (f", column {p.column}" if p.column else "")
+        also = f" (also in {word} {numbers[p.other]})" if p.other is not None else ""
+        sentences.append(f"{place}: {p.reason}{also}; {p.remedy}")
+    others = len({p.row for p in ordered}) - 1
+    more = f" ({others} more bad row{'s' if others > 1 else ''})" if others else ""
+    raise ObservationError(
+        f"{sentences[0]}{more}.",
+        row=int(numbers[ordered[0].row]),
+        column=ordered[0].column,
+        problems=[f"{sentence}." for sentence in sentences],
+    )

@@ -1,0 +1,346 @@
+"""File formats of the observations table: CSV, ECSV and Parquet, in and out.
+
+CSV and ECSV are read cell by cell with the line each row stands on, so that an error can name it.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.core.errors import ObservationError
+from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
+from starcal_uq.observations.checks import (
+    Problem,
+    check_columns,
+    parse_numbers,
+    parse_times,
+    parse_whole,
+    raise_problems,
+)
+from starcal_uq.observations.rows import as_plain, table_ending
+from starcal_uq.observations.table import COLUMNS, Observations
+from starcal_uq.runs.folder import atomic_path, atomic_write_text, ensure_new
+
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+
+_META_KEY = b"starcal_uq"
+
+
+@dataclass(frozen=True)
+class RawTable:
+    """A table as it stands in a file: texts, or numbers where the format has types.
+
+    Attributes
+    ----------
+    columns : dict
+        Name in the file to a list of str or an array, shape (N,); of Parquet only the wanted columns.
+    names : list of str
+        Names of all columns of the file.
+    numbers : array of int64, shape (N,)
+        Line (CSV, ECSV) or row from 1 (Parquet).
+    word : str
+        ``"line"`` or ``"row"``.
+    meta : dict
+        Metadata of the table.
+    units : dict
+        Name in the file to unit, where one is stated.
+    problems : list of Problem
+        Rows that do not fit the header.
+    """
+
+    columns: dict[str, Any]
+    names: list[str]
+    numbers: IntArray
+    word: str
+    meta: AnyDict = field(default_factory=dict)
+    units: dict[str, str] = field(default_factory=dict)
+    problems: list[Problem] = field(default_factory=list)
+
+
+def _read_bytes(path: Path) -> bytes:
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise ObservationError(f"{path}: the file does not exist; check the path.") from None
+    except OSError as error:
+        reason = error.strerror
+        raise ObservationError(f"{path}: cannot be read ({reason}); check its permissions.") from error
+    if not data.strip():
+        raise ObservationError(f"{path}: the file is empty; give a table of observations.")
+    return data
+
+
+def read_observations(path: str | os.PathLike[str], camera: Camera | None, mapping: Mapping[str, str]) -> Observations:
+    """See `starcal_uq.observations.table.load_observations`."""
+    if unknown := [name for name in mapping if name not in COLUMNS]:
+        raise ObservationError(
+            f"columns: {unknown[0]!r} is no column of observations; use {', '.join(COLUMNS)}.",
+            column=unknown[0],
+        )
+    path = Path(path)
+    if os.path.isdir(path):
+        raise ObservationError(f"{path}: is a directory; name a file of observations.")
+    ending = table_ending(path)
+    names = {name: mapping.get(name, name) for name in COLUMNS}
+    raw = _read(path, _read_bytes(path), ending, set(names.values()))
+    check_names(path, raw, names, mapping)
+    if not len(raw.numbers):
+        raise ObservationError(f"{path}: the table has a header but no rows; give a table with observations.")
+    columns, problems, unknown_frame = convert_columns(path, raw, names)
+    problems += check_columns(columns, camera, unknown_frame)
+    # A message names the column as it is called in this file.
+    named = [replace(p, column=names[p.column] if p.column else None) for p in problems]
+    raise_problems(str(path), raw.word, raw.numbers, named)
+    return Observations(**columns, meta=table_meta(path, raw, names, mapping))
+
+
+def _read(path: Path, data: bytes, ending: str, wanted: set[str]) -> RawTable:
+    if ending == ".parquet":
+        return _read_parquet(path, data, wanted)
+    return _read_text(path, data, ecsv=ending == ".ecsv")
+
+
+def check_names(path: Path, raw: RawTable, names: Mapping[str, str], mapping: Mapping[str, str]) -> None:
+    """Raise `ObservationError` where a column is missing that is required or was named."""
+    missing = [c for c in names if names[c] not in raw.names and (COLUMNS[c].required or c in mapping)]
+    if missing:
+        wanted = names[missing[0]]
+        others = f" (so are {', '.join(names[c] for c in missing[1:])})" if missing[1:] else ""
+        raise ObservationError(
+            f"{path}: column {wanted} is missing{others}; add it, or map it from one of the file's columns "
+            f"({', '.join(raw.names)}).",
+            column=wanted,
+            problems=[f"{path}: column {names[c]} is missing." for c in missing],
+        )
+    for name in names.values():
+        if raw.names.count(name) > 1:
+            raise ObservationError(f"{path}: column {name} occurs twice; remove or rename one.", column=name)
+
+
+def convert_columns(
+    path: Path, raw: RawTable, names: Mapping[str, str]
+) -> tuple[dict[str, Any], list[Problem], BoolArray]:
+    """Typed columns, what was wrong with their cells, and the rows whose frame is unknown."""
+    columns: dict[str, Any] = {}
+    problems = list(raw.problems)
+    unknown_frame = np.zeros(len(raw.numbers), dtype=np.bool_)
+    for name, own in names.items():
+        cells = raw.columns.get(own)
+        if cells is None:
+            continue
+        kind = COLUMNS[name].kind
+        if isinstance(cells, np.ndarray):
+            if kind == "number" or (kind == "whole" and cells.dtype.kind in "iu"):
+                columns[name] = cells
+                continue
+            cells = [str(value) for value in cells.tolist()]
+        if not COLUMNS[name].required and not any(map(str.strip, cells)):
+            continue  # an optional column without a single value is as good as absent
+        bad: list[Problem] = []
+        if kind == "whole":
+            columns[name], bad = parse_whole(name, cells)
+            unknown_frame[[p.row for p in bad]] = True
+        elif kind == "number":
+            values, bad = parse_numbers(name, cells)
+            columns[name] = _to_unit(path, name, values, raw.units.get(own, ""))
+        elif kind == "time":
+            columns[name], bad = parse_times(name, cells)
+        else:
+            columns[name] = np.array([cell.strip() for cell in cells], dtype=np.str_)
+        problems += bad
+    return columns, problems, unknown_frame
+
+
+def _to_unit(path: Path, name: str, values: FloatArray, unit: str) -> FloatArray:
+    """`values` of an ECSV column in the unit that the name of the column states."""
+    wanted = COLUMNS[name].unit
+    if unit in ("", wanted) or name == "mag":
+        return values
+    from astropy import units as u
+
+    try:
+        converted: FloatArray = u.Unit(unit).to(u.Unit(wanted), values, equivalencies=u.temperature())
+    except (u.UnitConversionError, ValueError, TypeError):
+        raise ObservationError(
+            f"{path}: column {name} has the unit {unit!r}; give it in {wanted}.", column=name
+        ) from None
+    return converted
+
+
+def table_meta(path: Path, raw: RawTable, names: Mapping[str, str], mapping: Mapping[str, str]) -> AnyDict:
+    """The metadata of a table: what the file carries, where it came from, and which columns were ignored."""
+    meta = {"source": str(path), **raw.meta}
+    ignored = [name for name in raw.names if name not in names.values()]
+    meta["ignored_columns"] = ignored or list(meta.get("ignored_columns", []))
+    if mapping:
+        meta["columns"] = dict(mapping)
+    if "ra_deg" in mapping or "dec_deg" in mapping:
+        # What the file says of its own ra_deg and dec_deg need not hold for other columns.
+        meta["directions"] = "undeclared"
+    if meta.get("directions", "undeclared") not in ("apparent", "catalogue", "undeclared"):
+        raise ObservationError(
+            f"{path}: its metadata say directions = {meta['directions']!r}; use apparent, catalogue or undeclared."
+        )
+    return meta
+
+
+def _read_text(path: Path, data: bytes, ecsv: bool) -> RawTable:
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise ObservationError(
+            f"{path}, line {line}: the text is not UTF-8; save the file in the encoding UTF-8.", row=line
+        ) from None
+    header = _ecsv_header(path, text) if ecsv else {}
+    rows, numbers = _rows(path, text, header.get("delimiter", "," if not ecsv else " "))
+    if not rows:
+        raise ObservationError(f"{path}: the file holds comments only; give a table of observations.")
+    names = [name.strip() for name in rows.pop(0)]
+    width = len(names)
+    problems = []
+    for i, row in enumerate(rows):
+        if len(row) != width:
+            reason = f"{len(row)} value{'s' if len(row) != 1 else ''} under a header of {width} columns"
+            problems.append(Problem(i, None, reason))
+            rows[i] = [""] * width
+    return RawTable(
+        columns={name: [row[i] for row in rows] for i, name in enumerate(names)},
+        names=names,
+        numbers=np.array(numbers[1:], dtype=np.int64),
+        word="line",
+        meta=_ecsv_meta(header),
+        units={column["name"]: column["unit"] for column in header.get("datatype", []) if column.get("unit")},
+        problems=problems,
+    )
+
+
+def _rows(path: Path, text: str, delimiter: str) -> tuple[list[list[str]], list[int]]:
+    """Rows that are neither blank nor comments, header first, and the line of each."""
+    # Comments become blank lines before the parser sees them: a quote in one would swallow the lines after
+    # it, and dropping the line would shift the count.
+    lines = ("\n" if line.startswith("#") else line for line in io.StringIO(text, newline=""))
+    reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True, strict=True)
+    rows, numbers = [], []
+    try:
+        for row in reader:
+            if any(map(str.strip, row)):
+                rows.append(row)
+                numbers.append(reader.line_num)
+    except csv.Error as error:
+        raise ObservationError(
+            f"{path}, line {reader.line_num}: the row cannot be read ({error}); check its quotation marks.",
+            row=reader.line_num,
+        ) from None
+    return rows, numbers
+
+
+def _ecsv_header(path: Path, text: str) -> AnyDict:
+    """The YAML header of an ECSV file (Astropy Proposal for Enhancement 6)."""
+    if not text.startswith("# %ECSV"):
+        raise ObservationError(
+            f"{path}, line 1: '# %ECSV 1.0' is missing; name a plain table .csv, or write it with astropy.",
+            row=1,
+        )
+    from astropy.table import meta
+
+    lines = []
+    for line in text.splitlines()[1:]:
+        if not line.startswith("#"):
+            break
+        if not line.startswith("##"):
+            lines.append(line[2:])
+    try:
+        header: AnyDict = dict(meta.get_header_from_yaml(lines))
+    except meta.YamlParseError:
+        raise ObservationError(f"{path}: the ECSV header is not valid YAML; write the file with astropy.") from None
+    return header
+
+
+def _ecsv_meta(header: AnyDict) -> AnyDict:
+    stored = dict(header.get("meta") or {})
+    values = {key: value for key, value in stored.items() if not str(key).startswith("__")}
+    plain: AnyDict = json.loads(json.dumps(values, default=as_plain))
+    return plain
+
+
+def _read_parquet(path: Path, data: bytes, wanted: set[str]) -> RawTable:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    try:
+        file = parquet.ParquetFile(pa.BufferReader(data))
+        names = list(file.schema_arrow.names)
+        table = file.read(columns=[name for name in names if name in wanted])
+    except (pa.ArrowException, OSError) as error:
+        reason = str(error).splitlines()[0]
+        raise ObservationError(f"{path}: is no readable Parquet file ({reason}); write it again.") from None
+    columns = {name: arrow_values(table.column(name)) for name in table.column_names}
+    stored = (file.schema_arrow.metadata or {}).get(_META_KEY)
+    meta = json.loads(stored) if stored else {}
+    return RawTable(columns, names, np.arange(1, table.num_rows + 1), "row", meta)
+
+
+def arrow_values(column: Any) -> Any:
+    """An arrow column as an array if it holds numbers without nulls, else as texts."""
+    import pyarrow as pa
+
+    kind = column.type
+    if not column.null_count and (pa.types.is_floating(kind) or pa.types.is_integer(kind)):
+        return column.to_numpy()
+    if pa.types.is_timestamp(kind):
+        texts = np.datetime_as_string(column.to_numpy().astype("datetime64[ns]"))
+        return ["" if text == "NaT" else text for text in texts.tolist()]
+    return ["" if value is None else str(value) for value in column.to_pylist()]
+
+
+def write_observations(observations: Observations, path: str | os.PathLike[str], force: bool) -> None:
+    """See `Observations.save`."""
+    ending = table_ending(Path(path))
+    ensure_new(path, force)
+    if ending == ".csv":
+        atomic_write_text(path, _csv_text(observations))
+        return
+    meta = json.loads(json.dumps(observations.meta, default=as_plain))
+    with atomic_path(path) as temporary:
+        if ending == ".ecsv":
+            table = observations.with_meta().to_table()
+            table.meta = meta
+            table.write(temporary, format="ascii.ecsv", delimiter=",")
+        else:
+            _write_parquet(observations, temporary, meta)
+
+
+def _csv_text(observations: Observations) -> str:
+    columns = []
+    for name, values in observations.columns.items():
+        cells = values.tolist()
+        # An empty cell is how every spreadsheet writes a gap.
+        columns.append(["" if v != v else v for v in cells] if COLUMNS[name].gaps else cells)
+    text = io.StringIO(newline="")
+    writer = csv.writer(text, lineterminator="\n")  # writes floats by repr, which keeps every digit
+    writer.writerow(observations.columns)
+    writer.writerows(zip(*columns, strict=True))
+    return text.getvalue()
+
+
+def _write_parquet(observations: Observations, path: Path, meta: AnyDict) -> None:
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    arrays = {
+        name: pa.array(values.tolist() if values.dtype.kind == "U" else values)
+        for name, values in observations.columns.items()
+    }
+    table = pa.table(arrays).replace_schema_metadata({_META_KEY: json.dumps(meta).encode()})
+    parquet.write_table(table, path, compression="zstd")

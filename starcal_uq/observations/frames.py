@@ -1,0 +1,118 @@
+"""Stars of many frames as arrays with the star axis last, and sums over the stars of a frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from starcal_uq.observations.table import Observations
+
+
+@dataclass(frozen=True)
+class StarFrames:
+    """Measured pixels and catalogue directions, contiguous by frame.
+
+    Attributes
+    ----------
+    pixel : (2, N) array
+        Measured positions, px.
+    r : (3, N) array
+        Unit vectors, ICRS.
+    weight : (N,) array or None
+        Inverse of the stated noise of each star, 1/px; None when all stars are alike.
+    starts : (K + 1,) array of int
+        Frame k holds the stars ``starts[k]:starts[k + 1]``.
+    """
+
+    pixel: FloatArray
+    r: FloatArray
+    weight: FloatArray | None
+    starts: IntArray
+
+    @classmethod
+    def from_observations(cls, obs: Observations) -> StarFrames:
+        """Take the arrays that estimators need."""
+        return cls(
+            pixel=np.ascontiguousarray(obs.xy.T),
+            r=np.ascontiguousarray(obs.directions_icrs.T),
+            weight=None if obs.sigma_px is None else 1.0 / obs.sigma_px,
+            starts=obs.frame_starts,
+        )
+
+    @classmethod
+    def joined(cls, pieces: Sequence[StarFrames]) -> StarFrames:
+        """The frames of several pieces, one after the other; all or none of them have weights."""
+        if len(pieces) == 1:
+            return pieces[0]
+        offsets = np.cumsum([0, *(piece.n_stars for piece in pieces)])
+        weights = [piece.weight for piece in pieces if piece.weight is not None]
+        starts = [piece.starts[:-1] + offset for piece, offset in zip(pieces, offsets[:-1], strict=True)]
+        return cls(
+            pixel=np.concatenate([piece.pixel for piece in pieces], axis=1),
+            r=np.concatenate([piece.r for piece in pieces], axis=1),
+            weight=np.concatenate(weights) if len(weights) == len(pieces) else None,
+            starts=np.concatenate([*starts, offsets[-1:]]),
+        )
+
+    @property
+    def n_stars(self) -> int:
+        """Number of stars over all frames."""
+        return int(self.pixel.shape[1])
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+        return len(self.starts) - 1
+
+    @property
+    def sizes(self) -> IntArray:
+        """Stars per frame, (K,)."""
+        return np.diff(self.starts)
+
+    def sum(self, values: FloatArray) -> FloatArray:
+        """Sum (..., N) over the stars of each frame: (..., K)."""
+        return np.add.reduceat(values, self.starts[:-1], axis=-1)
+
+    def spread(self, values: FloatArray) -> FloatArray:
+        """Give every star the value of its frame: (..., K) to (..., N)."""
+        return np.repeat(values, self.sizes, axis=-1)
+
+    def part(self, first: int, last: int) -> StarFrames:
+        """Frames `first` up to, not including, `last`."""
+        stars = slice(int(self.starts[first]), int(self.starts[last]))
+        return StarFrames(
+            pixel=self.pixel[:, stars],
+            r=self.r[:, stars],
+            weight=None if self.weight is None else self.weight[stars],
+            starts=self.starts[first : last + 1] - self.starts[first],
+        )
+
+    def select(self, mask: BoolArray) -> StarFrames:
+        """The stars of a mask (N,); frames that keep none are left out."""
+        sizes = self.sum(mask.astype(np.float64)).astype(np.int64)
+        return StarFrames(
+            pixel=np.ascontiguousarray(self.pixel[:, mask]),
+            r=np.ascontiguousarray(self.r[:, mask]),
+            weight=None if self.weight is None else self.weight[mask],
+            starts=np.concatenate([[0], np.cumsum(sizes[sizes > 0])]).astype(np.int64),
+        )
+
+    def parts(self, max_stars: int = 100_000) -> list[tuple[int, int]]:
+        """Ranges of frames with about `max_stars` stars each, so that memory stays bounded."""
+        n_parts = max(1, -(-self.n_stars // max_stars))
+        targets = np.linspace(0, self.n_stars, n_parts + 1)
+        edges = np.unique(np.searchsorted(self.starts, targets))
+        return [(int(a), int(b)) for a, b in pairwise(edges)]
+
+    def rotated(self, rotations: FloatArray) -> FloatArray:
+        """Catalogue directions in the camera frame: ``b = R r`` with R_cam_icrs (K, 3, 3); (3, N)."""
+        rows = [[self.spread(np.ascontiguousarray(rotations[:, i, j])) for j in range(3)] for i in range(3)]
+        x, y, z = self.r
+        return np.stack([a * x + b * y + c * z for a, b, c in rows])

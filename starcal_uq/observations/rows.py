@@ -1,0 +1,97 @@
+"""What every table with one row per star and frame has in common, and how such tables are written."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from starcal_uq.core.errors import ObservationError
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+
+_Array = TypeVar("_Array", bound="np.ndarray[Any, Any]")
+
+ENDINGS = (".csv", ".ecsv", ".parquet")
+
+
+class FrameRows:
+    """Rows sorted by frame; a class that has these columns gets the rest from here.
+
+    Attributes
+    ----------
+    frame : array of int64, shape (N,)
+        Frame number of each row, ascending.
+    frame_ids : array of int64, shape (K,)
+        Frame numbers, ascending.
+    x_px, y_px : array, shape (N,)
+        Centroids, pixels.
+    """
+
+    frame: IntArray
+    frame_ids: Any
+    x_px: FloatArray
+    y_px: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+    @property
+    def n_stars(self) -> int:
+        """Number of rows N: stars summed over frames."""
+        return len(self.frame)
+
+    @cached_property
+    def frame_starts(self) -> IntArray:
+        """First row of each frame, and N, shape (K + 1,): frame k has rows ``starts[k]:starts[k + 1]``."""
+        starts = np.searchsorted(self.frame, self.frame_ids).astype(np.int64)
+        return locked(np.append(starts, np.int64(len(self.frame))))
+
+    @property
+    def stars_per_frame(self) -> IntArray:
+        """Number of stars in each frame, shape (K,)."""
+        return np.diff(self.frame_starts)
+
+    @cached_property
+    def xy(self) -> FloatArray:
+        """Centroids, shape (N, 2), pixels."""
+        return locked(np.column_stack([self.x_px, self.y_px]))
+
+    def _mask(self, mask: ArrayLike, table: str) -> BoolArray:
+        """A mask of rows, checked; `table` is what messages call the table."""
+        chosen = np.asarray(mask)
+        if chosen.dtype != np.bool_ or chosen.shape != self.frame.shape:
+            raise ObservationError(
+                f"{table}: the mask is {chosen.dtype} of shape {chosen.shape}; "
+                f"give true or false for each of the {len(self)} rows."
+            )
+        return chosen
+
+    def _frame_numbers(self, ids: ArrayLike, table: str) -> IntArray:
+        """Numbers of frames, which must be there."""
+        wanted = np.asarray(ids).ravel()
+        missing = np.setdiff1d(wanted, self.frame_ids)
+        if missing.size:
+            raise ObservationError(f"{table}: there is no frame {missing[0]}; choose among frame_ids.")
+        return wanted
+
+
+def locked(array: _Array) -> _Array:
+    """The array, which can no longer be written to."""
+    array.setflags(write=False)
+    return array
+
+
+def table_ending(path: Path) -> str:
+    """The ending of a table's file name, which decides on its format."""
+    ending = path.suffix.lower()
+    if ending not in ENDINGS:
+        raise ObservationError(f"{path}: the ending {ending or '(none)'} is unknown; use {', '.join(ENDINGS)}.")
+    return ending
+
+
+def as_plain(value: Any) -> Any:
+    """For json.dumps: numpy values as Python's, anything else in words."""
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)

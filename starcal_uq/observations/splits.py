@@ -1,0 +1,78 @@
+"""Two halves of one set of frames, and how many frames two tables share."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.core.errors import ComparisonError
+
+if TYPE_CHECKING:
+    from starcal_uq.observations.table import Observations
+
+SPLITS = ("odd-even", "halves", "random")
+_LABELS = {
+    "odd-even": ("odd frames", "even frames"),
+    "halves": ("first half", "second half"),
+    "random": ("random half", "the other frames"),
+}
+
+
+def split_frames(obs: Observations, how: str = "odd-even", *, seed: int = 0) -> tuple[Observations, Observations]:
+    """Two tables that share no frame and together are the whole.
+
+    Parameters
+    ----------
+    obs : Observations
+        At least two frames.
+    how : {"odd-even", "halves", "random"}
+        Every other frame in their order (the first, third... are the odd ones, whatever their numbers); the first and
+        the second half; or a random half.
+    seed : int
+        Of the random half.
+
+    Raises
+    ------
+    ComparisonError
+        For another `how`, or fewer than two frames.
+    """
+    labels = split_labels(how)
+    if obs.n_frames < 2:
+        raise ComparisonError(f"observations: {obs.n_frames} frame cannot be split in two; give at least two frames.")
+    place = np.arange(obs.n_frames)
+    if how == "odd-even":
+        first = place % 2 == 0
+    elif how == "halves":
+        first = place < (obs.n_frames + 1) // 2
+    else:
+        first = np.random.default_rng(seed).permutation(obs.n_frames) < (obs.n_frames + 1) // 2
+    parts = [obs.select_frames(obs.frame_ids[mask]) for mask in (first, ~first)]
+    return parts[0].with_meta(split=labels[0]), parts[1].with_meta(split=labels[1])
+
+
+def split_labels(how: str) -> tuple[str, str]:
+    """What the two halves are called.
+
+    Raises
+    ------
+    ComparisonError
+        For a split that is not known.
+    """
+    if how not in _LABELS:
+        raise ComparisonError(f"split {how!r} is unknown: use one of {', '.join(SPLITS)}.")
+    return _LABELS[how]
+
+
+def shared_frames(a: Observations, b: Observations) -> int:
+    """Number of frames of `a` that `b` holds as well, whatever their numbers: the same pixels and directions."""
+    theirs = set(_frames(b))
+    return sum(frame in theirs for frame in _frames(a))
+
+
+def _frames(obs: Observations) -> list[bytes]:
+    """Every frame as bytes of its rows, sorted."""
+    rows = np.column_stack([obs.x_px, obs.y_px, obs.ra_deg, obs.dec_deg]) + 0.0
+    starts = obs.frame_starts
+    parts = (rows[starts[k] : starts[k + 1]] for k in range(obs.n_frames))
+    return [part[np.lexsort(part.T)].tobytes() for part in parts]

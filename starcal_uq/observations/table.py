@@ -1,0 +1,327 @@
+"""The observations table: measured star positions with the directions they belong to, frame by frame.
+
+It is the only thing that passes from images, or a simulation, to the estimators. Reading is in
+`observation_files`, the checks of every row are in `observation_checks`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import html
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from starcal_uq.core.errors import ObservationError
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray, StrArray
+from starcal_uq.observations.rows import FrameRows, locked
+
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of the table, as it is called in files.
+
+    Attributes
+    ----------
+    name : str
+        Name in files and of the attribute.
+    kind : {"whole", "number", "text", "time"}
+        Type of the values.
+    unit : str
+        Unit, empty where there is none.
+    required : bool
+        Whether every table has the column.
+    gaps : bool
+        Whether single values may be missing (NaN, or an empty text).
+    description : str
+        What it holds.
+    """
+
+    name: str
+    kind: Literal["whole", "number", "text", "time"]
+    unit: str
+    required: bool
+    gaps: bool
+    description: str
+
+
+COLUMNS: dict[str, Column] = {
+    column.name: column
+    for column in (
+        Column("frame", "whole", "", True, False, "frame number"),
+        Column("x_px", "number", "pix", True, False, "centroid; 0 is the centre of the first pixel"),
+        Column("y_px", "number", "pix", True, False, "centroid, y downwards; 0 as for x_px"),
+        Column("ra_deg", "number", "deg", True, False, "right ascension, ICRS axes"),
+        Column("dec_deg", "number", "deg", True, False, "declination, ICRS axes"),
+        Column("sigma_px", "number", "pix", False, False, "centroid noise per axis"),
+        Column("star_id", "text", "", False, True, "name of the star in its catalogue"),
+        Column("mag", "number", "mag", False, True, "magnitude"),
+        Column("time_utc", "time", "", False, False, "middle of the exposure, UTC, ISO 8601"),
+        Column("temperature_c", "number", "deg_C", False, True, "temperature of the optics, Celsius"),
+    )
+}
+_DTYPES: dict[str, type] = {"whole": np.int64, "number": np.float64, "text": np.str_, "time": np.str_}
+
+
+@dataclass(frozen=True, eq=False)
+class Observations(FrameRows):
+    """Stars measured in pixels, with their directions; one row per star and frame, sorted by frame.
+
+    Rows given in another order are sorted by frame; within a frame they keep their order. The arrays are
+    copies and cannot be written to.
+
+    Attributes
+    ----------
+    frame : array of int64, shape (N,)
+        Frame number.
+    x_px, y_px : array, shape (N,)
+        Centroid, pixels; (0, 0) is the centre of the first pixel, y grows downwards.
+    ra_deg, dec_deg : array, shape (N,)
+        Direction in ICRS axes, degrees; ``meta["directions"]`` says whether aberration is in it.
+    sigma_px : array, shape (N,), or None
+        Centroid noise per axis, pixels.
+    star_id : array of str, shape (N,), or None
+        Name in a catalogue; empty where unknown.
+    mag : array, shape (N,), or None
+        Magnitude; NaN where unknown.
+    time_utc : array of str, shape (N,), or None
+        Middle of the exposure, UTC, such as ``2026-11-21T01:02:03.5``.
+    temperature_c : array, shape (N,), or None
+        Temperature of the optics, Celsius; NaN where unknown.
+    meta : dict
+        Plain values about the table: ``directions`` ("apparent", "catalogue" or "undeclared"),
+        ``observer_velocity_km_s`` (three numbers or None), ``source``, ``ignored_columns``, ``seed`` and more.
+
+    Raises
+    ------
+    ObservationError
+        If the columns differ in length or cannot be converted to their types.
+    """
+
+    frame: IntArray
+    x_px: FloatArray
+    y_px: FloatArray
+    ra_deg: FloatArray
+    dec_deg: FloatArray
+    sigma_px: FloatArray | None = None
+    star_id: StrArray | None = None
+    mag: FloatArray | None = None
+    time_utc: StrArray | None = None
+    temperature_c: FloatArray | None = None
+    meta: AnyDict = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        columns = {name: _array(name, values) for name, values in self.columns.items()}
+        n = len(columns["frame"])
+        for name, values in columns.items():
+            if len(values) != n:
+                raise ObservationError(
+                    f"observations: {name} has {len(values)} rows and frame has {n}; give equal lengths.",
+                    column=name,
+                )
+        frame = columns["frame"]
+        if np.any(frame[1:] < frame[:-1]):
+            order = np.argsort(frame, kind="stable")
+            columns = {name: values[order] for name, values in columns.items()}
+        for name, values in columns.items():
+            # A column without a single value is as good as absent, and files do not tell the two apart.
+            absent = COLUMNS[name].gaps and n > 0 and _all_missing(values)
+            object.__setattr__(self, name, None if absent else locked(values))
+        directions = self.meta.get("directions", "undeclared")
+        if directions not in ("apparent", "catalogue", "undeclared"):
+            raise ObservationError(
+                f"observations: meta directions is {directions!r}; use apparent, catalogue or undeclared."
+            )
+        object.__setattr__(self, "meta", {**self.meta, "directions": directions})
+
+    @property
+    def columns(self) -> dict[str, Any]:
+        """The columns that are present, in their fixed order: name to array of shape (N,)."""
+        return {name: getattr(self, name) for name in COLUMNS if getattr(self, name) is not None}
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames K."""
+        return len(self.frame_ids)
+
+    @cached_property
+    def frame_ids(self) -> IntArray:
+        """Frame numbers that occur, ascending, shape (K,)."""
+        return locked(np.unique(self.frame))
+
+    @cached_property
+    def directions_icrs(self) -> FloatArray:
+        """Unit vectors of the directions, shape (N, 3), ICRS axes."""
+        ra, dec = np.radians(self.ra_deg), np.radians(self.dec_deg)
+        return locked(np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]))
+
+    @property
+    def directions_declared(self) -> bool:
+        """Whether the table says if its directions are apparent or straight from a catalogue."""
+        return bool(self.meta["directions"] != "undeclared")
+
+    @cached_property
+    def data_hash(self) -> str:
+        """SHA-256 (hex) of the columns that are present; the same for the same table from any file format."""
+        digest = hashlib.sha256()
+        for name, values in self.columns.items():
+            digest.update(f"{name}:{len(values)};".encode())
+            if values.dtype.kind == "U":
+                # The length before each text: without it ("ab", "c") and ("a", "bc") would agree.
+                digest.update("".join(f"{len(text)}:{text}" for text in values.tolist()).encode())
+            else:
+                # Adding zero makes -0.0 and 0.0, which compare equal, agree in their bytes.
+                values = values + values.dtype.type(0)
+                digest.update(values.astype(values.dtype.newbyteorder("<")).tobytes())
+        return digest.hexdigest()
+
+    def select(self, mask: ArrayLike) -> Observations:
+        """The rows where `mask` (bool, shape (N,)) is true."""
+        chosen = self._mask(mask, "observations")
+        return replace(self, **{name: values[chosen] for name, values in self.columns.items()})
+
+    def select_frames(self, ids: ArrayLike) -> Observations:
+        """The rows of the frames with these numbers.
+
+        Raises
+        ------
+        ObservationError
+            If a frame does not occur in the table.
+        """
+        wanted = self._frame_numbers(ids, "observations")
+        return self.select(np.isin(self.frame, wanted))
+
+    def with_meta(self, **entries: Any) -> Observations:
+        """The same table with entries of `meta` added or changed, such as ``directions="apparent"``."""
+        return replace(self, meta={**self.meta, **entries})
+
+    def check(self, camera: Camera | None = None) -> None:
+        """Apply the checks of `load_observations` to a table made in memory.
+
+        Raises
+        ------
+        ObservationError
+            If a row is bad; rows are numbered from 1 in the order of this table.
+        """
+        from starcal_uq.observations.checks import check_columns, raise_problems
+
+        rows = np.arange(1, len(self) + 1)
+        raise_problems("observations", "row", rows, check_columns(self.columns, camera))
+
+    def to_dataframe(self) -> Any:
+        """The columns as a pandas DataFrame; `meta` is in its ``attrs``."""
+        import pandas as pd
+
+        frame = pd.DataFrame({name: values.copy() for name, values in self.columns.items()})
+        frame.attrs.update(self.meta)
+        return frame
+
+    def to_table(self) -> Any:
+        """The columns as an astropy Table with units and descriptions; `meta` is in its ``meta``."""
+        from astropy.table import Table
+
+        table = Table(self.columns, meta=dict(self.meta))
+        for name in self.columns:
+            table[name].unit = COLUMNS[name].unit or None
+            table[name].description = COLUMNS[name].description
+        return table
+
+    def head(self, n: int = 5) -> Any:
+        """The first `n` rows as a pandas DataFrame."""
+        return self.to_dataframe().head(n)
+
+    def save(self, path: str | os.PathLike[str], force: bool = False) -> None:
+        """Write the table without loss of digits; the ending decides: ``.csv``, ``.ecsv`` or ``.parquet``.
+
+        ECSV and Parquet carry `meta`; CSV is plain, so that every spreadsheet opens it, and loses `meta`.
+
+        Raises
+        ------
+        ObservationError
+            If the ending is unknown.
+        RunFolderError
+            If the file exists and `force` is false, or cannot be written.
+        """
+        from starcal_uq.observations.files import write_observations
+
+        write_observations(self, path, force)
+
+    def _repr_html_(self) -> str:
+        shown = {name: values[:5].tolist() for name, values in self.columns.items()}
+        head = "".join(f"<th>{name}</th>" for name in shown)
+        body = "".join(
+            "<tr>" + "".join(f"<td>{html.escape(_shown(value))}</td>" for value in row) + "</tr>"
+            for row in zip(*shown.values(), strict=True)
+        )
+        title = f"{self.n_stars} stars in {self.n_frames} frames, directions {self.meta['directions']}"
+        return f"<table><caption>{title}</caption><tr>{head}</tr>{body}</table>"
+
+    def __repr__(self) -> str:
+        return f"Observations({self.n_stars} stars, {self.n_frames} frames; {', '.join(self.columns)})"
+
+
+def load_observations(
+    path: str | os.PathLike[str],
+    camera: Camera | None = None,
+    columns: Mapping[str, str] | None = None,
+) -> Observations:
+    """Read and check a table of observations (``.csv``, ``.ecsv`` or ``.parquet``).
+
+    Parameters
+    ----------
+    path
+        The file. In CSV and ECSV, lines that start with ``#`` are comments.
+    camera
+        If given, every centroid must lie on its detector.
+    columns
+        Names in the file of columns that are called otherwise, such as ``{"ra_deg": "ra_apparent_deg"}``.
+        Columns that are not needed are ignored and listed in ``meta["ignored_columns"]``.
+
+    Raises
+    ------
+    ObservationError
+        If the file cannot be read or a row is bad; the message names the first bad row and counts the
+        others, and ``problems`` of the error lists them all.
+    """
+    from starcal_uq.observations.files import read_observations
+
+    return read_observations(path, camera, columns or {})
+
+
+def _shown(value: Any) -> str:
+    """A cell for people: five decimals are a hundredth of a milli-pixel and 0.04 arcsec."""
+    return f"{value:.5f}" if isinstance(value, float) else str(value)
+
+
+def _array(name: str, values: Any) -> Any:
+    """A one-dimensional copy of `values` in the type of column `name`."""
+    kind = COLUMNS[name].kind
+    array = np.asarray(values)
+    if kind in ("text", "time") and array.dtype.kind == "O":
+        # pandas marks a missing text by None or NaN, which would become the words "None" and "nan".
+        array = np.array(["" if v is None or v != v else str(v) for v in array.tolist()], dtype=np.str_)
+    if kind == "whole" and array.dtype.kind == "f" and not all(v.is_integer() for v in array.tolist()):
+        raise ObservationError(f"observations: {name} holds fractions; give whole numbers.", column=name)
+    try:
+        array = np.array(array, dtype=_DTYPES[kind])
+    except (TypeError, ValueError) as error:
+        raise ObservationError(
+            f"observations: column {name} is not of kind {kind!r} ({error}); convert it first.", column=name
+        ) from None
+    if array.ndim != 1:
+        raise ObservationError(
+            f"observations: column {name} has shape {array.shape}; give one value per row.", column=name
+        )
+    return array
+
+
+def _all_missing(values: Any) -> bool:
+    return bool(np.all(values == "" if values.dtype.kind == "U" else np.isnan(values)))

@@ -1,0 +1,1 @@
+"""The paper's field experiment from rendered frames."""

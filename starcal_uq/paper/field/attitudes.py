@@ -1,0 +1,172 @@
+"""Attitude errors of the field experiment, and what they consist of.
+
+The error of a frame is the rotation from the true attitude to that of QUEST, about the camera's axes x (pitch), y (yaw)
+and z (roll). It has three parts. *Noise* is what changes when the centroids are put where the stars truly are. What
+is left then is the camera's: its mean over the frames is the *common rotation*, which a calibration of the alignment
+takes out, and the *rest* differs from frame to frame with the places of the stars.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import left_error, rotation_to_quaternion
+from starcal_uq.attitude.wahba import quest
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.projection import unproject
+from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.identification.search import LEAST_SIGMA_PX
+from starcal_uq.paper.field.frames import FieldFrames
+from starcal_uq.paper.field.identification import FieldIdentification, true_pixels
+
+if TYPE_CHECKING:
+    from starcal_uq.sky.catalogue import StarCatalogue
+
+ARCSEC = float(np.degrees(1.0) * 3600.0)
+# What can be wrong with a camera, by itself.
+SOURCES = ("principal point", "focal length", "distortion")
+
+
+@dataclass(frozen=True, eq=False)
+class FieldStars:
+    """Identified stars of frames, ready for QUEST; m stars in k frames.
+
+    Attributes
+    ----------
+    xy_px, true_px : (m, 2) array
+        Measured, and where the stars truly are.
+    directions : (m, 3) array
+        Of the catalogue.
+    sigma_px : (m,) array
+        Stated noise, px per axis.
+    starts : (k + 1,) array of int
+        Where the stars of each frame begin, and their number.
+    quaternions : (k, 4) array
+        True attitudes.
+    """
+
+    xy_px: FloatArray
+    true_px: FloatArray
+    directions: FloatArray
+    sigma_px: FloatArray
+    starts: IntArray
+    quaternions: FloatArray
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames k."""
+        return len(self.quaternions)
+
+    @property
+    def noise_scale(self) -> float:
+        """Noise of the centroids over what is stated, from the truth; outliers do not count."""
+        squared = np.sum((self.xy_px - self.true_px) ** 2, axis=1) / self.sigma_px**2
+        # The median of chi-square with two degrees of freedom is 2 ln 2.
+        return float(np.sqrt(np.median(squared) / (2.0 * np.log(2.0))))
+
+    def frames(self, chosen: IntArray) -> FieldStars:
+        """Some frames, in any order and number."""
+        lengths = np.diff(self.starts)[chosen]
+        rows = np.concatenate([np.arange(self.starts[k], self.starts[k + 1]) for k in chosen])
+        return FieldStars(
+            self.xy_px[rows],
+            self.true_px[rows],
+            self.directions[rows],
+            self.sigma_px[rows],
+            np.concatenate([[0], np.cumsum(lengths)]),
+            self.quaternions[chosen],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class AttitudeErrors:
+    """Attitude errors of k frames with one camera, arcsec; columns pitch, yaw, roll.
+
+    Attributes
+    ----------
+    total : (k, 3) array
+        Estimated against true attitude.
+    camera : (k, 3) array
+        The same without noise.
+    """
+
+    total: FloatArray
+    camera: FloatArray
+
+    @property
+    def rms(self) -> FloatArray:
+        """Everything, against the true attitude, (3,)."""
+        return _rms(self.total)
+
+    @property
+    def common(self) -> FloatArray:
+        """The rotation common to all frames, with its sign, (3,)."""
+        mean: FloatArray = np.mean(self.camera, axis=0)
+        return mean
+
+    @property
+    def rest(self) -> FloatArray:
+        """What the camera does differently from frame to frame, (3,)."""
+        return _rms(self.camera - self.common)
+
+    @property
+    def noise(self) -> FloatArray:
+        """What centroid noise does, (3,)."""
+        return _rms(self.total - self.camera)
+
+    @property
+    def aligned(self) -> FloatArray:
+        """What is left when the alignment was calibrated with the same camera: the scatter about the mean, (3,)."""
+        return _rms(self.total - np.mean(self.total, axis=0))
+
+    @property
+    def sum_of_squares(self) -> FloatArray:
+        """Root of the sum of the squared parts, (3,); `rms` up to the chance correlation of noise with the others."""
+        total: FloatArray = np.sqrt(self.common**2 + self.rest**2 + self.noise**2)
+        return total
+
+
+def identified_stars(
+    frames: FieldFrames, truth: Camera, stars: StarCatalogue, found: FieldIdentification
+) -> FieldStars | None:
+    """The stars of the correctly identified frames; None where there is no such frame."""
+    keep = found.correct[found.frame]
+    frame, row, star = found.frame[keep], found.row[keep], found.star[keep]
+    chosen = np.flatnonzero(found.correct)
+    if not len(chosen):
+        return None
+    table = frames.centroids
+    return FieldStars(
+        np.column_stack([table.x_px[row], table.y_px[row]]),
+        true_pixels(truth, frames.rotations[frame], stars.directions_icrs[star]),
+        stars.directions_icrs[star],
+        table.sigma_px[row],
+        np.append(np.searchsorted(frame, chosen), len(frame)),
+        rotation_to_quaternion(frames.rotations[chosen]),
+    )
+
+
+def attitude_errors(stars: FieldStars, camera: Camera) -> AttitudeErrors:
+    """Attitudes by QUEST with a camera, against the truth, with and without noise."""
+    weights = np.hypot(stars.sigma_px, LEAST_SIGMA_PX) / camera.focal_px
+    b = np.stack([unproject(camera, stars.xy_px), unproject(camera, stars.true_px)])
+    found = quest(b, stars.directions, stars.starts, sigma_rad=weights, covariance=False)
+    error = left_error(found.quaternions, stars.quaternions) * ARCSEC
+    return AttitudeErrors(error[0], error[1])
+
+
+def single_faults(truth: Camera, camera: Camera) -> dict[str, Camera]:
+    """Cameras that have one of another camera's faults each, and are right otherwise; keys are `SOURCES`."""
+    return {
+        "principal point": truth.replace(x0_px=camera.x0_px, y0_px=camera.y0_px),
+        "focal length": truth.replace(focal_mm=camera.focal_mm),
+        "distortion": truth.replace(distortion=camera.distortion, coefficients=camera.coefficients),
+    }
+
+
+def _rms(error: FloatArray) -> FloatArray:
+    size: FloatArray = np.sqrt(np.mean(error**2, axis=0))
+    return size

@@ -1,0 +1,234 @@
+"""`field_experiment`: the paper's field experiment by simulation, from rendered frames to its Table 3."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.formatting import plural
+from starcal_uq.core.types import FloatArray
+from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.paper.field.attitudes import attitude_errors, identified_stars
+from starcal_uq.paper.field.field_replicates import replicate_field
+from starcal_uq.paper.field.frames import FieldFrames, take_frames
+from starcal_uq.paper.field.identification import WRONG_PX, identify_all, true_pixels
+from starcal_uq.paper.field.published import (
+    FIELD_CAMERAS,
+    NOMINAL_FOCAL_MM,
+    OTHER_NOMINAL_FOCAL_MM,
+    READINGS,
+    TRUE_CAMERA,
+    UNCALIBRATED,
+    FieldReading,
+)
+from starcal_uq.paper.field.result import FieldExperiment
+from starcal_uq.paper.published import PAPER_METHODS
+from starcal_uq.pipeline.refine import bootstrap
+from starcal_uq.runs.folder import PathLike, RunFolder, check_new_run, provenance
+from starcal_uq.sky.catalogue import load_catalogue
+from starcal_uq.sky.neighbours import without_disturbed
+
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.core.tasks import Progress
+    from starcal_uq.observations.table import Observations
+    from starcal_uq.pipeline.refine import Bootstrap
+    from starcal_uq.sky.catalogue import StarCatalogue
+
+# What the camera may misplace a star by in the corner of the field. A star tracker in flight takes its calibration for
+# right, and allows for little more than noise.
+TOLERANCE_PX = 0.5
+TOLERANCES_PX = (0.1, 0.2, TOLERANCE_PX, 1.0, 2.0, 5.0)
+# Identified with stars down to so much beyond the limit.
+_CATALOGUE_MORE_MAG = 1.0
+# The first identification knows the data sheet only: the principal point within a tenth of the detector.
+_FIRST_TOLERANCES = {"focal_tolerance": 0.03, "centre_tolerance_px": 150.0, "distortion_tolerance_px": 5.0}
+_N_REPLICATES = 100
+_LEAST = 20
+# Work of each part in common units, for the progress bar.
+_SHARES = {"frames": 45, "identification": 35, "replicates": 15, "report": 5}
+
+
+def field_experiment(
+    out: PathLike,
+    *,
+    n_frames: int = 200,
+    n_calibration_frames: int = 200,
+    reading: str = "window",
+    seed: int = 2017,
+    n_replicates: int = _N_REPLICATES,
+    workers: int | None = None,
+    progress: Progress | None = None,
+    force: bool = False,
+) -> FieldExperiment:
+    """Simulate the field experiment of Ye & Yang 2017 and set its Table 3 beside the outcome.
+
+    Frames of their field unit are rendered, searched for stars and identified. Some calibrate the sensor by three
+    methods; the others are identified and solved by QUEST with the uncalibrated sensor, the three calibrations, and
+    the truth as a control.
+
+    Parameters
+    ----------
+    out : path
+        Folder to write: ``field.html`` (self-contained), ``table_3.csv``, ``rates.csv``, ``parts.csv``,
+        ``sources.csv``, ``data_sheets.csv``, ``cameras.csv``, ``frames.csv``, and the figures as PNG in ``figures``.
+        Nothing is written before everything is computed.
+    n_frames : int
+        Frames of the test, at least 20; the paper has 200.
+    n_calibration_frames : int
+        Frames of the calibration, at least 20. The paper does not say how many it used.
+    reading : {"window", "full"}
+        How the printed sensor is read (`field_published.READINGS`).
+    seed : int
+        The same seed gives the same numbers, for any number of processes.
+    n_replicates : int
+        Repetitions with other noise, from which the ranges of the errors come; at least 20.
+    workers : int, optional
+        Processes; as many as there are processors by default, 0 for none beside this one.
+    progress : callable, optional
+        Called as ``progress(done, total)``, in units of work.
+    force : bool
+        Write into a folder that holds files already; those of the same names are replaced.
+
+    Returns
+    -------
+    FieldExperiment
+
+    Raises
+    ------
+    RunFolderError
+        If the folder holds files and `force` is false, or cannot be written.
+    CalibrationError
+        For numbers that are too small or an unknown reading, or when a method gives no result.
+    IdentificationError
+        When the frames of the calibration cannot be identified.
+    SamplingError
+        If processes cannot be used.
+    KeyboardInterrupt
+        After Ctrl-C; nothing is written then.
+    """
+    from starcal_uq.paper.show.field import write_field
+
+    check_new_run(RunFolder(out), force)
+    sensor = _check(reading, n_frames, n_calibration_frames, n_replicates)
+    bar = _Bar(progress)
+    stars = load_catalogue(max_mag=sensor.limit_mag + _CATALOGUE_MORE_MAG)
+    taken = take_frames(sensor, n_calibration_frames + n_frames, seed, workers, bar.part("frames"))
+    campaign, frames = taken.part(0, n_calibration_frames), taken.part(n_calibration_frames, len(taken.rotations))
+    found, words = _campaign(campaign, sensor, stars)
+    calibrations = {name: calibrate(found.observations, sensor.nominal(), method=name) for name in PAPER_METHODS}
+    cameras = {
+        UNCALIBRATED: sensor.nominal().replace(distortion="none"),
+        **{name: cal.camera for name, cal in calibrations.items()},
+        TRUE_CAMERA: sensor.truth,
+    }
+    sheets = {f: sensor.nominal(f).replace(distortion="none") for f in OTHER_NOMINAL_FOCAL_MM}
+    # The long ones first, so that no process waits for another at the end.
+    jobs: list[tuple[Camera, float]] = [(camera, TOLERANCE_PX) for camera in sheets.values()]
+    named = [(name, tolerance) for name in FIELD_CAMERAS for tolerance in TOLERANCES_PX]
+    jobs += [(cameras[name], tolerance) for name, tolerance in named]
+    results = identify_all(frames, sensor.truth, stars, jobs, workers, bar.part("identification"))
+    sweep = dict(zip(named, results[len(sheets) :], strict=True))
+    tests = {}
+    for name in FIELD_CAMERAS:
+        chosen = identified_stars(frames, sensor.truth, stars, sweep[name, TOLERANCE_PX])
+        if chosen is not None:
+            tests[name] = chosen
+    data_sheets = {}
+    for focal_mm, result in zip(sheets, results, strict=False):
+        chosen = identified_stars(frames, sensor.truth, stars, result)
+        data_sheets[focal_mm] = (result, None if chosen is None else attitude_errors(chosen, result.camera))
+    replicates = replicate_field(
+        found.observations,
+        _true_campaign(campaign, found.observations, sensor.truth),
+        tests[TRUE_CAMERA].noise_scale,
+        sensor.nominal(),
+        tests,
+        cameras,
+        n_replicates=n_replicates,
+        seed=seed,
+        workers=workers,
+        progress=bar.part("replicates"),
+    )
+    settings: dict[str, Any] = {"reading": reading, "n_frames": n_frames, "n_calibration_frames": n_calibration_frames}
+    settings |= {"tolerance_px": TOLERANCE_PX, "n_replicates": n_replicates, "nominal_focal_mm": NOMINAL_FOCAL_MM}
+    experiment = FieldExperiment(
+        path=Path(out),
+        reading=sensor,
+        tolerance_px=TOLERANCE_PX,
+        campaign=campaign,
+        frames=frames,
+        calibrations=calibrations,
+        cameras=cameras,
+        campaign_words=words,
+        sweep=sweep,
+        data_sheets=data_sheets,
+        stars=tests,
+        errors={name: attitude_errors(chosen, cameras[name]) for name, chosen in tests.items()},
+        replicates=replicates,
+        provenance=provenance(seed, settings, found.observations.data_hash),
+    )
+    write_field(experiment)
+    bar.finish()
+    return experiment
+
+
+def _check(reading: str, n_frames: int, n_calibration_frames: int, n_replicates: int) -> FieldReading:
+    if reading not in READINGS:
+        raise CalibrationError(f"reading {reading!r} of the field unit is unknown: use one of {', '.join(READINGS)}.")
+    sizes = {"n_frames": n_frames, "n_calibration_frames": n_calibration_frames, "n_replicates": n_replicates}
+    for name, number in sizes.items():
+        if number < _LEAST:
+            raise CalibrationError(f"{name} is {number}: the field experiment needs at least {_LEAST}.")
+    return READINGS[reading]
+
+
+def _campaign(frames: FieldFrames, reading: FieldReading, stars: StarCatalogue) -> tuple[Bootstrap, str]:
+    """Identify the frames of the calibration from the data sheet; and what became of them, in words."""
+    nominal, width_px = reading.nominal(), reading.sensor.psf_sigma_px
+
+    def prepare(obs: Observations) -> Observations:
+        # Rendered stars are where the catalogue has them.
+        return without_disturbed(obs.with_meta(directions="apparent"), stars, nominal, width_px)
+
+    found = bootstrap(frames.centroids, nominal, stars, prepare=prepare, identification=_FIRST_TOLERANCES)
+    obs = found.observations
+    place = _true_campaign(frames, obs, reading.truth)
+    wrong = int(np.sum(np.hypot(obs.x_px - place[:, 0], obs.y_px - place[:, 1]) > WRONG_PX))
+    n = len(frames.rotations)
+    words = (
+        f"{found.identification.n_identified} of {plural(n, 'frame')} of the calibration are identified from the data "
+        f"sheet; {plural(obs.n_stars, 'star')} are calibrated, {wrong if wrong else 'none'} of them wrong."
+    )
+    return found, words
+
+
+def _true_campaign(frames: FieldFrames, obs: Observations, truth: Camera) -> FloatArray:
+    """Where the stars of observations truly are, (m, 2) px."""
+    return true_pixels(truth, frames.rotations[obs.frame], obs.directions_icrs)
+
+
+class _Bar:
+    """One progress bar for several parts, which come in their order."""
+
+    def __init__(self, progress: Progress | None) -> None:
+        self.progress, self.total, self.before = progress, sum(_SHARES.values()), 0
+
+    def part(self, name: str) -> Progress:
+        """A progress callback for one part."""
+        before, share = self.before, _SHARES[name]
+        self.before += share
+
+        def move(done: int, total: int) -> None:
+            if self.progress is not None:
+                self.progress(before + share * done // max(total, 1), self.total)
+
+        return move
+
+    def finish(self) -> None:
+        """All is done."""
+        if self.progress is not None:
+            self.progress(self.total, self.total)

@@ -1,0 +1,161 @@
+"""Frames of the field experiment: rendered, searched for stars, and chosen by the paper's rule."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import random_rotations
+from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.tasks import Progress, run_tasks
+from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.images.centroids import COLUMNS, FRAME_COLUMNS, Centroids
+from starcal_uq.images.extract import extract_centroids
+from starcal_uq.paper.field.published import MORE_THAN_STARS, FieldReading
+from starcal_uq.simulation.frames import Sky
+from starcal_uq.simulation.rendering import Scene
+from starcal_uq.sky.catalogue import load_catalogue
+
+if TYPE_CHECKING:
+    from starcal_uq.sky.catalogue import StarCatalogue
+
+# Stars this much fainter than the limit still shine.
+_FAINTER_MAG = 2.0
+# Attitudes that show too few stars down to so much beyond the limit are not rendered: noise would have to lift several
+# stars by this much.
+_DOUBTFUL_MAG = 0.5
+_BATCH = 256
+# Candidates for each frame wanted, and some more; a second helping is drawn where they do not suffice.
+_CANDIDATES, _MORE_CANDIDATES = 1.9, 8
+_MAX_BATCHES = 400
+_CHUNK = 8
+
+
+@dataclass(frozen=True, eq=False)
+class FieldFrames:
+    """Frames with more than six stars.
+
+    Attributes
+    ----------
+    centroids : Centroids
+        Stars found in frames 0 .. n - 1.
+    rotations : (n, 3, 3) array
+        True R_cam_icrs.
+    share : float
+        Part of random attitudes that gave such a frame.
+    """
+
+    centroids: Centroids
+    rotations: FloatArray
+    share: float
+
+    def part(self, first: int, last: int) -> FieldFrames:
+        """Frames first .. last - 1, numbered from 0."""
+        table = self.centroids
+        rows = (table.frame >= first) & (table.frame < last)
+        columns: AnyDict = {name: getattr(table, name)[rows] for name in COLUMNS}
+        columns["frame"] = columns["frame"] - first
+        frames: AnyDict = {name: getattr(table, name)[first:last] for name in FRAME_COLUMNS}
+        frames["frame_ids"] = np.arange(last - first)
+        part = Centroids(**columns, **frames, messages=(), meta=table.meta)
+        return FieldFrames(part, self.rotations[first:last], self.share)
+
+
+class _RenderTask:
+    """Renders candidate attitudes and finds the stars; every number has noise of its own."""
+
+    def __init__(self, scene: Scene, rotations: FloatArray, first: int, seed: int) -> None:
+        self.scene, self.rotations, self.first, self.seed = scene, rotations, first, seed
+
+    def __call__(self, number: int) -> Centroids:
+        frame = self.first + number
+        rng = np.random.default_rng([self.seed, 1, frame])
+        image = self.scene.render(self.rotations[number], rng, frame=frame).image
+        return extract_centroids(image)
+
+
+def take_frames(
+    reading: FieldReading, n_frames: int, seed: int, workers: int | None, progress: Progress | None
+) -> FieldFrames:
+    """Render random attitudes until `n_frames` of them show more than six stars.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        After Ctrl-C.
+    CalibrationError
+        When next to no attitude shows enough stars.
+    """
+    stars, camera = load_catalogue(max_mag=reading.limit_mag + _FAINTER_MAG), reading.truth
+    scene = Scene(stars, camera, reading.sensor)
+    attitudes = _Attitudes(reading, np.random.default_rng([seed, 0]))
+    kept: list[Centroids] = []
+    rotations: list[FloatArray] = []
+    rank, done = 0, 0
+    while len(kept) < n_frames:
+        missing = n_frames - len(kept)
+        some, ranks = attitudes.take(int(np.ceil(missing * _CANDIDATES)) + _MORE_CANDIDATES)
+        before = len(kept)
+
+        def move(number: int, total: int, before: int = before) -> None:
+            if progress is not None:
+                progress(min(n_frames, before + number * (n_frames - before) // total), n_frames)
+
+        tables, interrupted = run_tasks(
+            _RenderTask(scene, some, done, seed),
+            len(some),
+            caller="field_experiment",
+            chunk=_CHUNK,
+            workers=workers,
+            progress=move,
+        )
+        if interrupted:
+            raise KeyboardInterrupt
+        done += len(some)
+        for table, rotation, number in zip(tables, some, ranks, strict=True):
+            if len(kept) < n_frames and len(table.frame) > MORE_THAN_STARS:
+                kept.append(table)
+                rotations.append(rotation)
+                rank = int(number)
+    return FieldFrames(_joined(kept), np.array(rotations), n_frames / (rank + 1))
+
+
+class _Attitudes:
+    """Random attitudes; those that cannot show enough stars are passed over, but counted."""
+
+    def __init__(self, reading: FieldReading, rng: np.random.Generator) -> None:
+        stars: StarCatalogue = load_catalogue(max_mag=reading.limit_mag + _DOUBTFUL_MAG)
+        self.sky = Sky(stars, reading.truth, 0.0)
+        self.rng, self.drawn = rng, 0
+        self.rotations: list[FloatArray] = []
+        self.ranks: list[int] = []
+
+    def take(self, n: int) -> tuple[FloatArray, list[int]]:
+        """The next n, and which of all random ones they are."""
+        for _ in range(_MAX_BATCHES):
+            if len(self.rotations) >= n:
+                break
+            batch = random_rotations(_BATCH, self.rng)
+            for number, (seen, _xy) in enumerate(self.sky.views(batch)):
+                if len(seen) > MORE_THAN_STARS:
+                    self.rotations.append(batch[number])
+                    self.ranks.append(self.drawn + number)
+            self.drawn += _BATCH
+        else:
+            raise CalibrationError("the field experiment: next to no attitude shows more than six stars.")
+        rotations, ranks = np.array(self.rotations[:n]), self.ranks[:n]
+        del self.rotations[:n], self.ranks[:n]
+        return rotations, ranks
+
+
+def _joined(tables: list[Centroids]) -> Centroids:
+    """One table of many single frames, numbered anew."""
+    columns: AnyDict = {name: np.concatenate([getattr(t, name) for t in tables]) for name in COLUMNS}
+    columns["frame"] = np.repeat(np.arange(len(tables)), [len(t.frame) for t in tables])
+    frames: AnyDict = {name: np.concatenate([getattr(t, name) for t in tables]) for name in FRAME_COLUMNS}
+    frames["frame_ids"] = np.arange(len(tables))
+    messages = dict.fromkeys(message for table in tables for message in table.messages)
+    meta = {key: value for key, value in tables[0].meta.items() if key != "images_sha256"}
+    return Centroids(**columns, **frames, messages=tuple(messages), meta=meta)

@@ -1,0 +1,141 @@
+"""Identification of the field experiment's frames, as a star tracker in flight would do it, and whether it is right.
+
+A star tracker in flight holds its camera for right: each frame is identified for itself with tolerances that are the
+same whatever the camera. `Tolerances` of a number of pixels mean that the camera may misplace a star in the corner of
+the field by so much, by its focal length or by its distortion, and the principal point by so much.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.projection import project
+from starcal_uq.core.tasks import Progress, run_tasks
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+from starcal_uq.identification.proposers import Proposer, prepare_engine
+from starcal_uq.identification.pyramid import CameraTolerance
+from starcal_uq.identification.search import FrameTable, Search, field_geometry
+from starcal_uq.paper.field.frames import FieldFrames
+
+if TYPE_CHECKING:
+    from starcal_uq.sky.catalogue import StarCatalogue
+
+# A star is wrong if it truly is farther than this from the centroid that was given its name.
+WRONG_PX = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class FieldIdentification:
+    """Every frame identified with one camera and one tolerance.
+
+    Attributes
+    ----------
+    camera : Camera
+        The camera.
+    tolerance_px : float
+        The tolerance.
+    frame, row, star : (m,) array of int
+        Of every star named: its frame, its row in the table of centroids and in the catalogue.
+    correct, wrong : (n,) array of bool
+        Frames with an attitude and no wrong star; with one.
+    """
+
+    camera: Camera
+    tolerance_px: float
+    frame: IntArray
+    row: IntArray
+    star: IntArray
+    correct: BoolArray
+    wrong: BoolArray
+
+    @property
+    def n_frames(self) -> int:
+        """Frames tried."""
+        return len(self.correct)
+
+
+def corner_tolerance(camera: Camera, tolerance_px: float) -> CameraTolerance:
+    """The tolerances that so many pixels stand for."""
+    return CameraTolerance(tolerance_px / camera.corner_radius_px, tolerance_px, tolerance_px)
+
+
+class _IdentifyTask:
+    """Identifies all frames with one camera and one tolerance."""
+
+    def __init__(
+        self,
+        frames: FieldFrames,
+        truth: Camera,
+        stars: StarCatalogue,
+        jobs: list[tuple[Camera, float]],
+        proposer: Proposer,
+    ) -> None:
+        self.frames, self.truth, self.stars, self.jobs, self.proposer = frames, truth, stars, jobs, proposer
+
+    def __call__(self, number: int) -> FieldIdentification:
+        camera, tolerance_px = self.jobs[number]
+        field = FrameTable(self.frames.centroids, camera)
+        # `identify` would try failed frames again with wider tolerances and refine the camera over all frames.
+        search = Search(camera, self.stars, corner_tolerance(camera, tolerance_px), proposer=self.proposer)
+        n = len(field.ids)
+        matches = [search.frame(field, k).match for k in range(n)]
+        solved = [(k, match) for k, match in enumerate(matches) if match is not None]
+        empty = [np.empty(0, dtype=np.int64)]
+        frame = np.repeat([k for k, _ in solved], [len(match) for _, match in solved]).astype(np.int64)
+        row = np.concatenate([field.rows[k][match.centroid] for k, match in solved] or empty)
+        star = np.concatenate([match.star for _, match in solved] or empty)
+        bad = self._distance_px(frame, row, star) > WRONG_PX
+        wrong = np.bincount(frame[bad], minlength=n) > 0
+        correct = (np.bincount(frame, minlength=n) > 0) & ~wrong
+        return FieldIdentification(camera, tolerance_px, frame, row, star, correct, wrong)
+
+    def _distance_px(self, frame: IntArray, row: IntArray, star: IntArray) -> FloatArray:
+        table = self.frames.centroids
+        xy = np.column_stack([table.x_px[row], table.y_px[row]])
+        place = true_pixels(self.truth, self.frames.rotations[frame], self.stars.directions_icrs[star])
+        distance: FloatArray = np.nan_to_num(np.hypot(*(xy - place).T), nan=np.inf)
+        return distance
+
+
+def true_pixels(truth: Camera, rotations: FloatArray, directions: FloatArray) -> FloatArray:
+    """Where stars (m, 3) truly are under attitudes (m, 3, 3): (m, 2), NaN for those behind the camera."""
+    b = np.einsum("nij,nj->ni", rotations, directions)
+    place = np.full((len(b), 2), np.nan)
+    ahead = b[:, 2] > 0.5
+    place[ahead] = project(truth, b[ahead])
+    return place
+
+
+def identify_all(
+    frames: FieldFrames,
+    truth: Camera,
+    stars: StarCatalogue,
+    jobs: list[tuple[Camera, float]],
+    workers: int | None,
+    progress: Progress | None,
+) -> list[FieldIdentification]:
+    """Identify the frames once for each job (camera, tolerance in px).
+
+    Raises
+    ------
+    KeyboardInterrupt
+        After Ctrl-C.
+    """
+    # One set of pairs serves all cameras, whose fields differ little.
+    wide = CameraTolerance(0.03, 0.0, 0.0)
+    proposer = prepare_engine("pyramid", stars, field_geometry(truth), wide, False, None)
+    found, interrupted = run_tasks(
+        _IdentifyTask(frames, truth, stars, jobs, proposer),
+        len(jobs),
+        caller="field_experiment",
+        chunk=1,
+        workers=workers,
+        progress=progress,
+    )
+    if interrupted:
+        raise KeyboardInterrupt
+    return found

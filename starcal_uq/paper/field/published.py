@@ -1,0 +1,191 @@
+"""What Ye & Yang (2017) print about their field experiment (section 3.4, Table 3), and how its sensor is read.
+
+The printed sensor is not one: see `READINGS`. Everything that had to be assumed stands here, each with its reason.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.paper.published import LEAST_SQUARES, PROPOSED, SAMAAN, Printed
+from starcal_uq.simulation.sensor import Sensor
+
+UNCALIBRATED, TRUE_CAMERA = "uncalibrated", "truth"
+# Rows of their Table 3, in order; the truth is ours, as a control.
+FIELD_METHODS = (UNCALIBRATED, LEAST_SQUARES, SAMAAN, PROPOSED)
+FIELD_CAMERAS = (*FIELD_METHODS, TRUE_CAMERA)
+RATE, PITCH, YAW, ROLL = "rate_percent", "pitch_arcsec", "yaw_arcsec", "roll_arcsec"
+AXES = (PITCH, YAW, ROLL)
+
+
+def _rows(rate: str, pitch: str, yaw: str, roll: str, method: str, row: int) -> tuple[Printed, ...]:
+    texts = {RATE: rate, PITCH: pitch, YAW: yaw, ROLL: roll}
+    return tuple(Printed(method, quantity, text, f"Table 3, row {row}") for quantity, text in texts.items())
+
+
+TABLE_3: tuple[Printed, ...] = (
+    *_rows("89", "65", "72", "127.2", UNCALIBRATED, 1),
+    *_rows("93", "45", "49", "69", LEAST_SQUARES, 2),
+    *_rows("95", "17", "21", "32", SAMAAN, 3),
+    *_rows("96", "10", "11", "16.2", PROPOSED, 4),
+)
+# Section 3.4: the sensor, its calibration by the proposed method, and the frames.
+FIELD_DEG, PIXEL_UM, FOCAL_MM, X0_PX, Y0_PX, K1, K2 = 10.8, 5.5, 44.38, 1142.06, 1058.62, -3.7e-9, 3.93e-16
+N_CHOSEN, N_TAKEN, MORE_THAN_STARS = 200, 600, 6
+
+# A data sheet gives whole millimetres, the centre of the detector, and no distortion.
+NOMINAL_FOCAL_MM = 44.0
+# Other data sheets, for comparison: the print rounded to 0.1 mm, and the next whole millimetre.
+OTHER_NOMINAL_FOCAL_MM = (44.4, 45.0)
+# Sides of the detector of which the window is a part: a common format of 5.5 um pixels.
+_DETECTOR_PX = 2048
+
+
+@dataclass(frozen=True)
+class PrintedFact:
+    """A printed number of the sensor under a reading.
+
+    Attributes
+    ----------
+    name, text : str
+        What is printed.
+    kept : bool
+        Whether the reading keeps it.
+    words : str
+        How, or why not.
+    """
+
+    name: str
+    text: str
+    kept: bool
+    words: str
+
+
+@dataclass(frozen=True)
+class FieldReading:
+    """One consistent sensor.
+
+    Attributes
+    ----------
+    name, words : str
+        Its name here, and what it says.
+    side_px : int
+        Pixels that are read out, per side.
+    offset_px : int
+        First of them on the detector: a pixel coordinate of the paper is ours plus this.
+    limit_mag : float
+        Magnitude (Gaia G) of stars of which half are found. It makes about a third of random attitudes show more than
+        six stars, as many as were chosen of the paper's frames, 200 of 600.
+    facts : tuple of PrintedFact
+        Every printed number of the sensor.
+    """
+
+    name: str
+    words: str
+    side_px: int
+    offset_px: int
+    limit_mag: float
+    facts: tuple[PrintedFact, ...]
+
+    @property
+    def truth(self) -> Camera:
+        """The sensor with the calibrated values of the paper."""
+        return Camera(
+            width_px=self.side_px,
+            height_px=self.side_px,
+            pixel_um=PIXEL_UM,
+            focal_mm=FOCAL_MM,
+            x0_px=X0_PX - self.offset_px,
+            y0_px=Y0_PX - self.offset_px,
+            coefficients=(K1, K2),
+            name="field unit of Ye & Yang 2017",
+        )
+
+    def nominal(self, focal_mm: float = NOMINAL_FOCAL_MM) -> Camera:
+        """The sensor as a data sheet has it: principal point at the centre, no distortion.
+
+        The model has coefficients, which are zero, so that a calibration can estimate them.
+        """
+        centre = 0.5 * (self.side_px - 1)
+        return self.truth.replace(
+            focal_mm=focal_mm, x0_px=centre, y0_px=centre, coefficients=(0.0, 0.0), name="data sheet"
+        )
+
+    @property
+    def sensor(self) -> Sensor:
+        """Detector and PSF: the default star tracker, as sensitive as `limit_mag` says.
+
+        Behind the filter of the detection, a star at the limit stands out by five standard deviations of the
+        background, which is the threshold: half of such stars are found.
+        """
+        return Sensor(zero_point_e_s=_ZERO_POINT_E_S * 10.0 ** (0.4 * (self.limit_mag - _ZERO_POINT_MAG)))
+
+
+# With this the default sensor finds half of the stars of this magnitude.
+_ZERO_POINT_E_S, _ZERO_POINT_MAG = 9.7e4, 4.9
+
+_KEPT = (
+    PrintedFact("pixel", "5.5 µm", True, "as printed"),
+    PrintedFact("focal length", "44.38 mm", True, "as printed"),
+)
+_DISTORTION = PrintedFact(
+    "distortion",
+    "k₁ = −3.7·10⁻⁹, k₂ = 3.93·10⁻¹⁶",
+    True,
+    "in px⁻² and px⁻⁴, by eq. 14; monotonic over the field",
+)
+READINGS: dict[str, FieldReading] = {
+    "window": FieldReading(
+        "window",
+        "The middle 1524 × 1524 px of a 2048 × 2048 detector are read out, and pixels are counted on the whole "
+        "detector.",
+        1524,
+        262,
+        4.7,
+        (
+            PrintedFact("field", "10.8° × 10.8°", True, "10.79°: 1524 px of 5.5 µm at 44.38 mm"),
+            *_KEPT,
+            PrintedFact(
+                "principal point",
+                "(1142.06, 1058.62) px",
+                True,
+                "118.6 and 35.1 px off the centre of the 2048 px, and (880.06, 796.62) in the window",
+            ),
+            _DISTORTION,
+        ),
+    ),
+    "full": FieldReading(
+        "full",
+        "All of a 2048 × 2048 detector is read out.",
+        _DETECTOR_PX,
+        0,
+        4.05,
+        (
+            PrintedFact("field", "10.8° × 10.8°", False, "14.46°: 2048 px of 5.5 µm at 44.38 mm"),
+            *_KEPT,
+            PrintedFact("principal point", "(1142.06, 1058.62) px", True, "118.6 and 35.1 px off the centre"),
+            _DISTORTION,
+        ),
+    ),
+}
+# Readings that were not simulated, and why.
+REJECTED_READINGS: tuple[tuple[str, str], ...] = (
+    (
+        "A detector of 1525 × 1525 px, the size of 10.8° at 44.38 mm.",
+        "The principal point would lie 380 and 297 px off its centre, a quarter of its side.",
+    ),
+    (
+        "2048 × 2048 px of 5.5 µm that cover 10.8°.",
+        "The focal length would be 59.6 mm, which contradicts the calibrated 44.38 mm.",
+    ),
+    (
+        "2048 × 2048 px that cover 10.8° at 44.38 mm.",
+        "The pixels would be of 4.1 µm, which contradicts the printed 5.5 µm.",
+    ),
+)
+
+
+def printed_field(method: str, quantity: str) -> Printed:
+    """The printed number of a row and column of Table 3."""
+    return next(number for number in TABLE_3 if (number.method, number.quantity) == (method, quantity))

@@ -1,0 +1,283 @@
+"""The result of the field experiment: cameras, identifications and attitude errors beside the paper's Table 3."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.core.types import AnyDict
+from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.paper.field.attitudes import (
+    SOURCES,
+    AttitudeErrors,
+    FieldStars,
+    attitude_errors,
+    single_faults,
+)
+from starcal_uq.paper.field.field_replicates import FieldReplicates
+from starcal_uq.paper.field.frames import FieldFrames
+from starcal_uq.paper.field.identification import FieldIdentification
+from starcal_uq.paper.field.published import AXES, FIELD_METHODS, RATE, FieldReading, printed_field
+from starcal_uq.paper.statistics import wilson_interval
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FIELD_REPORT = "field.html"
+AS_IT_STANDS, ALIGNED, BOTH, NEITHER = "against the true attitude", "after alignment", "either way", "no"
+
+
+@dataclass(frozen=True, eq=False)
+class FieldExperiment:
+    """The paper's field experiment, simulated.
+
+    Attributes
+    ----------
+    path : Path
+        Folder of the report, the tables and the figures.
+    reading : FieldReading
+        How the printed sensor is read.
+    tolerance_px : float
+        Tolerance of the identification in the main table.
+    campaign : FieldFrames
+        Frames of the calibration.
+    frames : FieldFrames
+        Frames of the test.
+    calibrations : mapping
+        Method to `Calibration`.
+    cameras : mapping
+        Name of each camera to it: ``uncalibrated``, the three methods, ``truth``.
+    campaign_words : str
+        What became of the campaign's identification.
+    sweep : mapping
+        (camera name, tolerance in px) to its `FieldIdentification`.
+    data_sheets : mapping
+        Nominal focal length (mm) to the `FieldIdentification` and the `AttitudeErrors` of a camera with it, at the
+        tolerance of the main table; no errors where no frame was identified.
+    stars : mapping
+        Camera name to the stars identified with it, in the main table's frames.
+    errors : mapping
+        Camera name to its `AttitudeErrors`.
+    replicates : FieldReplicates
+        The errors over repetitions.
+    provenance : dict
+        Seed, settings, versions, time and hash of the campaign.
+    """
+
+    path: Path
+    reading: FieldReading
+    tolerance_px: float
+    campaign: FieldFrames
+    frames: FieldFrames
+    calibrations: Mapping[str, Calibration]
+    cameras: Mapping[str, Camera]
+    campaign_words: str
+    sweep: Mapping[tuple[str, float], FieldIdentification]
+    data_sheets: Mapping[float, tuple[FieldIdentification, AttitudeErrors | None]]
+    stars: Mapping[str, FieldStars]
+    errors: Mapping[str, AttitudeErrors]
+    replicates: FieldReplicates
+    provenance: AnyDict
+
+    @property
+    def report(self) -> Path:
+        """The report, which needs no other file."""
+        return self.path / FIELD_REPORT
+
+    @property
+    def verdict(self) -> str:
+        """What comes out and what does not, in plain words."""
+        from starcal_uq.paper.show.field_words import findings
+
+        return " ".join(findings(self))
+
+    @property
+    def tolerances(self) -> tuple[float, ...]:
+        """Tolerances of the sweep, px, ascending."""
+        return tuple(sorted({tolerance for _, tolerance in self.sweep}))
+
+    def identified(self, camera: str) -> FieldIdentification:
+        """The identification of the main table."""
+        return self.sweep[camera, self.tolerance_px]
+
+    def table_3(self) -> pd.DataFrame:
+        """The paper's Table 3 beside ours: one row for each printed number.
+
+        Columns: method, quantity, printed; ours, low, high: identification rate with its Wilson interval, or error
+        against the true attitude with the range of 95 % of repetitions; aligned, aligned_low, aligned_high: the same
+        about the mean over the frames; common (with its sign), rest, noise: the parts; agrees: whether the printed
+        number is in the range, and in which one. Errors are root mean squares in arcsec.
+        """
+        import pandas as pd
+
+        return pd.DataFrame([self._row(method, name) for method in FIELD_METHODS for name in (RATE, *AXES)])
+
+    def _row(self, method: str, quantity: str) -> AnyDict:
+        number = printed_field(method, quantity)
+        row: AnyDict = {"method": method, "quantity": quantity, "printed": number.text}
+        if quantity == RATE:
+            found = self.identified(method)
+            low, high = (100.0 * end for end in wilson_interval(int(found.correct.sum()), found.n_frames))
+            agrees = AS_IT_STANDS if _within(number.value, low, high) else NEITHER
+            return row | {
+                "ours": 100.0 * float(np.mean(found.correct)),
+                "low": low,
+                "high": high,
+                "agrees": "yes" if agrees == AS_IT_STANDS else NEITHER,
+            }
+        if method not in self.errors:
+            return row | {"agrees": NEITHER}
+        axis, errors = AXES.index(quantity), self.errors[method]
+        for name, part in (("ours", "rms"), ("aligned", "aligned")):
+            low3, high3 = self.replicates.interval(method, part)
+            prefix = "" if part == "rms" else "aligned_"
+            row[name] = float(getattr(errors, part)[axis])
+            row[f"{prefix}low"], row[f"{prefix}high"] = float(low3[axis]), float(high3[axis])
+        for part in ("common", "rest", "noise"):
+            row[part] = float(getattr(errors, part)[axis])
+        stands = _within(number.value, row["low"], row["high"])
+        aligned = _within(number.value, row["aligned_low"], row["aligned_high"])
+        outcome = {(True, True): BOTH, (True, False): AS_IT_STANDS, (False, True): ALIGNED, (False, False): NEITHER}
+        return row | {"agrees": outcome[stands, aligned]}
+
+    def rates(self) -> pd.DataFrame:
+        """Identification against tolerance: camera, tolerance_px, n_frames, correct, wrong, rate, low, high."""
+        import pandas as pd
+
+        rows = []
+        for (camera, tolerance), found in self.sweep.items():
+            rows.append({"camera": camera, "tolerance_px": tolerance, **_counts(found)})
+        return pd.DataFrame(rows)
+
+    def parts(self) -> pd.DataFrame:
+        """What the errors consist of: a row for each camera and axis, arcsec.
+
+        Columns: camera, axis, rms, sum_of_squares (root of the squares of the three parts), aligned, common, rest,
+        noise, and for each of the parts the range over repetitions in ``_low`` and ``_high``.
+        """
+        import pandas as pd
+
+        rows = []
+        for camera, errors in self.errors.items():
+            for index, axis in enumerate(AXES):
+                row: AnyDict = {"camera": camera, "axis": axis.removesuffix("_arcsec")}
+                row["sum_of_squares"] = float(errors.sum_of_squares[index])
+                for part in ("rms", "aligned", "common", "rest", "noise"):
+                    low, high = self.replicates.interval(camera, part)
+                    row[part] = float(getattr(errors, part)[index])
+                    row[f"{part}_low"], row[f"{part}_high"] = float(low[index]), float(high[index])
+                rows.append(row)
+        return pd.DataFrame(rows)
+
+    def sources(self) -> pd.DataFrame:
+        """Each fault of each camera by itself, without noise: camera, source, axis, common, rest (arcsec).
+
+        The faults of an estimated camera make up for each other, so that together they do less than each alone.
+        """
+        import pandas as pd
+
+        rows = []
+        truth = self.reading.truth
+        for camera, stars in self.stars.items():
+            faults = single_faults(truth, self.cameras[camera])
+            for source in SOURCES:
+                errors = attitude_errors(stars, faults[source])
+                for index, axis in enumerate(AXES):
+                    rows.append(
+                        {
+                            "camera": camera,
+                            "source": source,
+                            "axis": axis.removesuffix("_arcsec"),
+                            "common": float(errors.common[index]),
+                            "rest": float(errors.rest[index]),
+                        }
+                    )
+        return pd.DataFrame(rows)
+
+    def other_data_sheets(self) -> pd.DataFrame:
+        """Other nominal focal lengths: focal_mm, identification as in `rates`, errors after alignment (arcsec)."""
+        import pandas as pd
+
+        rows = []
+        for focal_mm, (found, errors) in self.data_sheets.items():
+            aligned = np.full(3, np.nan) if errors is None else errors.aligned
+            axes = dict(zip(AXES, aligned.tolist(), strict=True))
+            rows.append({"focal_mm": focal_mm, **_counts(found), **axes})
+        return pd.DataFrame(rows)
+
+    def camera_table(self) -> pd.DataFrame:
+        """The cameras: camera, parameter, value, sigma (claimed; empty where none is), truth; px units."""
+        import pandas as pd
+
+        truth = self.reading.truth
+        true = dict(zip(truth.parameter_names, truth.theta.tolist(), strict=True))
+        rows = []
+        for name, camera in self.cameras.items():
+            known = self.calibrations.get(name)
+            sigmas = [np.nan] * len(camera.theta) if known is None else known.sigmas.tolist()
+            for parameter, value, sigma in zip(camera.parameter_names, camera.theta.tolist(), sigmas, strict=True):
+                row = {"camera": name, "parameter": parameter, "value": value, "sigma": sigma, "truth": true[parameter]}
+                rows.append(row)
+        return pd.DataFrame(rows)
+
+    def frame_table(self) -> pd.DataFrame:
+        """Every test frame with every camera: camera, frame, n_stars, correct, wrong, pitch, yaw, roll (arcsec)."""
+        import pandas as pd
+
+        tables = []
+        for camera in self.cameras:
+            found = self.identified(camera)
+            n = np.bincount(found.frame, minlength=found.n_frames)
+            error = np.full((found.n_frames, 3), np.nan)
+            if camera in self.errors:
+                error[found.correct] = self.errors[camera].total
+            columns: AnyDict = {"camera": camera, "frame": np.arange(found.n_frames), "n_stars": n}
+            columns |= {"correct": found.correct, "wrong": found.wrong}
+            columns |= {name: error[:, index] for index, name in enumerate(AXES)}
+            tables.append(pd.DataFrame(columns))
+        return pd.concat(tables, ignore_index=True)
+
+    def plot_rates(self) -> Any:
+        """Identification rate against tolerance; returns the matplotlib Figure."""
+        from starcal_uq.paper.show.field_part import plot_rates
+
+        printed = {method: printed_field(method, RATE).value for method in FIELD_METHODS}
+        return plot_rates(self.rates(), printed, self.tolerance_px)
+
+    def plot_errors(self) -> Any:
+        """Attitude errors and their parts beside the printed ones; returns the matplotlib Figure."""
+        from starcal_uq.paper.show.field_part import plot_errors
+
+        printed = {(method, axis): printed_field(method, axis).value for method in FIELD_METHODS for axis in AXES}
+        return plot_errors(self.parts(), {(m, axis.removesuffix("_arcsec")): v for (m, axis), v in printed.items()})
+
+    def _repr_html_(self) -> str:
+        from html import escape
+
+        table = self.table_3().to_html(index=False, border=0, float_format=lambda value: f"{value:.4g}")
+        return f"<p><b>Field experiment of Ye &amp; Yang 2017</b>: {escape(self.verdict)}</p>{table}"
+
+    def __repr__(self) -> str:
+        return f"FieldExperiment({self.reading.name}, {len(self.frames.rotations)} frames; report {str(self.report)!r})"
+
+
+def _counts(found: FieldIdentification) -> AnyDict:
+    correct = int(found.correct.sum())
+    low, high = wilson_interval(correct, found.n_frames)
+    return {
+        "n_frames": found.n_frames,
+        "correct": correct,
+        "wrong": int(found.wrong.sum()),
+        "rate": correct / found.n_frames,
+        "low": low,
+        "high": high,
+    }
+
+
+def _within(value: float, low: float, high: float) -> bool:
+    return bool(low <= value <= high)

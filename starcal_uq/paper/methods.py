@@ -1,0 +1,105 @@
+"""The methods that are compared, each as one call of `calibrate`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from starcal_uq.core.types import AnyDict
+from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.estimation.recursive.recursion_options import RECURSIVE_METHODS, RecursionOptions
+
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.observations.table import Observations
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to calibrate.
+
+    Attributes
+    ----------
+    label : str
+        What it is called in tables and figures.
+    description : str
+        What it does, in one line.
+    method : str
+        As in `calibrate`.
+    recursion : RecursionOptions, optional
+        As in `calibrate`.
+    """
+
+    label: str
+    description: str
+    method: str
+    recursion: RecursionOptions | None = None
+
+    def calibrate(self, obs: Observations, start: Camera) -> Calibration:
+        """Calibrate observations; recursive methods as a stream.
+
+        A stream gives them the same estimate and covariance, and no residuals and attitudes, which take time.
+
+        Raises
+        ------
+        CalibrationError
+            When the method gives no good result.
+        """
+        source = [obs] if self.method in RECURSIVE_METHODS else obs
+        return calibrate(source, start, method=self.method, recursion=self.recursion)
+
+    def to_dict(self) -> AnyDict:
+        """Plain values, for a file."""
+        recursion = None if self.recursion is None else self.recursion.to_dict()
+        return {name: getattr(self, name) for name in _PLAIN} | {"recursion": recursion}
+
+    @classmethod
+    def from_dict(cls, values: AnyDict) -> Method:
+        """Inverse of `to_dict`."""
+        recursion = values["recursion"]
+        options = None if recursion is None else RecursionOptions.from_dict(recursion)
+        return cls(**{name: values[name] for name in _PLAIN}, recursion=options)
+
+
+_PLAIN = ("label", "description", "method")
+
+METHODS = (
+    Method(
+        "least squares",
+        "optics by least squares on interstar angles, distortion ignored",
+        "least_squares",
+    ),
+    Method(
+        "samaan",
+        "optics by a Kalman filter on interstar angles with their full covariance, distortion linearly afterwards",
+        "samaan",
+    ),
+    Method(
+        "samaan, diagonal",
+        "the same with the angles of a frame taken as independent, as in the historical filters",
+        "samaan",
+        RecursionOptions(pair_covariance="diagonal"),
+    ),
+    Method(
+        "griffith",
+        "optics by recursive least squares on interstar angles, one frame at a time, distortion ignored",
+        "griffith",
+    ),
+    Method(
+        "griffith, all",
+        "the same for optics and distortion together",
+        "griffith",
+        RecursionOptions(parameters="all"),
+    ),
+    Method(
+        "three stages",
+        "optics and distortion together by least squares on interstar angles (Ye & Yang 2017)",
+        "three_stage",
+    ),
+    Method(
+        "efficient",
+        "three stages, then the likelihood of the star positions with the attitudes eliminated",
+        "efficient",
+    ),
+)

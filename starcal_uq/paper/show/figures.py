@@ -1,0 +1,265 @@
+"""Figures of the reproduction of Ye & Yang 2017: their Fig. 3, their Figs. 4 to 6, and their numbers on one axis."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.camera.distortion import parameters
+from starcal_uq.core.formatting import significant
+from starcal_uq.core.types import FloatArray
+from starcal_uq.presentation.figures import style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.collections import QuadMesh
+    from matplotlib.colors import LogNorm
+    from matplotlib.figure import Figure
+
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.paper.judgement import Judged
+
+# Arrows along each side of the detector.
+_ARROWS = 12
+# z-values within this are drawn to scale.
+_LINEAR_Z = 3.0
+_PALETTE = (style.VERMILLION, style.ORANGE, style.BLUE, style.GREEN, style.PURPLE, style.SKY)
+# Optics in the order of the paper's Fig. 3: unit, px to unit (unless mm), and end of the linear part of the axis.
+_ORDER = {"f": ("mm", 0.0, 1e-3), "x0": ("px", 1.0, 0.1), "y0": ("px", 1.0, 0.1)}
+
+
+def plot_trajectories(
+    calibrations: Mapping[str, Calibration], truth: Camera, printed: Mapping[str, Sequence[float | None]]
+) -> Figure:
+    """The optics on their way to the estimate (the paper's Fig. 3): batch methods by iteration, filters by frame.
+
+    Distances from the truth, on axes that are linear near it and logarithmic beyond: the start is far away, and the end
+    is what matters.
+
+    Parameters
+    ----------
+    calibrations : mapping
+        Label to result. Those with a stage ``filter`` are drawn against the number of frames, with the band of one
+        claimed standard deviation.
+    truth : Camera
+        The camera to reach.
+    printed : mapping
+        Label to the paper's final f (mm), x0 and y0, or None: marks at the right edge.
+    """
+    filters = [name for name, cal in calibrations.items() if any(s.name == "filter" for s in cal.stages)]
+    colours = dict(zip(calibrations, _PALETTE, strict=False))
+    names = [p.name for p in parameters("none")]
+    figure = style.new_figure(10.0, 8.6)
+    panels = figure.subplots(len(_ORDER), 2, sharey="row", sharex="col")
+    for row, (name, (unit, factor, threshold)) in enumerate(_ORDER.items()):
+        index = names.index(name)
+        true = float(truth.theta[index])
+        to_unit = truth.pixel_um / 1000.0 if name == "f" else factor
+        by_iteration, by_frame = (style.dress(ax, grid=True) for ax in panels[row])
+        for label, cal in calibrations.items():
+            colour = colours[label]
+            if label in filters:
+                _by_frame(by_frame, cal, index, true, to_unit, colour)
+            else:
+                path = (np.concatenate([s.trajectory[:, index] for s in cal.stages]) - true) * to_unit
+                # First stages of several methods coincide: the shorter path is drawn as rings around the longer.
+                short = len(cal.stages) == 1
+                by_iteration.plot(
+                    path,
+                    color=colour,
+                    marker="o",
+                    markersize=7.5 if short else 3.6,
+                    markerfacecolor="none" if short else colour,
+                    linewidth=2.6 if short else 1.3,
+                    alpha=0.75 if short else 1.0,
+                )
+            value = printed.get(label, [None] * len(_ORDER))[row]
+            if value is not None:
+                _mark(by_frame if label in filters else by_iteration, value - true * to_unit, colour)
+        for ax in (by_iteration, by_frame):
+            ax.axhline(0.0, color=style.INK, linewidth=1.0, dashes=(4, 2))
+        _distance_axis((by_iteration, by_frame), threshold)
+        latex = parameters("none")[index].latex
+        style.label(by_iteration, y=f"{latex} − {true * to_unit:g} [{unit}]")
+    by_frame.set_xscale("log")
+    style.label(panels[0, 0], "Batch methods: by iteration")
+    style.label(panels[0, 1], "Filter: by frame, with its claimed standard deviation")
+    style.label(panels[-1, 0], x="iteration, all stages in a row")
+    style.label(panels[-1, 1], x="frames")
+    _trajectory_key(figure, colours, bool(printed))
+    return figure
+
+
+def _by_frame(ax: Axes, cal: Calibration, index: int, true: float, to_unit: float, colour: str) -> None:
+    """A filter's estimate and claimed band after each frame."""
+    stage = next(s for s in cal.stages if s.name == "filter")
+    values = (stage.trajectory[:, index] - true) * to_unit
+    # The first entry is the start; a logarithmic axis begins at one frame.
+    frames = np.linspace(0.0, cal.n_frames, len(values))[1:]
+    ax.plot(frames, values[1:], color=colour, linewidth=1.3)
+    if stage.sigmas is not None:
+        sigma = stage.sigmas[1:, index] * to_unit
+        ax.fill_between(frames, values[1:] - sigma, values[1:] + sigma, color=colour, alpha=0.18, linewidth=0)
+
+
+def _mark(ax: Axes, value: float, colour: str) -> None:
+    """A printed value at the right edge."""
+    ax.plot(
+        1.0,
+        value,
+        marker="<",
+        markersize=7.0,
+        color=colour,
+        markeredgecolor=style.INK,
+        markeredgewidth=0.6,
+        linestyle="none",
+        clip_on=False,
+        zorder=5,
+        transform=ax.get_yaxis_transform(),
+    )
+
+
+def _distance_axis(axes: Sequence[Axes], threshold: float) -> None:
+    """Linear within the threshold, logarithmic beyond, and reaching the start; the axis is shared."""
+    from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
+
+    ax = axes[0]
+    values = np.concatenate([np.asarray(line.get_ydata(), dtype=np.float64) for one in axes for line in one.lines])
+    low, high = float(values.min()), float(values.max())
+    reach = max(-low, high)
+    powers = threshold * 10.0 ** np.arange(int(np.ceil(np.log10(max(reach / threshold, 10.0)))) + 1)
+    ax.set_yscale("symlog", linthresh=threshold, linscale=0.6)
+    ends = [min(low, -10.0 * threshold), max(high, 10.0 * threshold)]
+    ax.set_ylim(2.0 * ends[0], 2.0 * ends[1])
+    ax.yaxis.set_major_locator(FixedLocator([*(-powers[::-1]), 0.0, *powers]))
+    ax.yaxis.set_minor_locator(NullLocator())
+    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}".replace("-", "−")))
+
+
+def _trajectory_key(figure: Figure, colours: Mapping[str, str], printed: bool) -> None:
+    from matplotlib.lines import Line2D
+
+    handles = [Line2D([], [], color=colour, linewidth=1.6, label=label) for label, colour in colours.items()]
+    handles.append(Line2D([], [], color=style.INK, linewidth=1.0, dashes=(4, 2), label="truth"))
+    if printed:
+        handles.append(
+            Line2D(
+                [],
+                [],
+                color=style.GREY,
+                marker="<",
+                markersize=7.0,
+                markeredgecolor=style.INK,
+                linestyle="",
+                label="printed in the paper",
+            )
+        )
+    style.legend_above(
+        figure,
+        handles,
+        fontsize=style.LABEL_SIZE,
+        columnspacing=1.4,
+        handlelength=1.8,
+    )
+
+
+def plot_error_fields(
+    fields: Mapping[str, tuple[FloatArray, FloatArray, FloatArray]],
+    titles: Mapping[str, str],
+    printed: Mapping[str, str],
+) -> Figure:
+    """Errors over the detector without noise (the paper's Figs. 4 to 6): size as colour, direction as arrows.
+
+    Parameters
+    ----------
+    fields : mapping
+        Key to ``(xy (n, 2), eq. 16 (n, 2), best rotation removed (n, 2))`` on a square grid, px.
+    titles, printed : mapping
+        Key to title, and to what the paper prints as its largest residual.
+    """
+    from matplotlib.colors import LogNorm
+
+    figure = style.new_figure(3.55 * len(fields) + 0.9, 8.2)
+    panels = figure.subplots(2, len(fields), squeeze=False, sharex=True, sharey=True)
+    sizes = [np.hypot(*part.T) for _, *parts in fields.values() for part in parts]
+    top = 10.0 ** np.ceil(np.log10(max(float(size.max()) for size in sizes)))
+    norm = LogNorm(1e-4 * top, top)
+    kinds = ("eq. 16", "rotation removed")
+    for column, (key, (xy, *parts)) in enumerate(fields.items()):
+        for row, (kind, error) in enumerate(zip(kinds, parts, strict=True)):
+            image = _error_panel(panels[row, column], xy, error, norm)
+            note = f" (printed: {printed[key]})" if key in printed else ""
+            title = f"{titles[key]}, {kind}\nlargest {significant(float(np.hypot(*error.T).max()))} px{note}"
+            style.label(panels[row, column], title, "x [px]" if row else "", "y [px]" if column == 0 else "")
+    bar = figure.colorbar(image, ax=panels, fraction=0.03, pad=0.015, extend="min")
+    style.dress_bar(bar, "size of the error [px]")
+    return figure
+
+
+def _error_panel(ax: Axes, xy: FloatArray, error: FloatArray, norm: LogNorm) -> QuadMesh:
+    style.dress(ax)
+    n = round(np.sqrt(len(xy)))
+    x, y = xy[:n, 0], xy[::n, 1]
+    size = np.hypot(*error.T).reshape(n, n)
+    low = float(norm.vmin or 0.0)
+    image = ax.pcolormesh(x, y, np.maximum(size, low), norm=norm, cmap="cividis", shading="gouraud", rasterized=True)
+    some = np.unique(np.linspace(0, n - 1, _ARROWS + 2).round().astype(int)[1:-1])
+    grid = np.ix_(some, some)
+    along = [part.reshape(n, n)[grid] for part in (*xy.T, *error.T)]
+    longest = float(np.hypot(*error.T).max())
+    if longest > 0.0:
+        # Arrows tell the direction; their length, the root of the size over the panel's largest, keeps small ones seen.
+        length = np.sqrt(np.hypot(*along[2:]) * longest)
+        along[2:] = [part / np.maximum(length, 1e-300) for part in along[2:]]
+        scale = 1.0 / (0.95 * (x[some[1]] - x[some[0]]))
+        ax.quiver(
+            *along, angles="xy", scale_units="xy", scale=scale, color="white", width=0.005, headwidth=3.6, pivot="mid"
+        )
+    ax.set_xlim(x[0], x[-1])
+    ax.set_ylim(y[-1], y[0])
+    ax.set_aspect("equal")
+    return image
+
+
+def plot_printed_numbers(judged: Sequence[Judged], names: Sequence[str]) -> Figure:
+    """Every printed number as a distance from our draws: under the main reading, and under the closest one.
+
+    The axis is to scale within three standard deviations and logarithmic beyond.
+    """
+    figure = style.new_figure(9.6, 1.5 + 0.285 * len(judged))
+    ax = style.dress(figure.add_subplot())
+    place = np.arange(len(judged))[::-1]
+    main = np.array([one.main.z for one in judged])
+    nearest = np.array([min((t.z for t in one.trials), key=abs) for one in judged])
+    ax.axvspan(-_LINEAR_Z, _LINEAR_Z, color=style.GREEN, alpha=0.15, linewidth=0)
+    ax.axvline(0.0, color=style.GREY, linewidth=0.8)
+    ax.hlines(place, nearest, main, color=style.LIGHT, linewidth=1.6, zorder=1)
+    ax.plot(
+        nearest, place, "o", color="white", markeredgecolor=style.GREY, markersize=5.0, label="closest of all readings"
+    )
+    ax.plot(main, place, "o", color=style.BLUE, markersize=5.0, label="as printed (main reading)")
+    reach = 1.6 * max(10.0, float(np.abs(main).max()))
+    ax.set_xscale("symlog", linthresh=_LINEAR_Z, linscale=1.3)
+    ax.set_xlim(-reach, reach)
+    powers = 10.0 ** np.arange(1, np.floor(np.log10(reach)) + 1)
+    ticks = [*(-powers[::-1]), -3.0, 0.0, 3.0, *powers]
+    ax.set_xticks(ticks, [f"{tick:g}".replace("-", "−") for tick in ticks])
+    ax.set_xticks([], minor=True)
+    ax.set_yticks(place, names)
+    ax.tick_params(axis="y", length=0.0)
+    ax.set_ylim(-0.7, len(judged) - 0.3)
+    ax.grid(True, axis="y", color=style.LIGHT, linewidth=0.5)
+    ax.set_axisbelow(True)
+    style.label(ax, "", "(printed − our mean) / standard deviation of a new run")
+    figure.legend(
+        *ax.get_legend_handles_labels(),
+        loc="outside upper center",
+        ncols=2,
+        fontsize=style.LABEL_SIZE,
+        frameon=False,
+        labelcolor=style.INK,
+    )
+    return figure

@@ -1,0 +1,143 @@
+"""Where the interaction of optics and distortion costs more than noise, in plain words."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.core.formatting import count, fixed, join_words, plural, significant
+from starcal_uq.core.types import FloatArray
+
+if TYPE_CHECKING:
+    from starcal_uq.paper.interaction_result import InteractionStudy, Threshold
+
+# Spread over noise that is worth a sentence.
+_NOTICEABLE = 1.3
+_NOUN = {
+    "distortion": "of distortion at the corner",
+    "field": "of field",
+    "frames": "frames",
+    "stars": "stars in a frame",
+}
+_EVERYWHERE = {
+    "distortion": "at every distortion studied",
+    "field": "at every field of view studied",
+    "frames": "at every number of frames studied",
+    "stars": "at every number of stars studied",
+}
+
+
+def verdict(study: InteractionStudy) -> str:
+    """One paragraph: what is held fixed, then method by method."""
+    from starcal_uq.paper.interaction_result import HANDLING
+
+    sentences = [f"{_setting(study)} the bias of the optics exceeds one standard deviation of the noise:"]
+    sentences += [sentence_on(study, method) for method in HANDLING]
+    sentences += [_price(study)]
+    if study.interrupted:
+        sentences.append("The study was interrupted: later replicates are missing.")
+    return " ".join(sentence for sentence in sentences if sentence)
+
+
+def sentence_on(study: InteractionStudy, method: str) -> str:
+    """Where the bias of one method passes one standard deviation of its noise."""
+    from starcal_uq.paper.interaction_result import AXES, HANDLING
+
+    found = [t for t in study.thresholds if t.method == method and t.kind == "bias"]
+    if not found:
+        return ""
+    what = "ignores the distortion" if HANDLING[method] == "ignores" else f"{HANDLING[method]} the two"
+    who = f"{method[:1].upper()}{method[1:]}, which {what}"
+    if all(t.side == "never" for t in found):
+        rows = study.table[study.table["method"] == method]
+        largest = float(rows["bias_over_noise"].max())
+        return f"{who}: nowhere (largest bias {significant(largest, 1)} standard deviations)."
+    parts = []
+    for axis in AXES:
+        some = [t for t in found if t.axis == axis]
+        if some:
+            parts.append(_along(axis, some))
+    return f"{who}: {'; '.join(parts)}.{_scatter(study, method)}"
+
+
+def _scatter(study: InteractionStudy, method: str) -> str:
+    """How much more than noise the spread holds at the unvaried point, where that is noticeable."""
+    base = study.table[study.table["axis"] == "distortion"]["n_frames"]
+    rows = study.table[(study.table["axis"] == "frames") & (study.table["method"] == method)]
+    rows = rows[rows["n_frames"].isin(base)]
+    ratio = (rows["spread"] / rows["noise"]).to_numpy()
+    if len(ratio) == 0 or not ratio.min() > _NOTICEABLE:
+        return ""
+    return f" Its spread is {_span(ratio)} times the noise, because the bias depends on where the stars happen to be."
+
+
+def _span(values: FloatArray) -> str:
+    low, high = fixed(float(values.min()), 1), fixed(float(values.max()), 1)
+    return low if low == high else f"{low} to {high}"
+
+
+def _along(axis: str, found: list[Threshold]) -> str:
+    """One axis, parameters with the same kind of answer together."""
+    unit = {"distortion": "px ", "field": "deg "}.get(axis, "")
+    parts = []
+    for side, start, end in (("above", "from", " on"), ("below", "up to", "")):
+        some = [t for t in found if t.side == side]
+        if some:
+            values = join_words([f"{_value(axis, t.value)} ({t.parameter})" for t in some])
+            parts.append(f"{start} {values} {unit}{_NOUN[axis]}{end}")
+    for side, words in (("always", _EVERYWHERE[axis]), ("never", _EVERYWHERE[axis].replace("at every", "at no"))):
+        names = [t.parameter for t in found if t.side == side]
+        if names:
+            parts.append(words if len(names) == len(found) else f"{words} ({join_words(names)})")
+    return ", ".join(parts)
+
+
+def cell(axis: str, t: Threshold | None) -> str:
+    """One threshold in a table: the value, or everywhere or nowhere along the axis."""
+    if t is None:
+        return ""
+    if t.side == "always":
+        return "everywhere"
+    if t.side == "never":
+        return "nowhere"
+    return f"{'from' if t.side == 'above' else 'up to'} {_value(axis, t.value)}"
+
+
+def _value(axis: str, value: float) -> str:
+    # More digits than one would be those of chance.
+    return count(int(float(f"{value:.0e}"))) if axis == "frames" else significant(value, 1)
+
+
+def _setting(study: InteractionStudy) -> str:
+    """What holds along the axes that do not vary it."""
+    table = study.table
+    base = table[table["axis"] == "distortion"]
+    field = table[table["axis"] != "field"]
+    corner = table[table["axis"] != "distortion"]["corner_size_px"]
+    if base.empty or corner.empty:
+        return "Where the axis does not say otherwise,"
+    row = base.iloc[0]
+    return (
+        f"With {plural(int(row['n_frames']), 'frame')} of {fixed(float(row['stars_per_frame']), 0)} stars, a field of "
+        f"{fixed(float(field['field_deg'].iloc[0]), 1)} deg, {significant(float(corner.iloc[0]))} px of distortion at "
+        f"the corner and {significant(float(row['sigma_px']), 1)} px of noise, where the axis does not say otherwise,"
+    )
+
+
+def _price(study: InteractionStudy) -> str:
+    """What coupling costs where there is nothing to couple, and from where on it pays."""
+    from starcal_uq.paper.interaction_result import OPTICS, REFERENCE
+
+    simple = "least squares"
+    parts = []
+    for parameter in OPTICS:
+        one, two = (study.points("distortion", m, parameter) for m in (simple, REFERENCE))
+        if one.empty or float(one["corner_size_px"].iloc[0]) != 0.0:
+            return ""
+        parts.append((parameter, float(two["spread"].iloc[0] / one["spread"].iloc[0])))
+    price = join_words([f"{fixed(ratio, 1)} ({name})" for name, ratio in parts])
+    text = f"Without distortion, coupling costs: the spread of {REFERENCE} is {price} times that of {simple}"
+    pays = [study.threshold("distortion", simple, parameter, "rmse") for parameter in OPTICS]
+    known = [f"{significant(t.value, 1)} px ({t.parameter})" for t in pays if np.isfinite(t.value)]
+    return f"{text}; it pays from a distortion of {join_words(known)} at the corner on." if known else f"{text}."

@@ -1,0 +1,175 @@
+"""Estimates of many replicates against the truth, the Cramer-Rao bound, and what their method claims.
+
+The spread of n Gaussian estimates follows a chi distribution, ``(n - 1) s^2 / sigma^2 ~ chi-square(n - 1)``: from it
+come the intervals of claimed over spread and of the efficiency. Three things are tested of every method and parameter:
+is the mean error zero (t test), is the spread what is claimed (chi-square test; another for the textbook's claim), and
+does the claimed 95 % interval hold the truth 95 times in a hundred (binomial test). All p-values of a table go through
+Holm's procedure together, so that chance is called a finding in one of a hundred such tables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from starcal_uq.core.formatting import fixed, percent, significant
+from starcal_uq.core.types import AnyDict, BoolArray, FloatArray
+
+# Of one false finding among all tests of a table.
+FAMILY_LEVEL = 0.01
+# With fewer, claims that are half of the spread could go unnoticed.
+ENOUGH_REPLICATES = 50
+_INTERVAL = 0.95
+# Standard deviations of a normal 95 % interval, which is what a sigma is read as.
+_HALF_WIDTH = 1.959963984540054
+# A bias below this fraction of the spread matters to nobody, however surely it is there.
+_SLIGHT = 0.5
+HONEST = "honest"
+TOO_FEW = "too few replicates to judge"
+
+
+def summarise(error: FloatArray, claimed: FloatArray, classical: FloatArray, crlb: float) -> AnyDict:
+    """Statistics of one parameter of one method.
+
+    Parameters
+    ----------
+    error : (n,) array
+        Estimate minus truth.
+    claimed : (n,) array
+        Standard deviations that the method gives.
+    classical : (n,) array
+        Standard deviations by the formula of the textbooks; NaN where there is none.
+    crlb : float
+        The bound on the standard deviation.
+
+    Returns
+    -------
+    dict
+        As the columns of `Replicates.table`, and the p-values of the tests, in keys that end in ``_p``.
+    """
+    from scipy.stats import binomtest, t
+
+    n = len(error)
+    # NumPy numbers, which divide by zero without an exception.
+    bias = np.mean(error)
+    spread = np.std(error, ddof=1) if n > 1 else np.float64(np.nan)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        bias_se = spread / np.sqrt(n)
+        rmse = np.sqrt(np.mean(error**2))
+        low, high = chi_interval(n)
+        values: AnyDict = {
+            "n": n,
+            "bias": bias,
+            "bias_se": bias_se,
+            "bias_over_spread": bias / spread,
+            "spread": spread,
+            "spread_se": spread / np.sqrt(2.0 * max(n - 1, 1)),
+            "crlb": crlb,
+            "efficiency": (crlb / spread) ** 2,
+            "efficiency_low": (crlb / spread * low) ** 2,
+            "efficiency_high": (crlb / spread * high) ** 2,
+            "rmse": rmse,
+            "rmse_over_crlb": rmse / crlb,
+            "bias_p": float(2.0 * t.sf(abs(bias / bias_se), n - 1)),
+        }
+        for suffix, sigmas in (("", claimed), ("_classical", classical)):
+            size = np.sqrt(np.mean(sigmas**2))
+            known = bool(np.isfinite(size))
+            held = int(np.sum(np.abs(error) <= _HALF_WIDTH * sigmas))
+            wilson = wilson_interval(held, n) if known else (np.nan, np.nan)
+            values |= {
+                f"claimed{suffix}": size,
+                f"claimed{suffix}_over_spread": size / spread,
+                f"claimed{suffix}_over_spread_low": size / spread * low,
+                f"claimed{suffix}_over_spread_high": size / spread * high,
+                f"claimed{suffix}_over_rmse": size / rmse,
+                f"coverage95{suffix}": held / n if known else np.nan,
+                f"coverage95{suffix}_low": wilson[0],
+                f"coverage95{suffix}_high": wilson[1],
+                f"claimed{suffix}_p": chi_p_value(spread / size, n) if known else np.nan,
+                f"coverage95{suffix}_p": float(binomtest(held, n, _INTERVAL).pvalue) if known else np.nan,
+            }
+    return values
+
+
+def chi_interval(n: int) -> tuple[float, float]:
+    """Factors (low, high) on ``1 / s`` that give the 95 % interval of ``1 / sigma`` for n Gaussian values."""
+    from scipy.stats import chi2
+
+    if n < 2:
+        return float("nan"), float("nan")
+    tail = 0.5 * (1.0 - _INTERVAL)
+    low, high = np.sqrt(chi2.ppf([tail, 1.0 - tail], n - 1) / (n - 1))
+    return float(low), float(high)
+
+
+def chi_p_value(ratio: float, n: int) -> float:
+    """Two-sided p-value of ``s / sigma`` when sigma is the true standard deviation of n Gaussian values."""
+    from scipy.stats import chi2
+
+    if n < 2 or not np.isfinite(ratio):
+        return float("nan")
+    statistic = (n - 1) * ratio**2
+    return float(min(1.0, 2.0 * min(chi2.cdf(statistic, n - 1), chi2.sf(statistic, n - 1))))
+
+
+def wilson_interval(successes: int, n: int, z: float = _HALF_WIDTH) -> tuple[float, float]:
+    """Interval for a fraction (Wilson 1927), 95 % by default."""
+    if n == 0:
+        return float("nan"), float("nan")
+    fraction = successes / n
+    centre = fraction + z**2 / (2 * n)
+    half = z * np.sqrt(fraction * (1.0 - fraction) / n + (z / (2 * n)) ** 2)
+    scale = 1.0 + z**2 / n
+    # Rounding must not leave the fraction outside.
+    low = 0.0 if successes == 0 else float((centre - half) / scale)
+    high = 1.0 if successes == n else float((centre + half) / scale)
+    return low, high
+
+
+def holm(p_values: Sequence[float], level: float = FAMILY_LEVEL) -> BoolArray:
+    """Which of many tests are rejected at an overall level (Holm 1979); NaN stands for no test."""
+    p = np.asarray(p_values, dtype=np.float64)
+    rejected = np.zeros(len(p), dtype=np.bool_)
+    order = [i for i in np.argsort(p, kind="stable") if np.isfinite(p[i])]
+    for place, i in enumerate(order):
+        if p[i] > level / (len(order) - place):
+            break
+        rejected[i] = True
+    return rejected
+
+
+def words(row: AnyDict, bias: bool, claim: bool, coverage: bool) -> str:
+    """Verdict on one parameter of one method, given which tests object."""
+    if row["n"] < ENOUGH_REPLICATES:
+        return TOO_FEW
+    parts = []
+    if bias:
+        sigmas = abs(row["bias_over_spread"])
+        if sigmas < _SLIGHT:
+            parts.append(f"slightly biased by {significant(sigmas)} of its sigmas")
+        else:
+            share = significant(row["claimed_over_rmse"])
+            parts.append(f"biased by {significant(sigmas)} of its sigmas, claims {share} of its error")
+    if claim:
+        parts.append(claim_words(row["claimed_over_spread"]))
+    if coverage and not parts:
+        parts.append(f"its 95 % intervals hold the truth in {percent(row['coverage95'], 3)}")
+    return "; ".join(parts) or HONEST
+
+
+def classical_words(row: AnyDict, rejected: bool) -> str:
+    """The same for the formula of the textbooks; empty where there is none."""
+    if not np.isfinite(row["claimed_classical"]):
+        return ""
+    if row["n"] < ENOUGH_REPLICATES:
+        return TOO_FEW
+    return claim_words(row["claimed_classical_over_spread"]) if rejected else HONEST
+
+
+def claim_words(ratio: float) -> str:
+    """What a claim is against the spread."""
+    if ratio < 1.0:
+        return f"claims too little: {fixed(ratio, 2)} of its spread"
+    return f"claims too much: {significant(ratio, 3)} times its spread"

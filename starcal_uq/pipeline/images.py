@@ -1,0 +1,240 @@
+"""The steps of a run that starts from images: centroids, identification, bootstrapping."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.core.errors import ObservationError
+from starcal_uq.core.formatting import plural
+from starcal_uq.core.times import julian_year, utc_text
+from starcal_uq.estimation.noise_floor import settle_noise
+from starcal_uq.pipeline.record import IMAGES, record_images
+from starcal_uq.runs.folder import RunFolder, atomic_path
+from starcal_uq.sky.apparent import catalogue_directions, make_apparent, without_low_stars
+from starcal_uq.sky.site import check_sky
+
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.cli.progress import Progress
+    from starcal_uq.core.types import FloatArray, StrArray
+    from starcal_uq.identification.proposers import Engine
+    from starcal_uq.images.centroids import Centroids
+    from starcal_uq.observations.table import Observations
+    from starcal_uq.pipeline.refine import Bootstrap
+    from starcal_uq.sky.site import Site
+
+CENTROIDS, IDENTIFICATION = "centroids.parquet", "identification.csv"
+# Where the embedded catalogue has its stars; images without a time are compared with these.
+_CATALOGUE_EPOCH = 2016.0
+_NUMBER = re.compile(r"\d+(?:\.\d+)?")
+# Magnitudes; the embedded catalogue ends at the second.
+_FAINTER_NEIGHBOURS, _FAINTEST = 1.5, 10.0
+
+
+def are_images(paths: Sequence[Path]) -> bool:
+    """Whether paths name images or folders of them, rather than one table of observations."""
+    from starcal_uq.images.image import IMAGE_ENDINGS
+
+    def is_image(path: Path) -> bool:
+        name = path.name.lower()
+        return name.endswith(IMAGE_ENDINGS) or (path.is_dir() and not name.endswith((".csv", ".ecsv", ".parquet")))
+
+    return any(is_image(path) for path in paths)
+
+
+def epoch_of(centroids: Centroids) -> float:
+    """Julian year of the images, or that of the embedded catalogue where no image has a time."""
+    times = centroids.time_utc[centroids.time_utc != ""]
+    return julian_year(times) if len(times) else _CATALOGUE_EPOCH
+
+
+def counted(messages: Sequence[str]) -> list[str]:
+    """Messages about many images, each sentence once with the number of images it stands for.
+
+    Sentences that differ in their numbers only are one, with the range of each number.
+    """
+    alike: dict[str, list[str]] = {}
+    for message in messages:
+        alike.setdefault(_NUMBER.sub("#", message.partition(": ")[2] or message), []).append(message)
+    return [group[0] if len(group) == 1 else _together(group) for group in alike.values()]
+
+
+def _together(messages: Sequence[str]) -> str:
+    sentences = [message.partition(": ")[2] or message for message in messages]
+    ranges = []
+    for column in zip(*(_NUMBER.findall(sentence) for sentence in sentences), strict=True):
+        low, high = min(column, key=float), max(column, key=float)
+        ranges.append(low if low == high else f"{low} to {high}")
+    pieces = _NUMBER.split(sentences[0])
+    words = "".join(piece + number for piece, number in zip(pieces, [*ranges, ""], strict=True))
+    return f"{len(messages)} images: {words}"
+
+
+def observations_from_images(
+    images: Sequence[Path],
+    camera: Camera,
+    *,
+    max_mag: float,
+    epoch: float | None = None,
+    gain_e_per_count: float | None = None,
+    directions: str | None = None,
+    site: Site | None = None,
+    in_space: bool = False,
+    time_utc: str | None = None,
+    engine: Engine = "pyramid",
+    tell: Callable[[str], None] | None = None,
+    progress: Progress | None = None,
+) -> tuple[Observations, Centroids, Bootstrap]:
+    """Find, identify and calibrate with the nominal camera, then identify again with what was learnt.
+
+    Parameters
+    ----------
+    images : sequence of Path
+        Image files or folders of them.
+    camera : Camera
+        The nominal camera.
+    max_mag : float
+        Magnitude limit of the embedded catalogue, Gaia G.
+    epoch : float, optional
+        Julian year of the star positions; that of the images by default (`epoch_of`).
+    gain_e_per_count : float, optional
+        Where the files do not say it.
+    directions : {"apparent", "undeclared", "catalogue"}, optional
+        By default annual aberration is applied where every image has a time, and nothing is declared where not.
+        ``apparent`` takes the catalogue's directions for what the camera saw, as in rendered images.
+    site : Site, optional
+        Where on the ground the camera stood: diurnal aberration and refraction are applied too, and stars lower than
+        ten degrees left out.
+    in_space : bool
+        Whether the camera was above the air, so that nothing need be said of refraction.
+    time_utc : str, optional
+        Middle of the exposure of all images whose files do not say it; it goes before a time in a file's name.
+    engine : {"pyramid", "tetra3rs"}
+        What finds attitudes.
+    tell : callable, optional
+        Gets what a user should know of the images, one sentence each, before anything is made of them.
+    progress : callable, optional
+        Called with (images done, images in all).
+
+    Raises
+    ------
+    ImageError, IdentificationError, CalibrationError
+        When nothing can be made of the images.
+    ObservationError
+        When a site is given and an image has no time, or shows stars that were below the horizon there.
+    CatalogueError
+        When the time is not readable.
+    """
+    from starcal_uq.images.extract import extract_centroids
+    from starcal_uq.pipeline.refine import bootstrap
+    from starcal_uq.sky.catalogue import load_catalogue
+    from starcal_uq.sky.neighbours import without_disturbed
+
+    check_sky(directions, site, in_space)
+    if time_utc is not None:
+        time_utc = utc_text(time_utc)
+    centroids = extract_centroids(list(images), camera=camera, gain_e_per_count=gain_e_per_count, progress=progress)
+    centroids = with_time(centroids, time_utc)
+    if tell is not None:
+        for message in counted(centroids.messages):
+            tell(f"note: {message}")
+        tell(centroids.summary)
+    if site is not None:
+        _check_times(centroids)
+    year = epoch_of(centroids) if epoch is None else epoch
+    stars = load_catalogue(max_mag=max_mag, epoch=year)
+    # A neighbour need not be bright enough to be identified to displace a star.
+    neighbours = load_catalogue(max_mag=max(max_mag, min(max_mag + _FAINTER_NEIGHBOURS, _FAINTEST)), epoch=year)
+
+    rendered = _rendered(images)
+    motion = directions in (None, "catalogue")
+    width = centroids.psf_sigma_px[np.isfinite(centroids.psf_sigma_px)]
+    psf_sigma_px = float(np.median(width)) if len(width) else 1.0
+
+    def prepare(obs: Observations) -> Observations:
+        obs = without_disturbed(obs, neighbours, camera, psf_sigma_px)
+        if in_space or rendered:
+            obs = obs.with_meta(observer="space" if in_space else "rendered")
+        timed = obs.time_utc is not None and bool((obs.time_utc != "").all())
+        if not motion or (directions is None and not timed):
+            return obs.with_meta(directions=directions or "undeclared")
+        obs = obs.with_meta(directions="catalogue")
+        return make_apparent(obs if site is None else without_low_stars(obs, site), site=site)
+
+    def to_catalogue(apparent: FloatArray, times: StrArray) -> FloatArray:
+        return catalogue_directions(apparent, times, site=site)
+
+    found = bootstrap(
+        centroids,
+        camera,
+        stars,
+        prepare=prepare,
+        to_catalogue=to_catalogue if motion else None,
+        identification={"engine": engine},
+    )
+    return settle_noise(found.observations, found.calibration), centroids, found
+
+
+def with_time(centroids: Centroids, time_utc: str | None) -> Centroids:
+    """Centroids with a time (UTC) for all frames whose images do not say it, be it in their header.
+
+    Parameters
+    ----------
+    centroids : Centroids
+        Times from the names of files give way.
+    time_utc : str or None
+        Middle of the exposure; None leaves all as it is. An offset such as "+02:00" is taken out.
+
+    Raises
+    ------
+    CatalogueError
+        When the time is not readable, or a date alone.
+    """
+    from starcal_uq.images.image import time_in_name_message
+
+    if time_utc is None:
+        return centroids
+    time_utc = utc_text(time_utc)
+    named = {time_in_name_message(str(name)) for name in centroids.image}
+    said = named & set(centroids.messages)
+    times = [
+        time_utc if time == "" or time_in_name_message(str(name)) in said else str(time)
+        for name, time in zip(centroids.image, centroids.time_utc, strict=True)
+    ]
+    kept = tuple(message for message in centroids.messages if message not in said)
+    return replace(centroids, time_utc=np.array(times, dtype=np.str_), messages=kept)
+
+
+def _rendered(images: Sequence[Path]) -> bool:
+    """Whether all images come from `render_frames`, whose stars shine through no air."""
+    from starcal_uq.images.image import IMAGE_ENDINGS, is_rendered
+
+    paths = [p for path in images for p in (sorted(path.iterdir()) if path.is_dir() else [path])]
+    paths = [path for path in paths if path.name.lower().endswith(IMAGE_ENDINGS)]
+    return bool(paths) and all(is_rendered(path) for path in paths)
+
+
+def _check_times(centroids: Centroids) -> None:
+    used = (centroids.problem == "") & (centroids.stars_per_frame > 0)
+    untimed = centroids.image[used & (centroids.time_utc == "")]
+    if len(untimed):
+        others = f" (and {plural(len(untimed) - 1, 'other')})" if len(untimed) > 1 else ""
+        raise ObservationError(
+            f"{untimed[0]}{others}: the image has no time, without which the site does not say where the stars stood; "
+            "give the time (UTC, such as 2026-11-21T03:04:05).",
+            column="time_utc",
+        )
+
+
+def save_image_results(run: RunFolder, centroids: Centroids, found: Bootstrap) -> None:
+    """Keep the centroids and the record of every frame in the run folder."""
+    centroids.save(run.path / CENTROIDS, force=True)
+    record_images(centroids, found).save(run.path / IMAGES)
+    with atomic_path(run.path / IDENTIFICATION) as temporary:
+        found.identification.to_dataframe().to_csv(temporary, index=False)

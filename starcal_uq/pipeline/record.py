@@ -1,0 +1,190 @@
+"""What became of every image of a run, and what identifying twice changed: kept in the run folder for the report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.formatting import plural
+from starcal_uq.core.types import AnyDict
+from starcal_uq.runs.folder import PathLike, atomic_write_text
+
+if TYPE_CHECKING:
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.identification.result import Identification
+    from starcal_uq.images.centroids import Centroids
+    from starcal_uq.observations.table import Observations
+    from starcal_uq.pipeline.refine import Bootstrap
+
+# File in the run folder.
+IMAGES = "images.json"
+
+
+@dataclass(frozen=True)
+class RoundRecord:
+    """One round of identification and calibration.
+
+    Attributes
+    ----------
+    n_frames : int
+        Frames identified.
+    n_stars : int
+        Stars calibrated.
+    new, given_up : int
+        Stars identified that the round before had not, and the other way round; zero in the first round.
+    parameters : dict
+        Name to (estimate, standard deviation), px units.
+    sigma_name, sigma
+        Which noise was estimated, and its value.
+    """
+
+    n_frames: int
+    n_stars: int
+    new: int
+    given_up: int
+    parameters: dict[str, tuple[float, float]]
+    sigma_name: str
+    sigma: float
+
+
+@dataclass(frozen=True)
+class ImageRow:
+    """One image: its name, time, centroids, outcome in words, and stars identified in the first and the last round."""
+
+    frame: int
+    image: str
+    time_utc: str
+    n_centroids: int
+    outcome: str
+    n_first: int
+    n_last: int
+
+
+@dataclass(frozen=True)
+class ImageRecord:
+    """The images of a run.
+
+    Attributes
+    ----------
+    rounds : tuple of RoundRecord
+        The first with the nominal camera, the last with what was learnt.
+    rows : tuple of ImageRow
+        Every image, used or not.
+    n_disturbed : int
+        Stars left out because the light of a neighbour displaces them.
+    parity : str
+        "normal" or "mirrored".
+    """
+
+    rounds: tuple[RoundRecord, ...]
+    rows: tuple[ImageRow, ...]
+    n_disturbed: int
+    parity: str
+
+    @property
+    def left_out(self) -> tuple[ImageRow, ...]:
+        """Images without an identified star."""
+        return tuple(row for row in self.rows if not row.n_last)
+
+    @property
+    def summary(self) -> str:
+        """What was used, in two sentences."""
+        used = len(self.rows) - len(self.left_out)
+        found = sum(row.n_centroids for row in self.rows)
+        words = f"{used} of {plural(len(self.rows), 'image')} used; {plural(found, 'star image')} were found in them"
+        words += f", and {sum(row.n_last for row in self.rows)} of these were identified."
+        if self.n_disturbed:
+            words += f" {plural(self.n_disturbed, 'star')} left out, because the light of a neighbour displaces them."
+        if self.parity == "mirrored":
+            words += " The images are mirror images of the sky: x is counted from the right edge."
+        return words
+
+    def save(self, path: PathLike) -> None:
+        """Write as JSON, all or nothing."""
+        atomic_write_text(path, json.dumps(asdict(self), indent=1) + "\n")
+
+    @classmethod
+    def load(cls, path: PathLike) -> ImageRecord:
+        """Read what `save` wrote.
+
+        Raises
+        ------
+        RunFolderError
+            If the file cannot be read or is something else.
+        """
+        try:
+            with open(path, encoding="utf-8") as file:
+                document = json.load(file)
+            return cls(
+                tuple(_round(entry) for entry in document["rounds"]),
+                tuple(ImageRow(**row) for row in document["rows"]),
+                int(document["n_disturbed"]),
+                str(document["parity"]),
+            )
+        except OSError as error:
+            raise RunFolderError(f"{path}: cannot be read ({error.strerror or error}).") from error
+        except (KeyError, TypeError, ValueError) as error:
+            raise RunFolderError(
+                f"{path}: is not a record of images; run `starcal-uq run IMAGES... CAMERA -o RUN` again."
+            ) from error
+
+
+def record_images(centroids: Centroids, found: Bootstrap) -> ImageRecord:
+    """The record of a bootstrapped run."""
+    first, last = found.rounds[0][0], found.rounds[-1][0]
+    counted = {frame.frame: frame.n_identified for frame in first.frames}
+    by_frame = {frame.frame: frame for frame in last.frames}
+    rows = []
+    for k, number in enumerate(centroids.frame_ids.tolist()):
+        frame = by_frame.get(number)
+        problem = str(centroids.problem[k])
+        rows.append(
+            ImageRow(
+                frame=number,
+                image=str(centroids.image[k]),
+                time_utc=str(centroids.time_utc[k]),
+                n_centroids=int(centroids.stars_per_frame[k]),
+                outcome=problem or ("not searched" if frame is None else frame.status),
+                n_first=counted.get(number, 0),
+                n_last=0 if frame is None else frame.n_identified,
+            )
+        )
+    rounds, before = [], None
+    for identification, obs, calibration in found.rounds:
+        rounds.append(_recorded(identification, obs, calibration, before))
+        before = identification
+    disturbed = found.observations.meta.get("disturbed_stars", 0)
+    return ImageRecord(tuple(rounds), tuple(rows), int(disturbed), last.parity)
+
+
+def identified_pairs(obs: Observations) -> set[tuple[int, str]]:
+    """Frame number and star of every row, where the stars are named."""
+    if obs.star_id is None:
+        return set()
+    return set(zip(obs.frame.tolist(), obs.star_id.tolist(), strict=True))
+
+
+def _recorded(
+    identification: Identification, obs: Observations, cal: Calibration, before: Identification | None
+) -> RoundRecord:
+    now = identified_pairs(identification.observations)
+    old = now if before is None else identified_pairs(before.observations)
+    values = zip(cal.parameter_names, cal.theta.tolist(), cal.sigmas.tolist(), strict=True)
+    return RoundRecord(
+        n_frames=identification.n_identified,
+        n_stars=obs.n_stars,
+        new=len(now - old),
+        given_up=len(old - now),
+        parameters={name: (value, sigma) for name, value, sigma in values},
+        sigma_name=cal.sigma_name,
+        sigma=float(cal.sigma),
+    )
+
+
+def _round(entry: Mapping[str, Any]) -> RoundRecord:
+    values: AnyDict = dict(entry)
+    values["parameters"] = {name: (float(v), float(s)) for name, (v, s) in values["parameters"].items()}
+    return RoundRecord(**values)

@@ -1,0 +1,155 @@
+"""From centroids and a data sheet to a calibration: identify, calibrate, identify better, calibrate again.
+
+A nominal camera is some per cent off, so that the first identification must tolerate much and may miss faint stars and
+poor frames. The calibration of what it found leaves tolerances of a fraction of a pixel, and a second identification
+finds more stars and refuses what fitted by luck.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+from starcal_uq.core.errors import CalibrationError, IdentificationError
+from starcal_uq.core.formatting import plural
+from starcal_uq.identification.engine import identify
+from starcal_uq.pipeline.displacement import ToCatalogue, as_measured, mirrored, undisplaced
+from starcal_uq.pipeline.record import identified_pairs
+
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.identification.result import Identification
+    from starcal_uq.images.centroids import Centroids
+    from starcal_uq.observations.table import Observations
+    from starcal_uq.sky.catalogue import StarCatalogue
+
+
+@dataclass(frozen=True, eq=False)
+class Bootstrap:
+    """What two rounds of identification and calibration found.
+
+    Attributes
+    ----------
+    rounds : tuple of (Identification, Observations, Calibration)
+        In their order; the observations are those that were calibrated.
+    """
+
+    rounds: tuple[tuple[Identification, Observations, Calibration], ...]
+
+    @property
+    def identification(self) -> Identification:
+        """The last one."""
+        return self.rounds[-1][0]
+
+    @property
+    def observations(self) -> Observations:
+        """The last ones."""
+        return self.rounds[-1][1]
+
+    @property
+    def calibration(self) -> Calibration:
+        """The last one."""
+        return self.rounds[-1][2]
+
+    @property
+    def summary(self) -> str:
+        """What the second round changed, in words."""
+        (before, _, first), (after, _, second) = self.rounds[0], self.rounds[-1]
+        old, new = identified_pairs(before.observations), identified_pairs(after.observations)
+        words = (
+            f"{plural(len(old), 'star')} in {plural(before.n_identified, 'frame')} with the nominal camera, "
+            f"{plural(len(new), 'star')} in {plural(after.n_identified, 'frame')} with the calibrated one: "
+            f"{len(new - old)} new, {len(old - new)} given up."
+        )
+        shift = (second.theta - first.theta) / second.sigmas
+        moved = ", ".join(
+            f"{name} {value:+.1f}" for name, value in zip(second.parameter_names, shift.tolist(), strict=True)
+        )
+        return f"{words} The estimate moved, in its standard deviations: {moved}."
+
+
+def bootstrap(
+    centroids: Centroids,
+    camera: Camera,
+    stars: StarCatalogue,
+    *,
+    prepare: Callable[[Observations], Observations] | None = None,
+    to_catalogue: ToCatalogue | None = None,
+    method: dict[str, Any] | None = None,
+    identification: dict[str, Any] | None = None,
+) -> Bootstrap:
+    """Identify with the nominal camera, calibrate, and do both again with what was learnt.
+
+    Parameters
+    ----------
+    centroids : Centroids
+        Measured stars of all frames.
+    camera : Camera
+        The nominal camera.
+    stars : StarCatalogue
+        Catalogue.
+    prepare : callable, optional
+        What is done to observations before they are calibrated, such as making directions apparent.
+    to_catalogue : callable, optional
+        Where `prepare` makes directions apparent, its inverse: apparent directions (n, 3) and their times (n,) to
+        catalogue directions (n, 3). The second identification then looks for stars where they are seen. It is not
+        used where `prepare` leaves the directions as they are.
+    method : dict, optional
+        Options of `calibrate`.
+    identification : dict, optional
+        Options of `identify`.
+
+    Raises
+    ------
+    IdentificationError
+        When no frame is identified.
+    CalibrationError
+        When the stars that were identified do not determine the camera.
+    """
+    from starcal_uq.estimation.calibrate import calibrate
+
+    options = identification or {}
+    found = identify(centroids, camera, stars, **options)
+    rounds: list[tuple[Identification, Observations, Calibration]] = []
+    for number in range(2):
+        if not found.n_identified:
+            raise IdentificationError(f"no frame is identified: {found.summary}")
+        obs = found.observations if prepare is None else prepare(found.observations)
+        try:
+            known = calibrate(obs, found.nominal if number == 0 else rounds[0][0].nominal, **(method or {}))
+        except CalibrationError as error:
+            stars_words, frames_words = plural(obs.n_stars, "star"), plural(found.n_identified, "frame")
+            raise CalibrationError(
+                f"{stars_words} in {frames_words} were identified, but they do not determine the camera ({error}) Give "
+                "more frames, fainter stars (max_mag), or a distortion model with fewer terms in the camera file.",
+                error.status,
+            ) from error
+        rounds.append((found, obs, known))
+        if number == 0:
+            found = _again(centroids, found, obs, known, stars, to_catalogue, options)
+    return Bootstrap(tuple(rounds))
+
+
+def _again(
+    centroids: Centroids,
+    first: Identification,
+    obs: Observations,
+    known: Calibration,
+    stars: StarCatalogue,
+    to_catalogue: ToCatalogue | None,
+    options: dict[str, Any],
+) -> Identification:
+    """The second identification, with the calibrated camera and centroids freed from what displaces the stars."""
+    flipped = first.parity == "mirrored"
+    table = mirrored(centroids, known.camera.width_px) if flipped else centroids
+    moved = table
+    if to_catalogue is not None and obs.meta["directions"] == "apparent":
+        moved = undisplaced(table, obs, known.camera, to_catalogue)
+    found = identify(moved, known.camera, stars, calibration=known, **options)
+    # What follows is said against the data sheet.
+    found = replace(found, nominal=first.nominal)
+    if found.n_identified:
+        found = replace(found, observations=as_measured(found.observations, moved, table))
+    return replace(found, parity="mirrored") if flipped else found

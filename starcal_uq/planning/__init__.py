@@ -1,0 +1,1 @@
+"""Before any data: forecasts and designs."""

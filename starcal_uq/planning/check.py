@@ -1,0 +1,291 @@
+"""Is a forecast right? Campaigns simulated and calibrated in full, against what was forecast of them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from starcal_uq.core.errors import CalibrationError, CatalogueError, PlanningError, StarcalError
+from starcal_uq.core.formatting import significant
+from starcal_uq.core.tasks import Progress, run_tasks
+from starcal_uq.core.types import BoolArray, FloatArray
+from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.planning.forecast import Forecast, Forecaster, inverses, spreads
+from starcal_uq.planning.information import random_frames
+from starcal_uq.planning.plan import N_FRAMES
+from starcal_uq.runs.folder import atomic_path
+from starcal_uq.simulation.frames import simulate
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.sky.catalogue import StarCatalogue
+
+_INTERVAL = (0.025, 0.975)
+_TOLERANCE, _FAMILY_LEVEL = 0.05, 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class ForecastCheck:
+    """Forecast and simulation, for G numbers of frames, C campaigns of each, Q quantities and p parameters.
+
+    Attributes
+    ----------
+    forecast : Forecast
+        What was forecast.
+    n_parameters : int
+        p.
+    stated : (G, C, Q) array
+        1 sigma that the calibration of each campaign states; NaN where one failed.
+    error : (G, C, p) array
+        Estimate minus truth.
+    nees : (G, C) array
+        Normalised squared error of the parameters with the covariance that the calibration states.
+    nees_forecast : (G, C) array
+        The same with the mean covariance that was forecast.
+    dof : (G, C) array
+        Degrees of freedom of the calibrations.
+    failures : tuple of str
+        Reasons of the campaigns without a result.
+    """
+
+    forecast: Forecast
+    n_parameters: int
+    stated: FloatArray
+    error: FloatArray
+    nees: FloatArray
+    nees_forecast: FloatArray
+    dof: FloatArray
+    failures: tuple[str, ...]
+
+    @property
+    def n_campaigns(self) -> int:
+        """Campaigns C of each number of frames."""
+        return int(self.nees.shape[1])
+
+    @property
+    def ratio(self) -> FloatArray:
+        """Mean of what the campaigns state over the forecast, (G, Q)."""
+        ratio: FloatArray = np.nanmean(self.stated, axis=1) / self.forecast.sigma
+        return ratio
+
+    @property
+    def ratio_se(self) -> FloatArray:
+        """Standard error of `ratio` from the scatter of the campaigns, (G, Q)."""
+        n = np.sum(np.isfinite(self.nees), axis=1)[:, None]
+        error: FloatArray = np.nanstd(self.stated, axis=1, ddof=1) / np.sqrt(n) / self.forecast.sigma
+        return error
+
+    def nees_ratio(self, of_forecast: bool = False) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Pooled squared z: mean squared error over its expectation (G,), 1 if the covariance is right.
+
+        Also the interval that holds 95 % of such ratios if it is.
+        """
+        from scipy.stats import chi2
+
+        values = self.nees_forecast if of_forecast else self.nees
+        n = np.sum(np.isfinite(values), axis=1) * self.n_parameters
+        nu = np.nanmean(self.dof, axis=1)
+        expected = np.ones_like(nu) if of_forecast else nu / (nu - 2.0)
+        low, high = (chi2.ppf(level, n) / n for level in _INTERVAL)
+        return np.nanmean(values, axis=1) / self.n_parameters / expected, low, high
+
+    @property
+    def nees_rejected(self) -> BoolArray:
+        """Numbers of frames (G,) whose squared errors are not what they should be: Bonferroni over all, at 1 %."""
+        from scipy.stats import chi2
+
+        found, _, _ = self.nees_ratio()
+        n = np.sum(np.isfinite(self.nees), axis=1) * self.n_parameters
+        p = 2.0 * np.minimum(chi2.cdf(found * n, n), chi2.sf(found * n, n))
+        return np.asarray(p < _FAMILY_LEVEL / len(n))
+
+    @property
+    def largest_difference(self) -> float:
+        """Largest relative difference of a forecast from the mean of the campaigns."""
+        return float(np.max(np.abs(self.ratio - 1.0)))
+
+    @property
+    def ok(self) -> bool:
+        """Every forecast is within 5 % of the campaigns, and no test of squared errors objects."""
+        return self.largest_difference < _TOLERANCE and not bool(np.any(self.nees_rejected))
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """One row per number of frames and quantity.
+
+        Columns are ``n_frames``, ``quantity``, ``forecast`` and ``stated`` (mean over campaigns), ``ratio`` with its
+        standard error ``ratio_se``; and, the same for all quantities of a number of frames, ``nees_ratio`` with the
+        interval ``nees_low`` to ``nees_high``.
+        """
+        import pandas as pd
+
+        found, low, high = self.nees_ratio()
+        n_quantities = len(self.forecast.names)
+
+        def repeated(values: Any) -> Any:
+            return np.repeat(values, n_quantities)
+
+        return pd.DataFrame(
+            {
+                "n_frames": repeated(self.forecast.n_frames),
+                "quantity": list(self.forecast.names) * len(self.forecast.n_frames),
+                "forecast": self.forecast.sigma.ravel(),
+                "stated": np.nanmean(self.stated, axis=1).ravel(),
+                "ratio": self.ratio.ravel(),
+                "ratio_se": self.ratio_se.ravel(),
+                "nees_ratio": repeated(found),
+                "nees_low": repeated(low),
+                "nees_high": repeated(high),
+            }
+        )
+
+    @property
+    def verdict(self) -> str:
+        """What was found, in plain words."""
+        from starcal_uq.presentation.words.planning import check_verdict
+
+        return check_verdict(self)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the table as CSV, atomically and to the last digit; overwritten."""
+        with atomic_path(path) as temporary:
+            self.to_dataframe().to_csv(temporary, index=False)
+
+    def plot(self, **options: Any) -> Any:
+        """Ratios to the forecast, and squared errors: `starcal_uq.presentation.figures.planning.plot_forecast_check`."""
+        from starcal_uq.presentation.figures.planning import plot_forecast_check
+
+        return plot_forecast_check(self, **options)
+
+    def _repr_html_(self) -> str:
+        from html import escape
+
+        table = self.to_dataframe().to_html(index=False, float_format=lambda v: significant(v, 3), border=0)
+        return f"<p><b>Forecast against simulation</b>: {escape(self.verdict)}</p>{table}"
+
+
+def check_forecast(
+    camera: Camera,
+    stars: StarCatalogue,
+    *,
+    sigma_px: float = 0.05,
+    n_frames: Sequence[int] = N_FRAMES,
+    min_stars: int = 10,
+    n_campaigns: int = 50,
+    n_geometries: int = 3000,
+    seed: int = 0,
+    workers: int | None = None,
+    progress: Progress | None = None,
+) -> ForecastCheck:
+    """Simulate and calibrate campaigns, and compare what they state and how far they err with the forecast of `plan`.
+
+    The attitudes of the simulation are not those of the forecast, and every calibration starts from a data sheet:
+    principal point in the centre, no distortion.
+
+    Parameters
+    ----------
+    camera, stars, sigma_px, n_frames, min_stars, n_geometries
+        As for `plan`; one noise for all stars.
+    n_campaigns : int
+        Campaigns of each number of frames.
+    seed : int
+        The same seed gives the same result for any number of processes.
+    workers : int, optional
+        Processes; as many as there are processors by default, 0 for this one.
+    progress : callable, optional
+        Called as ``progress(done, total)``.
+
+    Raises
+    ------
+    PlanningError
+        For fewer than two campaigns.
+    CatalogueError
+        When the field is too narrow for the catalogue to show `min_stars`.
+    CalibrationError
+        When no campaign of some number of frames gave a result, or after Ctrl-C before the last one.
+    """
+    if n_campaigns < 2 or not n_frames:
+        raise PlanningError(f"n_campaigns is {n_campaigns}: give at least 2, and at least one number of frames.")
+    mission = random_frames(stars, camera, sigma_px, n_frames=n_geometries, min_stars=min_stars, seed=seed)
+    forecaster = Forecaster(mission.information, mission.mean_stars, mission, seed=seed)
+    task = partial(_campaign, _Study(camera, stars, sigma_px, min_stars, tuple(n_frames), n_campaigns, seed))
+    outcomes, interrupted = run_tasks(
+        task,
+        len(n_frames) * n_campaigns,
+        caller="check_forecast",
+        chunk=5,
+        workers=workers,
+        progress=progress,
+    )
+    if interrupted:
+        raise CalibrationError("the check of the forecast was interrupted: run it again with fewer campaigns.")
+    shape = (len(n_frames), n_campaigns)
+    p = len(camera.theta)
+    error = np.array([o.error for o in outcomes]).reshape(*shape, p)
+    covariance = np.array([o.covariance for o in outcomes]).reshape(*shape, p, p)
+    if np.isnan(error[..., 0]).all(axis=1).any():
+        raise CalibrationError(next(o.failure for o in outcomes if o.failure))
+    forms = np.stack([q.form for q in forecaster.quantities])
+    expected = inverses(np.stack([forecaster.covariances(n).mean(axis=0) for n in n_frames]))
+    return ForecastCheck(
+        forecast=forecaster.forecast(n_frames),
+        n_parameters=p,
+        stated=np.where(np.isnan(error[..., :1]), np.nan, spreads(forms, covariance)),
+        error=error,
+        nees=np.einsum("gci,gcij,gcj->gc", error, inverses(covariance), error),
+        nees_forecast=np.einsum("gci,gij,gcj->gc", error, expected, error),
+        dof=np.array([o.dof for o in outcomes], dtype=np.float64).reshape(shape),
+        failures=tuple(o.failure for o in outcomes if o.failure),
+    )
+
+
+class _Study(NamedTuple):
+    """What all campaigns share; sent once to every process."""
+
+    camera: Camera
+    stars: StarCatalogue
+    sigma_px: float
+    min_stars: int
+    n_frames: tuple[int, ...]
+    n_campaigns: int
+    seed: int
+
+
+class _Outcome(NamedTuple):
+    """One campaign: why it has no result (or nothing), error (p,), covariance (p, p), degrees of freedom."""
+
+    failure: str
+    error: FloatArray
+    covariance: FloatArray
+    dof: float
+
+
+def _campaign(study: _Study, index: int) -> _Outcome:
+    """Simulate and calibrate campaign number `index`."""
+    camera = study.camera
+    x0, y0 = camera.centre_px
+    sheet = camera.replace(x0_px=x0, y0_px=y0, coefficients=(0.0,) * len(camera.coefficients))
+    # Other streams than those of the forecast.
+    seed = np.random.SeedSequence([study.seed, 4], spawn_key=(index,)).generate_state(1, np.uint64)[0]
+    try:
+        obs = simulate(
+            study.stars,
+            camera,
+            n_frames=study.n_frames[index // study.n_campaigns],
+            min_stars=study.min_stars,
+            sigma_px=study.sigma_px,
+            seed=int(seed),
+        )
+        cal = calibrate(obs, sheet)
+    except CatalogueError:
+        raise
+    except StarcalError as error:
+        p = len(camera.theta)
+        return _Outcome(str(error), np.full(p, np.nan), np.full((p, p), np.nan), np.nan)
+    return _Outcome("", cal.theta - camera.theta, cal.covariance, float(cal.dof))

@@ -1,0 +1,244 @@
+"""Which frames to take next: a choice among candidate attitudes by optimal design.
+
+Frames are added one by one, each the one that helps most (greedy), and then exchanged as long as another candidate is
+better (Fedorov 1972, *Theory of Optimal Experiments*). What "helps" means is the criterion:
+
+- ``D``: the determinant of the information on the parameters, i.e. the volume of their joint uncertainty;
+- ``A``: the mean variance, per axis across the boresight, of a part of the attitude error over the mission's attitudes.
+
+Candidates are ranked by the derivative of the criterion, which costs one product of matrices; the best of them are then
+evaluated exactly.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import random_rotations
+from starcal_uq.core.errors import PlanningError
+from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.planning.forecast import ARCSEC, inverses, quantities, spreads
+from starcal_uq.planning.frame_choice_result import FrameChoice
+from starcal_uq.planning.information import FrameSet, Noise, look_at, random_frames
+from starcal_uq.planning.plan import HasInformation, start_information
+from starcal_uq.runs.folder import provenance
+
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.sky.catalogue import StarCatalogue
+
+CRITERIA = ("D", "A")
+CHOICE_SCOPES = ("common", "rest", "calibration")
+# Without data, a thousandth of a mean frame makes the first steps defined.
+_FAINT = 1e-3
+_EXACT, _SWAPS_PER_FRAME, _RANDOM_SETS, _RANDOM_PATHS = 48, 3, 200, 20
+_GAIN = 1e-9
+
+
+def choose_frames(
+    camera: Camera,
+    stars: StarCatalogue,
+    *,
+    n_frames: int,
+    candidates: FloatArray | int = 3000,
+    sigma_px: Noise = 0.05,
+    min_stars: int = 10,
+    criterion: str = "A",
+    scope: str = "common",
+    after: HasInformation | None = None,
+    n_geometries: int = 1000,
+    seed: int = 0,
+) -> FrameChoice:
+    """Choose the frames that improve a calibration most.
+
+    Parameters
+    ----------
+    camera : Camera
+        The sheet, or the camera of the calibration `after`.
+    stars : StarCatalogue
+        The sky, to the sensor's limit.
+    n_frames : int
+        Frames to take.
+    candidates : (M, 3, 3) array or int
+        Attitudes (R_cam_icrs) that could be taken; or how many random ones to choose from. Each is taken at most once.
+    sigma_px : float or callable
+        Centroid noise, as for `plan`.
+    min_stars : int
+        Candidates with fewer stars are refused.
+    criterion : {"A", "D"}
+        ``A`` for the attitude error of `scope`, ``D`` for the parameters as a whole.
+    scope : {"common", "rest", "calibration"}
+        Part of the attitude error that ``A`` is about.
+    after : Calibration or Posterior, optional
+        Data that are there already.
+    n_geometries : int
+        Random attitudes that stand for the mission.
+    seed : int
+        Repeats bit for bit.
+
+    Raises
+    ------
+    PlanningError
+        For settings that cannot work, or fewer candidates than frames.
+    CatalogueError
+        When the field is too narrow for the catalogue to show `min_stars`.
+    """
+    _check(n_frames, min_stars, criterion, scope)
+    mission = random_frames(stars, camera, sigma_px, n_frames=n_geometries, min_stars=min_stars, seed=seed)
+    pool = _pool(stars, camera, candidates, sigma_px, min_stars, seed)
+    if pool.n_frames < n_frames:
+        raise PlanningError(
+            f"{pool.n_frames} candidate attitudes show {min_stars} stars, fewer than the {n_frames} frames asked for: "
+            "give more candidates or ask for fewer frames."
+        )
+    start = start_information(after, camera)
+    design = _Design(pool.information, criterion, _weights(mission, scope), start)
+    chosen, exchanges = design.choose(n_frames)
+    measured = quantities(mission)
+    forms = np.stack([q.form for q in measured])
+    rng = np.random.default_rng([seed, 2])
+    random_sets = np.stack([rng.permutation(pool.n_frames)[:n_frames] for _ in range(_RANDOM_SETS)])
+    none = np.zeros((len(camera.theta),) * 2) if start is None else start
+    richest = np.argsort(-pool.n_stars, kind="stable")[:n_frames]
+    sums = {
+        name: none + pool.information[some].sum(axis=-3)
+        for name, some in (("after", chosen), ("richest", richest), ("random", random_sets))
+    }
+    reference = design.score(sums["after"])
+    n_given = candidates if isinstance(candidates, int) else len(candidates)
+    settings = {"criterion": criterion, "scope": scope, "n_frames": n_frames, "candidates": n_given}
+    return FrameChoice(
+        rotations=pool.rotations[chosen],
+        candidate=chosen,
+        n_stars=pool.n_stars[chosen],
+        criterion=criterion,
+        scope=scope,
+        names=tuple(q.name for q in measured),
+        before=spreads(forms, inverses(none)),
+        **{name: spreads(forms, inverses(total)) for name, total in sums.items()},
+        score_path=design.path(chosen, reference),
+        random_path=np.mean([design.path(some, reference) for some in random_sets[:_RANDOM_PATHS]], axis=0),
+        n_candidates=pool.n_frames,
+        n_refused=n_given - pool.n_frames,
+        exchanges=exchanges,
+        provenance=provenance(seed, settings, None),
+    )
+
+
+def _pool(
+    stars: StarCatalogue, camera: Camera, candidates: FloatArray | int, noise: Noise, min_stars: int, seed: int
+) -> FrameSet:
+    if isinstance(candidates, int):
+        rotations = random_rotations(max(candidates, 1), np.random.default_rng([seed, 3]))
+    else:
+        rotations = np.asarray(candidates, dtype=np.float64)
+        if rotations.ndim != 3 or rotations.shape[1:] != (3, 3):
+            raise PlanningError(
+                f"candidates have the shape {rotations.shape}: give rotation matrices R_cam_icrs (M, 3, 3)."
+            )
+    return look_at(stars, camera, rotations, noise, min_stars)
+
+
+def _weights(mission: FrameSet, scope: str) -> FloatArray:
+    """Matrix (p, p) whose product with a covariance is the mean variance per axis across the boresight, arcsec^2."""
+    response = {"common": mission.common[None], "rest": mission.rest, "calibration": mission.response}[scope]
+    rows = ARCSEC * response[:, :2].reshape(-1, response.shape[-1]) / np.sqrt(2.0 * len(response))
+    weights: FloatArray = rows.T @ rows
+    return weights
+
+
+class _Design:
+    """A greedy choice with exchanges, in parameters scaled to order one."""
+
+    def __init__(self, information: FloatArray, criterion: str, weights: FloatArray, start: FloatArray | None) -> None:
+        mean = information.mean(axis=0)
+        self._scale = 1.0 / np.sqrt(np.diag(mean))
+        both = np.outer(self._scale, self._scale)
+        self._information = information * both
+        self._flat = self._information.reshape(len(information), -1)
+        self._weights = weights * both
+        self._start = _FAINT * mean * both if start is None else start * both
+        self._is_d = criterion == "D"
+
+    def choose(self, n: int) -> tuple[IntArray, int]:
+        """Indices (n,) in the order of their value, and how many were exchanged."""
+        chosen: list[int] = []
+        total = self._start.copy()
+        for _ in range(n):
+            best, _ = self._best(total, chosen)
+            chosen.append(best)
+            total = total + self._information[best]
+        exchanges = self._exchange(chosen, total)
+        return self._ordered(np.array(chosen, dtype=np.int64)), exchanges
+
+    def _exchange(self, chosen: list[int], total: FloatArray) -> int:
+        """Exchange frames in place until none is better, or each was looked at a few times."""
+        swapped = 0
+        for _ in range(_SWAPS_PER_FRAME):
+            before = swapped
+            for place in range(len(chosen)):
+                without = total - self._information[chosen[place]]
+                others = chosen[:place] + chosen[place + 1 :]
+                best, value = self._best(without, others)
+                if value < self._value(total) - _GAIN * abs(self._value(total)):
+                    total = without + self._information[best]
+                    chosen[place] = best
+                    swapped += 1
+            if swapped == before:
+                break
+        return swapped
+
+    def _best(self, total: FloatArray, taken: list[int]) -> tuple[int, float]:
+        """The candidate whose addition makes the criterion least, and what it makes it."""
+        inverse = np.linalg.inv(total)
+        slope = inverse if self._is_d else inverse @ self._weights @ inverse
+        gain = self._flat @ slope.ravel()
+        gain[taken] = -np.inf
+        # While few frames are there, one more changes everything and the derivative says little.
+        n_exact = min(len(gain) - len(taken), _EXACT if len(taken) > 10 else 10 * _EXACT)
+        some = np.argpartition(-gain, n_exact - 1)[:n_exact]
+        values = self._values(total + self._information[some])
+        place = int(np.argmin(values))
+        return int(some[place]), float(values[place])
+
+    def _values(self, totals: FloatArray) -> FloatArray:
+        """Criterion (m,), less is better: mean variance, or minus the log determinant."""
+        if self._is_d:
+            logs: FloatArray = -np.linalg.slogdet(totals)[1]
+            return logs
+        values: FloatArray = np.einsum("nij,ij->n", np.linalg.inv(totals), self._weights)
+        return values
+
+    def _value(self, total: FloatArray) -> float:
+        return float(self._values(total[None])[0])
+
+    def _ordered(self, chosen: IntArray) -> IntArray:
+        """Most valuable first: greedily among the chosen ones."""
+        left, order, total = list(chosen), [], self._start.copy()
+        while left:
+            place = int(np.argmin(self._values(total + self._information[left])))
+            total = total + self._information[left[place]]
+            order.append(left.pop(place))
+        return np.array(order, dtype=np.int64)
+
+    def score(self, total: FloatArray) -> float:
+        """Criterion of an information matrix in px units."""
+        return self._value(total * np.outer(self._scale, self._scale))
+
+    def path(self, frames: IntArray, reference: float) -> FloatArray:
+        """Criterion after each frame as 1 sigma; for ``D`` per parameter, relative to a `reference` value."""
+        values = self._values(self._start + np.cumsum(self._information[frames], axis=0))
+        return np.exp(0.5 * (values - reference) / len(self._scale)) if self._is_d else np.sqrt(values)
+
+
+def _check(n_frames: int, min_stars: int, criterion: str, scope: str) -> None:
+    for good, text in (
+        (n_frames >= 1, f"n_frames is {n_frames}: give at least 1."),
+        (min_stars >= 3, f"min_stars is {min_stars}: an attitude needs at least 3."),
+        (criterion in CRITERIA, f"the criterion {criterion!r} is unknown: use one of {', '.join(CRITERIA)}."),
+        (scope in CHOICE_SCOPES, f"the scope {scope!r} cannot be optimised: use one of {', '.join(CHOICE_SCOPES)}."),
+    ):
+        if not good:
+            raise PlanningError(text)

@@ -1,0 +1,366 @@
+"""Forecast of a calibration from the information of its frames, before any data.
+
+The covariance of the parameters after n frames is the inverse of the sum of their information. Few frames make a
+calibration that depends on which they are: the forecast is therefore the mean over campaigns of n frames drawn from a
+set of random ones, with the range of 90 % of the campaigns beside it.
+
+Everything else is linear in the parameters, so that its variance is the sum over entries of a matrix times that
+covariance: parameters in other units, the displacement at the corner of the detector, and per axis of the attitude the
+common rotation and the rest, root mean square over the attitudes of the mission.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.camera.distortion import get_model, parameters
+from starcal_uq.core.errors import PlanningError
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+from starcal_uq.maths.circular import mixture_radius
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from starcal_uq.planning.information import FrameSet
+
+ARCSEC = 648_000.0 / np.pi
+AXES = ("pitch", "yaw", "roll")
+# Parts of the attitude error that a target can be set for: what is in the error of one attitude.
+SCOPES = {
+    "common": "the common rotation of the calibration",
+    "rest": "the rest of the calibration, after alignment",
+    "calibration": "the calibration, common rotation and rest together",
+    "total": "the calibration and the centroid noise of a frame together",
+}
+BAND = (0.05, 0.95)
+N_CAMPAIGNS = 200
+MAX_FRAMES = 10_000_000
+# Attitudes of the mission that quantiles are taken over, and scales of the covariance that they are interpolated from.
+_MISSION_FRAMES, _SCALES = 200, 9
+# Worse than this, digits are lost in the inverse.
+_WORST_CONDITION = 1e13
+_TOLERANCE, _GUESS_FRAMES = 0.002, 1000
+
+
+@dataclass(frozen=True, eq=False)
+class Quantity:
+    """Something linear in the parameters.
+
+    Attributes
+    ----------
+    name : str
+        Column in tables, with the unit.
+    form : (p, p) array
+        Its variance is the sum of ``form * covariance``.
+    """
+
+    name: str
+    form: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """What campaigns of n frames will give, for G numbers of frames and Q quantities.
+
+    Attributes
+    ----------
+    n_frames : (G,) array of int
+        Frames of a campaign.
+    names : tuple of str
+        The quantities, with their units.
+    sigma, low, high : (G, Q) array
+        Standard deviation that a calibration will state: mean over campaigns, and the range of 90 % of them.
+    radius, radius_low, radius_high : (G,) array
+        Two-axis error across the boresight at the confidence asked for, arcsec: mean and range of 90 %.
+    noise_sigma : (G,) array
+        Relative standard error of the estimated centroid noise.
+    """
+
+    n_frames: IntArray
+    names: tuple[str, ...]
+    sigma: FloatArray
+    low: FloatArray
+    high: FloatArray
+    radius: FloatArray
+    radius_low: FloatArray
+    radius_high: FloatArray
+    noise_sigma: FloatArray
+
+    def of(self, name: str) -> FloatArray:
+        """Mean standard deviation (G,) of one quantity."""
+        column: FloatArray = self.sigma[:, self.names.index(name)]
+        return column
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """One row per number of frames: every quantity, and the radius with its range."""
+        import pandas as pd
+
+        table = pd.DataFrame({"n_frames": self.n_frames})
+        for j, name in enumerate(self.names):
+            table[name] = self.sigma[:, j]
+        return table.assign(
+            noise_relative=self.noise_sigma,
+            radius_arcsec=self.radius,
+            radius_low_arcsec=self.radius_low,
+            radius_high_arcsec=self.radius_high,
+        )
+
+
+def quantities(mission: FrameSet) -> tuple[Quantity, ...]:
+    """Parameters, and per axis the common rotation and the rest over the attitudes of a mission."""
+    camera = mission.camera
+    known = parameters(camera.distortion)
+    p = len(known)
+    unit = np.eye(p)
+    found = [_quantity(f"{k.name}_{_suffix(k.unit)}", unit[i : i + 1]) for i, k in enumerate(known)]
+    found.append(_quantity("f_mm", unit[2:3] * camera.pixel_um / 1000.0))
+    if p > 3:
+        found.append(_quantity("distortion_corner_px", _corner_displacement(mission)))
+    for axis, name in enumerate(AXES):
+        found.append(_quantity(f"common_{name}_arcsec", ARCSEC * mission.common[axis : axis + 1]))
+    for axis, name in enumerate(AXES):
+        found.append(_quantity(f"rest_{name}_arcsec", ARCSEC * mission.rest[:, axis] / np.sqrt(mission.n_frames)))
+    return tuple(found)
+
+
+def _suffix(unit: str) -> str:
+    """``px`` as it is, ``px^-2`` as ``per_px2``."""
+    base, _, power = unit.partition("^-")
+    return f"per_{base}{'' if power == '1' else power}" if power else base
+
+
+def _quantity(name: str, rows: FloatArray) -> Quantity:
+    """The root of the sum of the squares of some rows (m, p), taken at the parameters."""
+    return Quantity(name, rows.T @ rows)
+
+
+def _corner_displacement(mission: FrameSet) -> FloatArray:
+    """Displacement (2, p) px by the distortion at the corner that is farthest from the principal point."""
+    camera = mission.camera
+    model = get_model(camera.distortion)
+    corners = np.array([-0.5, camera.width_px - 0.5]), np.array([-0.5, camera.height_px - 0.5])
+    u, v = (
+        side[np.argmax(np.abs(side - point))] - point for side, point in zip(corners, camera.theta[:2], strict=True)
+    )
+    columns = np.zeros((2, len(camera.theta)))
+    for j, one in enumerate(np.eye(len(model.coefficients)).tolist()):
+        columns[:, 3 + j] = model.displacement(u, v, one)
+    return columns
+
+
+def nea_arcsec(mission: FrameSet) -> FloatArray:
+    """Noise-equivalent angle (3,): standard deviation by centroid noise, root mean square over frames."""
+    nea: FloatArray = ARCSEC * np.sqrt(np.diagonal(mission.noise, axis1=1, axis2=2).mean(axis=0))
+    return nea
+
+
+def campaigns(
+    information: FloatArray, n_frames: int, n_campaigns: int, seed: int, start: FloatArray | None
+) -> FloatArray:
+    """Covariances (C, p, p) after campaigns of n frames drawn, with replacement, from those of `information` (M, p, p).
+
+    `start` (p, p) is information that is there already. What a campaign does not determine is infinite.
+    """
+    m, p = information.shape[:2]
+    rng = np.random.default_rng([seed, n_frames])
+    counts = rng.multinomial(n_frames, np.full(m, 1.0 / m), size=n_campaigns)
+    total = (counts @ information.reshape(m, -1)).reshape(-1, p, p)
+    return inverses(total if start is None else total + start)
+
+
+def inverses(information: FloatArray) -> FloatArray:
+    """Inverses (..., p, p) of matrices whose entries span many orders of magnitude; infinite where singular."""
+    diagonal = np.diagonal(information, axis1=-2, axis2=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = 1.0 / np.sqrt(diagonal)
+        scaled = information * scale[..., :, None] * scale[..., None, :]
+    good: BoolArray = np.asarray(np.isfinite(scaled).all(axis=(-2, -1)))
+    p = information.shape[-1]
+    scaled = np.where(good[..., None, None], scaled, np.eye(p))
+    good = np.asarray(good & (np.asarray(np.linalg.cond(scaled)) < _WORST_CONDITION))
+    inverse = np.linalg.inv(np.where(good[..., None, None], scaled, np.eye(p)))
+    with np.errstate(invalid="ignore"):
+        inverse = inverse * scale[..., :, None] * scale[..., None, :]
+    return np.where(good[..., None, None], inverse, np.inf)
+
+
+def spreads(forms: FloatArray, covariances: FloatArray) -> FloatArray:
+    """Standard deviations (..., Q) of quantities with forms (Q, p, p) under covariances (..., p, p)."""
+    flat = covariances.reshape(*covariances.shape[:-2], -1)
+    known = np.isfinite(flat).all(axis=-1, keepdims=True)
+    variances = np.where(known, flat, 0.0) @ forms.reshape(len(forms), -1).T
+    return np.where(known, np.sqrt(np.maximum(variances, 0.0)), np.inf)
+
+
+class Forecaster:
+    """Forecasts for one set of frames, one mission and one target.
+
+    Parameters
+    ----------
+    information : (M, p, p) array
+        Of each frame that a campaign may take.
+    n_stars : float
+        Stars per frame on average.
+    mission : FrameSet
+        Frames whose attitudes count.
+    confidence : float
+        Of the two-axis radius.
+    scope : str
+        One of `SCOPES`.
+    start : (p, p) array, optional
+        Information that is there already.
+    start_dof : float
+        Degrees of freedom of those data.
+    n_campaigns : int
+        Campaigns to average over.
+    seed : int
+        Repeats bit for bit.
+
+    Raises
+    ------
+    PlanningError
+        For an unknown scope, or a confidence that is no probability.
+    """
+
+    def __init__(
+        self,
+        information: FloatArray,
+        n_stars: float,
+        mission: FrameSet,
+        *,
+        confidence: float = 0.997,
+        scope: str = "common",
+        start: FloatArray | None = None,
+        start_dof: float = 0.0,
+        n_campaigns: int = N_CAMPAIGNS,
+        seed: int = 0,
+    ) -> None:
+        if scope not in SCOPES:
+            raise PlanningError(f"the scope {scope!r} is unknown: use one of {', '.join(SCOPES)}.")
+        if not 0.0 < confidence < 1.0:
+            raise PlanningError(f"the confidence {confidence!r} is no probability: give one such as 0.997.")
+        self.information, self.n_stars, self.mission = information, n_stars, mission
+        self.confidence, self.scope, self.start = confidence, scope, start
+        self.start_dof, self.n_campaigns, self.seed = start_dof, n_campaigns, seed
+        self.quantities = quantities(mission)
+        self._forms = np.stack([q.form for q in self.quantities])
+        some = slice(None, None, max(1, mission.n_frames // _MISSION_FRAMES))
+        # Centred, so that the common rotation is the same in every scope.
+        response = np.zeros((1, *mission.common.shape)) if scope == "common" else mission.rest[some]
+        response = response - response.mean(axis=0)
+        if scope != "rest":
+            response = response + mission.common
+        self._response = ARCSEC * response[:, :2]
+        self._noise = ARCSEC**2 * mission.noise[some, :2, :2] if scope == "total" else np.zeros((1, 2, 2))
+        self._size = np.einsum("kap,kaq->pq", self._response, self._response) / len(self._response)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the quantities."""
+        return tuple(q.name for q in self.quantities)
+
+    def forecast(self, n_frames: Sequence[int]) -> Forecast:
+        """What campaigns of each of these numbers of frames will give."""
+        rows = []
+        for n in n_frames:
+            covariances = self.covariances(n)
+            sigma, radius = spreads(self._forms, covariances), self.radii(covariances, n)
+            rows.append((sigma.mean(axis=0), *_band(sigma), radius.mean(), *_band(radius), self.noise_sigma(n)))
+        columns = [np.array(column) for column in zip(*rows, strict=True)]
+        return Forecast(np.array(n_frames, dtype=np.int64), self.names, *columns)
+
+    def covariances(self, n_frames: int) -> FloatArray:
+        """Covariances (C, p, p) of the parameters after drawn campaigns of n frames."""
+        return campaigns(self.information, n_frames, self.n_campaigns, self.seed, self.start)
+
+    def dof(self, n_frames: int) -> float:
+        """Independent numbers beyond the parameters, with those of the data that are there already."""
+        own = n_frames * (2.0 * self.n_stars - 3.0) - len(self._size)
+        return float(max(1.0, own + self.start_dof))
+
+    def noise_sigma(self, n_frames: int) -> float:
+        """Relative standard error of the estimated noise."""
+        return float(1.0 / np.sqrt(2.0 * self.dof(n_frames)))
+
+    def radii(self, covariances: FloatArray, n_frames: int) -> FloatArray:
+        """Two-axis errors (C,) across the boresight at the confidence, arcsec, after some campaigns.
+
+        Their size differs from campaign to campaign, their shape hardly: the radius is that of the mean covariance,
+        interpolated to the size of each. The noise is estimated, too: quantiles are those of Student's distribution.
+        """
+        sizes = spreads(self._size[None], covariances)[:, 0] ** 2
+        known = np.isfinite(sizes)
+        if not known.any():
+            return np.full(len(sizes), np.inf)
+        mean = covariances[known].mean(axis=0)
+        shape = self._response @ mean @ np.swapaxes(self._response, 1, 2)
+        size = float(np.mean(np.trace(shape, axis1=1, axis2=2)))
+        ratios = np.where(known, sizes, size) / size
+        grid = np.linspace(np.sqrt(ratios.min()) * 0.999, np.sqrt(ratios.max()) * 1.001, _SCALES)
+        at_grid = [mixture_radius(g**2 * shape + self._noise, self.confidence) for g in grid]
+        radii = student_factor(self.confidence, self.dof(n_frames)) * np.interp(np.sqrt(ratios), grid, at_grid)
+        return np.where(known, radii, np.inf)
+
+    def floor_arcsec(self) -> float:
+        """Radius that no number of frames goes below: that of the centroid noise, where the scope has it."""
+        return mixture_radius(self._noise, self.confidence)
+
+    def frames_needed(self, target_arcsec: float, share: float | None = None) -> int | None:
+        """Fewest frames whose radius is within a target; None where no number up to ten million is enough.
+
+        Parameters
+        ----------
+        target_arcsec : float
+            Two-axis error across the boresight at the confidence.
+        share : float, optional
+            Part of the campaigns that keep the target, such as 0.95; by default campaigns keep it on average.
+        """
+        if self.floor_arcsec() >= target_arcsec:
+            return None
+
+        def kept(n: int) -> bool:
+            radii = self.radii(self.covariances(n), n)
+            return bool((radii.mean() if share is None else np.quantile(radii, share)) <= target_arcsec)
+
+        low, high = self._bracket(target_arcsec, kept)
+        while high - low > max(1, int(_TOLERANCE * high)):
+            middle = min(max(round(float(np.sqrt(low * high))), low + 1), high - 1)
+            low, high = (low, middle) if kept(middle) else (middle, high)
+        return high if high <= MAX_FRAMES else None
+
+    def _bracket(self, target_arcsec: float, kept: Callable[[int], bool]) -> tuple[int, int]:
+        """Numbers of frames that do not keep a target and that do; the second is beyond ten million where none does."""
+        square = float(np.mean(self.radii(self.covariances(_GUESS_FRAMES), _GUESS_FRAMES))) ** 2
+        floor = self.floor_arcsec() ** 2
+        guess = _GUESS_FRAMES * (square - floor) / (target_arcsec**2 - floor)
+        high = int(min(max(guess, 1.0), MAX_FRAMES)) if np.isfinite(guess) else 1
+        low, step = 0, 1.02
+        if kept(high):
+            while high > 1:
+                low = int(high / step)
+                if low < 1 or not kept(low):
+                    return max(low, 0), high
+                high, step = low, step**2
+            return 0, 1
+        while not kept(high):
+            if high >= MAX_FRAMES:
+                return MAX_FRAMES, MAX_FRAMES + 1
+            low, high, step = high, min(int(np.ceil(high * step)) + 1, MAX_FRAMES), step**2
+        return low, high
+
+
+def student_factor(confidence: float, dof: float) -> float:
+    """How much wider a two-axis interval is because the noise is estimated, with that many degrees of freedom."""
+    from scipy.stats import f as fisher
+
+    return float(np.sqrt(2.0 * fisher.ppf(confidence, 2.0, dof) / (-2.0 * np.log1p(-confidence))))
+
+
+def _band(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    finite = np.where(np.isfinite(values), values, np.finfo(np.float64).max)
+    low, high = np.quantile(finite, BAND, axis=0, method="closest_observation")
+    return tuple(np.where(end < np.finfo(np.float64).max, end, np.inf) for end in (low, high))  # type: ignore[return-value]

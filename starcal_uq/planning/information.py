@@ -1,0 +1,199 @@
+"""What frames will say about the camera before they are taken: the information of each, from geometry alone.
+
+Of a frame, a calibration needs to know where its stars will fall and how well each will be located. The information on
+the parameters with the frame's attitude eliminated, the response of the attitude to the parameters, and the attitude's
+own noise then follow from the likelihood that calibrates, at the camera's own parameters and without noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.core.errors import PlanningError
+from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.observations.frames import StarFrames
+from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky, choose_attitudes
+
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.sky.catalogue import StarCatalogue
+
+# Centroid noise, px per axis: one number, or a function from magnitudes (n,) to (n,).
+Noise = float | Callable[[FloatArray], FloatArray]
+
+# An attitude needs this many stars before it says anything about the camera.
+LEAST_STARS = 3
+_STARS_AT_ONCE = 20_000
+
+
+@dataclass(frozen=True, eq=False)
+class FrameSet:
+    """Frames that could be taken, without noise, and what each says. M frames, N stars, p parameters.
+
+    Attributes
+    ----------
+    camera : Camera
+        Seen through which, and linearised at which.
+    rotations : (M, 3, 3) array
+        R_cam_icrs.
+    frames : StarFrames
+        Noise-free pixels, directions, and the inverse of each star's noise.
+    mag : (N,) array
+        Magnitudes.
+    information : (M, p, p) array
+        Fisher information of each frame on the parameters, its attitude eliminated (px units).
+    response : (M, 3, p) array
+        Derivative of its attitude (pitch, yaw, roll; rad) with respect to the parameters.
+    noise : (M, 3, 3) array
+        Covariance of its attitude due to centroid noise, rad^2.
+    """
+
+    camera: Camera
+    rotations: FloatArray
+    frames: StarFrames
+    mag: FloatArray
+    information: FloatArray
+    response: FloatArray
+    noise: FloatArray
+
+    @property
+    def n_frames(self) -> int:
+        """Number M of frames."""
+        return len(self.rotations)
+
+    @property
+    def n_stars(self) -> IntArray:
+        """Stars per frame, (M,)."""
+        return self.frames.sizes
+
+    @property
+    def mean_stars(self) -> float:
+        """Stars per frame on average."""
+        return float(np.mean(self.n_stars))
+
+    @cached_property
+    def common(self) -> FloatArray:
+        """Common rotation (3, p): the mean of `response` over the frames."""
+        common: FloatArray = self.response.mean(axis=0)
+        return common
+
+    @cached_property
+    def rest(self) -> FloatArray:
+        """What the attitude of each frame adds to the common rotation, (M, 3, p)."""
+        rest: FloatArray = self.response - self.common
+        return rest
+
+    def seen_within(self, fraction: float) -> FloatArray:
+        """Information (M, p, p) when only stars in the middle of the detector are used.
+
+        Parameters
+        ----------
+        fraction : float
+            Part of the detector's area, as a window of the detector's shape around its centre. A frame with fewer than
+            three stars in it has no information.
+        """
+        centre = np.array(self.camera.centre_px)[:, None]
+        half = 0.5 * np.sqrt(fraction) * np.array([[self.camera.width_px], [self.camera.height_px]])
+        inside = np.all(np.abs(self.frames.pixel - centre) <= half, axis=0)
+        enough = self.frames.sum(inside.astype(np.float64)) >= LEAST_STARS
+        kept = inside & np.repeat(enough, self.frames.sizes)
+        information = np.zeros_like(self.information)
+        if enough.any():
+            some, _, _ = _matrices(self.camera, self.frames.select(kept), self.rotations[enough])
+            information[enough] = some
+        return information
+
+
+def look_at(stars: StarCatalogue, camera: Camera, rotations: FloatArray, noise: Noise, min_stars: int) -> FrameSet:
+    """The frames at given attitudes that show enough stars; the others are left out.
+
+    Raises
+    ------
+    PlanningError
+        When none shows `min_stars`.
+    """
+    views = Sky(stars, camera, EDGE_SIGMAS * largest_noise(noise, stars.mag)).views(rotations)
+    enough = np.array([len(seen) >= min_stars for seen, _ in views], dtype=np.bool_)
+    if not enough.any():
+        raise PlanningError(
+            f"none of the {len(rotations)} candidate attitudes shows {min_stars} stars: give others, lower min_stars "
+            "or use a deeper catalogue."
+        )
+    return _frame_set(
+        stars, camera, rotations[enough], [v for v, good in zip(views, enough, strict=True) if good], noise
+    )
+
+
+def random_frames(
+    stars: StarCatalogue, camera: Camera, noise: Noise, *, n_frames: int, min_stars: int, seed: int
+) -> FrameSet:
+    """Frames at uniformly random attitudes that show at least `min_stars` stars, as `simulate` takes them.
+
+    Raises
+    ------
+    CatalogueError
+        When the field is too narrow for the catalogue to show `min_stars`.
+    """
+    sky = Sky(stars, camera, EDGE_SIGMAS * largest_noise(noise, stars.mag))
+    rng = np.random.default_rng(seed)
+    return _frame_set(stars, camera, *choose_attitudes(sky, rng, n_frames=n_frames, min_stars=min_stars), noise)
+
+
+def noise_of(noise: Noise, mag: FloatArray) -> FloatArray:
+    """Noise of stars, px per axis, (n,).
+
+    Raises
+    ------
+    PlanningError
+        When it is not positive and finite for every star.
+    """
+    values = np.asarray(noise(mag), dtype=np.float64) if callable(noise) else np.full(mag.shape, float(noise))
+    if values.shape != mag.shape or not np.all((values > 0.0) & np.isfinite(values)):
+        raise PlanningError(
+            "sigma_px must be a noise above zero in px, or a function that gives one for every magnitude of an array."
+        )
+    return values
+
+
+def largest_noise(noise: Noise, mag: FloatArray) -> float:
+    """The noise of the faintest star, px per axis: stars this near to the edge are left out."""
+    return float(np.max(noise_of(noise, mag), initial=0.0))
+
+
+def _frame_set(
+    stars: StarCatalogue,
+    camera: Camera,
+    rotations: FloatArray,
+    views: list[tuple[IntArray, FloatArray]],
+    noise: Noise,
+) -> FrameSet:
+    index = np.concatenate([seen for seen, _ in views])
+    mag = stars.mag[index]
+    frames = StarFrames(
+        pixel=np.ascontiguousarray(np.concatenate([xy for _, xy in views]).T),
+        r=np.ascontiguousarray(stars.directions_icrs[index].T),
+        weight=1.0 / noise_of(noise, mag),
+        starts=np.concatenate([[0], np.cumsum([len(seen) for seen, _ in views])]).astype(np.int64),
+    )
+    return FrameSet(camera, rotations, frames, mag, *_matrices(camera, frames, rotations))
+
+
+def _matrices(camera: Camera, frames: StarFrames, rotations: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Information (M, p, p), attitude response (M, 3, p) and attitude noise (M, 3, 3) of every frame."""
+    information, response, noise = [], [], []
+    for first, last in frames.parts(_STARS_AT_ONCE):
+        likelihood = MarginalLikelihood(frames.part(first, last), camera.distortion)
+        state, _ = likelihood.profile(camera.theta, rotations[first:last])
+        derivatives = likelihood.derivatives(camera.theta, state)
+        h = likelihood.project_out(state, derivatives)
+        information.append(np.moveaxis(likelihood.frames.sum(np.einsum("axn,bxn->abn", h, h)), 2, 0))
+        # A parameter too large turns the attitude the other way: the stars are where they are.
+        response.append(-likelihood.attitude_response(state, derivatives).transpose(2, 1, 0))
+        noise.append(np.moveaxis(state.inverse, 2, 0))
+    return np.concatenate(information), np.concatenate(response), np.concatenate(noise)

@@ -1,0 +1,289 @@
+"""How many frames does a calibration need? From the camera sheet alone, before any data.
+
+Frames are drawn at random attitudes as `simulate` draws them, each one's information is that of the likelihood that
+calibrates (`starcal_uq.planning.information`), and campaigns of any number of frames are forecast from them
+(`starcal_uq.planning.forecast`). No data are simulated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import random_rotations
+from starcal_uq.core.errors import PlanningError
+from starcal_uq.core.types import FloatArray
+from starcal_uq.planning.forecast import N_CAMPAIGNS, SCOPES, Forecaster, nea_arcsec
+from starcal_uq.planning.information import FrameSet, Noise, largest_noise, noise_of, random_frames
+from starcal_uq.planning.plan_result import Need, Plan
+from starcal_uq.runs.folder import provenance
+from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.sky.catalogue import StarCatalogue
+
+N_FRAMES = (10, 30, 100, 300, 1000, 3000)
+SWEEP_FRAMES = 1000
+_SWEEP_GEOMETRIES, _SWEEP_CAMPAIGNS, _TRIED_ATTITUDES = 1000, 64, 1000
+# With fewer attitudes than this that show enough stars, a magnitude limit is left out of the sweep.
+_LEAST_SKY = 0.02
+# More noise than this is a mistake in the units.
+_WORST_NOISE_PX = 20.0
+_MAG_STEPS = (-2.0, -1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5, 2.0)
+_NOISE_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
+_FIELD_PARTS = (0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
+
+
+class HasInformation(Protocol):
+    """A `Calibration` or `Posterior`: what its data say about the parameters."""
+
+    @property
+    def information(self) -> FloatArray:
+        """Fisher information (p, p)."""
+        ...
+
+
+def plan(
+    camera: Camera,
+    stars: StarCatalogue,
+    *,
+    sigma_px: Noise = 0.05,
+    n_frames: Sequence[int] = N_FRAMES,
+    min_stars: int = 10,
+    max_mag: float | None = None,
+    target_arcsec: float | None = None,
+    confidence: float = 0.997,
+    scope: str = "common",
+    after: HasInformation | None = None,
+    sweeps: bool = True,
+    n_geometries: int = 3000,
+    n_campaigns: int = N_CAMPAIGNS,
+    seed: int = 0,
+) -> Plan:
+    """Forecast parameter and attitude errors of a calibration, and the frames that it needs.
+
+    Parameters
+    ----------
+    camera : Camera
+        The sheet; optics and distortion are those that one expects.
+    stars : StarCatalogue
+        The sky.
+    sigma_px : float or callable
+        Centroid noise, px per axis; a function from magnitudes (n,) to noise (n,) where it depends on them.
+    n_frames : sequence of int
+        Sizes of campaigns to forecast.
+    min_stars : int
+        Frames with fewer stars are not used (at least 3).
+    max_mag : float, optional
+        The sensor's limit, where `stars` is deeper: the sweep then goes beyond it.
+    target_arcsec : float, optional
+        Two-axis error across the boresight that is to be kept.
+    confidence : float
+        Probability of that.
+    scope : {"common", "rest", "calibration", "total"}
+        Part of the attitude error that the target is for: the common rotation, the rest after alignment, both, or both
+        with the centroid noise of a frame.
+    after : Calibration or Posterior, optional
+        Data that are there already, whose information counts.
+    sweeps : bool
+        Also forecast 1000 frames with other magnitude limits, noise, and parts of the detector.
+    n_geometries : int
+        Random attitudes that campaigns are drawn from, and that the errors of attitude are taken over.
+    n_campaigns : int
+        Campaigns to average over.
+    seed : int
+        Repeats bit for bit.
+
+    Raises
+    ------
+    PlanningError
+        For settings that cannot work.
+    CatalogueError
+        When the field is too narrow for the catalogue to show `min_stars`.
+    """
+    _check(n_frames, min_stars, target_arcsec, n_geometries, n_campaigns)
+    if isinstance(sigma_px, (int, float)) and not 0.0 < sigma_px <= _WORST_NOISE_PX:
+        raise PlanningError(
+            f"the centroid noise is {sigma_px:g} px: give a number above zero, at most {_WORST_NOISE_PX:g} px per axis."
+        )
+    start = start_information(after, camera)
+    limit = float(np.max(stars.mag, initial=-np.inf)) if max_mag is None else float(max_mag)
+    seen = stars.select(stars.mag <= limit)
+    if len(seen) == 0:
+        raise PlanningError(f"no star is brighter than max_mag={limit:g}: raise it or use another catalogue.")
+    frames = random_frames(seen, camera, sigma_px, n_frames=n_geometries, min_stars=min_stars, seed=seed)
+    # A posterior does not say how many data it rests on; its noise is then as uncertain as the new frames make it.
+    options = {
+        "confidence": confidence,
+        "start": start,
+        "start_dof": float(getattr(after, "dof", 0.0)),
+        "n_campaigns": n_campaigns,
+        "seed": seed,
+    }
+    forecast = _forecaster(frames, scope, options).forecast(n_frames)
+    noise = float(np.sqrt(np.mean(noise_of(sigma_px, frames.mag) ** 2)))
+    settings = {
+        "n_geometries": n_geometries,
+        "n_campaigns": n_campaigns,
+        "stars": stars.source,
+        "band": stars.band,
+        "after": None if after is None else type(after).__name__,
+    }
+    table = None
+    if sweeps:
+        scene = _Scene(stars, camera, sigma_px, limit, min_stars, seed)
+        table = _sweep(scene, frames, noise, scope, options | {"n_campaigns": _SWEEP_CAMPAIGNS}, target_arcsec)
+    return Plan(
+        camera=camera,
+        sigma_px=noise,
+        max_mag=limit,
+        min_stars=min_stars,
+        mean_stars=frames.mean_stars,
+        sky_fraction=_sky_fraction(seen, camera, sigma_px, min_stars, seed),
+        forecast=forecast,
+        nea_arcsec=nea_arcsec(frames),
+        confidence=confidence,
+        scope=scope,
+        target_arcsec=target_arcsec,
+        needs=() if target_arcsec is None else _needs(frames, target_arcsec, options),
+        sweeps=table,
+        seed=seed,
+        provenance=provenance(seed, settings, None),
+    )
+
+
+class _Scene(NamedTuple):
+    """What the sweeps vary around."""
+
+    stars: StarCatalogue
+    camera: Camera
+    noise: Noise
+    max_mag: float
+    min_stars: int
+    seed: int
+
+
+def _forecaster(frames: FrameSet, scope: str, options: dict[str, Any]) -> Forecaster:
+    return Forecaster(frames.information, frames.mean_stars, frames, scope=scope, **options)
+
+
+def _needs(frames: FrameSet, target_arcsec: float, options: dict[str, Any]) -> tuple[Need, ...]:
+    found = []
+    for scope in SCOPES:
+        forecaster = _forecaster(frames, scope, options)
+        found.append(
+            Need(
+                scope,
+                forecaster.frames_needed(target_arcsec),
+                forecaster.frames_needed(target_arcsec, share=0.95),
+                forecaster.floor_arcsec(),
+            )
+        )
+    return tuple(found)
+
+
+def _sweep(
+    scene: _Scene,
+    frames: FrameSet,
+    noise_px: float,
+    scope: str,
+    options: dict[str, Any],
+    target_arcsec: float | None,
+) -> pd.DataFrame:
+    import pandas as pd
+
+    rows = []
+    for name, value, information, mission, sky in _points(scene, frames, noise_px):
+        forecaster = Forecaster(information, mission.mean_stars, mission, scope=scope, **options)
+        row = {"sweep": name, "value": value, "sky_fraction": sky, "mean_stars": mission.mean_stars}
+        row |= forecaster.forecast((SWEEP_FRAMES,)).to_dataframe().iloc[0].to_dict()
+        row |= dict(zip((f"nea_{axis}_arcsec" for axis in ("pitch", "yaw", "roll")), nea_arcsec(mission), strict=True))
+        if target_arcsec is not None:
+            needed = forecaster.frames_needed(target_arcsec)
+            row["frames_needed"] = np.inf if needed is None else float(needed)
+        rows.append(row)
+    table = pd.DataFrame(rows)
+    return table.astype({"n_frames": np.int64})
+
+
+def _points(
+    scene: _Scene, frames: FrameSet, noise_px: float
+) -> Iterator[tuple[str, float, FloatArray, FrameSet, float]]:
+    """Name, value, information, mission and part of the sky of every point of the sweeps."""
+    deepest = float(np.max(scene.stars.mag))
+    for step in _MAG_STEPS:
+        limit = scene.max_mag + step
+        # A catalogue ends at its faintest star, a little above the limit that it was cut at.
+        if limit > deepest + 0.1:
+            break
+        stars = scene.stars.select(scene.stars.mag <= limit)
+        sky = _sky_fraction(stars, scene.camera, scene.noise, scene.min_stars, scene.seed)
+        if sky < _LEAST_SKY:
+            continue
+        some = random_frames(
+            stars,
+            scene.camera,
+            scene.noise,
+            n_frames=_SWEEP_GEOMETRIES,
+            min_stars=scene.min_stars,
+            seed=scene.seed,
+        )
+        yield "magnitude limit", limit, some.information, some, sky
+    seen = scene.stars.select(scene.stars.mag <= scene.max_mag)
+    sky = _sky_fraction(seen, scene.camera, scene.noise, scene.min_stars, scene.seed)
+    for factor in _NOISE_FACTORS:
+        scaled = replace(frames, information=frames.information / factor**2, noise=frames.noise * factor**2)
+        yield "noise", factor * noise_px, scaled.information, scaled, sky
+    for part in _FIELD_PARTS:
+        yield "part of the detector", part, frames.seen_within(part), frames, sky
+
+
+def _sky_fraction(stars: StarCatalogue, camera: Camera, noise: Noise, min_stars: int, seed: int) -> float:
+    """Part of random attitudes that show enough stars."""
+    if len(stars) == 0:
+        return 0.0
+    sky = Sky(stars, camera, EDGE_SIGMAS * largest_noise(noise, stars.mag))
+    views = sky.views(random_rotations(_TRIED_ATTITUDES, np.random.default_rng([seed, 1])))
+    return float(np.mean([len(seen) >= min_stars for seen, _ in views]))
+
+
+def start_information(after: HasInformation | None, camera: Camera) -> FloatArray | None:
+    """Information (p, p) of data that are there already; None without.
+
+    Raises
+    ------
+    PlanningError
+        When they are about other parameters than the camera's.
+    """
+    if after is None:
+        return None
+    start = np.asarray(after.information, dtype=np.float64)
+    if start.shape != (len(camera.theta),) * 2:
+        raise PlanningError(
+            f"the data that are there already are about {len(start)} parameters, but the camera has "
+            f"{len(camera.theta)}: plan for the camera of that calibration."
+        )
+    return start
+
+
+def _check(
+    n_frames: Sequence[int], min_stars: int, target_arcsec: float | None, n_geometries: int, n_campaigns: int
+) -> None:
+    for good, text in (
+        (len(n_frames) > 0 and all(n >= 1 for n in n_frames), "n_frames holds a number below 1, or none: give some."),
+        (min_stars >= 3, f"min_stars is {min_stars}: an attitude needs at least 3."),
+        (
+            target_arcsec is None or 0.0 < target_arcsec < np.inf,
+            f"the target is {target_arcsec} arcsec: give an error above zero.",
+        ),
+        (n_geometries >= 50, f"n_geometries is {n_geometries}: give at least 50."),
+        (n_campaigns >= 20, f"n_campaigns is {n_campaigns}: give at least 20."),
+    ):
+        if not good:
+            raise PlanningError(text)

@@ -1,0 +1,150 @@
+"""Figure of an error budget: what each contributor reaches, and the totals against their limits."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.budgeting.rows import AXES, CROSS_BORESIGHT, SCOPES, Contributor, confidence_text
+from starcal_uq.budgeting.shapes import one_axis_factor, two_axis_radius
+from starcal_uq.core.formatting import significant
+from starcal_uq.presentation.figures import style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from starcal_uq.budgeting.result import Budget
+
+_PANELS = ((CROSS_BORESIGHT, "Across the boresight, X and Y together"), ("roll", "About the boresight, Z"))
+_COLOURS = {"posterior": style.SKY, "file": style.ORANGE}
+_TALL = 0.31
+
+
+def plot_budget(budget: Budget) -> Figure:
+    """What each contributor reaches at the budget's confidence, and the totals (mixed interpretation), in two panels.
+
+    Contributors that nobody assessed stand in the figure by name: an empty place is not a zero. Limits are drawn of
+    requirements that the totals may be held against: at the budget's confidence, and mixed.
+    """
+    names = list(dict.fromkeys(row.name for row in budget.rows))
+    figure = style.new_figure(11.5, 1.6 + _TALL * (len(names) + 3))
+    panels = figure.subplots(1, 2, sharey=True)
+    for ax, (axis, title) in zip(panels, _PANELS, strict=True):
+        _panel(ax, budget, names, axis)
+        style.label(ax, title, f"|mean| + n sigma at {confidence_text(budget.confidence)} [arcsec]")
+    style.legend_above(figure, _handles(budget))
+    return figure
+
+
+def _panel(ax: Axes, budget: Budget, names: list[str], axis: str) -> None:
+    style.dress(ax, grid=True)
+    ax.grid(False, axis="y")
+    by_name = {name: [row for row in budget.rows if row.name == name] for name in names}
+    reaches = {name: _reach(rows, axis, budget.confidence) for name, rows in by_name.items()}
+    sums = [budget.total(axis, scope) for scope in SCOPES]
+    limits = [outcome for outcome in budget.comparable if outcome.requirement.axis == axis]
+    shown = [value for value in reaches.values() if value] + [s.rule_arcsec for s in sums if s.rule_arcsec > 0.0]
+    shown += [outcome.requirement.limit_arcsec for outcome in limits]
+    low, high = (min(shown), max(shown)) if shown else (0.1, 1.0)
+    left = 10.0 ** np.floor(np.log10(low * 0.7))
+    # Room on the right for the numbers.
+    ax.set_xlim(left, high * (high / left) ** 0.22)
+    ax.set_xscale("log")
+    for place, name in enumerate(names):
+        row = by_name[name][0]
+        value = reaches[name]
+        if not _present(budget, name, axis):
+            _write(ax, left, place, "–", style.GREY)
+            continue
+        if value is None or value == 0.0:
+            missing = value is None
+            text = "not assessed" if missing else "does not apply" if not row.applies else "0"
+            colour = style.VERMILLION if missing else style.GREY
+            _write(ax, left, place, text, colour, italic=missing)
+            continue
+        hatch = "///" if row.absorbed_by_alignment == "yes" else ""
+        source = next((r.source for r in by_name[name] if r.assessed), "file")
+        ax.barh(place, value - left, left=left, height=0.66, color=_COLOURS[source], hatch=hatch, edgecolor="white")
+        _write(ax, value, place, f"{significant(value)}″", style.INK)
+    for offset, entry in enumerate(sums):
+        at = len(names) + 0.7 + offset
+        if not entry.rule_arcsec > 0.0:
+            _write(ax, left, at, "not assessed", style.VERMILLION, italic=True)
+            continue
+        ax.plot(entry.rule_arcsec, at, "o", color=style.INK, markersize=7)
+        ax.plot(entry.sampled_arcsec, at, "D", color="white", markeredgecolor=style.INK, markersize=4.2)
+        least = "≥ " if entry.at_least else ""
+        mine = [outcome.requirement.limit_arcsec for outcome in limits if outcome.total.scope == entry.scope]
+        larger = entry.rule_arcsec if entry.unresolved else entry.larger_arcsec
+        _write(ax, max(larger, *mine, 0.0), at, f"{least}{significant(larger, 3)}″", style.INK, shift=8)
+    for outcome in limits:
+        at = len(names) + 0.7 + SCOPES.index(outcome.requirement.scope)
+        colour = style.VERMILLION if outcome.verdict == "violated" else style.GREEN
+        limit = outcome.requirement.limit_arcsec
+        ax.plot([limit, limit], [at - 0.42, at + 0.42], color=colour, linewidth=2.4)
+    ax.axhline(len(names) - 0.15, color=style.GREY, linewidth=0.7)
+    ax.set_ylim(len(names) + 2.4, -0.7)
+    places = [*range(len(names)), *(len(names) + 0.7 + i for i in range(2))]
+    ax.set_yticks(places, [*names, *(f"total {scope}" for scope in SCOPES)], fontsize=style.TICK_SIZE)
+    ax.tick_params(axis="y", length=0)
+
+
+def _present(budget: Budget, name: str, axis: str) -> bool:
+    """False for a contributor of the user's own that its file names on other axes only."""
+    axes = AXES[:2] if axis == CROSS_BORESIGHT else (axis,)
+    return any(row.name == name and row.axis in axes for row in budget.rows)
+
+
+def _reach(rows: list[Contributor], axis: str, confidence: float) -> float | None:
+    """|mean| + n sigma of one contributor; None if it is not assessed on this axis."""
+    axes = AXES[:2] if axis == CROSS_BORESIGHT else (axis,)
+    chosen = [row for row in rows if row.axis in axes and row.assessed]
+    if not chosen or len(chosen) < len([row for row in rows if row.axis in axes]):
+        return None
+    mean = math.hypot(*(row.mean_arcsec for row in chosen))
+    if len(chosen) == 2:
+        return mean + two_axis_radius(confidence, chosen[0].sigma_arcsec, chosen[1].sigma_arcsec)
+    return mean + one_axis_factor(confidence) * chosen[0].sigma_arcsec
+
+
+def _write(ax: Axes, x: float, y: float, text: str, colour: str, *, italic: bool = False, shift: int = 4) -> None:
+    ax.annotate(
+        text,
+        (x, y),
+        xytext=(shift, 0),
+        textcoords="offset points",
+        va="center",
+        fontsize=style.TICK_SIZE,
+        color=colour,
+        style="italic" if italic else "normal",
+    )
+
+
+def _handles(budget: Budget) -> list[object]:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    handles: list[object] = [
+        Patch(facecolor=style.SKY, label="from the posterior"),
+        Patch(facecolor=style.ORANGE, label="from the budget file"),
+        Patch(facecolor=style.GREY, hatch="///", edgecolor="white", label="absorbed by alignment"),
+        Line2D([], [], marker="o", linestyle="", color=style.INK, markersize=7, label="total by the rule"),
+        Line2D(
+            [],
+            [],
+            marker="D",
+            linestyle="",
+            color="white",
+            markeredgecolor=style.INK,
+            markersize=4.2,
+            label="total by sampling",
+        ),
+    ]
+    if budget.comparable:
+        handles.append(Line2D([], [], color=style.GREEN, linewidth=2.4, label="limit"))
+    if any(outcome.verdict == "violated" for outcome in budget.comparable):
+        handles.append(Line2D([], [], color=style.VERMILLION, linewidth=2.4, label="limit, violated"))
+    return handles

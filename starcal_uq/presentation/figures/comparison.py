@@ -1,0 +1,111 @@
+"""Difference of two cameras over the detector, beside what was to be expected."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.core.formatting import significant
+from starcal_uq.core.types import FloatArray
+from starcal_uq.presentation.figures import style
+from starcal_uq.presentation.figures.levels import round_levels, ticks_at_levels
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.colors import Normalize
+    from matplotlib.figure import Figure
+
+    from starcal_uq.comparison.result import CameraComparison
+
+_ARROWS = 9
+# Share of the largest length below which all colours are the same.
+_FOOT = 0.04
+# Below this, arcsec, only rounding is left.
+_NOTHING = 1e-9
+_TIMES = (1.0, 2.0, 3.0)
+
+
+def plot_camera_comparison(found: CameraComparison) -> Figure:
+    """Arrows and size of the difference, and beside it the size that the joint uncertainty gives, in the same colours.
+
+    White lines in the left panel are where the difference is one, two and three times the joint standard deviation of
+    its length. Without a covariance there is the left panel alone.
+    """
+    tall = 1.0 + 4.05 * float(np.ptp(found.y_px) / np.ptp(found.x_px))
+    figure = style.new_figure(11.0 if found.tested else 6.6, tall)
+    panels = figure.subplots(1, 2 if found.tested else 1, squeeze=False)[0]
+    length = np.linalg.norm(found.difference_arcsec, axis=-1)
+    if length.max() < _NOTHING:
+        length = np.zeros_like(length)
+    both = np.stack([length, found.sigma_arcsec]) if found.tested else length
+    # Lengths vanish at points; what is a small share of the largest has one colour.
+    foot = _FOOT * float(both.max())
+    levels, norm = round_levels(np.maximum(both, foot))
+    a, b = found.labels
+    image = _filled(panels[0], found, length, levels, norm, f"{b} minus {a}")
+    if found.tested:
+        _multiples(panels[0], found)
+        _filled(panels[1], found, found.sigma_arcsec, levels, norm, "Expected from both uncertainties (1 sigma)")
+    _arrows(panels[0], found)
+    bar = figure.colorbar(image, ax=list(panels), fraction=0.046, pad=0.02)
+    style.dress_bar(bar, "difference of directions [arcsec]")
+    ticks_at_levels(bar, levels)
+    return figure
+
+
+def _filled(
+    ax: Axes, found: CameraComparison, values: FloatArray, levels: FloatArray, norm: Normalize | None, title: str
+) -> Any:
+    style.dress(ax)
+    x, y = found.x_px, found.y_px
+    image = ax.contourf(x, y, np.maximum(values, levels[0]), levels=levels, norm=norm, cmap="cividis")
+    ax.set_xlim(x[0], x[-1])
+    ax.set_ylim(y[-1], y[0])
+    ax.set_aspect("equal")
+    style.label(ax, title, "x [px]", "y [px]")
+    return image
+
+
+def _multiples(ax: Axes, found: CameraComparison) -> None:
+    """Contours of the difference in its standard deviations."""
+    lines = ax.contour(found.x_px, found.y_px, found.ratio, levels=_TIMES, colors="white", linewidths=(0.9, 1.3, 1.8))
+    ax.clabel(lines, fmt=lambda v: f"{v:g}σ", fontsize=style.TICK_SIZE, colors="white")
+
+
+def _arrows(ax: Axes, found: CameraComparison) -> None:
+    step = max(1, (len(found.x_px) - 1) // (_ARROWS - 1))
+    some = slice(step // 2, None, step)
+    d = found.difference_arcsec[some, some]
+    x, y = np.meshgrid(found.x_px[some], found.y_px[some])
+    # The largest are in the corners and would leave nothing to see elsewhere.
+    typical = float(np.percentile(np.linalg.norm(d, axis=-1), 85.0))
+    if typical < _NOTHING:
+        return
+    spacing = float(found.x_px[step] - found.x_px[0])
+    arrows = ax.quiver(
+        x,
+        y,
+        d[..., 0],
+        d[..., 1],
+        angles="xy",
+        scale_units="xy",
+        scale=typical / (0.8 * spacing),
+        color="white",
+        edgecolor=style.INK,
+        linewidth=0.6,
+        width=0.006,
+    )
+    exponent = np.floor(np.log10(typical))
+    key = max(s * 10.0**exponent for s in (1.0, 2.0, 5.0) if s * 10.0**exponent <= typical)
+    ax.quiverkey(
+        arrows,
+        0.93,
+        1.033,
+        key,
+        f"{significant(key, 1)}″",
+        labelpos="W",
+        fontproperties={"size": style.TICK_SIZE},
+        labelcolor=style.INK,
+        color=style.INK,
+    )

@@ -1,0 +1,138 @@
+"""Correlation heat maps and the price of coupling."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.core.formatting import significant
+from starcal_uq.core.types import FloatArray
+from starcal_uq.presentation.figures import style
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from matplotlib.image import AxesImage
+
+    from starcal_uq.propagation.coupling import Coupling
+
+_SYMBOLS = {"x0": "$x_0$", "y0": "$y_0$", "f": "$f$", "sigma": r"$\sigma$", "sigma_scale": r"$s_\sigma$"}
+_SYMBOLS |= {name: f"${name[0]}_{name[1]}$" for name in ("k1", "k2", "k3", "p1", "p2")}
+
+
+def plot_correlation(coupling: Coupling, ax: Axes | None = None, *, extended: bool = False) -> Axes:
+    """Heat map of the correlation matrix with its numbers.
+
+    Parameters
+    ----------
+    coupling
+        Result of `starcal_uq.coupling`.
+    ax
+        Where to draw; a new figure if not given.
+    extended
+        With the constant attitude errors pitch, yaw and roll that the parameters cause.
+    """
+    names = coupling.extended_names if extended else coupling.parameter_names
+    if ax is None:
+        side = 1.4 + 0.62 * len(names)
+        ax = style.new_axes(side + 0.8, side)
+    image = _extended(ax, coupling) if extended else _heat_map(ax, np.asarray(coupling.correlation), names)
+    style.label(ax, "With the boresight" if extended else "Camera parameters")
+    style.colour_bar(ax, image, "correlation")
+    return ax
+
+
+def plot_correlations(coupling: Coupling) -> Figure:
+    """Both matrices side by side: the camera parameters alone, and with the boresight."""
+    p, q = len(coupling.parameter_names), len(coupling.extended_names)
+    figure = style.new_figure(11.0, 11.0 * q / (p + q) * 0.83 + 0.5)
+    left, right = figure.subplots(1, 2, width_ratios=(p, q))
+    _heat_map(left, np.asarray(coupling.correlation), coupling.parameter_names)
+    image = _extended(right, coupling)
+    style.label(left, "Camera parameters")
+    style.label(right, "With the constant attitude error they cause")
+    bar = figure.colorbar(image, ax=[left, right], fraction=0.03, pad=0.02, aspect=32)
+    style.dress_bar(bar, "correlation")
+    return figure
+
+
+def plot_couplings(coupling: Coupling, ax: Axes | None = None) -> Axes:
+    """How many times larger each sigma is because the other parameters are unknown too."""
+    if ax is None:
+        ax = style.new_axes(4.6, 2.6)
+    style.dress(ax, grid=True)
+    ratio = np.asarray(coupling.sigma_marginal) / np.asarray(coupling.sigma_conditional)
+    rows = np.arange(len(ratio))
+    ax.barh(rows, ratio, color=style.BLUE, height=0.62)
+    for row, value in zip(rows, ratio, strict=True):
+        ax.annotate(
+            f"×{significant(float(value))}",
+            (value, row),
+            xytext=(4, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=style.TICK_SIZE,
+            color=style.INK,
+        )
+    ax.axvline(1.0, color=style.INK, linewidth=1.0)
+    ax.set_yticks(rows, [symbol(n) for n in coupling.parameter_names], fontsize=style.LABEL_SIZE)
+    ax.invert_yaxis()
+    ax.set_xlim(0.0, 1.18 * float(ratio.max()))
+    ax.grid(False, axis="y")
+    style.label(ax, "Price of coupling", "sigma / sigma if all other parameters were known")
+    return ax
+
+
+def symbol(name: str) -> str:
+    """The name as a mathematical symbol for labels, or itself."""
+    return _SYMBOLS.get(name, name)
+
+
+def _extended(ax: Axes, coupling: Coupling) -> AxesImage:
+    image = _heat_map(ax, np.asarray(coupling.extended_correlation), coupling.extended_names)
+    split = len(coupling.parameter_names) - 0.5
+    ax.axhline(split, color=style.INK, linewidth=1.2)
+    ax.axvline(split, color=style.INK, linewidth=1.2)
+    return image
+
+
+def _heat_map(ax: Axes, matrix: FloatArray, names: Sequence[str]) -> AxesImage:
+    image = ax.imshow(matrix, cmap="RdBu_r", vmin=-1.0, vmax=1.0)
+    style.dress(ax)
+    for spine in ax.spines.values():
+        spine.set_visible(False)
+    ax.tick_params(length=0.0, top=True, labeltop=True, bottom=False, labelbottom=False)
+    ticks = np.arange(len(names))
+    ax.set_xticks(ticks, [symbol(n) for n in names], fontsize=style.LABEL_SIZE)
+    ax.set_yticks(ticks, [symbol(n) for n in names], fontsize=style.LABEL_SIZE)
+    ax.set_xticks(ticks[1:] - 0.5, minor=True)
+    ax.set_yticks(ticks[1:] - 0.5, minor=True)
+    ax.grid(True, which="minor", color="white", linewidth=1.6)
+    ax.tick_params(which="minor", length=0.0, top=False, bottom=False, left=False)
+    for (row, column), value in np.ndenumerate(matrix):
+        colour = "white" if abs(value) > 0.62 else style.INK
+        weight = "bold" if row != column and abs(value) >= 0.7 else "normal"
+        ax.text(
+            column,
+            row,
+            correlation_text(float(value), row == column),
+            ha="center",
+            va="center",
+            fontsize=style.TICK_SIZE,
+            color=colour,
+            weight=weight,
+        )
+    return image
+
+
+def correlation_text(value: float, diagonal: bool = False) -> str:
+    """Two decimals; three near one, because 0.99 and 0.999 differ by a factor of three in sigma."""
+    if diagonal:
+        return "1"
+    if abs(value) >= 0.99:
+        text = f"{np.sign(value) * min(abs(value), 0.9999):.4f}" if abs(value) >= 0.999 else f"{value:.3f}"
+    else:
+        text = f"{value:.2f}"
+    return text.replace("-", "−") if float(text) != 0.0 else "0.00"

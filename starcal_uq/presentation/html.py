@@ -1,0 +1,29 @@
+"""Templates of the reports, and images inside a page."""
+
+from __future__ import annotations
+
+import base64
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+
+def template_environment() -> Environment:
+    """Jinja's environment for the templates of the package: everything is escaped, and a missing name is an error."""
+    import jinja2
+
+    return jinja2.Environment(
+        loader=jinja2.ChoiceLoader(
+            [jinja2.PackageLoader(package) for package in ("starcal_uq.presentation", "starcal_uq.paper.show")]
+        ),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+
+
+def embedded_image(png: bytes) -> dict[str, Any]:
+    """An image and its width on the page: half its pixels, so that it is sharp on fine screens and on paper."""
+    return {"data": base64.b64encode(png).decode("ascii"), "width": int.from_bytes(png[16:20], "big") // 2}

@@ -1,0 +1,177 @@
+"""A plan as one HTML file, and the tables and figures beside it."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.core.formatting import count, fixed, significant
+from starcal_uq.presentation.html import embedded_image, template_environment
+from starcal_uq.presentation.words.planning import SCOPE_NAMES, level, need_words, settings_sentence
+from starcal_uq.runs.folder import RunFolder, atomic_path, atomic_write_bytes, atomic_write_text
+
+if TYPE_CHECKING:
+    from starcal_uq.planning.check import ForecastCheck
+    from starcal_uq.planning.frame_choice_result import FrameChoice
+    from starcal_uq.planning.plan_result import Plan
+
+PAGE = "plan.html"
+_TEMPLATE = "plan.html.j2"
+_FRAMES_SHOWN = 30
+# Columns of the table, under their groups.
+_GROUPS = (
+    (
+        "Parameters",
+        (("x0_px", "x₀ [px]"), ("y0_px", "y₀ [px]"), ("f_mm", "f [mm]"), ("distortion_corner_px", "Corner [px]")),
+    ),
+    ("Common rotation [arcsec]", tuple((f"common_{axis}_arcsec", axis) for axis in ("pitch", "yaw", "roll"))),
+    ("Rest [arcsec]", tuple((f"rest_{axis}_arcsec", axis) for axis in ("pitch", "yaw", "roll"))),
+)
+
+
+def write_plan(
+    plan: Plan, folder: str | os.PathLike[str], choice: FrameChoice | None = None, check: ForecastCheck | None = None
+) -> Path:
+    """Tables, figures and the page, which comes last: it is there only if all else is."""
+    path = RunFolder(folder).create().path
+    images = plan_figures(plan, choice, check)
+    page = render_plan(plan, images, choice, check)
+    figures = RunFolder(path / "figures").create().path
+    for name, png in images.items():
+        atomic_write_bytes(figures / f"{name}.png", png)
+    tables = {"plan": plan.to_dataframe()} | ({} if plan.sweeps is None else {"sweeps": plan.sweeps})
+    for name, table in tables.items():
+        with atomic_path(path / f"{name}.csv") as temporary:
+            table.to_csv(temporary, index=False, lineterminator="\n")
+    if choice is not None:
+        choice.save(path / "frames.csv")
+    if check is not None:
+        check.save(path / "check.csv")
+    atomic_write_text(path / "plan.json", json.dumps(plan_record(plan), indent=1) + "\n")
+    atomic_write_text(path / PAGE, page)
+    return path / PAGE
+
+
+def plan_record(plan: Plan) -> dict[str, Any]:
+    """The plan as plain values: settings, what is needed, and the forecast by number of frames."""
+    return {
+        "verdict": plan.verdict,
+        "camera": plan.camera.to_dict(),
+        "sigma_px": plan.sigma_px,
+        "max_mag": plan.max_mag,
+        "min_stars": plan.min_stars,
+        "mean_stars": plan.mean_stars,
+        "sky_fraction": plan.sky_fraction,
+        "confidence": plan.confidence,
+        "scope": plan.scope,
+        "target_arcsec": plan.target_arcsec,
+        "needs": [
+            {
+                "scope": need.scope,
+                "frames": need.frames,
+                "frames_surely": need.frames_surely,
+                "floor_arcsec": need.floor_arcsec,
+            }
+            for need in plan.needs
+        ],
+        # What a campaign does not determine is infinite, for which JSON has no number.
+        "forecast": [
+            {key: value if np.isfinite(value) else None for key, value in row.items()}
+            for row in plan.to_dataframe().to_dict("records")
+        ],
+        "provenance": plan.provenance,
+    }
+
+
+def plan_figures(plan: Plan, choice: FrameChoice | None = None, check: ForecastCheck | None = None) -> dict[str, bytes]:
+    """Every figure as PNG, by name."""
+    from starcal_uq.presentation.figures.style import png_bytes
+
+    figures = {"forecast": plan.plot_forecast()}
+    if plan.sweeps is not None:
+        figures["sweeps"] = plan.plot_sweeps()
+    if choice is not None:
+        figures["choice"] = choice.plot()
+    if check is not None:
+        figures["check"] = check.plot()
+    return {name: png_bytes(figure) for name, figure in figures.items()}
+
+
+def render_plan(
+    plan: Plan,
+    images: Mapping[str, bytes],
+    choice: FrameChoice | None = None,
+    check: ForecastCheck | None = None,
+) -> str:
+    """The page; `images` are PNG by the names of `plan_figures`."""
+    context = _context(plan, images)
+    context |= {"choice": None if choice is None else choice.verdict, "check": None if check is None else check.verdict}
+    context |= {"frame_rows": [] if choice is None else _frame_rows(choice)}
+    return template_environment().get_template(_TEMPLATE).render(context) + "\n"
+
+
+def _frame_rows(choice: FrameChoice) -> list[dict[str, str]]:
+    """The chosen frames, most valuable first."""
+    return [
+        {
+            "order": str(row["order"]),
+            "ra": fixed(row["ra_deg"], 2),
+            "dec": fixed(row["dec_deg"], 2),
+            "roll": fixed(row["roll_deg"], 1),
+            "stars": str(row["n_stars"]),
+            "score": significant(row["score"], 3),
+        }
+        for row in choice.to_dataframe().head(_FRAMES_SHOWN).to_dict("records")
+    ]
+
+
+def _context(plan: Plan, images: Mapping[str, bytes]) -> dict[str, Any]:
+    table = plan.to_dataframe()
+    groups = [(name, [pair for pair in columns if pair[0] in table]) for name, columns in _GROUPS]
+    shown = [pair for _, pairs in groups for pair in pairs]
+    edges = {pairs[0][0] for _, pairs in groups}
+    return {
+        "title": plan.camera.name or "Plan of a calibration",
+        "created": plan.provenance["created_utc"],
+        "version": plan.provenance["versions"].get("starcal_uq") or "",
+        "verdict": plan.verdict,
+        "settings": settings_sentence(plan),
+        "level": level(plan.confidence),
+        "scope": SCOPE_NAMES[plan.scope],
+        "target": None if plan.target_arcsec is None else f"{plan.target_arcsec:g} arcsec",
+        "needs": [
+            {
+                "scope": SCOPE_NAMES[need.scope],
+                "chosen": need.scope == plan.scope,
+                "frames": need_words(need, need.frames),
+                "surely": need_words(need, need.frames_surely),
+                "floor": significant(need.floor_arcsec, 3) if need.floor_arcsec > 0.0 else "0",
+            }
+            for need in plan.needs
+        ],
+        "groups": [(name, len(pairs)) for name, pairs in groups],
+        "heads": [(head, column in edges) for column, head in shown],
+        "rows": [
+            {
+                "n": count(int(row["n_frames"])),
+                "cells": [(significant(float(row[column])), column in edges) for column, _ in shown],
+                "radius": significant(float(row["radius_arcsec"]), 3),
+                "range": f"{significant(float(row['radius_low_arcsec']), 3)} to "
+                f"{significant(float(row['radius_high_arcsec']), 3)}",
+            }
+            for row in table.to_dict("records")
+        ],
+        "nea": [significant(float(value)) for value in plan.nea_arcsec],
+        "camera_rows": [(key, value) for key, value in plan.camera.to_dict().items() if key != "name"],
+        "unreached": plan.frames_needed is not None
+        and plan.sweeps is not None
+        and not bool(np.isfinite(plan.sweeps["frames_needed"]).all()),
+        "seed": plan.seed,
+        "provenance": plan.provenance["settings"],
+        "images": {name: embedded_image(png) for name, png in images.items()},
+    }

@@ -1,0 +1,156 @@
+"""The tables on what questions the model: tests for misfit, jackknife, models, replicated data, derived quantities."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.camera.distortion import parameters
+from starcal_uq.core.formatting import count, decimals_for, fixed, percent, plural, pretty_unit, significant
+from starcal_uq.diagnostics.verdict.model import MISFIT_P
+from starcal_uq.inference.derived import derived_quantities
+from starcal_uq.presentation.report.tables import Row, symbol
+
+if TYPE_CHECKING:
+    from starcal_uq.diagnostics.diagnose import Diagnosis
+    from starcal_uq.diagnostics.jackknife import Jackknife
+    from starcal_uq.diagnostics.misfit import Misfit
+    from starcal_uq.diagnostics.models import ModelComparison
+    from starcal_uq.diagnostics.predictive import PredictiveCheck
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.inference.posterior import Posterior
+
+
+def diagnosis_context(found: Diagnosis | None, cal: Calibration) -> dict[str, Any]:
+    """What the misfit section shows; empty where there is no diagnosis."""
+    if found is None:
+        return {}
+    return {
+        "misfit_rows": misfit_rows(found.misfit),
+        "misfit_sentence": _misfit_sentence(found),
+        "jackknife_rows": [] if found.jackknife is None else jackknife_rows(found.jackknife, cal),
+        "jackknife_sentence": "" if found.jackknife is None else _jackknife_sentence(found.jackknife),
+        "comparison_rows": [] if found.comparison is None else comparison_rows(found.comparison, cal),
+        "comparison_sentence": "" if found.comparison is None else found.comparison.statement,
+        "predictive_rows": predictive_rows(found.predictive),
+    }
+
+
+def misfit_rows(found: Misfit) -> list[Row]:
+    """One row per test."""
+    rows = []
+    for test in found.tests:
+        kind = f"F({count(test.dof)}, {count(test.dof_residual)}) = {fixed(test.statistic, 2)}"
+        rows.append(
+            {
+                "name": test.name[0].upper() + test.name[1:],
+                "statistic": kind if test.dof else f"z = {fixed(test.statistic, 2)}",
+                "p": significant(test.p_value),
+                "p_holm": significant(test.p_holm),
+                "found": test.p_holm < MISFIT_P,
+                "size": "" if np.isnan(test.size_px) else significant(test.size_px),
+                "visible": "" if np.isnan(test.visible) else percent(test.visible),
+                "amplitudes": "; ".join(str(a) for a in test.amplitudes),
+            }
+        )
+    return rows
+
+
+def _misfit_sentence(found: Diagnosis) -> str:
+    rejected = found.misfit.found(MISFIT_P)
+    several = f"{plural(len(found.misfit.tests), 'test')}, overall p = {significant(found.misfit.p_value)}"
+    if not rejected:
+        return f"None found anything ({several})."
+    return f"{len(rejected)} of {several}."
+
+
+def jackknife_rows(found: Jackknife, cal: Calibration) -> list[Row]:
+    """One row per parameter."""
+    formal, robust = (np.sqrt(np.diag(c)) for c in (found.formal_covariance, found.jackknife_covariance))
+    low, high = found.expected()
+    p_values = found.p_values
+    return [
+        {
+            "symbol": symbol(p.name),
+            "unit": pretty_unit(p.scaled_unit),
+            "formal": significant(float(formal[i]) / p.scale),
+            "jackknife": significant(float(robust[i]) / p.scale),
+            "ratio": fixed(float(found.ratio[i]), 2),
+            "expected": f"{fixed(float(low[i]), 2)} to {fixed(float(high[i]), 2)}",
+            "sandwich": fixed(float(found.sandwich_ratio[i]), 2),
+            "p": significant(float(p_values[i])),
+            "factor": fixed(float(found.factors[i]), 2),
+        }
+        for i, p in enumerate(parameters(cal.camera.distortion))
+    ]
+
+
+def _jackknife_sentence(found: Jackknife) -> str:
+    low, high = float(found.ratio.min()), float(found.ratio.max())
+    return f"Here the ratios are {fixed(low, 2)} to {fixed(high, 2)}, over {plural(found.n_frames, 'frame')}."
+
+
+def comparison_rows(found: ModelComparison, cal: Calibration) -> list[Row]:
+    """One row per model, the best first."""
+    unit = " px" if cal.sigma_name == "sigma" else ""
+    rows = []
+    for score in found.scores:
+        parts = [
+            f"{significant(float(np.hypot(*part[:2])))} / {significant(abs(part[2]))}"
+            for part in (score.common_arcsec, score.rest_arcsec)
+        ]
+        mine = score.model == found.fitted
+        best = score.difference == 0.0
+        rows.append(
+            {
+                "model": score.model,
+                "fitted": mine,
+                "parameters": score.n_parameters,
+                "sigma": f"{significant(score.sigma, 4)}{unit}",
+                "difference": "best" if best else f"{fixed(score.difference, 1)} ± {fixed(score.difference_se, 1)}",
+                "outcome": "rejected" if score.rejected else "not rejected",
+                "common": "–" if mine else parts[0],
+                "rest": "–" if mine else parts[1],
+                "khat": fixed(score.max_khat, 2)
+                + (f" ({score.n_replaced} in closed form)" if score.n_replaced else ""),
+            }
+        )
+    return rows
+
+
+def predictive_rows(found: PredictiveCheck) -> list[Row]:
+    """One row per statistic."""
+    rows = []
+    for s in found.statistics:
+        decimals = decimals_for(s.replicated_high - s.replicated_low)
+        low, high = fixed(s.replicated_low, decimals), fixed(s.replicated_high, decimals)
+        rows.append(
+            {
+                "name": s.name,
+                "observed": fixed(s.observed, decimals),
+                "range": f"{low} to {high}",
+                "p": significant(s.p_value),
+            }
+        )
+    return rows
+
+
+def derived_rows(post: Posterior) -> list[Row]:
+    """Convergence of what follows from the parameters."""
+    rows = []
+    for d in derived_quantities(post):
+        decimals = decimals_for(d.sd)
+        mean = "0" if d.name.startswith("common") else fixed(d.mean, decimals)
+        rows.append(
+            {
+                "name": d.name[0].upper() + d.name[1:],
+                "value": f"{mean} ± {significant(d.sd)}",
+                "unit": d.unit,
+                "rhat": fixed(d.rhat, 4),
+                "bulk": count(int(d.ess_bulk)),
+                "tail": count(int(d.ess_tail)),
+                "mcse_share": percent(d.mcse / d.sd if d.sd > 0.0 else 0.0),
+            }
+        )
+    return rows

@@ -1,0 +1,120 @@
+"""Fill the template."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from starcal_uq.camera.distortion import get_model
+from starcal_uq.core.formatting import MINUS, count, join_words
+from starcal_uq.diagnostics.verdict import limits
+from starcal_uq.diagnostics.verdict.judge import judge, worst
+from starcal_uq.diagnostics.verdict.levels import Check, Level, Question
+from starcal_uq.presentation.html import embedded_image, template_environment
+from starcal_uq.presentation.pages import budget_tables_part as budget_tables
+from starcal_uq.presentation.report import diagnostics as model_tables
+from starcal_uq.presentation.report import field_words, image_tables, tables, words
+from starcal_uq.runs.run import Results
+
+_MARKS = {Level.PASS: "✓", Level.WARN: "!", Level.FAIL: "✗"}
+
+
+def render(results: Results, figures: Mapping[str, bytes]) -> str:
+    """The report as one HTML document.
+
+    Parameters
+    ----------
+    results
+        What to report.
+    figures
+        PNG images by the names of `starcal_uq.presentation.report.figures.draw_figures`; a missing one is left out.
+    """
+    environment = template_environment()
+    environment.filters["symbol"] = tables.symbol
+    environment.filters["minus"] = _minus
+    return environment.get_template("report.html.j2").render(context(results, figures)) + "\n"
+
+
+def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
+    """What the template shows."""
+    cal, post, obs = results.calibration, results.posterior, results.observations
+    verdict = judge(obs, cal, post, results.truth, results.attitude, results.diagnosis)
+    converged = verdict.of(Question.CONVERGED)
+    trust = verdict.of(Question.TRUSTWORTHY)
+    return {
+        "title": (results.truth or cal.nominal).name or results.name,
+        "run_name": results.name,
+        "created": (post or cal).provenance.get("created_utc", ""),
+        "version": (post or cal).provenance.get("versions", {}).get("starcal_uq") or "",
+        "verdict": verdict,
+        "marks": _MARKS,
+        "Level": Level,
+        "converged_level": worst(converged),
+        "trust_level": worst(trust),
+        "converged_words": _answer(converged),
+        "trust_words": _answer(trust),
+        "limits": limits(obs, cal, results.coupling, results.attitude, results.diagnosis),
+        "data_sentence": words.data_sentence(results),
+        "results": results,
+        "names": [p.name for p in tables.all_parameters(results)],
+        "parameter_rows": tables.parameter_rows(results),
+        "attitude_rows": [] if results.attitude is None else tables.attitude_rows(results.attitude),
+        "attitude_sentence": words.attitude_sentence(results),
+        "equivalent_sentence": field_words.equivalent_sentence(results.field_map),
+        "coupling_rows": [] if results.coupling is None else tables.coupling_rows(results.coupling, results),
+        "weak_directions": [] if results.coupling is None else tables.weak_directions(results.coupling),
+        "diagnostics_rows": [] if post is None else tables.diagnostics_rows(post),
+        "methods_rows": tables.methods_rows(results),
+        "derived_rows": [] if post is None else model_tables.derived_rows(post),
+        **model_tables.diagnosis_context(results.diagnosis, cal),
+        **image_tables.image_context(results.images, cal),
+        **budget_tables.budget_context(results.budget),
+        "stage_rows": tables.stage_rows(results),
+        "pair_rows": tables.pair_rows(results),
+        "prior_rows": words.prior_rows(results),
+        "likelihood_sentence": words.likelihood_sentence(results),
+        "sigma_sentence": words.sigma_sentence(results),
+        "sampling_sentence": words.sampling_sentence(results),
+        "compressed_sentence": words.compressed_sentence(results),
+        **_distortion(results),
+        "degrees_of_freedom": count(cal.dof),
+        "provenance_rows": words.provenance_rows(results),
+        "images": {name: embedded_image(png) for name, png in figures.items()},
+    }
+
+
+def _distortion(results: Results) -> dict[str, Any]:
+    """The formula of the distortion model, from its registry entry."""
+    model = get_model(results.calibration.camera.distortion)
+    radial = [(c.name, c.order - 1) for c in model.coefficients if c.name.startswith("k")]
+    forward = model.direction == "forward"
+    return {
+        "distortion_source": model.source,
+        "radial_terms": radial,
+        "decentring": [c.name for c in model.coefficients if not c.name.startswith("k")],
+        "from_point": "ideal" if forward else "distorted",
+        "to_point": "distorted" if forward else "ideal",
+    }
+
+
+def _answer(checks: tuple[Check, ...]) -> str:
+    """The outcome of some checks in one line; what failed is explained elsewhere."""
+    if worst(checks) is Level.PASS:
+        every = "Both" if len(checks) == 2 else f"All {len(checks)}"
+        return f"{every} checks passed: {_listed(checks)}."
+    parts = []
+    for level, verb in ((Level.FAIL, "failed"), (Level.WARN, "raised a warning"), (Level.PASS, "passed")):
+        found = tuple(check for check in checks if check.level is level)
+        if found:
+            parts.append(f"{len(found)} of {len(checks)} {verb}: {_listed(found)}.")
+    return " ".join(parts)
+
+
+def _listed(checks: tuple[Check, ...]) -> str:
+    return join_words([check.phrase for check in checks])
+
+
+def _minus(text: str) -> str:
+    """True minus signs in front of numbers."""
+    return re.sub(r"(?<![\w.])-(?=\d)", MINUS, text)

@@ -1,0 +1,284 @@
+"""The tables of a report: rows of finished text, with digits that end where the uncertainty begins."""
+
+from __future__ import annotations
+
+import re
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.camera.distortion import Parameter, parameters, sigma_parameter
+from starcal_uq.core.formatting import count, decimals_for, fixed, percent, pretty_unit, significant, with_sigma
+from starcal_uq.diagnostics.verdict.estimate import truth_z
+from starcal_uq.propagation.attitude_error import CONTRIBUTORS, INTERACTION
+
+if TYPE_CHECKING:
+    from markupsafe import Markup
+
+    from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.propagation.attitude_error import AttitudeError
+    from starcal_uq.propagation.coupling import Coupling
+    from starcal_uq.runs.run import Results
+
+Row = dict[str, Any]
+
+# Two-sided 95 % quantile of the normal distribution.
+Z_95 = 1.959964
+
+
+def symbol(name: str) -> Markup:
+    """A parameter's name as a mathematical symbol in HTML."""
+    from markupsafe import Markup, escape
+
+    if name == "sigma":
+        return Markup("<i>σ</i>")
+    if name == "sigma_scale":
+        return Markup("<i>s</i><sub>σ</sub>")
+    match = re.fullmatch(r"([a-z])(\d*)", name)
+    if match is None:
+        return Markup("{}").format(escape(name))
+    base = Markup("<i>{}</i>").format(match[1])
+    return base + Markup("<sub>{}</sub>").format(match[2]) if match[2] else base
+
+
+def all_parameters(results: Results) -> tuple[Parameter, ...]:
+    """Camera parameters and the noise."""
+    cal = results.calibration
+    return (*parameters(cal.camera.distortion), sigma_parameter(cal.sigma_name == "sigma_scale"))
+
+
+def parameter_rows(results: Results) -> list[Row]:
+    """One row per parameter, and one for the focal length in millimetres."""
+    cal, post, truth = results.calibration, results.posterior, results.truth
+    mean, sd = np.append(cal.theta, cal.sigma), np.append(cal.sigmas, cal.sigma_std)
+    low, high = mean - Z_95 * sd, mean + Z_95 * sd
+    prior: list[tuple[float, float] | None] = [None] * len(mean)
+    if post is not None:
+        mean, sd = post.draws.mean(axis=0), post.sd
+        low, high = np.quantile(post.draws, (0.025, 0.975), axis=0)
+        names = post.parameter_names
+        prior = list(zip(post.priors.mean(names).tolist(), post.priors.sd(names).tolist(), strict=True))
+    start: list[float | None] = [*cal.nominal.theta.tolist(), None]
+    true: list[float | None] = [None] * len(mean)
+    z = np.full(len(mean), np.nan)
+    if truth is not None:
+        true[: len(cal.theta)] = truth.theta.tolist()
+        z[: len(cal.theta)] = truth_z(cal, truth, post)
+    rows = []
+    for i, parameter in enumerate(all_parameters(results)):
+        numbers = (mean[i], sd[i], low[i], high[i], prior[i], start[i], true[i], z[i])
+        rows.append(_parameter_row(parameter, parameter.scaled_unit, parameter.scale, *numbers))
+        if parameter.name == "f":
+            per_mm = 1000.0 / cal.camera.pixel_um
+            rows.append(_parameter_row(parameter, "mm", per_mm, *numbers))
+            rows[-1]["description"] = "the same in millimetres"
+    return rows
+
+
+def _parameter_row(
+    parameter: Parameter,
+    unit: str,
+    scale: float,
+    mean: float,
+    sd: float,
+    low: float,
+    high: float,
+    prior: tuple[float, float] | None,
+    start: float | None,
+    true: float | None,
+    z: float,
+) -> Row:
+    spread = sd / scale
+    decimals = decimals_for(spread)
+    # A noise that was given has no spread: show it, and leave the rest empty.
+    known = spread > 0.0
+    prior_text = ""
+    if prior is not None and known:
+        if parameter.name.startswith("sigma"):
+            prior_text = "log-normal, below"
+        else:
+            prior_text = f"{with_sigma(prior[0] / scale, prior[1] / scale)} ± {significant(prior[1] / scale)}"
+    return {
+        "symbol": symbol(parameter.name),
+        "description": parameter.description,
+        "unit": pretty_unit(unit),
+        "estimate": fixed(mean / scale, decimals) if known else significant(mean / scale, 4),
+        "sigma": significant(spread) if known else "given",
+        "interval": f"{fixed(low / scale, decimals)} … {fixed(high / scale, decimals)}" if known else "",
+        "prior": prior_text,
+        "start": "" if start is None else with_sigma(start / scale, spread * 10.0),
+        "truth": "" if true is None else with_sigma(true / scale, spread / 10.0).rstrip("0").rstrip("."),
+        "z": "" if not np.isfinite(z) else ("+" if z > 0 else "") + fixed(z, 1),
+    }
+
+
+_ATTITUDE_NOTES = (
+    "random, new in every frame",
+    "one constant for the mission",
+    "depends on where the stars are",
+    "common rotation and rest together",
+    "beyond the sum of both",
+)
+
+
+def attitude_rows(error: AttitudeError) -> list[Row]:
+    """Contributions to the attitude error: 1 sigma, 95 % and 99.7 % for each axis and across the boresight, arcsec."""
+    table = error.to_dataframe()
+    rows = []
+    for (contributor, group), note in zip(table.groupby("contributor", sort=False), _ATTITUDE_NOTES, strict=True):
+        shown = _small if contributor == INTERACTION else significant
+        columns = {
+            column: [shown(float(v)) for v in group[f"{column}_arcsec"]]
+            for column in ("sigma", "p95", "p997", "first_order")
+        }
+        text = str(contributor)
+        if group["sigma_arcsec"].isna().any():
+            note = "not sampled by the version that wrote this run"
+        absorbed = str(group["absorbed_by_alignment"].iloc[0])
+        name = text[0].upper() + text[1:]
+        rows.append({"name": name, "note": note, "absorbed": absorbed, "total": text == CONTRIBUTORS[3], **columns})
+    return rows
+
+
+def _small(arcsec: float) -> str:
+    """The interaction is shown to be small, and no more: twelve columns leave no room for powers of ten."""
+    if np.isnan(arcsec):
+        return "—"
+    return "< 0.001".replace(" ", "\N{NO-BREAK SPACE}") if 0.0 < arcsec < 0.0005 else significant(arcsec)
+
+
+def coupling_rows(coupling: Coupling, results: Results) -> list[Row]:
+    """Marginal and conditional sigma, inflation, Cramer-Rao bound and contraction of every parameter."""
+    rows = []
+    for i, parameter in enumerate(parameters(results.calibration.camera.distortion)):
+        scale = parameter.scale
+        contraction = None if coupling.contraction is None else float(coupling.contraction[i])
+        rows.append(
+            {
+                "symbol": symbol(parameter.name),
+                "unit": pretty_unit(parameter.scaled_unit),
+                "marginal": significant(float(coupling.sigma_marginal[i]) / scale),
+                "conditional": significant(float(coupling.sigma_conditional[i]) / scale),
+                "ratio": significant(float(coupling.sigma_marginal[i] / coupling.sigma_conditional[i])),
+                "inflation": significant(float(coupling.variance_inflation[i])),
+                "bound": significant(float(coupling.crlb_sigma[i]) / scale),
+                "contraction": "" if contraction is None else _contraction_text(contraction),
+            }
+        )
+    return rows
+
+
+def _contraction_text(contraction: float) -> str:
+    """As the factor by which the data shrank the prior's sigma: 1 - 1e-6 would print as 1."""
+    remaining = max(1.0 - contraction, 1e-30)
+    return f"{significant(1.0 / np.sqrt(remaining))} ×"
+
+
+def weak_directions(coupling: Coupling) -> list[Row]:
+    """The directions that the data determine worst, in words and as weights."""
+    rows = []
+    for direction in coupling.weak_directions:
+        if direction.variance <= 1.4:
+            continue
+        weights = zip(coupling.parameter_names, direction.weights, strict=True)
+        parts = [(symbol(name), fixed(float(w), 2)) for name, w in weights if abs(w) >= 0.1]
+        share = direction.variance / len(coupling.parameter_names)
+        rows.append({"words": direction.words, "weights": parts, "share": percent(share)})
+    return rows
+
+
+def diagnostics_rows(post: Posterior) -> list[Row]:
+    """Convergence of every sampled parameter."""
+    d = post.diagnostics
+    rows = []
+    for i in post.sampled:
+        parameter = post.parameters[i]
+        rows.append(
+            {
+                "symbol": symbol(parameter.name),
+                "rhat": fixed(float(d.rhat[i]), 4),
+                "bulk": count(int(d.ess_bulk[i])),
+                "tail": count(int(d.ess_tail[i])),
+                "mcse": _with_unit(significant(float(d.mcse[i]) / parameter.scale), parameter),
+                "mcse_share": percent(float(d.mcse[i] / post.sd[i])),
+                "mean": mean_to_mcse(
+                    float(post.draws[:, i].mean()) / parameter.scale, float(d.mcse[i]) / parameter.scale
+                ),
+                "tau": fixed(float(d.autocorrelation[i]), 1),
+            }
+        )
+    return rows
+
+
+def mean_to_mcse(mean: float, mcse: float) -> str:
+    """A mean with the digits that its Monte Carlo error leaves: the last one is larger than the error."""
+    decimals = 0 if not mcse > 0.0 else max(0, int(np.floor(-np.log10(mcse))))
+    return fixed(mean, decimals)
+
+
+def _with_unit(number: str, parameter: Parameter) -> str:
+    unit = pretty_unit(parameter.scaled_unit)
+    return f"{number} × {unit}" if parameter.scale != 1.0 else f"{number} {unit}".strip()
+
+
+def methods_rows(results: Results) -> list[Row]:
+    """Estimate, Laplace approximation, importance sampling and emcee side by side."""
+    cal, post = results.calibration, results.posterior
+    if post is None:
+        return []
+    d, estimate = post.diagnostics, np.append(cal.theta, cal.sigma)
+    spread, draws_mean = np.append(cal.sigmas, cal.sigma_std), post.draws.mean(axis=0)
+    sources = ((estimate, spread), (d.laplace_mean, d.laplace_sd), (d.psis_mean, d.psis_sd), (draws_mean, post.sd))
+    rows = []
+    for i in post.sampled:
+        parameter = post.parameters[i]
+        # One digit more than elsewhere: the table is there to show small differences.
+        decimals = decimals_for(float(post.sd[i]) / parameter.scale, 3)
+        cells = [
+            f"{fixed(float(m[i]) / parameter.scale, decimals)} ± {fixed(float(s[i]) / parameter.scale, decimals)}"
+            for m, s in sources
+        ]
+        unit = pretty_unit(parameter.scaled_unit)
+        rows.append({"symbol": symbol(parameter.name), "unit": unit, "cells": cells})
+    return rows
+
+
+def stage_rows(results: Results) -> list[Row]:
+    """What each stage of the estimation did."""
+    cal = results.calibration
+    names = parameters(cal.camera.distortion)
+    rows = []
+    for i, stage in enumerate(cal.stages, 1):
+        ends = [
+            with_sigma(float(v) / p.scale, float(s) / p.scale)
+            for v, s, p in zip(stage.trajectory[-1], cal.sigmas, names, strict=True)
+        ]
+        rows.append(
+            {
+                "number": i,
+                "name": stage.name,
+                "iterations": len(stage.trajectory) - 1,
+                "ends": ends,
+                "status": stage.status.name.lower().replace("_", " "),
+                "seconds": f"{significant(1000.0 * stage.seconds)} ms",
+            }
+        )
+    return rows
+
+
+def pair_rows(results: Results) -> list[Row]:
+    """The paper's estimator beside the efficient one: its sigma and the price in precision."""
+    cal = results.calibration
+    pair_sigma = np.sqrt(np.diag(cal.pair_covariance))
+    return [
+        {
+            "symbol": symbol(p.name),
+            "unit": pretty_unit(p.scaled_unit),
+            "pair": f"{with_sigma(float(cal.pair_theta[i]) / p.scale, float(pair_sigma[i]) / p.scale)} ± "
+            f"{significant(float(pair_sigma[i]) / p.scale)}",
+            "efficient": f"{with_sigma(float(cal.theta[i]) / p.scale, float(cal.sigmas[i]) / p.scale)} ± "
+            f"{significant(float(cal.sigmas[i]) / p.scale)}",
+            "ratio": fixed(float(pair_sigma[i] / cal.sigmas[i]) ** 2, 2),
+        }
+        for i, p in enumerate(parameters(cal.camera.distortion))
+    ]

@@ -1,0 +1,191 @@
+"""Sentences of a report that depend on the run."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.core.formatting import count, fixed, percent, plural, significant
+from starcal_uq.diagnostics.verdict import air
+from starcal_uq.diagnostics.verdict.air import conditional_words, corrected_words
+from starcal_uq.diagnostics.verdict.draws import propagation_difference
+
+if TYPE_CHECKING:
+    from starcal_uq.observations.table import Observations
+    from starcal_uq.runs.run import Results
+
+_DIRECTIONS = {
+    "apparent": "apparent directions (aberration included)",
+    "catalogue": "directions straight from a catalogue (aberration not included)",
+    "undeclared": "directions not declared as apparent or as straight from a catalogue",
+}
+
+
+def data_sentence(results: Results) -> str:
+    """What the result rests on, in one or two sentences."""
+    obs, cal = results.observations, results.calibration
+    per_frame = obs.stars_per_frame
+    low, high = int(per_frame.min()), int(per_frame.max())
+    each = f"{low} stars each" if low == high else f"{low} to {high} stars each, median {np.median(per_frame):g}"
+    source = {"simulated": "Simulated data: "}.get(str(obs.meta.get("source", "")), "")
+    stars = f"{plural(obs.n_stars, 'star')} in {plural(obs.n_frames, 'frame')} ({each})"
+    unique = ""
+    if obs.star_id is not None and len(np.unique(obs.star_id)) < obs.n_stars:
+        unique = f", {count(len(np.unique(obs.star_id)))} different stars"
+    camera = cal.camera
+    horizontal, vertical = camera.fov_deg
+    return (
+        f"{source}{stars}{unique}, with {_directions(obs)}. Camera: {camera.width_px} × {camera.height_px} pixels of "
+        f"{camera.pixel_um:g} µm, {fixed(horizontal, 1)}° × {fixed(vertical, 1)}° field, distortion model "
+        f"“{camera.distortion}”. Centroid noise was {_noise_words(results)}.{_air_words(results)}"
+    )
+
+
+def _directions(obs: Observations) -> str:
+    declared = str(obs.meta["directions"])
+    if declared == "apparent" and air(obs) == "corrected":
+        return "apparent directions (aberration and refraction included)"
+    if declared == "apparent" and air(obs) == "unknown":
+        return "directions that include aberration but no refraction"
+    return _DIRECTIONS[declared]
+
+
+def _air_words(results: Results) -> str:
+    """What refraction does to f, where the stars were or may have been seen through air."""
+    obs, cal = results.observations, results.calibration
+    if air(obs) == "corrected":
+        return f" {corrected_words(obs, cal)}"
+    return f" {conditional_words(cal)}" if air(obs) == "unknown" else ""
+
+
+def _noise_words(results: Results) -> str:
+    cal, post = results.calibration, results.posterior
+    if cal.sigma_name == "sigma_scale":
+        floor = results.observations.meta.get("noise_floor_px")
+        more = (
+            f", with {significant(float(floor))} px per axis added that even bright stars show in their residuals"
+            if floor
+            else ""
+        )
+        return f"stated star by star{more}; the data ask for {significant(cal.sigma, 3)} times that"
+    if post is not None and not post.sigma_sampled:
+        return f"given as {significant(float(post.sigma_draws[0]), 3)} px per axis"
+    return f"estimated from the data: {significant(cal.sigma, 3)} px per axis"
+
+
+def sigma_sentence(results: Results) -> str:
+    """How the noise was treated."""
+    post = results.posterior
+    kind = "px per axis, the same for all stars"
+    if results.calibration.sigma_name == "sigma_scale":
+        kind = "a common factor on the noise that each star states"
+    if post is None:
+        return f"The noise σ ({kind}) is estimated from the residuals and their degrees of freedom."
+    if post.sigma_sampled:
+        return f"The noise σ ({kind}) is a parameter: it is sampled with the others, on its logarithm."
+    return f"The noise σ ({kind}) was given as {significant(float(post.sigma_draws[0]), 4)} and not sampled."
+
+
+def likelihood_sentence(results: Results) -> str:
+    """Which likelihood was sampled, where it is not the one whose formula the report shows."""
+    post = results.posterior
+    kind = "marginal" if post is None else post.diagnostics.likelihood
+    known = {
+        "marginal": "",
+        "student_t": (
+            "The posterior of this run is that of the robust variant: each star’s residual follows a bivariate Student "
+            "t instead of a Gaussian, with the attitude of the frame integrated out in the same way."
+        ),
+        "pairs": (
+            "The posterior of this run is that of the angles between stars, a composite likelihood whose curvature is "
+            "adjusted to its Godambe information."
+        ),
+        "pairs_naive": (
+            "The posterior of this run takes the angles between stars as independent, which they are not: its "
+            "intervals are several times too narrow."
+        ),
+    }
+    return known.get(kind, f"The posterior of this run is that of the likelihood “{kind}” that was passed.")
+
+
+def attitude_sentence(results: Results) -> str:
+    """What the numbers of the attitude table rest on."""
+    error = results.attitude
+    if error is None:
+        return ""
+    return (
+        f"{plural(error.n_draws, 'posterior draw')} through QUEST on {plural(error.n_frames, 'frame')} "
+        f"({error.frames}); first-order propagation gives the same σ within {percent(propagation_difference(error))}."
+    )
+
+
+def prior_rows(results: Results) -> list[dict[str, str]]:
+    """The priors as statements."""
+    if results.posterior is None:
+        return []
+    table = results.posterior.priors.to_dataframe()
+    return [{"name": str(row.parameter), "statement": str(row.statement)} for row in table.itertuples()]
+
+
+def sampling_sentence(results: Results) -> str:
+    """How many draws, by which moves, from which likelihood."""
+    post = results.posterior
+    if post is None:
+        return ""
+    settings: Mapping[str, Any] = post.provenance.get("settings", {})
+    d = post.diagnostics
+    moves = f", moves “{settings['moves']}”" if "moves" in settings else ""
+    rates = f"{fixed(float(d.acceptance.min()), 2)} to {fixed(float(d.acceptance.max()), 2)}"
+    return (
+        f"emcee: {post.n_ensembles} separately seeded ensembles of {post.n_walkers} walkers, {post.n_steps} kept steps "
+        f"each{moves}; {count(d.n_evaluations)} evaluations of the {d.likelihood_used} likelihood; acceptance {rates}."
+    )
+
+
+def compressed_sentence(results: Results) -> str:
+    """How the compressed likelihood compares with the exact one."""
+    post = results.posterior
+    if post is None or not np.isfinite(post.diagnostics.compressed_max_difference):
+        return ""
+    d = post.diagnostics
+    return (
+        "Compressed and exact log likelihood differ by at most "
+        f"{significant(d.compressed_max_difference)} nat within three standard deviations (k-hat of the weights "
+        f"between them {fixed(d.compressed_khat, 2)})."
+    )
+
+
+def provenance_rows(results: Results) -> list[tuple[str, str]]:
+    """What is needed to repeat the run."""
+    rows: list[tuple[str, str]] = [("Data, SHA-256", results.observations.data_hash)]
+    source = results.observations.meta.get("source")
+    if source:
+        rows.append(("Source of the data", str(source)))
+    steps: list[tuple[str, Mapping[str, Any]]] = [("Calibration", results.calibration.provenance)]
+    if results.posterior is not None:
+        steps.append(("Sampling", results.posterior.provenance))
+    if results.diagnosis is not None:
+        steps.append(("Diagnosis", results.diagnosis.provenance))
+    for name, step in steps:
+        rows.append((f"{name}, time", str(step.get("created_utc", "unknown"))))
+        if step.get("seed") is not None:
+            rows.append((f"{name}, seed", str(step["seed"])))
+        rows.append((f"{name}, settings", _settings_text(step.get("settings", {}))))
+    versions: Mapping[str, Any] = steps[-1][1].get("versions", {})
+    rows.append(("Versions", ", ".join(f"{name} {version}" for name, version in versions.items() if version)))
+    return rows
+
+
+def _settings_text(settings: Mapping[str, Any]) -> str:
+    return ", ".join(f"{name} = {_plain(value)}" for name, value in settings.items()) or "none"
+
+
+def _plain(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    if isinstance(value, float):
+        return f"{value:g}"
+    return json.dumps(value, default=str)

@@ -1,0 +1,75 @@
+"""The outcome of a comparison in words."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.core.formatting import fixed, plural, significant, with_sigma
+
+if TYPE_CHECKING:
+    from starcal_uq.comparison.result import CameraComparison
+
+_SMALLEST_P = 1e-12
+# Below this, arcsec, no one can tell a difference from none.
+_NOTHING = 1e-6
+
+
+def p_words(p: float) -> str:
+    """``p = 0.31``, or a bound where the Gaussian tail means nothing any more."""
+    if np.isnan(p):
+        return "p not known"
+    if p < _SMALLEST_P:
+        return "p < 10⁻¹²"
+    return f"p = {significant(p)}"
+
+
+def headline(found: CameraComparison) -> str:
+    """The verdict in one short sentence."""
+    a, b = found.labels
+    # A phrase begins the sentence with a capital; the name of a run stays what it is.
+    a = a[:1].upper() + a[1:] if " " in a else a
+    size = f"{_size(found.rms_arcsec)} arcsec rms"
+    if not found.tested:
+        return f"{a} and {b} differ by {size} over the detector; whether chance explains it was not tested."
+    expected = f"{significant(found.expected_rms_arcsec)} was to be expected"
+    if found.verdict == "agree":
+        return f"{a} and {b} agree: {size} over the detector, where {expected}."
+    if found.verdict == "maps differ":
+        return f"{a} and {b} differ by {size} over the detector, where {expected}."
+    return f"{a} and {b} map the field alike ({size}, where {expected}), but their parameters differ."
+
+
+def rotation_words(found: CameraComparison) -> str:
+    """The rotation that was removed, with its uncertainty."""
+    parts = []
+    for name, value, sigma in zip(
+        ("pitch", "yaw", "roll"), found.rotation_arcsec, found.rotation_sigma_arcsec, strict=True
+    ):
+        parts.append(f"{name} {_value(float(value), float(sigma))}")
+    return f"{parts[0]}, {parts[1]}, {parts[2]} arcsec"
+
+
+def _size(value: float) -> str:
+    return significant(value) if value >= _NOTHING else "less than 10⁻⁶"
+
+
+def _value(value: float, sigma: float) -> str:
+    """A value with its sigma; tiny ones, which no one can tell from zero, without digits that mean nothing."""
+    if not np.isfinite(sigma):
+        return significant(value) if abs(value) >= _NOTHING else "0"
+    if sigma < 5e-4:
+        return f"{fixed(value, 3)} ± 0.000"
+    return f"{with_sigma(value, sigma)} ± {significant(sigma)}"
+
+
+def verdict_words(found: CameraComparison) -> str:
+    """The verdict, the rotation and both p-values."""
+    rotation = f"The rotation removed is {rotation_words(found)}."
+    if not found.tested:
+        return f"{headline(found)} {rotation} {found.rule}"
+    tests = f"Map: {p_words(found.p_map)}"
+    if np.isfinite(found.p_parameters):
+        tests += f"; parameters as a whole: {p_words(found.p_parameters)} ({plural(found.n_directions, 'direction')})"
+    return f"{headline(found)} {rotation} {tests}."

@@ -1,0 +1,135 @@
+"""Plans in words."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.core.formatting import MINUS, count, fixed, join_words, percent, plural, significant
+
+if TYPE_CHECKING:
+    from starcal_uq.planning.check import ForecastCheck
+    from starcal_uq.planning.frame_choice_result import FrameChoice
+    from starcal_uq.planning.plan_result import Need, Plan
+
+SCOPE_NAMES = {
+    "common": "common rotation",
+    "rest": "rest of the calibration",
+    "calibration": "calibration (common rotation and rest)",
+    "total": "calibration and centroid noise",
+}
+
+
+def frames(number: int | None) -> str:
+    """A number of frames to three digits, rounded up; what cannot be reached is said."""
+    if number is None:
+        return "no number of frames"
+    step = 10 ** max(0, len(str(number)) - 3)
+    return plural(-(-number // step) * step, "frame")
+
+
+def need_words(need: Need, number: int | None) -> str:
+    """`frames` of a need, or why there is no number."""
+    if number is None:
+        return "no number of frames" if need.floor_arcsec > 0.0 else "more than ten million"
+    return frames(number)
+
+
+def level(confidence: float) -> str:
+    """A confidence in per cent, with all its digits."""
+    return f"{100.0 * confidence:.6g}\N{NO-BREAK SPACE}%"
+
+
+def verdict(plan: Plan) -> str:
+    """The plan in a few sentences: what the target takes, else what the largest campaign gives."""
+    if plan.need is None:
+        return _largest(plan)
+    target = f"{plan.target_arcsec:g} arcsec across the boresight at {level(plan.confidence)}"
+    return f"{_needed(plan.need, target)}{_others(plan)}"
+
+
+def _needed(need: Need, target: str) -> str:
+    name = SCOPE_NAMES[need.scope]
+    if need.frames is None:
+        if need.floor_arcsec > 0.0:
+            return (
+                f"No number of frames keeps {target} for {name}: centroid noise alone is "
+                f"{significant(need.floor_arcsec, 3)} arcsec."
+            )
+        return f"Not even ten million frames keep {target} for the {name}."
+    surely = "" if need.frames_surely is None else f" ({frames(need.frames_surely)} for 95 % of campaigns to keep it)"
+    return f"To keep {target} for the {name} takes {frames(need.frames)}{surely}."
+
+
+def _others(plan: Plan) -> str:
+    """The need of the part that alignment leaves, beside that of the common rotation."""
+    if plan.scope != "common":
+        return ""
+    rest = next(need for need in plan.needs if need.scope == "rest")
+    return (
+        f" If alignment is calibrated with the same parameters, only the rest counts: {need_words(rest, rest.frames)}."
+    )
+
+
+def _largest(plan: Plan) -> str:
+    found = plan.forecast
+    common = max(found.of("common_pitch_arcsec")[-1], found.of("common_yaw_arcsec")[-1])
+    rest = max(found.of("rest_pitch_arcsec")[-1], found.of("rest_yaw_arcsec")[-1])
+    return (
+        f"{frames(int(found.n_frames[-1]))} of {significant(plan.mean_stars, 3)} stars at "
+        f"{significant(plan.sigma_px)} px give a common rotation of {significant(common)} and a rest of "
+        f"{significant(rest)} arcsec (1 sigma per axis across the boresight), beside centroid noise of "
+        f"{significant(float(max(plan.nea_arcsec[:2])))} arcsec in every frame."
+    )
+
+
+def settings_sentence(plan: Plan) -> str:
+    """What the forecast assumes."""
+    return (
+        f"Stars to magnitude {plan.max_mag:.2f} ({significant(plan.mean_stars, 3)} a frame on average), centroid noise "
+        f"of {significant(plan.sigma_px)} px per axis, frames at random attitudes with at least {plan.min_stars} "
+        f"stars: {percent(plan.sky_fraction)} of the sky shows them."
+    )
+
+
+def choice_verdict(choice: FrameChoice) -> str:
+    """What the choice is worth."""
+    parts = []
+    for name, part in (("common rotation", "common"), ("rest", "rest")):
+        cross = [choice.names.index(f"{part}_{axis}_arcsec") for axis in ("pitch", "yaw")]
+        random = np.sqrt(np.mean(choice.random[:, cross] ** 2, axis=1))
+        ratio = random / np.sqrt(np.mean(choice.after[cross] ** 2))
+        low, high = np.quantile(ratio, (0.05, 0.95))
+        parts.append(
+            f"a {name} smaller by a factor of {fixed(float(ratio.mean()), 2)} "
+            f"({fixed(float(low), 2)} to {fixed(float(high), 2)} for 90 % of random sets)"
+        )
+    main = "rest" if choice.scope == "rest" else "common"
+    cross = [choice.names.index(f"{main}_{axis}_arcsec") for axis in ("pitch", "yaw")]
+    richest = fixed(float(np.sqrt(np.mean(choice.richest[cross] ** 2) / np.mean(choice.after[cross] ** 2))), 2)
+    aim = "the parameters as a whole" if choice.criterion == "D" else f"the {SCOPE_NAMES[choice.scope]}"
+    return (
+        f"{frames(len(choice.rotations))} of {count(choice.n_candidates)} candidates, chosen for {aim}, give "
+        f"{join_words(parts)} than as many random frames; the frames with most stars would give a "
+        f"{SCOPE_NAMES[main]} {richest} times as large."
+    )
+
+
+def check_verdict(check: ForecastCheck) -> str:
+    """Whether forecast and simulation agree."""
+    outside = [int(n) for n, bad in zip(check.forecast.n_frames, check.nees_rejected, strict=True) if bad]
+    g, q = np.unravel_index(int(np.argmax(np.abs(check.ratio - 1.0))), check.ratio.shape)
+    ratio = float(check.ratio[g, q] - 1.0)
+    sign = "+" if ratio > 0.0 else MINUS
+    sentence = (
+        f"{count(check.n_campaigns)} simulated campaigns of each size: the sigmas they state differ from the forecast "
+        f"by at most {sign}{percent(abs(ratio))} ({check.forecast.names[q]}, "
+        f"{plural(int(check.forecast.n_frames[g]), 'frame')}); "
+    )
+    if outside:
+        return (
+            sentence
+            + f"squared errors are not what they should be with {join_words([count(n) for n in outside])} frames."
+        )
+    return sentence + "their squared errors are what they should be."

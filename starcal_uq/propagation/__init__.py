@@ -1,0 +1,1 @@
+"""What a posterior means: couplings, attitude errors, maps over the field."""

@@ -1,0 +1,289 @@
+"""The attitude error of single frames by contributor: the result of `starcal_uq.propagation.propagate.propagate`."""
+
+from __future__ import annotations
+
+import csv
+import os
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.formatting import percent, significant
+from starcal_uq.core.types import FloatArray
+from starcal_uq.runs.folder import atomic_path
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+AXES = ("pitch", "yaw", "roll")
+CROSS_BORESIGHT = "cross-boresight"
+COLUMNS = (*AXES, CROSS_BORESIGHT)
+INTERACTION = "interaction, calibration and noise"
+CONTRIBUTORS = (
+    "centroid noise (NEA)",
+    "calibration, common rotation",
+    "calibration, rest",
+    "calibration, total",
+    INTERACTION,
+)
+OBSERVED = "observed frames"
+_ABSORBED = ("no", "yes", "no", "in part", "no")
+# Runs of earlier versions hold the first four only.
+_REQUIRED = CONTRIBUTORS[:4]
+# A ratio of sigmas below a microarcsecond means nothing.
+_SMALLEST_ARCSEC = 1e-6
+_ROUNDING_ARCSEC = 1e-9
+_AGREE = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """Sampled over first-order standard deviations.
+
+    Noise, draws and first-order propagation share the same realisations, so that the ratios depart from one by what is
+    not linear, and hardly by chance.
+
+    Attributes
+    ----------
+    contributors : tuple of str
+        Rows: centroid noise, common rotation and rest.
+    ratio : (3, 3) array
+        Sampled over first order; columns are pitch, yaw and roll. NaN where both are below a microarcsecond.
+    """
+
+    contributors: tuple[str, ...]
+    ratio: FloatArray
+
+    @property
+    def largest(self) -> float:
+        """Largest departure of a ratio from one; 0 where there is none to be had."""
+        real = self.ratio[np.isfinite(self.ratio)]
+        return float(np.max(np.abs(real - 1.0), initial=0.0))
+
+    @property
+    def sentence(self) -> str:
+        """What the ratios mean."""
+        if self.largest <= _AGREE:
+            return (
+                f"Sampled and first-order standard deviations agree within {percent(max(self.largest, 1e-6))}: "
+                "attitude errors are linear in parameters and noise."
+            )
+        distance = np.where(np.isfinite(self.ratio), np.abs(self.ratio - 1.0), 0.0)
+        row, axis = np.unravel_index(int(np.argmax(distance)), distance.shape)
+        return (
+            f"Sampled and first-order standard deviations differ by up to {percent(self.largest)} "
+            f"({self.contributors[row]}, {AXES[axis]}): attitude errors are not linear over this posterior, and the "
+            "sampled values hold."
+        )
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """One row per contributor and axis: ``contributor``, ``axis``, ``sampled_over_first_order``."""
+        import pandas as pd
+
+        return pd.DataFrame(
+            {
+                "contributor": np.repeat(self.contributors, 3).astype(object),
+                "axis": np.array(AXES * len(self.contributors), dtype=object),
+                "sampled_over_first_order": self.ratio.ravel(),
+            }
+        )
+
+    def _repr_html_(self) -> str:
+        table = self.to_dataframe().to_html(index=False, float_format=lambda v: f"{v:.5f}", border=0)
+        return f"<p>{self.sentence}</p>{table}"
+
+
+@dataclass(frozen=True, eq=False)
+class AttitudeError:
+    """Attitude error of single frames by contributor, arcsec.
+
+    Axes are ``("pitch", "yaw", "roll")``: left rotation vectors about camera +X, +Y and the boresight +Z.
+
+    Attributes
+    ----------
+    nea_arcsec : (3,) array
+        Centroid noise: root mean square over frames of the standard deviation.
+    common_arcsec : (3,) array
+        Standard deviation of the common rotation over the posterior.
+    rest_arcsec : (3,) array
+        Standard deviation of the rest over the posterior, root mean square over frames.
+    p95_arcsec, p997_arcsec : (5, 4) array
+        Half-widths that hold 95 % and 99.7 % of the absolute errors: rows are `CONTRIBUTORS`, columns the three axes
+        and the angle across the boresight, the root of pitch^2 + yaw^2 (2.45 and 3.41 sigma per axis if Gaussian).
+    analytic_nea_arcsec, analytic_common_arcsec, analytic_rest_arcsec : (3,) array
+        The same standard deviations by first-order propagation, on the same frames.
+    n_draws, n_frames : int
+        What the numbers rest on.
+    common_draws_arcsec : (D, 3) array or None
+        Common rotation of every draw; None when read from a file.
+    rest_rms_per_frame_arcsec : (K, 3) array or None
+        Standard deviation of the rest in each frame; None when read from a file.
+    nea_per_frame_arcsec : (K, 3) array or None
+        Standard deviation from centroid noise in each frame, first order; None when read from a file.
+    interaction_arcsec : (3,) array
+        Root mean square of what noise and a wrong calibration do together beyond the sum of what each does alone. To
+        first order there is nothing. NaN when read from a file of a version that did not sample it.
+    frames : str
+        Which frames these are, such as ``observed frames``.
+    """
+
+    nea_arcsec: FloatArray
+    common_arcsec: FloatArray
+    rest_arcsec: FloatArray
+    p95_arcsec: FloatArray
+    p997_arcsec: FloatArray
+    analytic_nea_arcsec: FloatArray
+    analytic_common_arcsec: FloatArray
+    analytic_rest_arcsec: FloatArray
+    n_draws: int
+    n_frames: int
+    common_draws_arcsec: FloatArray | None = None
+    rest_rms_per_frame_arcsec: FloatArray | None = None
+    nea_per_frame_arcsec: FloatArray | None = None
+    interaction_arcsec: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
+    frames: str = OBSERVED
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Names of the three axes."""
+        return AXES
+
+    @property
+    def calibration_total_arcsec(self) -> FloatArray:
+        """Common rotation and rest together (3,), which are uncorrelated by construction."""
+        return np.hypot(self.common_arcsec, self.rest_arcsec)
+
+    @property
+    def agreement(self) -> Agreement:
+        """Sampled beside first-order propagation."""
+        sampled = np.stack((self.nea_arcsec, self.common_arcsec, self.rest_arcsec))
+        first = np.stack((self.analytic_nea_arcsec, self.analytic_common_arcsec, self.analytic_rest_arcsec))
+        real = np.maximum(sampled, first) > _SMALLEST_ARCSEC
+        ratio = np.where(real, sampled / np.where(first > 0.0, first, np.nan), np.nan)
+        return Agreement(CONTRIBUTORS[:3], ratio)
+
+    @property
+    def one_number_sentence(self) -> str:
+        """What a single number for the calibration would hide."""
+        common, rest = with_cross(self.common_arcsec)[3], with_cross(self.rest_arcsec)[3]
+        # Below this it is rounding: frames that all show the same stars have no part that changes.
+        if not rest > _ROUNDING_ARCSEC:
+            return f"Across the boresight the calibration is a common rotation of {significant(float(common))} arcsec."
+        words = f"{significant(float(np.hypot(common, rest)))} arcsec per axis across the boresight"
+        ratio = float(common / rest)
+        if ratio < 1.0:
+            return (
+                f"The calibration contributes {words}, of which most depends on where the stars are "
+                f"({significant(float(rest))} arcsec) and no alignment absorbs it."
+            )
+        return (
+            f"Whoever reports one number for the calibration, {words}, reports a constant that alignment calibration "
+            f"absorbs: what remains in flight is {significant(float(rest))} arcsec, smaller by a factor of "
+            f"{significant(ratio)}."
+        )
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """One row per contributor and axis.
+
+        Columns are ``contributor``, ``axis``, ``sigma_arcsec``, ``p95_arcsec``, ``p997_arcsec``,
+        ``first_order_arcsec`` (sigma by first-order propagation) and ``absorbed_by_alignment`` (yes, no, in part).
+        The cross-boresight rows hold the root mean square of the sigmas of pitch and yaw.
+        """
+        import pandas as pd
+
+        sampled = (
+            self.nea_arcsec,
+            self.common_arcsec,
+            self.rest_arcsec,
+            self.calibration_total_arcsec,
+            self.interaction_arcsec,
+        )
+        analytic = (
+            self.analytic_nea_arcsec,
+            self.analytic_common_arcsec,
+            self.analytic_rest_arcsec,
+            np.hypot(self.analytic_common_arcsec, self.analytic_rest_arcsec),
+            0.0 * self.interaction_arcsec,
+        )
+        return pd.DataFrame(
+            {
+                "contributor": np.repeat(CONTRIBUTORS, len(COLUMNS)).astype(object),
+                "axis": np.array(COLUMNS * len(CONTRIBUTORS), dtype=object),
+                "sigma_arcsec": np.concatenate([with_cross(values) for values in sampled]),
+                "p95_arcsec": self.p95_arcsec.ravel(),
+                "p997_arcsec": self.p997_arcsec.ravel(),
+                "first_order_arcsec": np.concatenate([with_cross(values) for values in analytic]),
+                "absorbed_by_alignment": np.repeat(_ABSORBED, len(COLUMNS)).astype(object),
+            }
+        )
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the table as CSV, atomically and to the last digit; overwritten. Single draws are not kept."""
+        table = self.to_dataframe().assign(n_draws=self.n_draws, n_frames=self.n_frames, frames=self.frames)
+        with atomic_path(path) as temporary:
+            table.to_csv(temporary, index=False)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> AttitudeError:
+        """Read what `save` wrote.
+
+        A table of a version that did not sample the interaction is read; the interaction is then not known (NaN).
+
+        Raises
+        ------
+        RunFolderError
+            If the file is missing or is not such a table.
+        """
+        names = ("sigma", "p95", "p997", "first_order")
+        try:
+            with open(path, newline="", encoding="utf-8") as file:
+                rows = {(row["contributor"], row["axis"]): row for row in csv.DictReader(file)}
+            known = CONTRIBUTORS if (INTERACTION, AXES[0]) in rows else _REQUIRED
+            chosen = [[rows[contributor, axis] for axis in COLUMNS] for contributor in known]
+            table = np.full((len(names), len(CONTRIBUTORS), len(COLUMNS)), np.nan)
+            table[:, : len(known)] = [
+                [[float(row[f"{name}_arcsec"] or "nan") for row in line] for line in chosen] for name in names
+            ]
+            if not np.isfinite(table[:, : len(_REQUIRED)]).all():
+                raise ValueError("a number is missing")
+            first = chosen[0][0]
+            counts = {name: int(first[name]) for name in ("n_draws", "n_frames")}
+            frames = first.get("frames") or OBSERVED
+        except OSError as error:
+            raise RunFolderError(
+                f"{path}: cannot be read ({error.strerror or error}); run `starcal-uq propagate RUN` first."
+            ) from error
+        except (KeyError, TypeError, ValueError, csv.Error) as error:
+            raise RunFolderError(
+                f"{path}: is not a table of attitude errors; run `starcal-uq propagate RUN` to write it again."
+            ) from error
+        sigma, p95, p997, analytic = table
+        return cls(
+            *(sigma[0, :3], sigma[1, :3], sigma[2, :3], p95, p997),
+            *(analytic[0, :3], analytic[1, :3], analytic[2, :3]),
+            n_draws=counts["n_draws"],
+            n_frames=counts["n_frames"],
+            interaction_arcsec=sigma[4, :3],
+            frames=frames,
+        )
+
+    def plot_attitude(self, **options: Any) -> Any:
+        """Bars per contributor and axis; options as for `starcal_uq.presentation.figures.propagation.plot_attitude`."""
+        from starcal_uq.presentation.figures.propagation import plot_attitude
+
+        return plot_attitude(self, **options)
+
+    def _repr_html_(self) -> str:
+        table = self.to_dataframe().to_html(index=False, float_format=significant, na_rep="not known", border=0)
+        return (
+            f"<p><b>Attitude error</b> of single frames: {self.n_draws} posterior draws through QUEST on "
+            f"{self.n_frames} frames ({self.frames}).</p>{table}<p>{self.agreement.sentence}</p>"
+            f"<p>{self.one_number_sentence}</p>"
+        )
+
+
+def with_cross(sigma: FloatArray) -> FloatArray:
+    """Sigmas of the three axes (3,), then the root mean square of the two across the boresight: (4,)."""
+    return np.append(sigma, np.sqrt(np.mean(sigma[:2] ** 2)))

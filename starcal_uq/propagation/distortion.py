@@ -1,0 +1,218 @@
+"""The distortion that the posterior believes in: displacement against radius, with credible bands.
+
+The displacement is what distortion does to an image point, distorted minus ideal, at the place where the point is seen;
+its radial part points away from the principal point of each draw. A pointwise band holds the given share of draws at
+each radius by itself; a curve of the posterior leaves it somewhere more often than that. The simultaneous band is
+mean +- c sd with c such that the given share of draws stays inside everywhere (the "sup-t" band; Montiel Olea &
+Plagborg-Moller 2019, J. Applied Econometrics 34(1), 1-17).
+
+Focal length and distortion are coupled: what one adds, the other takes off. These bands are of the distortion alone;
+where there are stars, they are wider than the uncertainty of directions, which the field map shows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.fields import ARCSEC
+from starcal_uq.camera.projection import unproject, unproject_theta
+from starcal_uq.core.errors import DistortionError
+from starcal_uq.core.formatting import percent, significant
+from starcal_uq.core.types import FloatArray
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.observations.table import Observations
+
+_AZIMUTHS_DEG = (0.0, 45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0)
+
+
+@dataclass(frozen=True, eq=False)
+class DistortionCurve:
+    """Radial displacement against the radius at which a point is seen.
+
+    Attributes
+    ----------
+    radius_px : (n,) array
+        Distance from the principal point, from zero to the farthest corner of the detector.
+    azimuth_deg : (A,) array
+        Directions from the principal point, 0 along rising x and 90 along rising y; empty of meaning, and of length
+        one, for models that are the same in all directions.
+    mean_px, sd_px : (A, n) array
+        Mean and standard deviation of the radial displacement over the posterior, px.
+    lower_px, upper_px : (A, n) array
+        Pointwise band.
+    lower_simultaneous_px, upper_simultaneous_px : (A, n) array
+        Band that holds whole curves, over all radii and azimuths at once.
+    arcsec_per_px : (n,) array
+        Angle that a radial displacement of one pixel stands for at each radius.
+    level : float
+        Share of the posterior in the bands.
+    multiplier : float
+        Half-width of the simultaneous band in standard deviations.
+    model : str
+        Distortion model.
+    n_draws : int
+        Draws used.
+    star_radius_px : float
+        Largest radius of an observed star: beyond it the curve is extrapolated; NaN where stars were not given.
+    """
+
+    radius_px: FloatArray
+    azimuth_deg: FloatArray
+    mean_px: FloatArray
+    sd_px: FloatArray
+    lower_px: FloatArray
+    upper_px: FloatArray
+    lower_simultaneous_px: FloatArray
+    upper_simultaneous_px: FloatArray
+    arcsec_per_px: FloatArray
+    level: float
+    multiplier: float
+    model: str
+    n_draws: int
+    star_radius_px: float
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """One row per azimuth and radius: mean, sd and bands in px, and mean and sd in arcsec."""
+        import pandas as pd
+
+        count, n = self.mean_px.shape
+        scale = np.tile(self.arcsec_per_px, count)
+        names = ("mean_px", "sd_px", "lower_px", "upper_px", "lower_simultaneous_px", "upper_simultaneous_px")
+        return pd.DataFrame(
+            {
+                "azimuth_deg": np.repeat(self.azimuth_deg, n),
+                "radius_px": np.tile(self.radius_px, count),
+                **{name: getattr(self, name).ravel() for name in names},
+                "mean_arcsec": self.mean_px.ravel() * scale,
+                "sd_arcsec": self.sd_px.ravel() * scale,
+            }
+        )
+
+    @property
+    def corner_words(self) -> str:
+        """Displacement at the largest radius, with its standard deviation, in words."""
+        row = int(np.argmax(np.abs(self.mean_px[:, -1])))
+        value, sd = float(self.mean_px[row, -1]), float(self.sd_px[row, -1])
+        scale = float(self.arcsec_per_px[-1])
+        where = "" if len(self.mean_px) == 1 else f" at {self.azimuth_deg[row]:g}° from the x axis"
+        return (
+            f"At {self.radius_px[-1]:.0f} px{where} the distortion is {significant(value, 4)} ± {significant(sd)} px "
+            f"({significant(value * scale, 4)} ± {significant(sd * scale)} arcsec)."
+        )
+
+    def plot_distortion(self, **options: Any) -> Any:
+        """Curve and bands; options as for `starcal_uq.presentation.figures.distortion.plot_distortion_curve`."""
+        from starcal_uq.presentation.figures.distortion import plot_distortion_curve
+
+        return plot_distortion_curve(self, **options)
+
+    def _repr_html_(self) -> str:
+        return (
+            f"<p><b>Distortion</b> ({self.model}), {self.n_draws} draws: {self.corner_words} "
+            f"Bands of {percent(self.level)}; the simultaneous one is ±{self.multiplier:.2f} sd wide.</p>"
+        )
+
+
+def distortion_curve(
+    post: Posterior,
+    obs: Observations | None = None,
+    *,
+    n: int = 101,
+    n_draws: int = 2000,
+    level: float = 0.95,
+    azimuths_deg: Sequence[float] | None = None,
+    seed: int = 0,
+) -> DistortionCurve:
+    """Radial displacement against radius, with pointwise and simultaneous credible bands.
+
+    Parameters
+    ----------
+    post : Posterior
+        Draws of the camera.
+    obs : Observations, optional
+        Shows how far out stars were observed.
+    n : int
+        Radii from zero to the farthest corner.
+    n_draws : int
+        Draws taken at random from the posterior; all if there are fewer.
+    level : float
+        Share of the posterior in the bands.
+    azimuths_deg : sequence of float, optional
+        Directions for models with decentring terms; by default every 45 degrees. Others are the same in all.
+    seed : int
+        Chooses the draws.
+
+    Raises
+    ------
+    ValueError
+        For fewer than two radii or a level outside (0, 1).
+    DistortionError
+        For a camera without distortion, or when a draw folds the distortion within the detector.
+    """
+    if n < 2 or not 0.0 < level < 1.0:
+        raise ValueError(f"a curve needs at least 2 radii and a level between 0 and 1, not {n} and {level:g}.")
+    model = get_model(post.camera.distortion)
+    if not model.coefficients:
+        raise DistortionError("the camera's distortion model is 'none', so there is no curve: choose another model.")
+    decentred = any(not c.name.startswith("k") for c in model.coefficients)
+    chosen = _AZIMUTHS_DEG if azimuths_deg is None else tuple(azimuths_deg)
+    azimuth = np.array(chosen if decentred else (0.0,), dtype=np.float64)
+    camera = post.camera.with_theta(post.mean)
+    radius = np.linspace(0.0, _farthest(camera.width_px, camera.height_px, post.mean), n)
+    outward = np.column_stack([np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))])
+    offsets = (radius[None, :, None] * outward[:, None]).reshape(-1, 2)
+    unproject(camera, offsets + post.mean[:2])
+    draws = post.thin(n_draws, seed)[:, :-1]
+    curves = np.stack([_radial(model.name, theta, offsets, outward, n) for theta in draws])
+    if not np.isfinite(curves).all():
+        raise DistortionError(
+            f"at some posterior draws the distortion {model.name!r} folds over within the detector: use more frames, a "
+            "tighter prior or a model with fewer coefficients."
+        )
+    mean, sd = curves.mean(axis=0), curves.std(axis=0, ddof=1)
+    tail = 50.0 * (1.0 - level)
+    lower, upper = np.percentile(curves, (tail, 100.0 - tail), axis=0)
+    positive = sd > 1e-9 * sd.max()
+    excess = np.abs(curves - mean)[:, positive] / sd[positive]
+    multiplier = float(np.quantile(excess.max(axis=1), level))
+    f = float(post.mean[2])
+    return DistortionCurve(
+        radius_px=radius,
+        azimuth_deg=azimuth,
+        mean_px=mean,
+        sd_px=sd,
+        lower_px=lower,
+        upper_px=upper,
+        lower_simultaneous_px=mean - multiplier * sd,
+        upper_simultaneous_px=mean + multiplier * sd,
+        arcsec_per_px=f / (f * f + radius * radius) * ARCSEC,
+        level=level,
+        multiplier=multiplier,
+        model=model.name,
+        n_draws=len(draws),
+        star_radius_px=np.nan if obs is None else float(np.hypot(*(obs.xy - post.mean[:2]).T).max()),
+    )
+
+
+def _farthest(width: int, height: int, theta: FloatArray) -> float:
+    """Distance of the farthest corner from the principal point."""
+    x = max(theta[0] + 0.5, width - 0.5 - theta[0])
+    y = max(theta[1] + 0.5, height - 0.5 - theta[1])
+    return float(np.hypot(x, y))
+
+
+def _radial(model: str, theta: FloatArray, offsets: FloatArray, outward: FloatArray, n: int) -> FloatArray:
+    """Radial part (A, n) of distorted minus ideal points, at offsets (A * n, 2) from the draw's principal point."""
+    b = unproject_theta(model, theta, offsets + theta[:2])
+    displacement = offsets - theta[2] * b[:, :2] / b[:, 2:]
+    radial: FloatArray = np.sum(displacement.reshape(len(outward), n, 2) * outward[:, None], axis=2)
+    return radial

@@ -1,0 +1,191 @@
+"""Merge run folders into a run folder, with the observations of all of them where they are there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from starcal_uq.core.errors import CalibrationError, RunFolderError
+from starcal_uq.core.types import AnyDict, FloatArray, StrArray
+from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.expansion import optimum
+from starcal_uq.estimation.merging import merge, renumbered
+from starcal_uq.observations.table import COLUMNS, Observations, load_observations
+from starcal_uq.runs.folder import PathLike, RunFolder, check_new_run
+
+_FILES = (
+    "observations",
+    "camera",
+    "calibration",
+    "arrays",
+    "posterior",
+    "coupling",
+    "attitude",
+    "field_map",
+    "budget",
+    "report",
+)
+
+
+def merge_runs(
+    paths: Sequence[PathLike],
+    out: PathLike | None = None,
+    *,
+    noise: str = "common",
+    allow_inconsistent: bool = False,
+    force: bool = False,
+) -> Calibration:
+    """Merge run folders and write the result as a run folder.
+
+    Where every run still holds the observations it was calibrated on, they are joined (`join_observations`) and written
+    too, so that exact checks and the attitude error remain possible. Otherwise the merged run has none: `sample` takes
+    it with ``obs=None``, and its residuals and attitudes are those of the runs.
+
+    Parameters
+    ----------
+    paths : sequence of path
+        Run folders.
+    out : path, optional
+        Folder to write; nothing is written without it.
+    noise, allow_inconsistent
+        As in `merging.merge`.
+    force : bool
+        Replace the results in `out` if it is not empty.
+
+    Returns
+    -------
+    Calibration
+        See `merging.merge`.
+
+    Raises
+    ------
+    RunFolderError
+        If a folder lacks its calibration, or `out` is one of the runs, or not empty.
+    CalibrationError
+        If the runs cannot be merged.
+    """
+    folders = [RunFolder(path) for path in paths]
+    target = None if out is None else RunFolder(out)
+    if target is not None:
+        _check_target(target, folders, force)
+    calibrations = [Calibration.load(folder.require("calibration")) for folder in folders]
+    names = _names(folders)
+    tables = [_own_observations(folder, cal) for folder, cal in zip(folders, calibrations, strict=True)]
+    present = [table for table in tables if table is not None]
+    joined = None
+    if len(present) == len(tables) and len(present) > 1:
+        stated = [optimum(cal.compressed).sigma for cal in calibrations] if noise == "own" else None
+        joined = join_observations(present, names, stated)
+    merged = merge(calibrations, joined, names=names, noise=noise, allow_inconsistent=allow_inconsistent)
+    if target is not None:
+        target.create()
+        for name in _FILES:
+            getattr(target, name).unlink(missing_ok=True)
+        if joined is not None:
+            joined.save(target.observations, force=True)
+        merged.nominal.save(target.camera, force=True)
+        merged.save(target.calibration)
+    return merged
+
+
+def join_observations(
+    tables: Sequence[Observations], names: Sequence[str], noise: Sequence[float] | None = None
+) -> Observations:
+    """All rows in one table, frames renumbered run by run.
+
+    The frame numbers of the first run stay, those of each further run are shifted to follow; ``meta["merged"]`` holds
+    the shifts. An optional column that only some runs have is filled where it may have gaps, and left out otherwise.
+
+    Parameters
+    ----------
+    tables : sequence of Observations
+        One per run.
+    names : sequence of str
+        What the runs are called.
+    noise : sequence of float, optional
+        Noise of each run, px or a factor on what its stars state, to be written as their stated noise.
+
+    Raises
+    ------
+    CalibrationError
+        If a star of a frame is in two runs, only some state their noise, or directions are of different kinds.
+    """
+    kinds = {table.meta["directions"] for table in tables}
+    if len(kinds) > 1:
+        raise CalibrationError(
+            f"the runs' directions are of different kinds ({', '.join(sorted(kinds))}), so that their focal lengths "
+            "mean different things: declare them when calibrating."
+        )
+    _, shifts = renumbered([table.frame_ids for table in tables])
+    columns: AnyDict = {}
+    for name in COLUMNS:
+        values = [getattr(table, name) for table in tables]
+        if name == "sigma_px" and noise is not None:
+            values = [_stated(table, factor) for table, factor in zip(tables, noise, strict=True)]
+        missing = [value is None for value in values]
+        if name == "sigma_px" and any(missing) and not all(missing):
+            raise CalibrationError("only some of the runs state the noise of their stars: merge with noise 'own'.")
+        if all(missing) or (any(missing) and not COLUMNS[name].gaps):
+            continue
+        columns[name] = np.concatenate(
+            [_gaps(name, len(t)) if v is None else v for t, v in zip(tables, values, strict=True)]
+        )
+    columns["frame"] = np.concatenate([table.frame + shift for table, shift in zip(tables, shifts, strict=True)])
+    _check_disjoint(columns, tables, names)
+    parts = [
+        {"name": name, "frame_shift": shift, "n_frames": table.n_frames, "data_sha256": table.data_hash}
+        for name, shift, table in zip(names, shifts, tables, strict=True)
+    ]
+    meta: AnyDict = {"directions": tables[0].meta["directions"], "source": f"merged from {', '.join(names)}"}
+    truths = [table.meta.get("truth") for table in tables]
+    if truths[0] is not None and all(truth == truths[0] for truth in truths):
+        meta["truth"] = truths[0]
+    return Observations(**columns, meta={**meta, "merged": parts})
+
+
+def _stated(table: Observations, factor: float) -> FloatArray:
+    stated = np.ones(len(table)) if table.sigma_px is None else table.sigma_px
+    return np.asarray(factor * stated)
+
+
+def _gaps(name: str, n: int) -> FloatArray | StrArray:
+    return np.full(n, "", dtype=np.str_) if COLUMNS[name].kind == "text" else np.full(n, np.nan)
+
+
+def _check_disjoint(columns: AnyDict, tables: Sequence[Observations], names: Sequence[str]) -> None:
+    """The same centroid of the same star, to the last bit, is the same measurement."""
+    owner = np.repeat(np.arange(len(tables)), [len(table) for table in tables])
+    rows = np.column_stack([columns[name] for name in ("x_px", "y_px", "ra_deg", "dec_deg")])
+    _, group = np.unique(rows, axis=0, return_inverse=True)
+    group = group.reshape(-1)
+    order = np.lexsort((owner, group))
+    shared = (np.diff(group[order]) == 0) & (np.diff(owner[order]) != 0)
+    if np.any(shared):
+        at = int(np.flatnonzero(shared)[0])
+        first, second = owner[order[at]], owner[order[at + 1]]
+        raise CalibrationError(
+            f"{names[second]}: {int(np.sum(shared))} of its stars are measurements that another run holds too (first "
+            f"{names[first]}), which would count twice: leave one of the runs out, or calibrate them apart."
+        )
+
+
+def _own_observations(folder: RunFolder, calibration: Calibration) -> Observations | None:
+    """The observations of a run; None where they are missing or no longer those of its calibration."""
+    if not folder.observations.is_file():
+        return None
+    table = load_observations(folder.observations)
+    return table if table.data_hash == calibration.provenance.get("data_sha256") else None
+
+
+def _names(folders: Sequence[RunFolder]) -> list[str]:
+    short = [folder.path.resolve().name for folder in folders]
+    return short if len(set(short)) == len(short) else [str(folder.path) for folder in folders]
+
+
+def _check_target(target: RunFolder, folders: Sequence[RunFolder], force: bool) -> None:
+    place: Path = target.path.resolve()
+    if any(folder.path.resolve() == place for folder in folders):
+        raise RunFolderError(f"{target.path}: is one of the runs to merge; name another folder for the result.")
+    check_new_run(target, force)

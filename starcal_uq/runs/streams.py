@@ -1,0 +1,151 @@
+"""A recursive calibration of a table of any size, from file to run folder; an interrupted one goes on.
+
+While the filter runs, its state is kept in the folder; at the end the state gives way to the calibration and to the
+estimates after every frame.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from starcal_uq.camera.distortion import parameters
+from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.interrupts import interrupt_between_steps
+from starcal_uq.core.types import AnyDict
+from starcal_uq.estimation.recursive.recursion_options import RecursionOptions
+from starcal_uq.estimation.recursive.stream import RecursiveCalibration
+from starcal_uq.observations.streams import FrameStream, stream_frames
+from starcal_uq.runs.folder import RunFolder, atomic_path, atomic_write_text, check_new_run
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.estimation.calibration import Calibration
+
+STATE, SOURCE, HISTORY = "recursion.npz", "recursion.json", "history.csv"
+# Frames between two looks at Ctrl-C, and between two savings of the state.
+_CHUNK, _SAVE_EVERY = 64, 4096
+
+
+def filter_run(
+    path: str | Path,
+    camera: Camera,
+    out: str | Path,
+    *,
+    method: str = "griffith",
+    options: RecursionOptions | None = None,
+    columns: Mapping[str, str] | None = None,
+    force: bool = False,
+) -> Calibration:
+    """Calibrate recursively from a file that need not fit into memory.
+
+    Parameters
+    ----------
+    path : path
+        What `stream_frames` reads.
+    camera : Camera
+        Start values.
+    out : path
+        Run folder: ``camera.toml``, ``calibration.json`` and ``history.csv``; it holds no observations.
+    method, options
+        As for `RecursiveCalibration`.
+    columns : mapping, optional
+        Names in the file of columns that are called otherwise.
+    force : bool
+        Replace what the folder holds, and start anew.
+
+    Raises
+    ------
+    RunFolderError
+        When the folder holds results, or the state of another calibration.
+    ObservationError, CalibrationError
+        As `stream_frames` and `RecursiveCalibration`.
+    KeyboardInterrupt
+        After Ctrl-C; the state is kept, and the same call goes on from it.
+    """
+    run, stream = RunFolder(out), stream_frames(path, camera, columns)
+    options = options or RecursionOptions()
+    filtering = RecursiveCalibration(camera, method, options)
+    identity: AnyDict = {
+        "files": [[str(file.resolve()), file.stat().st_size, file.stat().st_mtime_ns] for file in stream.paths],
+        "columns": dict(columns or {}),
+        "camera": camera.to_dict(),
+        "method": method,
+        "options": options.to_dict(),
+    }
+    state = run.path / STATE
+    if force:
+        state.unlink(missing_ok=True)
+    if state.exists():
+        _check_same(run.path / SOURCE, identity)
+        filtering = RecursiveCalibration.load(state)
+    else:
+        check_new_run(run, force)
+
+    def keep() -> None:
+        run.create()
+        atomic_write_text(run.path / SOURCE, json.dumps(identity) + "\n")
+        filtering.save(state)
+
+    _feed(filtering, stream, keep)
+    calibration = filtering.result()
+    run.create()
+    camera.save(run.camera, force=True)
+    calibration.save(run.calibration)
+    with atomic_path(run.path / HISTORY) as temporary:
+        history(calibration).to_csv(temporary, index=False)
+    for name in (STATE, SOURCE):
+        (run.path / name).unlink(missing_ok=True)
+    return calibration
+
+
+def _feed(filtering: RecursiveCalibration, stream: FrameStream, keep: Callable[[], None]) -> None:
+    """Give the filter the frames that it has not seen; `keep` saves its state."""
+    frames = iter(stream)
+    next(islice(frames, filtering.n_frames, filtering.n_frames), None)
+    saved = filtering.n_frames
+    with interrupt_between_steps() as check:
+        try:
+            for index, frame in enumerate(frames):
+                filtering.update(frame)
+                if index % _CHUNK == 0:
+                    check()
+                if filtering.n_frames - saved >= _SAVE_EVERY:
+                    keep()
+                    saved = filtering.n_frames
+        except KeyboardInterrupt:
+            keep()
+            raise
+
+
+def _check_same(path: Path, identity: AnyDict) -> None:
+    try:
+        same = json.loads(path.read_text(encoding="utf-8")) == json.loads(json.dumps(identity))
+    except (OSError, ValueError):
+        same = False
+    if not same:
+        raise RunFolderError(
+            f"{path.parent}: holds an unfinished calibration of other data or with other settings: repeat its call to "
+            "go on, or start anew with --force."
+        )
+
+
+def history(calibration: Calibration) -> pd.DataFrame:
+    """Estimates and the filter's own sigmas after every frame (every second, fourth ... of very many).
+
+    Columns are ``row`` (0 is the start), the parameters in px units, and ``sigma_`` with each parameter's name.
+    """
+    import pandas as pd
+
+    stage = next(stage for stage in calibration.stages if stage.name == "filter")
+    table: AnyDict = {"row": range(len(stage.trajectory))}
+    for index, parameter in enumerate(parameters(calibration.camera.distortion)[: stage.trajectory.shape[1]]):
+        table[parameter.name] = stage.trajectory[:, index]
+        if stage.sigmas is not None and index < stage.sigmas.shape[1]:
+            table[f"sigma_{parameter.name}"] = stage.sigmas[:, index]
+    return pd.DataFrame(table)

@@ -1,0 +1,1 @@
+"""Data with known truth: stars in frames, and rendered images."""

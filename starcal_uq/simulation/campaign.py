@@ -1,0 +1,145 @@
+"""Many rendered frames in a folder."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.core.errors import RunFolderError, SensorError
+from starcal_uq.core.types import FloatArray
+from starcal_uq.runs.folder import ensure_new
+from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky, choose_attitudes
+from starcal_uq.simulation.rendered_files import write_frame
+from starcal_uq.simulation.rendering import Scene
+from starcal_uq.simulation.sensor import Sensor
+from starcal_uq.simulation.truth import check_time
+
+if TYPE_CHECKING:
+    from starcal_uq.sky.catalogue import StarCatalogue
+
+_PATTERN = "frame_*.fits"
+
+
+def render_frames(
+    stars: StarCatalogue,
+    camera: Camera,
+    out_dir: str | os.PathLike[str],
+    *,
+    n_frames: int = 100,
+    min_stars: int = 10,
+    sensor: Sensor | None = None,
+    seed: int = 0,
+    attitudes: FloatArray | None = None,
+    rates_rad_s: ArrayLike | None = None,
+    times_utc: Sequence[str] | None = None,
+    sigma_px: float = 0.05,
+    force: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> list[Path]:
+    """Render frames at random attitudes into FITS files ``frame_00000.fits``, ``frame_00001.fits``, ...
+
+    The attitudes are those of `simulate` with the same catalogue, camera, `seed`, `min_stars` and `sigma_px`.
+
+    Parameters
+    ----------
+    stars : StarCatalogue
+        Stars with the directions that the camera sees; all of them shine, and all count for `min_stars`.
+    camera : Camera
+        The truth.
+    out_dir : str or path
+        Folder, made if it does not exist.
+    n_frames : int
+        Number of frames.
+    min_stars : int
+        Attitudes with fewer stars on the detector are drawn again.
+    sensor : Sensor, optional
+        Detector and PSF; ``Sensor()`` by default.
+    seed : int
+        Repeats bit for bit. The noise of a frame depends on the seed and the frame number only.
+    attitudes : (n, 3, 3) array, optional
+        R_cam_icrs at the middle of the exposures, instead of random ones; `n_frames` is then ignored.
+    rates_rad_s : (3,) or (n, 3) array, optional
+        Angular rate of the camera in its own axes, rad/s, of all frames or of each.
+    times_utc : sequence of str, optional
+        Middle of each exposure, UTC, ISO 8601; recorded only, the stars are not moved.
+    sigma_px : float
+        The noise of the `simulate` to be matched: stars within six times this of the edge do not count for
+        `min_stars`. It adds no noise.
+    force : bool
+        Whether existing files may be replaced.
+    progress : callable, optional
+        Called with (done, total) after every frame.
+
+    Returns
+    -------
+    list of Path
+        The files, in order.
+
+    Raises
+    ------
+    RunFolderError
+        If frames are in the folder already and `force` is false, or would remain among the new ones.
+    CatalogueError
+        When too few attitudes show `min_stars` stars.
+    SensorError
+        For arguments that do not fit together.
+    """
+    if n_frames < 1 or min_stars < 0 or seed < 0 or not sigma_px >= 0.0:
+        raise SensorError(
+            f"rendering: n_frames={n_frames}, min_stars={min_stars}, seed={seed}, sigma_px={sigma_px} do not fit; "
+            "give at least one frame and no negative number."
+        )
+    rotations, _ = choose_attitudes(
+        Sky(stars, camera, EDGE_SIGMAS * sigma_px),
+        np.random.default_rng(seed),
+        n_frames=n_frames,
+        min_stars=min_stars,
+        attitudes=None if attitudes is None else np.asarray(attitudes, dtype=np.float64).reshape(-1, 3, 3),
+    )
+    n = len(rotations)
+    rates = np.zeros(3) if rates_rad_s is None else np.asarray(rates_rad_s, dtype=np.float64)
+    if rates.shape not in ((3,), (n, 3)):
+        raise SensorError(f"rendering: the rates have shape {rates.shape}; give (3,) or ({n}, 3) in rad/s.")
+    times = [None] * n if times_utc is None else [check_time(text) for text in times_utc]
+    if len(times) != n:
+        raise SensorError(f"rendering: there are {len(times)} times for {n} frames; give one for each.")
+    paths = _targets(Path(out_dir), n, force)
+    scene = Scene(stars, camera, Sensor() if sensor is None else sensor)
+    for number, path in enumerate(paths):
+        frame = scene.render(
+            rotations[number],
+            np.random.default_rng([seed, number]),
+            rate_rad_s=np.broadcast_to(rates, (n, 3))[number],
+            frame=number,
+            seed=seed,
+            time_utc=times[number],
+        )
+        write_frame(frame, path, force)
+        if progress is not None:
+            progress(number + 1, n)
+    return paths
+
+
+def _targets(folder: Path, n: int, force: bool) -> list[Path]:
+    """The files to write, in a folder where no other frames would be taken for theirs."""
+    paths = [folder / f"frame_{number:05d}.fits" for number in range(n)]
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        present = sorted(folder.glob(_PATTERN))
+    except OSError as error:
+        raise RunFolderError(f"{folder}: the folder cannot be made ({error.strerror}); choose another.") from error
+    others = sorted(set(present) - set(paths))
+    if others:
+        raise RunFolderError(
+            f"{others[0]}: the folder holds {len(others)} other frames that would mix with the new ones; "
+            "choose an empty folder or remove them."
+        )
+    if present:
+        ensure_new(present[0], force)
+    return paths

@@ -1,0 +1,229 @@
+"""Observations of a catalogue through a camera, with known truth."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import random_rotations
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.projection import fold_radius_px, project, unproject
+from starcal_uq.core.errors import CameraError, CatalogueError
+from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.observations.table import Observations
+
+if TYPE_CHECKING:
+    from starcal_uq.sky.catalogue import StarCatalogue
+
+# Attitudes drawn at once; also how many are tried before a camera is declared too narrow for its catalogue.
+_BATCH = 256
+_MAX_TRIES_PER_FRAME = 2000
+# More attitudes than this take minutes: refused as soon as the first tries say that so many would be needed.
+_MAX_TRIES = 500_000
+# Stars nearer to the edge than this many sigma are left out, so that noise does not decide which stars are seen.
+EDGE_SIGMAS = 6.0
+
+# The equation of Ye & Yang 2017 that is read as the distortion of their simulation, and the model that says the same.
+CONVENTIONS = {"eq14": "brown", "eq6": "inverse"}
+
+
+def paper_camera(convention: str = "eq14") -> Camera:
+    """The sensor of Table 1 of Ye & Yang 2017: 1024 x 1024 pixels of 12 um behind 70.2262 mm, about 10 degrees.
+
+    Parameters
+    ----------
+    convention : {"eq14", "eq6"}
+        The equation that the coefficients belong to: eq. 14 takes ideal points to distorted ones (model ``brown``),
+        eq. 6 distorted points to ideal ones (model ``inverse``). The paper has both.
+
+    Raises
+    ------
+    CameraError
+        For another convention.
+    """
+    if convention not in CONVENTIONS:
+        raise CameraError(f"convention {convention!r} is unknown: use one of {', '.join(CONVENTIONS)}.")
+    return Camera(
+        width_px=1024,
+        height_px=1024,
+        pixel_um=12.0,
+        focal_mm=70.2262,
+        x0_px=500.0,
+        y0_px=530.0,
+        distortion=CONVENTIONS[convention],
+        coefficients=(2.0e-10, -3.5e-15),
+        name="Ye & Yang 2017, Table 1",
+    )
+
+
+def paper_start(convention: str = "eq14") -> Camera:
+    """The start of the paper's section 3.2: 72 mm, principal point (512, 512), no distortion."""
+    return paper_camera(convention).replace(
+        focal_mm=72.0, x0_px=512.0, y0_px=512.0, coefficients=(0.0, 0.0), name="start of Ye & Yang 2017"
+    )
+
+
+def simulate(
+    stars: StarCatalogue,
+    camera: Camera,
+    *,
+    n_frames: int = 1000,
+    min_stars: int = 10,
+    sigma_px: float = 0.05,
+    seed: int = 0,
+    attitudes: FloatArray | None = None,
+) -> Observations:
+    """Simulate identified stars in frames at uniformly random attitudes.
+
+    Parameters
+    ----------
+    stars : StarCatalogue
+        Catalogue; its magnitude limit is the sensor's.
+    camera : Camera
+        The truth.
+    n_frames : int
+        Number of frames.
+    min_stars : int
+        Attitudes with fewer stars in the field are drawn again (at least 3).
+    sigma_px : float
+        Gaussian centroid noise, px per axis.
+    seed : int
+        Repeats bit for bit.
+    attitudes : (n_frames, 3, 3) array, optional
+        R_cam_icrs to use instead of random ones; `n_frames` is then ignored, and every frame must hold `min_stars`.
+
+    Returns
+    -------
+    Observations
+        Directions are those of the catalogue as given, so that they are exactly what the camera saw
+        (``meta["directions"] = "apparent"``).
+
+    Raises
+    ------
+    CatalogueError
+        When the field is too narrow for the catalogue to show `min_stars`.
+    DistortionError
+        When the camera's distortion folds over inside the field.
+    """
+    if not sigma_px >= 0.0 or min_stars < 3 or n_frames < 1:
+        raise ValueError(
+            f"sigma_px={sigma_px}, min_stars={min_stars}, n_frames={n_frames}: noise must not be negative, a frame "
+            "needs at least 3 stars, and there must be at least one frame."
+        )
+    rng = np.random.default_rng(seed)
+    sky = Sky(stars, camera, EDGE_SIGMAS * sigma_px)
+    _, frames = choose_attitudes(sky, rng, n_frames=n_frames, min_stars=min_stars, attitudes=attitudes)
+    index = np.concatenate([seen for seen, _ in frames])
+    xy = np.concatenate([xy for _, xy in frames])
+    xy = xy + sigma_px * rng.standard_normal(xy.shape)
+    return Observations(
+        frame=np.repeat(np.arange(len(frames)), [len(seen) for seen, _ in frames]),
+        x_px=xy[:, 0],
+        y_px=xy[:, 1],
+        ra_deg=stars.ra_deg[index],
+        dec_deg=stars.dec_deg[index],
+        star_id=stars.star_id[index],
+        mag=stars.mag[index],
+        meta={
+            "source": "simulated",
+            "directions": "apparent",
+            "seed": seed,
+            "sigma_px": sigma_px,
+            "truth": camera.to_dict(),
+        },
+    )
+
+
+def choose_attitudes(
+    sky: Sky, rng: np.random.Generator, *, n_frames: int, min_stars: int, attitudes: FloatArray | None = None
+) -> tuple[FloatArray, list[tuple[IntArray, FloatArray]]]:
+    """Attitudes that show at least `min_stars` stars: random ones, or the given ones after a check.
+
+    Parameters
+    ----------
+    sky : Sky
+        Catalogue and camera.
+    rng : numpy.random.Generator
+        Source of the attitudes; it is left alone when `attitudes` are given.
+    n_frames, min_stars : int
+        As for `simulate`.
+    attitudes : (n_frames, 3, 3) array, optional
+        R_cam_icrs.
+
+    Returns
+    -------
+    rotations : (n, 3, 3) array
+    views : list of (indices, pixels)
+        As `Sky.views` returns them for these rotations.
+
+    Raises
+    ------
+    CatalogueError
+        When a given attitude shows fewer stars, or random ones nearly always do.
+    """
+    if attitudes is not None:
+        frames = sky.views(attitudes)
+        for number, (seen, _) in enumerate(frames):
+            if len(seen) < min_stars:
+                raise CatalogueError(
+                    f"the attitude with index {number} shows {len(seen)} stars, fewer than min_stars={min_stars}: "
+                    "choose other attitudes, a deeper catalogue or a smaller min_stars."
+                )
+        return attitudes, frames
+    chosen: list[FloatArray] = []
+    frames = []
+    tries = 0
+    while len(frames) < n_frames:
+        rotations = random_rotations(_BATCH, rng)
+        views = sky.views(rotations)
+        enough = [number for number, view in enumerate(views) if len(view[0]) >= min_stars]
+        frames += [views[number] for number in enough]
+        chosen.append(rotations[enough])
+        tries += _BATCH
+        hopeless = tries >= _MAX_TRIES_PER_FRAME and n_frames * tries > _MAX_TRIES * (len(frames) + 1)
+        if hopeless or tries > _MAX_TRIES_PER_FRAME * (len(frames) + 1):
+            raise CatalogueError(
+                f"only {len(frames)} of {tries} random attitudes show {min_stars} stars of the catalogue: "
+                "raise max_mag, or lower min_stars."
+            )
+    return np.concatenate(chosen)[:n_frames], frames[:n_frames]
+
+
+class Sky:
+    """Finds the stars of a catalogue on the detector.
+
+    Parameters
+    ----------
+    stars : StarCatalogue
+        Catalogue.
+    camera : Camera
+        Optics and detector.
+    margin_px : float
+        Stars nearer to the edge than this are left out; a negative margin lets in stars outside the detector.
+    """
+
+    def __init__(self, stars: StarCatalogue, camera: Camera, margin_px: float) -> None:
+        self.camera = camera
+        self.directions = stars.directions_icrs
+        self.low = -0.5 + margin_px
+        self.high = np.array([camera.width_px, camera.height_px]) - 0.5 - margin_px
+        low, high = min(-0.5, self.low), np.maximum(np.array([camera.width_px, camera.height_px]) - 0.5, self.high)
+        b = unproject(camera, np.array([(x, y) for x in (low, high[0]) for y in (low, high[1])]))
+        # A little wider than the farthest corner; the exact cut is made in pixels.
+        self.min_cosine = float(np.cos(1.02 * np.max(np.arccos(b[:, 2]))))
+        if self.min_cosine > 0.0:
+            ideal_px = camera.focal_px * np.sqrt(1.0 / self.min_cosine**2 - 1.0)
+            if fold_radius_px(camera.distortion, camera.theta, ideal_px) <= ideal_px:
+                self.min_cosine = float(np.min(b[:, 2]))
+
+    def views(self, rotations: FloatArray) -> list[tuple[IntArray, FloatArray]]:
+        """Catalogue indices (m,) and noise-free pixels (m, 2) of the stars on the detector, for each rotation."""
+        frame, star = np.nonzero(rotations[:, 2] @ self.directions.T > self.min_cosine)
+        b = np.einsum("nij,nj->ni", rotations[frame], self.directions[star])
+        xy = project(self.camera, b)
+        inside = np.all((xy > self.low) & (xy < self.high), axis=1)
+        edges = np.searchsorted(frame[inside], np.arange(len(rotations) + 1))
+        star, xy = star[inside], xy[inside]
+        return [(star[i:j], xy[i:j]) for i, j in pairwise(edges)]

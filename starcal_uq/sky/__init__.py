@@ -1,0 +1,1 @@
+"""Where stars are seen: catalogues, apparent places, sites, refraction."""

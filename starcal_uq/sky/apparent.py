@@ -1,0 +1,348 @@
+"""From catalogue directions to apparent ones: the Earth's velocity and the aberration of light.
+
+An observer that moves with velocity v sees every star displaced towards v by up to v/c: 20.5 arcsec for the Earth.
+The attitude absorbs the mean displacement of a frame; its change across the field (3.6 arcsec over 10 degrees)
+stretches the star pattern and would otherwise end up in the focal length.
+
+An observer on the ground also moves with the Earth's rotation and looks through the air (`ground_sky`).
+
+Not modelled: the deflection of light by the Sun (4 mas at 90 degrees from the Sun, 15 mas at 30) and annual parallax
+(0.75 arcsec for the nearest star, below 0.1 arcsec for all but a few dozen stars of naked-eye brightness).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.core.errors import CatalogueError, ObservationError
+from starcal_uq.core.formatting import plural
+from starcal_uq.core.times import julian_days
+from starcal_uq.core.types import FloatArray
+from starcal_uq.sky.positions import ra_dec_deg, unit_vectors
+from starcal_uq.sky.refraction import (
+    LEAST_ALTITUDE_DEG,
+    altitude_deg,
+    refract,
+    refraction_constants,
+    shrinking,
+    site_among_stars,
+)
+from starcal_uq.sky.site import Site
+
+if TYPE_CHECKING:
+    from starcal_uq.observations.table import Observations
+
+LIGHT_SPEED_KM_S = 299792.458
+AU_PER_DAY_KM_S = 149597870.7 / 86400.0
+# No spacecraft has exceeded 200 km/s; a velocity given in m/s does.
+MAX_VELOCITY_KM_S = 1000.0
+SUN_DISTANCE_AU = 1.0
+# Faster than this relative to the Earth's centre, an observer is in space: the ground moves at 0.46 km/s.
+_IN_SPACE_KM_S = 1.0
+_NO_AIR = ("space", "rendered")
+_ARCSEC = 648000.0 / np.pi
+_STARS_PER_FRAME = 4
+
+
+def earth_velocity_km_s(time_utc: Any) -> FloatArray:
+    """Barycentric velocity of the Earth's centre, ICRS axes.
+
+    Parameters
+    ----------
+    time_utc
+        One UTC time or a sequence of them: ISO 8601 text ("2026-11-21T03:04:05.6", a trailing "Z" or an offset such
+        as "+02:00" is understood), `datetime.datetime` or `numpy.datetime64`. A time without an offset is UTC.
+
+    Returns
+    -------
+    ndarray, shape (3,) for one time, (n, 3) for a sequence
+        Velocity in km/s, from `erfa.epv00` (a fit to DE405, good to 5 mm/s between 1900 and 2100). TT stands for
+        TDB: their difference of 2 ms moves the velocity by 1e-8 km/s.
+
+    Raises
+    ------
+    CatalogueError
+        A time is not readable; the message quotes it and gives its place in the sequence, from 1.
+    """
+    import erfa
+
+    days, _, inverse = julian_days(time_utc)
+    _, barycentric = erfa.epv00(days[:, 0], days[:, 1])
+    velocity = (np.asarray(barycentric["v"], dtype=np.float64) * AU_PER_DAY_KM_S)[inverse]
+    return velocity[0] if np.ndim(time_utc) == 0 else velocity
+
+
+def aberrate(directions: FloatArray, velocity_km_s: FloatArray | Sequence[float]) -> FloatArray:
+    """Apparent directions for a moving observer: special-relativistic aberration.
+
+    Parameters
+    ----------
+    directions
+        Unit vectors of the stars for an observer at rest in the solar system's barycentre, shape (n, 3) or (3,).
+    velocity_km_s
+        The observer's barycentric velocity in the same axes, km/s, shape (3,) or one row for each direction.
+
+    Returns
+    -------
+    ndarray, same shape as `directions`
+        Unit vectors, from `erfa.ab`. Its gravitational term is that of an observer 1 au from the Sun, 0.4
+        micro-arcsec.
+
+    Raises
+    ------
+    CatalogueError
+        The velocity is not three finite numbers, or is too large to be meant in km/s.
+    """
+    import erfa
+
+    velocity = check_velocity(velocity_km_s, len(directions) if directions.ndim == 2 else None) / LIGHT_SPEED_KM_S
+    inverse_gamma = np.sqrt(1.0 - np.sum(velocity**2, axis=-1))
+    return np.asarray(erfa.ab(directions, velocity, SUN_DISTANCE_AU, inverse_gamma), dtype=np.float64)
+
+
+def apparent_directions(
+    directions: FloatArray,
+    time_utc: Any,
+    observer_velocity_km_s: FloatArray | Sequence[float] | None = None,
+    site: Site | None = None,
+) -> FloatArray:
+    """Directions as a moving observer, or one at a site on the ground, sees them.
+
+    Parameters
+    ----------
+    directions
+        Unit vectors at the epoch of the observation, ICRS axes, shape (n, 3).
+    time_utc
+        One UTC time or n of them, as for `earth_velocity_km_s`.
+    observer_velocity_km_s
+        Velocity relative to the Earth's centre, ICRS axes, km/s, shape (3,) or (n, 3).
+    site
+        With a site its own velocity and the refraction of its air are added.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        Unit vectors, still along the ICRS axes: precession, nutation and the Earth's rotation are not applied, which
+        only an attitude would notice.
+    """
+    velocity = earth_velocity_km_s(time_utc)
+    if observer_velocity_km_s is not None:
+        velocity = velocity + check_velocity(observer_velocity_km_s, len(directions))
+    if site is None:
+        return aberrate(directions, velocity)
+    zenith, moving = site_among_stars(site, time_utc)
+    return refract(aberrate(directions, velocity + moving), zenith, refraction_constants(site))
+
+
+def catalogue_directions(
+    apparent: FloatArray,
+    time_utc: Any,
+    observer_velocity_km_s: FloatArray | Sequence[float] | None = None,
+    site: Site | None = None,
+) -> FloatArray:
+    """The inverse of `apparent_directions`, by iteration.
+
+    Parameters
+    ----------
+    apparent
+        Unit vectors as seen, ICRS axes, shape (n, 3).
+    time_utc, observer_velocity_km_s, site
+        As for `apparent_directions`.
+
+    Returns
+    -------
+    ndarray, shape (n, 3)
+        Unit vectors; good to 1e-4 arcsec from an altitude of ten degrees upwards.
+    """
+    found = apparent
+    for _ in range(4):
+        found = found + apparent - apparent_directions(found, time_utc, observer_velocity_km_s, site)
+        found = found / np.linalg.norm(found, axis=-1, keepdims=True)
+    return found
+
+
+def make_apparent(
+    obs: Observations,
+    observer_velocity_km_s: FloatArray | Sequence[float] | None = None,
+    site: Site | None = None,
+) -> Observations:
+    """Observations with directions as the moving observer saw them, from space or from the ground.
+
+    Aberration is added, and refraction where there is a site: the catalogue directions must already be at the epoch
+    of the observations.
+
+    Parameters
+    ----------
+    obs
+        Observations with a `time_utc` in every row, whose directions are those of a catalogue (undeclared ones are
+        taken to be).
+    observer_velocity_km_s
+        Velocity relative to the Earth's centre, ICRS axes, km/s, shape (3,) or one row for each observation; zero by
+        default. A low orbit adds 7.6 km/s (5 arcsec), a site on the ground at most 0.47 km/s (0.3 arcsec).
+    site
+        Where on the ground the camera stood; it gives the velocity, so that none is given beside it.
+
+    Returns
+    -------
+    Observations
+        The same rows; `meta["directions"]` is "apparent", `meta["observer_velocity_km_s"]` is the mean of the
+        barycentric velocities that were applied, one for each row; `meta["observer"]` is "ground" with a site, "space"
+        with a velocity above 1 km/s or where it said so, else "unknown". With a site, `meta["site"]` holds it and
+        `meta["atmosphere"]` the air that was taken and what it does.
+
+    Raises
+    ------
+    ObservationError
+        The directions are apparent already, a time is missing or unreadable, or stars are below the horizon of the
+        site or lower than ten degrees (`without_low_stars` leaves these out).
+    CatalogueError
+        The velocity is not usable.
+    """
+    if obs.meta.get("directions") == "apparent":
+        raise ObservationError(
+            "The directions of these observations are apparent already; aberration would be applied twice, "
+            'so leave out make_apparent or set meta["directions"] to "catalogue".'
+        )
+    if site is not None and observer_velocity_km_s is not None:
+        raise ObservationError("A site has a velocity of its own: give the site or the observer's velocity, not both.")
+    velocity = _earth_velocity(obs)
+    if observer_velocity_km_s is not None:
+        own = check_velocity(observer_velocity_km_s, len(obs))
+        velocity = velocity + own
+    directions = unit_vectors(obs.ra_deg, obs.dec_deg)
+    meta: dict[str, Any] = {"directions": "apparent"}
+    if site is None:
+        seen = aberrate(directions, velocity)
+        moving = observer_velocity_km_s is not None and float(np.linalg.norm(own, axis=-1).max()) > _IN_SPACE_KM_S
+        known = obs.meta.get("observer")
+        meta["observer"] = "space" if moving else known if known in _NO_AIR else "unknown"
+    else:
+        altitude = _altitudes(obs, site, directions, velocity)
+        low = altitude < LEAST_ALTITUDE_DEG
+        if low.any():
+            raise ObservationError(
+                f"{plural(int(low.sum()), 'star')} {'is' if low.sum() == 1 else 'are'} lower than "
+                f"{LEAST_ALTITUDE_DEG:g} degrees (the first in frame {obs.frame[low][0]}), where refraction is not "
+                "known well enough; leave them out with without_low_stars.",
+                column="time_utc",
+            )
+        zenith, moved = site_among_stars(site, obs.time_utc)
+        velocity = velocity + moved
+        constants = refraction_constants(site)
+        seen = refract(aberrate(directions, velocity), zenith, constants)
+        meta |= {"observer": "ground", "site": site.to_dict(), "atmosphere": _atmosphere(site, constants, altitude)}
+    ra, dec = ra_dec_deg(seen)
+    meta["observer_velocity_km_s"] = [float(component) for component in velocity.mean(axis=0)]
+    return replace(obs, ra_deg=ra, dec_deg=dec, meta={**obs.meta, **meta})
+
+
+def without_low_stars(obs: Observations, site: Site, least_altitude_deg: float = LEAST_ALTITUDE_DEG) -> Observations:
+    """The stars that stand high enough above a site, in frames that keep at least four.
+
+    Parameters
+    ----------
+    obs
+        Observations with catalogue directions and a `time_utc` in every row.
+    site
+        Where on the ground the camera stood.
+    least_altitude_deg
+        Altitude as seen, refraction included.
+
+    Returns
+    -------
+    Observations
+        The other rows; `meta["low_stars"]` says how many were left out.
+
+    Raises
+    ------
+    ObservationError
+        A time is missing or unreadable, or a frame shows stars that were below the horizon: then the site, the time or
+        the identification is wrong.
+    """
+    altitude = _altitudes(obs, site, unit_vectors(obs.ra_deg, obs.dec_deg), _earth_velocity(obs))
+    kept = obs.select(altitude >= least_altitude_deg)
+    kept = kept.select_frames(kept.frame_ids[kept.stars_per_frame >= _STARS_PER_FRAME])
+    if not kept.n_stars:
+        raise ObservationError(
+            f"No frame has {_STARS_PER_FRAME} stars higher than {least_altitude_deg:g} degrees at the site ({site}), "
+            "below which refraction is not known well enough: take images of higher stars."
+        )
+    return kept.with_meta(low_stars=obs.n_stars - kept.n_stars)
+
+
+def _earth_velocity(obs: Observations) -> FloatArray:
+    if obs.time_utc is None:
+        raise ObservationError(
+            "The observations have no column 'time_utc', which the Earth's velocity depends on; add it "
+            "(UTC, such as 2026-11-21T03:04:05) or give directions that are apparent already.",
+            column="time_utc",
+        )
+    try:
+        return earth_velocity_km_s(obs.time_utc)
+    except CatalogueError as error:
+        raise ObservationError(f"Column 'time_utc': {error}", column="time_utc") from error
+
+
+def _altitudes(obs: Observations, site: Site, directions: FloatArray, velocity: FloatArray) -> FloatArray:
+    """Altitude of every star as seen, degrees; an error where a frame's stars were below the horizon."""
+    zenith, moving = site_among_stars(site, obs.time_utc)
+    seen = refract(aberrate(directions, velocity + moving), zenith, refraction_constants(site))
+    altitude = altitude_deg(seen, zenith)
+    if not obs.n_stars:
+        return altitude
+    starts = np.searchsorted(obs.frame, obs.frame_ids)
+    mean = np.add.reduceat(altitude, starts) / obs.stars_per_frame
+    below = np.flatnonzero(mean < 0.0)
+    if len(below):
+        first = below[0]
+        times = "" if obs.time_utc is None else f" at {obs.time_utc[starts[first]]} UTC"
+        others = f" (and {plural(len(below) - 1, 'other')})" if len(below) > 1 else ""
+        raise ObservationError(
+            f"The stars of frame {obs.frame_ids[first]}{others} were {-mean[first]:.0f} degrees below the "
+            f"horizon of the site ({site}){times}: correct the site (north and east are positive) or the time, which "
+            "must be UTC.",
+            column="time_utc",
+        )
+    return altitude
+
+
+def _atmosphere(site: Site, constants: tuple[float, float], altitude: FloatArray) -> dict[str, Any]:
+    """What was taken for the air, and what it does, in plain values."""
+    return {
+        "pressure_hpa": site.air_pressure_hpa,
+        "temperature_c": site.air_temperature_c,
+        "relative_humidity": site.relative_humidity,
+        "wavelength_um": site.wavelength_um,
+        "assumed": list(site.assumed),
+        "refraction_a_arcsec": constants[0] * _ARCSEC,
+        "refraction_b_arcsec": constants[1] * _ARCSEC,
+        "altitude_min_deg": float(altitude.min(initial=90.0)),
+        "altitude_max_deg": float(altitude.max(initial=0.0)),
+        "shrinking": float(np.mean(shrinking(altitude, constants))) if len(altitude) else 0.0,
+    }
+
+
+def check_velocity(velocity_km_s: FloatArray | Sequence[float], rows: int | None = None) -> FloatArray:
+    """The velocity as an array, or a CatalogueError that says what is wrong with it.
+
+    Its shape must be (3,), or (rows, 3) where `rows` directions are given.
+    """
+    try:
+        velocity = np.asarray(velocity_km_s, dtype=np.float64)
+    except (TypeError, ValueError):
+        velocity = np.empty(0)
+    shapes: tuple[tuple[int, ...], ...] = ((3,),) if rows is None else ((3,), (rows, 3))
+    if velocity.shape not in shapes or not np.isfinite(velocity).all():
+        raise CatalogueError(
+            "The observer's velocity must be three finite numbers in km/s (ICRS axes)"
+            + (f", or {rows} rows of them" if rows is not None else "")
+            + f"; it is {np.array2string(np.asarray(velocity_km_s), threshold=6)}."
+        )
+    fastest = float(np.sqrt((velocity**2).sum(axis=-1)).max(initial=0.0))
+    if fastest > MAX_VELOCITY_KM_S:
+        raise CatalogueError(f"An observer's velocity of {fastest:.6g} km/s is not believable; was it in m/s?")
+    return velocity

@@ -1,0 +1,251 @@
+"""Where on the ground a camera stood, and the air above it."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import tomllib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from functools import lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from starcal_uq.core.errors import SiteError
+from starcal_uq.core.types import AnyDict
+from starcal_uq.runs.folder import atomic_write_text, ensure_new
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+    from pydantic_core import ErrorDetails
+
+_HEADER = """\
+# Site of a camera on the ground.
+#
+# latitude_deg, longitude_deg: geodetic (as maps and GPS give them); north and east are positive.
+# height_m: above the ellipsoid or the sea. pressure_hpa: at the site itself, not reduced to sea level.
+# temperature_c: of the air. Without pressure or temperature, those of the standard atmosphere at this height.
+# relative_humidity: 0 to 1. wavelength_um: effective wavelength of lens and detector, micrometres.
+
+"""
+# Range, and what to write: said wherever the key is missing or wrong.
+_RANGES: dict[str, tuple[float, float]] = {
+    "latitude_deg": (-90.0, 90.0),
+    "longitude_deg": (-180.0, 360.0),
+    "height_m": (-500.0, 9000.0),
+    "pressure_hpa": (200.0, 1100.0),
+    "temperature_c": (-90.0, 60.0),
+    "relative_humidity": (0.0, 1.0),
+    "wavelength_um": (0.3, 2.5),
+}
+_WANTED = {
+    "latitude_deg": "the latitude in degrees, north positive, from -90 to 90",
+    "longitude_deg": "the longitude in degrees, east positive, from -180 to 360",
+    "height_m": "the height in metres, from -500 to 9000",
+    "pressure_hpa": "the pressure at the site in hPa, from 200 to 1100, or leave it out",
+    "temperature_c": "the temperature in degrees Celsius, from -90 to 60, or leave it out",
+    "relative_humidity": "the relative humidity, from 0 to 1",
+    "wavelength_um": "the effective wavelength in micrometres, from 0.3 to 2.5",
+    "name": "a name in quotes",
+}
+
+
+@dataclass(frozen=True)
+class Site:
+    """A place on the ground and the air above it.
+
+    Attributes
+    ----------
+    latitude_deg, longitude_deg : float
+        Geodetic, degrees; north and east are positive.
+    height_m : float
+        Height, metres.
+    pressure_hpa : float or None
+        Pressure at the site (not reduced to sea level), hPa; None for that of the standard atmosphere.
+    temperature_c : float or None
+        Temperature of the air, Celsius; None for that of the standard atmosphere.
+    relative_humidity : float
+        0 to 1. Between dry and wet air refraction differs by 0.2 %.
+    wavelength_um : float
+        Effective wavelength, micrometres. From 0.5 to 0.7 refraction changes by 1.1 %.
+    name : str
+        A name, for reports.
+
+    Raises
+    ------
+    SiteError
+        If a value is no number or out of range.
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float = 0.0
+    pressure_hpa: float | None = None
+    temperature_c: float | None = None
+    relative_humidity: float = 0.5
+    wavelength_um: float = 0.6
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        table = {name: value for name, value in vars(self).items() if value is not None}
+        for name, value in parse_site(table, "site").items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def air_pressure_hpa(self) -> float:
+        """Pressure, hPa: as given, or that of the International Standard Atmosphere at the site's height."""
+        if self.pressure_hpa is not None:
+            return self.pressure_hpa
+        return float(1013.25 * (1.0 - 2.25577e-5 * self.height_m) ** 5.25588)
+
+    @property
+    def air_temperature_c(self) -> float:
+        """Temperature, Celsius: as given, or that of the International Standard Atmosphere at the site's height."""
+        return 15.0 - 0.0065 * self.height_m if self.temperature_c is None else self.temperature_c
+
+    @property
+    def assumed(self) -> tuple[str, ...]:
+        """What of pressure and temperature is that of the standard atmosphere."""
+        given = {"pressure": self.pressure_hpa, "temperature": self.temperature_c}
+        return tuple(name for name, value in given.items() if value is None)
+
+    def __str__(self) -> str:
+        north, east = self.latitude_deg, (self.longitude_deg + 180.0) % 360.0 - 180.0
+        words = f"{abs(north):.2f}° {'N' if north >= 0 else 'S'}, {abs(east):.2f}° {'E' if east >= 0 else 'W'}"
+        return f"{self.name + ', ' if self.name else ''}{words}, {self.height_m:.0f} m"
+
+    def to_dict(self) -> AnyDict:
+        """Keys and values of a [site] table; what is not given is left out."""
+        return {name: value for name, value in asdict(self).items() if value is not None}
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any]) -> Site:
+        """From keys and values of a [site] table.
+
+        Raises
+        ------
+        SiteError
+            As `load`.
+        """
+        return cls(**parse_site(table, "site"))
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Site:
+        """From a TOML file with a [site] table.
+
+        Raises
+        ------
+        SiteError
+            If the file cannot be read, is no TOML, has no [site] table, or a key is missing, unknown or wrong.
+        """
+        return cls(**_read(Path(path)))
+
+    def save(self, path: str | os.PathLike[str], force: bool = False) -> None:
+        """Write a TOML file without loss of digits.
+
+        Raises
+        ------
+        RunFolderError
+            If the file exists and `force` is false, or cannot be written.
+        """
+        import tomli_w
+
+        ensure_new(path, force)
+        atomic_write_text(path, _HEADER + tomli_w.dumps({"site": self.to_dict()}))
+
+
+@lru_cache
+def _schema() -> type[BaseModel]:
+    from pydantic import ConfigDict, Field, create_model
+
+    kept: dict[str, Any] = {}
+    for entry in fields(Site):
+        if entry.name == "name":
+            kept["name"] = (str, "")
+            continue
+        low, high = _RANGES[entry.name]
+        required = entry.name in ("latitude_deg", "longitude_deg")
+        kept[entry.name] = (
+            (float, Field(ge=low, le=high))
+            if required
+            else (float | None if entry.default is None else float, Field(default=entry.default, ge=low, le=high))
+        )
+    config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+    return create_model("SiteTable", __config__=config, **kept)
+
+
+def parse_site(table: Mapping[str, Any], where: str) -> AnyDict:
+    """Arguments of `Site` from a [site] table.
+
+    Parameters
+    ----------
+    table
+        Keys and values.
+    where
+        What to call the table in messages, such as "site.toml, section [site]".
+
+    Raises
+    ------
+    SiteError
+        For an unknown or missing key, or a value of the wrong type, not finite or out of range.
+    """
+    from pydantic import ValidationError
+
+    try:
+        return _schema().model_validate(dict(table)).model_dump()
+    except ValidationError as error:
+        problems = [_problem(e) for e in error.errors()]
+        others = len(problems) - 1
+        more = f" ({others} more bad key{'s' if others > 1 else ''})" if others else ""
+        end = "" if problems[0].endswith("?") and not more else "."
+        raise SiteError(f"{where}: {problems[0]}{more}{end}") from None
+
+
+def _problem(error: ErrorDetails) -> str:
+    key = str(error["loc"][0])
+    if error["type"] == "missing":
+        return f"key {key} is missing; add {_WANTED[key]}"
+    if error["type"] != "extra_forbidden":
+        return f"key {key} is {error['input']!r}; write {_WANTED[key]}"
+    near = difflib.get_close_matches(key, _WANTED, n=1)
+    hint = f"did you mean {near[0]}?" if near else f"remove it (known: {', '.join(_WANTED)})"
+    return f"key {key} is unknown; {hint}"
+
+
+def _read(path: Path) -> AnyDict:
+    if os.path.isdir(path):
+        raise SiteError(f"{path}: is a directory; name the site's TOML file.")
+    try:
+        content = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
+    except FileNotFoundError:
+        raise SiteError(f"{path}: the site file does not exist; check the path.") from None
+    except OSError as error:
+        raise SiteError(f"{path}: the site file cannot be read ({error.strerror}); check its permissions.") from error
+    except UnicodeDecodeError:
+        raise SiteError(f"{path}: the site file is not UTF-8 text; save it as TOML in UTF-8.") from None
+    except tomllib.TOMLDecodeError as error:
+        raise SiteError(f"{path}: the site file is not valid TOML: {error}; correct that line.") from None
+    section = content.pop("site", None)
+    if not isinstance(section, dict):
+        raise SiteError(f"{path}: section [site] is missing; write [site] above latitude_deg and longitude_deg.")
+    if content:
+        raise SiteError(
+            f"{path}: {next(iter(content))} stands outside section [site]; remove it or move it below [site]."
+        )
+    return parse_site(section, f"{path}, section [site]")
+
+
+def check_sky(directions: str | None, site: Site | None, in_space: bool) -> None:
+    """Refuse a site together with what contradicts it.
+
+    Raises
+    ------
+    SiteError
+    """
+    if site is not None and in_space:
+        raise SiteError("A camera in space has no site on the ground: give one or the other.")
+    if site is not None and directions not in (None, "catalogue"):
+        raise SiteError(
+            f"With a site the directions are made apparent, but they are declared {directions}: leave out the site or "
+            "the declaration."
+        )
