@@ -17,7 +17,8 @@ import numpy as np
 from starcal_uq.comparison.compare import compare
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibrate import calibrate
-from starcal_uq.simulation.frames import paper_camera, paper_start, simulate
+from starcal_uq.paper.camera import paper_camera, paper_start
+from starcal_uq.simulation.frames import simulate
 from starcal_uq.sky.catalogue import load_catalogue
 
 if TYPE_CHECKING:

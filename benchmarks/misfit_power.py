@@ -20,7 +20,8 @@ from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.misfit import ALPHA, misfit_tests
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.observations.table import Observations
-from starcal_uq.simulation.frames import paper_camera, paper_start, simulate
+from starcal_uq.paper.camera import paper_camera, paper_start
+from starcal_uq.simulation.frames import simulate
 from starcal_uq.sky.apparent import aberrate
 from starcal_uq.sky.catalogue import load_catalogue
 from starcal_uq.sky.positions import ra_dec_deg, unit_vectors

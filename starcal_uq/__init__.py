@@ -131,7 +131,7 @@ _LOCATION = {
     "render": "simulation.rendering",
     "render_frames": "simulation.campaign",
     "replicate": "paper.replicates",
-    "report": "presentation.report.report",
+    "report": "runs.steps",
     "reproduce": "paper.reproduction",
     "sample": "inference.sample",
     "screen": "estimation.screening.screening",

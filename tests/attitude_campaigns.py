@@ -25,8 +25,9 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import project, unproject_theta
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.observations.table import Observations
+from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.propagation.attitude_error import AttitudeError
-from starcal_uq.simulation.frames import paper_camera, paper_start, simulate
+from starcal_uq.simulation.frames import simulate
 from starcal_uq.sky.catalogue import load_catalogue
 
 ARCSEC = 648_000.0 / np.pi

@@ -8,7 +8,8 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.observations.table import Observations
-from starcal_uq.simulation.frames import paper_camera, simulate
+from starcal_uq.paper.camera import paper_camera
+from starcal_uq.simulation.frames import simulate
 from starcal_uq.sky.catalogue import load_catalogue
 
 COEFFICIENTS: dict[str, tuple[float, ...]] = {

@@ -19,7 +19,8 @@ from starcal_uq.inference.gaussian_priors import GaussianPriors
 from starcal_uq.inference.posterior import Posterior
 from starcal_uq.inference.priors import Priors
 from starcal_uq.inference.sample import sample
-from starcal_uq.inference.update import AllowedShift, check_chain, load_priors, prior_from, shift_test
+from starcal_uq.inference.update import AllowedShift, check_chain, prior_from, shift_test
+from starcal_uq.runs.priors import load_priors
 from starcal_uq.simulation.frames import simulate
 from starcal_uq.sky.catalogue import load_catalogue
 

@@ -11,11 +11,12 @@ import pytest
 from scipy import stats
 
 import starcal_uq as sc
-from starcal_uq.diagnostics.diagnose import FILE, TABLES, Diagnosis, diagnose, diagnose_run, load_diagnosis, multi_start
+from starcal_uq.diagnostics.diagnose import FILE, TABLES, Diagnosis, diagnose, multi_start
 from starcal_uq.diagnostics.jackknife import Jackknife, accept_inflation, jackknife_frames
 from starcal_uq.diagnostics.models import ModelComparison, closed_form, compare_models
 from starcal_uq.diagnostics.predictive import PredictiveCheck, predictive_check
 from starcal_uq.estimation.normals import FrameNormals
+from starcal_uq.runs.steps import diagnose_run, load_diagnosis
 from tests.scenes import camera, nominal, observations, with_sigmas
 
 

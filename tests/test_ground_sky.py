@@ -426,8 +426,8 @@ def test_night_is_night():
 
 def _first_paragraph(obs, **meta):
     from starcal_uq.diagnostics.verdict.judge import judge
+    from starcal_uq.presentation.report.results import Results
     from starcal_uq.presentation.report.words import data_sentence
-    from starcal_uq.runs.run import Results
 
     obs = obs.with_meta(**meta)
     cal = sc.calibrate(obs, NOMINAL)

@@ -18,9 +18,9 @@ from starcal_uq.core.errors import DistortionError, ObservationError, RunFolderE
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.observations.table import Observations
+from starcal_uq.paper.camera import paper_start
 from starcal_uq.propagation.attitude_error import AXES, CONTRIBUTORS, AttitudeError
 from starcal_uq.propagation.propagate import propagate
-from starcal_uq.simulation.frames import paper_start
 from starcal_uq.simulation.mission import mission_frames, noise_by_magnitude
 from starcal_uq.sky.catalogue import load_catalogue
 from tests.attitude_campaigns import clean_frames, failures, fly, linear_estimator, with_noise

@@ -16,8 +16,9 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import project, unproject
 from starcal_uq.core.errors import CatalogueError, ImageError, RunFolderError, SensorError
 from starcal_uq.images.image import read_image
+from starcal_uq.paper.camera import paper_camera
 from starcal_uq.simulation.campaign import render_frames
-from starcal_uq.simulation.frames import paper_camera, simulate
+from starcal_uq.simulation.frames import simulate
 from starcal_uq.simulation.psf import profiles
 from starcal_uq.simulation.rendered_files import read_truth, truth_table, write_frame
 from starcal_uq.simulation.rendering import Scene, render

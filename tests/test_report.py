@@ -11,10 +11,11 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.core.formatting import significant
-from starcal_uq.diagnostics.diagnose import FILE, diagnose_run
+from starcal_uq.diagnostics.diagnose import FILE
 from starcal_uq.presentation.report.page import render
 from starcal_uq.presentation.report.tables import attitude_rows, parameter_rows, symbol, weak_directions
 from starcal_uq.runs.run import load_results
+from starcal_uq.runs.steps import diagnose_run
 from tests.scenes import camera, nominal, observations
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
@@ -273,7 +274,7 @@ def test_a_report_that_fails_leaves_the_old_one(run, monkeypatch):
     before = run.report.read_bytes()
     figures = {path: path.stat().st_mtime_ns for path in run.figures.iterdir()}
     monkeypatch.setattr("starcal_uq.presentation.report.figures.draw_figures", lambda _: {"corner": b"new"})
-    monkeypatch.setattr("starcal_uq.presentation.report.report.render", lambda *_: 1 / 0)
+    monkeypatch.setattr("starcal_uq.presentation.report.page.render", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         sc.report(run.path)
     assert run.report.read_bytes() == before

@@ -18,6 +18,7 @@ from starcal_uq.camera.projection import unproject
 from starcal_uq.paper import published
 from starcal_uq.paper import reproduction as command
 from starcal_uq.paper.angles import fit_angles
+from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.paper.checks import NO, WITHIN_NOISE, paper_checks, printed_camera
 from starcal_uq.paper.error_readings import MAXIMUM, REPROJECTION, error_sizes
 from starcal_uq.paper.errors import (
@@ -38,7 +39,7 @@ from starcal_uq.paper.replicates import replicate
 from starcal_uq.paper.result import Reproduction
 from starcal_uq.paper.shared_replicates import is_slow, joined, replicate_shared
 from starcal_uq.paper.table_2 import row_tests
-from starcal_uq.simulation.frames import paper_camera, paper_start, simulate
+from starcal_uq.simulation.frames import simulate
 from tests.scenes import observations
 
 TRUTH = paper_camera()

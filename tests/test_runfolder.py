@@ -11,14 +11,9 @@ from pathlib import Path
 import pytest
 
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.runs.folder import (
-    RunFolder,
-    atomic_path,
-    atomic_write_bytes,
-    atomic_write_text,
-    ensure_new,
-    provenance,
-)
+from starcal_uq.core.files import atomic_path, atomic_write_bytes, atomic_write_text, ensure_new
+from starcal_uq.core.provenance import provenance
+from starcal_uq.runs.folder import RunFolder
 
 
 def names(folder: Path) -> list[str]:

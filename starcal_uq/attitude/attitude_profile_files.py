@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.core.errors import AttitudeProfileError, CatalogueError, ObservationError
+from starcal_uq.core.files import table_ending
 from starcal_uq.core.times import julian_days
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.observations.rows import table_ending
 
 NAMED = ("qx", "qy", "qz", "qw")
 _NUMBERED = (("q0", "q1", "q2", "q3"), ("q1", "q2", "q3", "q4"))

@@ -16,9 +16,9 @@ from starcal_uq.budgeting.posterior import inflation, posterior_rows
 from starcal_uq.budgeting.result import Budget, by_contributor, judge
 from starcal_uq.budgeting.rows import AXES, AXIS_LABELS, FROM_FILE, Contributor, not_assessed
 from starcal_uq.budgeting.totals import N_SAMPLES, totals
-from starcal_uq.core.errors import BudgetError, RunFolderError
+from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.formatting import join_words
-from starcal_uq.runs.folder import RunFolder, provenance
+from starcal_uq.core.provenance import provenance
 
 if TYPE_CHECKING:
     from starcal_uq.diagnostics.diagnose import Diagnosis
@@ -139,51 +139,3 @@ def _missing(rows: tuple[Contributor, ...]) -> tuple[str, ...]:
             some = "" if len(absent) == len(axes) else f" (about {join_words([AXIS_LABELS[axis] for axis in absent])})"
             names.append(name + some)
     return tuple(names)
-
-
-def budget_run(
-    run_path: str | os.PathLike[str],
-    *,
-    file: BudgetFile | str | os.PathLike[str] | None = None,
-    confidence: float | None = None,
-    seed: int = 0,
-) -> Budget:
-    """The budget of a run folder, written to its ``budget.csv``.
-
-    The attitude errors are those of ``attitude.csv``, and the tests of the model those of ``diagnosis.json`` if the run
-    was diagnosed.
-
-    Parameters
-    ----------
-    run_path : path
-        Folder of a run that holds a posterior and its attitude errors.
-    file, confidence, seed
-        As for `budget`.
-
-    Raises
-    ------
-    RunFolderError
-        If a part is missing, or the data are not those of the run.
-    BudgetError
-        If the file is wrong.
-    """
-    from starcal_uq.diagnostics.diagnose import load_diagnosis
-    from starcal_uq.estimation.calibration import Calibration
-    from starcal_uq.inference.posterior import Posterior
-    from starcal_uq.observations.table import load_observations
-    from starcal_uq.propagation.attitude_error import AttitudeError
-
-    run = RunFolder(run_path)
-    stated = file if isinstance(file, BudgetFile) or file is None else load_budget_file(file)
-    cal = Calibration.load(run.require("calibration"))
-    post = Posterior.load(run.require("posterior"))
-    attitude = AttitudeError.load(run.require("attitude"))
-    obs = load_observations(run.require("observations"))
-    if obs.data_hash != cal.provenance.get("data_sha256"):
-        raise RunFolderError(
-            f"{run.path}: the calibration was made from other observations than {run.observations.name} holds; run "
-            "`starcal-uq calibrate` again."
-        )
-    found = budget(post, obs, attitude, file=stated, confidence=confidence, misfit=load_diagnosis(run, cal), seed=seed)
-    found.save(run.budget)
-    return found

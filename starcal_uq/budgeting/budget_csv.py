@@ -13,7 +13,7 @@ from starcal_uq.budgeting.file import Requirement
 from starcal_uq.budgeting.rows import Contributor
 from starcal_uq.budgeting.totals import Total
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.runs.folder import atomic_path
+from starcal_uq.core.files import atomic_path
 
 if TYPE_CHECKING:
     from starcal_uq.budgeting.result import Budget

@@ -18,7 +18,7 @@ from starcal_uq.budgeting.rows import (
     Expected,
 )
 from starcal_uq.budgeting.shapes import HALF_WIDTHS
-from starcal_uq.runs.folder import atomic_write_text, ensure_new
+from starcal_uq.core.files import atomic_write_text, ensure_new
 
 _LETTERS = dict(zip(AXES, "XYZ", strict=True))
 

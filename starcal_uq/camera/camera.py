@@ -22,8 +22,8 @@ from starcal_uq.camera.camera_files import camera_text, parse_table, read_camera
 from starcal_uq.camera.distortion import get_model, parameter_names
 from starcal_uq.camera.opencv import from_opencv, to_opencv
 from starcal_uq.core.errors import CameraError, DistortionError
+from starcal_uq.core.files import atomic_write_text, ensure_new
 from starcal_uq.core.types import BoolArray, FloatArray
-from starcal_uq.runs.folder import atomic_write_text, ensure_new
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from rich.table import Table
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.formatting import decimals_for, fixed, plural, pretty_unit, significant
+from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
@@ -25,16 +27,22 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.screening.result import Screening
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import Observations
+    from starcal_uq.propagation.attitude_error import AttitudeError
     from starcal_uq.propagation.coupling import Coupling
-    from starcal_uq.propagation.propagate import AttitudeError
 
 # Where the output is not a terminal it has no width of its own; tables then get the room they need.
 _WIDTH = None if sys.stdout.isatty() else 110
+
+
 AXES = ("pitch", "yaw", "roll")
+
 
 # Names of files, runs and requirements may hold square brackets, which are no markup.
 out = Console(width=_WIDTH, markup=False)
+
+
 err = Console(stderr=True, markup=False)
+
 
 UNDECLARED = (
     "Neither time nor observer velocity was declared: annual aberration stretches a 10 degree field by up to "
@@ -245,3 +253,19 @@ def warn_undeclared(obs: Observations) -> None:
     ignored = obs.meta.get("ignored_columns")
     if ignored:
         err.print(f"note: columns not used: {', '.join(ignored)}", highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def progress_bar(label: str) -> Iterator[Progress | None]:
+    """Yield a function ``(done, total)`` that moves a bar; None where nobody would see it."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from starcal_uq.cli.console import err
+
+    if not err.is_terminal:
+        yield None
+        return
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=err, transient=True) as bar:
+        task = bar.add_task(label, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from starcal_uq.cli.console import progress_bar
 from starcal_uq.cli.options import CameraFile, Engine, Force, Json, TimeUtc, check_same_sensor, parse_engine
-from starcal_uq.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -53,10 +53,10 @@ def centroid_command(
     """Find the stars in images, with a covariance for each; a frame that cannot be used is named and left out."""
     from starcal_uq.camera.camera import Camera
     from starcal_uq.cli.console import print_json, records
+    from starcal_uq.core.files import ensure_new
     from starcal_uq.core.times import utc_text
     from starcal_uq.images.extract import extract_centroids
     from starcal_uq.pipeline.images import counted, with_time
-    from starcal_uq.runs.folder import ensure_new
 
     ensure_new(out, force)
     if time is not None:
@@ -106,10 +106,11 @@ def identify_command(
     """Identify the stars of every frame without knowing where the camera pointed; frames that do not fit are named."""
     from starcal_uq.camera.camera import Camera
     from starcal_uq.cli.console import print_json, records, show_table
+    from starcal_uq.core.files import ensure_new
     from starcal_uq.identification.engine import identify
     from starcal_uq.images.centroids import Centroids
     from starcal_uq.pipeline.images import epoch_of
-    from starcal_uq.runs.folder import RunFolder, ensure_new
+    from starcal_uq.runs.folder import RunFolder
     from starcal_uq.runs.steps import best_calibration
     from starcal_uq.sky.catalogue import load_catalogue
 

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from starcal_uq.cli.console import progress_bar
 from starcal_uq.cli.options import FAINTEST, CameraFile, Force, Json, RunPath, Seed, check_same_sensor
-from starcal_uq.cli.progress import progress_bar
+from starcal_uq.core.files import check_new_folder
 
 if TYPE_CHECKING:
     from starcal_uq.budgeting.result import Budget
@@ -26,17 +27,17 @@ def register(app: typer.Typer) -> None:
     app.command("plan")(plan_command)
 
 
-def new_folder(out: Path | None, force: bool) -> None:
+def check_output(out: Path | None, force: bool) -> None:
     """Refuse a folder that holds something, and a run's own folder even with `force`: its results would be mixed."""
     from starcal_uq.core.errors import RunFolderError
-    from starcal_uq.runs.folder import RunFolder, check_new_run
+    from starcal_uq.runs.folder import RunFolder
 
     if out is None:
         return
     run = RunFolder(out)
     if run.calibration.exists():
         raise RunFolderError(f"{out}: is the folder of a run, whose files would be mixed with these; name another.")
-    check_new_run(run, force)
+    check_new_folder(run.path, force)
 
 
 def budget_command(
@@ -61,10 +62,10 @@ def budget_command(
     json: Json = False,
 ) -> None:
     """Attitude error budget in the terms of ECSS; status 1 when a requirement is violated."""
-    from starcal_uq.budgeting.budget import budget_run
     from starcal_uq.budgeting.result import FORMATS
     from starcal_uq.cli.console import print_json
-    from starcal_uq.runs.folder import ensure_new
+    from starcal_uq.core.files import ensure_new
+    from starcal_uq.runs.steps import budget_run
 
     if template is not None and file is not None and template.resolve() == file.resolve():
         raise typer.BadParameter(f"--template would write over {file}: name another file.")
@@ -170,7 +171,7 @@ def compare_command(
             if split is None
             else f"--split compares parts of one run: leave out {runs[-1]}."
         )
-    new_folder(out, force)
+    check_output(out, force)
     options: dict[str, Any] = {"level": level, "seed": seed}
     names = _two_labels(labels)
     if split is None:
@@ -242,7 +243,7 @@ def plan_command(
     from starcal_uq.presentation.pages.planning import plan_record
     from starcal_uq.sky.catalogue import load_catalogue
 
-    new_folder(out, force)
+    check_output(out, force)
     if after is not None and check is not None:
         raise typer.BadParameter("--check simulates campaigns from nothing: leave it out with --after.")
     sheet, known, noise = Camera.load(camera), None, 0.05

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from starcal_uq.cli.console import progress_bar
 from starcal_uq.cli.options import Force, Json, Seed
-from starcal_uq.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,8 +38,8 @@ def reproduce_command(
     """Run Ye & Yang 2017 again: each of its numbers beside ours, with the uncertainty that they lack."""
     from starcal_uq.cli.console import out as console
     from starcal_uq.cli.console import print_json, records, show_table
+    from starcal_uq.paper.camera import CONVENTIONS
     from starcal_uq.paper.reproduction import reproduce
-    from starcal_uq.simulation.frames import CONVENTIONS
 
     if convention not in CONVENTIONS:
         raise typer.BadParameter(f"--convention {convention!r} is unknown: use one of {', '.join(CONVENTIONS)}.")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from starcal_uq.cli.console import progress_bar
 from starcal_uq.cli.images import load_images
 from starcal_uq.cli.mission import fail_if_violated, show_budget
 from starcal_uq.cli.options import (
@@ -34,8 +35,8 @@ from starcal_uq.cli.options import (
     Velocity,
     Walkers,
 )
-from starcal_uq.cli.progress import progress_bar
 from starcal_uq.cli.steps import estimator, load_table, sample_run
+from starcal_uq.core.files import check_new_folder
 
 if TYPE_CHECKING:
     from starcal_uq.budgeting.result import Budget
@@ -57,13 +58,14 @@ def demo(
 ) -> None:
     """The experiment of Ye & Yang 2017, end to end, ending in DIR/report.html."""
     from starcal_uq.cli.console import err, show_calibration
-    from starcal_uq.runs.folder import RunFolder, check_new_run
+    from starcal_uq.paper.camera import paper_camera, paper_start
+    from starcal_uq.runs.folder import RunFolder
     from starcal_uq.runs.steps import calibrate_step
-    from starcal_uq.simulation.frames import paper_camera, paper_start, simulate
+    from starcal_uq.simulation.frames import simulate
     from starcal_uq.sky.catalogue import load_catalogue
 
     run = RunFolder(out)
-    check_new_run(run, force)
+    check_new_folder(run.path, force)
     err.print(f"Simulating {frames} frames of the paper's sensor (Gaia G <= 6, 0.05 px noise, seed {seed}) ...")
     truth = paper_camera()
     obs = simulate(
@@ -123,12 +125,12 @@ def run_command(
     """Calibrate, sample, couple, propagate, budget and report: all from stars or images to RUN/report.html."""
     from starcal_uq.budgeting.file import load_budget_file
     from starcal_uq.cli.console import show_calibration, show_screening, warn_air
-    from starcal_uq.pipeline.images import are_images, save_image_results
-    from starcal_uq.runs.folder import RunFolder, check_new_run
-    from starcal_uq.runs.steps import calibrate_step, truth_of
+    from starcal_uq.pipeline.images import are_images
+    from starcal_uq.runs.folder import RunFolder
+    from starcal_uq.runs.steps import calibrate_step, save_image_results, truth_of
 
     folder = RunFolder(out)
-    check_new_run(folder, force)
+    check_new_folder(folder.path, force)
     if budget is not None:
         # A mistake in it should not show after the work.
         load_budget_file(budget)
@@ -192,10 +194,8 @@ def _after_calibration(
     run: Any, seed: int, draws: int, *, show: bool = False, budget: Path | None = None, **sampling: Any
 ) -> None:
     """Sample, couple, propagate, question the model, budget, report; status 1 when a check or a requirement failed."""
-    from starcal_uq.budgeting.budget import budget_run
     from starcal_uq.cli.console import show_attitude, show_posterior
-    from starcal_uq.diagnostics.diagnose import diagnose_run
-    from starcal_uq.runs.steps import coupling_step, propagate_step, report_step
+    from starcal_uq.runs.steps import budget_run, coupling_step, diagnose_run, propagate_step, report_step
 
     posterior = sample_run(run, seed, force=True, **sampling)
     coupling_step(run)

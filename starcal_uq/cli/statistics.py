@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 
+from starcal_uq.cli.console import progress_bar
 from starcal_uq.cli.options import CameraFile, Force, Json, NewRun, RunPath, Seed
-from starcal_uq.cli.progress import progress_bar
+from starcal_uq.core.files import check_new_folder
 
 _VALIDATION = ("quantity", "unit", "coverage_95", "coverage_low", "coverage_high", "coverage_p", "rank_p")
 _SHOWN = {
@@ -56,14 +57,15 @@ def validate_command(
     from starcal_uq.camera.camera import Camera
     from starcal_uq.cli.console import out as console
     from starcal_uq.cli.console import print_json, records, show_table
+    from starcal_uq.core.files import atomic_write_bytes
     from starcal_uq.diagnostics.validation.validate import TRUTHS, validate
-    from starcal_uq.runs.folder import RunFolder, atomic_write_bytes, check_new_run
+    from starcal_uq.runs.folder import RunFolder
 
     if truth not in TRUTHS:
         raise typer.BadParameter(f"--truth {truth!r} is unknown: use one of {', '.join(TRUTHS)}.")
     sensor = Camera.load(camera)
     folder = RunFolder(out)
-    check_new_run(folder, force)
+    check_new_folder(folder.path, force)
     with progress_bar("replicates") as progress:
         found = validate(
             sensor,
@@ -77,8 +79,8 @@ def validate_command(
             truth=truth,  # type: ignore[arg-type]
             progress=progress,
         )
+    from starcal_uq.core.files import atomic_path
     from starcal_uq.presentation.figures.style import png_bytes
-    from starcal_uq.runs.folder import atomic_path
 
     folder.create()
     found.save(out / "validation.npz")
@@ -104,7 +106,7 @@ def diagnose_command(
 ) -> None:
     """Question the model: misfit, jackknife, other distortion models, predictive checks, other starts."""
     from starcal_uq.cli.console import print_json, records, show_table
-    from starcal_uq.diagnostics.diagnose import diagnose_run
+    from starcal_uq.runs.steps import diagnose_run
 
     with progress_bar("diagnosis") as progress:
         found = diagnose_run(run, n_starts=starts, seed=seed, progress=progress)

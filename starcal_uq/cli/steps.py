@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from starcal_uq.cli.console import progress_bar
 from starcal_uq.cli.options import (
     FAINTEST,
     CameraFile,
@@ -37,7 +38,7 @@ from starcal_uq.cli.options import (
     parse_columns,
     parse_velocity,
 )
-from starcal_uq.cli.progress import progress_bar
+from starcal_uq.core.files import check_new_folder
 
 
 def register(app: typer.Typer) -> None:
@@ -106,7 +107,7 @@ def simulate_command(
 ) -> None:
     """Simulate identified stars with the embedded catalogue; directions are written as the sensor saw them."""
     from starcal_uq.camera.camera import Camera
-    from starcal_uq.runs.folder import ensure_new
+    from starcal_uq.core.files import ensure_new
     from starcal_uq.simulation.frames import simulate
     from starcal_uq.sky.catalogue import load_catalogue
 
@@ -157,10 +158,10 @@ def calibrate_command(
 ) -> None:
     """Estimate optics and distortion: three stages and refinement, with covariance."""
     from starcal_uq.cli.console import print_json, records, show_calibration, show_screening, warn_air
-    from starcal_uq.runs.folder import RunFolder, check_new_run
+    from starcal_uq.runs.folder import RunFolder
     from starcal_uq.runs.steps import calibrate_step, truth_of
 
-    check_new_run(RunFolder(out), force)
+    check_new_folder(out, force)
     obs, nominal = load_table(observations, camera, column, directions, observer_velocity, site, in_space)
     calibration, screening = calibrate_step(
         RunFolder(out), obs, nominal, force=force, screening=screen, **estimator(method, solver, robust)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.camera.distortion import get_model
-from starcal_uq.estimation.merging import data_hashes
+from starcal_uq.core.provenance import data_hashes
 from starcal_uq.inference.gaussian_priors import GaussianPriors
 from starcal_uq.observations.splits import shared_frames
 

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.files import atomic_write_bytes, atomic_write_text
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.types import AnyDict, FloatArray
-from starcal_uq.runs.folder import atomic_write_bytes, atomic_write_text
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -4,17 +4,120 @@ from __future__ import annotations
 
 import json
 import os
+import secrets
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from starcal_uq.core.errors import RunFolderError, StarcalError
+from starcal_uq.core.errors import ObservationError, RunFolderError, StarcalError
 from starcal_uq.core.types import AnyDict
-from starcal_uq.runs.folder import atomic_path
+
+PathLike = str | os.PathLike[str]
+
+
+def ensure_new(path: PathLike, force: bool = False) -> None:
+    """Refuse to write over an existing file unless ``force`` is set.
+
+    Raises
+    ------
+    RunFolderError
+        If `path` exists and `force` is false, or if it exists and is no regular file.
+    """
+    path = Path(path)
+    # os.path, because Path.exists raises in a folder that may not be searched; the write itself reports that.
+    if not os.path.exists(path):
+        return
+    if path.is_dir():
+        raise RunFolderError(f"{path}: is a directory; name a file to write to.")
+    if not path.is_file():
+        raise RunFolderError(f"{path}: is not a regular file; name a file to write to.")
+    if not force:
+        raise RunFolderError(
+            f"{path}: the file exists already; choose another name or use --force (force=True in Python)."
+        )
+
+
+def check_new_folder(path: PathLike, force: bool = False) -> None:
+    """Refuse a folder that holds anything, unless forced; called before any work is done.
+
+    Raises
+    ------
+    RunFolderError
+        When the folder exists and is not empty, or is a file.
+    """
+    path = Path(path)
+    if path.exists() and not path.is_dir():
+        raise RunFolderError(f"{path}: is a file, not a folder for results; name another folder.")
+    if path.is_dir() and any(path.iterdir()) and not force:
+        raise RunFolderError(
+            f"{path}: the folder exists and is not empty; name another, or replace its results with --force."
+        )
+
+
+def new_folder(path: PathLike) -> Path:
+    """Make a folder, with its parents, if it does not exist.
+
+    Raises
+    ------
+    RunFolderError
+        If a file is in the way or the operating system refuses.
+    """
+    path = Path(path)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunFolderError(f"{path}: the folder cannot be made ({error.strerror}); choose another place.") from error
+    return path
+
+
+@contextmanager
+def atomic_path(path: PathLike) -> Iterator[Path]:
+    """Yield a temporary path beside `path`, and rename it to `path` if the block succeeds.
+
+    The temporary name keeps the ending, because many writers choose the format by it. If the block raises,
+    the temporary file is removed and `path` is as it was.
+
+    Raises
+    ------
+    RunFolderError
+        If the folder is missing, `path` is a directory or a device, or the system refuses the write.
+    """
+    # A link is followed: replacing it by a file would silently detach the place it points to.
+    target = Path(os.path.realpath(path))
+    ensure_new(target, force=True)
+    if not os.path.isdir(target.parent):
+        raise RunFolderError(f"{path}: the folder {target.parent} does not exist; create it first.")
+    # No tempfile.mkstemp: its files are private to the user, and would stay so after the rename.
+    temporary = target.parent / f".{secrets.token_hex(8)}.tmp{target.suffix}"
+    try:
+        yield temporary
+        os.replace(temporary, target)
+    except OSError as error:
+        reason = error.strerror or str(error)
+        raise RunFolderError(
+            f"{path}: cannot be written ({reason}); check the permissions of the folder and the free space."
+        ) from error
+    finally:
+        # Asked first: in a folder that may not be searched, unlink would raise and hide the reason.
+        if os.path.lexists(temporary):
+            temporary.unlink()
+
+
+def atomic_write_bytes(path: PathLike, data: bytes) -> None:
+    """Write `data` to `path`, all or nothing."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(data)
+
+
+def atomic_write_text(path: PathLike, text: str) -> None:
+    """Write `text` to `path` in UTF-8 with line feeds as they are, all or nothing."""
+    atomic_write_bytes(path, text.encode("utf-8"))
+
 
 # A file that was cut off, or is something else, shows itself by any of these, depending on where it was cut.
 _UNREADABLE = (KeyError, ValueError, TypeError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error, StarcalError)
@@ -60,3 +163,19 @@ def reading_archive(
         raise RunFolderError(f"{path}: cannot be read ({error.strerror or error}); {missing}.") from error
     except _UNREADABLE as error:
         raise RunFolderError(f"{path}: {wrong}.") from error
+
+
+ENDINGS = (".csv", ".ecsv", ".parquet")
+
+
+def table_ending(path: Path) -> str:
+    """The ending of a table's file name, which decides on its format."""
+    ending = path.suffix.lower()
+    if ending not in ENDINGS:
+        raise ObservationError(f"{path}: the ending {ending or '(none)'} is unknown; use {', '.join(ENDINGS)}.")
+    return ending
+
+
+def as_plain(value: Any) -> Any:
+    """For json.dumps: numpy values as Python's, anything else in words."""
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)

@@ -6,15 +6,15 @@ other starts take seconds; the report reads what is stored, and leaves out what 
 
 from __future__ import annotations
 
-import json
-import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.core.errors import RunFolderError, StarcalError
+from starcal_uq.core.errors import StarcalError
+from starcal_uq.core.provenance import provenance
+from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.jackknife import Jackknife, jackknife_frames
 from starcal_uq.diagnostics.misfit import Misfit, misfit_tests
@@ -23,25 +23,27 @@ from starcal_uq.diagnostics.predictive import PredictiveCheck, predictive_check
 from starcal_uq.estimation.calibrate import METHODS, calibrate
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.normals import FrameNormals
-from starcal_uq.observations.table import load_observations
-from starcal_uq.runs.folder import RunFolder, atomic_path, atomic_write_text, provenance
 
 if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import Observations
 
 FILE = "diagnosis.json"
+
+
 TABLES = {
     "misfit": "misfit.csv",
     "jackknife": "jackknife.csv",
     "comparison": "comparison.csv",
     "predictive": "predictive.csv",
 }
+
+
 # How far the other starts are from the nominal camera: of its focal length, and of the detector's longer side.
 _START_FOCAL, _START_CENTRE = 0.05, 0.1
-_SAME_SIGMA, _BETTER = 0.1, 1e-6
 
-Progress = Callable[[int, int], None]
+
+_SAME_SIGMA, _BETTER = 0.1, 1e-6
 
 
 @dataclass(frozen=True)
@@ -234,68 +236,3 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
         elif other.chi2 < cal.chi2 * (1.0 - _BETTER):
             better += 1
     return MultiStart(n, same, better, failed, largest)
-
-
-def diagnose_run(
-    run_path: str | os.PathLike[str],
-    *,
-    models: Sequence[str] = MODELS,
-    n_starts: int = 5,
-    seed: int = 0,
-    progress: Progress | None = None,
-) -> Diagnosis:
-    """Diagnose a run and write ``diagnosis.json`` into its folder, with the tables as CSV beside it.
-
-    Parameters
-    ----------
-    run_path : path
-        Folder of a run that holds a calibration at least.
-    models, n_starts, seed, progress
-        As for `diagnose`.
-
-    Raises
-    ------
-    RunFolderError
-        If there is no calibration, or its data are not those of the run.
-    """
-    run = RunFolder(run_path)
-    cal = Calibration.load(run.require("calibration"))
-    obs = load_observations(run.require("observations"))
-    if obs.data_hash != cal.provenance.get("data_sha256"):
-        raise RunFolderError(
-            f"{run.path}: the calibration was made from other observations than {run.observations.name} holds; run "
-            "`starcal-uq calibrate` again."
-        )
-    post = None
-    if run.posterior.exists():
-        from starcal_uq.inference.posterior import Posterior
-
-        post = Posterior.load(run.posterior)
-    found = diagnose(obs, cal, post, models=models, n_starts=n_starts, seed=seed, progress=progress)
-    for name, file_name in TABLES.items():
-        part = getattr(found, name)
-        if part is not None:
-            with atomic_path(run.path / file_name) as temporary:
-                part.to_dataframe().to_csv(temporary, index=False)
-    atomic_write_text(run.path / FILE, json.dumps(found.to_dict(), indent=1) + "\n")
-    return found
-
-
-def load_diagnosis(run: RunFolder, cal: Calibration) -> Diagnosis | None:
-    """The stored diagnosis of a calibration; None if there is none, or it is of another calibration.
-
-    Raises
-    ------
-    RunFolderError
-        If the file cannot be read.
-    """
-    path = run.path / FILE
-    if not path.exists():
-        return None
-    try:
-        found = Diagnosis.from_dict(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, KeyError, ValueError, TypeError) as error:
-        raise RunFolderError(
-            f"{path}: cannot be read as a diagnosis ({type(error).__name__}: {error}): run `starcal-uq diagnose` again."
-        ) from error
-    return found if found.is_of(cal) else None

@@ -11,6 +11,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import sigma_parameter
 from starcal_uq.camera.projection import fold_radius_px
 from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.provenance import provenance
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibration import Calibration
@@ -18,7 +19,6 @@ from starcal_uq.estimation.compressed import compress
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.solvers import is_singular
 from starcal_uq.estimation.stages import Stage
-from starcal_uq.runs.folder import provenance
 
 if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations

@@ -10,6 +10,7 @@ from starcal_uq.attitude.rotations import rotation_to_quaternion
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import sigma_parameter
 from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.provenance import provenance
 from starcal_uq.core.status import Status
 from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, assemble, check_camera, noise_px
 from starcal_uq.estimation.baselines import check_count, least_squares, recursive
@@ -24,7 +25,6 @@ from starcal_uq.estimation.stages import Stage, distortion_stage, joint_stage, o
 from starcal_uq.estimation.student import parse_dof
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.table import Observations
-from starcal_uq.runs.folder import provenance
 
 METHODS = ("efficient", "three_stage", "least_squares", "samaan", "griffith")
 LIKELIHOODS = ("marginal", "student_t")

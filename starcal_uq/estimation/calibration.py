@@ -12,12 +12,12 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.errors import CalibrationError, RunFolderError
+from starcal_uq.core.files import atomic_path, atomic_write_text
 from starcal_uq.core.formatting import decimals_for, fixed
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.estimation.compressed import CompressedLikelihood
 from starcal_uq.estimation.stages import Stage
-from starcal_uq.runs.folder import atomic_path, atomic_write_text
 
 if TYPE_CHECKING:
     import pandas as pd

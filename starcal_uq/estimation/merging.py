@@ -16,6 +16,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import rotation_to_quaternion
 from starcal_uq.camera.distortion import sigma_parameter
 from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.provenance import data_hashes, provenance
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.estimation.calibration import Calibration
@@ -24,9 +25,10 @@ from starcal_uq.estimation.expansion import Optimum, combined, optimum, scaled, 
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.observations.table import Observations
-from starcal_uq.runs.folder import provenance
 
 NOISES = ("common", "own")
+
+
 # Up to this many sigmas of a run, its quadratic expansion was never wrong by more than 0.15 nat, even with five frames.
 # Runs of one camera stay within five.
 MAX_DISTANCE = 8.0
@@ -126,13 +128,6 @@ def renumbered(frame_ids: Sequence[IntArray]) -> tuple[IntArray, list[int]]:
         shifts.append(0 if following is None else following - int(ids.min()))
         following = int(ids.max()) + shifts[-1] + 1
     return np.concatenate([ids + shift for ids, shift in zip(frame_ids, shifts, strict=True)]), shifts
-
-
-def data_hashes(provenance: AnyDict) -> set[str]:
-    """Hashes of all data that a result rests on: its own, and those of the runs it was merged from."""
-    parts = provenance.get("merge", {}).get("parts", [])
-    found = {str(value) for part in parts for value in part["data_sha256"]}
-    return found | {str(provenance["data_sha256"])} if provenance.get("data_sha256") else found
 
 
 def _check_mergeable(calibrations: Sequence[Calibration], names: Sequence[str], noise: str) -> None:

@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.files import atomic_path
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.runs.folder import atomic_path
 
 # Stars a field should hold; a star with this many brighter ones within a field's area around it is no pattern star.
 PATTERN_STARS = 18

@@ -15,10 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.errors import ObservationError
+from starcal_uq.core.files import as_plain, atomic_path, ensure_new, table_ending
 from starcal_uq.core.types import AnyDict
 from starcal_uq.images.centroids import COLUMNS, FRAME_COLUMNS, Centroids
-from starcal_uq.observations.rows import as_plain, table_ending
-from starcal_uq.runs.folder import atomic_path, ensure_new
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -11,13 +11,13 @@ from typing import Any, Literal
 import numpy as np
 
 from starcal_uq.core.errors import SamplingError
+from starcal_uq.core.files import atomic_path
 from starcal_uq.core.interrupts import interrupt_between_steps
+from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.inference.target import Density, student_t_log_density
-from starcal_uq.runs.folder import atomic_path
 
 Moves = Literal["mixture", "stretch"]
-Progress = Callable[[int, int], None]
 
 # Tails a little heavier than normal: most proposals are accepted, and no part of the posterior is out of reach.
 PROPOSAL_DF = 8.0

@@ -18,9 +18,9 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.files import atomic_path, ensure_new
 from starcal_uq.inference.posterior import Diagnostics, Laplace, Posterior
 from starcal_uq.inference.priors import Priors
-from starcal_uq.runs.folder import atomic_path, ensure_new
 
 _FORMAT = "starcal_uq posterior 1"
 _Record = TypeVar("_Record", Laplace, Diagnostics)

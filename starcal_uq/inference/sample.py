@@ -13,8 +13,9 @@ import numpy as np
 
 from starcal_uq.camera.distortion import parameters, sigma_parameter
 from starcal_uq.core.errors import SamplingError
+from starcal_uq.core.provenance import data_hashes, provenance
+from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import AnyDict, FloatArray
-from starcal_uq.estimation.merging import data_hashes
 from starcal_uq.inference.checks import (
     ESS_BOUND,
     RHAT_BOUND,
@@ -23,7 +24,7 @@ from starcal_uq.inference.checks import (
     check_compression,
     diagnose,
 )
-from starcal_uq.inference.ensemble import PROPOSAL_DF, Chains, EnsembleSettings, Moves, Progress, run_ensembles
+from starcal_uq.inference.ensemble import PROPOSAL_DF, Chains, EnsembleSettings, Moves, run_ensembles
 from starcal_uq.inference.named import (
     Evaluation,
     LikelihoodName,
@@ -46,7 +47,6 @@ from starcal_uq.inference.target import (
     start_target,
 )
 from starcal_uq.inference.update import check_chain
-from starcal_uq.runs.folder import provenance
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,13 +15,11 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model, parameters
 from starcal_uq.core.errors import PriorError
-from starcal_uq.core.types import AnyDict, FloatArray
-from starcal_uq.estimation.merging import data_hashes
+from starcal_uq.core.provenance import data_hashes
+from starcal_uq.core.types import FloatArray
 from starcal_uq.inference.gaussian_priors import GaussianPriors
-from starcal_uq.inference.physical_priors import priors_from_table
 from starcal_uq.inference.posterior import Posterior
-from starcal_uq.inference.priors import SIGMA_NAMES, Priors, positive_number, read_priors_table
-from starcal_uq.runs.folder import RunFolder
+from starcal_uq.inference.priors import SIGMA_NAMES, Priors, positive_number
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,8 +27,14 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
 
 NOISES = ("default", "posterior")
+
+
 _SHIFT_KEYS = ("principal_point_px", "focal_fraction", "distortion_corner_px")
+
+
 _CHAIN_KEYS = ("prior_from", "inflation", "noise", "shift")
+
+
 ALPHA = 1e-3
 
 
@@ -139,61 +142,6 @@ def prior_from(
             "detector": _detector(posterior.camera),
         },
     )
-
-
-def prior_from_run(run: str | Path, **options: Any) -> GaussianPriors:
-    """The posterior of a run folder as a prior; options as for `prior_from`."""
-    from starcal_uq.estimation.calibration import Calibration
-
-    folder = RunFolder(run)
-    posterior = Posterior.load(folder.require("posterior"))
-    hashes = data_hashes(Calibration.load(folder.calibration).provenance) if folder.calibration.exists() else set()
-    return prior_from(posterior, name=folder.path.resolve().name, data_sha256=hashes, **options)
-
-
-def load_priors(
-    path: str | Path, camera: Camera, per_star_sigma: bool = False, data_sha256: Collection[str] = ()
-) -> Priors:
-    """Read a ``[priors]`` table: physical terms, or ``prior_from = "RUN"`` for the posterior of an earlier run.
-
-    With ``prior_from`` (relative to the file), the table may hold ``inflation``, ``noise`` (``default``, ``posterior``)
-    and a table ``[priors.shift]`` with ``principal_point_px``, ``focal_fraction`` and ``distortion_corner_px``.
-
-    Parameters
-    ----------
-    path : path
-        TOML file.
-    camera : Camera
-        Nominal camera of the run that is to be sampled.
-    per_star_sigma : bool
-        Whether its stars state their noise.
-    data_sha256 : collection of str
-        Hashes of its data; an earlier posterior that holds them already is refused.
-
-    Raises
-    ------
-    PriorError
-        For a file that cannot be read, an unknown key, or an earlier run of another camera or of the same data.
-    """
-    table = read_priors_table(path)
-    if "prior_from" not in table:
-        return priors_from_table(path, table, camera, per_star_sigma)
-    for key in table:
-        if key not in _CHAIN_KEYS:
-            raise PriorError(
-                f"{path}: unknown key {key!r} in [priors] beside prior_from; use one of {', '.join(_CHAIN_KEYS)}."
-            )
-    try:
-        run = Path(path).parent / _text(table, "prior_from")
-        options: AnyDict = {"shift": AllowedShift(**_numbers(table.get("shift", {}), "shift", _SHIFT_KEYS))}
-        options |= _numbers({k: v for k, v in table.items() if k == "inflation"}, "priors", ("inflation",))
-        if "noise" in table:
-            options["noise"] = _text(table, "noise")
-        priors = prior_from_run(run, per_star_sigma=per_star_sigma, **options)
-        check_chain(priors, camera, data_sha256)
-    except PriorError as error:
-        raise PriorError(f"{path}: {error}") from None
-    return priors
 
 
 def check_chain(priors: Priors, camera: Camera, data_sha256: Collection[str] = ()) -> None:

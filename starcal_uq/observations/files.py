@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.errors import ObservationError
+from starcal_uq.core.files import as_plain, atomic_path, atomic_write_text, ensure_new, table_ending
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
 from starcal_uq.observations.checks import (
     Problem,
@@ -26,9 +27,7 @@ from starcal_uq.observations.checks import (
     parse_whole,
     raise_problems,
 )
-from starcal_uq.observations.rows import as_plain, table_ending
 from starcal_uq.observations.table import COLUMNS, Observations
-from starcal_uq.runs.folder import atomic_path, atomic_write_text, ensure_new
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera

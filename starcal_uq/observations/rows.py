@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import cached_property
-from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
@@ -13,8 +12,6 @@ from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 
 _Array = TypeVar("_Array", bound="np.ndarray[Any, Any]")
-
-ENDINGS = (".csv", ".ecsv", ".parquet")
 
 
 class FrameRows:
@@ -82,16 +79,3 @@ def locked(array: _Array) -> _Array:
     """The array, which can no longer be written to."""
     array.setflags(write=False)
     return array
-
-
-def table_ending(path: Path) -> str:
-    """The ending of a table's file name, which decides on its format."""
-    ending = path.suffix.lower()
-    if ending not in ENDINGS:
-        raise ObservationError(f"{path}: the ending {ending or '(none)'} is unknown; use {', '.join(ENDINGS)}.")
-    return ending
-
-
-def as_plain(value: Any) -> Any:
-    """For json.dumps: numpy values as Python's, anything else in words."""
-    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)

@@ -14,11 +14,12 @@ from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.table import Observations
+from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.paper.errors import MapError, PointErrors, map_error, reprojection_error_px
 from starcal_uq.paper.methods import METHODS, Method
 from starcal_uq.paper.published import MAX_MAG, MIN_STARS, N_FRAMES, SIGMA_PX
 from starcal_uq.paper.replicates import crlb_sigmas
-from starcal_uq.simulation.frames import paper_camera, paper_start, simulate
+from starcal_uq.simulation.frames import simulate
 from starcal_uq.sky.catalogue import load_catalogue
 
 if TYPE_CHECKING:

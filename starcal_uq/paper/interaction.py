@@ -23,11 +23,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from starcal_uq.core.errors import SamplingError, StarcalError
+from starcal_uq.core.provenance import provenance
 from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.recursive.recursion_options import RecursionOptions
 from starcal_uq.observations.frames import StarFrames
+from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.paper.interaction_points import (
     DISTORTION_SCALES,
     FIELDS_DEG,
@@ -41,8 +43,7 @@ from starcal_uq.paper.interaction_points import (
 )
 from starcal_uq.paper.interaction_result import HANDLING, InteractionStudy, summary_rows
 from starcal_uq.paper.replicates import crlb_sigmas
-from starcal_uq.runs.folder import provenance
-from starcal_uq.simulation.frames import paper_camera, paper_start, simulate
+from starcal_uq.simulation.frames import simulate
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera

@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.files import atomic_path
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.paper.statistics import chi_interval
-from starcal_uq.runs.folder import atomic_path
 
 if TYPE_CHECKING:
     import pandas as pd

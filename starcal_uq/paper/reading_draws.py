@@ -19,10 +19,11 @@ from starcal_uq.estimation.recursive.recursion_options import RecursionOptions
 from starcal_uq.estimation.stages import distortion_stage, joint_stage, optics_stage
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.angles import fit_angles
+from starcal_uq.paper.camera import CONVENTIONS, paper_camera, paper_start
 from starcal_uq.paper.error_readings import error_sizes
 from starcal_uq.paper.errors import undistorted
 from starcal_uq.paper.published import LEAST_SQUARES, N_FRAMES, N_STARS, PROPOSED, SAMAAN
-from starcal_uq.simulation.frames import CONVENTIONS, paper_camera, paper_start, simulate
+from starcal_uq.simulation.frames import simulate
 
 if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations

@@ -14,16 +14,17 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from starcal_uq.core.errors import CalibrationError, DistortionError, SamplingError, StarcalError
+from starcal_uq.core.provenance import provenance
 from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.observations.frames import StarFrames
+from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.paper.errors import map_error, reprojection_error_px
 from starcal_uq.paper.methods import METHODS, Method
 from starcal_uq.paper.replicates_methods import inverse_diagonal, solve_all
 from starcal_uq.paper.replicates_result import Replicates
-from starcal_uq.runs.folder import provenance
-from starcal_uq.simulation.frames import paper_camera, paper_start, simulate
+from starcal_uq.simulation.frames import simulate
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera

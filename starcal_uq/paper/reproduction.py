@@ -6,17 +6,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.types import AnyDict
-from starcal_uq.paper.published import PAPER_METHODS
-from starcal_uq.runs.folder import (
+from starcal_uq.core.files import (
     PathLike,
-    RunFolder,
     atomic_path,
     atomic_write_bytes,
     atomic_write_text,
-    check_new_run,
-    provenance,
+    check_new_folder,
+    new_folder,
 )
+from starcal_uq.core.provenance import provenance
+from starcal_uq.core.types import AnyDict
+from starcal_uq.paper.published import PAPER_METHODS
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -87,6 +87,7 @@ def reproduce(
     KeyboardInterrupt
         After Ctrl-C; nothing is written then.
     """
+    from starcal_uq.paper.camera import paper_camera, paper_start
     from starcal_uq.paper.checks import paper_checks
     from starcal_uq.paper.experiment import run_paper
     from starcal_uq.paper.interaction import interaction_study
@@ -94,10 +95,9 @@ def reproduce(
     from starcal_uq.paper.result import Reproduction
     from starcal_uq.paper.shared_replicates import replicate_shared
     from starcal_uq.paper.table_2 import judge_all
-    from starcal_uq.simulation.frames import paper_camera, paper_start
 
     folder = Path(out)
-    check_new_run(RunFolder(folder), force)
+    check_new_folder(folder, force)
     _check_sizes(n_replicates, n_frames)
     bar = _Bar(progress, study)
     truth, start = paper_camera(convention), paper_start(convention)
@@ -206,8 +206,8 @@ def _write(found: Reproduction) -> None:
 
     figures = draw_figures(found)
     page = render(found, figures)
-    RunFolder(found.path).create()
-    folder = RunFolder(found.path / "figures").create().path
+    new_folder(found.path)
+    folder = new_folder(found.path / "figures")
     for name, png in figures.items():
         atomic_write_bytes(folder / f"{name}.png", png)
     for name, table in _tables(found).items():

@@ -14,14 +14,12 @@ from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.times import julian_year, utc_text
 from starcal_uq.estimation.noise_floor import settle_noise
-from starcal_uq.pipeline.record import IMAGES, record_images
-from starcal_uq.runs.folder import RunFolder, atomic_path
 from starcal_uq.sky.apparent import catalogue_directions, make_apparent, without_low_stars
 from starcal_uq.sky.site import check_sky
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
-    from starcal_uq.cli.progress import Progress
+    from starcal_uq.core.tasks import Progress
     from starcal_uq.core.types import FloatArray, StrArray
     from starcal_uq.identification.proposers import Engine
     from starcal_uq.images.centroids import Centroids
@@ -30,9 +28,15 @@ if TYPE_CHECKING:
     from starcal_uq.sky.site import Site
 
 CENTROIDS, IDENTIFICATION = "centroids.parquet", "identification.csv"
+
+
 # Where the embedded catalogue has its stars; images without a time are compared with these.
 _CATALOGUE_EPOCH = 2016.0
+
+
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
+
+
 # Magnitudes; the embedded catalogue ends at the second.
 _FAINTER_NEIGHBOURS, _FAINTEST = 1.5, 10.0
 
@@ -230,11 +234,3 @@ def _check_times(centroids: Centroids) -> None:
             "give the time (UTC, such as 2026-11-21T03:04:05).",
             column="time_utc",
         )
-
-
-def save_image_results(run: RunFolder, centroids: Centroids, found: Bootstrap) -> None:
-    """Keep the centroids and the record of every frame in the run folder."""
-    centroids.save(run.path / CENTROIDS, force=True)
-    record_images(centroids, found).save(run.path / IMAGES)
-    with atomic_path(run.path / IDENTIFICATION) as temporary:
-        found.identification.to_dataframe().to_csv(temporary, index=False)

@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.files import PathLike, atomic_write_text
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.types import AnyDict
-from starcal_uq.runs.folder import PathLike, atomic_write_text
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from starcal_uq.core.errors import CalibrationError, CatalogueError, PlanningError, StarcalError
+from starcal_uq.core.files import atomic_path
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import BoolArray, FloatArray
@@ -18,7 +19,6 @@ from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.planning.forecast import Forecast, Forecaster, inverses, spreads
 from starcal_uq.planning.information import random_frames
 from starcal_uq.planning.plan import N_FRAMES
-from starcal_uq.runs.folder import atomic_path
 from starcal_uq.simulation.frames import simulate
 
 if TYPE_CHECKING:

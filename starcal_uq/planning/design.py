@@ -18,12 +18,12 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import random_rotations
 from starcal_uq.core.errors import PlanningError
+from starcal_uq.core.provenance import provenance
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.planning.forecast import ARCSEC, inverses, quantities, spreads
 from starcal_uq.planning.frame_choice_result import FrameChoice
 from starcal_uq.planning.information import FrameSet, Noise, look_at, random_frames
 from starcal_uq.planning.plan import HasInformation, start_information
-from starcal_uq.runs.folder import provenance
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera

@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.attitude.rotations import rotation_to_quaternion
+from starcal_uq.core.files import atomic_path
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
-from starcal_uq.runs.folder import atomic_path
 from starcal_uq.sky.positions import ra_dec_deg
 
 if TYPE_CHECKING:

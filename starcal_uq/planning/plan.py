@@ -15,11 +15,11 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import random_rotations
 from starcal_uq.core.errors import PlanningError
+from starcal_uq.core.provenance import provenance
 from starcal_uq.core.types import FloatArray
 from starcal_uq.planning.forecast import N_CAMPAIGNS, SCOPES, Forecaster, nea_arcsec
 from starcal_uq.planning.information import FrameSet, Noise, largest_noise, noise_of, random_frames
 from starcal_uq.planning.plan_result import Need, Plan
-from starcal_uq.runs.folder import provenance
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky
 
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.files import atomic_path
 from starcal_uq.core.formatting import percent, significant
 from starcal_uq.core.types import FloatArray
-from starcal_uq.runs.folder import atomic_path
 
 if TYPE_CHECKING:
     import pandas as pd

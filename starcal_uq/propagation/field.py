@@ -34,9 +34,9 @@ from starcal_uq.camera.fields import (
 )
 from starcal_uq.camera.projection import unproject, unproject_jacobian
 from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.files import atomic_path
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.types import FloatArray
-from starcal_uq.runs.folder import atomic_path
 
 if TYPE_CHECKING:
     import pandas as pd

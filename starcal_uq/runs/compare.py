@@ -12,9 +12,9 @@ from starcal_uq.runs.folder import RunFolder
 
 if TYPE_CHECKING:
     from starcal_uq.comparison.result import CameraComparison
+    from starcal_uq.core.files import PathLike
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import Observations
-    from starcal_uq.runs.folder import PathLike
 
 
 def compare_runs(

@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from starcal_uq.core.errors import CalibrationError, RunFolderError
+from starcal_uq.core.files import PathLike, check_new_folder
 from starcal_uq.core.types import AnyDict, FloatArray, StrArray
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.expansion import optimum
 from starcal_uq.estimation.merging import merge, renumbered
 from starcal_uq.observations.table import COLUMNS, Observations, load_observations
-from starcal_uq.runs.folder import PathLike, RunFolder, check_new_run
+from starcal_uq.runs.folder import RunFolder
 
 _FILES = (
     "observations",
@@ -188,4 +189,4 @@ def _check_target(target: RunFolder, folders: Sequence[RunFolder], force: bool) 
     place: Path = target.path.resolve()
     if any(folder.path.resolve() == place for folder in folders):
         raise RunFolderError(f"{target.path}: is one of the runs to merge; name another folder for the result.")
-    check_new_run(target, force)
+    check_new_folder(target, force)

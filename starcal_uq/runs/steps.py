@@ -6,38 +6,61 @@ report) are removed when a step they depend on is done again, so that a folder n
 
 from __future__ import annotations
 
+import json
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from starcal_uq.budgeting.budget import budget
+from starcal_uq.budgeting.file import BudgetFile, load_budget_file
+from starcal_uq.budgeting.result import Budget
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import sigma_parameter
-from starcal_uq.cli.progress import Progress
 from starcal_uq.core.errors import CalibrationError, ObservationError, RunFolderError
+from starcal_uq.core.files import atomic_path, atomic_write_text, check_new_folder, ensure_new
+from starcal_uq.core.tasks import Progress
+from starcal_uq.diagnostics.diagnose import FILE, TABLES, Diagnosis, diagnose
+from starcal_uq.diagnostics.models import MODELS
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.observations.table import Observations, load_observations
-from starcal_uq.runs.folder import RunFolder, atomic_path, check_new_run, ensure_new
+from starcal_uq.pipeline.images import CENTROIDS, IDENTIFICATION
+from starcal_uq.pipeline.record import IMAGES, record_images
+from starcal_uq.presentation.report.page import render
+from starcal_uq.runs.folder import RunFolder
+from starcal_uq.runs.run import load_results
 from starcal_uq.sky.site import check_sky
 
 if TYPE_CHECKING:
     from starcal_uq.attitude.profile import Scalar, Sense
     from starcal_uq.diagnostics.verdict.judge import Verdict
     from starcal_uq.estimation.screening.result import Screening
+    from starcal_uq.images.centroids import Centroids
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.inference.priors import Priors
+    from starcal_uq.pipeline.refine import Bootstrap
+    from starcal_uq.propagation.attitude_error import AttitudeError
     from starcal_uq.propagation.coupling import Coupling
     from starcal_uq.propagation.field import FieldMap
-    from starcal_uq.propagation.propagate import AttitudeError
     from starcal_uq.propagation.spectrum_result import ErrorSpectrum
     from starcal_uq.sky.site import Site
 
-
 DIRECTIONS = ("undeclared", "catalogue", "apparent")
+
+
 REJECTED = "rejected.csv"
+
+
 DIAGNOSIS_FILES = ("diagnosis.json", "misfit.csv", "jackknife.csv", "comparison.csv", "predictive.csv")
+
+
 _AFTER_SAMPLING = ("coupling", "attitude", "field_map", "spectrum", "budget", "report")
+
+
 _AFTER_CALIBRATION = ("posterior", *_AFTER_SAMPLING)
+
+
 _ALL = ("observations", "camera", "calibration", "arrays", *_AFTER_CALIBRATION)
 
 
@@ -139,7 +162,7 @@ def calibrate_step(
         from starcal_uq.estimation.calibrate import calibrate
 
         calibration = calibrate(obs, nominal, **options)
-    check_new_run(run, force)
+    check_new_folder(run.path, force)
     _remove(run, _ALL)
     run.create()
     obs.save(run.observations, force=True)
@@ -211,8 +234,8 @@ def coupling_step(run: RunFolder) -> Coupling:
 
 def read_priors(run: RunFolder, path: Path) -> Priors:
     """Priors of a TOML file for a run: physical terms, or the posterior of an earlier run."""
-    from starcal_uq.estimation.merging import data_hashes
-    from starcal_uq.inference.update import load_priors
+    from starcal_uq.core.provenance import data_hashes
+    from starcal_uq.runs.priors import load_priors
 
     calibration = Calibration.load(run.require("calibration"))
     per_star = calibration.sigma_name == sigma_parameter(True).name
@@ -319,7 +342,6 @@ def propagate_step(
 
 def report_step(run: RunFolder) -> Path:
     """Write the report of whatever the run holds; the truth of a simulation is shown beside the estimate."""
-    from starcal_uq.presentation.report.report import report
 
     return report(run.path)
 
@@ -349,3 +371,161 @@ def truth_of(obs: Observations) -> Camera | None:
 def best_calibration(run: RunFolder) -> Calibration | Posterior:
     """What a run knows of the camera: its posterior, or its calibration where there is no posterior yet."""
     return load_posterior(run) if run.posterior.exists() else Calibration.load(run.require("calibration"))
+
+
+def report(run_path: str | os.PathLike[str], truth: Camera | None = None) -> Path:
+    """Write ``RUN/report.html`` and the figures in ``RUN/figures``.
+
+    Parameters
+    ----------
+    run_path : path
+        Folder of a run that holds a calibration at least. What is missing beyond that is named in the report together
+        with the command that makes it.
+    truth : Camera, optional
+        The camera of a simulation, shown beside the estimate. Observations made by `starcal_uq.simulate` carry it, and
+        it is then taken from them.
+
+    Returns
+    -------
+    Path
+        The report. It needs no network, no script and no other file.
+
+    Raises
+    ------
+    RunFolderError
+        If there is no calibration, a file cannot be read, or files of different runs are mixed.
+    """
+    from starcal_uq.core.files import atomic_write_bytes, atomic_write_text
+    from starcal_uq.presentation.report.figures import draw_figures
+    from starcal_uq.runs.folder import RunFolder
+
+    run = RunFolder(run_path)
+    results = load_results(run, truth)
+    figures = draw_figures(results)
+    page = render(results, figures)
+    run.figures.mkdir(exist_ok=True)
+    for name, png in figures.items():
+        atomic_write_bytes(run.figures / f"{name}.png", png)
+    atomic_write_text(run.report, page)
+    return run.report
+
+
+def diagnose_run(
+    run_path: str | os.PathLike[str],
+    *,
+    models: Sequence[str] = MODELS,
+    n_starts: int = 5,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Diagnosis:
+    """Diagnose a run and write ``diagnosis.json`` into its folder, with the tables as CSV beside it.
+
+    Parameters
+    ----------
+    run_path : path
+        Folder of a run that holds a calibration at least.
+    models, n_starts, seed, progress
+        As for `diagnose`.
+
+    Raises
+    ------
+    RunFolderError
+        If there is no calibration, or its data are not those of the run.
+    """
+    run = RunFolder(run_path)
+    cal = Calibration.load(run.require("calibration"))
+    obs = load_observations(run.require("observations"))
+    if obs.data_hash != cal.provenance.get("data_sha256"):
+        raise RunFolderError(
+            f"{run.path}: the calibration was made from other observations than {run.observations.name} holds; run "
+            "`starcal-uq calibrate` again."
+        )
+    post = None
+    if run.posterior.exists():
+        from starcal_uq.inference.posterior import Posterior
+
+        post = Posterior.load(run.posterior)
+    found = diagnose(obs, cal, post, models=models, n_starts=n_starts, seed=seed, progress=progress)
+    for name, file_name in TABLES.items():
+        part = getattr(found, name)
+        if part is not None:
+            with atomic_path(run.path / file_name) as temporary:
+                part.to_dataframe().to_csv(temporary, index=False)
+    atomic_write_text(run.path / FILE, json.dumps(found.to_dict(), indent=1) + "\n")
+    return found
+
+
+def load_diagnosis(run: RunFolder, cal: Calibration) -> Diagnosis | None:
+    """The stored diagnosis of a calibration; None if there is none, or it is of another calibration.
+
+    Raises
+    ------
+    RunFolderError
+        If the file cannot be read.
+    """
+    path = run.path / FILE
+    if not path.exists():
+        return None
+    try:
+        found = Diagnosis.from_dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, KeyError, ValueError, TypeError) as error:
+        raise RunFolderError(
+            f"{path}: cannot be read as a diagnosis ({type(error).__name__}: {error}): run `starcal-uq diagnose` again."
+        ) from error
+    return found if found.is_of(cal) else None
+
+
+def budget_run(
+    run_path: str | os.PathLike[str],
+    *,
+    file: BudgetFile | str | os.PathLike[str] | None = None,
+    confidence: float | None = None,
+    seed: int = 0,
+) -> Budget:
+    """The budget of a run folder, written to its ``budget.csv``.
+
+    The attitude errors are those of ``attitude.csv``, and the tests of the model those of ``diagnosis.json`` if the run
+    was diagnosed.
+
+    Parameters
+    ----------
+    run_path : path
+        Folder of a run that holds a posterior and its attitude errors.
+    file, confidence, seed
+        As for `budget`.
+
+    Raises
+    ------
+    RunFolderError
+        If a part is missing, or the data are not those of the run.
+    BudgetError
+        If the file is wrong.
+    """
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.observations.table import load_observations
+    from starcal_uq.propagation.attitude_error import AttitudeError
+    from starcal_uq.runs.steps import load_diagnosis
+
+    run = RunFolder(run_path)
+    stated = file if isinstance(file, BudgetFile) or file is None else load_budget_file(file)
+    cal = Calibration.load(run.require("calibration"))
+    post = Posterior.load(run.require("posterior"))
+    attitude = AttitudeError.load(run.require("attitude"))
+    obs = load_observations(run.require("observations"))
+    if obs.data_hash != cal.provenance.get("data_sha256"):
+        raise RunFolderError(
+            f"{run.path}: the calibration was made from other observations than {run.observations.name} holds; run "
+            "`starcal-uq calibrate` again."
+        )
+    found = budget(post, obs, attitude, file=stated, confidence=confidence, misfit=load_diagnosis(run, cal), seed=seed)
+    found.save(run.budget)
+    return found
+
+
+def save_image_results(run: RunFolder, centroids: Centroids, found: Bootstrap) -> None:
+    """Keep the centroids and the record of every frame in the run folder."""
+    centroids.save(run.path / CENTROIDS, force=True)
+    record_images(centroids, found).save(run.path / IMAGES)
+    with atomic_path(run.path / IDENTIFICATION) as temporary:
+        found.identification.to_dataframe().to_csv(temporary, index=False)

@@ -14,12 +14,13 @@ from typing import TYPE_CHECKING
 
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.files import atomic_path, atomic_write_text, check_new_folder
 from starcal_uq.core.interrupts import interrupt_between_steps
 from starcal_uq.core.types import AnyDict
 from starcal_uq.estimation.recursive.recursion_options import RecursionOptions
 from starcal_uq.estimation.recursive.stream import RecursiveCalibration
 from starcal_uq.observations.streams import FrameStream, stream_frames
-from starcal_uq.runs.folder import RunFolder, atomic_path, atomic_write_text, check_new_run
+from starcal_uq.runs.folder import RunFolder
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -85,7 +86,7 @@ def filter_run(
         _check_same(run.path / SOURCE, identity)
         filtering = RecursiveCalibration.load(state)
     else:
-        check_new_run(run, force)
+        check_new_folder(run.path, force)
 
     def keep() -> None:
         run.create()

@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import RunFolderError, SensorError
+from starcal_uq.core.files import ensure_new
 from starcal_uq.core.types import FloatArray
-from starcal_uq.runs.folder import ensure_new
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky, choose_attitudes
 from starcal_uq.simulation.rendered_files import write_frame
 from starcal_uq.simulation.rendering import Scene

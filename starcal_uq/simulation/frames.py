@@ -10,7 +10,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import random_rotations
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import fold_radius_px, project, unproject
-from starcal_uq.core.errors import CameraError, CatalogueError
+from starcal_uq.core.errors import CatalogueError
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.observations.table import Observations
 
@@ -19,50 +19,17 @@ if TYPE_CHECKING:
 
 # Attitudes drawn at once; also how many are tried before a camera is declared too narrow for its catalogue.
 _BATCH = 256
+
+
 _MAX_TRIES_PER_FRAME = 2000
+
+
 # More attitudes than this take minutes: refused as soon as the first tries say that so many would be needed.
 _MAX_TRIES = 500_000
+
+
 # Stars nearer to the edge than this many sigma are left out, so that noise does not decide which stars are seen.
 EDGE_SIGMAS = 6.0
-
-# The equation of Ye & Yang 2017 that is read as the distortion of their simulation, and the model that says the same.
-CONVENTIONS = {"eq14": "brown", "eq6": "inverse"}
-
-
-def paper_camera(convention: str = "eq14") -> Camera:
-    """The sensor of Table 1 of Ye & Yang 2017: 1024 x 1024 pixels of 12 um behind 70.2262 mm, about 10 degrees.
-
-    Parameters
-    ----------
-    convention : {"eq14", "eq6"}
-        The equation that the coefficients belong to: eq. 14 takes ideal points to distorted ones (model ``brown``),
-        eq. 6 distorted points to ideal ones (model ``inverse``). The paper has both.
-
-    Raises
-    ------
-    CameraError
-        For another convention.
-    """
-    if convention not in CONVENTIONS:
-        raise CameraError(f"convention {convention!r} is unknown: use one of {', '.join(CONVENTIONS)}.")
-    return Camera(
-        width_px=1024,
-        height_px=1024,
-        pixel_um=12.0,
-        focal_mm=70.2262,
-        x0_px=500.0,
-        y0_px=530.0,
-        distortion=CONVENTIONS[convention],
-        coefficients=(2.0e-10, -3.5e-15),
-        name="Ye & Yang 2017, Table 1",
-    )
-
-
-def paper_start(convention: str = "eq14") -> Camera:
-    """The start of the paper's section 3.2: 72 mm, principal point (512, 512), no distortion."""
-    return paper_camera(convention).replace(
-        focal_mm=72.0, x0_px=512.0, y0_px=512.0, coefficients=(0.0, 0.0), name="start of Ye & Yang 2017"
-    )
 
 
 def simulate(

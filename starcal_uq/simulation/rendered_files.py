@@ -29,8 +29,8 @@ from starcal_uq.attitude.rotations import quaternion_to_rotation, rotation_to_qu
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.errors import ImageError, StarcalError
+from starcal_uq.core.files import atomic_write_bytes, ensure_new
 from starcal_uq.observations.table import Observations
-from starcal_uq.runs.folder import atomic_write_bytes, ensure_new
 from starcal_uq.simulation.sensor import Sensor
 from starcal_uq.simulation.truth import FrameTruth, RenderedFrame
 

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.core.errors import SensorError
+from starcal_uq.core.files import atomic_write_text, ensure_new
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.runs.folder import atomic_write_text, ensure_new
 from starcal_uq.simulation.psf import KINDS, profiles
 
 _WHOLE = ("bits", "hot_pixel_seed")

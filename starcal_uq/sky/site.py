@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.core.errors import SiteError
+from starcal_uq.core.files import atomic_write_text, ensure_new
 from starcal_uq.core.types import AnyDict
-from starcal_uq.runs.folder import atomic_write_text, ensure_new
 
 if TYPE_CHECKING:
     from pydantic import BaseModel

@@ -23,12 +23,12 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError, PriorError, SamplingError
+from starcal_uq.core.provenance import provenance
 from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.validation.replicates import MARGINAL, LikelihoodMaker, Study, Truth
 from starcal_uq.diagnostics.validation.result import Validation
 from starcal_uq.diagnostics.validation.validation_pool import Progress, run_replicates
 from starcal_uq.inference.priors import Priors
-from starcal_uq.runs.folder import provenance
 
 if TYPE_CHECKING:
     from starcal_uq.sky.catalogue import StarCatalogue

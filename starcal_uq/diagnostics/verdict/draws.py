@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from starcal_uq.inference.derived import Derived
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import Observations
-    from starcal_uq.propagation.propagate import AttitudeError
+    from starcal_uq.propagation.attitude_error import AttitudeError
 
 _FOLD_DRAWS = 40
 BOUNDS_SHARE = 1e-3

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import Observations
-    from starcal_uq.propagation.propagate import AttitudeError
+    from starcal_uq.propagation.attitude_error import AttitudeError
 
 __all__ = [
     "Check",

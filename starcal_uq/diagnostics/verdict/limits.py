@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from starcal_uq.diagnostics.diagnose import Diagnosis
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.observations.table import Observations
+    from starcal_uq.propagation.attitude_error import AttitudeError
     from starcal_uq.propagation.coupling import Coupling
-    from starcal_uq.propagation.propagate import AttitudeError
 
 _STRONG = 0.7
 # A shift within two standard deviations is what noise in the further parameters gives.

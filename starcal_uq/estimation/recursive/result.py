@@ -10,6 +10,7 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import sigma_parameter
 from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.provenance import provenance
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.assemble import check_camera
@@ -20,7 +21,6 @@ from starcal_uq.estimation.recursive.innovations import frame_normals
 from starcal_uq.estimation.recursive.recursion_sums import FrameSums, entry_count, frame_entries
 from starcal_uq.estimation.solvers import is_singular
 from starcal_uq.estimation.stages import Stage
-from starcal_uq.runs.folder import provenance
 
 # The scatter of fewer frames than this per parameter says less about the covariance than the model does: less is needed
 # where the distortion is ignored, because the model is then known to be wrong.

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.files import atomic_path
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict
 from starcal_uq.estimation.recursive.filter import Recursion
 from starcal_uq.estimation.recursive.recursion_sums import FrameSums, History
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.observations.frames import StarFrames
-from starcal_uq.runs.folder import atomic_path
 
 _KIND = "starcal_uq recursive calibration"
 _VERSION = 1

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.core.files import atomic_path, ensure_new
 from starcal_uq.core.formatting import fixed, join_words, percent, plural, significant
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
 from starcal_uq.estimation.screening.outliers import MIN_STARS, StarResiduals, star_threshold
-from starcal_uq.runs.folder import atomic_path, ensure_new
 
 if TYPE_CHECKING:
     import pandas as pd

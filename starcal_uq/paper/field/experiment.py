@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.files import PathLike, check_new_folder
 from starcal_uq.core.formatting import plural
+from starcal_uq.core.provenance import provenance
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.paper.field.attitudes import attitude_errors, identified_stars
@@ -27,7 +29,6 @@ from starcal_uq.paper.field.published import (
 from starcal_uq.paper.field.result import FieldExperiment
 from starcal_uq.paper.published import PAPER_METHODS
 from starcal_uq.pipeline.refine import bootstrap
-from starcal_uq.runs.folder import PathLike, RunFolder, check_new_run, provenance
 from starcal_uq.sky.catalogue import load_catalogue
 from starcal_uq.sky.neighbours import without_disturbed
 
@@ -112,7 +113,7 @@ def field_experiment(
     """
     from starcal_uq.paper.show.field import write_field
 
-    check_new_run(RunFolder(out), force)
+    check_new_folder(out, force)
     sensor = _check(reading, n_frames, n_calibration_frames, n_replicates)
     bar = _Bar(progress)
     stars = load_catalogue(max_mag=sensor.limit_mag + _CATALOGUE_MORE_MAG)

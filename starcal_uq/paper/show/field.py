@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from starcal_uq.core.files import atomic_path, atomic_write_bytes, atomic_write_text, new_folder
 from starcal_uq.paper.field.published import REJECTED_READINGS
 from starcal_uq.paper.show import field_words as words
 from starcal_uq.presentation.html import embedded_image, template_environment
-from starcal_uq.runs.folder import RunFolder, atomic_path, atomic_write_bytes, atomic_write_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -23,8 +23,8 @@ def write_field(found: FieldExperiment) -> None:
     figures = field_figures(found)
     tables = _tables(found)
     page = render_field(found, figures)
-    RunFolder(found.path).create()
-    folder = RunFolder(found.path / "figures").create().path
+    new_folder(found.path)
+    folder = new_folder(found.path / "figures")
     for name, png in figures.items():
         atomic_write_bytes(folder / f"{name}.png", png)
     for name, table in tables.items():

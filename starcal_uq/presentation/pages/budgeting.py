@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 from starcal_uq.budgeting.result import Budget
 from starcal_uq.budgeting.rows import AXIS_LABELS, confidence_text
 from starcal_uq.budgeting.totals import Total
+from starcal_uq.core.files import atomic_path, atomic_write_text
 from starcal_uq.core.formatting import MINUS
 from starcal_uq.presentation.html import template_environment
 from starcal_uq.presentation.pages.budget_tables import NOT_ASSESSED, NOT_RESOLVED, budget_context, headline, tables
-from starcal_uq.runs.folder import atomic_path, atomic_write_text
 
 if TYPE_CHECKING:
     from openpyxl.worksheet.worksheet import Worksheet

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.core.files import atomic_path, atomic_write_bytes, atomic_write_text, new_folder
 from starcal_uq.core.formatting import count, fixed, significant
 from starcal_uq.presentation.html import embedded_image, template_environment
 from starcal_uq.presentation.words.planning import SCOPE_NAMES, level, need_words, settings_sentence
-from starcal_uq.runs.folder import RunFolder, atomic_path, atomic_write_bytes, atomic_write_text
 
 if TYPE_CHECKING:
     from starcal_uq.planning.check import ForecastCheck
@@ -38,10 +38,10 @@ def write_plan(
     plan: Plan, folder: str | os.PathLike[str], choice: FrameChoice | None = None, check: ForecastCheck | None = None
 ) -> Path:
     """Tables, figures and the page, which comes last: it is there only if all else is."""
-    path = RunFolder(folder).create().path
+    path = new_folder(folder)
     images = plan_figures(plan, choice, check)
     page = render_plan(plan, images, choice, check)
-    figures = RunFolder(path / "figures").create().path
+    figures = new_folder(path / "figures")
     for name, png in images.items():
         atomic_write_bytes(figures / f"{name}.png", png)
     tables = {"plan": plan.to_dataframe()} | ({} if plan.sweeps is None else {"sweeps": plan.sweeps})

@@ -16,7 +16,7 @@ from starcal_uq.presentation.figures.residuals import plot_residuals
 from starcal_uq.presentation.figures.style import figure_of, png_bytes
 
 if TYPE_CHECKING:
-    from starcal_uq.runs.run import Results
+    from starcal_uq.presentation.report.results import Results
 
 
 def draw_figures(results: Results) -> dict[str, bytes]:

@@ -15,7 +15,7 @@ from starcal_uq.presentation.html import embedded_image, template_environment
 from starcal_uq.presentation.pages import budget_tables_part as budget_tables
 from starcal_uq.presentation.report import diagnostics as model_tables
 from starcal_uq.presentation.report import field_words, image_tables, tables, words
-from starcal_uq.runs.run import Results
+from starcal_uq.presentation.report.results import Results
 
 _MARKS = {Level.PASS: "✓", Level.WARN: "!", Level.FAIL: "✗"}
 

@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from markupsafe import Markup
 
     from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.presentation.report.results import Results
     from starcal_uq.propagation.attitude_error import AttitudeError
     from starcal_uq.propagation.coupling import Coupling
-    from starcal_uq.runs.run import Results
 
 Row = dict[str, Any]
 

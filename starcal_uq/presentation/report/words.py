@@ -15,7 +15,7 @@ from starcal_uq.diagnostics.verdict.draws import propagation_difference
 
 if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
-    from starcal_uq.runs.run import Results
+    from starcal_uq.presentation.report.results import Results
 
 _DIRECTIONS = {
     "apparent": "apparent directions (aberration included)",

@@ -1,0 +1,96 @@
+"""What a report is made from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.observations.table import Observations
+
+if TYPE_CHECKING:
+    from starcal_uq.budgeting.result import Budget
+    from starcal_uq.diagnostics.diagnose import Diagnosis
+    from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.pipeline.record import ImageRecord
+    from starcal_uq.propagation.attitude_error import AttitudeError
+    from starcal_uq.propagation.coupling import Coupling
+    from starcal_uq.propagation.distortion import DistortionCurve
+    from starcal_uq.propagation.field import FieldMap
+
+
+@dataclass(frozen=True)
+class Missing:
+    """A part that the report lacks.
+
+    Attributes
+    ----------
+    what : str
+        The part, in words.
+    command : str
+        The command that makes it.
+    """
+
+    what: str
+    command: str
+
+
+@dataclass(frozen=True)
+class Results:
+    """Everything that a report is made from; None for what the run does not hold.
+
+    Attributes
+    ----------
+    name : str
+        Name of the run.
+    observations : Observations
+        The data.
+    calibration : Calibration
+        The estimate.
+    posterior : Posterior or None
+        The draws.
+    coupling : Coupling or None
+        The couplings, of the posterior if there is one, else of the estimate.
+    attitude : AttitudeError or None
+        The attitude error.
+    field_map : FieldMap or None
+        The direction uncertainty over the field.
+    diagnosis : Diagnosis or None
+        What questions the model: tests for misfit, jackknife, comparison of models.
+    truth : Camera or None
+        The camera of a simulation.
+    images : ImageRecord or None
+        What became of the images, where the run started from images.
+    budget : Budget or None
+        The attitude error budget.
+    missing : tuple of Missing
+        What the run does not hold.
+    """
+
+    name: str
+    observations: Observations
+    calibration: Calibration
+    posterior: Posterior | None = None
+    coupling: Coupling | None = None
+    attitude: AttitudeError | None = None
+    field_map: FieldMap | None = None
+    diagnosis: Diagnosis | None = None
+    truth: Camera | None = None
+    images: ImageRecord | None = None
+    budget: Budget | None = None
+    missing: tuple[Missing, ...] = ()
+
+    @cached_property
+    def distortion_curve(self) -> DistortionCurve | None:
+        """Distortion against radius with its bands; None without a posterior or distortion, or where a draw folds."""
+        from starcal_uq.core.errors import DistortionError
+        from starcal_uq.propagation.distortion import distortion_curve
+
+        if self.posterior is None:
+            return None
+        try:
+            return distortion_curve(self.posterior, self.observations)
+        except DistortionError:
+            return None
