@@ -29,10 +29,7 @@ if TYPE_CHECKING:
 NOISES = ("default", "posterior")
 
 
-_SHIFT_KEYS = ("principal_point_px", "focal_fraction", "distortion_corner_px")
-
-
-_CHAIN_KEYS = ("prior_from", "inflation", "noise", "shift")
+SHIFT_KEYS = ("principal_point_px", "focal_fraction", "distortion_corner_px")
 
 
 ALPHA = 1e-3
@@ -57,7 +54,7 @@ class AllowedShift:
     distortion_corner_px: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in _SHIFT_KEYS:
+        for name in SHIFT_KEYS:
             value = float(getattr(self, name))
             if not (np.isfinite(value) and value >= 0.0):
                 raise PriorError(f"the allowed shift {name!r} is {value:g}: it must be a finite number, zero or more.")
@@ -169,23 +166,6 @@ def check_chain(priors: Priors, camera: Camera, data_sha256: Collection[str] = (
 
 def _detector(camera: Camera) -> list[float]:
     return [camera.width_px, camera.height_px, camera.pixel_um]
-
-
-def _text(table: Mapping[str, Any], key: str) -> str:
-    if not isinstance(table[key], str):
-        raise PriorError(f"key {key!r} in [priors] must be a text.")
-    return str(table[key])
-
-
-def _numbers(table: Any, where: str, keys: Collection[str]) -> dict[str, float]:
-    if not isinstance(table, Mapping):
-        raise PriorError(f"{where!r} in [priors] must be a table with {', '.join(keys)}.")
-    for key, value in table.items():
-        if key not in keys:
-            raise PriorError(f"unknown key {key!r} in [priors.{where}]; use one of {', '.join(keys)}.")
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise PriorError(f"key {key!r} of [priors] must be a number.")
-    return {key: float(value) for key, value in table.items()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import PriorError
@@ -14,11 +14,27 @@ from starcal_uq.inference.gaussian_priors import GaussianPriors
 from starcal_uq.inference.physical_priors import priors_from_table
 from starcal_uq.inference.posterior import Posterior
 from starcal_uq.inference.priors import Priors, read_priors_table
-from starcal_uq.inference.update import _CHAIN_KEYS, _SHIFT_KEYS, AllowedShift, _numbers, _text, check_chain, prior_from
+from starcal_uq.inference.update import SHIFT_KEYS, AllowedShift, check_chain, prior_from
 from starcal_uq.runs.folder import RunFolder
 
-if TYPE_CHECKING:
-    pass
+_CHAIN_KEYS = ("prior_from", "inflation", "noise", "shift")
+
+
+def _text(table: Mapping[str, Any], key: str) -> str:
+    if not isinstance(table[key], str):
+        raise PriorError(f"key {key!r} in [priors] must be a text.")
+    return str(table[key])
+
+
+def _numbers(table: Any, where: str, keys: Collection[str]) -> dict[str, float]:
+    if not isinstance(table, Mapping):
+        raise PriorError(f"{where!r} in [priors] must be a table with {', '.join(keys)}.")
+    for key, value in table.items():
+        if key not in keys:
+            raise PriorError(f"unknown key {key!r} in [priors.{where}]; use one of {', '.join(keys)}.")
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise PriorError(f"key {key!r} of [priors] must be a number.")
+    return {key: float(value) for key, value in table.items()}
 
 
 def prior_from_run(run: str | Path, **options: Any) -> GaussianPriors:
@@ -65,7 +81,7 @@ def load_priors(
             )
     try:
         run = Path(path).parent / _text(table, "prior_from")
-        options: AnyDict = {"shift": AllowedShift(**_numbers(table.get("shift", {}), "shift", _SHIFT_KEYS))}
+        options: AnyDict = {"shift": AllowedShift(**_numbers(table.get("shift", {}), "shift", SHIFT_KEYS))}
         options |= _numbers({k: v for k, v in table.items() if k == "inflation"}, "priors", ("inflation",))
         if "noise" in table:
             options["noise"] = _text(table, "noise")
