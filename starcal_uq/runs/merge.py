@@ -189,4 +189,4 @@ def _check_target(target: RunFolder, folders: Sequence[RunFolder], force: bool) 
     place: Path = target.path.resolve()
     if any(folder.path.resolve() == place for folder in folders):
         raise RunFolderError(f"{target.path}: is one of the runs to merge; name another folder for the result.")
-    check_new_folder(target, force)
+    check_new_folder(target.path, force)

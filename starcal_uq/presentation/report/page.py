@@ -8,9 +8,9 @@ from typing import Any
 
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.formatting import MINUS, count, join_words
-from starcal_uq.diagnostics.verdict import limits
 from starcal_uq.diagnostics.verdict.judge import judge, worst
 from starcal_uq.diagnostics.verdict.levels import Check, Level, Question
+from starcal_uq.diagnostics.verdict.limits import limits
 from starcal_uq.presentation.html import embedded_image, template_environment
 from starcal_uq.presentation.pages import budget_tables_part as budget_tables
 from starcal_uq.presentation.report import diagnostics as model_tables

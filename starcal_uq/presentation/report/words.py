@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.formatting import count, fixed, percent, plural, significant
-from starcal_uq.diagnostics.verdict import air
-from starcal_uq.diagnostics.verdict.air import conditional_words, corrected_words
+from starcal_uq.diagnostics.verdict.air import air, conditional_words, corrected_words
 from starcal_uq.diagnostics.verdict.draws import propagation_difference
 
 if TYPE_CHECKING:
