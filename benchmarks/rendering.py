@@ -15,10 +15,9 @@ import numpy as np
 
 import starcal_uq as sc
 from starcal_uq.attitude.rotations import random_rotations
-from starcal_uq.simulation.rendered_files import write_frame
-from starcal_uq.simulation.rendering import render
+from starcal_uq.simulation.rendering import render, uniform_shot_noise
 from starcal_uq.simulation.sensor import Sensor
-from starcal_uq.simulation.shot_noise import uniform_shot_noise
+from starcal_uq.simulation.truth import write_frame
 
 
 def milliseconds(run: Callable[[int], object], repeats: int = 15) -> float:

@@ -25,7 +25,7 @@ from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.estimation.recursive.innovations import frame_normals
-from starcal_uq.estimation.recursive.recursion_options import RecursionOptions
+from starcal_uq.estimation.recursive.start import RecursionOptions
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.streams import stream_frames
 

@@ -34,8 +34,7 @@ from pathlib import Path
 import numpy as np
 
 from starcal_uq.sky.gaia import CATALOGUE_EPOCH, GaiaRecords, read_gaia_records
-from starcal_uq.sky.positions import unit_vectors
-from starcal_uq.sky.proper_motion import propagate_proper_motion
+from starcal_uq.sky.positions import propagate_proper_motion, unit_vectors
 
 SOURCE_EPOCH = 2000.0
 HIPPARCOS_EPOCH = 1991.25

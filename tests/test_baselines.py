@@ -14,7 +14,7 @@ from starcal_uq.camera.distortion import model_names
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.estimation.calibrate import METHODS
-from starcal_uq.estimation.recursive.recursion_options import RecursionOptions
+from starcal_uq.estimation.recursive.start import RecursionOptions
 from starcal_uq.estimation.recursive.stream import RecursiveCalibration
 from tests.scenes import camera, nominal, observations, with_sigmas
 

@@ -13,18 +13,17 @@ from typing import Any
 
 import numpy as np
 import pytest
+from starcal_uq.presentation.pages.budget_tables_part import budget_context
 
 import starcal_uq as sc
 from starcal_uq.budgeting.budget import budget
-from starcal_uq.budgeting.budget_csv import read_csv
 from starcal_uq.budgeting.file import load_budget_file
 from starcal_uq.budgeting.posterior import inflation
-from starcal_uq.budgeting.result import Budget
+from starcal_uq.budgeting.result import Budget, read_csv
 from starcal_uq.budgeting.rows import AXES, COMMON, FROM_FILE, GAUSSIAN_997, INTERACTION, NEA, REST, TOTAL_AXES
 from starcal_uq.budgeting.shapes import one_axis_factor
 from starcal_uq.core.errors import BudgetError, RunFolderError
 from starcal_uq.diagnostics.misfit import Misfit, MisfitTest
-from starcal_uq.presentation.pages.budget_tables_part import budget_context
 from starcal_uq.presentation.pages.budgeting import tex
 from starcal_uq.propagation.attitude_error import AttitudeError
 from starcal_uq.runs.steps import budget_run, diagnose_run

@@ -14,8 +14,7 @@ import pytest
 from starcal_uq.core.errors import CatalogueError
 from starcal_uq.sky.catalogue import StarCatalogue, load_catalogue
 from starcal_uq.sky.gaia import completed_proper_motion, holds_proper_motion, read_gaia_records
-from starcal_uq.sky.positions import ra_dec_deg, unit_vectors
-from starcal_uq.sky.proper_motion import propagate_proper_motion
+from starcal_uq.sky.positions import propagate_proper_motion, ra_dec_deg, unit_vectors
 
 REFERENCE = Path(__file__).resolve().parents[2] / "shared" / "data" / "bright_star_pm.csv"
 OBSERVED = REFERENCE.with_name("esa_tetra3_observations.csv")

@@ -12,11 +12,12 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.special import erf
 
-from starcal_uq.images import photon_transfer, windowed_centroids
+from starcal_uq.images import background as photon_transfer
+from starcal_uq.images import fits as windowed_centroids
 from starcal_uq.images import psf as psf_measurement
+from starcal_uq.images.background import counts_per_electron
 from starcal_uq.images.extract import extract_centroids
 from starcal_uq.images.image import Image
-from starcal_uq.images.photon_transfer import counts_per_electron
 from starcal_uq.images.pixel_phase import phase_error, without_phase_error
 
 BACKGROUND_E, READ_NOISE_E, HALF, SUB = 50.0, 5.0, 12, 11

@@ -15,9 +15,8 @@ from starcal_uq.core.errors import PriorError
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.merging import merge
-from starcal_uq.inference.gaussian_priors import GaussianPriors
 from starcal_uq.inference.posterior import Posterior
-from starcal_uq.inference.priors import Priors
+from starcal_uq.inference.priors import GaussianPriors, Priors
 from starcal_uq.inference.sample import sample
 from starcal_uq.inference.update import AllowedShift, check_chain, prior_from, shift_test
 from starcal_uq.runs.priors import load_priors

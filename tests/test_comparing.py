@@ -22,7 +22,7 @@ from starcal_uq.core.errors import CalibrationError, ComparisonError, Distortion
 from starcal_uq.core.status import Status
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.calibration import Calibration
-from starcal_uq.inference.gaussian_priors import GaussianPriors
+from starcal_uq.inference.priors import GaussianPriors
 from starcal_uq.observations.splits import shared_frames, split_frames
 from starcal_uq.runs.compare import compare_runs, compare_split
 from starcal_uq.runs.folder import RunFolder

@@ -16,8 +16,7 @@ from starcal_uq.core.errors import AttitudeProfileError, RunFolderError, Samplin
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.observations.table import Observations
 from starcal_uq.propagation.propagate import propagate
-from starcal_uq.propagation.spectrum import error_spectrum
-from starcal_uq.propagation.spectrum_result import ErrorSpectrum
+from starcal_uq.propagation.spectrum import ErrorSpectrum, error_spectrum
 from starcal_uq.simulation.mission import profile_frames
 from starcal_uq.sky.catalogue import load_catalogue
 from tests.scenes import camera, nominal, observations

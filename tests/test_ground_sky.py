@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 import starcal_uq as sc
 from starcal_uq.core.errors import ObservationError, SiteError
 from starcal_uq.core.times import utc_text
-from starcal_uq.diagnostics.verdict.air import corrected_words
+from starcal_uq.diagnostics.verdict.observed import corrected_words
 from starcal_uq.images.image import read_image, time_in_name
 from starcal_uq.pipeline.displacement import as_measured, mirrored, undisplaced
 from starcal_uq.pipeline.images import observations_from_images, with_time

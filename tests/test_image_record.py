@@ -9,7 +9,7 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.pipeline.record import ImageRecord, ImageRow, RoundRecord, identified_pairs
-from starcal_uq.presentation.report.image_tables import image_context
+from starcal_uq.presentation.report.tables import image_context
 
 
 @pytest.fixture(scope="module")

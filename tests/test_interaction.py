@@ -10,9 +10,15 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.core.errors import RunFolderError, SamplingError
-from starcal_uq.estimation.recursive.recursion_options import RecursionOptions
-from starcal_uq.paper.interaction import estimates, interaction_study
-from starcal_uq.paper.interaction_points import Condition, deep_catalogue, solid_angle_sr, study_points
+from starcal_uq.estimation.recursive.start import RecursionOptions
+from starcal_uq.paper.interaction import (
+    Condition,
+    deep_catalogue,
+    estimates,
+    interaction_study,
+    solid_angle_sr,
+    study_points,
+)
 from starcal_uq.paper.interaction_result import AXES, HANDLING, OPTICS, InteractionStudy, crossing
 from tests.scenes import camera, observations
 

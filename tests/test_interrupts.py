@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.core.interrupts import interrupt_between_steps
+from starcal_uq.core.tasks import interrupt_between_steps
 from tests.scenes import observations
 
 

@@ -16,10 +16,9 @@ from starcal_uq.core.errors import CalibrationError, RunFolderError
 from starcal_uq.core.provenance import data_hashes
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.calibration import Calibration
-from starcal_uq.estimation.consistency import Consistency, consistency_of
-from starcal_uq.estimation.expansion import moved, optimum, scaled, total
+from starcal_uq.estimation.compressed import moved, optimum, scaled, total
 from starcal_uq.estimation.marginal import MarginalLikelihood
-from starcal_uq.estimation.merging import merge
+from starcal_uq.estimation.merging import Consistency, consistency_of, merge
 from starcal_uq.inference.sample import sample
 from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.propagation.coupling import coupling

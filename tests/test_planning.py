@@ -18,8 +18,7 @@ from starcal_uq.planning.check import ForecastCheck, check_forecast
 from starcal_uq.planning.design import choose_frames
 from starcal_uq.planning.forecast import Forecaster, inverses, nea_arcsec, quantities, spreads, student_factor
 from starcal_uq.planning.information import FrameSet, look_at, random_frames
-from starcal_uq.planning.plan import plan
-from starcal_uq.planning.plan_result import Plan
+from starcal_uq.planning.plan import Plan, plan
 from starcal_uq.presentation.words.planning import frames as frames_words
 from tests.scenes import COEFFICIENTS, camera, observations
 

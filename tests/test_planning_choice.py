@@ -10,8 +10,7 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.attitude.rotations import quaternion_to_rotation, random_rotations
 from starcal_uq.core.errors import PlanningError
-from starcal_uq.planning.design import choose_frames
-from starcal_uq.planning.frame_choice_result import FrameChoice
+from starcal_uq.planning.design import FrameChoice, choose_frames
 from tests.scenes import camera, observations
 
 

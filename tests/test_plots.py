@@ -18,17 +18,15 @@ from starcal_uq.presentation.figures.coupling import (
     plot_correlations,
     plot_couplings,
 )
-from starcal_uq.presentation.figures.estimation import plot_convergence
-from starcal_uq.presentation.figures.field_map import plot_field_map
-from starcal_uq.presentation.figures.inference import CONTOUR_MASSES, mass_levels, plot_corner
-from starcal_uq.presentation.figures.prior import plot_prior_posterior
-from starcal_uq.presentation.figures.propagation import plot_attitude
-from starcal_uq.presentation.figures.residuals import (
+from starcal_uq.presentation.figures.estimation import (
+    plot_convergence,
     plot_residual_histogram,
     plot_residual_map,
     plot_residual_radius,
     plot_residuals,
 )
+from starcal_uq.presentation.figures.inference import CONTOUR_MASSES, mass_levels, plot_corner, plot_prior_posterior
+from starcal_uq.presentation.figures.propagation import plot_attitude, plot_field_map
 from starcal_uq.presentation.figures.scales import axis_scale
 from starcal_uq.presentation.figures.style import figure_of, png_bytes
 from tests.scenes import camera, nominal, observations

@@ -14,11 +14,10 @@ from starcal_uq.core.status import Status
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.estimation.recursive import filter as recursion_module
-from starcal_uq.estimation.recursive import recursion_sums
-from starcal_uq.estimation.recursive.filter import Recursion
+from starcal_uq.estimation.recursive import filter as recursion_sums
+from starcal_uq.estimation.recursive.filter import FrameSums, Recursion
 from starcal_uq.estimation.recursive.innovations import FrameNormals, frame_normals
-from starcal_uq.estimation.recursive.recursion_options import RecursionOptions
-from starcal_uq.estimation.recursive.recursion_sums import FrameSums
+from starcal_uq.estimation.recursive.start import RecursionOptions
 from starcal_uq.estimation.recursive.stream import RecursiveCalibration
 from starcal_uq.estimation.solvers import levenberg_marquardt
 from starcal_uq.observations.frames import StarFrames

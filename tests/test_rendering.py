@@ -20,11 +20,9 @@ from starcal_uq.paper.camera import paper_camera
 from starcal_uq.simulation.campaign import render_frames
 from starcal_uq.simulation.frames import simulate
 from starcal_uq.simulation.psf import profiles
-from starcal_uq.simulation.rendered_files import read_truth, truth_table, write_frame
-from starcal_uq.simulation.rendering import Scene, render
+from starcal_uq.simulation.rendering import Scene, render, uniform_shot_noise
 from starcal_uq.simulation.sensor import Sensor
-from starcal_uq.simulation.shot_noise import uniform_shot_noise
-from starcal_uq.simulation.truth import RenderedFrame
+from starcal_uq.simulation.truth import RenderedFrame, read_truth, truth_table, write_frame
 from starcal_uq.sky.catalogue import StarCatalogue, load_catalogue
 from starcal_uq.sky.positions import ra_dec_deg
 

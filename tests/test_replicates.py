@@ -18,8 +18,7 @@ from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.methods import METHODS, Method
-from starcal_uq.paper.replicates import replicate
-from starcal_uq.paper.replicates_methods import solve_all
+from starcal_uq.paper.replicates import replicate, solve_all
 from starcal_uq.paper.replicates_result import Replicates
 from starcal_uq.paper.statistics import (
     HONEST,

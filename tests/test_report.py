@@ -273,7 +273,7 @@ def test_mixed_runs_are_refused_and_nothing_is_touched(run):
 def test_a_report_that_fails_leaves_the_old_one(run, monkeypatch):
     before = run.report.read_bytes()
     figures = {path: path.stat().st_mtime_ns for path in run.figures.iterdir()}
-    monkeypatch.setattr("starcal_uq.presentation.report.figures.draw_figures", lambda _: {"corner": b"new"})
+    monkeypatch.setattr("starcal_uq.presentation.report.page.draw_figures", lambda _: {"corner": b"new"})
     monkeypatch.setattr("starcal_uq.presentation.report.page.render", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         sc.report(run.path)

@@ -20,12 +20,14 @@ from starcal_uq.paper import reproduction as command
 from starcal_uq.paper.angles import fit_angles
 from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.paper.checks import NO, WITHIN_NOISE, paper_checks, printed_camera
-from starcal_uq.paper.error_readings import MAXIMUM, REPROJECTION, error_sizes
 from starcal_uq.paper.errors import (
+    MAXIMUM,
     OPTICS,
+    REPROJECTION,
     UNDISTORTIONS,
     aligned,
     detector_grid,
+    error_sizes,
     map_error,
     reprojection_error_px,
     undistorted,
@@ -33,11 +35,9 @@ from starcal_uq.paper.errors import (
 from starcal_uq.paper.judgement import MAX_CHANCE, Judged, Outcome, trial
 from starcal_uq.paper.methods import METHODS
 from starcal_uq.paper.published import LEAST_SQUARES, PAPER_METHODS, PROPOSED, SAMAAN, Printed, printed
-from starcal_uq.paper.reading_draws import AS_PRINTED, OTHER_EQUATION, READINGS
-from starcal_uq.paper.readings import run_readings
-from starcal_uq.paper.replicates import replicate
+from starcal_uq.paper.readings import AS_PRINTED, OTHER_EQUATION, READINGS, run_readings
+from starcal_uq.paper.replicates import is_slow, joined, replicate, replicate_shared
 from starcal_uq.paper.result import Reproduction
-from starcal_uq.paper.shared_replicates import is_slow, joined, replicate_shared
 from starcal_uq.paper.table_2 import row_tests
 from starcal_uq.simulation.frames import simulate
 from tests.scenes import observations

@@ -26,8 +26,8 @@ from starcal_uq.maths.ranks import (
     uniformity_band,
     uniformity_p_value,
 )
+from starcal_uq.presentation.figures.diagnostics import plot_validation
 from starcal_uq.presentation.figures.style import png_bytes
-from starcal_uq.presentation.figures.validation import plot_validation
 from tests import validation_controls as controls
 from tests.scenes import camera, nominal
 
@@ -294,7 +294,7 @@ def test_interrupt_before_the_first_result_is_an_interrupt(stars, monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("starcal_uq.diagnostics.validation.validation_pool.run_replicate", stop)
+    monkeypatch.setattr("starcal_uq.diagnostics.validation.validate.run_replicate", stop)
     with pytest.raises(KeyboardInterrupt):
         validate_study(study(), stars, 3, workers=0)
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
+from starcal_uq.core.status import Level, Question
 from starcal_uq.diagnostics.diagnose import diagnose
 from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals, residual_scale
 from starcal_uq.diagnostics.verdict import limits
 from starcal_uq.diagnostics.verdict.draws import propagation_difference
 from starcal_uq.diagnostics.verdict.judge import judge
-from starcal_uq.diagnostics.verdict.levels import Level, Question
 from starcal_uq.presentation.report.tables import mean_to_mcse
 from tests.scenes import camera, observations, with_sigmas
 

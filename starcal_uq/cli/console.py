@@ -230,7 +230,7 @@ def show_verdict(verdict: Verdict) -> None:
 
 def warn_air(obs: Observations, cal: Calibration) -> None:
     """Say what refraction does to the focal length where nothing is known of the air."""
-    from starcal_uq.diagnostics.verdict.air import REMEDY, air, conditional_words
+    from starcal_uq.diagnostics.verdict.observed import REMEDY, air, conditional_words
 
     if air(obs) == "unknown":
         err.print(f"warning: {conditional_words(cal)} {REMEDY}", style="yellow", highlight=False, soft_wrap=True)

@@ -47,7 +47,7 @@ def filter_command(
     from starcal_uq.camera.camera import Camera
     from starcal_uq.cli.console import print_json, records, show_calibration
     from starcal_uq.estimation.recursive.innovations import PAIR_COVARIANCES
-    from starcal_uq.estimation.recursive.recursion_options import RecursionOptions
+    from starcal_uq.estimation.recursive.start import RecursionOptions
     from starcal_uq.runs.streams import HISTORY, filter_run
 
     if pair_covariance not in PAIR_COVARIANCES:

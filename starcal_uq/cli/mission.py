@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.planning.check import ForecastCheck
-    from starcal_uq.planning.frame_choice_result import FrameChoice
-    from starcal_uq.planning.plan_result import Plan
+    from starcal_uq.planning.design import FrameChoice
+    from starcal_uq.planning.plan import Plan
 
 
 def register(app: typer.Typer) -> None:
@@ -75,7 +75,7 @@ def budget_command(
         ensure_new(path, force)
     found = budget_run(run, file=file, confidence=confidence, seed=seed)
     if template is not None:
-        from starcal_uq.budgeting.budget_template import write_budget_template
+        from starcal_uq.budgeting.file import write_budget_template
 
         write_budget_template(template, found.rows, force=force)
         print(f"Budget file to fill in: {template}. Next: starcal-uq budget {run} --file {template}")
@@ -96,7 +96,7 @@ def show_budget(found: Budget) -> None:
 
     from starcal_uq.budgeting.rows import confidence_text
     from starcal_uq.cli.console import out, show_table
-    from starcal_uq.presentation.pages.budget_tables import (
+    from starcal_uq.presentation.pages.budgeting import (
         NOT_ASSESSED,
         contributor_rows,
         explanations,

@@ -140,7 +140,7 @@ def merge_command(
     """Combine the likelihoods of several runs into one, without going back to the stars; tests that they agree."""
     from starcal_uq.cli.console import out as console
     from starcal_uq.cli.console import show_calibration, show_table
-    from starcal_uq.estimation.consistency import consistency_of
+    from starcal_uq.estimation.merging import consistency_of
     from starcal_uq.runs.merge import merge_runs
 
     merged = merge_runs(runs, out, noise=noise, allow_inconsistent=allow_inconsistent, force=force)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.provenance import data_hashes
-from starcal_uq.inference.gaussian_priors import GaussianPriors
+from starcal_uq.inference.priors import GaussianPriors
 from starcal_uq.observations.splits import shared_frames
 
 if TYPE_CHECKING:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -15,15 +16,23 @@ from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
 
 from starcal_uq.core.errors import SamplingError
-from starcal_uq.core.interrupts import interrupt_between_steps
 
 Progress = Callable[[int, int], None]
+
+
 T = TypeVar("T")
+
+
 # Numbers of the tasks and their results.
 Numbered = list[tuple[int, T]]
 
+
 _WAIT_S = 0.2
+
+
 _THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+
+
 _shared: list[Callable[[int], Any]] = []
 
 
@@ -178,3 +187,35 @@ def _start(path: Path) -> None:
 
 def _run(numbers: range) -> Numbered[Any]:
     return [(number, _shared[0](number)) for number in numbers]
+
+
+@contextmanager
+def interrupt_between_steps() -> Iterator[Callable[[], None]]:
+    """Hold Ctrl-C back until the function that this yields is called.
+
+    Yields
+    ------
+    callable
+        Raises KeyboardInterrupt if Ctrl-C was pressed since the context was entered. In a thread other than the main
+        one, which receives no signals, it does nothing.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: None
+        return
+    pressed = threading.Event()
+
+    def note(_signal: int, _frame: Any) -> None:
+        pressed.set()
+
+    def check() -> None:
+        if pressed.is_set():
+            pressed.clear()
+            raise KeyboardInterrupt
+
+    previous = signal.signal(signal.SIGINT, note)
+    try:
+        yield check
+        # Ctrl-C after the last step must not be lost.
+        check()
+    finally:
+        signal.signal(signal.SIGINT, previous)

@@ -22,20 +22,27 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.formatting import plural, significant
 from starcal_uq.core.types import AnyDict, FloatArray
-from starcal_uq.diagnostics.misfit_noise import NoiseSums, noise_weights
-from starcal_uq.diagnostics.shapes import Shape, View, shapes
+from starcal_uq.diagnostics.shapes import Shape, View, run_clock, shapes
 from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
     import pandas as pd
 
+    from starcal_uq.camera.camera import Camera
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.observations.table import Observations
 
 # Directions of which the fit absorbs all but this share of the square are not there to be tested.
 _ABSORBED = 1e-8
+
+
 _STARS_AT_ONCE = 10_000
+
+
 _LEAST_DOF = 10
+
+
 ALPHA = 0.05
 
 
@@ -360,3 +367,75 @@ class _Sums:
         return MisfitTest(
             name, against, statistic, rank, rest, p, 1.0, float(np.sqrt(excess)) * self.noise_px, float("nan")
         )
+
+
+def noise_weights(obs: Observations, camera: Camera) -> dict[str, FloatArray]:
+    """What the noise could change with: standardised values (N,) by name."""
+    radius2 = (obs.x_px - camera.x0_px) ** 2 + (obs.y_px - camera.y0_px) ** 2
+    candidates: dict[str, FloatArray] = {"radius": radius2}
+    if obs.mag is not None:
+        candidates["magnitude"] = obs.mag
+    clock, called = run_clock(obs)
+    if clock is not None:
+        candidates[called] = clock
+    found = {}
+    for name, values in candidates.items():
+        spread = float(np.nanstd(values))
+        if spread > 1e-9:
+            found[name] = np.nan_to_num((values - np.nanmean(values)) / spread)
+    return found
+
+
+class NoiseSums:
+    """Sums over stars that the moments need, for several weights.
+
+    Parameters
+    ----------
+    weights : dict
+        Name to values (N,).
+    p : int
+        Number of parameters.
+    """
+
+    def __init__(self, weights: dict[str, FloatArray], p: int) -> None:
+        self.weights = weights
+        n = len(weights)
+        self.squares = np.zeros(n)
+        self.trace = np.zeros(n)
+        self.trace2 = np.zeros(n)
+        self.parameters1 = np.zeros((n, p, p))
+        self.parameters2 = np.zeros((n, p, p))
+        self.crossed = np.zeros((n, p, p))
+
+    def add(self, frames: StarFrames, state: Any, h: FloatArray, e: FloatArray, rows: slice) -> None:
+        """Add some frames: h (p, 2, n) and e (2, n) with the attitudes removed."""
+        a, inverse = state.attitude, np.moveaxis(state.inverse, 2, 0)
+        for i, values in enumerate(self.weights.values()):
+            w = values[rows]
+            self.squares[i] += float(np.sum(w * e**2))
+            weighted, doubly = h * w, h * w**2
+            flat = h.reshape(len(h), -1)
+            self.parameters1[i] += weighted.reshape(len(h), -1) @ flat.T
+            self.parameters2[i] += doubly.reshape(len(h), -1) @ flat.T
+            awa = np.moveaxis(frames.sum(np.einsum("axn,bxn->abn", a * w, a)), 2, 0) @ inverse
+            aw2a = np.moveaxis(frames.sum(np.einsum("axn,bxn->abn", a * w**2, a)), 2, 0) @ inverse
+            awh = np.moveaxis(frames.sum(np.einsum("axn,bxn->abn", a * w, h)), 2, 0)
+            self.trace[i] += 2.0 * np.sum(w) - np.einsum("kaa->", awa)
+            # tr(W W) - 2 tr(P W W) + tr(P W P W) for the attitudes' part of P.
+            self.trace2[i] += 2.0 * np.sum(w**2) - 2.0 * np.einsum("kaa->", aw2a) + np.einsum("kab,kba->", awa, awa)
+            self.crossed[i] += np.einsum("kap,kab,kbq->pq", awh, inverse, awh)
+
+    def tests(self, matrix: FloatArray, inverse: FloatArray, rss: float, dof: int) -> list[tuple[str, float, float]]:
+        """Name, z and two-sided p-value of every weight."""
+        from scipy.special import erfc
+
+        found = []
+        for i, name in enumerate(self.weights):
+            by_h = inverse @ self.parameters1[i]
+            trace = self.trace[i] - np.trace(by_h)
+            trace2 = self.trace2[i] - 2.0 * np.trace(inverse @ self.parameters2[i])
+            trace2 += 2.0 * np.trace(inverse @ self.crossed[i]) + np.sum(by_h * by_h.T)
+            variance = 2.0 * (trace2 - trace**2 / dof) / (dof * (dof + 2.0))
+            z = float((self.squares[i] / rss - trace / dof) / np.sqrt(variance))
+            found.append((name, z, float(erfc(abs(z) / np.sqrt(2.0)))))
+        return found

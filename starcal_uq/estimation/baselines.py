@@ -13,8 +13,8 @@ from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, assemble, noise_px
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
-from starcal_uq.estimation.recursive.recursion_options import RecursionOptions
 from starcal_uq.estimation.recursive.result import distortion_after, joint_estimate, sums_at_estimate
+from starcal_uq.estimation.recursive.start import RecursionOptions
 from starcal_uq.estimation.recursive.stream import RecursiveCalibration
 from starcal_uq.estimation.stages import optics_stage
 from starcal_uq.observations.frames import StarFrames

@@ -17,7 +17,7 @@ from starcal_uq.estimation.baselines import check_count, least_squares, recursiv
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
-from starcal_uq.estimation.recursive.recursion_options import RECURSIVE_METHODS, RecursionOptions
+from starcal_uq.estimation.recursive.start import RECURSIVE_METHODS, RecursionOptions
 from starcal_uq.estimation.recursive.stream import raise_unless_good
 from starcal_uq.estimation.robust import compress_reweighted, refine, robust_start
 from starcal_uq.estimation.solvers import is_singular

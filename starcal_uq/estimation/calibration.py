@@ -207,7 +207,7 @@ class Calibration:
             raise CalibrationError(
                 "this calibration comes from a stream of frames and kept no residuals: calibrate loaded observations."
             )
-        from starcal_uq.presentation.figures.residuals import plot_residuals
+        from starcal_uq.presentation.figures.estimation import plot_residuals
 
         return plot_residuals(self, obs, **options)
 

@@ -4,18 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from os import PathLike
-from typing import Literal, Protocol, TypeAlias
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal, Protocol, TypeAlias
 
 import numpy as np
 
 from starcal_uq.core.errors import IdentificationError
 from starcal_uq.core.types import FloatArray
-from starcal_uq.identification.identification_tetra3rs import PlateSolver
 from starcal_uq.identification.pairs import StarPairs, cached_star_pairs, find_star_pairs
 from starcal_uq.identification.pyramid import CameraTolerance, FieldGeometry, Hypothesis, hypotheses
 from starcal_uq.sky.catalogue import StarCatalogue
+from starcal_uq.sky.gaia import write_gaia_records
 
 Engine: TypeAlias = Literal["pyramid", "tetra3rs"]
+
+
 ENGINES: tuple[Engine, ...] = ("pyramid", "tetra3rs")
 
 
@@ -95,3 +99,82 @@ def prepare_pairs(
     if cache:
         return cached_star_pairs(directions, stars.mag, field_sr, largest, cache_dir)
     return find_star_pairs(directions, stars.mag, field_sr, largest)
+
+
+# The table of patterns is made for fields this much smaller and larger than the tolerance of the focal length asks for.
+_FIELD_MARGIN = 0.02
+
+
+class PlateSolver:
+    """A pattern table of tetra3rs for one catalogue and field of view.
+
+    Raises
+    ------
+    IdentificationError
+        The package is not installed, or finds no patterns in the catalogue.
+    """
+
+    def __init__(self, stars: StarCatalogue, geometry: FieldGeometry, tolerance: CameraTolerance) -> None:
+        solver = _package()
+        fov_deg = _field_deg(geometry)
+        margin = tolerance.focal + _FIELD_MARGIN
+        with TemporaryDirectory() as folder:
+            path = Path(folder) / "stars.bin"
+            write_gaia_records(path, stars.ra_deg, stars.dec_deg, stars.mag)
+            try:
+                self._database = solver.SolverDatabase.generate_from_gaia(
+                    catalog_path=str(path),
+                    min_fov_deg=fov_deg * (1.0 - margin),
+                    max_fov_deg=fov_deg * (1.0 + margin),
+                    epoch_proper_motion_year=None,
+                )
+            except (ValueError, RuntimeError) as error:
+                raise IdentificationError(
+                    f'tetra3rs makes no patterns of this catalogue ({error}); use engine="pyramid".'
+                ) from error
+
+    def hypotheses(
+        self,
+        points: FloatArray,
+        sigma_px: FloatArray,
+        geometry: FieldGeometry,
+        tolerance: CameraTolerance,
+        max_centroids: int,
+        searched: int,
+    ) -> Iterator[list[Hypothesis]]:
+        """At most one hypothesis, from all centroids; none on a second call for the same frame."""
+        if searched or len(points) < 4:
+            return
+        solver = _package()
+        width, height = int(geometry.width_px), int(geometry.height_px)
+        # Points are brightest first, which is all that is used of the third column.
+        centroids = np.column_stack([points, np.arange(len(points), 0.0, -1.0)])
+        result = self._database.solve_from_centroids(
+            centroids,
+            camera_model=solver.CameraModel(geometry.focal_px, width, height),
+            fov_max_error_deg=_field_deg(geometry) * (tolerance.focal + geometry.relative_bias(tolerance)),
+            # No limit in time, only in patterns: the same result on every machine.
+            solve_timeout_ms=None,
+        )
+        # A mirrored sky is another search's, as it is for our own patterns.
+        if not result or result.parity_flip:
+            return
+        # In single precision, so that it is no rotation to ours.
+        u, _, v = np.linalg.svd(np.asarray(result.rotation_matrix_icrs_to_camera, dtype=np.float64))
+        focal_px = 0.5 * geometry.width_px / np.tan(np.radians(0.5 * float(result.fov_deg)))
+        yield [Hypothesis(u @ v, float(focal_px / geometry.focal_px))]
+
+
+def _field_deg(geometry: FieldGeometry) -> float:
+    """Horizontal field of view."""
+    return float(np.degrees(2.0 * np.arctan(0.5 * geometry.width_px / geometry.focal_px)))
+
+
+def _package() -> Any:
+    try:
+        import tetra3rs
+    except ImportError as error:
+        raise IdentificationError(
+            'the engine tetra3rs is not installed: run `pip install "starcal-uq[tetra3rs]"` or use engine="pyramid".'
+        ) from error
+    return tetra3rs

@@ -11,10 +11,9 @@ from starcal_uq.core.errors import ImageError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.types import AnyDict, BoolArray, IntArray
 from starcal_uq.images.background import PreparedImage, prepare_image
-from starcal_uq.images.fits import Stamps, StarFit, cut_stamps, explained, fit_stars, near_pairs
+from starcal_uq.images.fits import Stamps, StarFit, cut_stamps, explained, fit_stars, near_pairs, windowed
 from starcal_uq.images.image import Image
 from starcal_uq.images.psf import FIRST_SIGMA_PX, half_stamp_px, measure_psf, moment_sigma_px, pixel_at
-from starcal_uq.images.windowed_centroids import windowed
 
 # Half the detection kernel: what lies farther out adds 1 % to the signal-to-noise ratio and doubles the time.
 _KERNEL_HALF_SIGMAS, _KERNEL_HALF_MAX = 2.5, 5

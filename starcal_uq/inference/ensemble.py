@@ -12,8 +12,7 @@ import numpy as np
 
 from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.files import atomic_path
-from starcal_uq.core.interrupts import interrupt_between_steps
-from starcal_uq.core.tasks import Progress
+from starcal_uq.core.tasks import Progress, interrupt_between_steps
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.inference.target import Density, student_t_log_density
 

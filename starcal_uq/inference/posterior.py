@@ -5,16 +5,21 @@ Opening a saved posterior needs neither the sampler nor the symbolic model nor a
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import Parameter, parameters, sigma_parameter
+from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.files import atomic_path, ensure_new
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.inference.priors import SIGMA_NAMES, Priors
 
@@ -26,7 +31,11 @@ DRAW_ORDER = (
     "chain is one separately seeded ensemble; within a chain, draws are ordered by half of the run, then walker, then "
     "step in that half, so that split R-hat compares the two halves in time and all ensembles"
 )
+
+
 _QUANTILES = (0.025, 0.5, 0.975)
+
+
 _NUMBERS = ("prior_mean", "prior_sd", "mean", "sd", "q2.5", "q50", "q97.5", "mcse")
 
 
@@ -267,8 +276,6 @@ class Posterior:
         """ArviZ's groups ``posterior`` and ``sample_stats`` as xarray datasets (chain, draw)."""
         import xarray as xr
 
-        from starcal_uq.inference.posterior_files import to_json
-
         shape = (self.n_ensembles, self.n_walkers * self.n_steps)
         coords = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
         shown = self.parameters
@@ -348,7 +355,6 @@ class Posterior:
         RunFolderError
             If the file exists and `force` is false, or cannot be written.
         """
-        from starcal_uq.inference.posterior_files import save_posterior
 
         save_posterior(self, path, force)
 
@@ -361,7 +367,6 @@ class Posterior:
         RunFolderError
             If the file is missing or is not a posterior.
         """
-        from starcal_uq.inference.posterior_files import load_posterior
 
         return load_posterior(path)
 
@@ -372,8 +377,8 @@ class Posterior:
         return plot_corner(self, **options)
 
     def plot_prior_posterior(self, **options: Any) -> Any:
-        """Prior beside posterior; options as for `starcal_uq.presentation.figures.prior.plot_prior_posterior`."""
-        from starcal_uq.presentation.figures.prior import plot_prior_posterior
+        """Prior beside posterior; options as for `starcal_uq.presentation.figures.inference.plot_prior_posterior`."""
+        from starcal_uq.presentation.figures.inference import plot_prior_posterior
 
         return plot_prior_posterior(self, **options)
 
@@ -394,3 +399,101 @@ def _listed(messages: Sequence[str]) -> str:
     import html
 
     return f"<ul>{''.join(f'<li>{html.escape(m)}</li>' for m in messages)}</ul>" if messages else ""
+
+
+_FORMAT = "starcal_uq posterior 1"
+
+
+_Record = TypeVar("_Record", Laplace, Diagnostics)
+
+
+_ARRAYS = {
+    "draws": ("sample", "parameter"),
+    "log_posterior": ("sample",),
+    "information": ("camera_parameter", "camera_parameter_2"),
+    "rotation_per_theta": ("axis", "camera_parameter"),
+    "attitude_noise": ("axis", "axis_2"),
+}
+
+
+# Present only where the likelihood has such a parameter.
+_OPTIONAL = {"dof_draws": ("sample",)}
+
+
+_PLAIN = ("n_ensembles", "n_walkers", "n_steps", "sigma_sampled", "provenance")
+
+
+def to_json(value: Any) -> str:
+    """JSON text with exact floats; arrays become lists."""
+    return json.dumps(value, default=_plain)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return vars(value)
+    return str(value)
+
+
+def _record(cls: type[_Record], values: Mapping[str, Any]) -> _Record:
+    kinds = {field.name: str(field.type) for field in dataclasses.fields(cls)}
+    converted: dict[str, Any] = {}
+    for name, value in values.items():
+        if kinds[name] == "FloatArray":
+            converted[name] = np.asarray(value, dtype=np.float64)
+        else:
+            converted[name] = tuple(value) if kinds[name].startswith("tuple") else value
+    return cls(**converted)
+
+
+def save_posterior(posterior: Posterior, path: str | os.PathLike[str], force: bool) -> None:
+    """Write a posterior; see `Posterior.save`."""
+    import xarray as xr
+
+    ensure_new(path, force)
+    record = {
+        "parameter_names": posterior.parameter_names,
+        "camera": posterior.camera.to_dict(),
+        "priors": posterior.priors.to_dict(),
+        "laplace": posterior.laplace,
+        "diagnostics": posterior.diagnostics,
+        **{name: getattr(posterior, name) for name in _PLAIN},
+    }
+    arrays = {name: (dims, getattr(posterior, name)) for name, dims in (_ARRAYS | _OPTIONAL).items()}
+    root = xr.Dataset(
+        {name: value for name, value in arrays.items() if value[1] is not None},
+        attrs={"format": _FORMAT, "record": to_json(record)},
+    )
+    tree = xr.DataTree.from_dict({"/": root, **posterior.datasets()})
+    with atomic_path(path) as temporary:
+        tree.to_netcdf(temporary, engine="h5netcdf")
+
+
+def load_posterior(path: str | os.PathLike[str]) -> Posterior:
+    """Read a posterior; see `Posterior.load`."""
+    import h5netcdf
+
+    if not Path(path).is_file():
+        raise RunFolderError(f"{path}: there is no such file; run `starcal-uq sample RUN` first.")
+    try:
+        with h5netcdf.File(path, "r") as file:
+            if file.attrs.get("format") != _FORMAT:
+                raise RunFolderError(f"{path}: is not a posterior of this version; run `starcal-uq sample RUN` again.")
+            record = json.loads(str(file.attrs["record"]))
+            arrays: dict[str, Any] = {name: np.asarray(file.variables[name][...], dtype=np.float64) for name in _ARRAYS}
+            present = [name for name in _OPTIONAL if name in file.variables]
+            arrays |= {name: np.asarray(file.variables[name][...], dtype=np.float64) for name in present}
+    except (OSError, KeyError, ValueError) as error:
+        raise RunFolderError(
+            f"{path}: cannot be read as a posterior ({error}); run `starcal-uq sample RUN` again."
+        ) from error
+    return Posterior(
+        parameter_names=tuple(record["parameter_names"]),
+        priors=Priors.from_dict(record["priors"]),
+        laplace=_record(Laplace, record["laplace"]),
+        diagnostics=_record(Diagnostics, record["diagnostics"]),
+        camera=Camera.from_dict(record["camera"]),
+        **{name: record[name] for name in _PLAIN},
+        **arrays,
+    )

@@ -34,8 +34,7 @@ from starcal_uq.inference.named import (
     label_of,
     resolved_dof,
 )
-from starcal_uq.inference.posterior import Laplace, Posterior
-from starcal_uq.inference.posterior_files import to_json
+from starcal_uq.inference.posterior import Laplace, Posterior, to_json
 from starcal_uq.inference.priors import SIGMA_NAMES, Priors
 from starcal_uq.inference.surrogate import fit_polynomial
 from starcal_uq.inference.target import (

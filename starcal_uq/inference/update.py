@@ -17,9 +17,8 @@ from starcal_uq.camera.distortion import get_model, parameters
 from starcal_uq.core.errors import PriorError
 from starcal_uq.core.provenance import data_hashes
 from starcal_uq.core.types import FloatArray
-from starcal_uq.inference.gaussian_priors import GaussianPriors
 from starcal_uq.inference.posterior import Posterior
-from starcal_uq.inference.priors import SIGMA_NAMES, Priors, positive_number
+from starcal_uq.inference.priors import SIGMA_NAMES, GaussianPriors, Priors, positive_number
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -10,7 +10,7 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.formatting import fixed, significant
 from starcal_uq.core.types import FloatArray
-from starcal_uq.paper.error_readings import MAXIMUM, REPROJECTION, ErrorReading, point_errors, rms_px
+from starcal_uq.paper.errors import MAXIMUM, REPROJECTION, ErrorReading, point_errors, rms_px
 from starcal_uq.paper.published import (
     CLAIMED_RATIO,
     CLAIMED_Y0_ERROR_PX,

@@ -172,9 +172,9 @@ class InteractionStudy:
     @property
     def verdict(self) -> str:
         """Where the interaction starts to cost more than noise, method by method, in plain words."""
-        from starcal_uq.paper.show.study_words import verdict
+        from starcal_uq.paper.show.study_words import interaction_verdict
 
-        return verdict(self)
+        return interaction_verdict(self)
 
     def save_csv(self, path: str | os.PathLike[str]) -> None:
         """Write the table, atomically; overwritten. Numbers keep all digits."""
@@ -216,8 +216,8 @@ class InteractionStudy:
         return cls(table)
 
     def plot(self, **options: Any) -> Any:
-        """Bias and spread along the four axes; options as for `starcal_uq.paper.show.interaction.plot_interaction`."""
-        from starcal_uq.paper.show.interaction import plot_interaction
+        """Bias and spread along the four axes; options as for `starcal_uq.paper.show.study_figures.plot_interaction`."""
+        from starcal_uq.paper.show.study_figures import plot_interaction
 
         return plot_interaction(self, **options)
 

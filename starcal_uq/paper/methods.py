@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from starcal_uq.core.types import AnyDict
 from starcal_uq.estimation.calibrate import calibrate
-from starcal_uq.estimation.recursive.recursion_options import RECURSIVE_METHODS, RecursionOptions
+from starcal_uq.estimation.recursive.start import RECURSIVE_METHODS, RecursionOptions
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera

@@ -7,22 +7,36 @@ contradict the text are marked, and can at most explain a number, not confirm it
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import get_model
+from starcal_uq.core.errors import StarcalError
+from starcal_uq.core.status import Status
 from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import AnyDict, FloatArray
-from starcal_uq.paper.error_readings import MAXIMUM, REPROJECTION
-from starcal_uq.paper.published import MAX_MAG, N_FRAMES, N_STARS, Printed
-from starcal_uq.paper.reading_draws import READINGS, Key, Plan, draw
+from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.estimation.pairs import PairObjective
+from starcal_uq.estimation.recursive.start import RecursionOptions
+from starcal_uq.estimation.stages import distortion_stage, joint_stage, optics_stage
+from starcal_uq.observations.frames import StarFrames
+from starcal_uq.paper.angles import fit_angles
+from starcal_uq.paper.camera import CONVENTIONS, paper_camera, paper_start
+from starcal_uq.paper.errors import MAXIMUM, REPROJECTION, error_sizes, undistorted
+from starcal_uq.paper.published import LEAST_SQUARES, MAX_MAG, N_FRAMES, N_STARS, PROPOSED, SAMAAN, Printed
+from starcal_uq.simulation.frames import simulate
 from starcal_uq.sky.catalogue import load_catalogue
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from starcal_uq.observations.table import Observations
+    from starcal_uq.sky.catalogue import StarCatalogue
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,3 +139,227 @@ def run_readings(
     )
     keys = tuple(found[0])
     return Readings(keys, np.array([[one.get(key, np.nan) for one in found] for key in keys])), interrupted
+
+
+AS_PRINTED, OTHER_EQUATION, DIAGONAL = "as printed", "other equation", "diagonal"
+
+
+FEW_FRAMES = 100
+
+
+_PROCESS_NOISE_PX = 0.1
+
+
+_MAX_ITERATIONS = 200
+
+
+_SOLVER = "lm"
+
+
+# An estimate of a method, None where it failed.
+Estimates = Mapping[str, Camera | None]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A reading of the experiment.
+
+    Attributes
+    ----------
+    key : str
+        Short name, in tables.
+    words : str
+        In words; empty for what is printed.
+    faithful : bool
+        Whether the paper's text allows it.
+    """
+
+    key: str
+    words: str
+    faithful: bool
+
+
+READINGS = (
+    Reading(AS_PRINTED, "", True),
+    Reading(OTHER_EQUATION, "distortion by the other equation", True),
+    Reading("sparse sky", f"a sky of {N_STARS} stars", True),
+    Reading(DIAGONAL, "filter with pairs taken as independent", True),
+    Reading("plain filter", "filter that linearises each frame once", True),
+    Reading("process noise", f"filter with process noise of {_PROCESS_NOISE_PX} px a frame", True),
+    Reading("eq. 6 signs", "coefficients by eq. 6 as printed", True),
+    Reading("true attitudes", "coefficients from true attitudes and the estimated f", True),
+    Reading("true points", "coefficients from the true ideal points", True),
+    Reading("weighted pairs", "pairs weighted by their full covariance", False),
+    Reading("angles", "angles instead of the cosines of eq. 5", False),
+    Reading("few frames", f"{FEW_FRAMES} frames instead of {N_FRAMES}", False),
+)
+
+
+class Key(NamedTuple):
+    """What a draw is of: a reading of the experiment, a method, a quantity, and the reading of an error size."""
+
+    reading: str
+    method: str
+    quantity: str
+    error: str
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What all draws share; sent once to every process."""
+
+    stars: StarCatalogue
+    sparse: StarCatalogue
+    convention: str
+    n_frames: int
+    min_stars: int
+    sigma_px: float
+    seed: int
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One simulated data set.
+
+    Attributes
+    ----------
+    truth, start : Camera
+        What was simulated, and where every method starts.
+    obs : Observations
+        The stars.
+    noise_px : (N, 2) array
+        Centroid noise for the measures of error, which take the observed places for noise-free ones: it must not be
+        that of the observations, which moved these places already.
+    """
+
+    truth: Camera
+    start: Camera
+    obs: Observations
+    noise_px: FloatArray
+
+
+def draw(plan: Plan, index: int) -> dict[Key, float]:
+    """One seed under every reading; a method without a result leaves its keys out."""
+    # The last number keeps these seeds apart from those of `replicate`.
+    sequence = np.random.SeedSequence(plan.seed, spawn_key=(index, 1))
+    seeds = [int(s) for s in sequence.generate_state(4, np.uint64)]
+    rng = np.random.default_rng(seeds[3])
+    other = next(name for name in CONVENTIONS if name != plan.convention)
+    found: dict[Key, float] = {}
+    for reading, convention, stars, seed in (
+        (AS_PRINTED, plan.convention, plan.stars, seeds[0]),
+        (OTHER_EQUATION, other, plan.stars, seeds[1]),
+        ("sparse sky", plan.convention, plan.sparse, seeds[2]),
+    ):
+        truth, start = paper_camera(convention), paper_start(convention)
+        obs = simulate(
+            stars, truth, n_frames=plan.n_frames, min_stars=plan.min_stars, sigma_px=plan.sigma_px, seed=seed
+        )
+        scene = Scene(truth, start, obs, plan.sigma_px * rng.standard_normal((obs.n_stars, 2)))
+        printed = paper_methods(obs, start)
+        found |= measured(scene, reading, printed)
+        if reading == AS_PRINTED:
+            few = obs.select_frames(obs.frame_ids[:FEW_FRAMES])
+            found |= measured(scene, "few frames", paper_methods(few, start))
+            for key, estimates in alternatives(scene, printed).items():
+                found |= measured(scene, key, estimates)
+    return found
+
+
+def paper_methods(obs: Observations, start: Camera) -> Estimates:
+    """The three methods of the paper's Table 2 on one data set."""
+    frames = StarFrames.from_observations(obs)
+    optics = optics_stage(frames, start, _SOLVER, _MAX_ITERATIONS)
+    linear = distortion_stage(frames, start, optics.theta)
+    objective = PairObjective(frames, start.distortion)
+    joint = joint_stage(objective, start, linear.theta, _SOLVER, _MAX_ITERATIONS)
+    return {
+        LEAST_SQUARES: pinhole(start, optics.theta) if optics.status.ok else None,
+        SAMAAN: _recursive(obs, start, "samaan"),
+        PROPOSED: start.with_theta(joint.theta) if joint.status.ok else None,
+    }
+
+
+def pinhole(camera: Camera, theta: FloatArray) -> Camera:
+    """A camera without distortion, of the first three parameters."""
+    return camera.replace(distortion="none", coefficients=()).with_theta(theta[:3])
+
+
+def _recursive(obs: Observations, start: Camera, method: str, options: RecursionOptions | None = None) -> Camera | None:
+    try:
+        # As a stream: the same estimate, without the time that residuals take.
+        found = calibrate([obs], start, method=method, recursion=options, throw=False)
+    except StarcalError:
+        return None
+    # A filter that linearises every frame once says so by its status, and is what was asked for.
+    return found.camera if found.status in (Status.CONVERGED, Status.MAX_ITERATIONS) else None
+
+
+def alternatives(scene: Scene, printed: Estimates) -> dict[str, Estimates]:
+    """The readings that need no other data set, by name; `printed` are the estimates of `paper_methods`."""
+    obs, start = scene.obs, scene.start
+    found: dict[str, Estimates] = {
+        name: {SAMAAN: _recursive(obs, start, "samaan", options)}
+        for name, options in (
+            ("plain filter", RecursionOptions(iterations=1)),
+            ("process noise", RecursionOptions(process_noise=_PROCESS_NOISE_PX, sigma_px=obs.meta["sigma_px"])),
+        )
+    }
+    filtered = printed[SAMAAN]
+    if filtered is not None:
+        found |= {name: {SAMAAN: camera} for name, camera in _other_coefficients(scene, filtered).items()}
+        # The filter's optics are those of one least-squares problem over all frames.
+        found["weighted pairs"] = {LEAST_SQUARES: pinhole(start, filtered.theta)}
+    optics_camera, joint_camera = printed[LEAST_SQUARES], printed[PROPOSED]
+    if optics_camera is not None and joint_camera is not None:
+        found["angles"] = {
+            LEAST_SQUARES: pinhole(start, fit_angles(obs, "none", optics_camera.theta)),
+            PROPOSED: start.with_theta(fit_angles(obs, start.distortion, joint_camera.theta)),
+        }
+    return found
+
+
+def _other_coefficients(scene: Scene, filtered: Camera) -> dict[str, Camera]:
+    """Coefficients by linear least squares at the filter's optics, from other ideal points or with other signs."""
+    truth, obs = scene.truth, scene.obs
+    centre = filtered.theta[:2]
+    ideal = undistorted(truth, obs.xy)
+    measured_at = obs.xy + scene.noise_px - centre
+    scaled = (ideal - truth.theta[:2]) * (filtered.focal_px / truth.focal_px)
+    frames = StarFrames.from_observations(obs)
+    # Eq. 6 with the sign that is printed, on data and attitudes as in the second stage.
+    crossed = filtered.replace(distortion="inverse" if filtered.distortion == "brown" else "brown")
+    signs = distortion_stage(frames, crossed, filtered.theta).theta
+    return {
+        "eq. 6 signs": filtered.with_theta(signs),
+        "true attitudes": _with_coefficients(filtered, scaled, measured_at),
+        "true points": _with_coefficients(filtered, ideal - centre, measured_at),
+    }
+
+
+def _with_coefficients(camera: Camera, ideal: FloatArray, seen: FloatArray) -> Camera:
+    """The camera with the coefficients that take ideal to measured offsets (N, 2) best."""
+    model = get_model(camera.distortion)
+    forward = model.direction == "forward"
+    at, target = (ideal, seen - ideal) if forward else (seen, ideal - seen)
+    units = np.eye(len(model.coefficients))
+    columns = [np.concatenate(model.displacement(at[:, 0], at[:, 1], tuple(unit))) for unit in units]
+    design = np.stack(columns, axis=1)
+    scale = np.linalg.norm(design, axis=0)
+    k = np.linalg.lstsq(design / scale, target.T.ravel(), rcond=None)[0] / scale
+    return camera.replace(coefficients=tuple(k.tolist()))
+
+
+def measured(scene: Scene, reading: str, estimates: Estimates) -> dict[Key, float]:
+    """Parameters and errors of every estimate."""
+    found: dict[Key, float] = {}
+    for method, camera in estimates.items():
+        if camera is None:
+            continue
+        values = {"x0_px": camera.x0_px, "y0_px": camera.y0_px, "f_mm": camera.focal_mm}
+        values |= dict(zip(("k1", "k2"), camera.coefficients, strict=False))
+        values["y0_error_px"] = abs(camera.y0_px - scene.truth.y0_px)
+        found |= {Key(reading, method, quantity, ""): float(value) for quantity, value in values.items()}
+        for quantity, choice, value in error_sizes(scene.truth, camera, scene.obs.xy, scene.noise_px):
+            found[Key(reading, method, quantity, choice.key)] = value
+    return found

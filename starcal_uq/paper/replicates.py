@@ -6,6 +6,7 @@ estimates, the sigmas that each method gives, and the Cramer-Rao bound of the de
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -18,16 +19,18 @@ from starcal_uq.core.provenance import provenance
 from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.paper.errors import map_error, reprojection_error_px
 from starcal_uq.paper.methods import METHODS, Method
-from starcal_uq.paper.replicates_methods import inverse_diagonal, solve_all
 from starcal_uq.paper.replicates_result import Replicates
 from starcal_uq.simulation.frames import simulate
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.observations.table import Observations
     from starcal_uq.sky.catalogue import StarCatalogue
 
 # A replicate takes about half a second at a thousand frames.
@@ -273,3 +276,176 @@ def _check(
     ):
         if not good:
             raise SamplingError(text)
+
+
+@dataclass(frozen=True)
+class Solved:
+    """What a method found.
+
+    Attributes
+    ----------
+    camera : Camera
+        The estimate.
+    theta : (p,) array
+        Its parameters, px units.
+    sigmas : (p,) array
+        Its standard deviations, as the method claims them.
+    classical : (p,) array
+        Those of textbooks: for least squares over pairs ``(J^T J)^-1 s^2``, which presumes that pairs are independent,
+        although the m (m - 1) / 2 pairs of m stars hold 2 m - 3 independent numbers; for a filter its own, which
+        presume that its model holds. NaN where there is none, or where it is what the method claims anyway.
+    """
+
+    camera: Camera
+    theta: FloatArray
+    sigmas: FloatArray
+    classical: FloatArray
+
+
+def solve_all(
+    methods: Sequence[Method], obs: Observations, frames: StarFrames, start: Camera
+) -> list[Solved | StarcalError]:
+    """Every method's result, or why it has none; `frames` are those of `obs`.
+
+    The first stage of the efficient method is least squares, and its third is the paper's method: where it is among the
+    methods and converges, they are taken from it.
+    """
+    found: dict[Method, Solved | StarcalError] = {}
+    efficient = [method for method in methods if method.method == "efficient"]
+    others = [method for method in methods if method.method != "efficient"]
+    whole: Calibration | None = None
+    for method in (*efficient, *others):
+        try:
+            if whole is not None and method.method in _STAGES:
+                found[method] = _STAGES[method.method](whole, frames)
+                continue
+            cal = method.calibrate(obs, start)
+            found[method] = _solved(cal, frames)
+            whole = cal if method.method == "efficient" else whole
+        except StarcalError as error:
+            found[method] = error
+    return [found[method] for method in methods]
+
+
+def _solved(cal: Calibration, frames: StarFrames) -> Solved:
+    classical = np.full(len(cal.theta), np.nan)
+    if cal.method in _STAGES:
+        classical = textbook_sigmas(PairObjective(frames, cal.camera.distortion), cal.theta)
+    for stage in cal.stages:
+        if stage.sigmas is not None:
+            classical = np.where(stage.sigmas[-1] > 0.0, stage.sigmas[-1], np.nan)
+    return Solved(cal.camera, cal.theta, cal.sigmas, classical)
+
+
+def _first_stage(whole: Calibration, frames: StarFrames) -> Solved:
+    theta = whole.stages[0].theta[:3]
+    pairs = PairObjective(frames, "none")
+    camera = whole.nominal.replace(distortion="none", coefficients=()).with_theta(theta)
+    return Solved(camera, theta, np.sqrt(np.diag(pairs.godambe(theta))), textbook_sigmas(pairs, theta))
+
+
+def _third_stage(whole: Calibration, frames: StarFrames) -> Solved:
+    theta = whole.pair_theta
+    pairs = PairObjective(frames, whole.nominal.distortion)
+    sigmas = np.sqrt(np.diag(whole.pair_covariance))
+    return Solved(whole.nominal.with_theta(theta), theta, sigmas, textbook_sigmas(pairs, theta))
+
+
+_STAGES = {"least_squares": _first_stage, "three_stage": _third_stage}
+
+
+def textbook_sigmas(pairs: PairObjective, theta: FloatArray) -> FloatArray:
+    """Standard deviations (p,) of least squares over pairs, ``(J^T J)^-1 s^2``, as if pairs were independent."""
+    normal = pairs.evaluate(theta)
+    variance = normal.cost / (pairs.n_pairs - len(theta))
+    return np.sqrt(inverse_diagonal(normal.matrix) * variance)
+
+
+def inverse_diagonal(matrix: FloatArray) -> FloatArray:
+    """Diagonal of the inverse of an information matrix, whose entries may span thirty orders of magnitude."""
+    scale = 1.0 / np.sqrt(np.diag(matrix))
+    return np.asarray(np.diag(np.linalg.inv(matrix * np.outer(scale, scale))) * scale**2)
+
+
+# One in so many replicates for options of a method, which are there to show what they claim.
+SHARE = 4
+
+
+_LEAST = 8
+
+
+def is_slow(method: Method) -> bool:
+    """Whether a method takes part in one of `SHARE` replicates only: the filter that forms every pair."""
+    return method.recursion is not None and method.recursion.pair_covariance == "diagonal"
+
+
+def replicate_shared(
+    truth: Camera,
+    start: Camera,
+    *,
+    n_replicates: int,
+    n_frames: int,
+    seed: int,
+    workers: int | None,
+    progress: Progress | None,
+    methods: Sequence[Method] = METHODS,
+) -> Replicates:
+    """As `replicate`, but with slow methods in the first replicates only; the others hold NaN for them.
+
+    Raises
+    ------
+    SamplingError
+        If processes cannot be used.
+    CalibrationError
+        When a method never gave a result.
+    """
+    fast, slow = (tuple(m for m in methods if is_slow(m) is kind) for kind in (False, True))
+    options: AnyDict = {"truth": truth, "start": start, "n_frames": n_frames, "seed": seed, "workers": workers}
+    n_few = min(n_replicates, max(_LEAST, n_replicates // SHARE)) if slow else 0
+    total = n_replicates + n_few
+
+    def part(before: int) -> Progress | None:
+        return None if progress is None else lambda done, _: progress(before + done, total)
+
+    most = replicate(methods=fast, n_replicates=n_replicates, progress=part(0), **options)
+    if not slow or most.interrupted:
+        return most
+    few = replicate(methods=slow, n_replicates=n_few, progress=part(n_replicates), **options)
+    return joined(most, few, methods)
+
+
+def joined(most: Replicates, few: Replicates, methods: Sequence[Method]) -> Replicates:
+    """Two sets of replicates with different methods as one.
+
+    Parameters
+    ----------
+    most, few : Replicates
+        Of the same seed, truth and start; the replicates of `few` are the first ones of `most`, with the same data.
+    methods : sequence of Method
+        Those of both, in the order of the result.
+
+    Raises
+    ------
+    ValueError
+        When the replicates of `few` are not the first ones of `most`.
+    """
+    n, k = most.n_replicates, few.n_replicates
+    if not np.array_equal(most.replicate[:k], few.replicate) or not np.allclose(most.crlb[:k], few.crlb):
+        raise ValueError("the replicates to join are not of the same data: give both the same seed and settings.")
+
+    def one(name: str, method: Method) -> FloatArray:
+        if method in most.methods:
+            return np.asarray(getattr(most, name)[most.methods.index(method)])
+        values = getattr(few, name)[few.methods.index(method)]
+        padding = np.full((n - k, *values.shape[1:]), np.nan)
+        return np.concatenate([values, padding])
+
+    arrays = ("estimates", "claimed", "classical", "map_px", "map_arcsec", "reprojection_px")
+    none = ("",) * (n - k)
+    failures = tuple(
+        most.failures[most.methods.index(m)] if m in most.methods else (*few.failures[few.methods.index(m)], *none)
+        for m in methods
+    )
+    changes: AnyDict = {name: np.stack([one(name, method) for method in methods]) for name in arrays}
+    interrupted = most.interrupted or few.interrupted
+    return dataclasses.replace(most, methods=tuple(methods), failures=failures, interrupted=interrupted, **changes)

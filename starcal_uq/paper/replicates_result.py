@@ -11,6 +11,7 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
+from starcal_uq.core.files import reading_archive, write_archive
 from starcal_uq.core.formatting import fixed, percent, significant
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
 from starcal_uq.paper.methods import Method
@@ -200,13 +201,13 @@ class Replicates:
     @property
     def verdict(self) -> str:
         """What was found, in plain words, method by method."""
-        from starcal_uq.paper.show.replicates_words import verdict
+        from starcal_uq.paper.show.study_words import replicates_verdict
 
-        return verdict(self)
+        return replicates_verdict(self)
 
     def verdict_of(self, label: str) -> str:
         """What was found of one method, in plain words."""
-        from starcal_uq.paper.show.replicates_words import verdict_of
+        from starcal_uq.paper.show.study_words import verdict_of
 
         return verdict_of(self, label)
 
@@ -224,7 +225,6 @@ class Replicates:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything to one ``.npz`` file, atomically; overwritten."""
-        from starcal_uq.paper.replicates_files import save_replicates
 
         save_replicates(self, path)
 
@@ -237,7 +237,6 @@ class Replicates:
         RunFolderError
             If the file is missing or is not a set of replicates.
         """
-        from starcal_uq.paper.replicates_files import load_replicates
 
         return load_replicates(path)
 
@@ -281,4 +280,48 @@ class Replicates:
             f"<p><b>Replicates</b>: {escape(self.verdict)}</p><table><thead><tr>"
             + "".join(f"<th>{name}</th>" for name in head)
             + f"</tr></thead><tbody>{''.join(body)}</tbody></table>"
+        )
+
+
+_FORMAT = "starcal_uq replicates 1"
+
+
+_ARRAYS = ("replicate", "estimates", "claimed", "classical", "crlb", "map_px", "map_arcsec", "reprojection_px")
+
+
+_PLAIN = ("n_requested", "interrupted", "provenance")
+
+
+def save_replicates(found: Replicates, path: str | os.PathLike[str]) -> None:
+    """Write everything, atomically; overwritten."""
+    document: AnyDict = {name: getattr(found, name) for name in (*_PLAIN, "failures")}
+    document["methods"] = [method.to_dict() for method in found.methods]
+    document |= {"truth": found.truth.to_dict(), "start": found.start.to_dict()}
+    arrays = {name: getattr(found, name) for name in _ARRAYS}
+    write_archive(path, _FORMAT, document, arrays)
+
+
+def load_replicates(path: str | os.PathLike[str]) -> Replicates:
+    """Read what `save_replicates` wrote.
+
+    Raises
+    ------
+    RunFolderError
+        If the file is missing or is not a set of replicates.
+    """
+    from starcal_uq.paper.replicates_result import Replicates
+
+    words = {
+        "missing": "run `starcal-uq reproduce` first",
+        "wrong": "does not hold replicates; run `starcal-uq reproduce` to write it again",
+    }
+    with reading_archive(path, _FORMAT, **words) as (document, arrays):
+        values: AnyDict = {name: document[name] for name in _PLAIN}
+        return Replicates(
+            methods=tuple(Method.from_dict(method) for method in document["methods"]),
+            truth=Camera.from_dict(document["truth"]),
+            start=Camera.from_dict(document["start"]),
+            failures=tuple(tuple(reasons) for reasons in document["failures"]),
+            **{name: arrays[name] for name in _ARRAYS},
+            **values,
         )

@@ -92,8 +92,8 @@ def reproduce(
     from starcal_uq.paper.experiment import run_paper
     from starcal_uq.paper.interaction import interaction_study
     from starcal_uq.paper.readings import run_readings
+    from starcal_uq.paper.replicates import replicate_shared
     from starcal_uq.paper.result import Reproduction
-    from starcal_uq.paper.shared_replicates import replicate_shared
     from starcal_uq.paper.table_2 import judge_all
 
     folder = Path(out)

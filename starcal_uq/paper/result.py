@@ -139,7 +139,7 @@ class Reproduction:
     def plot_printed_numbers(self) -> Any:
         """Every printed number as a distance from our draws; returns the matplotlib Figure."""
         from starcal_uq.paper.show.figures import plot_printed_numbers
-        from starcal_uq.paper.show.report_tables import axis_names
+        from starcal_uq.paper.show.reproduction import axis_names
 
         return plot_printed_numbers(self.judged, axis_names(self.judged))
 

@@ -10,11 +10,10 @@ import numpy as np
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.types import AnyDict, FloatArray
-from starcal_uq.paper.error_readings import REPROJECTION
-from starcal_uq.paper.errors import reprojection_error_px
+from starcal_uq.paper.errors import REPROJECTION, reprojection_error_px
 from starcal_uq.paper.judgement import Judged, trial
 from starcal_uq.paper.published import PAPER_METHODS, PUBLISHED, SAMAAN, TABLE_2, Printed
-from starcal_uq.paper.reading_draws import AS_PRINTED, DIAGONAL, READINGS
+from starcal_uq.paper.readings import AS_PRINTED, DIAGONAL, READINGS
 
 if TYPE_CHECKING:
     import pandas as pd

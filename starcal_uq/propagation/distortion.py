@@ -110,8 +110,8 @@ class DistortionCurve:
         )
 
     def plot_distortion(self, **options: Any) -> Any:
-        """Curve and bands; options as for `starcal_uq.presentation.figures.distortion.plot_distortion_curve`."""
-        from starcal_uq.presentation.figures.distortion import plot_distortion_curve
+        """Curve and bands; options as for `starcal_uq.presentation.figures.propagation.plot_distortion_curve`."""
+        from starcal_uq.presentation.figures.propagation import plot_distortion_curve
 
         return plot_distortion_curve(self, **options)
 

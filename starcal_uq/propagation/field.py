@@ -147,8 +147,8 @@ class FieldMap:
             ) from error
 
     def plot_field_map(self, **options: Any) -> Any:
-        """Both maps; options as for `starcal_uq.presentation.figures.field_map.plot_field_map`."""
-        from starcal_uq.presentation.figures.field_map import plot_field_map
+        """Both maps; options as for `starcal_uq.presentation.figures.propagation.plot_field_map`."""
+        from starcal_uq.presentation.figures.propagation import plot_field_map
 
         return plot_field_map(self, **options)
 

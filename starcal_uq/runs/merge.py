@@ -11,7 +11,7 @@ from starcal_uq.core.errors import CalibrationError, RunFolderError
 from starcal_uq.core.files import PathLike, check_new_folder
 from starcal_uq.core.types import AnyDict, FloatArray, StrArray
 from starcal_uq.estimation.calibration import Calibration
-from starcal_uq.estimation.expansion import optimum
+from starcal_uq.estimation.compressed import optimum
 from starcal_uq.estimation.merging import merge, renumbered
 from starcal_uq.observations.table import COLUMNS, Observations, load_observations
 from starcal_uq.runs.folder import RunFolder

@@ -10,10 +10,8 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import PriorError
 from starcal_uq.core.provenance import data_hashes
 from starcal_uq.core.types import AnyDict
-from starcal_uq.inference.gaussian_priors import GaussianPriors
-from starcal_uq.inference.physical_priors import priors_from_table
 from starcal_uq.inference.posterior import Posterior
-from starcal_uq.inference.priors import Priors, read_priors_table
+from starcal_uq.inference.priors import GaussianPriors, Priors, priors_from_table, read_priors_table
 from starcal_uq.inference.update import SHIFT_KEYS, AllowedShift, check_chain, prior_from
 from starcal_uq.runs.folder import RunFolder
 

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from starcal_uq.propagation.attitude_error import AttitudeError
     from starcal_uq.propagation.coupling import Coupling
     from starcal_uq.propagation.field import FieldMap
-    from starcal_uq.propagation.spectrum_result import ErrorSpectrum
+    from starcal_uq.propagation.spectrum import ErrorSpectrum
     from starcal_uq.sky.site import Site
 
 DIRECTIONS = ("undeclared", "catalogue", "apparent")
@@ -396,7 +396,7 @@ def report(run_path: str | os.PathLike[str], truth: Camera | None = None) -> Pat
         If there is no calibration, a file cannot be read, or files of different runs are mixed.
     """
     from starcal_uq.core.files import atomic_write_bytes, atomic_write_text
-    from starcal_uq.presentation.report.figures import draw_figures
+    from starcal_uq.presentation.report.page import draw_figures
     from starcal_uq.runs.folder import RunFolder
 
     run = RunFolder(run_path)

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path, atomic_write_text, check_new_folder
-from starcal_uq.core.interrupts import interrupt_between_steps
+from starcal_uq.core.tasks import interrupt_between_steps
 from starcal_uq.core.types import AnyDict
-from starcal_uq.estimation.recursive.recursion_options import RecursionOptions
+from starcal_uq.estimation.recursive.start import RecursionOptions
 from starcal_uq.estimation.recursive.stream import RecursiveCalibration
 from starcal_uq.observations.streams import FrameStream, stream_frames
 from starcal_uq.runs.folder import RunFolder

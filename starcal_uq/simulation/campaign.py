@@ -15,10 +15,9 @@ from starcal_uq.core.errors import RunFolderError, SensorError
 from starcal_uq.core.files import ensure_new
 from starcal_uq.core.types import FloatArray
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky, choose_attitudes
-from starcal_uq.simulation.rendered_files import write_frame
 from starcal_uq.simulation.rendering import Scene
 from starcal_uq.simulation.sensor import Sensor
-from starcal_uq.simulation.truth import check_time
+from starcal_uq.simulation.truth import check_time, write_frame
 
 if TYPE_CHECKING:
     from starcal_uq.sky.catalogue import StarCatalogue

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import io
+import os
+import warnings
+from collections.abc import Iterable
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from starcal_uq import __version__
+from starcal_uq.attitude.rotations import quaternion_to_rotation, rotation_to_quaternion
 from starcal_uq.camera.camera import Camera
-from starcal_uq.core.errors import SensorError
+from starcal_uq.camera.distortion import get_model
+from starcal_uq.core.errors import ImageError, SensorError, StarcalError
+from starcal_uq.core.files import atomic_write_bytes, ensure_new
 from starcal_uq.core.types import FloatArray, StrArray
 from starcal_uq.images.image import Image
 from starcal_uq.observations.table import Observations
@@ -130,3 +139,186 @@ class RenderedFrame:
             saturation=sensor.saturation_counts,
             gain_e_per_count=sensor.gain_e_per_count,
         )
+
+
+SENSOR_KEYS = {
+    "psf_sigma_px": ("PSFSIG", "[px] standard deviation of the PSF"),
+    "psf": ("PSF", "integrated over pixels, or sampled"),
+    "zero_point_e_s": ("ZEROPT", "[electron/s] of a star of magnitude 0"),
+    "exposure_s": ("EXPTIME", "[s] exposure time"),
+    "background_e_px_s": ("BKG_E_S", "[electron/s] background per pixel"),
+    "dark_e_px_s": ("DARK_E_S", "[electron/s] dark current per pixel"),
+    "read_noise_e": ("RDNOISE", "[electron] read noise, RMS"),
+    "gain_e_per_count": ("EGAIN", "[electron/adu] gain"),
+    "offset_counts": ("OFFSET", "[adu] counts without electrons"),
+    "bits": ("BITS", "resolution of the converter"),
+    "full_well_e": ("FULLWELL", "[electron] that a pixel holds"),
+    "hot_pixel_fraction": ("HOTFRAC", "part of all pixels that are hot"),
+    "hot_pixel_e_s": ("HOT_E_S", "[electron/s] mean dark current of hot pixels"),
+    "hot_pixel_seed": ("HOTSEED", "seed of the hot pixels"),
+}
+
+
+_CAMERA_KEYS = {
+    "pixel_um": ("PIXUM", "[um] pixel pitch"),
+    "focal_mm": ("FOCALMM", "[mm] focal length"),
+    "x0_px": ("X0PX", "[px] principal point; 0 = centre of first pixel"),
+    "y0_px": ("Y0PX", "[px] principal point, y downwards"),
+}
+
+
+_TRUTH_COLUMNS = {
+    "x_px": "pix",
+    "y_px": "pix",
+    "electrons": "electron",
+    "ra_deg": "deg",
+    "dec_deg": "deg",
+    "mag": "mag",
+}
+
+
+def write_frame(frame: RenderedFrame, path: str | os.PathLike[str], force: bool = False) -> None:
+    """Write a rendered frame and its truth as FITS; the same frame gives the same bytes.
+
+    Parameters
+    ----------
+    frame : RenderedFrame
+        Quantised counts become 16-bit integers (``BZERO`` = 32768), others 64-bit floats.
+    path : str or path
+        The file; it appears complete or not at all.
+    force : bool
+        Whether an existing file may be replaced.
+
+    Raises
+    ------
+    RunFolderError
+        If the file exists and `force` is false, or cannot be written.
+    """
+    from astropy.io import fits
+
+    ensure_new(path, force)
+    image = fits.PrimaryHDU(frame.data)
+    image.header.extend(_cards(frame.truth))
+    truth = frame.truth
+    # FITS knows ASCII only; other letters become escapes such as \u03b1.
+    star_id = np.char.encode(truth.star_id, "ascii", "backslashreplace")
+    names = fits.Column("star_id", f"{max(1, star_id.dtype.itemsize)}A", array=star_id)
+    columns = [fits.Column(key, "D", unit, array=getattr(truth, key)) for key, unit in _TRUTH_COLUMNS.items()]
+    stream = io.BytesIO()
+    fits.HDUList([image, fits.BinTableHDU.from_columns([names, *columns], name="TRUTH")]).writeto(stream)
+    atomic_write_bytes(path, stream.getvalue())
+
+
+def _cards(truth: FrameTruth) -> list[tuple[str, Any, str]]:
+    camera, sensor = truth.camera, truth.sensor
+    cards: list[tuple[str, Any, str]] = [
+        ("BUNIT", "adu", "unit of the pixels"),
+        ("ROWORDER", "TOP-DOWN", "the first row is y = 0, the top of the image"),
+        ("FRAME", truth.frame, "frame number"),
+    ]
+    if truth.seed is not None:
+        cards.append(("SEED", truth.seed, "seed of the noise, with FRAME"))
+    if truth.time_utc is not None:
+        start = datetime.fromisoformat(truth.time_utc) - timedelta(seconds=0.5 * sensor.exposure_s)
+        cards += [
+            ("TIMESYS", "UTC", "time scale"),
+            ("DATE-OBS", start.isoformat(timespec="microseconds"), "start of the exposure"),
+            ("DATE-AVG", truth.time_utc, "middle of the exposure"),
+        ]
+    cards += [
+        (f"Q{axis}", float(value), "attitude R_cam_icrs, scalar-last quaternion")
+        for axis, value in zip("XYZW", rotation_to_quaternion(truth.rotation), strict=True)
+    ]
+    cards += [
+        (f"RATE{axis}", float(value), "[rad/s] angular rate in camera axes")
+        for axis, value in zip("XYZ", truth.rate_rad_s, strict=True)
+    ]
+    cards.append(("CAMNAME", camera.name.encode("ascii", "replace").decode("ascii"), "camera"))
+    cards += [(keyword, getattr(camera, key), text) for key, (keyword, text) in _CAMERA_KEYS.items()]
+    cards.append(("DISTORT", camera.distortion, "distortion model"))
+    cards += [
+        (coefficient.name.upper(), value, f"[{coefficient.unit}] distortion")
+        for coefficient, value in zip(get_model(camera.distortion).coefficients, camera.coefficients, strict=True)
+    ]
+    cards += [(keyword, getattr(sensor, key), text) for key, (keyword, text) in SENSOR_KEYS.items()]
+    return [
+        *cards,
+        ("SATURATE", sensor.saturation_counts, "[adu] a pixel with this or more is saturated"),
+        ("CREATOR", f"starcal-uq {__version__}", "program that rendered the frame"),
+        ("NUMPY", np.__version__, "version of NumPy, which draws the noise"),
+    ]
+
+
+def read_truth(path: str | os.PathLike[str]) -> FrameTruth:
+    """What a rendered frame shows, from its file.
+
+    Raises
+    ------
+    ImageError
+        If the file cannot be read, or does not carry a truth.
+    """
+    from astropy.io import fits
+
+    try:
+        with warnings.catch_warnings():
+            # Astropy only warns of a truncated file.
+            warnings.simplefilter("error")
+            with fits.open(io.BytesIO(Path(path).read_bytes()), memmap=False) as hdus:
+                header = hdus[0].header
+                table = hdus["TRUTH"].data
+                columns = {key: np.array(table[key], dtype=np.float64) for key in _TRUTH_COLUMNS}
+                star_id = np.array(table["star_id"], dtype=np.str_)
+                size = header["NAXIS1"], header["NAXIS2"]
+        model = get_model(header["DISTORT"])
+        camera = Camera(
+            *size,
+            **{key: header[keyword] for key, (keyword, _) in _CAMERA_KEYS.items()},
+            distortion=model.name,
+            coefficients=tuple(header[coefficient.name.upper()] for coefficient in model.coefficients),
+            name=header["CAMNAME"],
+        )
+        sensor = Sensor(**{key: header[keyword] for key, (keyword, _) in SENSOR_KEYS.items()})
+        quaternion = np.array([header[f"Q{axis}"] for axis in "XYZW"])
+        rate = np.array([header[f"RATE{axis}"] for axis in "XYZ"])
+        frame = int(header["FRAME"])
+    except FileNotFoundError:
+        raise ImageError(f"{path}: the file does not exist; check the path.") from None
+    except KeyError as error:
+        what = str(error.args[0]).rstrip(".")
+        raise ImageError(f"{path}: the file carries no truth ({what}); name a frame that was rendered.") from None
+    except (OSError, ValueError, TypeError, Warning, StarcalError) as error:
+        reason = str(error).rstrip(".")
+        raise ImageError(f"{path}: the truth cannot be read ({reason}); render the frame again.") from error
+    return FrameTruth(
+        camera,
+        sensor,
+        quaternion_to_rotation(quaternion),
+        rate,
+        star_id=star_id,
+        **columns,
+        frame=frame,
+        seed=header.get("SEED"),
+        time_utc=header.get("DATE-AVG"),
+    )
+
+
+def truth_table(paths: Iterable[str | os.PathLike[str]]) -> Observations:
+    """The table that perfect centroids and a perfect identification of these frames would give.
+
+    Raises
+    ------
+    ImageError
+        If there is no file, or one cannot be read.
+    """
+    truths = [read_truth(path) for path in paths]
+    if not truths:
+        raise ImageError("rendered frames: no file was named; give at least one.")
+    tables = [truth.observations for truth in truths]
+    columns: dict[str, Any] = {}
+    for name in ("frame", "x_px", "y_px", "ra_deg", "dec_deg"):
+        columns[name] = np.concatenate([getattr(table, name) for table in tables])
+    columns["star_id"] = np.concatenate([truth.star_id for truth in truths])
+    columns["mag"] = np.concatenate([truth.mag for truth in truths])
+    if all(truth.time_utc is not None for truth in truths):
+        columns["time_utc"] = np.repeat([str(truth.time_utc) for truth in truths], [len(truth) for truth in truths])
+    return Observations(**columns, meta=tables[0].meta)

@@ -21,8 +21,7 @@ from starcal_uq.sky.gaia import (
     read_gaia_records,
     star_names,
 )
-from starcal_uq.sky.positions import ra_dec_deg, unit_vectors
-from starcal_uq.sky.proper_motion import propagate_proper_motion
+from starcal_uq.sky.positions import propagate_proper_motion, ra_dec_deg, unit_vectors
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -16,7 +16,7 @@ from starcal_uq.core.errors import CatalogueError
 from starcal_uq.core.types import FloatArray, IntArray, StrArray
 from starcal_uq.sky.catalogue import StarCatalogue, check_epoch, prepare
 from starcal_uq.sky.cds import CdsFormat, read_cds
-from starcal_uq.sky.proper_motion import propagate_proper_motion
+from starcal_uq.sky.positions import propagate_proper_motion
 
 Format = Literal["csv", "ecsv", "fits", "hipparcos", "sao", "bsc"]
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
+from starcal_uq.core.files import reading_archive, write_archive
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
 from starcal_uq.diagnostics.validation.replicates import INTERVAL
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 
 # Of one false alarm among all tests of a validation.
 FAMILY_LEVEL = 0.01
+
+
 # Below this many replicates, intervals that are half as wide as they should be could go unnoticed.
 ENOUGH_REPLICATES = 100
 
@@ -229,7 +232,6 @@ class Validation:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything to one ``.npz`` file, atomically; overwritten."""
-        from starcal_uq.diagnostics.validation.validation_files import save_validation
 
         save_validation(self, path)
 
@@ -242,13 +244,12 @@ class Validation:
         RunFolderError
             If the file is missing or is not a validation.
         """
-        from starcal_uq.diagnostics.validation.validation_files import load_validation
 
         return load_validation(path)
 
     def plot(self, **options: Any) -> Any:
-        """Rank curves with their bands, coverage and NEES; options as for `starcal_uq.presentation.figures.validation.plot_validation`."""
-        from starcal_uq.presentation.figures.validation import plot_validation
+        """Rank curves with their bands, coverage and NEES; options as for `starcal_uq.presentation.figures.diagnostics.plot_validation`."""
+        from starcal_uq.presentation.figures.diagnostics import plot_validation
 
         return plot_validation(self, **options)
 
@@ -257,3 +258,52 @@ class Validation:
 
         table = self.to_dataframe().to_html(index=False, float_format=lambda v: significant(v, 3), border=0)
         return f"<p><b>Validation</b>: {escape(self.verdict)}</p>{table}"
+
+
+_FORMAT = "starcal_uq validation 1"
+
+
+_ARRAYS = (
+    *("replicate", "truth", "ranks", "covered", "error", "sd"),
+    *("nees", "nees_calibration", "compression_error", "dof"),
+)
+
+
+_PLAIN = ("n_ranked", "n_requested", "interrupted", "provenance")
+
+
+_TUPLES = ("quantities", "units", "failures")
+
+
+def save_validation(found: Validation, path: str | os.PathLike[str]) -> None:
+    """Write everything, atomically; overwritten."""
+    document: AnyDict = {name: getattr(found, name) for name in (*_PLAIN, *_TUPLES)}
+    document |= {name: getattr(found, name).to_dict() for name in ("camera", "nominal", "priors")}
+    arrays = {name: getattr(found, name) for name in _ARRAYS}
+    write_archive(path, _FORMAT, document, arrays)
+
+
+def load_validation(path: str | os.PathLike[str]) -> Validation:
+    """Read what `save_validation` wrote.
+
+    Raises
+    ------
+    RunFolderError
+        If the file is missing or is not a validation.
+    """
+    from starcal_uq.diagnostics.validation.result import Validation
+
+    words = {
+        "missing": "run `starcal-uq validate CAMERA` first",
+        "wrong": "is not a validation; run `starcal-uq validate CAMERA` to write it again",
+    }
+    with reading_archive(path, _FORMAT, **words) as (document, arrays):
+        values: AnyDict = {name: document[name] for name in _PLAIN}
+        values |= {name: tuple(document[name]) for name in _TUPLES}
+        return Validation(
+            camera=Camera.from_dict(document["camera"]),
+            nominal=Camera.from_dict(document["nominal"]),
+            priors=Priors.from_dict(document["priors"]),
+            **{name: arrays[name] for name in _ARRAYS},
+            **values,
+        )

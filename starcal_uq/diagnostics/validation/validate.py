@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,22 +25,32 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError, PriorError, SamplingError
 from starcal_uq.core.provenance import provenance
+from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import AnyDict
-from starcal_uq.diagnostics.validation.replicates import MARGINAL, LikelihoodMaker, Study, Truth
+from starcal_uq.diagnostics.validation.replicates import MARGINAL, LikelihoodMaker, Outcome, Study, Truth, run_replicate
 from starcal_uq.diagnostics.validation.result import Validation
-from starcal_uq.diagnostics.validation.validation_pool import Progress, run_replicates
 from starcal_uq.inference.priors import Priors
 
 if TYPE_CHECKING:
     from starcal_uq.sky.catalogue import StarCatalogue
 
 TRUTHS = ("fixed", "prior")
+
+
 # Student t is for stars that are not where they should be; its sigma is not the noise that is simulated here.
 LIKELIHOODS = (MARGINAL, "pairs", "pairs_naive")
+
+
 # What truth="prior" draws from by default: narrow enough that every draw is a camera that sees the same sky.
 _PRIOR_POINT_PX = 5.0
+
+
 _PRIOR_FOCAL = 1e-3
+
+
 _PRIOR_CORNER_PX = 1.0
+
+
 _PRIOR_LOG_SIGMA = 0.2
 
 
@@ -228,3 +239,28 @@ def _check(study: Study, n_replicates: int, workers: int | None) -> None:
 
 def _commonest(reasons: Sequence[str]) -> str:
     return Counter(reasons).most_common(1)[0][0]
+
+
+_CHUNK = 8
+
+
+def run_replicates(
+    study: Study, stars: StarCatalogue, n_replicates: int, workers: int | None, progress: Progress | None
+) -> tuple[list[Outcome], bool]:
+    """Run replicates 0 .. n_replicates - 1; parameters and exceptions as in `run_tasks`.
+
+    Returns
+    -------
+    list of Outcome
+        In order; all that were complete when Ctrl-C was pressed.
+    bool
+        True if it was.
+    """
+    return run_tasks(
+        partial(run_replicate, study, stars),
+        n_replicates,
+        caller="validate",
+        chunk=_CHUNK,
+        workers=workers,
+        progress=progress,
+    )

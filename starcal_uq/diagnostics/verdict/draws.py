@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.core.formatting import count, decimals_for, fixed, join_words, percent, significant
-from starcal_uq.diagnostics.verdict.levels import Check, Level, Question, pass_or_fail, pass_or_warn
+from starcal_uq.core.status import Check, Level, Question, pass_or_fail, pass_or_warn
 from starcal_uq.inference.checks import (
     ACCEPTANCE_RANGE,
     AGREEMENT_BOUND,

@@ -6,16 +6,23 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.core.formatting import fixed, plural
-from starcal_uq.diagnostics.verdict.levels import Check, Question, pass_or_fail
+from starcal_uq.core.formatting import fixed, join_words, plural, significant
+from starcal_uq.core.status import Check, Level, Question, pass_or_fail, pass_or_warn
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.core.types import FloatArray
+    from starcal_uq.diagnostics.diagnose import Diagnosis, MultiStart
+    from starcal_uq.diagnostics.jackknife import Jackknife
+    from starcal_uq.diagnostics.misfit import Misfit
+    from starcal_uq.diagnostics.models import ModelComparison
+    from starcal_uq.diagnostics.predictive import PredictiveCheck
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.inference.posterior import Posterior
 
 ESTIMATORS_Z = 4.0
+
+
 TRUTH_Z = 4.0
 
 
@@ -69,3 +76,105 @@ def truth_z(cal: Calibration, truth: Camera, post: Posterior | None = None) -> F
     if post is not None:
         return np.asarray((post.mean - truth.theta) / post.sd[: len(post.mean)], dtype=np.float64)
     return np.asarray((cal.theta - truth.theta) / cal.sigmas, dtype=np.float64)
+
+
+MISFIT_P, MISFIT_FAIL_P = 0.05, 1e-4
+
+
+JACKKNIFE_P, JACKKNIFE_RATIO = 0.01, 1.1
+
+
+# Patterns that repeat on the scale of a pixel act like more noise; they do not bend the map of the field.
+_LIKE_NOISE = ("pixel phase in x", "pixel phase in y")
+
+
+def model_checks(found: Diagnosis) -> list[Check]:
+    """Every check that a diagnosis allows."""
+    checks = [misfit(found.misfit)]
+    checks += [] if found.jackknife is None else [jackknife(found.jackknife)]
+    checks += [] if found.comparison is None else [comparison(found.comparison)]
+    return [*checks, predictive(found.predictive)]
+
+
+def misfit(found: Misfit) -> Check:
+    """Is there structure in the residuals?"""
+    name, threshold = "Unexplained structure", f"p ≥ {MISFIT_P:g}"
+    value = f"p = {significant(found.p_value)}, corrected for {plural(len(found.tests), 'test')}"
+    rejected = found.found(MISFIT_P)
+    if not rejected:
+        sentence = "The residuals show no structure beyond noise, in any of the ways that were looked for."
+        return Check(name, Question.TRUSTWORTHY, Level.PASS, value, threshold, sentence)
+    bending = [t for t in rejected if t.dof > 0 and t.against not in _LIKE_NOISE and t.p_holm < MISFIT_FAIL_P]
+    words = []
+    for test in rejected[:3]:
+        size = "" if np.isnan(test.size_px) else f", {significant(test.size_px)} px"
+        words.append(f"{test.name} (p = {significant(test.p_holm)}{size})")
+    more = "" if len(rejected) <= 3 else f" and {plural(len(rejected) - 3, 'other test')}"
+    sentence = f"The residuals hold more than noise: {join_words(words)}{more}. "
+    if bending:
+        sentence += "The model is wrong in a way that moves the parameters; no interval of this report holds that."
+    elif all(t.dof == 0 or t.against in _LIKE_NOISE for t in rejected):
+        sentence += "This acts like more noise, unevenly spread, and hardly moves the parameters."
+    else:
+        sentence += "No interval of this report holds that."
+    level = Level.FAIL if bending else Level.WARN
+    return Check(name, Question.TRUSTWORTHY, level, value, threshold, sentence)
+
+
+def jackknife(found: Jackknife) -> Check:
+    """Do frames scatter as their formal errors say?"""
+    p_values = np.minimum(found.p_values * len(found.p_values), 1.0)
+    worst = int(np.argmax(found.ratio))
+    bad = (p_values < JACKKNIFE_P) & (found.ratio > JACKKNIFE_RATIO)
+    low, high = float(found.ratio.min()), float(found.ratio.max())
+    value = f"ratios {fixed(low, 2)} to {fixed(high, 2)} ({found.parameter_names[worst]})"
+    threshold = f"≤ {fixed(max(float(found.expected(0.998)[1][worst]), JACKKNIFE_RATIO), 2)}"
+    if np.any(bad):
+        names = [name for name, flag in zip(found.parameter_names, bad, strict=True) if flag]
+        sentence = (
+            f"Frames disagree more than their formal errors allow, in {join_words(names)}: something makes stars of "
+            f"a frame err together. Accepting the inflation multiplies sigma by up to {fixed(high, 2)}."
+        )
+    else:
+        sentence = "Estimates that leave one frame out scatter as the formal errors say."
+    level = pass_or_warn(not np.any(bad))
+    return Check("Jackknife over frames", Question.TRUSTWORTHY, level, value, threshold, sentence)
+
+
+def comparison(found: ModelComparison) -> Check:
+    """Does another distortion model predict left-out frames better?"""
+    mine = found.of(found.fitted)
+    rejected = mine is not None and mine.rejected
+    if mine is None or mine.difference == 0.0:
+        value = f"{found.fitted!r} predicts best"
+    else:
+        value = f"{fixed(mine.difference, 1)} ± {fixed(mine.difference_se, 1)} nat from {found.scores[0].model!r}"
+    level = Level.FAIL if rejected else Level.PASS
+    return Check("Distortion model", Question.TRUSTWORTHY, level, value, "not rejected", found.statement)
+
+
+def predictive(found: PredictiveCheck) -> Check:
+    """Do replicated data look like the measured ones?"""
+    extreme = [s for s in found.statistics if s.extreme]
+    low = min(found.statistics, key=lambda s: min(s.p_value, 1.0 - s.p_value))
+    value = f"most extreme p = {significant(low.p_value)}"
+    if extreme:
+        sentence = f"Data made by the model differ from the measured ones in: {join_words([s.name for s in extreme])}."
+    else:
+        sentence = "Data made by the model have the same spread, tails and patterns as the measured ones."
+    name = "Posterior predictive check"
+    return Check(name, Question.TRUSTWORTHY, pass_or_warn(not extreme), value, "0.001 to 0.999", sentence)
+
+
+def starts(found: MultiStart) -> Check:
+    """Do other starts lead to the same optimum?"""
+    value = f"{found.same} of {found.n} starts"
+    if found.better:
+        level, sentence = Level.FAIL, "A start elsewhere reached a better optimum: calibrate again from there."
+    elif found.same < found.n:
+        stuck = found.n - found.same
+        level = Level.WARN
+        sentence = f"{plural(stuck, 'start')} did not reach this optimum, and no start reached a better one."
+    else:
+        level, sentence = Level.PASS, "Starts scattered around the nominal camera all lead to this optimum."
+    return Check("Other starts", Question.CONVERGED, level, value, "all at the same optimum", sentence)

@@ -10,14 +10,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from starcal_uq.core.formatting import join_words
+from starcal_uq.core.status import Check, Level, Question
 from starcal_uq.diagnostics.verdict import draws as sampling
-from starcal_uq.diagnostics.verdict import estimate, model, observed
-from starcal_uq.diagnostics.verdict.air import air, conditional_words, corrected_words
-from starcal_uq.diagnostics.verdict.draws import propagation_difference
-from starcal_uq.diagnostics.verdict.estimate import truth_z
-from starcal_uq.diagnostics.verdict.levels import Check, Level, Question
-from starcal_uq.diagnostics.verdict.limits import limits
-from starcal_uq.diagnostics.verdict.observed import aberration_words
+from starcal_uq.diagnostics.verdict import estimate, observed
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -26,22 +21,6 @@ if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import Observations
     from starcal_uq.propagation.attitude_error import AttitudeError
-
-__all__ = [
-    "Check",
-    "Level",
-    "Question",
-    "Verdict",
-    "aberration_words",
-    "air",
-    "conditional_words",
-    "corrected_words",
-    "judge",
-    "limits",
-    "propagation_difference",
-    "truth_z",
-    "worst",
-]
 
 
 @dataclass(frozen=True)
@@ -103,7 +82,7 @@ def judge(
     """
     checks: list[Check | None] = [estimate.estimation(cal), estimate.estimators_agree(cal)]
     if diagnosis is not None and diagnosis.starts is not None:
-        checks += [model.starts(diagnosis.starts)]
+        checks += [estimate.starts(diagnosis.starts)]
     if post is not None:
         from starcal_uq.inference.derived import derived_quantities
 
@@ -115,7 +94,7 @@ def judge(
     checks += [observed.directions(obs, cal), observed.residual_pattern(obs, cal), observed.outliers(obs, cal)]
     checks += [observed.noise(cal), observed.coverage(obs, cal)]
     if diagnosis is not None:
-        checks += model.model_checks(diagnosis)
+        checks += estimate.model_checks(diagnosis)
     if post is not None:
         checks += [sampling.prior_influence(post)]
     if attitude is not None:

@@ -8,9 +8,8 @@ import numpy as np
 
 from starcal_uq.core.formatting import significant
 from starcal_uq.diagnostics.residuals import bin_residuals
-from starcal_uq.diagnostics.verdict.air import air
-from starcal_uq.diagnostics.verdict.model import MISFIT_P
-from starcal_uq.diagnostics.verdict.observed import ARCSEC_PER_RAD, PATTERN_P
+from starcal_uq.diagnostics.verdict.estimate import MISFIT_P
+from starcal_uq.diagnostics.verdict.observed import ARCSEC_PER_RAD, PATTERN_P, air
 
 if TYPE_CHECKING:
     from starcal_uq.diagnostics.diagnose import Diagnosis

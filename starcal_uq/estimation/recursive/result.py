@@ -16,9 +16,8 @@ from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.assemble import check_camera
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.compressed import CompressedLikelihood
-from starcal_uq.estimation.recursive.filter import Recursion
+from starcal_uq.estimation.recursive.filter import FrameSums, Recursion, entry_count, frame_entries
 from starcal_uq.estimation.recursive.innovations import frame_normals
-from starcal_uq.estimation.recursive.recursion_sums import FrameSums, entry_count, frame_entries
 from starcal_uq.estimation.solvers import is_singular
 from starcal_uq.estimation.stages import Stage
 

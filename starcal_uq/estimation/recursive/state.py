@@ -17,8 +17,7 @@ from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict
-from starcal_uq.estimation.recursive.filter import Recursion
-from starcal_uq.estimation.recursive.recursion_sums import FrameSums, History
+from starcal_uq.estimation.recursive.filter import FrameSums, History, Recursion
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.observations.frames import StarFrames
 

@@ -16,9 +16,7 @@ from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, noise_px
 from starcal_uq.estimation.marginal import MarginalLikelihood
-from starcal_uq.estimation.recursive.filter import Recursion
-from starcal_uq.estimation.recursive.recursion_options import RECURSIVE_METHODS, RecursionOptions
-from starcal_uq.estimation.recursive.recursion_sums import FrameSums
+from starcal_uq.estimation.recursive.filter import FrameSums, Recursion
 from starcal_uq.estimation.recursive.result import (
     JointEstimate,
     distortion_after,
@@ -26,7 +24,7 @@ from starcal_uq.estimation.recursive.result import (
     joint_estimate,
     stream_calibration,
 )
-from starcal_uq.estimation.recursive.start import begin, prior_of
+from starcal_uq.estimation.recursive.start import RECURSIVE_METHODS, RecursionOptions, begin, prior_of
 from starcal_uq.estimation.recursive.state import read_state, recursion_from, recursion_state, write_state
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.observations.frames import StarFrames

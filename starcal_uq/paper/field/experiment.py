@@ -13,8 +13,7 @@ from starcal_uq.core.formatting import plural
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibrate import calibrate
-from starcal_uq.paper.field.attitudes import attitude_errors, identified_stars
-from starcal_uq.paper.field.field_replicates import replicate_field
+from starcal_uq.paper.field.attitudes import attitude_errors, identified_stars, replicate_field
 from starcal_uq.paper.field.frames import FieldFrames, take_frames
 from starcal_uq.paper.field.identification import WRONG_PX, identify_all, true_pixels
 from starcal_uq.paper.field.published import (

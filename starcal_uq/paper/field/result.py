@@ -15,11 +15,11 @@ from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.paper.field.attitudes import (
     SOURCES,
     AttitudeErrors,
+    FieldReplicates,
     FieldStars,
     attitude_errors,
     single_faults,
 )
-from starcal_uq.paper.field.field_replicates import FieldReplicates
 from starcal_uq.paper.field.frames import FieldFrames
 from starcal_uq.paper.field.identification import FieldIdentification
 from starcal_uq.paper.field.published import AXES, FIELD_METHODS, RATE, FieldReading, printed_field
@@ -92,7 +92,7 @@ class FieldExperiment:
     @property
     def verdict(self) -> str:
         """What comes out and what does not, in plain words."""
-        from starcal_uq.paper.show.field_words import findings
+        from starcal_uq.paper.show.field import findings
 
         return " ".join(findings(self))
 
@@ -244,14 +244,14 @@ class FieldExperiment:
 
     def plot_rates(self) -> Any:
         """Identification rate against tolerance; returns the matplotlib Figure."""
-        from starcal_uq.paper.show.field_part import plot_rates
+        from starcal_uq.paper.show.figures import plot_rates
 
         printed = {method: printed_field(method, RATE).value for method in FIELD_METHODS}
         return plot_rates(self.rates(), printed, self.tolerance_px)
 
     def plot_errors(self) -> Any:
         """Attitude errors and their parts beside the printed ones; returns the matplotlib Figure."""
-        from starcal_uq.paper.show.field_part import plot_errors
+        from starcal_uq.paper.show.figures import plot_errors
 
         printed = {(method, axis): printed_field(method, axis).value for method in FIELD_METHODS for axis in AXES}
         return plot_errors(self.parts(), {(m, axis.removesuffix("_arcsec")): v for (m, axis), v in printed.items()})

@@ -10,7 +10,7 @@ import numpy as np
 from starcal_uq.core.formatting import MINUS, count, fixed, join_words, percent, plural, significant, with_sigma
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.paper.checks import NO, PaperCheck
-from starcal_uq.paper.error_readings import MAXIMUM, REPROJECTION
+from starcal_uq.paper.errors import MAXIMUM, REPROJECTION
 from starcal_uq.paper.judgement import MAX_CHANCE, MAX_Z, Judged, Outcome, Trial
 from starcal_uq.paper.published import (
     CLAIMED_RATIO,
@@ -21,7 +21,7 @@ from starcal_uq.paper.published import (
     SAMAAN,
     printed,
 )
-from starcal_uq.paper.reading_draws import AS_PRINTED, OTHER_EQUATION
+from starcal_uq.paper.readings import AS_PRINTED, OTHER_EQUATION
 from starcal_uq.paper.statistics import ENOUGH_REPLICATES
 
 if TYPE_CHECKING:

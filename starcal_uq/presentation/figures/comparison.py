@@ -9,7 +9,7 @@ import numpy as np
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.figures import style
-from starcal_uq.presentation.figures.levels import round_levels, ticks_at_levels
+from starcal_uq.presentation.figures.scales import round_levels, ticks_at_levels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

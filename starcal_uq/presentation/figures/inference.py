@@ -6,19 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starcal_uq.core.formatting import pretty_unit
 from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.figures import style
-from starcal_uq.presentation.figures.marginals import (
-    BINS,
-    HALF_WIDTH_SD,
-    histogram,
-    limits,
-    sampled_names,
-    scaled_draws,
-    sparse,
-    truth_marks,
-)
-from starcal_uq.presentation.figures.scales import AxisScale
+from starcal_uq.presentation.figures.scales import AxisScale, axis_scale
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -27,6 +18,7 @@ if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.inference.priors import Priors
 
 # Probability inside the 1- and 2-sigma ellipses of a two-dimensional normal distribution: 1 - exp(-n^2 / 2).
 CONTOUR_MASSES = (0.3935, 0.8647)
@@ -180,3 +172,154 @@ def _corner_key(figure: Figure, gaussian: bool, truth: bool, n_draws: int) -> No
         title_fontsize=style.LABEL_SIZE,
         alignment="left",
     )
+
+
+def plot_prior_posterior(post: Posterior, truth: Camera | None = None) -> Figure:
+    """Prior and posterior of every parameter: on the scale of the prior (above) and of the posterior (below).
+
+    The upper row shows how much the data said, the lower row that the prior is flat where the posterior lives.
+    """
+    names = sampled_names(post)
+    scales, columns = scaled_draws(post)
+    marks = truth_marks(truth, names, scales)
+    figure = style.new_figure(1.0 + 1.75 * len(names), 4.1)
+    grid = figure.add_gridspec(2, len(names))
+    for i, name in enumerate(names):
+        parameter = post.parameters[post.sampled[i]]
+        upper = style.dress(figure.add_subplot(grid[0, i]))
+        wide = _prior_grid(post.priors, name, columns[i], scales[i])
+        density = _relative_prior(post.priors, name, wide)
+        upper.plot(wide / parameter.scale, density, color=style.GREEN, linewidth=1.5, dashes=(4, 1.5))
+        upper.axvline(
+            float(np.mean(columns[i]) * scales[i].factor + scales[i].reference) / parameter.scale,
+            color=style.BLUE,
+            linewidth=1.5,
+        )
+        upper.set_title(parameter.latex, fontsize=style.TITLE_SIZE, color=style.INK, pad=5)
+        upper.set_xlabel(_unit(parameter.scaled_unit), fontsize=style.TICK_SIZE, color=style.INK)
+        sparse(upper, y=False)
+        lower = style.dress(figure.add_subplot(grid[1, i]))
+        ends = limits(columns[i])
+        histogram(lower, columns[i], ends, None, i, marks[i])
+        near = np.linspace(*ends, 60)
+        height = _relative_prior(post.priors, name, near * scales[i].factor + scales[i].reference)
+        # The prior's own density in this unit would lie on the axis: only its slope can be shown.
+        lower.plot(near, 0.5 * height, color=style.GREEN, linewidth=1.5, dashes=(4, 1.5))
+        lower.set_xlim(*ends)
+        lower.set_xlabel(scales[i].label, fontsize=style.TICK_SIZE, color=style.INK)
+        sparse(lower, y=False)
+        if i == 0:
+            upper.set_ylabel("scale of\nthe prior", fontsize=style.LABEL_SIZE, color=style.INK)
+            lower.set_ylabel("scale of\nthe posterior", fontsize=style.LABEL_SIZE, color=style.INK)
+    _prior_key(figure, truth is not None)
+    return figure
+
+
+def _relative_prior(priors: Priors, name: str, values: FloatArray) -> FloatArray:
+    """Prior density relative to its largest value on the grid; flat where it underflows all over."""
+    density = priors.marginal_density(name, values)
+    return density / density.max() if density.max() > 0.0 else np.ones_like(density)
+
+
+def _prior_grid(priors: Priors, name: str, column: FloatArray, scale: AxisScale) -> FloatArray:
+    centre = float(np.mean(column) * scale.factor + scale.reference)
+    if name.startswith("sigma"):
+        top = max(1.4 * centre, priors.sigma_median * np.exp(1.2 * priors.sigma_log_sd))
+        return np.asarray(np.linspace(top / 400, top, 400))
+    mean, sd = float(priors.mean((name,))[0]), float(priors.sd((name,))[0])
+    return np.asarray(np.linspace(min(mean - 3 * sd, centre - 0.3 * sd), max(mean + 3 * sd, centre + 0.3 * sd), 300))
+
+
+def _prior_key(figure: Figure, truth: bool) -> None:
+    from matplotlib.lines import Line2D
+
+    handles = [
+        Line2D([], [], color=style.GREEN, dashes=(4, 1.5), linewidth=1.5, label="prior (below: its slope only)"),
+        Line2D([], [], color=style.BLUE, linewidth=1.5, label="posterior"),
+    ]
+    if truth:
+        handles.append(Line2D([], [], color=style.VERMILLION, linewidth=1.3, label="truth of the simulation"))
+    figure.legend(
+        handles=handles,
+        loc="outside upper left",
+        ncols=3,
+        fontsize=style.LABEL_SIZE,
+        frameon=False,
+        labelcolor=style.INK,
+    )
+
+
+def _unit(text: str) -> str:
+    return f"[{pretty_unit(text)}]" if pretty_unit(text) else ""
+
+
+BINS = 44
+
+
+HALF_WIDTH_SD = 3.6
+
+
+def scaled_draws(post: Posterior) -> tuple[list[AxisScale], list[FloatArray]]:
+    """Axis scale and plotted draws of every sampled parameter."""
+    draws = post.draws[:, list(post.sampled)]
+    spreads, means = draws.std(axis=0, ddof=1), draws.mean(axis=0)
+    entries = [post.parameters[i] for i in post.sampled]
+    scales = [axis_scale(p, float(m), float(s)) for p, m, s in zip(entries, means, spreads, strict=True)]
+    return scales, [scale(draws[:, i]) for i, scale in enumerate(scales)]
+
+
+def sampled_names(post: Posterior) -> tuple[str, ...]:
+    """Names of the parameters that were sampled."""
+    return tuple(post.parameter_names[i] for i in post.sampled)
+
+
+def limits(column: FloatArray) -> tuple[float, float]:
+    """Ends of the axis of one parameter."""
+    centre, spread = float(np.median(column)), float(np.std(column))
+    low, high = np.quantile(column, (0.0005, 0.9995))
+    return min(centre - HALF_WIDTH_SD * spread, float(low)), max(centre + HALF_WIDTH_SD * spread, float(high))
+
+
+def truth_marks(truth: Camera | None, names: tuple[str, ...], scales: list[AxisScale]) -> list[float | None]:
+    """The truth in plotted numbers; None where it is not known."""
+    if truth is None:
+        return [None] * len(names)
+    values = dict(zip(truth.parameter_names, truth.theta, strict=True))
+    return [float(scales[i](values[name])) if name in values else None for i, name in enumerate(names)]
+
+
+def histogram(
+    ax: Axes,
+    column: FloatArray,
+    limits: tuple[float, float],
+    gaussian: tuple[FloatArray, FloatArray] | None,
+    index: int,
+    mark: float | None,
+) -> None:
+    """Histogram of one parameter, with the normal curve of entry `index` of `gaussian` (mean, covariance)."""
+    counts, edges = np.histogram(column, bins=BINS, range=limits)
+    peak = counts.max()
+    ax.stairs(counts / peak, edges, fill=True, color=style.SKY, alpha=0.45)
+    ax.stairs(counts / peak, edges, color=style.BLUE, linewidth=1.0)
+    if gaussian is not None:
+        mean, sd = gaussian[0][index], np.sqrt(gaussian[1][index, index])
+        x = np.linspace(*limits, 200)
+        height = column.size * (edges[1] - edges[0]) / (sd * np.sqrt(2 * np.pi)) / peak
+        ax.plot(x, height * np.exp(-0.5 * ((x - mean) / sd) ** 2), color=style.INK, linewidth=1.0, dashes=(4, 2))
+    if mark is not None:
+        ax.axvline(mark, color=style.VERMILLION, linewidth=1.3)
+    ax.set_ylim(0.0, 1.12)
+
+
+def sparse(ax: Axes, *, y: bool) -> None:
+    """Three ticks at most, without offsets; no vertical axis unless `y`."""
+    from matplotlib.ticker import MaxNLocator
+
+    ax.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
+    if y:
+        ax.yaxis.set_major_locator(MaxNLocator(3, prune="both"))
+    else:
+        ax.set_yticks([])
+        ax.spines["left"].set_visible(False)
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.get_major_formatter().set_useOffset(False)  # type: ignore[attr-defined]

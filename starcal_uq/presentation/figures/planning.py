@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from starcal_uq.planning.check import ForecastCheck
-    from starcal_uq.planning.frame_choice_result import FrameChoice
-    from starcal_uq.planning.plan_result import Plan
+    from starcal_uq.planning.design import FrameChoice
+    from starcal_uq.planning.plan import Plan
 
 _SCOPES = {
     "common": "common rotation",

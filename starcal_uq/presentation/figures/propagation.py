@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.core.formatting import significant
+from starcal_uq.core.formatting import percent, significant
+from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.figures import style
+from starcal_uq.presentation.figures.scales import round_levels, ticks_at_levels
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
     from starcal_uq.propagation.attitude_error import AttitudeError
+    from starcal_uq.propagation.distortion import DistortionCurve
+    from starcal_uq.propagation.field import FieldMap
+    from starcal_uq.propagation.spectrum import ErrorSpectrum
 
 
 def plot_attitude(error: AttitudeError, ax: Axes | None = None) -> Axes:
@@ -58,3 +65,252 @@ def _interaction_words(error: AttitudeError) -> str:
     if not np.isfinite(values).all():
         return ""
     return f"interaction of calibration and noise: at most {significant(float(values.max()))}″ on any axis (not drawn)"
+
+
+_STARS_SHOWN = 600
+
+
+# Ellipses along each side (about), and the share of the space between them that the largest semi-axis takes.
+_ELLIPSES = 6
+
+
+_FILL = 0.46
+
+
+def plot_field_map(field: FieldMap) -> Figure:
+    """Direction uncertainty over the detector: absolute, and after the best constant rotation is removed.
+
+    Colours are the 1-sigma error per axis, root mean square of the two; ellipses are the 1-sigma ellipses, enlarged
+    from panel to panel by the factor that the key shows. A map of an earlier version has no ellipses.
+    """
+    # As tall as the panels, or the colour bars would outgrow them.
+    figure = style.new_figure(11.0, 0.85 + 4.05 * float(np.ptp(field.y_px) / np.ptp(field.x_px)))
+    left, right = figure.subplots(1, 2)
+    _panel(left, field, field.sigma_absolute_arcsec, field.covariance_absolute_arcsec2, "Absolute")
+    title = "Best constant rotation removed"
+    _panel(right, field, field.sigma_compensated_arcsec, field.covariance_compensated_arcsec2, title)
+    return figure
+
+
+def _panel(ax: Axes, field: FieldMap, values: FloatArray, covariance: FloatArray | None, title: str) -> None:
+    style.dress(ax)
+    x, y = np.asarray(field.x_px), np.asarray(field.y_px)
+    levels, norm = round_levels(values)
+    image = ax.contourf(x, y, values, levels=levels, norm=norm, cmap="cividis")
+    ax.contour(x, y, values, levels=levels[1:-1], colors="white", linewidths=0.5)
+    # A sample is enough to show where stars were, and evenly spaced rows are a sample.
+    some = slice(None, None, max(1, len(field.star_x_px) // _STARS_SHOWN))
+    ax.scatter(field.star_x_px[some], field.star_y_px[some], s=2.0, color="white", alpha=0.45, linewidths=0)
+    ax.set_xlim(x[0], x[-1])
+    ax.set_ylim(y[-1], y[0])
+    ax.set_aspect("equal")
+    style.label(ax, title, "x [px]", "y [px]")
+    bar = style.colour_bar(ax, image, "1 sigma per axis [arcsec]")
+    ticks_at_levels(bar, levels)
+    if covariance is not None:
+        _ellipses(ax, x, y, covariance)
+
+
+def _ellipses(ax: Axes, x: FloatArray, y: FloatArray, covariance: FloatArray) -> None:
+    """1-sigma ellipses in the middle of equal cells, drawn at one scale, and a key that says which."""
+    from matplotlib.collections import EllipseCollection
+
+    columns, rows = (_middles(axis) for axis in (x, y))
+    chosen = covariance[np.ix_(rows, columns)].reshape(-1, 2, 2)
+    centres = np.column_stack([grid.ravel() for grid in np.meshgrid(x[columns], y[rows])])
+    values, vectors = np.linalg.eigh(chosen)
+    semi = np.sqrt(np.maximum(values, 0.0))
+    if not semi.max() > 0.0:
+        return
+    spacing = min(abs(float(axis[1] - axis[0])) * (lines[1] - lines[0]) for axis, lines in ((x, columns), (y, rows)))
+    scale = _FILL * spacing / float(semi.max())
+    angle = np.degrees(np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1]))
+    for colour, width in (("white", 2.6), (style.INK, 1.1)):
+        ax.add_collection(
+            EllipseCollection(
+                2.0 * scale * semi[:, 1],
+                2.0 * scale * semi[:, 0],
+                angle,
+                facecolors="none",
+                edgecolors=colour,
+                linewidths=width,
+                units="xy",
+                offsets=centres,
+                offset_transform=ax.transData,
+            )
+        )
+    _key(ax, scale, float(semi.max()))
+
+
+def _middles(axis: FloatArray) -> list[int]:
+    """Evenly spaced grid lines, as far from the edges as half their distance or nearly so."""
+    step = max(1, round((len(axis) - 1) / _ELLIPSES))
+    count = max(2, (len(axis) - 1) // step)
+    first = (len(axis) - 1 - step * (count - 1)) // 2
+    return [first + step * place for place in range(count)]
+
+
+def _key(ax: Axes, scale: float, largest: float) -> None:
+    """A bar of a round length above the panel's right end, with its value."""
+    exponent = np.floor(np.log10(largest))
+    length = max(step * 10.0**exponent for step in (1.0, 2.0, 5.0) if step * 10.0**exponent <= largest)
+    share = length * scale / float(np.ptp(ax.get_xlim()))
+    ax.plot([1.0 - share, 1.0], [1.022, 1.022], color=style.INK, linewidth=1.6, transform=ax.transAxes, clip_on=False)
+    ax.annotate(
+        f"semi-axis {significant(length, 1)}″",
+        (1.0 - share, 1.022),
+        xycoords="axes fraction",
+        xytext=(-5, 0),
+        textcoords="offset points",
+        ha="right",
+        va="center",
+        fontsize=style.TICK_SIZE,
+        color=style.INK,
+        annotation_clip=False,
+    )
+
+
+_COLOURS = (style.BLUE, style.VERMILLION, style.GREEN)
+
+
+_DASHES = ("-", "--", "-")
+
+
+_BINS_PER_DECADE = 10
+
+
+# A spectrum is shown over so many decades below its top; what lies deeper is rounding.
+_DECADES = 9.0
+
+
+def plot_spectrum(spectrum: ErrorSpectrum, ax: Axes | None = None) -> Axes:
+    """Power spectral density of the frame-dependent part per axis, over the white floor of centroid noise."""
+    if ax is None:
+        ax = style.new_axes(7.2, 4.2)
+    style.dress(ax, grid=True)
+    f = spectrum.frequency_hz
+    top, bottom = 0.0, np.inf
+    for i, axis in enumerate(spectrum.axes):
+        x, y = _binned(f, spectrum.psd_arcsec2_hz[:, i])
+        rest = significant(float(spectrum.rest_arcsec[i]))
+        ax.plot(x, y, _DASHES[i], color=_COLOURS[i], lw=1.5, label=f"calibration, {axis}: {rest}″")
+        top, bottom = max(top, float(y.max())), min(bottom, float(y[y > 0.0].min(initial=np.inf)))
+    for names, members in (("pitch and yaw", [0, 1]), ("roll", [2])):
+        level = float(np.mean(spectrum.nea_psd_arcsec2_hz[members]))
+        nea = significant(float(np.sqrt(np.mean(spectrum.nea_arcsec[members] ** 2))))
+        ax.plot(f[[0, -1]], [level, level], ":", color=style.INK, lw=1.3)
+        ax.annotate(
+            f"centroid noise, {names}: {nea}″ a frame",
+            (f[-1], level),
+            xytext=(-4, 3),
+            ha="right",
+            textcoords="offset points",
+            fontsize=style.TICK_SIZE,
+            color=style.INK,
+        )
+        top = max(top, level)
+    ax.set_xscale("log")
+    ax.set_yscale("log")
+    ax.set_xlim(f[0], f[-1])
+    ax.set_ylim(max(bottom * 0.5, top * 10.0**-_DECADES), top * 8.0)
+    style.legend(ax, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, ncols=3, columnspacing=1.4)
+    style.label(ax, "", "frequency [Hz]", "power spectral density [arcsec²/Hz]")
+    return ax
+
+
+def plot_error_series(spectrum: ErrorSpectrum, ax: Axes | None = None) -> Axes:
+    """Standard deviation of the frame-dependent part over the posterior, at every instant, on a log axis."""
+    if ax is None:
+        ax = style.new_axes(7.2, 3.2)
+    style.dress(ax, grid=True)
+    for i, axis in enumerate(spectrum.axes):
+        ax.plot(
+            spectrum.time_s,
+            np.maximum(spectrum.sigma_arcsec[:, i], 1e-12),
+            color=_COLOURS[i],
+            lw=0.9,
+            label=axis,
+        )
+    ax.set_yscale("log")
+    shown = spectrum.sigma_arcsec[spectrum.sigma_arcsec > 0.0]
+    if shown.size:
+        ax.set_ylim(0.7 * float(np.quantile(shown, 0.002)), 1.5 * float(shown.max()))
+    ax.set_xlim(spectrum.time_s[0], spectrum.time_s[-1])
+    style.legend(ax, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, ncols=3)
+    style.label(ax, "", "time [s]", "1 sigma of the\nframe-dependent part [arcsec]")
+    return ax
+
+
+def _binned(f: FloatArray, psd: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Means of a spectrum over bins of equal ratio; single frequencies stay as they are."""
+    place = np.floor(_BINS_PER_DECADE * np.log10(f / f[0]) + 1e-9).astype(int)
+    _, start, count = np.unique(place, return_index=True, return_counts=True)
+    mean_f = np.exp(np.add.reduceat(np.log(f), start) / count)
+    return mean_f, np.add.reduceat(psd, start) / count
+
+
+_BAND_COLOURS = (
+    style.BLUE,
+    style.ORANGE,
+    style.GREEN,
+    style.VERMILLION,
+    style.PURPLE,
+    style.SKY,
+    style.INK,
+    style.GREY,
+)
+
+
+def plot_distortion_curve(curve: DistortionCurve) -> Figure:
+    """Mean radial displacement (left), and the bands around it in px and arcsec (right)."""
+    figure = style.new_figure(10.4, 3.7)
+    left, right = figure.subplots(1, 2)
+    for ax in (left, right):
+        style.dress(ax, grid=True)
+        ax.set_xlim(0.0, curve.radius_px[-1])
+        _beyond_stars(ax, curve)
+    azimuths = curve.azimuth_deg if len(curve.azimuth_deg) > 1 else [np.nan]
+    for row, azimuth in enumerate(azimuths):
+        colour = _BAND_COLOURS[row % len(_BAND_COLOURS)]
+        left.plot(curve.radius_px, curve.mean_px[row], color=colour, linewidth=1.6, label=f"{azimuth:g}°")
+    left.axhline(0.0, color=style.INK, linewidth=0.8)
+    if len(curve.azimuth_deg) > 1:
+        # Azimuths differ little in the width of the band; the widest stands for all.
+        style.legend(left, title="azimuth", title_fontsize=style.TICK_SIZE, ncols=2)
+    widest = int(np.argmax(curve.sd_px.max(axis=1)))
+    _bands(right, curve, widest)
+    where = "" if len(curve.azimuth_deg) == 1 else f", azimuth {curve.azimuth_deg[widest]:g}° (the widest)"
+    style.label(left, "Distortion", "distance from the principal point [px]", "radial displacement [px]")
+    style.label(right, f"Its uncertainty{where}", "distance from the principal point [px]", "minus the mean [px]")
+    return figure
+
+
+def _bands(ax: Axes, curve: DistortionCurve, row: int) -> None:
+    share = percent(curve.level)
+    mean = curve.mean_px[row]
+    simultaneous = (curve.lower_simultaneous_px[row] - mean, curve.upper_simultaneous_px[row] - mean)
+    pointwise = (curve.lower_px[row] - mean, curve.upper_px[row] - mean)
+    ax.fill_between(
+        curve.radius_px, *simultaneous, color=style.SKY, alpha=0.35, linewidth=0, label=f"{share}, whole curves"
+    )
+    ax.fill_between(
+        curve.radius_px, *pointwise, color=style.BLUE, alpha=0.45, linewidth=0, label=f"{share} at each radius"
+    )
+    ax.axhline(0.0, color=style.INK, linewidth=0.8)
+    style.legend(ax, loc="upper left")
+    # The scale of angles changes by a per cent over the field; one right-hand axis would lie by as much.
+    middle = float(curve.arcsec_per_px[0])
+    second = ax.secondary_yaxis("right", functions=(_times(middle), _times(1.0 / middle)))
+    second.set_ylabel("arcsec, at the scale of the centre", fontsize=style.LABEL_SIZE, color=style.INK)
+    second.tick_params(labelsize=style.TICK_SIZE, colors=style.INK, color=style.GREY, length=3.0, width=0.7)
+    second.spines["right"].set_visible(False)
+
+
+def _times(factor: float) -> Callable[[Any], Any]:
+    return lambda values: values * factor
+
+
+def _beyond_stars(ax: Axes, curve: DistortionCurve) -> None:
+    """Grey where no star was."""
+    if np.isfinite(curve.star_radius_px) and curve.star_radius_px < curve.radius_px[-1]:
+        ax.axvspan(curve.star_radius_px, curve.radius_px[-1], color=style.LIGHT, alpha=0.8, linewidth=0, zorder=0)

@@ -17,8 +17,8 @@ from starcal_uq.presentation.words.planning import SCOPE_NAMES, level, need_word
 
 if TYPE_CHECKING:
     from starcal_uq.planning.check import ForecastCheck
-    from starcal_uq.planning.frame_choice_result import FrameChoice
-    from starcal_uq.planning.plan_result import Plan
+    from starcal_uq.planning.design import FrameChoice
+    from starcal_uq.planning.plan import Plan
 
 PAGE = "plan.html"
 _TEMPLATE = "plan.html.j2"

@@ -8,7 +8,7 @@ import numpy as np
 
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.formatting import count, decimals_for, fixed, percent, plural, pretty_unit, significant
-from starcal_uq.diagnostics.verdict.model import MISFIT_P
+from starcal_uq.diagnostics.verdict.estimate import MISFIT_P
 from starcal_uq.inference.derived import derived_quantities
 from starcal_uq.presentation.report.tables import Row, symbol
 

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.formatting import count, fixed, percent, plural, significant
-from starcal_uq.diagnostics.verdict.air import air, conditional_words, corrected_words
 from starcal_uq.diagnostics.verdict.draws import propagation_difference
+from starcal_uq.diagnostics.verdict.observed import air, conditional_words, corrected_words
 
 if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
     from starcal_uq.presentation.report.results import Results
+    from starcal_uq.propagation.field import FieldMap
 
 _DIRECTIONS = {
     "apparent": "apparent directions (aberration included)",
@@ -188,3 +189,20 @@ def _plain(value: Any) -> str:
     if isinstance(value, float):
         return f"{value:g}"
     return json.dumps(value, default=str)
+
+
+def equivalent_sentence(field: FieldMap | None) -> str:
+    """The common rotation as an error of the principal point; empty without a map, or for one that does not hold it."""
+    if field is None:
+        return ""
+    pixels, angles = field.equivalent_principal_point_px, field.equivalent_principal_point_arcsec
+    if pixels is None or angles is None:
+        return ""
+    x, y = (
+        f"{significant(pixel)} px ({significant(angle)} arcsec)"
+        for pixel, angle in zip(pixels.tolist(), angles.tolist(), strict=True)
+    )
+    return (
+        "Equivalent principal point: the rotation that is removed on the right is what an error of the principal point "
+        f"of {x} along x and {y} along y (1 sigma) would do by itself."
+    )

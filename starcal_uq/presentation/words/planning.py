@@ -10,8 +10,8 @@ from starcal_uq.core.formatting import MINUS, count, fixed, join_words, percent,
 
 if TYPE_CHECKING:
     from starcal_uq.planning.check import ForecastCheck
-    from starcal_uq.planning.frame_choice_result import FrameChoice
-    from starcal_uq.planning.plan_result import Need, Plan
+    from starcal_uq.planning.design import FrameChoice
+    from starcal_uq.planning.plan import Need, Plan
 
 SCOPE_NAMES = {
     "common": "common rotation",
