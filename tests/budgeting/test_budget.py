@@ -1,0 +1,539 @@
+"""The error budget: rows from the posterior, inflation, requirements, and every format it is written in."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import re
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.budgeting.budget import budget
+from starcal_uq.budgeting.file import load_budget_file
+from starcal_uq.budgeting.posterior import inflation
+from starcal_uq.budgeting.result import Budget, read_csv
+from starcal_uq.budgeting.rows import AXES, COMMON, FROM_FILE, GAUSSIAN_997, INTERACTION, NEA, REST, TOTAL_AXES
+from starcal_uq.budgeting.shapes import one_axis_factor
+from starcal_uq.core.errors import BudgetError, RunFolderError
+from starcal_uq.diagnostics.misfit import Misfit, MisfitTest
+from starcal_uq.presentation.pages.budgeting import budget_context, tex
+from starcal_uq.propagation.attitude_error import AttitudeError
+from starcal_uq.runs.steps import budget_run, diagnose_run
+from tests.helpers.scenes import observations
+
+FILE = """
+[budget]
+title = "Test & <budget>_1"
+
+[[contributor]]
+name = "launch and settling shift"
+axis = "all"
+half_width_arcsec = 20.0
+distribution = "uniform"
+provenance = "analysis #3"
+
+[[contributor]]
+name = "thermo-elastic distortion"
+axis = "cross-boresight"
+half_width_arcsec = 1.5
+conditions = "100 % eclipse, 5 \\u00b0C"
+provenance = "thermal model"
+
+[[contributor]]
+name = "measurement date error"
+axis = "all"
+applies = false
+provenance = "inertial pointing"
+
+[[contributor]]
+name = "=my own"
+axis = "X"
+mean_arcsec = 0.25
+sigma_arcsec = 0.1
+ecss_class = "other"
+time_class = "constant"
+interpretation = "ensemble"
+absorbed_by_alignment = "no"
+provenance = "note"
+
+[[requirement]]
+name = "R-1 across"
+axis = "cross-boresight"
+limit_arcsec = 1.0
+
+[[requirement]]
+name = "R-2 about"
+axis = "Z"
+limit_arcsec = 100.0
+"""
+
+
+def attitude(**changes: Any) -> AttitudeError:
+    nea, common, rest = np.array([0.46, 0.46, 6.6]), np.array([4.8, 4.7, 0.01]), np.array([0.006, 0.006, 0.05])
+    values = [nea, common, rest, np.hypot(common, rest), np.array([1e-4, 1e-4, 1e-3])]
+    factors = np.array([[3.2], [2.9], [3.9], [2.97], [3.0]])
+    cross = [float(np.sqrt(np.mean(v[:2] ** 2))) for v in values]
+    table = np.column_stack((np.array(values), cross))
+    return dataclasses.replace(
+        AttitudeError(
+            *(nea, common, rest, 2.0 * table, factors * table, nea, common, rest),
+            n_draws=300,
+            n_frames=100,
+            interaction_arcsec=values[4],
+        ),
+        **changes,
+    )
+
+
+POST = SimpleNamespace(
+    draws=np.zeros((400, 6)),
+    mean=np.array([500.0, 530.0, 5850.0, 2e-10, -3.5e-15]),
+    provenance={"data_sha256": "0123456789abcdef"},
+    camera=SimpleNamespace(distortion="brown"),
+)
+OBS = SimpleNamespace(x_px=np.array([100.0, 900.0]), y_px=np.array([530.0, 530.0]))
+
+
+def made(file: Any = None, **changes: Any) -> Budget:
+    return budget(POST, OBS, attitude(), file=file, **{"n_samples": 20_000, **changes})  # type: ignore[arg-type]
+
+
+@pytest.fixture
+def stated(tmp_path: Path) -> Path:
+    path = tmp_path / "stated.toml"
+    path.write_text(FILE, encoding="utf-8")
+    return path
+
+
+def diagnosis(*tests: MisfitTest, comparison: Any = None, jackknife: Any = None) -> Any:
+    return SimpleNamespace(misfit=Misfit(tests, 1.0, 1000, 100), comparison=comparison, jackknife=jackknife)
+
+
+def pattern(size_px: float, p: float, against: str = "radius", dof: int = 5) -> MisfitTest:
+    return MisfitTest(f"pattern over {against}", against, 9.0, dof, 1000, p, p, size_px, 0.5)
+
+
+# --- rows ------------------------------------------------------------------------------------------------------------
+
+
+def test_the_posterior_fills_its_rows_and_no_others() -> None:
+    found = made()
+    rows = {(row.name, row.axis): row for row in found.rows}
+    for name, sigma in ((NEA, [0.46, 0.46, 6.6]), (COMMON, [4.8, 4.7, 0.01]), (REST, [0.006, 0.006, 0.05])):
+        assert [rows[name, axis].sigma_arcsec for axis in AXES] == sigma
+        assert rows[name, "roll"].source == "posterior" and "0123456789ab" in rows[name, "roll"].provenance
+    assert rows[COMMON, "pitch"].absorbed_by_alignment == "yes"
+    assert rows[COMMON, "pitch"].tail_997 == GAUSSIAN_997 < rows[NEA, "pitch"].tail_997 == pytest.approx(3.2)
+    assert rows[INTERACTION, "roll"].sigma_arcsec == 1e-3
+    assert set(found.not_assessed) == {entry.name for entry in FROM_FILE}
+    for row in found.rows:
+        assert row.assessed is (row.source == "posterior")
+        assert row.assessed or (math.isnan(row.sigma_arcsec) and math.isnan(row.mean_arcsec))
+
+
+def test_totals_keep_common_and_rest_apart() -> None:
+    found = made(n_samples=200_000)
+    before, after = (found.total("pitch", scope) for scope in ("before alignment", "after alignment"))
+    assert before.sigma_arcsec == pytest.approx(np.sqrt(4.8**2 + 0.46**2 + 0.006**2), rel=1e-6)
+    assert after.sigma_arcsec == pytest.approx(np.hypot(0.46, 0.006), rel=1e-6)
+    assert before.at_least and before.dominant == COMMON and after.dominant == NEA
+    assert found.total("cross-boresight").factor == pytest.approx(3.409, abs=1e-3)
+    assert after.rule_arcsec == pytest.approx(one_axis_factor(0.997) * after.sigma_arcsec)
+    assert len(found.totals) == 2 * len(TOTAL_AXES) * 3
+    with pytest.raises(ValueError, match="no total"):
+        found.total("boresight")
+
+
+def test_an_old_attitude_file_has_no_interaction() -> None:
+    old = attitude(interaction_arcsec=np.full(3, np.nan))
+    assert INTERACTION not in {row.name for row in budget(POST, OBS, old, n_samples=10_000).rows}  # type: ignore[arg-type]
+
+
+def test_confidence_of_call_file_and_default(tmp_path: Path) -> None:
+    path = tmp_path / "b.toml"
+    path.write_text("[budget]\nconfidence = 0.9\n", encoding="utf-8")
+    assert made().confidence == 0.997 and made(path).confidence == 0.9 and made(path, confidence=0.5).confidence == 0.5
+    assert made(load_budget_file(path)).confidence == 0.9
+    with pytest.raises(BudgetError, match=r"write 0\.95 for 95 %"):
+        made(confidence=95)
+    with pytest.raises(BudgetError, match="too few"):
+        made(n_samples=10)
+
+
+def test_rows_of_the_file_replace_what_is_not_assessed(stated: Path) -> None:
+    found = made(stated)
+    rows = {(row.name, row.axis): row for row in found.rows}
+    assert rows["thermo-elastic distortion", "pitch"].sigma_arcsec == pytest.approx(1.5 / math.sqrt(2.0))
+    assert not rows["thermo-elastic distortion", "roll"].assessed
+    assert "thermo-elastic distortion (about Z (roll))" in found.notes[-1]
+    assert "measurement date error" not in found.not_assessed
+    assert rows["=my own", "pitch"].ecss_class == "other" and not rows["=my own", "yaw"].assessed
+
+
+# --- inflation -------------------------------------------------------------------------------------------------------
+
+
+def test_without_a_diagnosis_the_budget_says_that_the_model_was_not_tested() -> None:
+    assert any("not tested" in note for note in made().notes)
+
+
+def test_nothing_found_nothing_inflated() -> None:
+    found = made(misfit=diagnosis(pattern(0.02, 0.4), pattern(0.1, 1e-9, "pixel phase in x")))
+    assert not any(row.inflated for row in found.rows)
+    assert any("found nothing" in note for note in found.notes) and any("pixel phase" in note for note in found.notes)
+
+
+def test_a_pattern_over_the_field_inflates_the_rest_with_its_whole_size() -> None:
+    found = made(misfit=diagnosis(pattern(0.02, 1e-6), pattern(0.01, 1e-9, "field")))
+    rows = {(row.name, row.axis): row for row in found.rows}
+    arcsec = 648000.0 / np.pi
+    assert rows[REST, "pitch"].sigma_arcsec == pytest.approx(np.hypot(0.006, 0.02 / 5850.0 * arcsec))
+    assert rows[REST, "roll"].sigma_arcsec == pytest.approx(np.hypot(0.05, 0.02 / 400.0 * arcsec))
+    # The added part has no tail of its own; with next to all of the variance it leaves next to nothing of the tail.
+    assert GAUSSIAN_997 < rows[REST, "pitch"].tail_997 < GAUSSIAN_997 + 0.01
+    assert rows[REST, "pitch"].raw_sigma_arcsec == 0.006 and rows[REST, "pitch"].inflated
+    assert "0.020 px" in rows[REST, "pitch"].conditions and "2 rejected tests" in rows[REST, "pitch"].conditions
+    assert not rows[COMMON, "pitch"].inflated and not rows[NEA, "pitch"].inflated
+    assert any(REST in note and "inflated" in note for note in found.notes)
+
+
+def comparison(rejected: bool) -> Any:
+    scores = [
+        SimpleNamespace(model="brown3", rejected=False, common_arcsec=(9.0, 0.1, 0.0), rest_arcsec=(0.001, 0.02, 0.0)),
+        SimpleNamespace(model="brown", rejected=rejected, common_arcsec=(0.0,) * 3, rest_arcsec=(0.0,) * 3),
+        SimpleNamespace(model="none", rejected=True, common_arcsec=(99.0,) * 3, rest_arcsec=(99.0,) * 3),
+    ]
+    return SimpleNamespace(
+        scores=tuple(scores), fitted="brown", of=lambda name: next(s for s in scores if s.model == name)
+    )
+
+
+def test_models_that_predict_as_well_count_where_they_differ_by_more_than_sigma() -> None:
+    found = inflation(attitude(), diagnosis(comparison=comparison(False)), POST, OBS)  # type: ignore[arg-type]
+    assert found.common_arcsec.tolist() == [9.0, 0.0, 0.0] and found.rest_arcsec.tolist() == [0.0, 0.02, 0.0]
+    assert "brown3" in found.common_reasons[0] and "none" not in found.common_reasons[0]
+    worse = inflation(attitude(), diagnosis(comparison=comparison(True)), POST, OBS)  # type: ignore[arg-type]
+    assert worse.common_arcsec.tolist() == [9.0, 0.1, 0.0] and worse.rest_arcsec.tolist() == [0.001, 0.02, 0.0]
+
+
+def test_frames_that_disagree_multiply_both_calibration_rows() -> None:
+    flagged = SimpleNamespace(ratio=np.array([1.0, 1.5]), p_values=np.array([0.5, 1e-6]))
+    rows = {(row.name, row.axis): row for row in made(misfit=diagnosis(jackknife=flagged)).rows}
+    assert rows[COMMON, "pitch"].sigma_arcsec == pytest.approx(1.5 * 4.8)
+    assert rows[REST, "roll"].sigma_arcsec == pytest.approx(1.5 * 0.05)
+    assert not rows[NEA, "pitch"].inflated
+    chance = SimpleNamespace(ratio=np.array([1.0, 1.5]), p_values=np.array([0.5, 0.1]))
+    assert not any(row.inflated for row in made(misfit=diagnosis(jackknife=chance)).rows)
+
+
+# --- requirements ----------------------------------------------------------------------------------------------------
+
+
+def test_a_violated_requirement_is_named_and_the_others_stay_open(stated: Path) -> None:
+    found = made(stated)
+    assert [outcome.requirement.name for outcome in found.violations] == ["R-1 across"]
+    assert [outcome.requirement.name for outcome in found.open_requirements] == ["R-2 about"]
+    violated, unproven = found.outcomes
+    assert "'R-1 across'" in violated.sentence and "is violated: at least" in violated.sentence
+    assert violated.margin_arcsec == pytest.approx(1.0 - violated.total.larger_arcsec) and violated.margin_arcsec < 0.0
+    assert "not assessed" in unproven.sentence and unproven.margin_arcsec > 0.0
+    table = found.requirements_dataframe()
+    assert table["verdict"].tolist() == ["violated", "open"]
+
+
+def complete(limit: float, judged_by: str = "both") -> str:
+    rows = "".join(
+        f'[[contributor]]\nname = "{entry.name}"\naxis = "all"\nsigma_arcsec = 0.01\ndistribution = "gaussian"\n'
+        'provenance = "test"\n'
+        for entry in FROM_FILE
+    )
+    return (
+        rows
+        + f'[[requirement]]\nname = "R"\naxis = "roll"\nlimit_arcsec = {limit}\njudged_by = "{judged_by}"\n'
+        + 'confidence = 0.997\nscope = "after alignment"\n'
+    )
+
+
+def test_met_only_if_everything_is_assessed(tmp_path: Path) -> None:
+    path = tmp_path / "complete.toml"
+    path.write_text(complete(30.0), encoding="utf-8")
+    found = made(path)
+    assert found.outcomes[0].verdict == "met" and not found.not_assessed and not found.violations
+    assert "is met" in found.outcomes[0].sentence
+    assert not any(entry.at_least for entry in found.totals)
+
+
+@pytest.mark.parametrize(("judged_by", "verdict"), [("rule", "met"), ("sampling", "violated"), ("both", "violated")])
+def test_what_judges_decides_where_rule_and_sampling_disagree(tmp_path: Path, judged_by: str, verdict: str) -> None:
+    # 6.6 arcsec of noise whose sigma varies: 19.6 by the rule, 21.1 by sampling.
+    path = tmp_path / "complete.toml"
+    path.write_text(complete(20.2, judged_by), encoding="utf-8")
+    assert made(path, n_samples=200_000).outcomes[0].verdict == verdict
+
+
+@pytest.mark.parametrize(
+    ("limit", "judged_by", "verdict"),
+    [
+        (60.0, "both", "open"),
+        (60.0, "sampling", "open"),
+        (60.0, "rule", "met"),
+        (20.0, "both", "violated"),
+        (20.0, "sampling", "open"),
+    ],
+)
+def test_a_confidence_beyond_the_samples_is_not_judged_by_them(
+    tmp_path: Path, limit: float, judged_by: str, verdict: str
+) -> None:
+    path = tmp_path / "complete.toml"
+    path.write_text(complete(limit, judged_by).replace("0.997", "0.9999999"), encoding="utf-8")
+    found = made(path, n_samples=200_000)
+    outcome = found.outcomes[0]
+    assert outcome.verdict == verdict
+    assert math.isnan(outcome.total.sampled_arcsec) and math.isnan(outcome.total.sampled_se_arcsec)
+    assert "99.99999\N{NO-BREAK SPACE}%" in outcome.sentence
+    if verdict == "open":
+        assert "200000 samples do not resolve a confidence of 99.99999" in outcome.sentence
+        assert "which knows Gaussian tails only, says 35.2 arcsec" in outcome.sentence
+        assert "1 requirement open: the samples do not resolve" in budget_context(found)["budget"]["headline"]
+    found.save(tmp_path / "budget.csv")
+    assert [entry.verdict for entry in Budget.load(tmp_path / "budget.csv").outcomes] == [verdict]
+    for ending in ("html", "tex"):
+        found.save(tmp_path / f"budget.{ending}")
+        assert "not resolved" in (tmp_path / f"budget.{ending}").read_text(encoding="utf-8")
+    # Negative control: a confidence that the samples just resolve.
+    path.write_text(complete(60.0).replace("0.997", "0.9999"), encoding="utf-8")
+    resolved = made(path, n_samples=200_000).outcomes[0]
+    assert resolved.verdict == "met" and resolved.total.sampled_se_arcsec > 0.0
+
+
+def test_a_budget_beyond_the_samples_is_whole(stated: Path, tmp_path: Path) -> None:
+    from openpyxl import load_workbook
+
+    found = made(stated, confidence=0.999999)
+    assert math.isnan(found.total("roll").larger_arcsec)
+    found.save(tmp_path / "budget.xlsx")
+    sheet = load_workbook(tmp_path / "budget.xlsx")["Totals"]
+    assert sheet["J2"].value == "not resolved" and sheet["D2"].number_format == "0.0000%"
+    json.dumps(found.to_dict(), allow_nan=False)
+    found.plot_budget()
+    assert "not resolved" in found._repr_html_()
+
+
+def test_a_contributor_of_the_users_own_is_not_zero_on_axes_that_the_file_leaves_out(tmp_path: Path) -> None:
+    own = FILE.split("[[contributor]]")[4].split("[[requirement]]")[0]
+    path = tmp_path / "own.toml"
+    path.write_text("[[contributor]]" + own, encoding="utf-8")
+    found = made(path)
+    rows = {row.axis: row for row in found.rows if row.name == "=my own"}
+    assert [rows[axis].assessed for axis in AXES] == [True, False, False]
+    assert "=my own" in found.not_assessed and "=my own" in found.total("Z").not_assessed
+    assert "=my own (about Y (yaw) and Z (roll))" in " ".join(found.notes)
+    path.write_text(
+        "[[contributor]]" + own + "[[contributor]]\nname = '=my own'\naxis = 'Z'\napplies = false\nprovenance = 'p'\n",
+        encoding="utf-8",
+    )
+    assert "=my own" not in made(path).total("Z").not_assessed
+
+
+@pytest.mark.parametrize(
+    ("label", "axis"), [("X", "pitch"), ("z", "roll"), ("Y (yaw)", "yaw"), ("X and Y together", "cross-boresight")]
+)
+def test_totals_answer_to_the_labels_of_the_tables(label: str, axis: str) -> None:
+    found = made()
+    assert found.total(label) is found.total(axis)
+    with pytest.raises(ValueError, match=r"one of X, Y, Z .*cross-boresight"):
+        found.total("W")
+
+
+# --- formats ---------------------------------------------------------------------------------------------------------
+
+
+def test_csv_is_lossless(stated: Path, tmp_path: Path) -> None:
+    found = made(stated, misfit=diagnosis(pattern(0.02, 1e-6)))
+    found.save(tmp_path / "budget.csv")
+    back = Budget.load(tmp_path / "budget.csv")
+    for name in ("rows", "totals", "outcomes", "confidence", "title", "notes", "provenance"):
+        assert repr(getattr(back, name)) == repr(getattr(found, name)), name
+    found.to_dataframe().to_csv(tmp_path / "frame.csv")
+    assert len(found.to_dataframe()) == len(found.rows) and len(found.totals_dataframe()) == len(found.totals)
+
+
+def test_json_has_null_where_nothing_is_known(stated: Path) -> None:
+    found = json.loads(json.dumps(made(stated).to_dict(), allow_nan=False))
+    missing = [row for row in found["contributors"] if not row["assessed"]]
+    assert missing and all(row["sigma_arcsec"] is None for row in missing)
+    assert found["violations"] == ["R-1 across"] and len(found["totals"]) == 24
+
+
+@pytest.mark.parametrize("text", ["", "a,b\n1,2\n", "record,name,value\nsetting,confidence,0.9\n"])
+def test_what_is_no_budget_is_refused(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "budget.csv"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(RunFolderError, match="is not an error budget"):
+        read_csv(path)
+    with pytest.raises(RunFolderError, match="cannot be read"):
+        read_csv(tmp_path / "none.csv")
+
+
+def test_excel_has_numbers_units_and_marks(stated: Path, tmp_path: Path) -> None:
+    from openpyxl import load_workbook
+
+    found = made(stated)
+    found.save(tmp_path / "budget.xlsx")
+    book = load_workbook(tmp_path / "budget.xlsx")
+    assert book.sheetnames == ["Contributors", "Totals", "Requirements", "Notes"]
+    sheet = book["Contributors"]
+    header = [cell.value for cell in sheet[1]]
+    assert sheet.freeze_panes == "B2" and sheet.auto_filter.ref and "Sigma [arcsec]" in header
+    column = header.index("Sigma [arcsec]") + 1
+    for index, row in enumerate(found.rows, start=2):
+        value = sheet.cell(index, column).value
+        assert value == (pytest.approx(row.sigma_arcsec, rel=1e-14) if row.assessed else "not assessed")
+        assert row.assessed or sheet.cell(index, column).fill.fgColor.rgb.endswith("FDF1D6")
+    names = [cell.value for cell in sheet["A"]]
+    assert "'=my own" in names and not any(cell.data_type == "f" for cells in sheet.iter_rows() for cell in cells)
+    requirements = book["Requirements"]
+    assert requirements["K2"].value == "violated" and requirements["A2"].fill.fgColor.rgb.endswith("FDE6DB")
+    assert all(dimension.width > 5 for dimension in sheet.column_dimensions.values())
+    made().save(tmp_path / "plain.xlsx")
+    assert "Requirements" not in load_workbook(tmp_path / "plain.xlsx").sheetnames
+
+
+def test_latex_is_balanced_and_escaped(stated: Path, tmp_path: Path) -> None:
+    made(stated).save(tmp_path / "budget.tex")
+    text = (tmp_path / "budget.tex").read_text(encoding="utf-8")
+    assert text.isascii()
+    body = re.sub(r"(?<!\\)%.*", "", text)
+    opened = re.findall(r"\\begin\{(\w+)\}", body)
+    assert sorted(opened) == sorted(re.findall(r"\\end\{(\w+)\}", body)) and "longtable" in opened
+    plain = re.sub(r"\\[{}]", "", body)
+    assert plain.count("{") == plain.count("}")
+    assert body.replace(r"\$", "").count("$") % 2 == 0
+    assert r"Test \& \textless{}budget\textgreater{}\_1" in text and r"analysis \#3" in text
+    for table in re.findall(r"\\begin\{longtable\}\{([^\n]*)\}\n(.*?)\\end\{longtable\}", body, flags=re.DOTALL):
+        columns = len(re.findall(r"L\{\d+mm\}|[lr]", table[0]))
+        for line in table[1].splitlines():
+            if line.rstrip().endswith(r"\\"):
+                spanned = sum(int(n) - 1 for n in re.findall(r"\\multicolumn\{(\d+)\}", line))
+                assert len(re.findall(r"(?<!\\)&", line)) + 1 + spanned == columns, line
+    assert text.count("violated") >= 2 and "not assessed" in text
+
+
+def test_tex_escapes_what_latex_would_read() -> None:
+    assert tex("1.5×10⁻⁵ & 5 % \\x_{y}^~") == (
+        r"1.5$\times$10$^{-5}$ \& 5 \% \textbackslash{}x\_\{y\}\textasciicircum{}\textasciitilde{}"
+    )
+
+
+def test_a_name_in_brackets_is_no_option_of_the_row_before() -> None:
+    assert tex("[R-1]") == "{[}R-1{]}"
+
+
+def test_html_stands_alone_and_escapes(stated: Path, tmp_path: Path) -> None:
+    made(stated).save(tmp_path / "budget.html")
+    text = (tmp_path / "budget.html").read_text(encoding="utf-8")
+    assert "<title>Test &amp; &lt;budget&gt;_1</title>" in text and "<budget>" not in text
+    assert "http" not in re.sub(r"data:image/png;base64,[^\"]*", "", text) and "<script" not in text
+    assert "VIOLATED" in text.upper() and "not assessed" in text and "R-1 across" in text
+    assert "{{" not in text and ">nan<" not in text and "None" not in text
+
+
+def test_other_endings_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(BudgetError, match=r"use one of \.csv, \.xlsx, \.tex, \.html"):
+        made().save(tmp_path / "budget.doc")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_notebook_shows_the_section(stated: Path) -> None:
+    assert "<h2" in made(stated)._repr_html_()
+
+
+def test_the_report_gets_one_name(stated: Path) -> None:
+    assert budget_context(None) == {"budget": None}
+    context = budget_context(made(stated))
+    assert set(context) == {"budget"} and context["budget"]["violated"] is True
+
+
+def test_the_figure_names_what_is_not_assessed_and_colours_the_limits(stated: Path) -> None:
+    found = made(stated)
+    figure = found.plot_budget()
+    left, right = figure.axes
+    labels = [text.get_text() for text in left.get_yticklabels()]
+    assert labels[-2:] == ["total before alignment", "total after alignment"] and "star catalogue" in labels
+    texts = [text.get_text() for text in left.texts]
+    assert texts.count("not assessed") == len(FROM_FILE) - 2 and "does not apply" in texts
+    assert [text.get_text() for text in right.texts].count("not assessed") == len(FROM_FILE) - 1
+    shown = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
+    assert "limit, violated" in shown
+    assert "limit" not in {text.get_text() for legend in made().plot_budget().legends for text in legend.get_texts()}
+
+
+@pytest.mark.parametrize(("line", "drawn"), [("", 1), ("confidence = 0.95\n", 0), ('interpretation = "ensemble"\n', 0)])
+def test_the_figure_draws_limits_of_its_own_confidence_only(tmp_path: Path, line: str, drawn: int) -> None:
+    path = tmp_path / "limit.toml"
+    path.write_text('[[requirement]]\nname = "R"\naxis = "Z"\nlimit_arcsec = 7654.0\n' + line, encoding="utf-8")
+    found = made(path)
+    right = found.plot_budget().axes[1]
+    assert sum(list(curve.get_xdata()) == [7654.0, 7654.0] for curve in right.lines) == drawn
+    page = found._repr_html_()
+    assert "Limits are drawn of requirements at this confidence in the mixed interpretation only" in page
+    assert ("1 of 1 are of another" in page) is (drawn == 0)
+
+
+# --- a run folder ----------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def full(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    run = sc.RunFolder(tmp_path_factory.mktemp("budget") / "run").create()
+    obs = observations(n_frames=60)
+    obs.save(run.observations)
+    start = sc.paper_start()
+    start.save(run.camera)
+    cal = sc.calibrate(obs, start)
+    cal.save(run.calibration)
+    post = sc.sample(obs, cal, seed=1, n_steps=100)
+    post.save(run.posterior)
+    sc.propagate(post, obs, n_draws=100, seed=1).save(run.attitude)
+    return run
+
+
+def test_the_budget_of_a_run_is_written_to_its_folder(full: Any, stated: Path) -> None:
+    found = budget_run(full.path, file=stated)
+    back = Budget.load(full.budget)
+    assert repr(back.totals) == repr(found.totals) and len(found.violations) == 1
+    error = AttitudeError.load(full.attitude)
+    assert found.total("roll").sigma_arcsec == pytest.approx(
+        np.hypot(error.nea_arcsec[2], error.rest_arcsec[2]), rel=1e-3
+    )
+    # Sampled from the rows, with their varying sigmas, it is what was propagated from the posterior.
+    assert found.total("roll").sampled_arcsec == pytest.approx(error.p997_arcsec[0][2], rel=0.03)
+    # Negative control: the rule's Gaussian quantile is not.
+    assert found.total("roll").rule_arcsec < 0.97 * error.p997_arcsec[0][2]
+    assert any("not tested" in note for note in found.notes)
+    obs, post = sc.load_observations(full.observations), sc.Posterior.load(full.posterior)
+    assert budget(post, obs, n_samples=10_000).total("roll").sigma_arcsec == pytest.approx(
+        found.total("roll").sigma_arcsec, rel=1e-2
+    )
+
+
+def test_a_diagnosed_run_is_inflated_or_says_that_nothing_was_found(full: Any, tmp_path: Path) -> None:
+    shutil.copytree(full.path, tmp_path / "run")
+    diagnose_run(tmp_path / "run", n_starts=0)
+    assert not any("not tested" in note for note in budget_run(tmp_path / "run").notes)
+
+
+def test_a_missing_part_is_named_with_its_command(full: Any, tmp_path: Path) -> None:
+    shutil.copytree(full.path, tmp_path / "run")
+    (tmp_path / "run" / "attitude.csv").unlink()
+    with pytest.raises(RunFolderError, match="starcal-uq propagate RUN"):
+        budget_run(tmp_path / "run")
+    with pytest.raises(BudgetError, match="does not exist"):
+        budget_run(full.path, file=tmp_path / "none.toml")

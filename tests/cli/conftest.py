@@ -1,0 +1,37 @@
+"""What the tests of the command line share."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.cli.app import main
+from tests.helpers.scenes import observations
+
+
+@pytest.fixture
+def cli(monkeypatch, capsys, tmp_path):
+    """Run a command in an empty folder; returns (status, standard output, standard error)."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["starcal-uq", *map(str, arguments)])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        captured = capsys.readouterr()
+        code = stop.value.code
+        return (0 if code is None else code), captured.out, captured.err
+
+    return call
+
+
+@pytest.fixture
+def inputs(tmp_path):
+    """Good observations and camera files, in a folder of their own."""
+    folder = tmp_path / "inputs"
+    folder.mkdir()
+    observations().save(folder / "obs.csv")
+    sc.paper_start().save(folder / "camera.toml")
+    return folder

@@ -1,0 +1,275 @@
+"""The command line as a user meets it: whole runs, JSON, help, and one sentence for every mistake."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from tests.helpers.commands import SMALL, files
+from tests.helpers.scenes import observations
+
+
+def test_run_writes_everything_and_prints_the_tables(cli, inputs, tmp_path):
+    status, out, err = cli("run", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", *SMALL)
+    assert status in (0, 1)
+    for heading in ("Calibration", "Posterior", "Attitude error", "Report:"):
+        assert heading in out
+    assert "Neither time nor observer velocity was declared" in err
+    run = sc.RunFolder(tmp_path / "run")
+    for path in (run.observations, run.camera, run.calibration, run.posterior, run.coupling, run.attitude, run.report):
+        assert path.stat().st_size > 0, path
+    page = run.report.read_text(encoding="utf-8")
+    assert page.lstrip().lower().startswith("<!doctype html>")
+    assert "http://" not in page.replace("http://www.w3.org", "")
+    # The same seed repeats the posterior bit for bit.
+    cli("run", inputs / "obs.csv", inputs / "camera.toml", "-o", "again", *SMALL)
+    again = sc.Posterior.load(tmp_path / "again" / "posterior.nc")
+    assert np.array_equal(again.draws, sc.Posterior.load(run.posterior).draws)
+
+
+def test_steps_one_by_one_with_json(cli, inputs):
+    status, out, _ = cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--json")
+    assert status == 0
+    table = json.loads(out)
+    assert table["status"] == "CONVERGED"
+    assert [row["parameter"] for row in table["parameters"]] == ["x0", "y0", "f", "k1", "k2", "sigma"]
+    status, out, _ = cli("coupling", "run")
+    assert status == 0
+    assert "variance inflation" in out
+    status, out, _ = cli("sample", "run", "--json", "--seed", "3", *SMALL)
+    assert status in (0, 1)
+    assert len(json.loads(out)["parameters"]) == 6
+    status, out, _ = cli("coupling", "run", "--json")
+    assert status == 0
+    assert "contraction" in json.loads(out)["parameters"][0]
+    status, out, _ = cli("propagate", "run", "--json", "--draws", "60")
+    assert status == 0
+    assert {row["axis"] for row in json.loads(out)["attitude_error"]} >= {"pitch", "yaw", "roll"}
+    status, out, _ = cli("report", "run")
+    assert status == 0
+    assert "report.html" in out
+
+
+def test_new_sampling_removes_what_the_old_one_led_to(cli, inputs, tmp_path):
+    cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run")
+    cli("sample", "run", *SMALL)
+    cli("propagate", "run", "--draws", "60")
+    assert (tmp_path / "run" / "attitude.csv").exists()
+    status, _, err = cli("sample", "run", *SMALL)
+    assert status == 2
+    assert "--force" in err
+    assert (tmp_path / "run" / "attitude.csv").exists()
+    cli("sample", "run", "--force", *SMALL)
+    assert not (tmp_path / "run" / "attitude.csv").exists()
+
+
+def test_simulate_writes_a_table_that_calibrates(cli, inputs, tmp_path):
+    status, out, _ = cli("simulate", inputs / "camera.toml", "-o", "obs.parquet", "--frames", 30, "--seed", 5)
+    assert status == 0
+    assert "30 frames" in out
+    first = (tmp_path / "obs.parquet").read_bytes()
+    status, _, err = cli("simulate", inputs / "camera.toml", "-o", "obs.parquet", "--frames", 30)
+    assert status == 2
+    assert "--force" in err
+    assert (tmp_path / "obs.parquet").read_bytes() == first
+    status, out, err = cli("calibrate", "obs.parquet", inputs / "camera.toml", "-o", "run")
+    assert status == 0
+    assert "truth" in out
+    assert "warning" not in err
+
+
+def test_demo_ends_with_the_table_of_truth_and_the_report(cli, tmp_path):
+    status, out, _ = cli("demo", "--out", "demo", "--frames", 60)
+    assert status == 0
+    assert "truth" in out
+    assert out.rstrip().endswith("report.html")
+    assert (tmp_path / "demo" / "report.html").exists()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [(), ("demo",), ("simulate",), ("calibrate",), ("sample",), ("coupling",), ("propagate",), ("report",), ("run",)],
+)
+def test_help_teaches(cli, command):
+    status, out, _ = cli(*command, "--help")
+    assert status == 0
+    assert "Usage" in out
+    assert len(out.splitlines()) > 8
+
+
+def _line(path, number, text):
+    lines = path.read_text().splitlines()
+    lines[number - 1] = text
+    path.write_text("\n".join(lines) + "\n")
+
+
+def _cell(path, number, column, text):
+    lines = path.read_text().splitlines()
+    index = lines[0].split(",").index(column)
+    cells = lines[number - 1].split(",")
+    cells[index] = text
+    _line(path, number, ",".join(cells))
+
+
+def _drop_column(folder):
+    path = folder / "obs.csv"
+    lines = [line.split(",") for line in path.read_text().splitlines()]
+    index = lines[0].index("y_px")
+    path.write_text("\n".join(",".join(c[:index] + c[index + 1 :]) for c in lines) + "\n")
+
+
+def _short_frame(folder):
+    path = folder / "obs.csv"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(lines[:3] + [line for line in lines[3:] if not line.startswith("0,")]) + "\n")
+
+
+def _duplicate_star(folder):
+    path = folder / "obs.csv"
+    lines = path.read_text().splitlines()
+    header = lines[0].split(",")
+    a, b = lines[1].split(","), lines[2].split(",")
+    for column in ("ra_deg", "dec_deg", "star_id"):
+        b[header.index(column)] = a[header.index(column)]
+    _line(path, 3, ",".join(b))
+
+
+def _text(name, old, new):
+    def change(folder):
+        path = folder / name
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new, 1))
+
+    return change
+
+
+def _cells(number, column, text):
+    return lambda folder: _cell(folder / "obs.csv", number, column, text)
+
+
+def _directory(folder):
+    (folder / "obs.csv").unlink()
+    (folder / "obs.csv").mkdir()
+
+
+MISTAKES = {
+    "missing column": (_drop_column, ["obs.csv", "y_px"]),
+    "text in a number column": (_cells(7, "x_px", "abc"), ["obs.csv", "line 7", "x_px", "abc"]),
+    "NaN": (_cells(9, "dec_deg", "nan"), ["obs.csv", "line 9", "dec_deg"]),
+    "pixel outside the detector": (_cells(5, "y_px", "1030.0"), ["obs.csv", "line 5", "y_px"]),
+    "too few stars": (_short_frame, ["obs.csv", "frame 0"]),
+    "duplicate star": (_duplicate_star, ["obs.csv", "line 3"]),
+    "declination of 91": (_cells(4, "dec_deg", "91.0"), ["obs.csv", "line 4", "dec_deg", "91"]),
+    "unknown key": (_text("camera.toml", "[camera]", "[camera]\nfocal_length = 70.0"), ["camera.toml", "focal_length"]),
+    "missing key": (_text("camera.toml", "focal_mm =", "# focal_mm ="), ["camera.toml", "focal_mm"]),
+    "missing section": (_text("camera.toml", "[camera]", "[kamera]"), ["camera.toml", "camera"]),
+    "broken TOML": (_text("camera.toml", "[camera]", "[camera"), ["camera.toml"]),
+    "empty file": (lambda folder: (folder / "obs.csv").write_text(""), ["obs.csv", "empty"]),
+    "a directory": (_directory, ["obs.csv", "director"]),
+    "missing file": (lambda folder: (folder / "obs.csv").unlink(), ["obs.csv"]),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+@pytest.mark.parametrize("command", ["calibrate", "run"])
+def test_every_mistake_is_one_sentence_and_touches_nothing(cli, inputs, tmp_path, mistake, command):
+    spoil, words = MISTAKES[mistake]
+    spoil(inputs)
+    before = files(tmp_path)
+    status, out, err = cli(command, inputs / "obs.csv", inputs / "camera.toml", "-o", "run")
+    assert status == 2
+    lines = [line for line in err.splitlines() if line.strip()]
+    assert len(lines) == 1, err
+    assert lines[0].startswith("error: ")
+    for word in words:
+        assert word in lines[0], (word, lines[0])
+    assert "Traceback" not in err + out
+    assert files(tmp_path) == before
+
+
+def test_output_that_exists_is_kept(cli, inputs, tmp_path):
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "mine.txt").write_text("keep me")
+    before = files(tmp_path)
+    status, _, err = cli("run", inputs / "obs.csv", inputs / "camera.toml", "-o", "run")
+    assert status == 2
+    assert "--force" in err
+    assert files(tmp_path) == before
+    status, _, _ = cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--force")
+    assert status == 0
+    assert (tmp_path / "run" / "mine.txt").read_text() == "keep me"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["sample", "nowhere"], ["nowhere"]),
+        (["report", "nowhere"], ["nowhere"]),
+        (["propagate", "nowhere"], ["nowhere"]),
+        (["calibrate"], ["OBS"]),
+        (["nonsense"], ["nonsense"]),
+    ],
+)
+def test_wrong_calls_end_with_status_2(cli, arguments, words):
+    status, _, err = cli(*arguments)
+    assert status == 2
+    for word in words:
+        assert word in err
+    assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        ("--solver", "magic", "solver"),
+        ("--method", "magic", "method"),
+        ("--directions", "left", "directions"),
+        ("--directions", "catalogue", "time_utc"),
+        ("--observer-velocity", "1,2", "three numbers"),
+        ("--column", "ra_deg", "NAME=IN_FILE"),
+        ("--column", "ra_deg=nothing", "nothing"),
+    ],
+)
+def test_wrong_options_are_named(cli, inputs, tmp_path, option, value, words):
+    before = files(tmp_path)
+    status, _, err = cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", option, value)
+    assert status == 2
+    assert words in err
+    assert files(tmp_path) == before
+
+
+def test_a_calibration_that_fails_leaves_no_folder(cli, inputs, tmp_path):
+    rng = np.random.default_rng(0)
+    obs = observations()
+    shuffled = rng.permutation(obs.n_stars)
+    import dataclasses
+
+    # Right ascensions keep the rows distinct; the declinations belong to other stars.
+    wrong = dataclasses.replace(obs, dec_deg=-obs.dec_deg[shuffled], ra_deg=obs.ra_deg, star_id=None)
+    wrong.save(inputs / "wrong.csv")
+    status, _, err = cli("calibrate", inputs / "wrong.csv", inputs / "camera.toml", "-o", "run")
+    assert status == 2
+    assert "error: the calibration" in err
+    assert not (tmp_path / "run").exists()
+
+
+def test_declared_directions_and_renamed_columns(cli, inputs):
+    text = (inputs / "obs.csv").read_text().replace("ra_deg", "alpha", 1)
+    (inputs / "obs.csv").write_text(text)
+    status, _, err = cli(
+        "calibrate",
+        inputs / "obs.csv",
+        inputs / "camera.toml",
+        "-o",
+        "run",
+        "--column",
+        "ra_deg=alpha",
+        "--directions",
+        "apparent",
+    )
+    assert status == 0
+    assert "warning" not in err

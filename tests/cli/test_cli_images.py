@@ -1,0 +1,229 @@
+"""From images to a report at the command line, and the bootstrap behind it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from scipy.spatial import cKDTree
+
+import starcal_uq as sc
+from starcal_uq.pipeline.images import counted, epoch_of
+from starcal_uq.pipeline.refine import bootstrap
+from starcal_uq.sky.neighbours import disturbed_stars, without_disturbed
+
+ESA = Path(__file__).resolve().parents[3] / "shared" / "data" / "esa-tetra3"
+
+
+@pytest.fixture(scope="module")
+def frames(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("frames")
+    stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
+    sc.render_frames(stars, sc.paper_camera(), folder, n_frames=25, seed=3, times_utc=["2026-11-25T00:00:00"] * 25)
+    return folder
+
+
+def test_simulated_images_go_through_the_commands_one_by_one(cli, tmp_path):
+    sc.paper_camera().save(tmp_path / "truth.toml")
+    sc.paper_start().save(tmp_path / "camera.toml")
+    status, out, _ = cli("simulate", "truth.toml", "-o", "obs.parquet", "--frames", 4, "--images", "img", "--seed", 1)
+    assert status == 0
+    assert len(list((tmp_path / "img").glob("*.fits"))) == 4
+    status, out, err = cli("centroid", "img", "-o", "centroids.parquet", "--camera", "camera.toml")
+    assert status == 0, err
+    status, out, _ = cli("identify", "centroids.parquet", "camera.toml", "-o", "found.csv", "--max-mag", 6, "--json")
+    assert status == 0
+    document = json.loads(out)
+    assert [frame["status"] for frame in document["frames"]] == ["identified"] * 4
+    found, truth = sc.load_observations(tmp_path / "found.csv"), sc.load_observations(tmp_path / "obs.parquet")
+    right = set(zip(truth.frame.tolist(), truth.star_id.tolist(), strict=True))
+    # Stars within six sigma of the edge are in the images but not in the table.
+    wrong = [pair for pair in zip(found.frame.tolist(), found.star_id.tolist(), strict=True) if pair not in right]
+    assert len(wrong) <= 0.03 * found.n_stars
+
+
+def test_run_from_images_to_report(cli, frames, tmp_path):
+    sc.paper_start().save(tmp_path / "camera.toml")
+    options = ("--directions", "apparent", "--max-mag", 6, "--screen", "--steps", 40)
+    status, _, err = cli("run", frames, "camera.toml", "-o", "run", *options)
+    assert status in (0, 1), err
+    assert "with the nominal camera" in err
+    run = sc.RunFolder(tmp_path / "run")
+    assert "identified anew" in run.report.read_text("utf-8")
+    assert len(pd.read_csv(run.path / "identification.csv")) == 25
+    assert sc.Centroids.load(run.path / "centroids.parquet").n_frames == 25
+    cal, truth = sc.Calibration.load(run.calibration), sc.paper_camera().theta
+    assert np.all(np.abs(cal.theta - truth) < 4.0 * cal.sigmas)
+    # What centroiding predicted is what the calibration finds.
+    assert cal.sigma_name == "sigma_scale"
+    assert cal.sigma == pytest.approx(1.0, abs=0.1)
+
+
+def test_options_of_the_other_kind_are_refused(cli, frames, tmp_path):
+    sc.paper_start().save(tmp_path / "camera.toml")
+    status, _, err = cli("run", frames, "camera.toml", "-o", "run", "--observer-velocity", "7,0,0")
+    assert status == 2
+    assert "--observer-velocity belongs to tables" in err
+    (tmp_path / "obs.csv").write_text("frame,x_px,y_px,ra_deg,dec_deg\n")
+    for option in (("--time", "2026-11-21T00:00:00"), ("--max-mag", 3), ("--gain", 1), ("--engine", "pyramid")):
+        status, _, err = cli("run", "obs.csv", "camera.toml", "-o", "run", *option)
+        assert status == 2
+        assert f"{option[0]} belongs to images" in err
+    assert not (tmp_path / "run").exists()
+
+
+def test_identify_refuses_the_calibration_of_another_sensor(cli, frames, tmp_path):
+    from starcal_uq.runs.steps import calibrate_step
+
+    obs = sc.simulate(sc.load_catalogue(max_mag=6.0, epoch=2026.9), sc.paper_camera(), n_frames=20, seed=1)
+    calibrate_step(sc.RunFolder(tmp_path / "run"), obs, sc.paper_start(), force=True)
+    sc.paper_start().replace(focal_mm=50.0).save(tmp_path / "other.toml")
+    assert cli("centroid", frames, "-o", "c.parquet")[0] == 0
+    status, _, err = cli("identify", "c.parquet", "other.toml", "-o", "o.csv", "--calibration", "run")
+    assert status == 2
+    assert "one sensor" in err
+
+
+def test_too_few_stars_say_what_was_identified(cli, frames, tmp_path, monkeypatch):
+    def stuck(*_arguments, **_options):
+        raise sc.CalibrationError("it went nowhere.")
+
+    monkeypatch.setattr("starcal_uq.estimation.calibrate.calibrate", stuck)
+    sc.paper_start().save(tmp_path / "camera.toml")
+    status, _, err = cli("run", frames, "camera.toml", "-o", "run", "--max-mag", 6, "--in-space")
+    assert status == 2
+    assert "stars in 25 frames were identified, but they do not determine the camera (it went nowhere.)" in err
+    # What was found in the images was said before.
+    assert "stars in 25 frames.\n" in err
+    assert not (tmp_path / "run").exists()
+
+
+def test_bootstrap_says_what_changed(frames):
+    table = sc.extract_centroids(frames)
+    stars = sc.load_catalogue(max_mag=6.0, epoch=epoch_of(table))
+    found = bootstrap(table, sc.paper_start(), stars)
+    assert len(found.rounds) == 2
+    assert found.identification.n_identified == 25
+    assert "new" in found.summary
+    assert "standard deviations" in found.summary
+    # The focal length is compared with the data sheet's, not with that of the first calibration.
+    change = 100.0 * abs(found.calibration.camera.focal_px / sc.paper_start().focal_px - 1.0)
+    assert f"{change:.2f} % shorter" in found.identification.summary
+    none = table.select_frames([])
+    with pytest.raises(sc.IdentificationError, match="no frame is identified"):
+        bootstrap(none, sc.paper_start(), stars)
+
+
+def test_bad_input_is_one_sentence(cli, tmp_path):
+    sc.paper_start().save(tmp_path / "camera.toml")
+    (tmp_path / "broken.fits").write_bytes(b"SIMPLE  =                    T")
+    (tmp_path / "text.png").write_text("no image")
+    (tmp_path / "empty").mkdir()
+    for command, status in (
+        (("centroid", "missing.fits", "-o", "c.csv"), (1, 2)),
+        (("centroid", "empty", "-o", "c.csv"), (2,)),
+        (("centroid", "broken.fits", "text.png", "-o", "d.csv"), (1,)),
+        (("identify", "missing.csv", "camera.toml", "-o", "o.csv"), (2,)),
+        (("run", "broken.fits", "camera.toml", "-o", "run"), (2,)),
+        (("run", "one.csv", "two.csv", "camera.toml", "-o", "run"), (2,)),
+        (("simulate", "camera.toml", "-o", "s.csv", "--sensor", "x.toml"), (2,)),
+    ):
+        found, out, err = cli(*command)
+        assert found in status, (command, out, err)
+        assert "Traceback" not in err
+        assert err.strip()
+    assert not (tmp_path / "run").exists()
+    assert not (tmp_path / "o.csv").exists()
+
+
+def test_one_message_for_many_images():
+    assert counted(["a: dark.", "b: dark.", "c: odd."]) == ["2 images: dark.", "c: odd."]
+    found = counted(["a1: 3 of 10 % left.", "b2: 12 of 10 % left.", "c: 1.5 of 9 % left."])
+    assert found == ["3 images: 1.5 to 12 of 9 to 10 % left."]
+    assert counted(["In all 7."]) == ["In all 7."]
+
+
+@pytest.mark.skipif(not ESA.is_dir(), reason="the real frames are not here")
+def test_real_frames_from_images_to_observations(cli, tmp_path):
+    camera = ESA.parent / "esa_tetra3_camera.toml"
+    status, _, _ = cli("centroid", ESA, "-o", "c.parquet", "--camera", camera)
+    assert status == 0
+    arguments = ("c.parquet", camera, "-o", "o.csv", "--max-mag", 7.5, "--epoch", 2019.57, "--json")
+    status, out, _ = cli("identify", *arguments)
+    assert status == 0
+    assert [frame["status"] for frame in json.loads(out)["frames"]] == ["identified"] * 8
+    found = sc.load_observations(tmp_path / "o.csv")
+    table = pd.read_csv(ESA.parent / "esa_tetra3_observations.csv")
+    n = 0
+    for frame, x, y, ra, dec in table[["frame", "x_px", "y_px", "ra_deg", "dec_deg"]].to_numpy():
+        here = (found.frame == frame) & (np.hypot(found.x_px - x, found.y_px - y) < 1.0)
+        if here.any():
+            n += 1
+            off = np.hypot((found.ra_deg[here][0] - ra) * np.cos(np.radians(dec)), found.dec_deg[here][0] - dec)
+            assert off * 3600.0 < 20.0, "a wrong identification"
+    assert n > 400
+    assert found.n_stars / 8 >= 30
+
+
+def test_stars_beside_a_neighbour_are_left_out():
+    truth = sc.paper_camera()
+    stars = sc.load_catalogue(max_mag=7.0)
+    obs = sc.simulate(stars, truth, n_frames=40, min_stars=10, seed=2)
+    mask = disturbed_stars(obs, stars, truth)
+    assert 0 < mask.sum() < 0.05 * obs.n_stars
+    kept = without_disturbed(obs, stars, truth)
+    assert kept.meta["disturbed_stars"] >= mask.sum()
+    # For the others, the nearest neighbour moves the light by less than a fifth of 0.05 px, or is out of reach.
+    distance, index = cKDTree(stars.directions_icrs).query(kept.directions_icrs, k=2)
+    near, flux = distance[:, 1] * truth.focal_px, 10.0 ** (-0.4 * (stars.mag[index[:, 1]] - kept.mag))
+    assert np.all((near * flux / (1.0 + flux) <= 0.2 * 0.05 + 1e-9) | (near > 3.99))
+    # Wider star images reach farther.
+    assert disturbed_stars(obs, stars, truth, psf_sigma_px=3.0).sum() > mask.sum()
+
+
+@pytest.mark.slow
+def test_rendered_frames_through_the_whole_chain(tmp_path):
+    truth = sc.paper_camera()
+    stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
+    sc.render_frames(stars, truth, tmp_path, n_frames=300, seed=11)
+    table = sc.extract_centroids(tmp_path)
+    found = bootstrap(table, sc.paper_start(), stars, prepare=lambda obs: without_disturbed(obs, stars, truth))
+    cal = found.calibration
+    assert found.identification.n_identified == 300
+    assert np.all(np.abs((cal.theta - truth.theta) / cal.sigmas) < 4.0)
+    assert cal.sigma == pytest.approx(1.0, abs=0.03)
+    # The control: stars where they were eleven years before are not what the camera saw.
+    old = sc.load_catalogue(max_mag=6.0, epoch=2016.0)
+    control = bootstrap(table, sc.paper_start(), old, prepare=lambda obs: without_disturbed(obs, old, truth))
+    assert control.calibration.sigma > 1.3
+
+
+@pytest.mark.skipif(not ESA.is_dir(), reason="the real frames are not here")
+def test_real_frames_from_images_to_the_report(cli, tmp_path):
+    camera = ESA.parent / "esa_tetra3_camera.toml"
+    sc.Site(52.2, 4.42, pressure_hpa=1013.0, temperature_c=20.0, name="Noordwijk").save(tmp_path / "site.toml")
+    status, _, err = cli("run", ESA, camera, "-o", "run", "--site", "site.toml", "--screen")
+    # Warnings only: the pixel phase that correction leaves, and a little with magnitude.
+    assert status == 0, err
+    assert "was added to the noise of every star" in err
+    run = sc.RunFolder(tmp_path / "run")
+    obs, cal = sc.load_observations(run.observations), sc.Calibration.load(run.calibration)
+    assert 0.03 < obs.meta["noise_floor_px"] < 0.05
+    assert cal.sigma == pytest.approx(1.0, abs=0.1)
+    f = cal.theta[2]
+    scale = np.array([1.0, 1.0, 1.0, f**2, f**4])
+    independent = np.array([[517.3, 1.0], [389.9, 1.4], [5116.54, 0.28], [0.078, 0.017], [1.5, 1.1]])
+    z = (cal.theta * scale - independent[:, 0]) / np.hypot(cal.sigmas * scale, independent[:, 1])
+    assert np.all(np.abs(z) < 2.0), z
+    report = run.report.read_text("utf-8")
+    assert "Noordwijk" in report
+    assert "8 of 8 images used" in report
+    # The control: without the site f is too short, and the report neither believes nor hides it.
+    status, _, err = cli("run", ESA, camera, "-o", "bare", "--screen")
+    assert status == 1
+    assert "conditional on refraction" in err
+    bare = sc.Calibration.load(sc.RunFolder(tmp_path / "bare").calibration)
+    assert (bare.theta[2] - 5116.54) / np.hypot(bare.sigmas[2], 0.28) < -5.0

@@ -1,0 +1,277 @@
+"""budget, compare, plan and the mission's sky of propagate at the command line."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import starcal_uq as sc
+
+REQUIREMENTS = """
+[[requirement]]
+name = "R-1 impossible"
+axis = "cross-boresight"
+limit_arcsec = 0.001
+
+[[requirement]]
+name = "R-2 generous"
+axis = "Z"
+limit_arcsec = 1000.0
+"""
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run with everything but the questions to the model, which take long."""
+    from starcal_uq.runs.steps import calibrate_step, propagate_step, sample_step
+
+    run = sc.RunFolder(tmp_path_factory.mktemp("mission") / "run")
+    stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
+    obs = sc.simulate(stars, sc.paper_camera(), n_frames=60, min_stars=8, sigma_px=0.05, seed=1)
+    calibrate_step(run, obs, sc.paper_start(), force=True)
+    sample_step(run, force=True, n_steps=60, seed=1)
+    propagate_step(run, n_draws=60, seed=1)
+    return run.path
+
+
+@pytest.fixture
+def run(finished: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(finished, tmp_path / "run"))
+
+
+def test_budget_in_all_formats(cli, run, tmp_path):
+    names = [f"budget.{ending}" for ending in ("csv", "xlsx", "tex", "html")]
+    status, out, _ = cli("budget", "run", *(word for name in names for word in ("-o", name)))
+    assert status == 0
+    assert "not assessed" in out
+    assert "at least" in out
+    for name in names:
+        assert (tmp_path / name).stat().st_size > 1000
+    kept, copy = (sc.Budget.load(folder / "budget.csv") for folder in (run, tmp_path))
+    pd.testing.assert_frame_equal(kept.to_dataframe(), copy.to_dataframe())
+    status, _, err = cli("budget", "run", "-o", "budget.csv")
+    assert status == 2
+    assert "exists already" in err
+    status, _, err = cli("budget", "run", "-o", "budget.docx")
+    assert status == 2
+    assert ".xlsx" in err
+
+
+def test_violated_requirement_is_named_and_ends_with_status_1(cli, run, tmp_path):
+    (tmp_path / "mission.toml").write_text(REQUIREMENTS)
+    status, out, err = cli("budget", "run", "--file", "mission.toml")
+    assert status == 1
+    assert "violated: 'R-1 impossible'" in err
+    assert "R-2 generous" in out
+    assert "R-2" not in err
+    (tmp_path / "kind.toml").write_text(REQUIREMENTS.replace("0.001", "1e4"))
+    status, out, err = cli("budget", "run", "--file", "kind.toml", "--json")
+    assert status == 0
+    assert json.loads(out)["requirements"]
+    # The report of the run now has the section, and its figure.
+    status, _, _ = cli("report", "run")
+    assert status == 0
+    text = (run / "report.html").read_text("utf-8")
+    assert 'id="budget"' in text
+    assert "R-1 impossible" in text
+
+
+def test_run_refuses_a_wrong_budget_file_before_any_work(cli, inputs, tmp_path):
+    (tmp_path / "wrong.toml").write_text("[[contributor]]\nname = 3\n")
+    status, _, err = cli("run", inputs / "obs.csv", inputs / "camera.toml", "-o", "new", "--budget", "wrong.toml")
+    assert status == 2
+    assert "wrong.toml" in err
+    assert not (tmp_path / "new").exists()
+
+
+def test_starter_file_lists_what_is_open_and_loads(cli, run, tmp_path):
+    status, out, _ = cli("budget", "run", "--template", "start.toml")
+    assert status == 0
+    assert "starcal-uq budget run --file start.toml" in out
+    assert "thermo-elastic distortion" in (tmp_path / "start.toml").read_text("utf-8")
+    status, _, _ = cli("budget", "run", "--file", "start.toml")
+    assert status == 0
+
+
+def test_mission_sky_takes_the_place_of_the_observed_frames(cli, run):
+    observed = sc.AttitudeError.load(run / "attitude.csv")
+    cli("budget", "run")
+    assert (run / "budget.csv").exists()
+    options = ("--attitudes", "random", "--max-mag", 6.5, "--frames", 200, "--draws", 60, "--json")
+    status, out, _ = cli("propagate", "run", *options)
+    assert status == 0
+    assert "random attitudes" in json.loads(out)["frames"]
+    mission = sc.AttitudeError.load(run / "attitude.csv")
+    # More stars, less noise; and what rested on the old numbers is gone.
+    assert mission.nea_arcsec[0] < observed.nea_arcsec[0]
+    assert not (run / "budget.csv").exists()
+
+
+def test_slew_has_a_spectrum(cli, run, tmp_path):
+    time = np.arange(0.0, 200.0, 5.0)
+    angle = np.radians(0.3 * time)
+    q = {"qx": np.sin(angle / 2), "qy": 0.0 * time, "qz": 0.0 * time, "qw": np.cos(angle / 2)}
+    pd.DataFrame({"time_s": time, **q}).to_csv(tmp_path / "slew.csv", index=False)
+    status, out, err = cli("propagate", "run", "--attitudes", "slew.csv", "--rate", 1.0, "--draws", 60)
+    assert status == 0, err
+    assert "correlat" in out or "frequenc" in out
+    spectrum = sc.ErrorSpectrum.load(run / "error_spectrum.npz")
+    assert spectrum.integral_arcsec2 == pytest.approx(spectrum.variance_arcsec2, rel=1e-6)
+    for wrong, word in (("none.csv", "none.csv"), ("run/calibration.json", "calibration.json")):
+        status, _, err = cli("propagate", "run", "--attitudes", wrong)
+        assert status == 2
+        assert word in err
+    status, _, err = cli("propagate", "run", "--attitudes", "slew.csv", "--scalar", "middle")
+    assert status == 2
+    assert "first, last" in err
+
+
+def test_compare_two_runs_and_two_halves(cli, run, tmp_path):
+    shutil.copytree(run, tmp_path / "again")
+    status, out, _ = cli("compare", "run", "--split", "odd-even", "-o", "page")
+    assert status == 0
+    assert "agree" in out
+    assert (tmp_path / "page" / "comparison.html").exists()
+    assert sc.CameraComparison.load(tmp_path / "page").tested
+    status, out, _ = cli("compare", "run", "again", "--labels", "cold,hot", "--json")
+    assert status == 0
+    # The same data: chance has no part in a difference.
+    document = json.loads(out)
+    assert document["labels"] == ["cold", "hot"]
+    assert document["p_map"] is None
+    for wrong in (("run",), ("run", "again", "--split", "odd-even"), ("run", "again", "--labels", "one")):
+        status, _, err = cli("compare", *wrong)
+        assert status == 2
+        assert err.strip()
+    status, _, err = cli("compare", "run", "again", "-o", "page")
+    assert status == 2
+    assert "not empty" in err
+
+
+def test_plan_before_any_data(cli, run, tmp_path):
+    sc.paper_start().save(tmp_path / "camera.toml")
+    options = ("--target-arcsec", 20, "--frames", 30, "--frames", 300, "--choose", 5, "-o", "plan")
+    status, out, _ = cli("plan", "camera.toml", *options)
+    assert status == 0
+    assert "frames" in out
+    assert (tmp_path / "plan" / "plan.html").exists()
+    assert len(pd.read_csv(tmp_path / "plan" / "plan.csv")) == 2
+    # Sixty frames that are there already are sixty fewer to take.
+    cal = sc.Calibration.load(run / "calibration.json")
+    cal.camera.save(tmp_path / "calibrated.toml")
+    options = ("--target-arcsec", 20, "--frames", 30, "--sigma", cal.sigma, "--json")
+    needs = []
+    for after in ((), ("--after", "run")):
+        status, out, _ = cli("plan", "calibrated.toml", *options, *after)
+        assert status == 0
+        needs.append(json.loads(out)["needs"][0]["frames"])
+    assert needs[0] - needs[1] == pytest.approx(60, abs=30)
+    # Centroid noise alone is more than this.
+    status, out, _ = cli("plan", "camera.toml", "--target-arcsec", 0.1, "--scope", "total", "--frames", 30)
+    assert status == 1
+    for wrong in (("--confidence", 99.7), ("--scope", "all"), ("--criterion", "E", "--choose", 3), ("--sigma", -1)):
+        status, _, err = cli("plan", "camera.toml", *wrong)
+        assert status == 2, wrong
+        assert err.strip()
+
+
+def test_square_brackets_are_no_markup(cli, run, tmp_path):
+    (tmp_path / "b.toml").write_text(REQUIREMENTS.replace("R-1 impossible", "R-1 [/x] rev [b]"))
+    status, out, err = cli("budget", "run", "--file", "b.toml")
+    assert status == 1
+    assert "R-1 [/x] rev [b]" in out
+    assert "R-1 [/x] rev [b]" in err
+    status, out, _ = cli("compare", "run", "--split", "halves", "--labels", "a[/x],b [red]")
+    assert status == 0
+    assert "a[/x] and b [red] agree" in out
+
+
+def test_a_runs_own_files_are_not_mixed_with_others(cli, run, tmp_path):
+    sc.paper_start().save(tmp_path / "camera.toml")
+    before = {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
+    for arguments in (
+        ("compare", "run", "--split", "halves", "-o", "run", "--force"),
+        ("plan", "camera.toml", "--frames", 30, "-o", "run", "--force"),
+    ):
+        status, _, err = cli(*arguments)
+        assert status == 2
+        assert "is the folder of a run" in err
+    assert {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
+    status, _, err = cli("budget", "run", "--file", "b.toml", "--template", "./b.toml", "--force")
+    assert status == 2
+    assert "write over" in err
+    status, _, err = cli("compare", "run", "--split", "halves", "--labels", "a,a")
+    assert status == 2
+
+
+def test_plan_after_a_run_of_another_sensor_is_refused(cli, run, tmp_path):
+    sc.paper_start().replace(width_px=512, height_px=512, x0_px=255.5, y0_px=255.5).save(tmp_path / "other.toml")
+    status, _, err = cli("plan", "other.toml", "--after", "run")
+    assert status == 2
+    assert "give the file and the run of one sensor" in err
+    # A stated noise is not overruled by that of the run.
+    sc.paper_start().save(tmp_path / "camera.toml")
+    found = []
+    for sigma in ((), ("--sigma", 0.5)):
+        status, out, _ = cli("plan", "camera.toml", "--after", "run", "--frames", 100, "--json", *sigma)
+        assert status == 0
+        found.append(json.loads(out)["sigma_px"])
+    assert found[0] == pytest.approx(0.05, rel=0.1)
+    assert found[1] == 0.5
+
+
+def test_plan_refuses_what_it_cannot_mean(cli, run, tmp_path):
+    sc.paper_start().save(tmp_path / "camera.toml")
+    for wrong, word in (
+        (("--after", "run", "--check", 10), "--check"),
+        (("--max-mag", 30), "ends at G = 10"),
+        (("--sigma", 300), "px per axis"),
+    ):
+        status, _, err = cli("plan", "camera.toml", "--frames", 30, *wrong)
+        assert status == 2
+        assert word in err
+    status, _, err = cli("propagate", "run", "--attitudes", "random", "--max-mag", 99)
+    assert status == 2
+    assert "ends at G = 10" in err
+    # What was asked for is in the document.
+    options = ("--frames", 30, "--target-arcsec", 1e-9, "--choose", 3, "--check", 10, "--json")
+    status, out, _ = cli("plan", "camera.toml", *options)
+    document = json.loads(out)
+    assert status == 1
+    assert len(document["choice"]["frames"]) == 3
+    assert document["check"]["table"]
+    assert "only the rest counts: more than ten million" in document["verdict"]
+
+
+def test_a_gap_in_a_profile_is_told(cli, run, tmp_path):
+    time = np.r_[np.arange(20.0), 5020.0 + np.arange(20.0)]
+    half = np.radians(0.01 * time) / 2
+    turn = {"time_s": time, "qx": np.sin(half), "qy": 0.0, "qz": 0.0, "qw": np.cos(half)}
+    pd.DataFrame(turn).to_csv(tmp_path / "gap.csv", index=False)
+    status, _, err = cli("propagate", "run", "--attitudes", "gap.csv", "--draws", 60)
+    assert status == 2
+    assert "the longest gap begins at 19 s" in err
+    status, _, err = cli("propagate", "run", "--attitudes", "gap.csv", "--rate", 0.1, "--draws", 60)
+    assert status == 0
+    assert "no attitude between 19 and 5020 s" in err
+
+
+def test_propagate_tells_what_it_found_odd(cli, run, tmp_path):
+    cli("budget", "run")
+    half = np.radians(np.arange(10.0)) / 2
+    pointings = {"time_s": np.arange(10.0), "qx": np.sin(half), "qy": 0.0, "qz": 0.0, "qw": 1.001 * np.cos(half)}
+    pd.DataFrame(pointings).to_csv(tmp_path / "ten.csv", index=False)
+    status, _, err = cli("propagate", "run", "--attitudes", "ten.csv", "--draws", 60)
+    assert status == 0
+    assert "normalised" in err
+    assert "too few for a spectrum" in err
+    assert "the budget rested on the numbers of before" in err
+    assert not (run / "error_spectrum.npz").exists()
+    status, _, err = cli("propagate", "run", "--rate", 2)
+    assert status == 2
+    assert "belong to an attitude profile" in err

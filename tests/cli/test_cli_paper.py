@@ -1,0 +1,81 @@
+"""`reproduce` and `filter` at the command line; fixtures as in the tests of the other commands."""
+
+from __future__ import annotations
+
+import json
+
+import pandas as pd
+import pytest
+
+
+def test_reproduce_writes_a_report_and_tables(cli, tmp_path):
+    size = ("--replicates", 8, "--frames", 20, "--no-study", "--workers", 1)
+    status, out, _ = cli("reproduce", "-o", "paper", *size, "--json")
+
+    assert status == 0
+    document = json.loads(out)
+    assert "The proposed method" in document["verdict"]
+    assert len(document["published"]) == len(pd.read_csv(tmp_path / "paper" / "published.csv"))
+    assert (tmp_path / "paper" / "reproduction.html").exists()
+
+    status, _, err = cli("reproduce", "-o", "paper", *size)
+    assert status == 2
+    assert "exists and is not empty" in err
+
+
+def test_reproduce_refuses_nonsense(cli, tmp_path):
+    for wrong in (("--convention", "eq9"), ("--replicates", 2), ("--frames", 3)):
+        status, _, err = cli("reproduce", "-o", "paper", *wrong)
+        assert status == 2
+        assert wrong[0].lstrip("-") in err
+    assert not (tmp_path / "paper").exists()
+
+
+@pytest.mark.slow
+def test_reproduce_field_writes_a_page_and_tables(cli, tmp_path):
+    size = ("--replicates", 20, "--frames", 20, "--workers", 1)
+    status, out, _ = cli("reproduce-field", "-o", "field", *size)
+    assert status == 0
+    assert "after alignment" in out
+    assert len(pd.read_csv(tmp_path / "field" / "table_3.csv")) == 16
+    assert (tmp_path / "field" / "field.html").exists()
+    status, _, err = cli("reproduce-field", "-o", "field", *size)
+    assert status == 2
+    assert "exists and is not empty" in err
+
+
+def test_reproduce_field_refuses_nonsense(cli, tmp_path):
+    for wrong in (("--reading", "half"), ("--replicates", 2), ("--frames", 3)):
+        status, _, err = cli("reproduce-field", "-o", "field", *wrong)
+        assert status == 2
+        assert wrong[0].lstrip("-") in err
+    assert not (tmp_path / "field").exists()
+
+
+def test_filter_then_sample(cli, inputs, tmp_path):
+    status, out, _ = cli("simulate", inputs / "camera.toml", "-o", "obs.parquet", "--frames", 30, "--seed", 5)
+    assert status == 0
+    status, out, _ = cli("filter", "obs.parquet", inputs / "camera.toml", "-o", "run")
+    assert status == 0
+    assert "history.csv" in out
+    assert len(pd.read_csv(tmp_path / "run" / "history.csv")) == 31
+    status, out, _ = cli("sample", "run", "--steps", 40, "--json")
+    assert status in (0, 1)
+    assert [row["parameter"] for row in json.loads(out)["parameters"]][:3] == ["x0", "y0", "f"]
+    status, _, err = cli("propagate", "run")
+    assert status == 2
+    assert "holds no observations" in err
+
+
+def test_filter_names_what_is_wrong(cli, inputs, tmp_path):
+    cli("simulate", inputs / "camera.toml", "-o", "obs.parquet", "--frames", 5)
+    for options, words in (
+        (("--method", "kalman"), "samaan, griffith"),
+        (("--forgetting", 1.5), "forgetting"),
+        (("--method", "samaan", "--process-noise", 0.1), "noise"),
+        (("--pair-covariance", "none"), "full, diagonal"),
+    ):
+        status, _, err = cli("filter", "obs.parquet", inputs / "camera.toml", "-o", "run", *options)
+        assert status == 2, err
+        assert words in err
+    assert not (tmp_path / "run").exists()

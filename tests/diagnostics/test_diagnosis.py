@@ -1,0 +1,277 @@
+"""Jackknife, comparison of models, replicated data and other starts; each with a case that must turn out otherwise."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from scipy import stats
+
+import starcal_uq as sc
+from starcal_uq.diagnostics.diagnose import FILE, TABLES, Diagnosis, diagnose, multi_start
+from starcal_uq.diagnostics.jackknife import Jackknife, accept_inflation, jackknife_frames
+from starcal_uq.diagnostics.models import ModelComparison, closed_form, compare_models
+from starcal_uq.diagnostics.predictive import PredictiveCheck, predictive_check
+from starcal_uq.estimation.normals import FrameNormals
+from starcal_uq.runs.steps import diagnose_run, load_diagnosis
+from tests.helpers.scenes import camera, nominal, observations, with_sigmas
+
+
+@pytest.fixture(scope="module")
+def obs():
+    return observations(n_frames=60)
+
+
+@pytest.fixture(scope="module")
+def cal(obs):
+    return sc.calibrate(obs, sc.paper_start())
+
+
+def clustered(obs, seed=0):
+    """Every frame with an error of its own in scale and shape, which independent noise does not have."""
+    rng = np.random.default_rng(seed)
+    offset = obs.xy - camera().theta[:2]
+    stretch = np.repeat(3e-4 * rng.standard_normal((obs.n_frames, 3)), obs.stars_per_frame, axis=0)
+    quadratic = 0.4 * (offset / 512.0) ** 2 * stretch[:, 1:] * 512.0
+    shift = offset * stretch[:, :1] + quadratic
+    return dataclasses.replace(obs, x_px=obs.x_px + shift[:, 0], y_px=obs.y_px + shift[:, 1])
+
+
+# --- jackknife -------------------------------------------------------------------------------------------------------
+
+
+def test_one_step_equals_refitting_without_a_frame(obs, cal):
+    found = jackknife_frames(obs, cal)
+    for k in (0, 17, 41, 59):
+        rest = obs.select(obs.frame != obs.frame_ids[k])
+        refit = sc.calibrate(rest, sc.paper_start())
+        assert np.max(np.abs(found.left_out[k] - refit.theta) / cal.sigmas) < 0.02, k
+    # The control: leaving a frame out moves the estimate by much more than that.
+    assert np.sqrt(np.mean(((found.left_out - cal.theta) / cal.sigmas) ** 2)) > 0.05
+
+
+def test_one_step_equals_refitting_with_stated_noise_and_few_frames():
+    obs = with_sigmas(observations(n_frames=60, sigma_px=0.0)).select_frames(range(12))
+    cal = sc.calibrate(obs, sc.paper_start())
+    found = jackknife_frames(obs, cal)
+    refits = [sc.calibrate(obs.select(obs.frame != k), sc.paper_start()).theta for k in obs.frame_ids]
+    scatter = np.array(refits) - np.mean(refits, axis=0)
+    exact = np.sqrt(np.sum(scatter**2, axis=0) * 11 / 12)
+    assert np.sqrt(np.diag(found.jackknife_covariance)) == pytest.approx(exact, rel=0.05)
+
+
+def test_formal_errors_are_those_of_the_calibration(obs, cal):
+    found = jackknife_frames(obs, cal)
+    assert np.sqrt(np.diag(found.formal_covariance)) == pytest.approx(cal.sigmas, rel=1e-3)
+
+
+def test_jackknife_p_values_are_nominal_and_clusters_are_found():
+    stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
+    p, wrong, ratios = [], [], []
+    for i in range(60):
+        one = sc.simulate(stars, camera(), n_frames=30, min_stars=10, sigma_px=0.05, seed=300 + i)
+        p.append(jackknife_frames(one, sc.calibrate(one, sc.paper_start())).p_values)
+        if i < 10:
+            found = jackknife_frames(bad := clustered(one, i), sc.calibrate(bad, sc.paper_start()))
+            wrong.append(found.p_values.min())
+            ratios.append(found.ratio[2])
+    p = np.array(p)
+    n = len(p)
+    assert np.all(np.abs(np.mean(p < 0.05, axis=0) - 0.05) < 4.0 * np.sqrt(0.05 * 0.95 / n))
+    assert all(stats.kstest(column, "uniform").pvalue > 1e-3 for column in p.T)
+    assert np.mean(np.array(wrong) < 0.01) > 0.7
+    assert np.mean(ratios) > 1.3
+
+
+@pytest.mark.slow
+def test_accepted_inflation_covers_what_formal_errors_do_not():
+    """Truth within the interval: formal errors fail for frames with errors of their own, inflated ones do not."""
+    stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
+    formal, inflated = [], []
+    for i in range(60):
+        one = sc.simulate(stars, camera(), n_frames=40, min_stars=10, sigma_px=0.05, seed=900 + i)
+        bad = clustered(one, i)
+        cal = sc.calibrate(bad, sc.paper_start())
+        accepted = accept_inflation(cal, jackknife_frames(bad, cal))
+        error = np.abs(cal.theta - camera().theta)
+        formal.append((error < 1.96 * cal.sigmas)[2])
+        inflated.append((error < 1.96 * accepted.sigmas)[2])
+    assert np.mean(formal) < 0.85
+    assert np.mean(inflated) > 0.86
+    assert np.mean(inflated) > np.mean(formal)
+
+
+def test_accepting_inflation_is_on_record_and_never_shrinks(obs, cal):
+    found = jackknife_frames(obs, cal)
+    accepted = accept_inflation(cal, found)
+    assert np.all(accepted.sigmas >= cal.sigmas * (1.0 - 1e-12))
+    assert accepted.correlation == pytest.approx(cal.correlation)
+    assert set(accepted.provenance["settings"]["inflation"]) == set(cal.parameter_names)
+    assert np.all(np.linalg.eigvalsh(found.inflated_covariance / np.outer(cal.sigmas, cal.sigmas)) > 0.0)
+    other = sc.calibrate(obs, nominal(camera("k1")))
+    with pytest.raises(sc.CalibrationError, match="same run"):
+        accept_inflation(other, found)
+    with pytest.raises(sc.CalibrationError, match="three or more"):
+        two = obs.select_frames(obs.frame_ids[:2])
+        jackknife_frames(two, sc.calibrate(two, sc.paper_start()))
+
+
+# --- comparison of models --------------------------------------------------------------------------------------------
+
+
+def test_importance_sampling_and_the_closed_form_agree(obs, cal):
+    found = compare_models(obs, cal, ("k1", "brown"))
+    for score in found.scores:
+        assert score.elpd == pytest.approx(score.closed_form, abs=0.5)
+        assert score.max_khat < 0.7 and score.n_replaced == 0
+        assert 2.0 < score.effective_parameters < 25.0
+
+
+def test_closed_form_is_the_ratio_of_evidences(obs, cal):
+    """p(y_k | others) = p(y) / p(others): evidences of the linear model, computed without any of its formulas."""
+    from scipy.special import gammaln
+
+    normals = FrameNormals.at(obs.select_frames(range(12)), cal)
+
+    def log_evidence(kept):
+        matrix, slope = normals.matrices[kept].sum(axis=0), normals.slopes[kept].sum(axis=0)
+        rss = normals.squares[kept].sum() - slope @ np.linalg.solve(matrix, slope)
+        half = 0.5 * (normals.dof[kept].sum() - len(slope))
+        volume = -0.5 * np.linalg.slogdet(matrix)[1] - 0.5 * normals.log_determinant[kept].sum()
+        return gammaln(half) - half * np.log(np.pi * rss) + volume
+
+    everything = np.ones(12, dtype=bool)
+    for k in range(12):
+        expected = log_evidence(everything) - log_evidence(np.arange(12) != k)
+        assert closed_form(normals)[k] == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_right_model_wins_and_richer_ones_are_not_rejected():
+    obs = observations("brown", n_frames=200)
+    found = compare_models(obs, sc.calibrate(obs, sc.paper_start()))
+    outcome = {score.model: score.rejected for score in found.scores}
+    assert outcome["none"] and outcome["k1"]
+    assert not any(outcome[m] for m in ("brown", "brown3", "brown_tangential"))
+    assert found.simplest.model == "brown"
+    assert found.failed == {}
+    poor = compare_models(obs, sc.calibrate(obs, nominal(camera("k1"))), ("k1", "brown"))
+    assert poor.of("k1").rejected
+    assert "use 'brown'" in poor.statement
+
+
+def test_a_superfluous_term_is_called_so_and_the_shift_is_stated():
+    obs = observations("k1", n_frames=60)
+    found = compare_models(obs, sc.calibrate(obs, nominal(camera("brown"))))
+    assert found.simplest.model == "k1"
+    assert found.statement.startswith("k2 is not needed")
+    assert "in common and" in found.statement
+    mine = found.of("brown")
+    assert np.hypot(*mine.common_arcsec[:2]) < 1e-3
+    # A principal point that moves by a pixel turns every attitude by the angle of a pixel.
+    other = found.of("brown_tangential")
+    fit = sc.calibrate(obs, nominal(camera("brown_tangential")))
+    base = sc.calibrate(obs, nominal(camera("brown")))
+    moved = np.hypot(*(fit.theta[:2] - base.theta[:2])) / base.theta[2] * 206_265.0
+    assert np.hypot(*other.common_arcsec[:2]) == pytest.approx(moved, rel=0.05)
+
+
+# --- replicated data, other starts, the whole -------------------------------------------------------------------------
+
+
+def test_replicates_look_like_data_of_the_model_and_unlike_others(obs, cal):
+    good = predictive_check(obs, cal, n_draws=200)
+    assert not any(s.extreme for s in good.statistics)
+    residuals = np.random.default_rng(1).standard_t(3, (2, obs.n_stars)) * 0.05
+    tails = dataclasses.replace(obs, x_px=obs.x_px + residuals[0], y_px=obs.y_px + residuals[1])
+    bad = predictive_check(tails, sc.calibrate(tails, sc.paper_start()), n_draws=300)
+    assert {s.name for s in bad.statistics if s.extreme} >= {"excess kurtosis"}
+    truth = camera("brown3").replace(coefficients=(2e-10, -3.5e-15, 8.0 / camera().corner_radius_px ** 7))
+    stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
+    bent = sc.simulate(stars, truth, n_frames=300, min_stars=10, sigma_px=0.05, seed=1)
+    ring = predictive_check(bent, sc.calibrate(bent, sc.paper_start()), n_draws=200)
+    assert ring.statistics[3].name.startswith("radial pattern") and ring.statistics[3].p_value < 0.05
+
+
+def test_replicates_use_the_posterior(obs, cal):
+    post = sc.sample(obs, cal, seed=1, n_steps=50)
+    assert not any(s.extreme for s in predictive_check(obs, cal, post, n_draws=100).statistics)
+    # The control: a posterior with noise that is too small cannot have made these data.
+    draws = post.draws.copy()
+    draws[:, -1] *= 0.8
+    small = predictive_check(obs, cal, dataclasses.replace(post, draws=draws), n_draws=100)
+    assert small.statistics[0].extreme
+
+
+def test_other_starts_find_the_same_optimum_or_say_so(obs, cal):
+    found = multi_start(obs, cal, 3, seed=1)
+    assert (found.same, found.better, found.failed) == (3, 0, 0)
+    assert found.largest_sigma < 0.01
+    # The control: an estimate that is not the optimum.
+    wrong = dataclasses.replace(cal, theta=cal.theta + 3 * cal.sigmas, chi2=cal.chi2 * 1.01)
+    assert multi_start(obs, wrong, 2, seed=1).better == 2
+
+
+def test_diagnosis_of_a_run_is_stored_and_belongs_to_its_calibration(obs, cal, tmp_path):
+    run = sc.RunFolder(tmp_path / "run").create()
+    obs.save(run.observations)
+    cal.save(run.calibration)
+    assert load_diagnosis(run, cal) is None
+    steps = []
+    found = diagnose_run(run.path, models=("k1",), n_starts=1, progress=lambda done, total: steps.append((done, total)))
+    assert steps == [(i, 5) for i in range(1, 6)]
+    assert {path.name for path in run.path.iterdir()} >= {FILE, *TABLES.values()}
+    again = load_diagnosis(run, sc.Calibration.load(run.calibration))
+    assert json.dumps(again.to_dict()) == json.dumps(found.to_dict())
+    assert isinstance(again, Diagnosis) and isinstance(again.jackknife, Jackknife)
+    assert isinstance(again.comparison, ModelComparison) and isinstance(again.predictive, PredictiveCheck)
+    assert all(word in again._repr_html_() for word in ("Misfit", "Jackknife", "Models", "predictive"))
+    with (run.path / TABLES["comparison"]).open() as stream:
+        assert {row["model"] for row in csv.DictReader(stream)} == {"k1", "brown"}
+    # The control: the diagnosis of another estimate is not shown with this one.
+    assert load_diagnosis(run, dataclasses.replace(cal, theta=cal.theta + 1e-9)) is None
+    (run.path / FILE).write_text("{}")
+    with pytest.raises(sc.RunFolderError, match="diagnose"):
+        load_diagnosis(run, cal)
+    observations(n_frames=60, seed=4).save(run.observations, force=True)
+    with pytest.raises(sc.RunFolderError, match="other observations"):
+        diagnose_run(run.path)
+
+
+def test_two_frames_have_no_jackknife_but_a_diagnosis(obs):
+    few = obs.select_frames(obs.frame_ids[:2])
+    found = diagnose(few, sc.calibrate(few, sc.paper_start()), models=(), n_starts=0)
+    assert found.jackknife is None and found.comparison is None and found.starts is None
+
+
+# --- real stars ------------------------------------------------------------------------------------------------------
+
+
+def test_real_stars_need_no_k2_and_show_the_phase_of_the_pixels(real_data, capsys):
+    start = sc.Camera.load(real_data / "esa_tetra3_camera.toml")
+    path = real_data / "esa_tetra3_observations.csv"
+    columns = {"ra_deg": "ra_apparent_deg", "dec_deg": "dec_apparent_deg"}
+    obs = sc.load_observations(path, start, columns=columns).with_meta(directions="apparent")
+    with path.open() as stream:
+        snr = np.array([float(row["snr"]) for row in csv.DictReader(stream)])
+    obs = obs.select(snr >= 10)
+    cal = sc.calibrate(obs, start)
+    found = diagnose(obs, cal, n_starts=0)
+    with capsys.disabled():
+        print(f"\njackknife / formal sigma: {np.round(found.jackknife.ratio, 2)}")
+    assert found.jackknife.ratio.min() == pytest.approx(0.64, abs=0.03)
+    assert found.jackknife.ratio.max() == pytest.approx(1.37, abs=0.03)
+    low, high = found.jackknife.expected()
+    assert np.all((found.jackknife.ratio > low) & (found.jackknife.ratio < high))
+    assert found.comparison.simplest.model == "k1"
+    assert found.comparison.statement.startswith("k2 is not needed")
+    assert found.comparison.of("none").rejected
+    assert found.misfit.found()[0].name == "error with the pixel phase in x"
+    smooth = [t for t in found.misfit.tests if t.dof and not t.against.startswith("pixel phase")]
+    assert all(t.p_holm > 0.05 for t in smooth)
+    # The control: with neither refraction nor aberration in the directions, the shape of the field is wrong too.
+    raw = sc.load_observations(path, start)
+    wrong = diagnose(raw, sc.calibrate(raw, start), models=(), n_starts=0).misfit
+    assert next(t for t in wrong.tests if t.name == "scale and skew of the axes").p_holm < 1e-4

@@ -1,0 +1,425 @@
+"""Validation finds right uncertainties right and wrong ones wrong, the same for any number of workers."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.attitude.rotations import left_error
+from starcal_uq.camera.projection import unproject_theta
+from starcal_uq.core.errors import CatalogueError, PriorError, RunFolderError, SamplingError
+from starcal_uq.diagnostics.validation.replicates import ARCSEC, LOG_LIKELIHOOD, Study, run_replicate
+from starcal_uq.diagnostics.validation.result import Validation
+from starcal_uq.diagnostics.validation.validate import narrow_priors, validate, validate_study
+from starcal_uq.maths.ranks import (
+    binomial_interval,
+    counts_below,
+    evaluation_points,
+    uniformity_band,
+    uniformity_p_value,
+)
+from starcal_uq.presentation.figures.diagnostics import plot_validation
+from starcal_uq.presentation.figures.style import png_bytes
+from tests.helpers import validation_controls as controls
+from tests.helpers.scenes import camera, nominal
+
+# Starts are draws of the Laplace approximation, which is nearly the posterior here: little has to be forgotten.
+LIGHT = {"n_steps": 20, "n_burn": 10}
+QUANTITIES = ("x0", "y0", "f", "k1", "k2", "sigma", "log_likelihood", "pitch", "yaw", "roll")
+
+
+def study(model="brown", n_frames=12, seed=5, sigma_px=0.05, **options):
+    truth = camera(model)
+    start = nominal(truth)
+    return Study(truth, start, sc.Priors.default(start), "fixed", n_frames, 10, sigma_px, seed, **{**LIGHT, **options})
+
+
+@pytest.fixture(scope="module")
+def stars():
+    return sc.load_catalogue(max_mag=6.0)
+
+
+@pytest.fixture(scope="module")
+def good(stars):
+    return validate_study(study(), stars, 100, workers=0, settings={"n_frames": 12})
+
+
+# --- ranks ---
+
+
+def test_band_and_p_value_say_the_same_and_are_exact():
+    """Of 400 uniform samples, 5 % leave the 95 % band, which are those with p < 0.05."""
+    rng = np.random.default_rng(1)
+    n, n_values = 50, 64
+    _, lower, upper = uniformity_band(n, n_values)
+    outside, below = 0, 0
+    p_values = []
+    for _ in range(400):
+        ranks = rng.integers(0, n_values, n)
+        curve = counts_below(ranks, n_values) / n
+        left = bool(np.any((curve < lower) | (curve > upper)))
+        p_values.append(uniformity_p_value(ranks, n_values))
+        outside += left
+        below += p_values[-1] < 0.05
+        assert left == (p_values[-1] < 0.05)
+    assert below == outside
+    # Counts are discrete, so that the band holds at least 95 %; four standard errors of the simulation.
+    assert 0.015 < outside / 400 <= 0.05 + 4 * np.sqrt(0.05 * 0.95 / 400)
+    assert np.mean(p_values) == pytest.approx(0.5, abs=0.06)
+
+
+@pytest.mark.parametrize("n_values", [1280, 320, 1000, 7])
+def test_points_divide_the_ranks(n_values):
+    k = evaluation_points(n_values)
+    assert n_values % k == 0
+    assert 1 < k <= 128
+    assert counts_below(np.arange(n_values), n_values).tolist() == [i * n_values // k for i in range(1, k)]
+
+
+@pytest.mark.parametrize(
+    "transform", [lambda u: 0.5 + 0.8 * (u - 0.5), lambda u: u**1.2, lambda u: np.where(u < 0.5, u**1.5, u)]
+)
+def test_ranks_that_are_not_uniform_are_found(transform):
+    u = (np.arange(1000) + 0.5) / 1000
+    assert uniformity_p_value((u * 1280).astype(int), 1280) > 0.99
+    assert uniformity_p_value((transform(u) * 1280).astype(int), 1280) < 1e-3
+
+
+def test_binomial_interval():
+    # Clopper & Pearson's own example: 3 of 10 at 95 %.
+    assert binomial_interval(3, 10) == pytest.approx((0.0667, 0.6525), abs=1e-4)
+    assert binomial_interval(0, 10)[0] == 0.0
+    assert binomial_interval(10, 10)[1] == 1.0
+
+
+# --- one replicate ---
+
+
+def test_draws_are_those_that_users_get(stars):
+    """A replicate's moments agree with those of `sample` on its data, within what the number of draws leaves open."""
+    settings = study(n_frames=40, n_steps=200)
+    outcome = run_replicate(settings, stars, 3)
+    noise = np.random.SeedSequence(settings.seed, spawn_key=(3,)).spawn(3)[1]
+    obs = sc.simulate(
+        stars,
+        settings.camera,
+        n_frames=40,
+        min_stars=10,
+        sigma_px=0.05,
+        seed=int(noise.generate_state(1, np.uint64)[0]),
+    )
+    cal = sc.calibrate(obs, settings.nominal)
+    post = sc.sample(obs, cal, seed=1)
+    # 12,800 draws with an autocorrelation time near 2.4: 5300 independent ones.
+    difference = (outcome.error[:6] + outcome.truth - post.draws.mean(axis=0)) / post.sd
+    assert np.abs(difference).max() < 4 * np.sqrt(1 / 5300 + 1 / 20000)
+    np.testing.assert_allclose(outcome.sd[:6], post.sd, rtol=0.06)
+    quantiles = np.quantile(post.draws, [0.025, 0.975], axis=0)
+    clear = np.min(np.abs(quantiles - outcome.truth), axis=0) > 0.1 * post.sd
+    inside = (quantiles[0] <= outcome.truth) & (outcome.truth <= quantiles[1])
+    assert (outcome.covered[:6] == inside)[clear].all()
+    assert abs(outcome.compression_error) < 0.02
+
+
+def test_attitude_errors_are_what_quest_finds(stars):
+    """The common rotation, to first order, against QUEST at the estimate and at the truth."""
+    truth = camera()
+    obs = sc.simulate(stars, truth, n_frames=40, min_stars=10, sigma_px=0.05, seed=8)
+    cal = sc.calibrate(obs, nominal(truth))
+
+    def attitudes(theta):
+        b = unproject_theta("brown", theta, obs.xy)
+        return sc.quest(b, obs.directions_icrs, obs.frame_starts, covariance=False).quaternions
+
+    found = ARCSEC * left_error(attitudes(cal.theta), attitudes(truth.theta)).mean(axis=0)
+    linear = ARCSEC * cal.rotation_per_theta @ (cal.theta - truth.theta)
+    np.testing.assert_allclose(linear[:2], found[:2], rtol=1e-3)
+    # Roll is a few hundredths of an arcsec; QUEST weights directions, the calibration pixels.
+    np.testing.assert_allclose(linear[2], found[2], atol=0.01)
+
+
+# --- verdicts ---
+
+
+def test_right_uncertainties_pass(good):
+    """A hundred replicates; the bounds are those that chance leaves with that many."""
+    assert good.quantities == QUANTITIES
+    assert good.n_replicates == 100
+    assert good.failures == ()
+    assert good.ok, good.verdict
+    assert (np.abs(good.coverage - 0.95) < 4 * np.sqrt(0.95 * 0.05 / 100)).all()
+    assert abs(good.nees_ratio - 1.0) < 4 * np.sqrt(2 / 500)
+    assert abs(good.nees_calibration_ratio - good.nees_ratio) < 0.05
+    assert (good.rank_p_value > 1e-3).all()
+    assert np.abs(good.compression_error).max() < 0.05
+    assert "are right as far as" in good.verdict
+
+
+@pytest.mark.parametrize("model", ["none", "brown_tangential"])
+def test_other_models_pass_with_truths_from_the_prior(stars, model):
+    truth = camera(model)
+    # A tenth of the default: decentring of several px makes another minimum, in which a calibration can end.
+    priors = narrow_priors(truth, 0.05).replace(distortion_corner_px=0.1)
+    settings = dataclasses.replace(study(model, n_frames=20), truth="prior", priors=priors)
+    found = validate_study(settings, stars, 40, workers=0)
+    assert found.quantities[:3] == ("x0", "y0", "f")
+    assert len(found.quantities) == 3 + len(truth.coefficients) + 5
+    assert not any(f.rejected for f in found.findings), found.verdict
+    # The truths are what the priors say.
+    expected = found.priors
+    z = (found.truth[:, :-1] - expected.mean(expected.names[:-1])) / expected.sd(expected.names[:-1])
+    assert np.abs(z.mean(axis=0)).max() < 4 / np.sqrt(40)
+    assert np.log(found.truth[:, -1] / 0.05).std() == pytest.approx(0.2, rel=0.45)
+
+
+def test_attitudes_forgotten_in_the_degrees_of_freedom_are_found(stars):
+    found = validate_study(study(likelihood=controls.forgets_attitudes), stars, 50, workers=0)
+    assert not found.ok
+    at = found.quantities.index("sigma")
+    assert found.rank_p_value[at] < 1e-5
+    assert found.z[:, at].mean() < -1.0
+    assert "Estimates of sigma are too low" in found.verdict
+
+
+def test_pairs_taken_as_independent_are_found(stars):
+    found = validate_study(study(likelihood="pairs_naive"), stars, 25, workers=0)
+    assert not found.ok
+    assert found.coverage[0] < 0.8
+    assert found.nees_ratio > 5.0
+    assert found.nees_p_value < 1e-6
+    assert "too narrow" in found.verdict
+
+
+def test_pairs_with_their_curvature_put_right_pass(stars):
+    found = validate_study(study(likelihood="pairs", n_frames=20), stars, 40, workers=0)
+    assert not any(f.rejected for f in found.findings), found.verdict
+    assert np.isnan(found.compression_error).all()
+
+
+def test_noise_understated_by_a_tenth_is_found(stars):
+    found = validate_study(study(assumed_sigma_px=0.045), stars, 120, workers=0)
+    assert "sigma" not in found.quantities
+    assert not found.ok
+    assert found.nees_p_value < 1e-3
+    assert "too narrow" in found.verdict
+
+
+def test_the_right_noise_given_passes(stars):
+    found = validate_study(study(assumed_sigma_px=0.05), stars, 40, workers=0)
+    assert not any(f.rejected for f in found.findings), found.verdict
+
+
+def test_few_replicates_are_no_verdict(stars):
+    found = validate_study(study(), stars, 8, workers=0)
+    assert not found.ok
+    assert "Too few replicates" in found.verdict
+
+
+def test_failed_replicates_are_counted_and_explained(good):
+    reasons = ("the calibration did not end well (SINGULAR): add frames.",) * 2 + ("another reason.",)
+    found = dataclasses.replace(good, failures=reasons)
+    assert not found.ok
+    assert "3 of 103 replicates gave no result, 2 of them because the calibration did not end well" in found.verdict
+
+
+def test_when_nothing_works_the_reason_is_given(stars, monkeypatch):
+    def fail(*_):
+        raise sc.CalibrationError("the stars do not suffice: add some.")
+
+    monkeypatch.setattr("starcal_uq.diagnostics.validation.replicates.calibrate", fail)
+    with pytest.raises(sc.CalibrationError, match="no replicate gave a result; the commonest reason: the stars do not"):
+        validate_study(study(), stars, 3, workers=0)
+
+
+def test_some_failures_leave_the_other_replicates(stars, monkeypatch):
+    calls = []
+
+    def fail_once(*arguments):
+        calls.append(0)
+        if len(calls) == 2:
+            raise sc.CalibrationError("the stars do not suffice: add some.")
+        return sc.calibrate(*arguments)
+
+    monkeypatch.setattr("starcal_uq.diagnostics.validation.replicates.calibrate", fail_once)
+    found = validate_study(study(), stars, 4, workers=0)
+    assert found.replicate.tolist() == [0, 2, 3]
+    assert found.failures == ("the stars do not suffice: add some.",)
+
+
+# --- workers, interrupts ---
+
+
+def _same(a, b):
+    for name in ("replicate", "truth", "ranks", "covered", "error", "sd", "nees", "compression_error"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+
+
+def test_workers_do_not_change_a_bit_and_progress_is_told(stars):
+    settings, calls = study(seed=11), []
+    alone = validate_study(settings, stars, 20, workers=0)
+    both = validate_study(settings, stars, 20, workers=2, progress=lambda done, total: calls.append((done, total)))
+    _same(alone, both)
+    _same(alone, validate_study(settings, stars, 20, workers=1))
+    assert calls[-1] == (20, 20)
+    assert [done for done, _ in calls] == sorted(done for done, _ in calls)
+    # A longer run begins with the shorter one.
+    np.testing.assert_array_equal(validate_study(settings, stars, 4, workers=0).ranks, alone.ranks[:4])
+    assert not np.array_equal(validate_study(study(seed=12), stars, 4, workers=0).ranks, alone.ranks[:4])
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_interrupt_keeps_what_is_done(stars, workers):
+    settings = study(seed=11)
+
+    def press(done, total):
+        if done >= 8:
+            signal.raise_signal(signal.SIGINT)
+
+    found = validate_study(settings, stars, 200, workers=workers, progress=press)
+    assert found.interrupted
+    assert 8 <= found.n_replicates < 200
+    assert f"interrupted after {found.n_replicates} of 200" in found.verdict
+    np.testing.assert_array_equal(found.ranks[0], validate_study(settings, stars, 1, workers=0).ranks[0])
+
+
+def test_interrupt_before_the_first_result_is_an_interrupt(stars, monkeypatch):
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("starcal_uq.diagnostics.validation.validate.run_replicate", stop)
+    with pytest.raises(KeyboardInterrupt):
+        validate_study(study(), stars, 3, workers=0)
+
+
+def test_a_local_function_cannot_go_to_workers(stars):
+    with pytest.raises(SamplingError, match="top level, or use workers=0"):
+        validate_study(study(likelihood=lambda obs, cal: cal.compressed), stars, 20, workers=2)
+
+
+def test_a_script_without_a_guard_ends_with_the_remedy(tmp_path, root):
+    """The processes import the script, which starts processes; without care both wait for each other forever."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import starcal_uq as sc\n"
+        "from starcal_uq.diagnostics.validation.validate import validate\n"
+        "validate(sc.paper_camera(), n_replicates=20, n_frames=8, workers=2)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    done = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, timeout=120, check=False, env=environment
+    )
+    assert done.returncode == 1
+    assert 'call validate below `if __name__ == "__main__":`' in done.stderr
+
+
+# --- surface ---
+
+
+def test_validate_from_the_camera_alone():
+    found = validate(sc.paper_camera(), n_replicates=2, n_frames=12, workers=0, seed=3)
+    assert found.nominal.coefficients == (0.0, 0.0)
+    assert (found.nominal.x0_px, found.nominal.y0_px) == (511.5, 511.5)
+    assert found.provenance["seed"] == 3
+    assert found.provenance["settings"]["n_frames"] == 12
+    np.testing.assert_array_equal(found.truth[:, :-1], np.tile(sc.paper_camera().theta, (2, 1)))
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"truth": "posterior"}, "truth 'posterior' is unknown"),
+        ({"n_replicates": 0}, "n_replicates is 0"),
+        ({"n_frames": 0}, "n_frames is 0"),
+        ({"min_stars": 2}, "min_stars is 2"),
+        ({"sigma_px": 0.0}, "sigma_px is 0"),
+        ({"sigma_px": float("nan")}, "sigma_px is nan"),
+        ({"workers": -1}, "workers is -1"),
+        ({"likelihood": "student_t"}, "'student_t' cannot be validated"),
+        ({"assumed_sigma_px": -1.0}, "assumed_sigma_px is -1"),
+    ],
+)
+def test_bad_settings_are_one_sentence(options, words):
+    with pytest.raises(SamplingError, match=words):
+        validate(sc.paper_camera(), **options)
+
+
+def test_priors_of_another_model_are_refused():
+    with pytest.raises(PriorError, match="make them with"):
+        validate(sc.paper_camera(), priors=sc.Priors.default(camera("none")))
+
+
+def test_a_field_without_stars_says_so():
+    narrow = sc.paper_camera().replace(focal_mm=2000.0)
+    with pytest.raises(CatalogueError, match="raise max_mag"):
+        validate(narrow, n_replicates=1, n_frames=5, max_mag=2.0, workers=0)
+
+
+def test_priors_that_make_no_camera_say_so(stars):
+    priors = narrow_priors(camera(), 0.05).replace(principal_point_centre_px=(-5000.0, 0.0))
+    with pytest.raises(PriorError, match="narrow the prior"):
+        validate_study(dataclasses.replace(study(), truth="prior", priors=priors), stars, 1, workers=0)
+
+
+def test_save_and_load_lose_nothing(good, tmp_path):
+    path = tmp_path / "validation.npz"
+    found = dataclasses.replace(good, failures=("a reason.",))
+    found.save(path)
+    again = Validation.load(path)
+    for field in dataclasses.fields(Validation):
+        before, after = getattr(found, field.name), getattr(again, field.name)
+        if isinstance(before, np.ndarray):
+            np.testing.assert_array_equal(before, after)
+            assert before.dtype == after.dtype
+        elif field.name == "provenance":
+            assert json.dumps(before) == json.dumps(after)
+        else:
+            assert before == after
+    assert again.verdict == found.verdict
+
+
+@pytest.mark.parametrize("content", [b"", b"no archive", None])
+def test_a_file_that_is_no_validation(tmp_path, content):
+    path = tmp_path / "validation.npz"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(RunFolderError, match="starcal-uq validate CAMERA"):
+        Validation.load(path)
+
+
+def test_table_and_html(good):
+    table = good.to_dataframe()
+    assert table["quantity"].tolist() == list(QUANTITIES)
+    assert table["unit"].tolist()[-3:] == ["arcsec"] * 3
+    assert (table["coverage_low"] <= table["coverage_95"]).all()
+    assert (table["coverage_95"] <= table["coverage_high"]).all()
+    assert table["posterior_sd"][0] == pytest.approx(np.median(good.sd[:, 0]))
+    html = good._repr_html_()
+    assert "are right as far as" in html
+    assert html.count("<tr") == len(QUANTITIES) + 1
+
+
+def test_figure_shows_curves_bands_and_coverage(good):
+    figure = plot_validation(good)
+    assert png_bytes(figure, dpi=50).startswith(b"\x89PNG")
+    panels = [ax for ax in figure.axes if ax.axison]
+    assert len(panels) == len(QUANTITIES) + 2
+    curve = panels[0].lines[1].get_ydata()
+    expected = counts_below(good.ranks[:, 0], good.n_ranked + 1) / 100 - np.arange(1, 128) / 128
+    np.testing.assert_allclose(curve[1:-1], expected)
+    assert panels[-1].get_title(loc="left").startswith("NEES/5")
+
+
+def test_log_likelihood_is_one_of_the_quantities(good):
+    """The joint log likelihood lies half a chi-square of p + 1 below its maximum, at the truth as at draws."""
+    at = QUANTITIES.index(LOG_LIKELIHOOD)
+    assert good.units[at] == "nat"
+    assert good.sd[:, at].mean() == pytest.approx(np.sqrt(6 / 2), rel=0.05)
+    assert abs(good.error[:, at].mean()) < 4 * np.sqrt(6 / 2 / 100)

@@ -1,0 +1,323 @@
+"""Every check of the verdict, turned to its other outcome; the test for patterns against its nominal false alarms."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.core.status import Level, Question
+from starcal_uq.diagnostics.diagnose import diagnose
+from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals, residual_scale
+from starcal_uq.diagnostics.verdict import limits
+from starcal_uq.diagnostics.verdict.draws import propagation_difference
+from starcal_uq.diagnostics.verdict.judge import judge
+from starcal_uq.presentation.report.tables import mean_to_mcse
+from tests.helpers.scenes import camera, observations, with_sigmas
+
+
+@pytest.fixture(scope="module")
+def run():
+    obs = observations(n_frames=120)
+    cal = sc.calibrate(obs, sc.paper_start())
+    return SimpleNamespace(obs=obs, cal=cal, post=sc.sample(obs, cal, seed=1, n_steps=100), truth=camera())
+
+
+def outcome(name: str, obs, cal, post=None, truth=None):
+    return next(check for check in judge(obs, cal, post, truth).checks if check.name == name)
+
+
+def with_diagnostics(post, **changes):
+    return dataclasses.replace(post, diagnostics=dataclasses.replace(post.diagnostics, **changes))
+
+
+def test_a_good_run_passes_every_check(run):
+    verdict = judge(run.obs, run.cal, run.post, run.truth)
+    assert verdict.level is Level.PASS, verdict.at(Level.FAIL) + verdict.at(Level.WARN)
+    assert len(verdict.checks) == 18
+    assert {check.question for check in verdict.checks} == set(Question)
+    assert all(check.sentence.endswith(".") and check.value and check.threshold for check in verdict.checks)
+    assert "every check passed" in verdict.headline
+
+
+def test_without_posterior_the_headline_says_so(run):
+    verdict = judge(run.obs, run.cal)
+    assert verdict.level is Level.PASS
+    assert "not been sampled" in verdict.headline
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("R-hat", {"rhat": np.full(6, 1.02)}),
+        ("Effective draws", {"ess_tail": np.full(6, 300.0)}),
+        ("Acceptance", {"acceptance": np.array([0.6, 0.6, 0.6, 0.02])}),
+        ("Independent posterior", {"psis_khat": 0.9}),
+        ("Independent posterior", {"agreement_sd": 0.5}),
+        ("Likelihood", {"compressed_max_difference": 3.0}),
+        ("Kind of likelihood", {"likelihood": "pairs_naive"}),
+    ],
+)
+def test_bad_sampling_fails(run, name, changes):
+    post = with_diagnostics(run.post, **changes)
+    assert outcome(name, run.obs, run.cal, post).level is Level.FAIL
+    verdict = judge(run.obs, run.cal, post)
+    assert verdict.level is Level.FAIL
+    assert verdict.headline.startswith("Do not use")
+
+
+def with_draws(post, change):
+    draws = post.draws.copy()
+    change(draws)
+    # A new object: means and standard deviations are remembered.
+    return dataclasses.replace(post, draws=draws)
+
+
+def test_derived_quantities_have_diagnostics_of_their_own(run):
+    """The rotation that the first ensemble implies is another one, although no diagnostic of a parameter says so."""
+    quarter = len(run.post.draws) // run.post.n_ensembles
+
+    def shift(draws):
+        draws[:quarter, 0] += 0.5 * run.post.sd[0]
+
+    check = outcome("Derived quantities", run.obs, run.cal, with_draws(run.post, shift))
+    assert check.level is Level.FAIL
+    assert "Common rotation, yaw" in check.sentence
+    assert outcome("R-hat", run.obs, run.cal, with_draws(run.post, shift)).level is Level.PASS
+
+
+def test_draws_off_the_detector_or_folded_fail(run):
+    def push(draws):
+        draws[: len(draws) // 100, 0] += 600.0
+
+    def fold(draws):
+        draws[:, 3] = -2e-6
+
+    check = outcome("Bounds", run.obs, run.cal, with_draws(run.post, push))
+    assert check.level is Level.FAIL and "off the detector" in check.sentence
+    check = outcome("Bounds", run.obs, run.cal, with_draws(run.post, fold))
+    assert check.level is Level.FAIL and "folds" in check.sentence
+    assert outcome("Bounds", run.obs, run.cal, run.post).level is Level.PASS
+
+
+def test_digits_that_monte_carlo_error_reaches_warn(run):
+    check = outcome("Digits", run.obs, run.cal, with_diagnostics(run.post, mcse=0.2 * run.post.sd))
+    assert check.level is Level.WARN
+    assert mean_to_mcse(12.34567, 0.012) == "12.3"
+    assert mean_to_mcse(12.34567, 0.0008) == "12.346"
+
+
+def test_a_posterior_of_other_data_fails(run):
+    other = dataclasses.replace(run.post, provenance={**run.post.provenance, "data_sha256": "0" * 64})
+    assert outcome("Data of the posterior", run.obs, run.cal, other).level is Level.FAIL
+
+
+@pytest.fixture(scope="module")
+def found(run):
+    return diagnose(run.obs, run.cal, models=("k1", "brown"), n_starts=2)
+
+
+class TestDiagnosis:
+    """Every check of the model, as it is and turned to its other outcome."""
+
+    def check(self, run, found, name):
+        verdict = judge(run.obs, run.cal, diagnosis=found)
+        return next(check for check in verdict.checks if check.name == name)
+
+    def test_all_pass_on_data_of_the_model(self, run, found):
+        verdict = judge(run.obs, run.cal, diagnosis=found)
+        assert verdict.level is Level.PASS, verdict.at(Level.WARN) + verdict.at(Level.FAIL)
+        names = {check.name for check in verdict.checks}
+        assert names >= {"Unexplained structure", "Jackknife over frames", "Distortion model", "Other starts"}
+        assert "Posterior predictive check" in names
+        assert all(check.sentence.endswith(".") and check.value and check.threshold for check in verdict.checks)
+        assert not any(s.startswith("The model") for s in limits(run.obs, run.cal, diagnosis=found))
+
+    def reject(self, found, start, p):
+        tests = tuple(
+            dataclasses.replace(t, p_value=p, p_holm=p, size_px=0.02 if t.dof else t.size_px)
+            if t.name.startswith(start)
+            else t
+            for t in found.misfit.tests
+        )
+        return dataclasses.replace(found, misfit=dataclasses.replace(found.misfit, tests=tests))
+
+    def test_structure_warns_or_fails_by_what_it_does(self, run, found):
+        weak = self.check(run, self.reject(found, "decentring", 0.01), "Unexplained structure")
+        strong = self.check(run, self.reject(found, "decentring", 1e-6), "Unexplained structure")
+        phase = self.check(run, self.reject(found, "error with the pixel phase in x", 1e-9), "Unexplained structure")
+        noise = self.check(run, self.reject(found, "noise that changes with mag", 1e-9), "Unexplained structure")
+        assert [c.level for c in (weak, strong, phase, noise)] == [Level.WARN, Level.FAIL, Level.WARN, Level.WARN]
+        assert "moves the parameters" in strong.sentence and "like more noise" in phase.sentence
+        assert "decentring" in strong.sentence
+
+    def test_frames_that_disagree_warn_with_the_factor(self, run, found):
+        scatter = dataclasses.replace(found.jackknife, jackknife_covariance=4.0 * found.jackknife.formal_covariance)
+        check = self.check(run, dataclasses.replace(found, jackknife=scatter), "Jackknife over frames")
+        assert check.level is Level.WARN
+        assert "up to 2.00" in check.sentence
+
+    def test_a_rejected_model_fails(self, run, found):
+        poor = dataclasses.replace(found, comparison=dataclasses.replace(found.comparison, fitted="k1"))
+        check = self.check(run, poor, "Distortion model")
+        assert check.level is Level.FAIL and "use 'brown'" in check.sentence
+
+    def test_replicates_and_starts(self, run, found):
+        odd = dataclasses.replace(found.predictive.statistics[1], p_value=0.0)
+        predictive = dataclasses.replace(found.predictive, statistics=(odd,))
+        check = self.check(run, dataclasses.replace(found, predictive=predictive), "Posterior predictive check")
+        assert check.level is Level.WARN and "largest residual" in check.sentence
+        for change, level in (({"better": 1, "same": 1}, Level.FAIL), ({"same": 1, "failed": 1}, Level.WARN)):
+            starts = dataclasses.replace(found.starts, **change)
+            assert self.check(run, dataclasses.replace(found, starts=starts), "Other starts").level is level
+
+    def test_a_model_that_moves_attitudes_is_a_limit(self, run, found):
+        scores = tuple(
+            dataclasses.replace(s, rejected=False, common_arcsec=(300.0, 0.0, 0.0)) if s.model == "k1" else s
+            for s in found.comparison.scores
+        )
+        moved = dataclasses.replace(found, comparison=dataclasses.replace(found.comparison, scores=scores))
+        sentence = limits(run.obs, run.cal, diagnosis=moved)[0]
+        assert "'k1' fits as well" in sentence and "300 arcsec" in sentence
+        bent = self.reject(found, "decentring", 1e-6)
+        assert "decentring" in limits(run.obs, run.cal, diagnosis=bent)[0]
+
+
+def test_an_unchecked_likelihood_warns(run):
+    post = with_diagnostics(run.post, compressed_max_difference=float("nan"))
+    assert outcome("Likelihood", run.obs, run.cal, post).level is Level.WARN
+
+
+def test_an_estimate_that_did_not_converge_fails_with_its_remedy(run):
+    cal = dataclasses.replace(run.cal, status=sc.Status.MAX_ITERATIONS)
+    check = outcome("Estimation", run.obs, cal)
+    assert check.level is Level.FAIL
+    assert sc.Status.MAX_ITERATIONS.remedy in check.sentence
+
+
+def test_estimators_that_disagree_fail(run):
+    shifted = run.cal.theta + 6.0 * np.sqrt(np.diag(run.cal.pair_covariance)) * np.array([0, 0, 1, 0, 0])
+    check = outcome("Two estimators", run.obs, dataclasses.replace(run.cal, pair_theta=shifted))
+    assert check.level is Level.FAIL
+    assert "(f)" in check.value
+
+
+@pytest.mark.parametrize("declared", ["undeclared", "catalogue"])
+def test_undeclared_directions_warn_with_the_size_of_the_effect(run, declared):
+    obs = dataclasses.replace(run.obs, meta={**run.obs.meta, "directions": declared})
+    check = outcome("Catalogue directions", obs, run.cal)
+    assert check.level is Level.WARN
+    assert ("Neither time nor observer velocity was declared" in check.sentence) == (declared == "undeclared")
+    # 20.5 arcsec of aberration times the field's diagonal of 0.246 rad.
+    assert "5.0 arcsec" in check.sentence
+
+
+def test_wrong_truth_fails(run):
+    wrong = run.truth.replace(focal_mm=run.truth.focal_mm * 1.001)
+    assert outcome("Known truth", run.obs, run.cal, run.post, wrong).level is Level.FAIL
+    assert outcome("Known truth", run.obs, run.cal, None, run.truth).level is Level.PASS
+
+
+def test_outliers_warn_and_are_located(run):
+    residuals = run.cal.residuals_px.copy()
+    residuals[[5, 400]] += 0.4
+    check = outcome("Outliers", run.obs, dataclasses.replace(run.cal, residuals_px=residuals))
+    assert check.level is Level.WARN
+    assert check.value.startswith("2 stars")
+    assert f"frame {run.obs.frame[5]}" in check.sentence or f"frame {run.obs.frame[400]}" in check.sentence
+
+
+@pytest.mark.parametrize(("sigma", "level"), [(0.05, Level.PASS), (2.0, Level.WARN), (0.0001, Level.WARN)])
+def test_noise_must_be_that_of_centroids(run, sigma, level):
+    cal = dataclasses.replace(run.cal, sigma=sigma)
+    assert outcome("Centroid noise per axis", run.obs, cal).level is level
+
+
+def test_few_frames_and_an_empty_corner_warn(run):
+    few = run.obs.select_frames(run.obs.frame_ids[:3])
+    cal = sc.calibrate(few, sc.paper_start())
+    assert outcome("Coverage of the field", few, cal).level is Level.WARN
+    half = np.asarray(run.obs.x_px < 600)
+    cal = dataclasses.replace(run.cal, residuals_px=run.cal.residuals_px[half])
+    check = outcome("Coverage of the field", run.obs.select(half), cal)
+    assert check.level is Level.WARN
+    assert "extrapolated" in check.sentence
+
+
+def test_a_tight_prior_is_named(run):
+    tight = run.post.priors.replace(focal_fraction=1e-5)
+    check = outcome("Influence of the priors", run.obs, run.cal, dataclasses.replace(run.post, priors=tight))
+    assert check.level is Level.WARN
+    assert check.value.endswith("(f)")
+    far = run.post.priors.replace(focal_px=run.post.priors.focal_px * 1.5)
+    check = outcome("Influence of the priors", run.obs, run.cal, dataclasses.replace(run.post, priors=far))
+    assert check.level is Level.WARN
+
+
+def test_a_pattern_in_the_residuals_is_found_and_sized(run):
+    """A displacement of 0.05 px across the field, which the fit did not see."""
+    pattern = 0.05 * np.stack([np.sin(run.obs.x_px / 200.0), np.cos(run.obs.y_px / 200.0)], axis=1)
+    cal = dataclasses.replace(run.cal, residuals_px=run.cal.residuals_px + pattern)
+    assert bin_residuals(cal, run.obs).pattern_px == pytest.approx(0.05 / np.sqrt(2.0), rel=0.15)
+    check = outcome("Pattern in the residuals", run.obs, cal)
+    assert check.level is Level.FAIL
+    assert "not in any interval" in check.sentence
+    assert limits(run.obs, cal)[0].startswith("The model")
+    weak = dataclasses.replace(run.cal, residuals_px=run.cal.residuals_px + 0.3 * pattern)
+    assert outcome("Pattern in the residuals", run.obs, weak).level is Level.WARN
+
+
+def test_the_pattern_test_raises_no_more_false_alarms_than_it_says(run):
+    """Residuals that are noise alone, 400 times: the share of p below 5 % is 5 % within its own error."""
+    rng = np.random.default_rng(5)
+    scale = residual_scale(run.cal, run.obs)[:, None]
+    p = [
+        bin_residuals(
+            dataclasses.replace(run.cal, residuals_px=scale * rng.standard_normal((run.obs.n_stars, 2))), run.obs
+        ).p_value
+        for _ in range(400)
+    ]
+    assert np.mean(np.array(p) < 0.05) == pytest.approx(0.05, abs=4.0 * np.sqrt(0.05 * 0.95 / 400))
+
+
+def test_binned_means_are_means_of_the_cells(run):
+    binned = bin_residuals(run.cal, run.obs)
+    assert binned.counts.sum() <= run.obs.n_stars
+    assert binned.counts.min() >= 5
+    k = 7
+    inside = np.all(np.abs(run.obs.xy - binned.centres[k]) <= binned.cell_px / 2.0, axis=1)
+    assert np.count_nonzero(inside) == binned.counts[k]
+    assert binned.means[k] == pytest.approx(run.cal.residuals_px[inside].mean(axis=0))
+
+
+def test_stated_noise_is_a_factor():
+    obs = with_sigmas(observations(n_frames=60))
+    cal = sc.calibrate(obs, sc.paper_start())
+    assert cal.sigma_name == "sigma_scale"
+    assert np.std(normalised_residuals(cal, obs)) == pytest.approx(1.0, abs=0.02)
+    verdict = judge(obs, cal)
+    assert "Factor on the stated noise" in [check.name for check in verdict.checks]
+
+
+def test_limits_name_the_largest_term_and_the_coupling(run):
+    error = SimpleNamespace(nea_arcsec=(0.5, 0.5, 7.0), common_arcsec=(5.4, 5.5, 0.1), rest_arcsec=(0.02, 0.02, 0.2))
+    sentences = limits(run.obs, run.cal, sc.coupling(run.post), error)
+    assert "common rotation (5.5 arcsec" in sentences[0]
+    assert "0.020 arcsec remains" in sentences[0]
+    assert "k1 trades against k2" in sentences[1] or "f trades against" in sentences[1]
+    error.common_arcsec = (0.1, 0.1, 0.1)
+    assert "centroid noise of a single frame dominates" in limits(run.obs, run.cal, attitude=error)[0]
+
+
+def test_propagation_that_departs_from_first_order_warns(run):
+    error = sc.propagate(run.post, run.obs, n_draws=200, seed=1)
+    verdict = judge(run.obs, run.cal, run.post, run.truth, error)
+    assert verdict.level is Level.PASS
+    assert verdict.checks[-2].name == "Propagation to attitude"
+    other = dataclasses.replace(error, analytic_rest_arcsec=error.analytic_rest_arcsec * 1.6)
+    check = judge(run.obs, run.cal, run.post, None, other).checks[-1]
+    assert check.level is Level.WARN
+    assert propagation_difference(other) == pytest.approx(0.375, abs=0.1)

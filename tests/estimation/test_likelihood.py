@@ -1,0 +1,129 @@
+"""The marginal likelihood, its information, and its compressed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from starcal_uq.attitude.rotations import exp_rotation
+from starcal_uq.camera.distortion import model_names
+from starcal_uq.camera.projection import project
+from starcal_uq.estimation.compressed import CompressedLikelihood, compress
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from tests.helpers.scenes import camera, observations, with_sigmas
+
+
+def _information_scale(matrix):
+    return 1.0 / np.sqrt(np.diag(matrix))
+
+
+def test_profile_is_the_least_squares_attitude_of_every_frame():
+    obs = with_sigmas(observations(n_frames=20))
+    likelihood = MarginalLikelihood(obs, "brown")
+    cam = camera()
+    state, cost = likelihood.profile(cam.theta)
+    total = 0.0
+    for k in range(obs.n_frames):
+        rows = slice(obs.frame_starts[k], obs.frame_starts[k + 1])
+        rotation = state.rotations[k]
+
+        def residual(phi, rows=rows, rotation=rotation):
+            b = obs.directions_icrs[rows] @ (exp_rotation(phi) @ rotation).T
+            return ((obs.xy[rows] - project(cam, b)) / obs.sigma_px[rows, None]).ravel()
+
+        solution = least_squares(residual, np.full(3, 1e-5), method="lm", x_scale=1e-6, xtol=1e-14, ftol=1e-14)
+        total += 2.0 * solution.cost
+        # Cross-boresight to 1e-9 rad; roll is weaker by the width of the field.
+        assert np.max(np.abs(solution.x)) < 1e-7
+    assert cost == pytest.approx(total, rel=1e-10)
+
+
+def test_information_is_the_schur_complement_of_the_attitudes():
+    obs = observations(n_frames=12)
+    likelihood = MarginalLikelihood(obs, "brown")
+    theta = camera().theta
+    state, _ = likelihood.profile(theta)
+    h = likelihood.derivatives(theta, state).reshape(5, -1).T
+    n, k = obs.n_stars, obs.n_frames
+    a = np.zeros((2, n, 3 * k))
+    for frame in range(k):
+        rows = slice(obs.frame_starts[frame], obs.frame_starts[frame + 1])
+        a[:, rows, 3 * frame : 3 * frame + 3] = state.attitude[:, :, rows].transpose(1, 2, 0)
+    a = a.reshape(2 * n, 3 * k)
+    schur = h.T @ h - h.T @ a @ np.linalg.solve(a.T @ a, a.T @ h)
+    scale = _information_scale(schur)
+    difference = (likelihood.evaluate(theta).matrix - schur) * np.outer(scale, scale)
+    assert np.max(np.abs(difference)) < 1e-8
+
+
+@pytest.mark.parametrize("model", model_names())
+def test_compressed_equals_exact_within_three_sigma(model):
+    obs = observations(model, n_frames=200, max_mag=6.5)
+    _compare(obs, model, 2e-3)
+
+
+@pytest.mark.parametrize("n_frames", [10, 60])
+def test_compressed_equals_exact_for_few_frames_and_stated_noise(n_frames):
+    _compare(observations(n_frames=n_frames), "brown", 0.1)
+    _compare(with_sigmas(observations(n_frames=n_frames)), "brown", 0.1)
+
+
+def _estimate(obs, model):
+    from starcal_uq.estimation.calibrate import calibrate
+    from tests.helpers.scenes import nominal
+
+    return calibrate(obs, nominal(camera(model)))
+
+
+def _compare(obs, model, bound):
+    cal = _estimate(obs, model)
+    exact = MarginalLikelihood(obs, model)
+    compressed = cal.compressed
+    rng = np.random.default_rng(1)
+    p = len(cal.theta)
+    z = rng.standard_normal((30, p))
+    z *= (rng.uniform(0, 3, 30) / np.linalg.norm(z, axis=1))[:, None]
+    theta = cal.theta + z @ compressed.whitening.T
+    difference = compressed.log_likelihood(theta, cal.sigma) - [exact.log_likelihood(t, cal.sigma) for t in theta]
+    assert np.max(np.abs(difference)) < bound
+    # Control: without the second-derivative columns the likelihood is worse, so they matter and are right.
+    if model == "brown" and obs.n_frames == 10:
+        gram = compressed.gram.copy()
+        gram[1 + p :] = 0.0
+        gram[:, 1 + p :] = 0.0
+        import dataclasses
+
+        linear = dataclasses.replace(compressed, gram=gram)
+        worse = linear.log_likelihood(theta, cal.sigma) - [exact.log_likelihood(t, cal.sigma) for t in theta]
+        assert np.max(np.abs(worse)) > 3 * np.max(np.abs(difference))
+
+
+def test_compressed_adds_over_frames_and_survives_a_round_trip():
+    obs = observations(n_frames=60)
+    cal = _estimate(obs, "brown")
+    whole = cal.compressed
+    parts = [
+        compress(
+            MarginalLikelihood(obs.select_frames(ids), "brown"), whole.theta_hat, whole.whitening @ whole.whitening.T
+        )
+        for ids in (obs.frame_ids[:25], obs.frame_ids[25:])
+    ]
+    assert np.allclose(sum(part.gram for part in parts), whole.gram, rtol=1e-6, atol=1e-7 * whole.gram.max() * 1e-3)
+    assert sum(part.log_determinant for part in parts) == pytest.approx(whole.log_determinant, rel=1e-12)
+    again = CompressedLikelihood.from_dict(whole.to_dict())
+    assert np.array_equal(again.gram, whole.gram)
+    assert np.array_equal(again.log_likelihood(cal.theta[None], 0.05), whole.log_likelihood(cal.theta[None], 0.05))
+
+
+def test_scaling_the_stated_noise_only_rescales_sigma():
+    import dataclasses
+
+    obs = with_sigmas(observations(n_frames=30, sigma_px=0.0))
+    doubled = dataclasses.replace(obs, sigma_px=2.0 * obs.sigma_px)
+    a, b = _estimate(obs, "brown"), _estimate(doubled, "brown")
+    assert a.sigma_name == "sigma_scale"
+    assert a.sigma == pytest.approx(2.0 * b.sigma, rel=1e-9)
+    assert np.allclose(a.theta, b.theta, rtol=1e-9)
+    assert np.allclose(a.covariance, b.covariance, rtol=1e-6)
+    assert 0.8 < a.sigma < 1.2

@@ -1,0 +1,327 @@
+"""Merged runs are what a calibration on all stars gives, and runs of different cameras are told apart."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.core.errors import CalibrationError, RunFolderError
+from starcal_uq.core.provenance import data_hashes
+from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.compressed import moved, optimum, scaled, total
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.merging import Consistency, consistency_of, merge
+from starcal_uq.inference.sample import sample
+from starcal_uq.observations.table import Observations, load_observations
+from starcal_uq.propagation.coupling import coupling
+from starcal_uq.runs.merge import join_observations, merge_runs
+from starcal_uq.simulation.frames import simulate
+from starcal_uq.sky.catalogue import load_catalogue
+from tests.helpers import scenes
+
+NOMINAL = scenes.nominal(scenes.camera())
+
+
+@lru_cache(maxsize=64)
+def simulated(seed: int, n_frames: int = 12, shift_f_px: float = 0.0, sigma_px: float = 0.05) -> Observations:
+    camera = scenes.camera()
+    theta = camera.theta.copy()
+    theta[2] += shift_f_px
+    stars = load_catalogue(max_mag=6.0, epoch=2026.9)
+    return simulate(stars, camera.with_theta(theta), n_frames=n_frames, min_stars=8, sigma_px=sigma_px, seed=seed)
+
+
+@lru_cache(maxsize=64)
+def calibrated(seed: int, n_frames: int = 12, shift_f_px: float = 0.0, sigma_px: float = 0.05) -> Calibration:
+    return calibrate(simulated(seed, n_frames, shift_f_px, sigma_px), NOMINAL)
+
+
+def halves(obs: Observations, at: int) -> tuple[Observations, Observations]:
+    return obs.select_frames(obs.frame_ids[:at]), obs.select_frames(obs.frame_ids[at:])
+
+
+def points(cal: Calibration, n: int = 50) -> np.ndarray:
+    u = np.random.default_rng(5).standard_normal((n, len(cal.theta)))
+    return cal.theta + u @ cal.compressed.whitening.T
+
+
+def write(folder: Path, obs: Observations, cal: Calibration) -> Path:
+    folder.mkdir()
+    obs.save(folder / "observations.parquet")
+    cal.nominal.save(folder / "camera.toml")
+    cal.save(folder / "calibration.json")
+    return folder
+
+
+@pytest.mark.parametrize("model", ["none", "brown", "brown_tangential", "inverse"])
+def test_moving_the_point_of_expansion_changes_no_value(model: str) -> None:
+    cal = calibrate(scenes.observations(model, n_frames=20), scenes.nominal(scenes.camera(model)))
+    rng = np.random.default_rng(1)
+    p = len(cal.theta)
+    matrix = cal.compressed.whitening @ (np.eye(p) + 0.3 * rng.standard_normal((p, p)))
+    whitening = np.linalg.cholesky(matrix @ matrix.T / np.outer(cal.sigmas, cal.sigmas)) * cal.sigmas[:, None]
+    there = moved(cal.compressed, cal.theta + 2.0 * cal.sigmas * rng.standard_normal(p), whitening)
+    theta = points(cal)
+    before, after = (c.log_likelihood(theta, cal.sigma) for c in (cal.compressed, there))
+    assert np.max(np.abs(before - after)) < 1e-6
+    # The control: without the slope of the log determinant, the values are not the same.
+    wrong = dataclasses.replace(there, log_determinant_slope=np.zeros(p))
+    assert np.max(np.abs(before - wrong.log_likelihood(theta, cal.sigma))) > 1e-4
+
+
+def test_optimum_of_a_compressed_likelihood_is_the_calibration() -> None:
+    cal = calibrated(1)
+    away = moved(cal.compressed, cal.theta + 3.0 * cal.sigmas, cal.compressed.whitening)
+    best = optimum(away)
+    assert np.all(np.abs(best.theta - cal.compressed.theta_hat) < 1e-4 * cal.sigmas)
+    assert np.allclose(best.covariance / np.outer(cal.sigmas, cal.sigmas), cal.correlation, atol=1e-4)
+    product = best.information @ best.covariance * np.outer(cal.sigmas, 1.0 / cal.sigmas)
+    assert np.allclose(product, np.eye(5), atol=1e-6)
+    assert best.sigma == pytest.approx(cal.sigma, rel=1e-6)
+
+
+@pytest.mark.parametrize("stated", [False, True])
+def test_two_halves_give_the_whole(stated: bool) -> None:
+    obs = scenes.observations(n_frames=200)
+    obs = scenes.with_sigmas(obs) if stated else obs
+    whole = calibrate(obs, NOMINAL)
+    parts = halves(obs, 70)
+    runs = [calibrate(part, NOMINAL) for part in parts]
+    merged = merge(runs, join_observations(parts, ["a", "b"]))
+    assert np.all(np.abs(merged.theta - whole.theta) < 1e-3 * whole.sigmas)
+    scale = np.outer(whole.sigmas, whole.sigmas)
+    assert np.max(np.abs(merged.covariance - whole.covariance) / scale) < 1e-3
+    assert merged.sigma == pytest.approx(whole.sigma, rel=1e-6)
+    assert merged.sigma_std == pytest.approx(whole.sigma_std, rel=1e-6)
+    assert merged.chi2 == pytest.approx(whole.chi2, rel=1e-6)
+    assert (merged.dof, merged.n_stars, merged.n_frames) == (whole.dof, whole.n_stars, whole.n_frames)
+    assert merged.sigma_name == whole.sigma_name
+    assert np.allclose(merged.information * scale, whole.information * scale, atol=2e-3 * whole.n_frames)
+    assert np.allclose(merged.rotation_per_theta * whole.sigmas, whole.rotation_per_theta * whole.sigmas, atol=1e-8)
+    assert np.allclose(merged.attitude_noise, whole.attitude_noise, rtol=1e-3, atol=1e-3 * whole.attitude_noise.max())
+    assert np.max(np.abs(merged.residuals_px - whole.residuals_px)) < 1e-5
+    assert np.max(np.abs(merged.quaternions - whole.quaternions)) < 1e-7
+    z = (merged.pair_theta - whole.pair_theta) / np.sqrt(np.diag(whole.pair_covariance))
+    assert np.max(np.abs(z)) < 1.0
+    # A half alone is not the whole.
+    assert np.max(np.abs(runs[0].theta - whole.theta) / whole.sigmas) > 0.1
+
+
+def test_merged_log_likelihood_is_the_sum_of_the_runs_and_near_the_exact_one() -> None:
+    obs = scenes.observations(n_frames=120)
+    runs = [calibrate(part, NOMINAL) for part in halves(obs, 40)]
+    merged = merge(runs)
+    theta = points(merged)
+    value = merged.compressed.log_likelihood(theta, merged.sigma)
+    parts = sum(run.compressed.log_likelihood(theta, merged.sigma) for run in runs)
+    assert np.max(np.abs(value - parts)) < 1e-6
+    exact = MarginalLikelihood(obs, "brown")
+    difference = value - [exact.log_likelihood(t, merged.sigma) for t in theta]
+    assert np.max(np.abs(difference)) < 0.01
+
+
+def test_own_noise_is_that_of_stars_which_state_it() -> None:
+    runs = [calibrated(1), calibrated(2, sigma_px=0.2)]
+    common = merge(runs)
+    assert consistency_of(common).noise_p_value < 1e-6
+    assert any("differ in noise" in message for message in consistency_of(common).messages)
+    obs = join_observations([simulated(1), simulated(2, sigma_px=0.2)], ["a", "b"], [run.sigma for run in runs])
+    whole = calibrate(obs, NOMINAL)
+    merged = merge(runs, obs, noise="own")
+    assert merged.sigma_name == "sigma_scale"
+    assert merged.sigma == pytest.approx(whole.sigma, rel=1e-4)
+    assert np.all(np.abs(merged.theta - whole.theta) < 1e-2 * whole.sigmas)
+    assert np.allclose(merged.covariance, whole.covariance, rtol=0.02)
+    assert np.max(np.abs(merged.residuals_px - whole.residuals_px)) < 1e-3
+    theta = points(merged)
+    exact = MarginalLikelihood(obs, "brown")
+    difference = merged.compressed.log_likelihood(theta, 1.1) - [exact.log_likelihood(t, 1.1) for t in theta]
+    assert np.max(np.abs(difference)) < 0.02
+    assert np.isnan(consistency_of(merged).noise_p_value)
+    # One noise for all is the worse estimate when they differ by a factor of four.
+    assert np.all(merged.sigmas < common.sigmas)
+
+
+def test_scaling_the_noise_leaves_the_likelihood_up_to_the_data_s_volume() -> None:
+    cal = calibrated(1)
+    theta = points(cal)
+    a = scaled(cal.compressed, 0.05).log_likelihood(theta, 1.3)
+    b = cal.compressed.log_likelihood(theta, 0.065)
+    assert np.ptp(a - b) < 1e-6
+
+
+def test_merged_calibration_can_be_sampled_and_analysed(tmp_path: Path) -> None:
+    merged = merge([calibrated(1), calibrated(2)])
+    merged.save(tmp_path / "calibration.json")
+    loaded = Calibration.load(tmp_path / "calibration.json")
+    post = sample(None, loaded, seed=1)
+    assert post.diagnostics.rhat.max() < 1.02
+    assert np.all(np.abs(post.mean - merged.theta) < 0.15 * merged.sigmas)
+    assert np.allclose(post.sd[:5], merged.sigmas, rtol=0.1)
+    assert coupling(post).correlation.shape == (5, 5)
+    record = consistency_of(loaded)
+    assert record is not None
+    assert record.to_dict() == consistency_of(merged).to_dict()
+
+
+def test_run_folders_are_merged_with_their_observations(tmp_path: Path) -> None:
+    paths = [write(tmp_path / f"night{i}", simulated(i), calibrated(i)) for i in (1, 2, 3)]
+    merged = merge_runs(paths, tmp_path / "all")
+    obs = load_observations(tmp_path / "all" / "observations.parquet")
+    loaded = Calibration.load(tmp_path / "all" / "calibration.json")
+    assert obs.data_hash == loaded.provenance["data_sha256"] == merged.provenance["data_sha256"]
+    assert np.array_equal(obs.frame_ids, loaded.frame_ids)
+    assert np.array_equal(obs.frame_ids, np.arange(36))
+    assert obs.meta["truth"] == scenes.camera().to_dict()
+    assert [part["frame_shift"] for part in obs.meta["merged"]] == [0, 12, 24]
+    assert Camera.load(tmp_path / "all" / "camera.toml") == NOMINAL
+    whole = calibrate(obs, NOMINAL)
+    assert np.all(np.abs(merged.theta - whole.theta) < 1e-2 * whole.sigmas)
+    post = sample(obs, loaded, seed=1)
+    assert post.diagnostics.ok, post.diagnostics.messages
+    assert post.diagnostics.likelihood_used == "compressed"
+    assert post.diagnostics.compressed_max_difference < 0.05
+    # Merging twice is merging once.
+    pair = merge_runs(paths[:2], tmp_path / "pair")
+    again = merge_runs([tmp_path / "pair", paths[2]], tmp_path / "again")
+    assert np.all(np.abs(again.theta - merged.theta) < 1e-4 * merged.sigmas)
+    assert data_hashes(pair.provenance) < data_hashes(again.provenance)
+
+
+def test_without_observations_the_runs_own_frames_stay(tmp_path: Path) -> None:
+    paths = [write(tmp_path / f"night{i}", simulated(i), calibrated(i)) for i in (1, 2)]
+    (paths[1] / "observations.parquet").unlink()
+    merged = merge_runs(paths, tmp_path / "all")
+    assert not (tmp_path / "all" / "observations.parquet").exists()
+    assert not merged.provenance["merge"]["has_observations"]
+    assert len(merged.residuals_px) == calibrated(1).n_stars + calibrated(2).n_stars
+
+
+def test_output_folder_is_protected(tmp_path: Path) -> None:
+    paths = [write(tmp_path / f"night{i}", simulated(i), calibrated(i)) for i in (1, 2)]
+    with pytest.raises(RunFolderError, match="is one of the runs"):
+        merge_runs(paths, paths[0], force=True)
+    out = tmp_path / "all"
+    out.mkdir()
+    (out / "posterior.nc").write_text("stale", encoding="utf-8")
+    with pytest.raises(RunFolderError, match="not empty"):
+        merge_runs(paths, out)
+    merge_runs(paths, out, force=True)
+    assert not (out / "posterior.nc").exists()
+    with pytest.raises(RunFolderError, match="calibrate"):
+        merge_runs([paths[0], tmp_path / "nothing"], tmp_path / "new")
+
+
+def test_data_that_would_count_twice_are_refused(tmp_path: Path) -> None:
+    cal = calibrated(1)
+    with pytest.raises(CalibrationError, match="count twice"):
+        merge([cal, cal])
+    merged = merge([cal, calibrated(2)])
+    with pytest.raises(CalibrationError, match="count twice"):
+        merge([merged, calibrated(2)])
+    # Two runs that share some frames have different hashes; their rows tell.
+    obs = simulated(7, 24)
+    first, second = obs.select_frames(obs.frame_ids[:14]), obs.select_frames(obs.frame_ids[10:])
+    with pytest.raises(CalibrationError, match="measurements that another run holds too"):
+        join_observations([first, second], ["a", "b"])
+    join_observations(halves(obs, 12), ["a", "b"])
+
+
+def test_what_cannot_be_merged_is_refused() -> None:
+    cal = calibrated(1)
+    with pytest.raises(CalibrationError, match="at least two"):
+        merge([cal])
+    with pytest.raises(CalibrationError, match="unknown"):
+        merge([cal, calibrated(2)], noise="both")
+    wider = dataclasses.replace(calibrated(2), camera=calibrated(2).camera.replace(width_px=1100))
+    with pytest.raises(CalibrationError, match="width_px is 1100"):
+        merge([cal, wider])
+    model = calibrate(simulated(2), scenes.nominal(scenes.camera("k1")))
+    with pytest.raises(CalibrationError, match="distortion is k1"):
+        merge([cal, model])
+    stated = calibrate(scenes.with_sigmas(simulated(2)), NOMINAL)
+    with pytest.raises(CalibrationError, match="noise 'own'"):
+        merge([cal, stated])
+    assert merge([cal, stated], noise="own").sigma_name == "sigma_scale"
+    settings = {**cal.provenance["settings"], "likelihood": "student_t"}
+    heavy = dataclasses.replace(cal, provenance={**cal.provenance, "settings": settings})
+    with pytest.raises(CalibrationError, match="student_t"):
+        merge([heavy, calibrated(2)])
+
+
+def test_tables_of_different_kinds_are_refused_or_filled() -> None:
+    a, b = simulated(1), simulated(2)
+    with pytest.raises(CalibrationError, match="different kinds"):
+        join_observations([a, b.with_meta(directions="undeclared")], ["a", "b"])
+    with pytest.raises(CalibrationError, match="only some"):
+        join_observations([a, scenes.with_sigmas(b)], ["a", "b"])
+    joined = join_observations([a, dataclasses.replace(b, mag=None)], ["a", "b"])
+    assert np.isnan(joined.mag[-1])
+    assert joined.mag[0] == a.mag[0]
+
+
+def test_another_camera_is_told_apart() -> None:
+    # 0.15 px of 5852: one marginal sigma of f, but five along the direction that the stars see best.
+    runs = [calibrated(11, 50), calibrated(12, 50, 0.15)]
+    with pytest.raises(CalibrationError, match="do not show the same camera"):
+        merge(runs)
+    found = consistency_of(merge(runs, allow_inconsistent=True))
+    assert found.p_value < 1e-3
+    assert not found.ok
+    assert "too small" in found.messages[0]
+    assert "do not show" in found._repr_html_()
+    with pytest.raises(CalibrationError, match="of its own sigmas"):
+        merge([calibrated(11, 50), calibrated(12, 50, 2.0)], allow_inconsistent=True)
+
+
+def test_the_run_that_deviates_is_named() -> None:
+    runs = [calibrated(11, 50), calibrated(13, 50), calibrated(14, 50, 0.15), calibrated(15, 50)]
+    found = consistency_of(merge(runs, names=["a", "b", "c", "d"], allow_inconsistent=True))
+    assert found.names[int(np.argmin(found.run_p_value))] == "c"
+    assert found.odd_one_out.startswith("c deviates most")
+    assert list(found.to_dataframe()["run"]) == ["a", "b", "c", "d"]
+
+
+def test_record_survives_json() -> None:
+    found = consistency_of(merge([calibrated(1), calibrated(2)]))
+    assert found is not None
+    assert Consistency.from_dict(found.to_dict()).to_dict() == found.to_dict()
+    assert consistency_of(calibrated(1)) is None
+
+
+def p_values(n: int, shift_f_px: float = 0.0) -> np.ndarray:
+    found = []
+    for i in range(n):
+        runs = [calibrated.__wrapped__(1000 + 3 * i + k, 12, shift_f_px * (k == 2)) for k in range(3)]
+        compared = consistency_of(merge(runs, allow_inconsistent=True))
+        found.append((compared.p_value, compared.run_p_value[1], compared.noise_p_value))
+    return np.array(found)
+
+
+def test_p_values_are_uniform_when_nothing_differs() -> None:
+    values = p_values(25)
+    for column in values.T:
+        assert stats.kstest(column, "uniform").pvalue > 1e-3
+    # The control: a focal length off by 0.3 px, one marginal sigma, in one of three runs.
+    assert stats.kstest(p_values(8, 0.3)[:, 0], "uniform").pvalue < 1e-3
+
+
+@pytest.mark.slow
+def test_p_values_are_uniform_in_a_long_run() -> None:
+    values = p_values(200)
+    for column in values.T:
+        assert stats.kstest(column, "uniform").pvalue > 1e-3
+
+
+def test_total_of_one_part_is_the_part() -> None:
+    cal = calibrated(1)
+    theta = points(cal)
+    value = total([cal.compressed]).log_likelihood(theta, 0.05)
+    assert np.allclose(value, cal.compressed.log_likelihood(theta, 0.05), rtol=0.0, atol=1e-6)

@@ -1,0 +1,365 @@
+"""The sampler draws from the posterior it was given, again and again the same, and says when it did not."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import integrate, stats
+
+from starcal_uq.core.errors import SamplingError
+from starcal_uq.core.status import Status
+from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.inference.checks import check_compression
+from starcal_uq.inference.priors import Priors
+from starcal_uq.inference.sample import sample
+from starcal_uq.inference.target import importance_check, laplace_approximation, scaled_inverse, start_target
+from tests.helpers.gaussian_camera import COVARIANCE, SD, GaussianLikelihood, gaussian_calibration
+from tests.helpers.scenes import camera, nominal, observations, with_sigmas
+
+QUICK: dict[str, Any] = {"n_ensembles": 2, "n_walkers": 16, "n_steps": 60, "n_burn": 5, "seed": 3}
+
+
+def whitened(draws: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    sd = np.sqrt(np.diag(covariance))
+    factor = np.linalg.cholesky(covariance / np.outer(sd, sd))
+    return np.linalg.solve(factor, ((draws - mean) / sd).T).T
+
+
+def conjugate(priors: Priors, cal: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of the posterior with the noise given."""
+    names = priors.names[:-1]
+    covariance = scaled_inverse(cal.information + priors.precision(names))
+    pull = cal.information @ cal.theta + priors.precision(names) @ priors.mean(names)
+    return covariance @ pull, covariance
+
+
+def test_known_posterior_is_recovered_at_extreme_scales() -> None:
+    cal = gaussian_calibration()
+    post = sample(None, cal, sigma=0.05, seed=1, evaluation="compressed")
+    mean, covariance = conjugate(post.priors, cal)
+    z = whitened(post.theta_draws, mean, covariance)
+    assert np.max(np.abs(z.mean(axis=0))) < 0.04
+    assert np.max(np.abs(np.cov(z.T) - np.eye(5))) < 0.05
+    assert np.allclose(post.laplace.covariance, covariance, rtol=1e-4)
+    assert post.diagnostics.ok, post.diagnostics.messages
+
+
+def test_informative_prior_shifts_the_posterior_as_it_must() -> None:
+    cal = gaussian_calibration()
+    # A focal length known to 0.02 px, 0.05 px away from the estimate, also moves k1 and k2 through their couplings.
+    priors = Priors.default(cal.nominal).replace(focal_px=cal.theta[2] + 0.05, focal_fraction=0.02 / cal.theta[2])
+    post = sample(None, cal, priors, sigma=0.05, seed=1, evaluation="compressed")
+    mean, covariance = conjugate(priors, cal)
+    assert abs(mean[3] - cal.theta[3]) > 0.5 * SD[3]
+    assert np.max(np.abs(post.mean - mean) / np.sqrt(np.diag(covariance))) < 0.05
+    assert np.allclose(np.sqrt(np.diag(post.covariance)), np.sqrt(np.diag(covariance)), rtol=0.03)
+    assert any("prior, not the data, limits f" in m for m in post.diagnostics.messages)
+
+
+def test_noise_has_the_posterior_found_by_quadrature() -> None:
+    # So few degrees of freedom that a forgotten Jacobian (a factor sigma) would move the mean by about 0.2 sd.
+    cal = gaussian_calibration(dof=12)
+    post = sample(None, cal, seed=1, evaluation="compressed")
+    s = np.geomspace(0.005, 2.0, 20_001)
+    # Theta integrated out over its flat likelihood gives sigma^5.
+    log_density = -6.0 * (0.05 / s) ** 2 - (12 - 5) * np.log(s)
+    log_density += stats.lognorm.logpdf(s, post.priors.sigma_log_sd, scale=post.priors.sigma_median)
+    density = np.exp(log_density - log_density.max())
+    density /= integrate.trapezoid(density, s)
+    cumulative = integrate.cumulative_trapezoid(density, s, initial=0.0)
+    u = np.interp(post.sigma_draws, s, cumulative)
+    assert np.max(np.abs(np.histogram(u, np.linspace(0, 1, 11))[0] / len(u) - 0.1)) < 0.012
+
+
+def test_defaults_give_ten_thousand_effective_draws() -> None:
+    d = sample(None, gaussian_calibration(), seed=5, evaluation="compressed").diagnostics
+    assert d.ok, d.messages
+    assert np.min(d.ess_bulk) > 10_000
+    assert np.min(d.ess_tail) > 10_000
+    assert np.max(d.autocorrelation) < 4.0
+    assert d.psis_khat < 0.5
+    assert "agree:" in d.agreement
+
+
+def test_stretch_move_agrees() -> None:
+    cal = gaussian_calibration()
+    post = sample(None, cal, sigma=0.05, moves="stretch", n_steps=400, seed=1, evaluation="compressed")
+    mean, covariance = conjugate(post.priors, cal)
+    z = whitened(post.theta_draws, mean, covariance)
+    assert np.max(np.abs(np.cov(z.T) - np.eye(5))) < 0.2
+    assert np.nanmax(post.diagnostics.autocorrelation) > 10.0
+
+
+def test_same_seed_same_bits_and_ensembles_differ() -> None:
+    cal = gaussian_calibration()
+    first, second, other = (sample(None, cal, **{**QUICK, "seed": seed}, evaluation="compressed") for seed in (3, 3, 4))
+    assert np.array_equal(first.draws, second.draws)
+    assert np.array_equal(first.log_posterior, second.log_posterior)
+    assert first.diagnostics.psis_khat == second.diagnostics.psis_khat
+    assert not np.any(first.draws[:, 0] == other.draws[:, 0])
+    ensembles = first.draws[:, 0].reshape(2, -1)
+    assert not np.array_equal(ensembles[0], ensembles[1])
+
+
+def test_a_seed_is_taken_and_recorded() -> None:
+    cal = gaussian_calibration()
+    options = {**QUICK, "seed": None}
+    post = sample(None, cal, **options, evaluation="compressed")
+    again = sample(None, cal, **{**options, "seed": post.provenance["seed"]}, evaluation="compressed")
+    assert np.array_equal(post.draws, again.draws)
+
+
+@pytest.mark.parametrize("stop", [3, 40, 65, 90, 129])
+def test_resumed_run_is_the_uninterrupted_run(tmp_path: Path, stop: int) -> None:
+    cal, checkpoint = gaussian_calibration(), tmp_path / "run.ckpt"
+    whole = sample(None, cal, **QUICK, evaluation="compressed")
+
+    def interrupt(done: int, total: int) -> None:
+        assert total == 2 * 65
+        if done == stop:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sample(None, cal, **QUICK, evaluation="compressed", checkpoint=checkpoint, progress=interrupt)
+    seen: list[int] = []
+    resumed = sample(
+        None, cal, **QUICK, evaluation="compressed", checkpoint=checkpoint, progress=lambda done, _: seen.append(done)
+    )
+    assert np.array_equal(resumed.draws, whole.draws)
+    assert np.array_equal(resumed.log_posterior, whole.log_posterior)
+    assert np.array_equal(resumed.diagnostics.acceptance, whole.diagnostics.acceptance)
+    # Work before the last checkpoint is not repeated.
+    assert len(seen) <= 130 - stop + 25
+    assert seen[-1] == 130
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_checkpoint_of_other_settings_is_refused(tmp_path: Path) -> None:
+    cal, checkpoint = gaussian_calibration(), tmp_path / "run.ckpt"
+
+    def interrupt(done: int, total: int) -> None:
+        if done == 40:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        sample(None, cal, **QUICK, evaluation="compressed", checkpoint=checkpoint, progress=interrupt)
+    with pytest.raises(SamplingError, match="other data or settings"):
+        sample(None, cal, **{**QUICK, "seed": 4}, evaluation="compressed", checkpoint=checkpoint)
+    checkpoint.write_bytes(b"not a checkpoint")
+    with pytest.raises(SamplingError, match="cannot be read as a checkpoint"):
+        sample(None, cal, **QUICK, evaluation="compressed", checkpoint=checkpoint)
+
+
+def test_given_noise_fills_the_last_column() -> None:
+    post = sample(None, gaussian_calibration(), sigma=0.07, **QUICK, evaluation="compressed")
+    assert np.all(post.sigma_draws == 0.07)
+    assert not post.sigma_sampled
+    assert post.draws.shape[1] == 6
+    assert np.isnan(post.diagnostics.rhat[-1])
+    # Information is proportional to sigma^-2.
+    assert np.allclose(post.sd[:5], SD * 1.4, rtol=0.15)
+
+
+def test_any_likelihood_with_the_right_method() -> None:
+    cal = gaussian_calibration(compressed=None)
+    likelihood = GaussianLikelihood(cal.theta, cal.information, cal.sigma, cal.dof)
+    post = sample(None, cal, **QUICK, likelihood=likelihood)
+    assert post.diagnostics.likelihood_used == "gaussian"
+    with pytest.raises(SamplingError, match="log_likelihood"):
+        sample(None, cal, **QUICK, likelihood=3)
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"n_ensembles": 1}, "at least 2"),
+        ({"n_walkers": 11}, "at least 12"),
+        ({"n_steps": 61}, "even"),
+        ({"n_burn": -1}, "n_burn"),
+        ({"moves": "snooker"}, "mixture, stretch"),
+        ({"sigma": 0.0}, "above zero"),
+        ({"sigma": "free"}, "'sampled'"),
+        ({"evaluation": "naive"}, "auto, compressed, exact"),
+        ({"evaluation": "exact"}, "needs the observations"),
+        ({"likelihood": "naive"}, "marginal, pairs, pairs_naive, student_t"),
+        ({"likelihood": "exact"}, "use evaluation='exact'"),
+        ({"likelihood": "pairs"}, "needs the observations"),
+        ({"dof": 4.0}, "belong to likelihood='student_t'"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(options: dict[str, Any], match: str) -> None:
+    with pytest.raises(SamplingError, match=match):
+        sample(None, gaussian_calibration(), **{**QUICK, **options})
+
+
+def test_unsound_calibrations_are_refused() -> None:
+    with pytest.raises(SamplingError, match="did not converge"):
+        sample(None, gaussian_calibration(status=Status.STALLED), **QUICK)
+    with pytest.raises(SamplingError, match="not positive definite"):
+        sample(None, gaussian_calibration(information=-scaled_inverse(COVARIANCE)), **QUICK)
+    priors = Priors.default(gaussian_calibration().nominal.replace(distortion="k1"))
+    with pytest.raises(SamplingError, match=r"Priors\.default"):
+        sample(None, gaussian_calibration(), priors, **QUICK)
+
+
+def test_starts_without_density_are_refused() -> None:
+    cal = gaussian_calibration()
+    inner = cal.compressed
+
+    class Cut:
+        def log_likelihood(self, theta: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+            # A wall one standard deviation from the mode.
+            return np.where(theta[:, 0] > cal.theta[0] + SD[0], -np.inf, inner.log_likelihood(theta, sigma))
+
+    class Nowhere:
+        def log_likelihood(self, theta: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+            return np.full(len(theta), np.nan)
+
+    with pytest.raises(SamplingError, match="start points"):
+        sample(None, cal, **QUICK, likelihood=Cut())
+    with pytest.raises(SamplingError, match="not finite"):
+        sample(None, cal, **QUICK, likelihood=Nowhere())
+
+
+def test_newton_finds_a_mode_away_from_its_start() -> None:
+    cal = gaussian_calibration()
+    priors = Priors.default(cal.nominal)
+    away = cal.theta + 20.0 * SD * np.array([1, -1, 1, 0, 0])
+    start = start_target(cal.compressed.log_likelihood, priors, away, 3.0 * cal.information, 0.08, cal.dof, False)
+    _, laplace = laplace_approximation(start)
+    assert laplace.converged
+    assert np.max(np.abs(laplace.mode[:5] - cal.theta) / SD) < 0.02
+    # With theta at its optimum, the mode in log sigma is sigma0 up to the prior's negligible pull.
+    assert np.exp(laplace.mode[5]) == pytest.approx(0.05, rel=1e-3)
+    assert np.sqrt(laplace.covariance[5, 5]) == pytest.approx(1 / np.sqrt(2 * cal.dof), rel=1e-2)
+
+
+def test_importance_sampling_knows_the_moments_and_its_own_limits() -> None:
+    cal = gaussian_calibration()
+    start = start_target(
+        cal.compressed.log_likelihood, Priors.default(cal.nominal), cal.theta, cal.information, 0.05, cal.dof, False
+    )
+    target, laplace = laplace_approximation(start)
+    check = importance_check(target, 20_000, 8.0, np.random.default_rng(1))
+    assert check.khat < 0.5
+    assert np.max(np.abs(check.mean - laplace.mean) / laplace.sd) < 0.05
+    assert np.allclose(check.sd, laplace.sd, rtol=0.03)
+    # A proposal three times too narrow in every direction does not pass for a good one.
+    narrow = dataclasses.replace(target, transform=target.transform / 3.0)
+    assert importance_check(narrow, 20_000, 50.0, np.random.default_rng(1)).khat > 0.7
+
+
+def test_compression_check_measures_the_difference() -> None:
+    cal = gaussian_calibration()
+    exact = cal.compressed.log_likelihood
+    start = start_target(exact, Priors.default(cal.nominal), cal.theta, cal.information, 0.05, cal.dof, False)
+    target, laplace = laplace_approximation(start)
+    draws = target.natural(np.random.default_rng(1).standard_normal((300, 6)))
+
+    def off_by(nat: float) -> Any:
+        # The difference is nat times the square of the first parameter's deviation, plus a constant that cannot matter.
+        return lambda t, s: exact(t, s) + nat * ((t[:, 0] - cal.theta[0]) / SD[0]) ** 2 + 7.0
+
+    fine = check_compression(off_by(0.001), exact, target, draws, laplace)
+    assert fine.good
+    assert fine.khat == 0.0
+    assert 0.002 < fine.max_difference < 0.009
+    bad = check_compression(off_by(0.2), exact, target, draws, laplace)
+    assert not bad.good
+    assert 0.5 < bad.max_difference < 1.9
+
+
+def test_too_short_a_run_fails_its_checks() -> None:
+    post = sample(None, gaussian_calibration(), **{**QUICK, "n_steps": 8}, evaluation="compressed")
+    assert not post.diagnostics.ok
+    assert any("effective sample size" in failure for failure in post.diagnostics.failures)
+    assert post.diagnostics.messages[0] == post.diagnostics.failures[0]
+
+
+def test_surprising_results_are_said() -> None:
+    cal = gaussian_calibration()
+    priors = Priors.default(cal.nominal).replace(focal_fraction=0.001)
+    messages = sample(None, cal, priors, **QUICK, evaluation="compressed").diagnostics.messages
+    assert any("prior standard deviations away" in m for m in messages)
+    off = cal.camera.replace(x0_px=-3.0).theta
+    likelihood = GaussianLikelihood(off, cal.information, cal.sigma, cal.dof)
+    away = gaussian_calibration(theta=off, compressed=likelihood)
+    failures = sample(None, away, **QUICK, evaluation="compressed").diagnostics.failures
+    assert any("off the detector" in f for f in failures)
+
+
+@pytest.fixture(scope="module")
+def few_frames() -> tuple[Any, Any]:
+    obs = observations(n_frames=8)
+    return obs, calibrate(obs, nominal(camera()))
+
+
+def test_compressed_and_exact_posteriors_are_the_same(few_frames: tuple[Any, Any]) -> None:
+    obs, cal = few_frames
+    auto, exact = (sample(obs, cal, **QUICK, evaluation=name) for name in ("auto", "exact"))
+    assert auto.diagnostics.likelihood_used == "compressed"
+    assert auto.diagnostics.compressed_max_difference < 0.1
+    assert any("differ by up to" in m for m in auto.diagnostics.messages)
+    assert np.isnan(exact.diagnostics.compressed_max_difference)
+    assert exact.diagnostics.likelihood_used == "exact"
+    # The same random numbers decide, so the draws themselves agree.
+    assert np.max(np.abs(auto.mean - exact.mean) / exact.sd[:5]) < 0.02
+    assert np.allclose(auto.sd, exact.sd, rtol=0.02)
+
+
+def spoilt(cal: Any) -> Any:
+    """A calibration whose compressed likelihood has half of the data counted twice."""
+    return dataclasses.replace(cal, compressed=dataclasses.replace(cal.compressed, gram=1.5 * cal.compressed.gram))
+
+
+@pytest.fixture(scope="module")
+def replaced(few_frames: tuple[Any, Any]) -> Any:
+    obs, cal = few_frames
+    return sample(obs, spoilt(cal), **QUICK)
+
+
+def test_a_wrong_compressed_likelihood_is_replaced(few_frames: tuple[Any, Any], replaced: Any) -> None:
+    obs, cal = few_frames
+    assert replaced.diagnostics.likelihood_used == "exact"
+    assert replaced.diagnostics.compressed_max_difference > 0.5
+    assert any("exact likelihood was sampled" in m for m in replaced.diagnostics.messages)
+    kept = sample(obs, spoilt(cal), **QUICK, evaluation="compressed")
+    assert any("use evaluation='auto'" in failure for failure in kept.diagnostics.failures)
+
+
+@pytest.mark.parametrize("stop", [40, 170])
+def test_a_replaced_likelihood_is_resumed(
+    few_frames: tuple[Any, Any], replaced: Any, tmp_path: Path, stop: int
+) -> None:
+    obs, cal = few_frames
+    wrong = spoilt(cal)
+    calls = 0
+
+    def interrupt(done: int, total: int) -> None:
+        nonlocal calls
+        calls += 1
+        if calls == stop:
+            raise KeyboardInterrupt
+
+    checkpoint = tmp_path / "run.ckpt"
+    # 40 is in the compressed run, 170 in the exact run that follows it.
+    with pytest.raises(KeyboardInterrupt):
+        sample(obs, wrong, **QUICK, progress=interrupt, checkpoint=checkpoint)
+    post = sample(obs, wrong, **QUICK, checkpoint=checkpoint)
+    assert np.array_equal(post.draws, replaced.draws)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("model", ["none", "brown_tangential", "inverse"])
+def test_every_distortion_model_and_stated_noise(model: str) -> None:
+    obs = with_sigmas(observations(model))
+    cal = calibrate(obs, nominal(camera(model)))
+    post = sample(obs, cal, **{**QUICK, "n_walkers": 32, "n_steps": 100})
+    assert post.parameter_names == (*camera(model).parameter_names, "sigma_scale")
+    assert post.diagnostics.likelihood_used == "compressed"
+    assert np.max(np.abs(post.mean - cal.theta) / cal.sigmas) < 0.3
+    assert np.allclose(post.sd[:-1], cal.sigmas, rtol=0.2)

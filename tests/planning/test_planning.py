@@ -1,0 +1,404 @@
+"""Plans: forecasts against calibrations, frames for a target, sweeps, words and files."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.budgeting.shapes import two_axis_radius
+from starcal_uq.core.errors import PlanningError
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.maths.circular import mixture_radius
+from starcal_uq.planning.check import ForecastCheck, check_forecast
+from starcal_uq.planning.design import choose_frames
+from starcal_uq.planning.forecast import Forecaster, inverses, nea_arcsec, quantities, spreads, student_factor
+from starcal_uq.planning.information import FrameSet, look_at, random_frames
+from starcal_uq.planning.plan import Plan, plan
+from starcal_uq.presentation.words.planning import frames as frames_words
+from tests.helpers.scenes import COEFFICIENTS, camera, observations
+
+ARCSEC = 648_000.0 / np.pi
+
+
+@lru_cache
+def sky(max_mag: float = 6.0) -> sc.StarCatalogue:
+    return sc.load_catalogue(max_mag=max_mag)
+
+
+@lru_cache
+def some_frames(n_frames: int = 1000) -> FrameSet:
+    return random_frames(sky(), camera(), 0.05, n_frames=n_frames, min_stars=10, seed=1)
+
+
+@lru_cache
+def made(**options: object) -> Plan:
+    return fresh(**options)
+
+
+def fresh(**options: object) -> Plan:
+    settings = {"n_geometries": 500, "n_campaigns": 100, **options}
+    return plan(camera(), sky(7.0), max_mag=6.0, **settings)  # type: ignore[arg-type]
+
+
+# --- quantiles of two axes -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("confidence", "factor"), [(0.95, 2.44775), (0.997, 3.40856), (0.9973, 3.43933)])
+def test_equal_axes_have_rayleighs_quantile(confidence, factor):
+    assert mixture_radius(4.0 * np.eye(2), confidence) == pytest.approx(2.0 * factor, rel=1e-5)
+
+
+def test_one_axis_has_the_gaussian_quantile():
+    assert mixture_radius(np.diag([0.0, 9.0]), 0.95) == pytest.approx(3.0 * 1.959964, rel=1e-5)
+
+
+def test_unequal_axes_and_mixtures_against_sampling():
+    rng = np.random.default_rng(0)
+    covariances = np.array([[[1.0, 0.3], [0.3, 0.2]], [[0.1, 0.0], [0.0, 0.4]]])
+    drawn = np.concatenate([rng.multivariate_normal(np.zeros(2), C, 400_000) for C in covariances])
+    sampled = np.quantile(np.hypot(*drawn.T), 0.99)
+    assert mixture_radius(covariances, 0.99) == pytest.approx(sampled, rel=0.01)
+    # Control: the mean covariance is not the mixture.
+    assert mixture_radius(covariances.mean(axis=0), 0.99) != pytest.approx(sampled, rel=0.03)
+
+
+def test_the_budget_says_the_same_of_unequal_axes():
+    for small in (0.0, 0.3, 1.0):
+        expected = two_axis_radius(0.997, 2.0, 2.0 * small)
+        assert mixture_radius(np.diag([4.0, 4.0 * small**2]), 0.997) == pytest.approx(expected, rel=1e-4)
+
+
+def test_a_confidence_that_is_no_probability_is_refused():
+    with pytest.raises(ValueError, match="probability"):
+        mixture_radius(np.eye(2), 99.7)
+
+
+# --- information -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("model", list(COEFFICIENTS))
+def test_information_is_that_of_a_calibration(model):
+    obs = observations(model)
+    cal = sc.calibrate(obs, camera(model))
+    found = look_at(sc.load_catalogue(max_mag=6.0, epoch=2026.9), cal.camera, _rotations(cal), cal.sigma, 3)
+    # The stars are the same but for a few at the edge, which noise has moved.
+    assert found.n_stars.sum() == pytest.approx(obs.n_stars, rel=0.005)
+    assert np.sqrt(np.diag(inverses(found.information.sum(axis=0)))) == pytest.approx(cal.sigmas, rel=0.02)
+    turned, expected = (response * cal.sigmas for response in (found.common, cal.rotation_per_theta))
+    assert turned == pytest.approx(expected, abs=0.01 * np.abs(expected).max())
+
+
+def _rotations(cal: sc.Calibration) -> np.ndarray:
+    from starcal_uq.attitude.rotations import quaternion_to_rotation
+
+    return quaternion_to_rotation(cal.quaternions)
+
+
+def test_noise_of_the_attitude_is_quests():
+    found = some_frames()
+    b = sc.unproject(camera(), found.frames.pixel.T)
+    result = sc.quest(b, found.frames.r.T, found.frames.starts, sigma_rad=0.05 / camera().focal_px)
+    expected = ARCSEC * np.sqrt(np.diagonal(result.covariance, axis1=1, axis2=2).mean(axis=0))
+    assert nea_arcsec(found) == pytest.approx(expected, rel=0.02)
+
+
+def test_response_of_the_attitude_is_that_of_quest():
+    """A parameter that is too large turns the attitude as `response` says."""
+    found, cam = some_frames(), camera()
+    step = np.array([0.5, 0.0, 0.2, 0.0, 0.0])
+    b = sc.unproject(cam.with_theta(cam.theta + step), found.frames.pixel.T)
+    turned = sc.quest(b, found.frames.r.T, found.frames.starts).rotations
+    from starcal_uq.attitude.rotations import rotation_vector
+
+    phi = rotation_vector(turned @ np.swapaxes(found.rotations, 1, 2))
+    assert phi.mean(axis=0)[:2] == pytest.approx((found.common @ step)[:2], rel=0.01, abs=1e-7)
+
+
+def test_noise_by_magnitude_weights_the_stars():
+    def noise(mag):
+        return 0.05 * 10.0 ** (0.2 * (mag - 6.0))
+
+    flat = some_frames(200)
+    found = random_frames(sky(), camera(), noise, n_frames=200, min_stars=10, seed=1)
+    assert found.frames.weight == pytest.approx(1.0 / noise(found.mag))
+    # Brighter stars are better than the faintest: more information than with 0.05 px for all.
+    assert np.trace(found.information.sum(axis=0) @ np.diag([1, 1, 0, 0, 0])) > 1.2 * np.trace(
+        flat.information.sum(axis=0) @ np.diag([1, 1, 0, 0, 0])
+    )
+
+
+def test_window_of_the_detector():
+    found = some_frames(200)
+    whole = found.seen_within(1.0)
+    assert whole == pytest.approx(found.information, rel=1e-6, abs=1e-6 * np.abs(found.information).max())
+    traces = [np.trace(found.seen_within(part)[:, :3, :3].sum(axis=0)) for part in (0.2, 0.5, 1.0)]
+    assert traces[0] < traces[1] < traces[2]
+    assert not found.seen_within(1e-4).any()
+
+
+# --- forecast --------------------------------------------------------------------------------------------------------
+
+
+def test_paper_set_up():
+    """The bound of the paper's 1000 frames: 0.15 px of principal point, 5 arcsec in common, 0.007 of rest."""
+    forecast = made(sweeps=False).forecast
+    row = {name: forecast.of(name)[list(forecast.n_frames).index(1000)] for name in forecast.names}
+    assert row["x0_px"] == pytest.approx(0.14, rel=0.1)
+    assert row["f_px"] == pytest.approx(0.026, rel=0.1)
+    assert row["f_mm"] == pytest.approx(row["f_px"] * 0.012)
+    assert row["k1_per_px2"] == pytest.approx(0.37e-10, rel=0.15)
+    assert row["common_pitch_arcsec"] == pytest.approx(4.9, rel=0.1)
+    assert 0.003 < row["rest_pitch_arcsec"] < 0.01
+    assert made(sweeps=False).nea_arcsec == pytest.approx([0.46, 0.46, 6.6], rel=0.1)
+
+
+def test_same_seed_same_plan_and_more_frames_are_better():
+    one, again = (plan(camera(), sky(), n_geometries=200, n_campaigns=40, sweeps=False, seed=5) for _ in range(2))
+    assert np.array_equal(one.forecast.sigma, again.forecast.sigma)
+    assert (np.diff(one.forecast.sigma, axis=0) < 0.0).all()
+    assert (one.forecast.low <= one.forecast.sigma).all()
+    assert (one.forecast.sigma <= one.forecast.high).all()
+
+
+def test_quantities_are_what_they_say():
+    """Displacement at the corner, common rotation and rest of drawn parameters scatter as the forms say."""
+    mission, cam = some_frames(), camera()
+    covariance = inverses(mission.information.sum(axis=0))
+    drawn = np.random.default_rng(0).multivariate_normal(np.zeros(5), covariance, 4000)
+    measured = quantities(mission)
+    sigma = dict(
+        zip([q.name for q in measured], spreads(np.stack([q.form for q in measured]), covariance), strict=True)
+    )
+    u, v = -0.5 - cam.x0_px, -0.5 - cam.y0_px
+    u = max(u, cam.width_px - 0.5 - cam.x0_px, key=abs)
+    v = max(v, cam.height_px - 0.5 - cam.y0_px, key=abs)
+    r2 = u * u + v * v
+    corner = np.hypot(u, v) * (drawn[:, 3] * r2 + drawn[:, 4] * r2**2)
+    assert sigma["distortion_corner_px"] == pytest.approx(corner.std(), rel=0.05)
+    phi = ARCSEC * np.einsum("kap,np->nka", mission.response, drawn)
+    common = phi.mean(axis=1)
+    assert sigma["common_yaw_arcsec"] == pytest.approx(common[:, 1].std(), rel=0.05)
+    assert sigma["rest_roll_arcsec"] == pytest.approx(np.sqrt(np.mean((phi - common[:, None])[..., 2] ** 2)), rel=0.05)
+
+
+@lru_cache
+def small_check() -> ForecastCheck:
+    return check_forecast(camera(), sky(), n_frames=(10, 30), n_campaigns=60, n_geometries=1000, workers=0, seed=3)
+
+
+def test_forecast_is_what_small_campaigns_state_and_do():
+    check = small_check()
+    assert check.ok, check.verdict
+    assert not check.failures
+    assert check.to_dataframe().shape == (2 * len(check.forecast.names), 9)
+    assert "60 simulated campaigns" in check.verdict
+
+
+def test_a_forecast_that_forgets_the_attitudes_fails():
+    """Control: with the attitudes known, the principal point would be known a hundred times better."""
+    found, cam = some_frames(), camera()
+    likelihood = MarginalLikelihood(found.frames, cam.distortion)
+    state, _ = likelihood.profile(cam.theta, found.rotations)
+    h = likelihood.derivatives(cam.theta, state)
+    wrong = np.moveaxis(found.frames.sum(np.einsum("axn,bxn->abn", h, h)), 2, 0)
+    forgetful = Forecaster(wrong, found.mean_stars, found, n_campaigns=50).forecast((10, 30))
+    check = replace(small_check(), forecast=forgetful)
+    assert not check.ok
+    assert (check.ratio[:, 0] > 20.0).all()
+
+
+def test_a_camera_that_errs_more_than_it_states_is_noticed():
+    """Control: errors a fifth larger than stated."""
+    check = small_check()
+    wrong = replace(check, nees=1.25**2 * check.nees)
+    assert wrong.nees_rejected.any()
+    assert not wrong.ok
+    assert "not what they should be" in wrong.verdict
+
+
+@pytest.mark.slow
+def test_forecast_against_simulation_from_10_to_3000_frames():
+    check = check_forecast(camera(), sky(), workers=2, seed=11)
+    assert list(check.forecast.n_frames) == [10, 30, 100, 300, 1000, 3000]
+    assert check.n_campaigns == 50
+    assert check.largest_difference < 0.05
+    assert not check.nees_rejected.any()
+    # The forecast itself is right about the errors, not only about what is stated.
+    found, low, high = check.nees_ratio(of_forecast=True)
+    assert np.all((found > low - 0.15) & (found < high + 0.15))
+
+
+# --- frames for a target ---------------------------------------------------------------------------------------------
+
+
+def test_frames_needed_keep_the_target_and_fewer_do_not():
+    forecaster = Forecaster(some_frames().information, 17.7, some_frames(), n_campaigns=100)
+    for target in (100.0, 20.0, 5.0):
+        needed = forecaster.frames_needed(target)
+        radius = [forecaster.radii(forecaster.covariances(n), n).mean() for n in (needed, int(0.95 * needed) - 1)]
+        assert radius[0] <= target < radius[1]
+        assert forecaster.frames_needed(target, share=0.95) > needed
+
+
+def test_first_order_law_of_the_target():
+    """Half the error takes four times the frames, and so does twice the noise."""
+    needs = [made(sweeps=False, target_arcsec=t).frames_needed for t in (10.0, 5.0)]
+    assert needs[1] == pytest.approx(4 * needs[0], rel=0.02)
+    noisy = made(sweeps=False, target_arcsec=10.0, sigma_px=0.1).frames_needed
+    assert noisy == pytest.approx(4 * needs[0], rel=0.03)
+
+
+def test_radius_is_the_rayleigh_quantile_of_the_common_rotation():
+    forecast = made(sweeps=False).forecast
+    sigma = np.sqrt(0.5 * (forecast.of("common_pitch_arcsec") ** 2 + forecast.of("common_yaw_arcsec") ** 2))
+    # Small campaigns: axes differ, and the noise is estimated.
+    assert forecast.radius[3:] / sigma[3:] == pytest.approx(np.full(3, 3.4086), rel=0.005)
+    assert forecast.radius[0] / sigma[0] > 3.42
+
+
+def test_estimated_noise_widens_as_students_distribution():
+    assert student_factor(0.997, 1e7) == pytest.approx(1.0, abs=1e-5)
+    rng = np.random.default_rng(1)
+    ratio = np.hypot(*rng.standard_normal((2, 400_000))) / np.sqrt(rng.chisquare(60, 400_000) / 60)
+    assert 3.40856 * student_factor(0.997, 60.0) == pytest.approx(np.quantile(ratio, 0.997), rel=0.01)
+
+
+def test_scopes_differ_and_noise_is_a_floor():
+    found = {need.scope: need for need in made(sweeps=False, target_arcsec=1.0).needs}
+    assert found["rest"].frames < 10 < 100_000 < found["common"].frames
+    assert found["calibration"].frames >= found["common"].frames
+    # Centroid noise alone is more than 1 arcsec at 99.7 %.
+    assert found["total"].frames is None
+    assert found["total"].floor_arcsec > 1.0
+    assert "centroid noise alone" in made(sweeps=False, target_arcsec=1.0, scope="total").verdict
+
+
+def test_data_that_are_there_already_count():
+    obs = observations()
+    cal = sc.calibrate(obs, camera())
+    alone, added = made(sweeps=False), fresh(sweeps=False, after=cal)
+    assert (added.forecast.sigma[0] < 0.6 * alone.forecast.sigma[0]).all()
+    # 3000 frames know more than 60 did.
+    assert added.forecast.sigma[-1] == pytest.approx(alone.forecast.sigma[-1], rel=0.03)
+    with pytest.raises(PlanningError, match="5 parameters, but the camera has 3"):
+        plan(camera("none"), sky(), after=cal)
+
+
+# --- sweeps ----------------------------------------------------------------------------------------------------------
+
+
+def test_sweeps_change_one_thing():
+    table = made(target_arcsec=5.0).sweeps
+    groups = dict(iter(table.groupby("sweep")))
+    assert set(groups) == {"magnitude limit", "noise", "part of the detector"}
+    magnitudes = groups["magnitude limit"]
+    assert magnitudes["value"].max() == 7.0
+    assert (np.diff(magnitudes["frames_needed"]) < 0).all()
+    noise = groups["noise"]
+    per_noise = (noise["common_pitch_arcsec"] / noise["value"]).to_numpy()
+    assert per_noise == pytest.approx(np.full(5, per_noise[2]), rel=1e-6)
+    assert (np.diff(groups["part of the detector"]["radius_arcsec"]) < 0).all()
+    # The same plan three times.
+    here = [
+        rows[np.isclose(rows["value"], at)].iloc[0]
+        for rows, at in ((magnitudes, 6.0), (noise, 0.05), (groups["part of the detector"], 1.0))
+    ]
+    assert [row["radius_arcsec"] for row in here] == pytest.approx([here[0]["radius_arcsec"]] * 3, rel=0.05)
+
+
+# --- refusals, words and files ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"n_frames": ()}, "below 1"),
+        ({"n_frames": (0,)}, "below 1"),
+        ({"min_stars": 2}, "at least 3"),
+        ({"target_arcsec": 0.0}, "above zero"),
+        ({"scope": "roll"}, "use one of common, rest"),
+        ({"confidence": 99.7}, "no probability"),
+        ({"max_mag": -5.0}, "no star is brighter"),
+        ({"sigma_px": 0.0}, "above zero"),
+        ({"sigma_px": lambda mag: mag[:1]}, "every magnitude"),
+        ({"n_geometries": 10}, "at least 50"),
+        ({"n_campaigns": 1}, "at least 20"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused_in_one_sentence(options, words):
+    with pytest.raises(PlanningError, match=words) as refused:
+        plan(camera(), sky(), sweeps=False, **options)
+    assert str(refused.value).endswith(".")
+
+
+def test_no_attitude_with_enough_stars():
+    with pytest.raises(PlanningError, match="none of the 1 candidate attitudes shows 400 stars"):
+        look_at(sky(), camera(), np.eye(3)[None], 0.05, 400)
+
+
+def test_words():
+    assert frames_words(10_757) == "10\u202f800 frames"
+    assert frames_words(1) == "1 frame"
+    assert frames_words(667) == "667 frames"
+    assert frames_words(None) == "no number of frames"
+    verdict = made(target_arcsec=5.0).verdict
+    assert verdict.startswith("To keep 5 arcsec across the boresight at 99.7\xa0% for the common rotation takes")
+    assert "only the rest counts: 1 frame" in verdict
+    assert "centroid noise of" in made(sweeps=False).verdict
+
+
+def test_folder_of_a_plan(tmp_path):
+    found = made(target_arcsec=5.0)
+    page = found.save(tmp_path / "plan")
+    text = page.read_text(encoding="utf-8")
+    assert "http" not in text.replace("http-equiv", "")
+    assert text.count("data:image/png") == 2
+    assert found.verdict.split(".")[0] in text
+    written = {path.relative_to(page.parent).as_posix() for path in page.parent.rglob("*") if path.is_file()}
+    assert written == {
+        *("plan.html", "plan.csv", "sweeps.csv", "plan.json", "figures/forecast.png", "figures/sweeps.png")
+    }
+    record = json.loads((page.parent / "plan.json").read_text())
+    assert record["needs"][0]["frames"] == found.frames_needed
+    assert record["forecast"][0]["n_frames"] == 10
+    assert found._repr_html_().startswith("<p><b>Plan</b>")
+
+
+def test_a_target_out_of_reach_is_drawn_as_error():
+    found = made(target_arcsec=1.0, scope="total")
+    assert found.frames_needed is None
+    panel = found.plot_sweeps().axes[0]
+    assert "target 1 arcsec" in panel.get_title(loc="left")
+    assert all(np.isfinite(line.get_ydata()).all() for line in panel.lines)
+
+
+def test_a_page_with_choice_and_check(tmp_path):
+    choice = choose_frames(camera(), sky(), n_frames=5, candidates=200, n_geometries=100)
+    page = made(sweeps=False).save(tmp_path / "plan", choice=choice, check=small_check())
+    text = page.read_text(encoding="utf-8")
+    assert text.count("data:image/png") == 3
+    assert "Frames to take" in text
+    assert "Forecast against simulation" in text
+    assert {"frames.csv", "check.csv"} < {path.name for path in page.parent.iterdir()}
+
+
+def test_a_plan_without_target_or_sweeps_is_drawn(tmp_path):
+    found = made(sweeps=False)
+    assert found.frames_needed is None
+    page = found.save(tmp_path / "plan").read_text(encoding="utf-8")
+    assert "Frames needed" not in page
+    with pytest.raises(ValueError, match="without sweeps"):
+        found.plot_sweeps()
+
+
+def test_one_distortion_less_one_column_less():
+    found = plan(camera("none"), sky(), n_geometries=100, n_campaigns=20, sweeps=False)
+    assert "distortion_corner_px" not in found.forecast.names
+    found.plot_forecast()
+    tangential = plan(camera("brown_tangential"), sky(), n_geometries=100, n_campaigns=20, sweeps=False)
+    assert {"p1_per_px", "p2_per_px", "k2_per_px4"} < set(tangential.forecast.names)

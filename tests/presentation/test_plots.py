@@ -1,0 +1,266 @@
+"""The figures show the numbers they are made from, in every model, legibly, and leave no trace in the process."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.camera.distortion import parameters
+from starcal_uq.presentation.figures.coupling import (
+    correlation_text,
+    plot_correlation,
+    plot_correlations,
+    plot_couplings,
+)
+from starcal_uq.presentation.figures.estimation import (
+    plot_convergence,
+    plot_residual_histogram,
+    plot_residual_map,
+    plot_residual_radius,
+    plot_residuals,
+)
+from starcal_uq.presentation.figures.inference import CONTOUR_MASSES, mass_levels, plot_corner, plot_prior_posterior
+from starcal_uq.presentation.figures.propagation import plot_attitude, plot_field_map
+from starcal_uq.presentation.figures.scales import axis_scale
+from starcal_uq.presentation.figures.style import figure_of, png_bytes
+from tests.helpers.scenes import camera, nominal, observations
+
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.fixture(scope="module", params=["brown", "none", "brown_tangential"])
+def run(request):
+    """A run per distortion model; the noise of the one without coefficients is given and not sampled."""
+    truth = camera(request.param)
+    obs = observations(request.param, n_frames=60)
+    cal = sc.calibrate(obs, nominal(truth))
+    sigma = 0.05 if request.param == "none" else "sampled"
+    post = sc.sample(obs, cal, seed=1, n_steps=50, sigma=sigma)
+    return SimpleNamespace(obs=obs, cal=cal, post=post, coupling=sc.coupling(post), truth=truth)
+
+
+@pytest.fixture
+def errors():
+    """Attitude errors and a map, the sizes of the paper's set-up."""
+    x, y = np.linspace(-0.5, 1023.5, 9), np.linspace(-0.5, 767.5, 7)
+    radius = np.hypot(x[None, :] - 500.0, y[:, None] - 400.0) / 700.0
+    attitude = SimpleNamespace(
+        axes=("pitch", "yaw", "roll"),
+        nea_arcsec=np.array([0.5, 0.5, 7.0]),
+        common_arcsec=np.array([5.4, 5.5, 0.1]),
+        rest_arcsec=np.array([0.02, 0.02, 0.2]),
+    )
+    absolute, compensated = 5.0 + 0.01 * radius, 0.002 + 0.1 * radius**4
+    shape = np.array([[1.2, 0.3], [0.3, 0.8]])
+    field = SimpleNamespace(
+        x_px=x,
+        y_px=y,
+        sigma_absolute_arcsec=absolute,
+        sigma_compensated_arcsec=compensated,
+        covariance_absolute_arcsec2=absolute[..., None, None] ** 2 * shape,
+        covariance_compensated_arcsec2=compensated[..., None, None] ** 2 * shape,
+        star_x_px=np.linspace(0.0, 1000.0, 30),
+        star_y_px=np.linspace(0.0, 700.0, 30),
+    )
+    return attitude, field
+
+
+def drawn(result):
+    figure = figure_of(result) if hasattr(result, "plot") else result
+    assert png_bytes(figure, dpi=50).startswith(PNG)
+    return figure
+
+
+def overlapping(figure):
+    """Pairs of tick labels of one axis that cover each other."""
+    figure.canvas.draw()
+    pairs = []
+    for ax in figure.axes:
+        for axis in (ax.xaxis, ax.yaxis):
+            low, high = sorted(axis.get_view_interval())
+            shown = [
+                tick.label1
+                for tick in axis.get_major_ticks()
+                if tick.label1.get_visible() and tick.label1.get_text() and low <= tick.get_loc() <= high
+            ]
+            boxes = [(label.get_text(), label.get_window_extent()) for label in shown]
+            pairs += [(a[0], b[0]) for a, b in itertools.combinations(boxes, 2) if a[1].overlaps(b[1])]
+    return pairs
+
+
+def test_corner_shows_every_sampled_parameter(run):
+    figure = drawn(plot_corner(run.post, run.cal, run.truth))
+    n = len(run.post.sampled)
+    assert len(figure.axes) == n * (n + 1) // 2
+    titles = [ax.get_title() for ax in figure.axes if ax.get_title()]
+    assert [title.split(" ")[0] for title in titles] == [run.post.parameters[i].latex for i in run.post.sampled]
+    assert overlapping(figure) == []
+
+
+def test_prior_and_posterior(run):
+    figure = drawn(plot_prior_posterior(run.post, run.truth))
+    assert len(figure.axes) == 2 * len(run.post.sampled)
+    assert overlapping(figure) == []
+
+
+def test_contours_hold_the_stated_mass():
+    """On a normal distribution the levels are those of the 1- and 2-sigma ellipses."""
+    x = np.linspace(-5, 5, 401)
+    density = np.exp(-0.5 * (x[:, None] ** 2 + x[None, :] ** 2))
+    outer, inner = mass_levels(density, CONTOUR_MASSES)
+    assert inner == pytest.approx(np.exp(-0.5), rel=0.01)
+    assert outer == pytest.approx(np.exp(-2.0), rel=0.02)
+
+
+def test_axis_is_value_minus_the_printed_number():
+    k1 = parameters("brown")[3]
+    scale = axis_scale(k1, 1.9634e-10, 0.39e-10)
+    assert scale.label == "$k_1$ − 1.96 [10⁻¹⁰ px⁻²]"
+    assert scale.title == "$k_1$ = (1.96 ± 0.39) × 10⁻¹⁰ px⁻²"
+    assert scale(2.35e-10) == pytest.approx(0.39)
+    fine = axis_scale(parameters("brown")[2], -5000.0, 0.0002)
+    assert fine.label == "$f$ + 5000.00000 [10⁻³ px]"
+    assert fine(np.array([-4999.999])) == pytest.approx([1.0])
+
+
+@pytest.mark.parametrize("extended", [False, True])
+def test_heat_map_prints_its_numbers(run, extended):
+    ax = plot_correlation(run.coupling, extended=extended)
+    matrix = run.coupling.extended_correlation if extended else run.coupling.correlation
+    texts = [text.get_text() for text in ax.texts]
+    wanted = [correlation_text(v, i == j) for (i, j), v in np.ndenumerate(matrix)]
+    assert texts == wanted
+    drawn(ax)
+    drawn(plot_correlations(run.coupling))
+
+
+def test_correlations_near_one_keep_their_digits():
+    assert [correlation_text(v) for v in (0.02, -0.943, 0.9912, -0.99931, 1.0 - 1e-9, -0.001)] == [
+        "0.02",
+        "−0.94",
+        "0.991",
+        "−0.9993",
+        "0.9999",
+        "0.00",
+    ]
+    assert correlation_text(1.0, diagonal=True) == "1"
+
+
+def test_price_of_coupling(run):
+    ax = plot_couplings(run.coupling)
+    ratio = run.coupling.sigma_marginal / run.coupling.sigma_conditional
+    assert [bar.get_width() for bar in ax.patches] == pytest.approx(ratio)
+    drawn(ax)
+
+
+def test_convergence_draws_the_trajectories(run):
+    figure = drawn(plot_convergence(run.cal, run.truth))
+    p = len(run.cal.parameter_names)
+    assert len(figure.axes) == 2 * p
+    trajectory = np.concatenate([stage.trajectory for stage in run.cal.stages])
+    focal_mm = figure.axes[2].lines[0].get_ydata()
+    assert focal_mm == pytest.approx(trajectory[:, 2] * run.cal.camera.pixel_um / 1000.0)
+    error = figure.axes[p].lines[-1].get_ydata()
+    assert error == pytest.approx((trajectory[:, 0] - run.truth.theta[0]) / run.cal.sigmas[0])
+    assert overlapping(figure) == []
+    drawn(plot_convergence(run.cal))
+
+
+def test_a_truth_of_another_model_is_not_compared(run):
+    other = camera("brown3")
+    figure = plot_convergence(run.cal, other)
+    assert "final estimate" in figure.axes[len(run.cal.parameter_names)].get_ylabel()
+
+
+def test_residuals(run):
+    figure = drawn(plot_residuals(run.cal, run.obs))
+    assert len(figure.axes) == 3
+    assert overlapping(figure) == []
+    few = run.obs.select_frames(run.obs.frame_ids[:3])
+    cal = sc.calibrate(few, run.cal.camera)
+    drawn(plot_residuals(cal, few))
+
+
+def test_panels_draw_on_the_axes_they_are_given(run, errors):
+    from matplotlib.figure import Figure
+
+    figure = Figure()
+    axes = figure.subplots(2, 3).ravel()
+    assert plot_residual_map(run.cal, run.obs, axes[0]) is axes[0]
+    assert plot_residual_radius(run.cal, run.obs, axes[1]) is axes[1]
+    assert plot_residual_histogram(run.cal, run.obs, axes[2]) is axes[2]
+    assert plot_correlation(run.coupling, axes[3]) is axes[3]
+    assert plot_couplings(run.coupling, axes[4]) is axes[4]
+    assert plot_attitude(errors[0], axes[5]) is axes[5]
+    for panel in (plot_residual_map, plot_residual_radius, plot_residual_histogram):
+        drawn(panel(run.cal, run.obs))
+
+
+def test_attitude_bars(errors):
+    attitude, _ = errors
+    ax = plot_attitude(attitude)
+    heights = [bar.get_height() for bar in ax.patches]
+    wanted = np.concatenate([attitude.nea_arcsec, attitude.common_arcsec, attitude.rest_arcsec])
+    assert heights == pytest.approx(wanted)
+    assert ax.get_yscale() == "log"
+    drawn(ax)
+    attitude.rest_arcsec = np.zeros(3)
+    drawn(plot_attitude(attitude))
+
+
+def test_field_map_has_a_colour_bar_for_each_panel(errors):
+    _, field = errors
+    figure = drawn(plot_field_map(field))
+    assert len(figure.axes) == 4
+    assert figure.axes[0].get_ylim()[0] > figure.axes[0].get_ylim()[1]
+    assert overlapping(figure) == []
+    # The compensated map spans a factor of fifty: levels in equal ratios, printed without powers of ten.
+    bar = figure.axes[3]
+    assert bar.get_yscale() == "log"
+    assert "0.01" in [label.get_text() for label in bar.get_yticklabels()]
+    field.sigma_absolute_arcsec = np.full_like(field.sigma_absolute_arcsec, 5.0)
+    field.sigma_compensated_arcsec = np.zeros_like(field.sigma_absolute_arcsec)
+    field.covariance_compensated_arcsec2 = np.zeros_like(field.covariance_absolute_arcsec2)
+    drawn(plot_field_map(field))
+
+
+def test_ellipses_of_the_field_map_lie_within_their_cells(errors):
+    _, field = errors
+    figure = drawn(plot_field_map(field))
+    ellipses = figure.axes[0].collections[-1]
+    places = ellipses.get_offsets()
+    step = min(np.diff(np.unique(places[:, i])).min() for i in (0, 1))
+    assert 0.85 * step < ellipses.get_widths().max() <= step
+    assert (ellipses.get_widths() > ellipses.get_heights()).all()
+    # The long axis points along rising x and y, which is downwards to the right.
+    assert np.all((ellipses.get_angles() % 180.0 > 0.0) & (ellipses.get_angles() % 180.0 < 45.0))
+    assert "semi-axis 5″" in [text.get_text() for text in figure.axes[0].texts]
+    # A map of an earlier version has no ellipses and is drawn all the same.
+    field.covariance_absolute_arcsec2 = field.covariance_compensated_arcsec2 = None
+    assert not drawn(plot_field_map(field)).axes[0].texts
+
+
+def test_figures_are_repeatable_and_show_themselves(run):
+    first, second = (png_bytes(figure_of(plot_couplings(run.coupling)), dpi=40) for _ in range(2))
+    assert first == second
+    assert plot_correlations(run.coupling)._repr_png_().startswith(PNG)
+
+
+def test_settings_of_the_user_stay_untouched(run):
+    import matplotlib
+
+    before = dict(matplotlib.rcParams)
+    plot_residuals(run.cal, run.obs)
+    plot_correlation(run.coupling)
+    assert dict(matplotlib.rcParams) == before
+
+
+def test_importing_plots_imports_no_matplotlib():
+    code = "import sys, starcal_uq.plots; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

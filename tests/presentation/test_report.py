@@ -1,0 +1,316 @@
+"""The report of a run: complete, self-contained, honest about what is missing, and written all or nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.core.formatting import significant
+from starcal_uq.diagnostics.diagnose import FILE
+from starcal_uq.presentation.report.page import render
+from starcal_uq.presentation.report.tables import attitude_rows, parameter_rows, symbol, weak_directions
+from starcal_uq.runs.run import load_results
+from starcal_uq.runs.steps import diagnose_run
+from tests.helpers.scenes import camera, nominal, observations
+
+VOID = {"meta", "img", "br", "hr", "link", "input"}
+SECTIONS = {"parameters", "attitude", "posterior", "coupling", "residuals", "convergence", "checks"}
+SECTIONS |= {"misfit", "diagnostics", "method", "provenance"}
+
+
+class Page(HTMLParser):
+    """Ids, links, images and texts of a page; fails on tags that are not closed in order."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.ids: set[str] = set()
+        self.links: list[str] = []
+        self.images: list[dict[str, str | None]] = []
+        self.tags: set[str] = set()
+        self.words: list[str] = []
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    def handle_starttag(self, tag, attrs):
+        values = dict(attrs)
+        self.tags.add(tag)
+        if tag not in VOID:
+            self.open.append(tag)
+        if "id" in values:
+            self.ids.add(values["id"])
+        if tag == "a":
+            self.links.append(values["href"])
+        if tag == "img":
+            self.images.append(values)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if "style" not in self.open:
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+
+@pytest.fixture(scope="module")
+def full(tmp_path_factory):
+    """A complete run folder with its report."""
+    run = sc.RunFolder(tmp_path_factory.mktemp("report") / "run").create()
+    obs = observations(n_frames=60)
+    obs.save(run.observations)
+    start = sc.paper_start()
+    start.save(run.camera)
+    cal = sc.calibrate(obs, start)
+    cal.save(run.calibration)
+    post = sc.sample(obs, cal, seed=1, n_steps=100)
+    post.save(run.posterior)
+    sc.propagate(post, obs, n_draws=200, seed=1).save(run.attitude)
+    sc.field_map(post, obs, n=9).save(run.field_map)
+    diagnose_run(run.path, n_starts=1)
+    assert sc.report(run.path) == run.report
+    return run
+
+
+@pytest.fixture
+def run(full, tmp_path):
+    """A copy that a test may change."""
+    shutil.copytree(full.path, tmp_path / "run")
+    return sc.RunFolder(tmp_path / "run")
+
+
+def page(run) -> Page:
+    return Page(run.report.read_text(encoding="utf-8"))
+
+
+def words(run, truth=None) -> str:
+    """The text of the report that a run would give, without drawing its figures."""
+    return Page(render(load_results(run, truth), {})).text
+
+
+def test_every_section_is_there_and_every_link_leads_somewhere(full):
+    found = page(full)
+    assert found.ids >= SECTIONS
+    assert {link.removeprefix("#") for link in found.links} == SECTIONS
+    assert len(found.images) == 11
+    assert all(image["alt"] for image in found.images)
+
+
+def test_one_file_without_network_or_script(full):
+    text = full.report.read_text(encoding="utf-8")
+    found = page(full)
+    assert "script" not in found.tags and "link" not in found.tags
+    assert all(image["src"].startswith("data:image/png;base64,") for image in found.images)
+    assert "http" not in text.replace("http-equiv", "")
+    assert "url(" not in text and "@import" not in text
+    assert len(text) < 4_000_000
+
+
+def test_figures_are_files_too(full):
+    names = {path.stem for path in full.figures.glob("*.png")}
+    assert names == {
+        "attitude",
+        "convergence",
+        "corner",
+        "correlation",
+        "distortion_curve",
+        "field_map",
+        "misfit",
+        "price_of_coupling",
+        "prior_posterior",
+        "residual_profiles",
+        "residuals",
+    }
+
+
+def test_verdict_comes_first_in_words(full):
+    text = page(full).text
+    assert text.index("every check passed") < text.index("stars in 60 frames") < text.index("95 % interval")
+    for question in ("Did it converge?", "Can it be trusted?", "What limits it?"):
+        assert question in text
+
+
+def test_parameters_are_those_of_the_posterior(full):
+    results = load_results(full)
+    rows = parameter_rows(results)
+    assert len(rows) == 7
+    post = results.posterior
+    assert [float(row["estimate"].replace("−", "-")) for row in rows if row["unit"] != "mm"] == pytest.approx(
+        post.draws.mean(axis=0) / np.array([1, 1, 1, 1e-10, 1e-15, 1]), abs=0.5
+    )
+    focal = rows[3]
+    assert float(focal["estimate"]) == pytest.approx(results.posterior.mean[2] * 0.012, abs=1e-3)
+    assert focal["truth"] == "70.2262"
+    low, high = (float(end) for end in rows[0]["interval"].split(" … "))
+    assert low < float(rows[0]["estimate"]) < high
+    z = (post.mean[0] - 500.0) / post.sd[0]
+    assert float(rows[0]["z"].replace("−", "-")) == pytest.approx(z, abs=0.051)
+    assert all(row["prior"] for row in rows)
+
+
+def test_digits_end_at_the_second_digit_of_sigma(full):
+    for row in parameter_rows(load_results(full)):
+        assert len(row["sigma"].replace(".", "").lstrip("0")) == 2
+        assert len(row["estimate"].partition(".")[2]) == len(row["sigma"].partition(".")[2])
+
+
+def test_field_map_and_distortion_in_words(full):
+    text = page(full).text
+    assert "Equivalent principal point" in text
+    assert "the distortion is" in text
+    field = load_results(full).field_map
+    assert f"{significant(field.equivalent_principal_point_px[0])} px" in text
+
+
+def test_attitude_table(full):
+    error = load_results(full).attitude
+    rows = attitude_rows(error)
+    assert [row["absorbed"] for row in rows] == ["no", "yes", "no", "in part", "no"]
+    assert all(len(row[group]) == 4 for row in rows for group in ("sigma", "p95", "p997"))
+    assert float(rows[1]["sigma"][0]) == pytest.approx(error.common_arcsec[0], rel=0.05)
+
+
+def test_weak_direction_names_the_distortion(full):
+    rows = weak_directions(load_results(full).coupling)
+    assert rows[0]["words"].startswith("k1 against")
+    assert str(rows[0]["weights"][0][0]).startswith("<i>")
+
+
+def test_without_posterior_the_report_says_which_command_makes_it(run):
+    for path in (run.posterior, run.attitude, run.field_map):
+        path.unlink()
+    sc.report(run.path)
+    found = page(run)
+    assert f"starcal-uq sample {run.path}" in found.text
+    assert f"starcal-uq propagate {run.path}" in found.text
+    assert found.ids >= {"parameters", "coupling", "residuals", "convergence", "checks", "method", "provenance"}
+    assert not found.ids & {"attitude", "posterior", "diagnostics"}
+    assert {link.removeprefix("#") for link in found.links} <= found.ids
+    assert "not been sampled" in found.text
+
+
+def test_misfit_section_shows_tests_jackknife_models_and_replicates(full):
+    text = page(full).text
+    section = text[text.rindex("Model error is in no posterior") : text.index("Fig. 3 of Ye")]
+    for words_of in (
+        "Error with the pixel phase in x",
+        "None found anything (16 tests",
+        "Jackknife over frames",
+        "No other model predicts left-out frames better than 'brown'",
+        "brown (this report)",
+        "rejected",
+        "excess kurtosis",
+    ):
+        assert words_of in section, words_of
+    assert "Focal length" in text and "Common rotation, yaw" in text
+
+
+def test_without_diagnosis_or_with_that_of_another_estimate_the_command_is_named(run):
+    text = (run.path / FILE).read_text(encoding="utf-8")
+    (run.path / FILE).write_text(text.replace('"theta": [\n  5', '"theta": [\n  6'), encoding="utf-8")
+    for _ in range(2):
+        found = words(run)
+        assert f"starcal-uq diagnose {run.path}" in found
+        assert "Jackknife over frames" not in found
+        (run.path / FILE).unlink(missing_ok=True)
+
+
+def test_undeclared_directions_are_warned_of_before_any_table(run):
+    obs = sc.load_observations(run.observations)
+    obs.with_meta(directions="undeclared").save(run.observations, force=True)
+    text = words(run)
+    assert text.index("Neither time nor observer velocity was declared") < text.index("95 % interval")
+    assert "not declared as apparent" in text
+
+
+def test_without_truth_there_is_no_truth(run):
+    obs = sc.load_observations(run.observations)
+    meta = {name: value for name, value in obs.meta.items() if name != "truth"}
+    dataclasses.replace(obs, meta=meta).save(run.observations, force=True)
+    assert "Truth" not in words(run)
+    assert "Truth" in words(run, camera())
+    # A truth of another distortion model cannot be compared parameter by parameter.
+    assert "Truth" not in words(run, camera("brown3"))
+
+
+def test_a_failed_check_turns_the_verdict_red(full):
+    results = load_results(full)
+    diagnostics = dataclasses.replace(results.posterior.diagnostics, rhat=np.full(6, 1.2))
+    results = dataclasses.replace(results, posterior=dataclasses.replace(results.posterior, diagnostics=diagnostics))
+    text = render(results, {})
+    assert "Do not use these numbers: R-hat failed." in Page(text).text
+    assert 'class="verdict fail"' in text
+
+
+def test_names_from_outside_are_text_and_not_markup(full):
+    results = load_results(full)
+    name = "<script>alert(1)</script> & co"
+    nominal_camera = results.calibration.nominal.replace(name=name)
+    cal = dataclasses.replace(results.calibration, nominal=nominal_camera)
+    text = render(dataclasses.replace(results, calibration=cal, truth=None), {})
+    assert "<script>" not in text
+    assert "&lt;script&gt;" in text
+    assert str(symbol("<b>")) == "&lt;b&gt;"
+
+
+def test_mixed_runs_are_refused_and_nothing_is_touched(run):
+    before = run.report.read_bytes()
+    observations(n_frames=60, seed=4).save(run.observations, force=True)
+    with pytest.raises(sc.RunFolderError, match="other observations"):
+        sc.report(run.path)
+    assert run.report.read_bytes() == before
+
+
+def test_a_report_that_fails_leaves_the_old_one(run, monkeypatch):
+    before = run.report.read_bytes()
+    figures = {path: path.stat().st_mtime_ns for path in run.figures.iterdir()}
+    monkeypatch.setattr("starcal_uq.presentation.report.page.draw_figures", lambda _: {"corner": b"new"})
+    monkeypatch.setattr("starcal_uq.presentation.report.page.render", lambda *_: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        sc.report(run.path)
+    assert run.report.read_bytes() == before
+    assert {path: path.stat().st_mtime_ns for path in run.figures.iterdir()} == figures
+
+
+def test_no_calibration_no_report(tmp_path):
+    with pytest.raises(sc.RunFolderError, match="starcal-uq calibrate"):
+        sc.report(sc.RunFolder(tmp_path / "empty").create().path)
+
+
+@pytest.mark.parametrize("model", ["none", "brown_tangential", "inverse"])
+def test_every_model_and_a_given_noise(model, tmp_path):
+    """Nothing is written for five parameters: without coefficients, with four, and in the other direction."""
+    truth = camera(model)
+    obs = observations(model, n_frames=60)
+    run = sc.RunFolder(tmp_path / "run").create()
+    obs.save(run.observations)
+    cal = sc.calibrate(obs, nominal(truth))
+    cal.save(run.calibration)
+    sc.sample(obs, cal, seed=1, n_steps=50, sigma=0.05).save(run.posterior)
+    text = words(run)
+    assert f"Distortion model “{model}”" in text
+    assert "was given as 0.05" in text
+    assert len(parameter_rows(load_results(run))) == len(cal.theta) + 2
+
+
+def test_real_data(real_data, tmp_path):
+    """Centroids of a real camera: noise and optics as known, and the warning on undeclared directions."""
+    start = sc.Camera.load(real_data / "esa_tetra3_camera.toml")
+    obs = sc.load_observations(real_data / "esa_tetra3_observations.csv", start)
+    run = sc.RunFolder(tmp_path / "run").create()
+    obs.save(run.observations)
+    cal = sc.calibrate(obs, start)
+    cal.save(run.calibration)
+    sc.sample(obs, cal, seed=1, n_steps=50).save(run.posterior)
+    text = words(run)
+    assert "567 stars in 8 frames" in text
+    assert "Neither time nor observer velocity was declared" in text

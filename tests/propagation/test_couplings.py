@@ -1,0 +1,81 @@
+"""The coupling report on the paper's sensor, and its formulas on matrices with known answers."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from tests.helpers.scenes import camera, nominal, observations
+
+
+@pytest.fixture(scope="module")
+def found():
+    return sc.coupling(sc.calibrate(observations(n_frames=300), sc.paper_start()))
+
+
+def test_correlations_of_the_paper_set_up(found):
+    """Focal length and distortion trade against each other; the principal point is on its own (DESIGN's figures)."""
+    c = found.correlation
+    assert c[2, 3] == pytest.approx(-0.94, abs=0.02)
+    assert c[2, 4] == pytest.approx(0.84, abs=0.03)
+    assert c[3, 4] == pytest.approx(-0.97, abs=0.01)
+    assert np.max(np.abs(c[:2, 2:])) < 0.2
+    assert [pair[:2] for pair in found.pairs()] == [("k1", "k2"), ("f", "k1"), ("f", "k2")]
+
+
+def test_weak_direction_is_said_in_words(found):
+    assert found.weak_directions[0].words.startswith("k1 against ")
+    assert "poorly" in found.weak_directions[0].words
+    assert sum(d.variance for d in found.weak_directions) == pytest.approx(5.0)
+    assert "x0" not in found.weak_directions[0].words
+
+
+def test_inflation_is_the_price_of_not_knowing_the_others(found):
+    scale = 1 / found.sigma_marginal
+    precision = np.linalg.inv(found.covariance * np.outer(scale, scale))
+    assert np.allclose(found.variance_inflation, np.diag(precision))
+    assert np.allclose(found.crlb_sigma, found.sigma_marginal, rtol=1e-6)
+    assert found.contraction is None
+
+
+def test_principal_point_and_boresight_are_one_near_gauge(found):
+    names = found.extended_names
+    e = found.extended_correlation
+    assert e[names.index("x0"), names.index("yaw")] == pytest.approx(-1.0, abs=1e-3)
+    assert e[names.index("y0"), names.index("pitch")] == pytest.approx(1.0, abs=1e-3)
+    # 1 px of principal point is 1 / f of boresight.
+    expected = np.rad2deg(found.sigma_marginal[0] / 5852.0) * 3600.0
+    assert found.common_rotation_arcsec[1] == pytest.approx(expected, rel=0.02)
+
+
+def test_common_rotation_is_what_a_wrong_principal_point_does():
+    """The analytic response against attitudes solved again with a shifted principal point."""
+    from starcal_uq.attitude.rotations import quaternion_to_rotation, rotation_vector
+    from starcal_uq.estimation.marginal import MarginalLikelihood
+
+    obs = observations(n_frames=40)
+    cal = sc.calibrate(obs, sc.paper_start())
+    likelihood = MarginalLikelihood(obs, "brown")
+    base = quaternion_to_rotation(cal.quaternions)
+    for index, step in ((0, 0.5), (1, 0.5), (2, 1.0), (3, 1e-9)):
+        theta = cal.theta.copy()
+        theta[index] += step
+        turned = rotation_vector(likelihood.rotations_at(theta) @ base.transpose(0, 2, 1))
+        expected = cal.rotation_per_theta[:, index] * step
+        assert np.allclose(np.mean(turned, axis=0), expected, rtol=5e-3, atol=2e-9)
+
+
+def test_table_and_page(found):
+    table = found.to_dataframe()
+    assert list(table["parameter"]) == ["x0", "y0", "f", "k1", "k2"]
+    assert {"corr_pitch", "corr_yaw", "corr_roll", "variance_inflation"} <= set(table.columns)
+    assert "poorly determined" in found._repr_html_()
+
+
+@pytest.mark.parametrize("model", ["none", "brown_tangential"])
+def test_other_models_need_no_other_code(model):
+    cal = sc.calibrate(observations(model, max_mag=6.5), nominal(camera(model)))
+    found = sc.coupling(cal)
+    assert found.parameter_names == camera(model).parameter_names
+    assert found.extended_correlation.shape == (len(cal.theta) + 3,) * 2

@@ -1,0 +1,124 @@
+"""Distortion against radius: displacement by its formula, and bands that hold what they say."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from starcal_uq.core.errors import DistortionError
+from starcal_uq.propagation.distortion import DistortionCurve, distortion_curve
+from tests.helpers.gaussian_camera import COVARIANCE
+from tests.helpers.scenes import camera, observations
+
+
+def gaussian_posterior(model: str = "brown", covariance: np.ndarray = COVARIANCE) -> SimpleNamespace:
+    cam = camera(model)
+    sd = np.sqrt(np.diag(covariance))
+    root = sd[:, None] * np.linalg.cholesky(covariance / np.outer(sd, sd))
+
+    def thin(n: int, seed: int) -> np.ndarray:
+        draws = cam.theta + np.random.default_rng(seed).standard_normal((n, len(sd))) @ root.T
+        return np.column_stack([draws, np.full(n, 0.05)])
+
+    return SimpleNamespace(camera=cam, mean=cam.theta, covariance=covariance, thin=thin)
+
+
+DECENTRED = np.diag([0.15, 0.15, 0.028, 1e-10, 1e-16, 1e-9, 1e-9]) ** 2
+
+
+@lru_cache
+def paper_curve() -> DistortionCurve:
+    return distortion_curve(gaussian_posterior(), observations(), n=41, n_draws=2000)
+
+
+def test_mean_is_the_formula() -> None:
+    """Distorted minus ideal is u (k1 u^2 + k2 u^4) at the ideal radius u of a point seen at radius r."""
+    found = paper_curve()
+    k1, k2 = camera("brown").coefficients
+    r = found.radius_px
+    u = r.copy()
+    for _ in range(20):
+        u = r - u * (k1 * u**2 + k2 * u**4)
+    np.testing.assert_allclose(found.mean_px[0], r - u, atol=4 * found.sd_px[0].max() / np.sqrt(2000) + 1e-12)
+    assert found.mean_px.shape == (1, 41)
+    assert found.radius_px[-1] == pytest.approx(np.hypot(523.5, 530.5))
+    f = camera("brown").theta[2]
+    assert found.arcsec_per_px[0] == pytest.approx(206264.806 / f)
+    assert found.arcsec_per_px[-1] < found.arcsec_per_px[0]
+
+
+def test_both_directions_of_a_model_give_the_same_sign() -> None:
+    """``inverse`` maps distorted to ideal points; the curve shows distorted minus ideal all the same."""
+    covariance = np.diag(np.diag(COVARIANCE))
+    found = distortion_curve(gaussian_posterior("inverse", covariance), n=21, n_draws=300)
+    k1, k2 = camera("inverse").coefficients
+    r = found.radius_px
+    np.testing.assert_allclose(found.mean_px[0], -(k1 * r**3 + k2 * r**5), atol=0.01)
+    assert found.mean_px.max() > 0.1
+
+
+def test_bands_hold_fresh_draws() -> None:
+    found = paper_curve()
+    fresh = distortion_curve_draws(5000, seed=99)
+    inside = (fresh >= found.lower_px[0]) & (fresh <= found.upper_px[0])
+    np.testing.assert_allclose(inside[:, 1:].mean(axis=0), 0.95, atol=0.02)
+    low, high = found.lower_simultaneous_px[0], found.upper_simultaneous_px[0]
+    tolerance = 1e-9 * found.sd_px.max()
+    whole = np.all((fresh >= low - tolerance) & (fresh <= high + tolerance), axis=1).mean()
+    assert whole == pytest.approx(0.95, abs=0.015)
+    # Control: pointwise bands do not hold whole curves.
+    assert inside[:, 1:].all(axis=1).mean() < 0.92
+
+
+def distortion_curve_draws(n: int, seed: int) -> np.ndarray:
+    """Curves of fresh draws by the formula, at the radii of `paper_curve`."""
+    theta = gaussian_posterior().thin(n, seed)[:, :-1]
+    r = paper_curve().radius_px
+    u = np.tile(r, (n, 1))
+    for _ in range(20):
+        u = r - u * (theta[:, 3:4] * u**2 + theta[:, 4:5] * u**4)
+    return r - u
+
+
+def test_decentring_is_shown_along_azimuths() -> None:
+    post = gaussian_posterior("brown_tangential", DECENTRED)
+    found = distortion_curve(post, n=11, n_draws=300, azimuths_deg=(0, 90, 180))
+    assert found.mean_px.shape == (3, 11)
+    p1, p2 = camera("brown_tangential").coefficients[2:]
+    r = found.radius_px[-1]
+    # Along +x and -x the radial parts differ by twice 3 p2 r^2, along y they hold 3 p1 r^2.
+    np.testing.assert_allclose(found.mean_px[0, -1] - found.mean_px[2, -1], 6 * p2 * r**2, rtol=0.05)
+    mean = 0.5 * (found.mean_px[0, -1] + found.mean_px[2, -1])
+    np.testing.assert_allclose(found.mean_px[1, -1] - mean, 3 * p1 * r**2, rtol=0.05)
+    assert len(distortion_curve(post, n=3, n_draws=50).azimuth_deg) == 8
+    assert len(distortion_curve(gaussian_posterior(), n=3, n_draws=50, azimuths_deg=(0, 90)).azimuth_deg) == 1
+
+
+def test_shows_itself() -> None:
+    from matplotlib.figure import Figure
+
+    found = paper_curve()
+    assert isinstance(found.plot_distortion(), Figure)
+    assert "whole" not in found._repr_html_()
+    assert "px" in found.corner_words
+    assert "arcsec" in found.corner_words
+    table = found.to_dataframe()
+    assert list(table.columns[:4]) == ["azimuth_deg", "radius_px", "mean_px", "sd_px"]
+    assert len(table) == 41
+    assert 600 < found.star_radius_px < 745
+    assert np.isnan(distortion_curve(gaussian_posterior(), n=3, n_draws=50).star_radius_px)
+    decentred = distortion_curve(gaussian_posterior("brown_tangential", DECENTRED), n=11, n_draws=100)
+    assert isinstance(decentred.plot_distortion(), Figure)
+    assert "from the x axis" in decentred.corner_words
+
+
+def test_what_has_no_curve_is_said() -> None:
+    with pytest.raises(ValueError, match="at least 2 radii"):
+        distortion_curve(gaussian_posterior(), n=1)
+    with pytest.raises(DistortionError, match="is 'none'"):
+        distortion_curve(gaussian_posterior("none", COVARIANCE[:3, :3]))
+    with pytest.raises(DistortionError, match="folds over"):
+        distortion_curve(gaussian_posterior(covariance=COVARIANCE * 1e10), n=5, n_draws=200)

@@ -1,0 +1,225 @@
+"""Spectrum of the attitude error along a slew, against SciPy's periodograms of attitudes solved here."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from starcal_uq.attitude.rotations import left_error
+from starcal_uq.attitude.wahba import quest
+from starcal_uq.camera.projection import unproject_theta
+from starcal_uq.core.errors import AttitudeProfileError, RunFolderError, SamplingError
+from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.observations.table import Observations
+from starcal_uq.propagation.propagate import propagate
+from starcal_uq.propagation.spectrum import ErrorSpectrum, error_spectrum
+from starcal_uq.simulation.mission import profile_frames
+from starcal_uq.sky.catalogue import load_catalogue
+from tests.helpers.gaussian_camera import gaussian_posterior
+from tests.helpers.profiles import slew
+from tests.helpers.scenes import camera, nominal, observations
+
+ARCSEC = 648_000.0 / np.pi
+
+
+@lru_cache
+def posterior(n: int = 2000, scale: float = 1.0):
+    return gaussian_posterior(calibrate(observations(), nominal(camera())), n=n, scale=scale)
+
+
+@lru_cache
+def frames(rate_deg_s: float = 0.1, n: int = 601, max_mag: float = 6.0) -> Observations:
+    """One frame per second along a slew."""
+    stars = load_catalogue(max_mag=max_mag, epoch=2026.9)
+    return profile_frames(stars, camera(), slew(n, 1.0, rate_deg_s=rate_deg_s, seed=2))
+
+
+@lru_cache
+def spectrum(rate_deg_s: float = 0.1) -> ErrorSpectrum:
+    return error_spectrum(posterior(), frames(rate_deg_s), n_draws=20)
+
+
+def rest_of_draws(post, obs: Observations) -> np.ndarray:
+    """Frame-dependent part (D, K, 3) of all draws, arcsec."""
+
+    def solve(theta: np.ndarray) -> np.ndarray:
+        b = unproject_theta("brown", theta, obs.xy)
+        return quest(b, obs.directions_icrs, obs.frame_starts).quaternions
+
+    phi = ARCSEC * np.stack([left_error(solve(theta), solve(post.mean)) for theta in post.theta_draws])
+    return phi - phi.mean(axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("n", [601, 600])
+@pytest.mark.parametrize("scale", [1.0, 100.0])
+def test_is_the_mean_periodogram_of_the_draws(n: int, scale: float) -> None:
+    from scipy.signal import periodogram
+
+    post, obs = posterior(40, scale), frames(n=n)
+    found = error_spectrum(post, obs, n_draws=40)
+    rest = rest_of_draws(post, obs)
+    f, psd = periodogram(rest, fs=1.0, axis=1, detrend=False)
+    # First order gives the posterior's covariance, with one draw less in the divisor, and no mean of draws.
+    shift = rest.mean(axis=0)
+    expected = (psd.sum(axis=0) - 40 * periodogram(shift, fs=1.0, axis=0, detrend=False)[1])[1:] / 39.0
+    np.testing.assert_allclose(found.frequency_hz, f[1:], rtol=1e-12)
+    tolerance = 1e-4 if scale == 1.0 else 0.06
+    top = expected.max(axis=0)
+    share = np.abs(found.psd_arcsec2_hz - expected) / top
+    assert share.max() < tolerance
+
+
+def test_integral_is_the_variance_and_that_of_the_table() -> None:
+    found = spectrum()
+    np.testing.assert_allclose(found.integral_arcsec2, found.variance_arcsec2, rtol=1e-10)
+    table = propagate(posterior(), frames())
+    np.testing.assert_allclose(found.rest_arcsec, table.rest_arcsec, rtol=1e-3)
+    np.testing.assert_allclose(found.nea_arcsec, table.nea_arcsec, rtol=1e-5)
+    np.testing.assert_allclose(np.sqrt(np.mean(found.sigma_arcsec**2, axis=0)), found.rest_arcsec, rtol=1e-3)
+    # The floor of white noise holds the variance of a frame over all frequencies.
+    np.testing.assert_allclose(found.nea_psd_arcsec2_hz * 0.5, found.nea_arcsec**2, rtol=1e-12)
+    np.testing.assert_allclose(found.share_below(1.0), 1.0)
+    np.testing.assert_allclose(found.below_arcsec(0.05), found.rest_arcsec * np.sqrt(found.share_below(0.05)))
+
+
+def test_error_changes_slowly_and_a_shuffled_series_does_not() -> None:
+    found = spectrum()
+    assert (found.share_below(0.05) > 0.85).all()
+    assert (found.correlation_time_s > 5.0).all()
+    assert (found.autocorrelation[0] == 1.0).all()
+    # Control: the same frames in random order are white.
+    obs = frames()
+    order = np.random.default_rng(3).permutation(obs.n_frames)
+    shuffled = dataclasses.replace(obs, frame=order[obs.frame])
+    white = error_spectrum(posterior(), shuffled, np.arange(601.0), n_draws=5)
+    assert (white.correlation_time_s < 1.0).all()
+    np.testing.assert_allclose(white.share_below(0.05), 0.1, atol=0.05)
+    np.testing.assert_allclose(white.variance_arcsec2, found.variance_arcsec2, rtol=3e-3)
+
+
+def test_correlation_is_that_of_the_draws() -> None:
+    post, obs = posterior(40), frames()
+    found = error_spectrum(post, obs, n_draws=40)
+    rest = rest_of_draws(post, obs)
+    for lag in (1, 10, 100):
+        expected = np.mean(rest[:, lag:] * rest[:, : len(found.time_s) - lag], axis=(0, 1)) / np.mean(rest**2, (0, 1))
+        np.testing.assert_allclose(found.autocorrelation[lag], expected, atol=0.03)
+
+
+def test_a_faster_slew_changes_the_error_faster() -> None:
+    """The same path of the sky in half the time: the same sizes, half the correlation time."""
+    slow = error_spectrum(posterior(), frames(0.1, 1201), n_draws=5)
+    fast = error_spectrum(posterior(), frames(0.2, 601), n_draws=5)
+    np.testing.assert_allclose(fast.rest_arcsec, slow.rest_arcsec, rtol=0.02)
+    np.testing.assert_allclose(slow.correlation_time_s / fast.correlation_time_s, 2.0, rtol=0.1)
+
+
+def test_averages_are_those_of_the_series() -> None:
+    post, obs = posterior(40), frames()
+    found = error_spectrum(post, obs, n_draws=40)
+    rest = rest_of_draws(post, obs)
+    for window in (1, 10, 60):
+        kernel = np.ones(window) / window
+        runs = np.apply_along_axis(np.convolve, 1, rest, kernel, "valid")
+        averaged, noise = found.averaged_arcsec(float(window))
+        np.testing.assert_allclose(averaged, np.sqrt(np.mean(runs**2, axis=(0, 1))), rtol=0.06)
+        np.testing.assert_allclose(noise, found.nea_arcsec / np.sqrt(window))
+    assert np.isnan(found.dominates_after_s).all()
+    assert "leaves it below centroid noise" in found.sentence
+    # With noise a hundred times smaller it matters soon.
+    quiet = dataclasses.replace(found, nea_arcsec=0.01 * found.nea_arcsec)
+    after = quiet.dominates_after_s
+    assert np.isfinite(after).all()
+    for axis, time in enumerate(after):
+        assert np.greater(*quiet.averaged_arcsec(time))[axis]
+    assert "it comes to exceed centroid noise: pitch after" in quiet.sentence
+    for seconds in (0.5, 200.0):
+        with pytest.raises(ValueError, match=r"choose 1 s to 150\.25 s"):
+            found.averaged_arcsec(seconds)
+
+
+def test_gaps_are_bridged_and_said() -> None:
+    obs, whole = frames(), spectrum()
+    kept = np.random.default_rng(4).random(obs.n_frames) > 0.05
+    kept[[0, -1]] = True
+    part = obs.select(kept[obs.frame])
+    found = error_spectrum(posterior(), part, np.flatnonzero(kept).astype(float), n_draws=5)
+    assert found.gap_share == pytest.approx(1.0 - kept.mean())
+    assert len(found.time_s) == 601
+    np.testing.assert_allclose(found.rest_arcsec, whole.rest_arcsec, rtol=0.02)
+    np.testing.assert_allclose(found.below_arcsec(0.02), whole.below_arcsec(0.02), rtol=0.03)
+    assert "were interpolated" in found.sentence
+    assert "interpolated" not in whole.sentence
+    # The first frame of a series counts from zero whatever its number.
+    late = dataclasses.replace(part, frame=part.frame + 7)
+    again = error_spectrum(posterior(), late, 1e3 + np.flatnonzero(kept), n_draws=5)
+    np.testing.assert_allclose(again.psd_arcsec2_hz, found.psd_arcsec2_hz, rtol=1e-12)
+
+
+def test_times_that_are_no_series_are_refused() -> None:
+    post, obs = posterior(), frames()
+    uneven = np.arange(601.0)
+    uneven[300:] += 0.4
+    sparse = obs.select(np.isin(obs.frame, np.flatnonzero(np.arange(601) % 4 != 1)[:200]) | (obs.frame > 400))
+    for table, times, message in (
+        (observations(), None, "these frames carry no times"),
+        (obs, np.arange(600.0), r"has shape \(600,\), but there are 601 frames"),
+        (obs, np.arange(601.0)[::-1], "increase from frame to frame"),
+        (obs, uneven, "not evenly spaced in time: interpolate the profile"),
+        (obs.select(obs.frame < 9), np.arange(9.0), "at least 16 frames, not 9"),
+        (
+            sparse,
+            sparse.frame_ids.astype(float),
+            "evenly spaced instants have no frame, more than a spectrum can bridge",
+        ),
+    ):
+        with pytest.raises(AttitudeProfileError, match=message):
+            error_spectrum(post, table, times)
+    with pytest.raises(SamplingError, match="at least two"):
+        error_spectrum(post, obs, n_draws=1)
+    # Times rounded to milliseconds are still a series.
+    rounded = error_spectrum(post, obs, np.round(np.arange(601) / 3.0, 3), n_draws=5)
+    assert rounded.step_s == pytest.approx(1.0 / 3.0, rel=1e-5)
+
+
+def test_file_is_lossless(tmp_path: Path) -> None:
+    found = spectrum()
+    found.save(tmp_path / "spectrum.npz")
+    loaded = ErrorSpectrum.load(tmp_path / "spectrum.npz")
+    for field in dataclasses.fields(ErrorSpectrum):
+        np.testing.assert_array_equal(getattr(loaded, field.name), getattr(found, field.name), err_msg=field.name)
+    (tmp_path / "bad.npz").write_bytes(b"no")
+    for name, message in (("bad.npz", "is not an error spectrum"), ("none.npz", "cannot be read")):
+        with pytest.raises(RunFolderError, match=message):
+            ErrorSpectrum.load(tmp_path / name)
+
+
+def test_shows_itself() -> None:
+    from matplotlib.axes import Axes
+
+    found = spectrum()
+    assert list(found.to_dataframe().columns) == ["frequency_hz", "axis", "rest_arcsec2_hz", "nea_arcsec2_hz"]
+    assert len(found.to_dataframe()) == 3 * len(found.frequency_hz)
+    ax = found.plot_spectrum()
+    assert isinstance(ax, Axes)
+    assert ax.get_legend().get_texts()[0].get_text().startswith("calibration, pitch")
+    assert isinstance(found.plot_time_series(), Axes)
+    other = found.plot_time_series()
+    assert found.plot_time_series(ax=other) is other
+    html = found._repr_html_()
+    assert "correlation time [s]" in html
+    assert "arcsec (pitch, yaw, roll)" in html
+
+
+def test_a_camera_without_error_has_no_spectrum() -> None:
+    post = posterior(10, 1e-9)
+    post.theta_draws[:] = post.draws[:, :-1] = post.mean
+    post.covariance = np.zeros((5, 5))
+    found = error_spectrum(post, frames(), n_draws=5)
+    assert np.isnan(found.correlation_time_s).all() or (found.rest_arcsec < 1e-6).all()
+    assert "no frame-dependent part" in dataclasses.replace(found, variance_arcsec2=np.zeros(3)).sentence
+    found.plot_spectrum()

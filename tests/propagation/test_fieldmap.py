@@ -1,0 +1,201 @@
+"""Direction uncertainty over the detector, against draws and rotations fitted one by one."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import lru_cache
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from starcal_uq.attitude.wahba import quest
+from starcal_uq.camera.projection import unproject_theta
+from starcal_uq.core.errors import DistortionError, RunFolderError
+from starcal_uq.propagation.field import FieldMap, field_map
+from tests.helpers.gaussian_camera import COVARIANCE
+from tests.helpers.scenes import camera, observations
+
+ARCSEC = 648_000.0 / np.pi
+
+
+def posterior(covariance: np.ndarray = COVARIANCE, **changes: object) -> SimpleNamespace:
+    cam = camera("brown", **changes)
+    return SimpleNamespace(camera=cam, mean=cam.theta, covariance=covariance)
+
+
+@lru_cache
+def paper_map() -> FieldMap:
+    return field_map(posterior(), observations())
+
+
+def test_maps_are_those_of_draws() -> None:
+    """Draw cameras, unproject the grid, remove each draw's best rotation by QUEST."""
+    n, n_draws = 7, 4000
+    post = posterior()
+    found = field_map(post, observations(), n=n)
+    sd = np.sqrt(np.diag(COVARIANCE))
+    root = np.linalg.cholesky(COVARIANCE / np.outer(sd, sd))
+    normal = np.random.default_rng(0).standard_normal((n_draws, 5))
+    draws = post.mean + sd * (normal @ root.T)
+    xy = np.column_stack([g.ravel() for g in np.meshgrid(found.x_px, found.y_px)])
+    b = unproject_theta("brown", post.mean, xy)
+    moved = np.stack([unproject_theta("brown", theta, xy) for theta in draws])
+    edge = np.where(np.isin(np.arange(n), (0, n - 1)), 0.5, 1.0)
+    rotation = quest(moved, b, np.array([0, n * n]), np.outer(edge, edge).ravel()).rotations[:, 0]
+    back = np.einsum("dji,dnj->dni", rotation, moved)
+    for difference, sigma, worst in (
+        (moved - b, found.sigma_absolute_arcsec, found.worst_absolute_arcsec),
+        (back - b, found.sigma_compensated_arcsec, found.worst_compensated_arcsec),
+    ):
+        scatter = np.einsum("dni,dnj->nij", difference, difference) / n_draws * ARCSEC**2
+        values = np.linalg.eigvalsh(scatter)
+        np.testing.assert_allclose(sigma.ravel(), np.sqrt(0.5 * values.sum(axis=1)), rtol=0.05)
+        np.testing.assert_allclose(worst.ravel(), np.sqrt(values[:, 2]), rtol=0.06)
+
+
+def test_grid_spans_the_detector() -> None:
+    found = paper_map()
+    assert found.x_px[[0, -1]].tolist() == [-0.5, 1023.5]
+    assert found.y_px[[0, -1]].tolist() == [-0.5, 1023.5]
+    assert found.sigma_absolute_arcsec.shape == (25, 25)
+    wide = field_map(posterior(width_px=1500), observations(), n=5)
+    assert wide.x_px[-1] == 1499.5
+    # Rows are y, columns are x: a wider detector is worse at its right edge.
+    assert wide.sigma_compensated_arcsec[2, -1] > wide.sigma_compensated_arcsec[-1, 2]
+
+
+def test_principal_point_is_taken_up_by_the_rotation() -> None:
+    found = paper_map()
+    sigma_px = 0.15
+    absolute = sigma_px / camera("brown").theta[2] * ARCSEC
+    np.testing.assert_allclose(found.sigma_absolute_arcsec, absolute, rtol=0.03)
+    assert found.sigma_compensated_arcsec.max() < 0.05 * absolute
+    # Control: an error of the focal length alone is no rotation.
+    only_f = field_map(posterior(np.diag([0, 0, 0.028**2, 0, 0])), observations())
+    assert only_f.sigma_compensated_arcsec.max() > 0.9 * only_f.sigma_absolute_arcsec.max()
+
+
+def test_worst_direction_bounds_the_mean_of_the_axes() -> None:
+    found = paper_map()
+    for sigma, worst in (
+        (found.sigma_absolute_arcsec, found.worst_absolute_arcsec),
+        (found.sigma_compensated_arcsec, found.worst_compensated_arcsec),
+    ):
+        assert (worst >= sigma * (1 - 1e-12)).all()
+        assert (worst <= sigma * np.sqrt(2) * (1 + 1e-12)).all()
+    # A focal length moves directions along the radius only.
+    only_f = field_map(posterior(np.diag([0, 0, 0.028**2, 0, 0])), observations(), n=4)
+    np.testing.assert_allclose(only_f.worst_absolute_arcsec, np.sqrt(2) * only_f.sigma_absolute_arcsec, rtol=1e-6)
+
+
+def test_file_is_lossless(tmp_path: Path) -> None:
+    found = paper_map()
+    path = tmp_path / "field_map.npz"
+    path.write_bytes(b"old")
+    found.save(path)
+    assert [p.name for p in tmp_path.iterdir()] == ["field_map.npz"]
+    loaded = FieldMap.load(path)
+    for field in dataclasses.fields(FieldMap):
+        np.testing.assert_array_equal(getattr(loaded, field.name), getattr(found, field.name))
+
+
+def test_broken_files_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "field_map.npz"
+    for content in (b"", b"text", b"PK\x03\x04 cut"):
+        path.write_bytes(content)
+        with pytest.raises(RunFolderError, match=r"field_map\.npz: is not a field map"):
+            FieldMap.load(path)
+    np.savez(path, x_px=np.zeros(3))
+    with pytest.raises(RunFolderError, match="is not a field map"):
+        FieldMap.load(path)
+    np.save(tmp_path / "array.npy", np.zeros(3))
+    with pytest.raises(RunFolderError, match="is not a field map"):
+        FieldMap.load(tmp_path / "array.npy")
+    with pytest.raises(RunFolderError, match=r"none\.npz: cannot be read .*; run `starcal-uq propagate RUN`"):
+        FieldMap.load(tmp_path / "none.npz")
+
+
+def test_shows_itself() -> None:
+    from matplotlib.figure import Figure
+
+    found = paper_map()
+    assert "best rotation removed" in found._repr_html_()
+    table = found.to_dataframe()
+    assert len(table) == 625
+    assert list(table.columns[:4]) == ["x_px", "y_px", "sigma_absolute_arcsec", "sigma_compensated_arcsec"]
+    row = table[(table["x_px"] == found.x_px[3]) & (table["y_px"] == found.y_px[7])]
+    assert row["sigma_compensated_arcsec"].item() == found.sigma_compensated_arcsec[7, 3]
+    assert isinstance(found.plot_field_map(), Figure)
+
+
+def test_what_cannot_be_mapped_is_said() -> None:
+    with pytest.raises(ValueError, match="at least 2 grid points"):
+        field_map(posterior(), observations(), n=1)
+    folded = posterior()
+    folded.mean = folded.mean * np.array([1, 1, 1, -1e4, 1])
+    with pytest.raises(DistortionError, match="folds over"):
+        field_map(folded, observations())
+
+
+def test_ellipses_are_those_of_draws() -> None:
+    """Covariance along camera X and Y, against draws of directions turned back by the linear best rotation."""
+    post = posterior()
+    found = field_map(post, observations(), n=5)
+    assert found.covariance_compensated_arcsec2.shape == (5, 5, 2, 2)
+    sd = np.sqrt(np.diag(COVARIANCE))
+    root = sd[:, None] * np.linalg.cholesky(COVARIANCE / np.outer(sd, sd))
+    draws = post.mean + np.random.default_rng(1).standard_normal((4000, 5)) @ root.T
+    xy = np.column_stack([g.ravel() for g in np.meshgrid(found.x_px, found.y_px)])
+    b = unproject_theta("brown", post.mean, xy)
+    moved = np.stack([unproject_theta("brown", theta, xy) for theta in draws])
+    edge = np.where(np.isin(np.arange(5), (0, 4)), 0.5, 1.0)
+    rotation = quest(moved, b, np.array([0, 25]), np.outer(edge, edge).ravel()).rotations[:, 0]
+    back = np.einsum("dji,dnj->dni", rotation, moved) - b
+    # Within 6 degrees of the boresight camera X and Y are the tangent axes to half a per cent.
+    for difference, covariance in (
+        (moved - b, found.covariance_absolute_arcsec2),
+        (back, found.covariance_compensated_arcsec2),
+    ):
+        e = difference[:, :, :2] * ARCSEC
+        scatter = np.einsum("dni,dnj->nij", e, e).reshape(5, 5, 2, 2) / 4000
+        scale = np.sqrt(np.einsum("yxii,yxjj->yxij", covariance, covariance))
+        np.testing.assert_allclose(scatter / scale, covariance / scale, atol=0.06)
+    # Off the diagonals of the detector the ellipses of a radial model are turned: the entry is not there by symmetry.
+    assert (
+        abs(found.covariance_compensated_arcsec2[0, 0, 0, 1]) > 0.3 * found.covariance_compensated_arcsec2[0, 0, 0, 0]
+    )
+
+
+def test_equivalent_principal_point() -> None:
+    """An error of x0 alone is itself; through the other parameters the point moves further."""
+    only_x0 = field_map(posterior(np.diag([0.15**2, 0, 0, 0, 0])), observations())
+    np.testing.assert_allclose(only_x0.equivalent_principal_point_px, [0.15, 0.0], atol=1e-9)
+    arcsec = 0.15 / camera("brown").theta[2] * ARCSEC
+    np.testing.assert_allclose(only_x0.equivalent_principal_point_arcsec, [arcsec, 0.0], atol=0.02 * arcsec)
+    # A focal length error turns the field only because the principal point is off the centre.
+    only_f = field_map(posterior(np.diag([0, 0, 0.028**2, 0, 0])), observations())
+    assert 0.0 < only_f.equivalent_principal_point_px[1] < 0.028 * 50 / 5852
+    found = paper_map()
+    assert (found.equivalent_principal_point_px >= 0.149).all()
+    assert "Equivalent principal point" in found._repr_html_()
+    # Pitch goes with y0 and yaw with x0, not the other way round.
+    assert only_x0.rotation_covariance_arcsec2[0, 0] < 1e-6 * only_x0.rotation_covariance_arcsec2[1, 1]
+
+
+def test_files_of_earlier_versions_lack_the_ellipses_only(tmp_path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    found = paper_map()
+    old = {f.name: getattr(found, f.name) for f in dataclasses.fields(FieldMap) if not f.name.endswith("2")}
+    np.savez(tmp_path / "field_map.npz", **old)
+    loaded = FieldMap.load(tmp_path / "field_map.npz")
+    assert loaded.covariance_absolute_arcsec2 is None
+    assert loaded.equivalent_principal_point_px is None
+    assert "Equivalent" not in loaded._repr_html_()
+    assert isinstance(loaded.plot_field_map(), Figure)
+    loaded.save(tmp_path / "again.npz")
+    assert FieldMap.load(tmp_path / "again.npz").covariance_compensated_arcsec2 is None
+    assert "compensated_xy_arcsec2" in found.to_dataframe()
+    assert "compensated_xy_arcsec2" not in loaded.to_dataframe()

@@ -1,0 +1,456 @@
+"""Attitude errors from the posterior: against attitudes solved one by one, and against simulated campaigns."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import lru_cache
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.attitude.rotations import left_error, rotation_to_quaternion, rotation_vector
+from starcal_uq.attitude.wahba import quest
+from starcal_uq.camera.projection import unproject_theta
+from starcal_uq.core.errors import DistortionError, ObservationError, RunFolderError, SamplingError
+from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.observations.table import Observations
+from starcal_uq.paper.camera import paper_start
+from starcal_uq.propagation.attitude_error import AXES, CONTRIBUTORS, AttitudeError
+from starcal_uq.propagation.propagate import propagate
+from starcal_uq.simulation.mission import mission_frames, noise_by_magnitude
+from starcal_uq.sky.catalogue import load_catalogue
+from tests.helpers.attitude_campaigns import clean_frames, failures, fly, linear_estimator, with_noise
+from tests.helpers.gaussian_camera import gaussian_posterior
+from tests.helpers.scenes import camera, nominal, observations, with_sigmas
+
+ARCSEC = 648_000.0 / np.pi
+
+
+@lru_cache
+def scene(model: str = "brown", stated: bool = False) -> tuple[Observations, Calibration]:
+    obs = observations(model)
+    obs = with_sigmas(obs) if stated else obs
+    return obs, calibrate(obs, nominal(camera(model)))
+
+
+@lru_cache
+def error(n_draws: int = 300) -> AttitudeError:
+    obs, cal = scene()
+    return propagate(gaussian_posterior(cal), obs, n_draws=n_draws, seed=1)
+
+
+@pytest.mark.parametrize("stated", [False, True])
+def test_rotations_are_those_of_scipy(stated: bool) -> None:
+    from scipy.spatial.transform import Rotation
+
+    obs, cal = scene(stated=stated)
+    post = gaussian_posterior(cal)
+    found = propagate(post, obs, n_draws=4, seed=3)
+    weights = np.ones(obs.n_stars) if obs.sigma_px is None else obs.sigma_px**-2.0
+
+    def attitudes(theta: np.ndarray) -> np.ndarray:
+        b, r = unproject_theta("brown", theta, obs.xy), obs.directions_icrs
+        frames = (slice(*obs.frame_starts[k : k + 2]) for k in range(obs.n_frames))
+        return np.array([Rotation.align_vectors(b[s], r[s], weights=weights[s])[0].as_matrix() for s in frames])
+
+    reference = attitudes(post.mean)
+    phi = np.array([rotation_vector(attitudes(d[:-1]) @ np.swapaxes(reference, 1, 2)) for d in post.thin(4, 3)])
+    np.testing.assert_allclose(found.common_draws_arcsec, phi.mean(axis=1) * ARCSEC, atol=1e-6)
+
+
+def test_with_all_draws_sigmas_are_plain_standard_deviations() -> None:
+    obs, cal = scene()
+    post = gaussian_posterior(cal, n=60)
+    found = propagate(post, obs, n_draws=60)
+    reference = quest(unproject_theta("brown", post.mean, obs.xy), obs.directions_icrs, obs.frame_starts)
+    b = np.stack([unproject_theta("brown", theta, obs.xy) for theta in post.theta_draws])
+    phi = ARCSEC * left_error(quest(b, obs.directions_icrs, obs.frame_starts).quaternions, reference.quaternions)
+    common = phi.mean(axis=1, keepdims=True)
+    np.testing.assert_allclose(found.common_arcsec, common[:, 0].std(axis=0, ddof=1), rtol=1e-8)
+    rest = (phi - common).std(axis=0, ddof=1)
+    np.testing.assert_allclose(found.rest_rms_per_frame_arcsec, rest, rtol=1e-4)
+    np.testing.assert_allclose(found.rest_arcsec, np.sqrt(np.mean(rest**2, axis=0)), rtol=1e-4)
+    total = np.sqrt(np.mean(phi.var(axis=0, ddof=1), axis=0))
+    np.testing.assert_allclose(found.calibration_total_arcsec, total, rtol=1e-6)
+
+
+def test_few_draws_tell_nearly_as_much_as_all() -> None:
+    obs, cal = scene()
+    post = gaussian_posterior(cal)
+    few, many = propagate(post, obs, n_draws=20, seed=4), propagate(post, obs, n_draws=4000)
+    for name in ("common_arcsec", "rest_arcsec"):
+        np.testing.assert_allclose(getattr(few, name), getattr(many, name), rtol=2e-3)
+    # Control: without the control variate, 20 draws are good to 16 % only.
+    plain = few.common_draws_arcsec.std(axis=0, ddof=1)
+    assert np.max(np.abs(plain / many.common_arcsec - 1.0)) > 0.05
+
+
+@pytest.mark.parametrize("model", ["none", "brown", "brown_tangential", "inverse"])
+@pytest.mark.parametrize("stated", [False, True])
+def test_sampled_and_first_order_agree(model: str, stated: bool) -> None:
+    obs, cal = scene(model, stated)
+    post = gaussian_posterior(cal)
+    found = propagate(post, obs, n_draws=50)
+    assert found.agreement.largest < 5e-3
+    assert found.agreement.ratio.shape == (3, 3)
+    assert "agree within" in found.agreement.sentence
+    # The likelihood's own linearisation weights pixels, QUEST directions: across the boresight hardly a difference.
+    common = ARCSEC * np.sqrt(np.diag(post.rotation_per_theta @ post.covariance @ post.rotation_per_theta.T))
+    np.testing.assert_allclose(found.common_arcsec[:2], common[:2], rtol=0.01)
+    np.testing.assert_allclose(found.common_arcsec[2], common[2], rtol=0.15)
+    np.testing.assert_allclose(found.nea_arcsec, ARCSEC * np.sqrt(np.diag(post.attitude_noise)), rtol=0.02)
+
+
+def test_sampling_sees_what_first_order_does_not() -> None:
+    """Principal points wrong by tens of pixels and k1 by a hundred sigmas: their product is no longer small."""
+    obs, cal = scene()
+    found = propagate(gaussian_posterior(cal, n=500, scale=100.0), obs, n_draws=500)
+    raw = found.common_draws_arcsec.std(axis=0, ddof=1)
+    np.testing.assert_allclose(found.common_arcsec, raw, rtol=1e-6)
+    assert found.agreement.largest > 0.02
+    assert "the sampled values hold" in found.agreement.sentence
+    table = found.agreement.to_dataframe()
+    assert list(table.columns) == ["contributor", "axis", "sampled_over_first_order"]
+    assert np.nanmax(np.abs(table["sampled_over_first_order"] - 1.0)) == found.agreement.largest
+    assert found.agreement.sentence in found.agreement._repr_html_()
+
+
+def test_interaction_is_what_the_sum_of_the_parts_misses() -> None:
+    """Both at once, solved here, against the parts; it is a product of the two, so that each scales it."""
+    obs, cal = scene()
+    base = propagate(gaussian_posterior(cal), obs).interaction_arcsec
+    wide = propagate(gaussian_posterior(cal, scale=10.0), obs).interaction_arcsec
+    np.testing.assert_allclose(wide / base, 10.0, rtol=0.02)
+    noisy = gaussian_posterior(cal)
+    noisy.sigma_draws = 10.0 * noisy.sigma_draws
+    np.testing.assert_allclose(propagate(noisy, obs).interaction_arcsec / base, 10.0, rtol=0.02)
+
+    post, rng, n = gaussian_posterior(cal), np.random.default_rng(8), 60
+    r, starts = obs.directions_icrs, obs.frame_starts
+    shift = post.theta_draws[:n]
+    e = post.sigma_draws.mean() * rng.standard_normal((n, obs.n_stars, 2))
+
+    def attitudes(thetas: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+        return quest(
+            np.stack([unproject_theta("brown", t, p) for t, p in zip(thetas, pixels, strict=True)]), r, starts
+        ).quaternions
+
+    same, pixels = np.repeat(post.mean[None], n, axis=0), np.broadcast_to(obs.xy, e.shape)
+    reference = attitudes(same[:1], pixels[:1])
+    phi = [
+        left_error(attitudes(*pair), reference) for pair in ((shift, obs.xy + e), (shift, pixels), (same, obs.xy + e))
+    ]
+    found = ARCSEC * np.sqrt(np.mean((phi[0] - phi[1] - phi[2]) ** 2, axis=(0, 1)))
+    np.testing.assert_allclose(found, base, rtol=0.3)
+    # Control: without taking both parts away, it is larger by three orders of magnitude.
+    assert (ARCSEC * np.sqrt(np.mean((phi[0] - phi[1]) ** 2, axis=(0, 1))) > 1e3 * base).all()
+
+
+def test_frames_of_a_mission_count_and_not_those_of_the_calibration() -> None:
+    obs, cal = scene()
+    post = gaussian_posterior(cal)
+    stars = load_catalogue(max_mag=7.0, epoch=2026.9)
+    deep = mission_frames(stars, cal.camera, n_frames=150, seed=2)
+    found, observed = propagate(post, deep, n_draws=20), propagate(post, obs, n_draws=20)
+    assert found.frames.startswith("random attitudes, ")
+    assert "magnitude 7.0" in found.frames
+    assert observed.frames == "observed frames"
+    # Noise falls with the root of the stars; the common rotation stays, because it is the camera's.
+    ratio = (deep.n_stars / deep.n_frames) / (obs.n_stars / obs.n_frames)
+    np.testing.assert_allclose(observed.nea_arcsec[:2] / found.nea_arcsec[:2], np.sqrt(ratio), rtol=0.1)
+    np.testing.assert_allclose(found.common_arcsec[:2], observed.common_arcsec[:2], rtol=0.01)
+    assert (found.rest_arcsec < observed.rest_arcsec).all()
+    assert found.agreement.largest < 2e-3
+
+
+def test_stated_noise_is_carried_over_by_magnitude() -> None:
+    obs, cal = scene(stated=True)
+    post = gaussian_posterior(cal)
+    stars = load_catalogue(max_mag=6.0, epoch=2026.9)
+    with pytest.raises(ObservationError, match="noise_like=observations"):
+        propagate(post, mission_frames(stars, cal.camera, n_frames=20), n_draws=5)
+    frames = mission_frames(stars, cal.camera, n_frames=100, noise_like=obs)
+    found, own = propagate(post, frames, n_draws=20), propagate(post, obs, n_draws=20)
+    # The median of the stated noise says less than all of it: stars of little noise carry an attitude.
+    assert np.all((found.nea_arcsec > own.nea_arcsec) & (found.nea_arcsec < 3.0 * own.nea_arcsec))
+    with pytest.raises(ObservationError, match="noise_like has no column sigma_px"):
+        mission_frames(stars, cal.camera, n_frames=20, noise_like=scene()[0])
+
+    mag = np.linspace(2.0, 6.0, 2000)
+    like = SimpleNamespace(mag=mag, sigma_px=0.01 * 10 ** (0.2 * (mag - 2.0)))
+    asked = np.array([1.0, 3.0, 5.0, 7.0, np.nan])
+    values = noise_by_magnitude(like, asked)
+    np.testing.assert_allclose(values[1:4], 0.01 * 10 ** (0.2 * (asked[1:4] - 2.0)), rtol=0.02)
+    assert values[0] == pytest.approx(0.01, rel=0.1)
+    assert values[4] == np.median(like.sigma_px)
+
+
+def test_principal_point_is_a_rotation_of_the_camera() -> None:
+    obs, cal = scene()
+    post = gaussian_posterior(cal, n=3)
+    f = cal.theta[2]
+    theta = cal.theta + np.array([[-1.0, 0, 0, 0, 0], [1.0, 0, 0, 0, 0], [0, 0, 0, 0, 0]])
+    post.theta_draws = theta
+    post.draws = np.column_stack((theta, np.full(3, 0.05)))
+    post.thin = lambda n, seed: post.draws
+    post.mean, post.covariance = theta.mean(axis=0), np.cov(theta, rowvar=False)
+    found = propagate(post, obs)
+    # x0 larger: every direction moves to -x, which is a negative yaw (rotation about +Y) of the camera-frame vectors.
+    expected = np.array([[0, 1, 0], [0, -1, 0], [0, 0, 0]]) * ARCSEC / f
+    np.testing.assert_allclose(found.common_draws_arcsec, expected, atol=0.02 * ARCSEC / f)
+    assert found.rest_arcsec[1] < 0.01 * found.common_arcsec[1]
+
+
+@pytest.mark.parametrize("stated", [False, True])
+def test_noise_term_is_that_of_noisy_frames(stated: bool) -> None:
+    obs, cal = scene(stated=stated)
+    post = gaussian_posterior(cal)
+    sigma = post.sigma_draws.mean() * (np.ones(obs.n_stars) if obs.sigma_px is None else obs.sigma_px)
+    weights = None if obs.sigma_px is None else obs.sigma_px**-2.0
+    rng = np.random.default_rng(5)
+    clean = quest(unproject_theta("brown", post.mean, obs.xy), obs.directions_icrs, obs.frame_starts, weights)
+    noise = sigma[:, None] * rng.standard_normal((1000, obs.n_stars, 2))
+    b = np.stack([unproject_theta("brown", post.mean, obs.xy + e) for e in noise])
+    noisy = quest(b, obs.directions_icrs, obs.frame_starts, weights)
+    errors = ARCSEC * left_error(noisy.quaternions, clean.quaternions)
+    found = propagate(post, obs, n_draws=2)
+    ratio = errors.std(axis=0) / found.nea_per_frame_arcsec
+    # 60 frames of 3 axes, each good to 2.2 %.
+    assert np.abs(ratio - 1.0).max() < 4.5 / np.sqrt(2000)
+    assert abs(ratio.mean() - 1.0) < 0.01
+    pooled = np.abs(errors.reshape(-1, 3))
+    pooled = np.column_stack((pooled, np.hypot(pooled[:, 0], pooled[:, 1])))
+    np.testing.assert_allclose(found.p95_arcsec[0], np.quantile(pooled, 0.95, axis=0), rtol=0.02)
+    np.testing.assert_allclose(found.p997_arcsec[0], np.quantile(pooled, 0.997, axis=0), rtol=0.06)
+
+
+def test_quantiles_are_those_of_the_draws() -> None:
+    obs, cal = scene()
+    post = gaussian_posterior(cal)
+    found = propagate(post, obs, n_draws=4000)
+    draws = np.abs(found.common_draws_arcsec - found.common_draws_arcsec.mean(axis=0))
+    draws = np.column_stack((draws, np.hypot(draws[:, 0], draws[:, 1])))
+    np.testing.assert_allclose(found.p95_arcsec[1], np.quantile(draws, 0.95, axis=0), rtol=2e-3)
+    np.testing.assert_allclose(found.p997_arcsec[1], np.quantile(draws, 0.997, axis=0), rtol=2e-3)
+    # Gaussian draws, two alike axes: 2.45 sigma, not 1.96.
+    assert found.p95_arcsec[1, 3] / np.sqrt(np.mean(found.common_arcsec[:2] ** 2)) == pytest.approx(2.45, abs=0.1)
+    assert found.p95_arcsec[1, 0] / found.common_arcsec[0] == pytest.approx(1.96, abs=0.1)
+    # The mixture over frames has longer tails than a Gaussian.
+    assert (found.p997_arcsec[2, :3] > 2.97 * found.rest_arcsec).all()
+
+
+def test_seed_repeats_and_changes_the_draws() -> None:
+    obs, cal = scene()
+    post = gaussian_posterior(cal)
+    one, again, other = (propagate(post, obs, n_draws=10, seed=s) for s in (1, 1, 2))
+    np.testing.assert_array_equal(one.common_draws_arcsec, again.common_draws_arcsec)
+    np.testing.assert_array_equal(one.p997_arcsec, again.p997_arcsec)
+    assert (one.common_draws_arcsec != other.common_draws_arcsec).all()
+
+
+def test_batches_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
+    obs, cal = scene()
+    post = gaussian_posterior(cal)
+    whole = propagate(post, obs, n_draws=10)
+    monkeypatch.setattr("starcal_uq.propagation.propagate._STARS_AT_ONCE", 3 * obs.n_stars)
+    parts = propagate(post, obs, n_draws=10)
+    np.testing.assert_array_equal(whole.common_draws_arcsec, parts.common_draws_arcsec)
+    np.testing.assert_allclose(whole.rest_arcsec, parts.rest_arcsec, rtol=1e-10)
+
+
+def test_table_has_one_row_per_contributor_and_axis() -> None:
+    found = error()
+    table = found.to_dataframe()
+    assert list(table.columns) == [
+        "contributor",
+        "axis",
+        "sigma_arcsec",
+        "p95_arcsec",
+        "p997_arcsec",
+        "first_order_arcsec",
+        "absorbed_by_alignment",
+    ]
+    assert list(table["axis"]) == [*AXES, "cross-boresight"] * 5
+    assert list(table["contributor"].unique()) == list(CONTRIBUTORS)
+    absorbed = table.groupby("contributor", sort=False)["absorbed_by_alignment"].first()
+    assert list(absorbed) == ["no", "yes", "no", "in part", "no"]
+    rows = table.set_index(["contributor", "axis"])["sigma_arcsec"]
+    assert rows["calibration, common rotation", "yaw"] == found.common_arcsec[1]
+    across = np.sqrt(np.mean(found.nea_arcsec[:2] ** 2))
+    assert rows["centroid noise (NEA)", "cross-boresight"] == pytest.approx(across)
+    assert (table["p95_arcsec"] > table["sigma_arcsec"]).all()
+    assert (table["p997_arcsec"] > table["p95_arcsec"]).all()
+    html = found._repr_html_()
+    assert "300 posterior draws" in html
+    assert "cross-boresight" in html
+
+
+def test_file_keeps_every_digit(tmp_path: Path) -> None:
+    found = error()
+    path = tmp_path / "attitude.csv"
+    path.write_text("old")
+    found.save(path)
+    assert [p.name for p in tmp_path.iterdir()] == ["attitude.csv"]
+    loaded = AttitudeError.load(path)
+    for field in dataclasses.fields(AttitudeError)[:10]:
+        np.testing.assert_array_equal(getattr(loaded, field.name), getattr(found, field.name), err_msg=field.name)
+    np.testing.assert_array_equal(loaded.interaction_arcsec, found.interaction_arcsec)
+    assert loaded.frames == found.frames
+    assert loaded.common_draws_arcsec is None
+    assert loaded.to_dataframe().equals(found.to_dataframe())
+
+
+def test_file_of_an_earlier_version_is_read_and_the_interaction_not_known(tmp_path: Path) -> None:
+    import pandas as pd
+
+    from starcal_uq.presentation.report.tables import attitude_rows
+
+    found, path = error(), tmp_path / "attitude.csv"
+    found.save(path)
+    table = pd.read_csv(path)
+    table[~table["contributor"].str.startswith("interaction")].drop(columns="frames").to_csv(path, index=False)
+    loaded = AttitudeError.load(path)
+    np.testing.assert_array_equal(loaded.rest_arcsec, found.rest_arcsec)
+    np.testing.assert_array_equal(loaded.p95_arcsec[:4], found.p95_arcsec[:4])
+    # Not zero, which would read as assessed.
+    assert np.isnan(loaded.interaction_arcsec).all()
+    assert np.isnan(loaded.p95_arcsec[4]).all()
+    assert "not known" in loaded._repr_html_()
+    row = attitude_rows(loaded)[-1]
+    assert row["sigma"] == ["—"] * 4
+    assert row["note"].startswith("not sampled by the version")
+    assert attitude_rows(found)[-1]["sigma"][2] == "<\N{NO-BREAK SPACE}0.001"
+    loaded.save(path)
+    assert np.isnan(AttitudeError.load(path).interaction_arcsec).all()
+    # Control: a missing number elsewhere is not excused.
+    table.loc[0, "sigma_arcsec"] = np.nan
+    table.to_csv(path, index=False)
+    with pytest.raises(RunFolderError, match="is not a table"):
+        AttitudeError.load(path)
+
+
+def test_one_number_is_taken_apart() -> None:
+    found = error()
+    assert "smaller by a factor of" in found.one_number_sentence
+    swapped = dataclasses.replace(found, common_arcsec=found.rest_arcsec, rest_arcsec=found.common_arcsec)
+    assert "no alignment absorbs it" in swapped.one_number_sentence
+    none = dataclasses.replace(found, rest_arcsec=np.zeros(3))
+    assert "is a common rotation of" in none.one_number_sentence
+
+
+@pytest.mark.parametrize(
+    "text", ["", "contributor,axis\n", "contributor,axis,sigma_arcsec\na,b,c\n", "\x00\x01", "a,b\n1,2,3\n4\n"]
+)
+def test_broken_files_are_named(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "attitude.csv"
+    path.write_text(text)
+    with pytest.raises(RunFolderError, match=r"attitude\.csv: is not a table of attitude errors"):
+        AttitudeError.load(path)
+    with pytest.raises(RunFolderError, match=r"none\.csv: cannot be read .*; run `starcal-uq propagate RUN`"):
+        AttitudeError.load(tmp_path / "none.csv")
+
+
+def test_what_cannot_be_propagated_is_said() -> None:
+    obs, cal = scene()
+    post = gaussian_posterior(cal)
+    with pytest.raises(SamplingError, match="at least two"):
+        propagate(post, obs, n_draws=1)
+    folded = gaussian_posterior(cal)
+    folded.theta_draws[:, 3] = folded.draws[:, 3] = -1e-5
+    with pytest.raises(DistortionError, match="10 of 10 posterior draws the distortion 'brown' folds over"):
+        propagate(folded, obs, n_draws=10)
+    scaled = gaussian_posterior(scene(stated=True)[1])
+    with pytest.raises(ObservationError, match="no sigma_px"):
+        propagate(scaled, obs, n_draws=10)
+
+
+def test_plots_itself() -> None:
+    from matplotlib.axes import Axes
+
+    assert isinstance(error().plot_attitude(), Axes)
+
+
+@pytest.mark.slow
+def test_propagated_posterior_against_campaigns_with_known_attitudes() -> None:
+    """A thousand frames: one campaign from pixels to its posterior, six thousand others that it must foretell."""
+    clean = clean_frames(1000)
+    rng = np.random.default_rng(0)
+    obs = with_noise(clean, 0.05 * rng.standard_normal(clean.xy.shape))
+    cal = calibrate(obs, paper_start())
+    post = sc.sample(obs, cal, seed=1)
+    found = propagate(post, obs)
+
+    # The linear estimator of the campaigns is what `calibrate` does.
+    G, truth, sd = linear_estimator(clean, camera("brown")), camera("brown").theta, np.sqrt(np.diag(cal.covariance))
+    for _ in range(3):
+        e = 0.05 * rng.standard_normal(clean.xy.shape)
+        linear = truth + np.einsum("na,pna->p", e, G)
+        assert np.abs((calibrate(with_noise(clean, e), paper_start()).theta - linear) / sd).max() < 0.05
+
+    narrow = dataclasses.replace(post, draws=post.draws.copy())
+    narrow.draws[:, :-1] += 0.1 * (post.mean - post.draws[:, :-1])
+    quiet = dataclasses.replace(post, draws=post.draws * np.append(np.ones(5), 0.9))
+    rows = [0, 2, 1, 3, 4]
+    confused = dataclasses.replace(
+        found, common_arcsec=found.rest_arcsec, rest_arcsec=found.common_arcsec, p95_arcsec=found.p95_arcsec[rows]
+    )
+    errors = (found, propagate(narrow, obs), propagate(quiet, obs), confused)
+    flown = fly(clean, errors, n=6000)
+    assert failures(flown[0], errors[0]) == set()
+    # Controls: a posterior 10 % too narrow, noise 10 % too small, and the two parts of the calibration confused.
+    assert failures(flown[1], errors[1]) == {"common", "rest"}
+    assert failures(flown[2], errors[2]) == {"nea"}
+    assert failures(flown[3], errors[3]) == {"common", "rest"}
+
+    # Noise and calibration are uncorrelated even on the calibration's own frames, so that squares add up.
+    assert np.abs(flown[0].correlation).max() < 0.01
+    parts = np.sqrt(sum(values**2 for values in flown[0].rms.values()))
+    np.testing.assert_allclose(flown[0].together, parts, rtol=0.005)
+    np.testing.assert_allclose(flown[0].interaction, found.interaction_arcsec, rtol=0.2)
+
+    # The set-up of Ye & Yang (2017): noise, a constant ten times as large, and next to nothing that remains.
+    nea, common, rest = found.nea_arcsec, found.common_arcsec, found.rest_arcsec
+    assert np.all((nea[:2] > 0.43) & (nea[:2] < 0.5)) and 6.0 < nea[2] < 7.2
+    assert np.all((common[:2] > 4.3) & (common[:2] < 5.6))
+    assert rest.max() < 0.1
+
+
+@pytest.mark.slow
+def test_errors_of_simulated_campaigns_are_as_predicted() -> None:
+    """Two hundred campaigns on one set of frames: attitudes at the estimate against the true ones."""
+    from scipy import stats
+
+    clean = observations(n_frames=60, sigma_px=0.0)
+    truth = camera("brown")
+    r, starts = clean.directions_icrs, clean.frame_starts
+    true = quest(unproject_theta("brown", truth.theta, clean.xy), r, starts).quaternions
+    rng = np.random.default_rng(6)
+    n = 200
+    common, rest = np.empty((n, 3)), np.empty((n, clean.n_frames, 3))
+    for i in range(n):
+        noise = 0.05 * rng.standard_normal((2, clean.n_stars))
+        obs = dataclasses.replace(clean, x_px=clean.x_px + noise[0], y_px=clean.y_px + noise[1])
+        theta = calibrate(obs, nominal(truth)).theta
+        # The calibration alone: its camera with the pixels it has not been fitted to.
+        phi = ARCSEC * left_error(quest(unproject_theta("brown", theta, clean.xy), r, starts).quaternions, true)
+        common[i] = phi.mean(axis=0)
+        rest[i] = phi - common[i]
+    predicted = propagate(gaussian_posterior(calibrate(obs, nominal(truth))), obs)
+    chi2 = np.sum(common**2, axis=0) / predicted.common_arcsec**2
+    assert (stats.chi2.cdf(chi2, n) > 1e-3).all()
+    assert (stats.chi2.sf(chi2, n) > 1e-3).all()
+    np.testing.assert_allclose(np.sqrt(np.mean(rest**2, axis=(0, 1))), predicted.rest_arcsec, rtol=0.15)
+    # Control: whoever takes the rest for the whole is wrong by far.
+    assert np.max(stats.chi2.sf(np.sum(common[:, :2] ** 2, axis=0) / predicted.rest_arcsec[:2] ** 2, n)) < 1e-12
+
+
+def test_quaternions_of_the_calibration_are_those_of_quest() -> None:
+    """The attitudes that the likelihood profiles and those of QUEST differ by a small part of the noise."""
+    obs, cal = scene()
+    found = quest(unproject_theta("brown", cal.theta, obs.xy), obs.directions_icrs, obs.frame_starts)
+    difference = ARCSEC * left_error(rotation_to_quaternion(found.rotations), cal.quaternions)
+    assert (np.sqrt(np.mean(difference**2, axis=0)) < 0.2 * error().nea_arcsec).all()

@@ -1,0 +1,644 @@
+"""The sky from the ground: zenith, diurnal aberration and refraction against astropy, erfa and a table of stars."""
+
+from __future__ import annotations
+
+import csv
+import re
+import shutil
+from dataclasses import replace
+
+import erfa
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import starcal_uq as sc
+from starcal_uq.core.errors import ObservationError, SiteError
+from starcal_uq.core.times import utc_text
+from starcal_uq.diagnostics.verdict.observed import corrected_words
+from starcal_uq.images.image import read_image, time_in_name
+from starcal_uq.pipeline.displacement import as_measured, mirrored, undisplaced
+from starcal_uq.pipeline.images import observations_from_images, with_time
+from starcal_uq.pipeline.refine import bootstrap
+from starcal_uq.sky.apparent import (
+    aberrate,
+    apparent_directions,
+    catalogue_directions,
+    earth_velocity_km_s,
+    make_apparent,
+    without_low_stars,
+)
+from starcal_uq.sky.positions import unit_vectors
+from starcal_uq.sky.refraction import altitude_deg, refract, refraction_constants, shrinking, site_among_stars
+from starcal_uq.sky.site import Site
+from tests.helpers.ground_scenes import CAMERA, NOMINAL, SITE, as_centroids, ground_frames, night
+
+TIME = "2019-07-29T20:47:26"
+ARCSEC = 648000.0 / np.pi
+NOORDWIJK = Site(latitude_deg=52.2, longitude_deg=4.42, temperature_c=20.0, name="Noordwijk")
+
+
+def above(site: Site, time: str, lowest_deg: float, n: int = 300, seed: int = 1) -> np.ndarray:
+    """Random directions above an altitude."""
+    vectors = np.random.default_rng(seed).normal(size=(20 * n, 3))
+    vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
+    zenith, _ = site_among_stars(site, time)
+    return vectors[altitude_deg(vectors, zenith) > lowest_deg][:n]
+
+
+def rotated_onto(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    rotation, _ = Rotation.align_vectors(b, a)
+    return rotation.apply(a)
+
+
+@pytest.fixture(scope="module")
+def stars():
+    return sc.load_catalogue(max_mag=6.5, epoch=2026.9)
+
+
+# ---------------------------------------------------------------------------------------------------------------- site
+
+
+def test_site_goes_through_its_file(tmp_path):
+    site = Site(-24.6272, -70.4042, 2635.0, temperature_c=11.5, name="Paranal")
+    site.save(tmp_path / "site.toml")
+    assert Site.load(tmp_path / "site.toml") == site
+    assert Site.from_dict(site.to_dict()) == site
+    assert str(site) == "Paranal, 24.63° S, 70.40° W, 2635 m"
+    # The standard atmosphere: 743 hPa is what Paranal has.
+    assert site.air_pressure_hpa == pytest.approx(734.0, abs=2.0)
+    assert site.assumed == ("pressure",)
+    assert Site(0.0, 0.0).air_temperature_c == 15.0
+    # Whole numbers are numbers.
+    (tmp_path / "whole.toml").write_text("[site]\nlatitude_deg = 52\nlongitude_deg = 4\npressure_hpa = 1000\n")
+    assert Site.load(tmp_path / "whole.toml") == Site(52.0, 4.0, pressure_hpa=1000.0)
+    with pytest.raises(sc.RunFolderError, match="exists"):
+        site.save(tmp_path / "site.toml")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", r"section \[site\] is missing; write \[site\]"),
+        ("[site]\nlatitude_deg = 52.0\n", "key longitude_deg is missing; add the longitude in degrees, east positive"),
+        ("[site]\nlatitude_deg = 152\nlongitude_deg = 4\n", "key latitude_deg is 152; write the latitude"),
+        ("[site]\nlatitude_deg = '52'\nlongitude_deg = 4\n", "key latitude_deg is '52'; write"),
+        ("[site]\nlatitude_deg = 52\nlongitude_deg = 4\nlattitude = 1\n", "key lattitude is unknown; did you mean"),
+        ("[site]\nlatitude_deg = 52\nlongitude_deg = 4\npressure_hpa = 101325\n", "pressure_hpa is 101325.*in hPa"),
+        ("[site]\nlatitude_deg = 52\nlongitude_deg = nan\n", "key longitude_deg is nan; write"),
+        ("x = 1\n[site]\nlatitude_deg = 52\nlongitude_deg = 4\n", "x stands outside section"),
+        ("[site\n", "not valid TOML"),
+    ],
+)
+def test_wrong_site_files_say_what_to_do(tmp_path, text, words):
+    path = tmp_path / "site.toml"
+    path.write_text(text)
+    with pytest.raises(SiteError, match=words) as caught:
+        Site.load(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value).strip()
+
+
+def test_wrong_sites_are_refused(tmp_path):
+    with pytest.raises(SiteError, match="does not exist"):
+        Site.load(tmp_path / "none.toml")
+    with pytest.raises(SiteError, match="is a directory"):
+        Site.load(tmp_path)
+    with pytest.raises(SiteError, match="latitude_deg is 91"):
+        Site(91.0, 0.0)
+    with pytest.raises(SiteError, match="temperature_c is 288"):
+        Site(52.0, 4.0, temperature_c=288.0)
+
+
+# ---------------------------------------------------------------------------------------------------------------- sky
+
+
+def _astropy():
+    from astropy.coordinates import EarthLocation
+    from astropy.time import Time
+    from astropy.utils import iers
+
+    return EarthLocation, Time, iers
+
+
+def test_site_against_astropy():
+    EarthLocation, Time, iers = _astropy()
+    times = [TIME, "2026-11-21T03:04:05.6"]
+    with iers.conf.set_temp("auto_download", False), iers.conf.set_temp("iers_degraded_accuracy", "ignore"):
+        place = EarthLocation.from_geodetic(SITE.longitude_deg, SITE.latitude_deg, SITE.height_m)
+        time = Time(times, scale="utc")
+        time.delta_ut1_utc = 0.0
+        position, velocity = place.get_gcrs_posvel(time)
+    zenith, ours = site_among_stars(SITE, times)
+    assert zenith.shape == ours.shape == (2, 3)
+    expected = velocity.xyz.to_value("km/s").T
+    # Astropy differentiates nothing but leaves precession out of the axis as well: 1e-6 of 0.44 km/s.
+    assert np.abs(ours - expected).max() < 2e-5
+    assert np.linalg.norm(ours, axis=1) == pytest.approx(0.465 * np.cos(np.radians(SITE.latitude_deg)), rel=2e-3)
+    # The geocentric direction differs from the zenith by the flattening, 0.19 degrees times sin(2 latitude).
+    there = position.xyz.value.T
+    there /= np.linalg.norm(there, axis=1, keepdims=True)
+    angle = np.degrees(np.arccos(np.sum(zenith * there, axis=1)))
+    assert angle == pytest.approx(0.1924 * abs(np.sin(np.radians(2 * SITE.latitude_deg))), rel=0.01)
+    one, _ = site_among_stars(SITE, times[1])
+    assert np.allclose(one, zenith[1], rtol=0, atol=1e-15)
+    # UT1 - UTC turns the zenith: 15 arcsec a second times the cosine of the latitude.
+    moved, _ = site_among_stars(SITE, TIME, ut1_minus_utc_s=0.5)
+    turned = np.linalg.norm(moved - zenith[0]) * ARCSEC
+    assert turned == pytest.approx(7.52 * np.cos(np.radians(SITE.latitude_deg)), rel=0.01)
+
+
+@pytest.mark.parametrize("site", [SITE, NOORDWIJK])
+def test_apparent_directions_against_astropy(site):
+    """Astropy's AltAz with pressure, after the best rotation: what is left is the Sun's deflection of light."""
+    from astropy import units as u
+    from astropy.coordinates import AltAz, SkyCoord
+
+    EarthLocation, Time, iers = _astropy()
+    directions = above(site, TIME, 12.0)
+    time = TIME if site is NOORDWIJK else "2019-07-30T04:00:00"
+    directions = above(site, time, 12.0)
+    ours = apparent_directions(directions, time, site=site)
+    with iers.conf.set_temp("auto_download", False), iers.conf.set_temp("iers_degraded_accuracy", "ignore"):
+        frame = AltAz(
+            obstime=Time(time, scale="utc"),
+            location=EarthLocation.from_geodetic(site.longitude_deg, site.latitude_deg, site.height_m),
+            pressure=site.air_pressure_hpa * u.hPa,
+            temperature=site.air_temperature_c * u.deg_C,
+            relative_humidity=site.relative_humidity,
+            obswl=site.wavelength_um * u.micron,
+        )
+        sky = SkyCoord(*directions.T, representation_type="cartesian", frame="icrs")
+        sky = SkyCoord(sky.spherical.lon, sky.spherical.lat, frame="icrs")
+        seen = sky.transform_to(frame)
+        astropy = unit_vectors(seen.az.deg, seen.alt.deg)
+    # Azimuth runs from north over east: a left-handed system.
+    astropy[:, 1] *= -1.0
+    left = np.linalg.norm(rotated_onto(ours, astropy) - astropy, axis=1) * ARCSEC
+    high = seen.alt.deg > 20.0
+    assert left[high].max() < 0.012
+    assert left.max() < 0.15
+    assert np.abs(altitude_deg(ours, site_among_stars(site, time)[0]) - seen.alt.deg).max() * 3600.0 < 16.0
+    # The control: without refraction, seconds of arc are left.
+    control = aberrate(directions, earth_velocity_km_s(time))
+    assert np.linalg.norm(rotated_onto(control, astropy) - astropy, axis=1).max() * ARCSEC > 20.0
+
+
+def test_refraction_is_the_formula_and_erfas():
+    zenith = np.array([0.0, 0.0, 1.0])
+    z_seen = np.radians(np.array([0.0, 10.0, 45.0, 60.0, 75.0, 80.0]))
+    # The conditions of the table in the documentation of erfa's refco: 58.18 arcsec at 45 degrees.
+    site = Site(50.0, 0.0, pressure_hpa=1005.0, temperature_c=7.0, relative_humidity=0.8, wavelength_um=0.574)
+    a, b = refraction_constants(site)
+    expected = a * np.tan(z_seen) + b * np.tan(z_seen) ** 3
+    z_vacuum = z_seen + expected
+    directions = np.column_stack([np.sin(z_vacuum), np.zeros(6), np.cos(z_vacuum)])
+    seen = refract(directions, zenith, (a, b))
+    assert np.arctan2(seen[:, 0], seen[:, 2]) == pytest.approx(z_seen, abs=1e-12)
+    assert expected[2] * ARCSEC == pytest.approx(58.18, abs=0.01)
+    # All over the sky, below the horizon too, lengths stay one.
+    sky = np.random.default_rng(2).normal(size=(1000, 3))
+    sky /= np.linalg.norm(sky, axis=1, keepdims=True)
+    assert np.linalg.norm(refract(sky, zenith, (a, b)), axis=1) == pytest.approx(1.0, abs=1e-14)
+    assert np.isfinite(refract(np.array([zenith, -zenith]), zenith, (a, b))).all()
+    # erfa's whole chain, which takes one step of Newton's method where this takes four.
+    astrom = erfa.apio(0.0, 0.0, 0.0, np.radians(50.0), 0.0, 0.0, 0.0, a, b)
+    _, zenith_distance, *_ = erfa.atioq(*_cirs(directions[1:5], np.radians(50.0)), astrom)
+    assert zenith_distance == pytest.approx(z_seen[1:5], abs=0.01 / ARCSEC)
+
+
+def _cirs(up: np.ndarray, latitude: float) -> tuple[np.ndarray, np.ndarray]:
+    """Right ascension and declination, at hour angle zero of Greenwich, of directions given by x south, z up."""
+    south, z = up[:, 0], up[:, 2]
+    x = np.cos(latitude) * z + np.sin(latitude) * south
+    y = up[:, 1]
+    w = np.sin(latitude) * z - np.cos(latitude) * south
+    return np.arctan2(y, x), np.arctan2(w, np.hypot(x, y))
+
+
+@pytest.mark.parametrize("altitude", [90.0, 60.0, 45.0, 25.0])
+def test_how_much_small_angles_shrink(altitude):
+    constants = refraction_constants(NOORDWIJK)
+    zenith, small = np.array([0.0, 0.0, 1.0]), 1e-3
+    z = np.radians(90.0 - altitude)
+    centre = np.array([np.sin(z), 0.0, np.cos(z)])
+    up, side = np.array([-np.cos(z), 0.0, np.sin(z)]), np.array([0.0, 1.0, 0.0])
+    parts = []
+    for axis in (up, side):
+        ends = np.array([centre + sign * small * axis for sign in (1, -1)])
+        ends /= np.linalg.norm(ends, axis=1, keepdims=True)
+        seen = refract(ends, zenith, constants)
+        before, after = (np.linalg.norm(pair[0] - pair[1]) for pair in (ends, seen))
+        parts.append(1.0 - after / before)
+    assert float(shrinking(altitude, constants)) == pytest.approx(np.mean(parts), rel=5e-3)
+    if altitude == 45.0:
+        # The textbook: R = A tan z to a thousandth, hence (A / 2) (1 + 1 / cos^2 z).
+        assert float(shrinking(45.0, constants)) == pytest.approx(1.5 * constants[0], rel=0.01)
+
+
+def test_catalogue_directions_are_the_inverse():
+    for site, lowest in ((SITE, 10.5), (None, -90.0)):
+        directions = above(SITE, TIME, lowest)
+        seen = apparent_directions(directions, TIME, site=site)
+        back = catalogue_directions(seen, TIME, site=site)
+        assert np.linalg.norm(back - directions, axis=1).max() * ARCSEC < 1e-4
+        assert np.linalg.norm(seen - directions, axis=1).max() * ARCSEC > 15.0
+
+
+def test_the_table_of_real_stars(real_data):
+    """Its apparent directions are those of air at 0 °C over 51.96° N, 4.51° E, without diurnal aberration."""
+    with (real_data / "esa_tetra3_observations.csv").open() as stream:
+        rows = list(csv.DictReader(stream))
+    column = {name: np.array([float(row[name]) for row in rows]) for name in rows[0] if name.endswith("deg")}
+    catalogue = unit_vectors(column["ra_deg"], column["dec_deg"])
+    expected = unit_vectors(column["ra_apparent_deg"], column["dec_apparent_deg"])
+
+    def left(site: Site) -> float:
+        zenith, _ = site_among_stars(site, TIME)
+        ours = refract(aberrate(catalogue, earth_velocity_km_s(TIME)), zenith, refraction_constants(site))
+        return float(np.linalg.norm(ours - expected, axis=1).max()) * ARCSEC
+
+    cold = Site(51.96, 4.51, pressure_hpa=1013.25, temperature_c=0.0, wavelength_um=0.55)
+    assert left(cold) < 0.06
+    # The controls: another pressure, another place.
+    assert left(replace(cold, pressure_hpa=1000.0)) > 0.5
+    assert left(replace(cold, latitude_deg=52.96)) > 0.5
+    assert left(replace(cold, longitude_deg=-4.51)) > 5.0
+
+
+# -------------------------------------------------------------------------------------------------------- observations
+
+
+def test_make_apparent_at_a_site(stars):
+    obs = ground_frames(stars, np.array([50.0, 35.0]))
+    apparent = make_apparent(obs, site=SITE)
+    assert apparent.meta["directions"] == "apparent"
+    assert apparent.meta["observer"] == "ground"
+    assert Site.from_dict(apparent.meta["site"]) == SITE
+    air = apparent.meta["atmosphere"]
+    assert (air["pressure_hpa"], air["temperature_c"], air["assumed"]) == (743.0, 12.0, [])
+    assert 27.0 < air["altitude_min_deg"] < 33.0
+    assert 54.0 < air["altitude_max_deg"] < 58.0
+    expected = apparent_directions(obs.directions_icrs, obs.time_utc, site=SITE)
+    assert np.linalg.norm(apparent.directions_icrs - expected, axis=1).max() < 1e-15
+    assert apparent.data_hash != make_apparent(obs).data_hash
+    assert make_apparent(obs).meta["observer"] == "unknown"
+    assert make_apparent(obs, (0.0, 7.6, 0.0)).meta["observer"] == "space"
+    assert make_apparent(obs, (0.0, 0.3, 0.0)).meta["observer"] == "unknown"
+    assert make_apparent(obs.with_meta(observer="space")).meta["observer"] == "space"
+    with pytest.raises(ObservationError, match="not both"):
+        make_apparent(obs, (0.0, 0.3, 0.0), site=SITE)
+    with pytest.raises(ObservationError, match="no column 'time_utc'"):
+        make_apparent(replace(obs, time_utc=None), site=SITE)
+
+
+def test_what_a_site_adds_survives_a_file(stars, tmp_path):
+    obs = make_apparent(ground_frames(stars, np.array([50.0])), site=SITE)
+    for name in ("obs.parquet", "obs.ecsv"):
+        obs.save(tmp_path / name)
+        again = sc.load_observations(tmp_path / name)
+        assert again.meta["site"] == obs.meta["site"]
+        assert again.meta["atmosphere"] == obs.meta["atmosphere"]
+
+
+def test_stars_below_the_horizon_mean_a_wrong_site_or_time(stars):
+    obs = ground_frames(stars, np.array([50.0, 60.0, 45.0]))
+    # The sign of the longitude is the usual mistake.
+    flipped = replace(SITE, longitude_deg=-SITE.longitude_deg)
+    for function in (make_apparent, without_low_stars):
+        words = (
+            r"frame 0 .*degrees below the horizon of the site \(24.60° S, 70.40° E, 2635 m\) at 2026-11-25T02:00:00 "
+        )
+        with pytest.raises(ObservationError, match=words + r"UTC: correct the site \(north and east are positive\)"):
+            function(obs, site=flipped)
+    # A clock that is ten hours off does the same.
+    local = replace(obs, time_utc=np.char.replace(obs.time_utc, "T0", "T1"))
+    with pytest.raises(ObservationError, match="which must be UTC"):
+        make_apparent(local, site=SITE)
+    # The control: with the right site nothing is said.
+    assert without_low_stars(obs, SITE).n_stars == obs.n_stars
+
+
+def test_low_stars_are_left_out(stars):
+    obs = ground_frames(stars, np.array([12.0, 50.0, 4.0]))
+    with pytest.raises(ObservationError, match=r"lower than 10 degrees .*without_low_stars"):
+        make_apparent(obs, site=SITE)
+    high = without_low_stars(obs, SITE)
+    assert 0 < high.meta["low_stars"] == obs.n_stars - high.n_stars
+    # All of the last frame is low, half of the first.
+    assert high.frame_ids.tolist() == [0, 1]
+    assert make_apparent(high, site=SITE).meta["atmosphere"]["altitude_min_deg"] >= 10.0
+    with pytest.raises(ObservationError, match="take images of higher stars"):
+        without_low_stars(obs.select_frames([2]), SITE)
+
+
+def test_refraction_moves_f_and_the_site_puts_it_right(stars):
+    obs = ground_frames(stars, np.random.default_rng(5).uniform(35.0, 80.0, 40), seed=3)
+    right = sc.calibrate(make_apparent(obs, site=SITE), NOMINAL)
+    z = (right.theta - CAMERA.theta) / right.sigmas
+    assert np.all(np.abs(z) < 4.0)
+    assert right.sigma == pytest.approx(0.05, rel=0.08)
+    # The control: without the site f is short by what the formula says, many sigma.
+    wrong = sc.calibrate(make_apparent(obs), NOMINAL)
+    predicted = make_apparent(obs, site=SITE).meta["atmosphere"]["shrinking"] * CAMERA.focal_px
+    assert predicted > 10.0 * wrong.sigmas[2]
+    assert wrong.theta[2] - CAMERA.theta[2] == pytest.approx(-predicted, abs=4.0 * wrong.sigmas[2])
+
+
+# ------------------------------------------------------------------------------------------------------ identification
+
+
+def _bootstrap(obs, stars, site, *, moved=True, flip=False):
+    table = as_centroids(obs)
+    table = mirrored(table, CAMERA.width_px) if flip else table
+    return bootstrap(
+        table,
+        NOMINAL,
+        stars,
+        prepare=lambda found: make_apparent(found, site=site),
+        to_catalogue=(lambda seen, times: catalogue_directions(seen, times, site=site)) if moved else None,
+    )
+
+
+def _named(obs):
+    return set(zip(obs.frame.tolist(), obs.star_id.tolist(), strict=True))
+
+
+def test_second_identification_looks_where_stars_are_seen(stars):
+    site = replace(SITE, pressure_hpa=1013.25)
+    obs = ground_frames(stars, np.random.default_rng(5).uniform(18.0, 31.0, 30), seed=3, site=site)
+    found = _bootstrap(obs, stars, site)
+    assert found.identification.n_identified == 30
+    assert not _named(found.observations) - _named(obs)
+    # Hardly a star that was found is given up, and the places are those that were measured.
+    given_up = len(_named(found.rounds[0][1]) - _named(found.observations))
+    # The others have a neighbour too near to tell which is which.
+    assert found.observations.n_stars > 0.98 * obs.n_stars
+    measured = dict(zip(zip(obs.frame, obs.star_id, strict=True), zip(obs.x_px, obs.y_px, strict=True), strict=True))
+    rows = zip(found.observations.frame, found.observations.star_id, strict=True)
+    places = np.column_stack([found.observations.x_px, found.observations.y_px])
+    assert np.array_equal([measured[row] for row in rows], places)
+    assert np.all(np.abs((found.calibration.theta - CAMERA.theta) / found.calibration.sigmas) < 4.0)
+    # The control: compared with the catalogue as it stands, the calibrated camera's tolerance loses stars.
+    control = _bootstrap(obs, stars, site, moved=False)
+    lost = len(_named(control.rounds[0][1]) - _named(control.observations))
+    print(given_up, lost, found.observations.n_stars, control.observations.n_stars, obs.n_stars)
+    assert lost >= 4
+
+
+def test_mirrored_images_keep_their_camera(stars):
+    obs = ground_frames(stars, np.random.default_rng(5).uniform(40.0, 80.0, 12), seed=4)
+    found = _bootstrap(obs, stars, SITE, flip=True)
+    assert found.identification.parity == "mirrored"
+    assert [r[0].n_identified for r in found.rounds] == [12, 12]
+    assert not _named(found.observations) - _named(obs)
+    # x is counted from the right edge of the mirrored image: the calibration is that of the camera itself.
+    assert np.all(np.abs((found.calibration.theta - CAMERA.theta) / found.calibration.sigmas) < 4.0)
+
+
+def test_moved_centroids_are_where_the_catalogue_has_them(stars):
+    obs = ground_frames(stars, np.array([25.0, 60.0, 40.0]), sigma_px=0.0)
+    table = as_centroids(obs)
+    seen = make_apparent(obs, site=SITE).select_frames([0, 1])
+    moved = undisplaced(table, seen, CAMERA, lambda u, t: catalogue_directions(u, t, site=SITE))
+    # The pixels of the catalogue's directions through the true camera, at the best attitude.
+    for number in (0, 1):
+        rows = table.frame == number
+        b = sc.projection.unproject(CAMERA, np.column_stack([moved.x_px[rows], moved.y_px[rows]]))
+        r = obs.directions_icrs[obs.frame == number]
+        left = np.linalg.norm(rotated_onto(r, b) - b, axis=1) * CAMERA.focal_px
+        assert np.median(left) < 1e-5
+        shift = np.hypot(moved.x_px[rows] - table.x_px[rows], moved.y_px[rows] - table.y_px[rows])
+        assert 0.03 < shift.max() < 1.0
+    untouched = table.frame == 2
+    assert np.array_equal(moved.x_px[untouched], table.x_px[untouched])
+    back = as_measured(replace(obs, x_px=moved.x_px, y_px=moved.y_px), moved, table)
+    assert np.array_equal(back.x_px, obs.x_px)
+
+
+def test_night_is_night():
+    assert len(night(30)) == 30
+    assert all(re.fullmatch(r"2026-11-25T\d\d:\d\d:00", time) for time in night(30))
+
+
+# -------------------------------------------------------------------------------------------------------------- report
+
+
+def _first_paragraph(obs, **meta):
+    from starcal_uq.diagnostics.verdict.judge import judge
+    from starcal_uq.presentation.report.results import Results
+    from starcal_uq.presentation.report.words import data_sentence
+
+    obs = obs.with_meta(**meta)
+    cal = sc.calibrate(obs, NOMINAL)
+    check = next(c for c in judge(obs, cal).checks if c.name == "Catalogue directions")
+    return data_sentence(Results("run", obs, cal)), check, cal
+
+
+def test_report_says_that_f_is_conditional_on_refraction(stars):
+    obs = ground_frames(stars, np.full(12, 45.0))
+    text, check, cal = _first_paragraph(make_apparent(obs))
+    assert "directions that include aberration but no refraction" in text
+    found = re.search(r"f is too short by ([\d.]+) px .* zenith and by ([\d.]+) px .* at 45°", text)
+    assert found is not None
+    constants = refraction_constants(Site(0.0, 0.0))
+    sizes = [float(shrinking(altitude, constants)) * cal.camera.focal_px for altitude in (90.0, 45.0)]
+    assert [float(size) for size in found.groups()] == pytest.approx(sizes, rel=0.05)
+    assert check.level.value == "warning"
+    assert "--site" in check.sentence
+    for declared in ("undeclared", "catalogue"):
+        text, check, _ = _first_paragraph(obs, directions=declared)
+        assert "is conditional on refraction" in text
+        assert "is conditional on refraction" in check.sentence
+        assert "Annual aberration" in check.sentence
+
+
+def test_report_is_silent_where_there_is_no_air(stars):
+    obs = ground_frames(stars, np.full(12, 45.0))
+    apparent = make_apparent(obs, site=SITE)
+    plain = replace(apparent, meta={"directions": "apparent"})
+    for table in (
+        plain,
+        replace(apparent, meta={"directions": "undeclared", "source": "simulated"}),
+        make_apparent(obs.with_meta(observer="space")),
+        make_apparent(obs, (0.0, 7.6, 0.0)),
+    ):
+        text, check, _ = _first_paragraph(table)
+        assert "refraction" not in text
+        assert "refraction" not in check.sentence
+
+
+def test_report_states_site_air_and_what_refraction_does(stars):
+    obs = ground_frames(stars, np.full(12, 45.0))
+    text, check, cal = _first_paragraph(make_apparent(obs, site=SITE))
+    assert "aberration and refraction included" in text
+    assert "Site: 24.60° S, 70.40° W, 2635 m. Refraction in air of 743 hPa and 12 °C is in the directions" in text
+    size = float(re.search(r"f would come out ([\d.]+) px", text)[1])
+    without = sc.calibrate(make_apparent(obs), NOMINAL)
+    assert size == pytest.approx(cal.theta[2] - without.theta[2], rel=0.05)
+    assert "conditional" not in text
+    assert check.level.value == "pass"
+    assert "standard atmosphere" not in text
+    # What is assumed is said; where the weather may matter more than noise, that too.
+    text, _, _ = _first_paragraph(make_apparent(obs, site=replace(SITE, pressure_hpa=None)))
+    assert "(pressure of the standard atmosphere)" in text
+    assert "The weather may differ" not in text
+    cal = replace(cal, covariance=0.04 * cal.covariance)
+    sharper = corrected_words(make_apparent(obs, site=replace(SITE, pressure_hpa=None)), cal)
+    assert "more than the sigma of f: state pressure and temperature" in sharper
+
+
+# -------------------------------------------------------------------------------------------------------------- images
+
+
+@pytest.mark.parametrize(
+    ("name", "time"),
+    [
+        ("2019-07-29T204726_Alt40_Azi-135_Try1.tiff", "2019-07-29T20:47:26"),
+        ("cam1_20190729T204726.png", "2019-07-29T20:47:26"),
+        ("2019-07-29T20-47-26.25Z.fits", "2019-07-29T20:47:26.25"),
+        ("2019-07-29T20_47_26.fits", "2019-07-29T20:47:26"),
+        ("2019-13-29T204726.png", None),
+        ("1019-07-29T204726.png", None),
+        ("2019-07-29T2047261.png", None),
+        ("2019-07-29.png", None),
+        ("img0.png", None),
+    ],
+)
+def test_times_in_names_of_files(name, time):
+    assert time_in_name(name) == time
+
+
+def test_an_images_own_time_wins(tmp_path):
+    from astropy.io import fits
+    from PIL import Image as Pillow
+
+    pixels = np.random.default_rng(0).normal(100.0, 3.0, (48, 64)).astype(np.uint16)
+    Pillow.fromarray(pixels).save(tmp_path / "2019-07-29T204726.png")
+    Pillow.fromarray(pixels).save(tmp_path / "plain.png")
+    own = fits.PrimaryHDU(pixels)
+    own.header["DATE-OBS"], own.header["EXPTIME"] = "2020-01-02T03:04:05", 2.0
+    own.writeto(tmp_path / "2019-07-29T204726.fits")
+    named = read_image(tmp_path / "2019-07-29T204726.png")
+    assert named.time_utc == "2019-07-29T20:47:26"
+    assert any("from the name of the file, as UTC" in message for message in named.messages)
+    header = read_image(tmp_path / "2019-07-29T204726.fits")
+    assert header.time_utc == "2020-01-02T03:04:06.000000"
+    assert not header.messages
+    table = sc.extract_centroids(tmp_path)
+    assert table.image.tolist() == ["2019-07-29T204726.fits", "2019-07-29T204726.png", "plain.png"]
+    given = with_time(table, "2021-05-06T07:08:09")
+    assert given.time_utc.tolist() == ["2020-01-02T03:04:06.000000"] + 2 * ["2021-05-06T07:08:09"]
+    assert not any("name of the file" in message for message in given.messages)
+    assert with_time(table, None) is table
+    # Tables hold UTC without an offset.
+    assert with_time(table, "2019-07-29T22:47:26+02:00").time_utc[2] == TIME
+    with pytest.raises(sc.CatalogueError, match="a date without a time of day"):
+        with_time(table, "2019-07-29")
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("2019-07-29T20:47:26", TIME),
+        (" 2019-07-29 20:47:26Z", TIME),
+        ("2019-07-29T22:47:26+02:00", TIME),
+        ("2019-07-29T20:47", "2019-07-29T20:47:00"),
+        ("2019-07-30T00:17:26.250+0330", "2019-07-29T20:47:26.250"),
+        ("2017-01-01T01:59:60.5+02:00", "2016-12-31T23:59:60.5"),
+        ("2019-12-31T23:00:00.-02:00", "2020-01-01T01:00:00"),
+    ],
+)
+def test_times_as_tables_hold_them(text, expected):
+    assert utc_text(text) == expected
+
+
+@pytest.mark.parametrize(
+    "text", ["2019-07-29", "2019-02-30", "noon", "", "2019-07-29T25:00", "1858-11-17T00:00:00", "2019-07-29T20:47:61"]
+)
+def test_other_times_are_refused_in_one_sentence(text):
+    with pytest.raises(sc.CatalogueError, match=f"^The time '{text}' is .*; write it as") as caught:
+        utc_text(text)
+    assert "number 1" not in str(caught.value)
+
+
+def test_a_missing_image_is_left_out_once(stars, tmp_path):
+    """With the centroids, not as a frame without them; the control is an image without stars."""
+    dark = sc.Image(np.random.default_rng(0).normal(100.0, 3.0, (768, 1024)), "dark")
+    table = sc.extract_centroids([tmp_path / "missing.png", dark], camera=NOMINAL)
+    assert (table.problem != "").tolist() == [True, False]
+    found = sc.identify(table, NOMINAL, stars)
+    assert found.n_left_out == 1 and len(found.frames) == 2
+    assert found.summary == "0 of 1 frame is identified. Left out: 1 with fewer than four centroids."
+
+
+def test_rendered_images_shine_through_no_air(stars, tmp_path):
+    sc.render_frames(stars, CAMERA, tmp_path, n_frames=6, seed=3, times_utc=["2026-11-25T00:00:00"] * 6)
+    obs, _, _ = observations_from_images([tmp_path], NOMINAL, max_mag=6.5)
+    assert obs.meta["observer"] == "rendered"
+    assert "refraction" not in _first_paragraph(obs)[0]
+    obs, _, _ = observations_from_images([tmp_path], NOMINAL, max_mag=6.5, in_space=True)
+    assert obs.meta["observer"] == "space"
+
+
+def test_images_and_sites_that_do_not_go_together(tmp_path):
+    with pytest.raises(SiteError, match="space has no site"):
+        observations_from_images([tmp_path], NOMINAL, max_mag=7.0, site=SITE, in_space=True)
+    with pytest.raises(SiteError, match="declared apparent"):
+        observations_from_images([tmp_path], NOMINAL, max_mag=7.0, site=SITE, directions="apparent")
+    with pytest.raises(sc.CatalogueError, match="'noon'"):
+        observations_from_images([tmp_path], NOMINAL, max_mag=7.0, time_utc="noon")
+
+
+@pytest.fixture(scope="module")
+def esa(real_data):
+    return real_data / "esa-tetra3", sc.Camera.load(real_data / "esa_tetra3_camera.toml")
+
+
+def test_real_frames_with_a_site_agree_with_the_independent_fit(esa, real_data):
+    folder, camera = esa
+    obs, table, found = observations_from_images([folder], camera, max_mag=7.0, site=NOORDWIJK)
+    assert set(table.time_utc) == {TIME}
+    assert found.identification.n_identified == 8
+    assert obs.n_stars / 8 >= 30
+    assert obs.meta["atmosphere"]["altitude_min_deg"] == pytest.approx(37.0, abs=1.0)
+    cal = found.calibration
+    f = cal.theta[2]
+    values = [*cal.theta[:3], cal.theta[3] * f**2, cal.theta[4] * f**4]
+    sigmas = [*cal.sigmas[:3], cal.sigmas[3] * f**2, cal.sigmas[4] * f**4]
+    independent = [(517.3, 1.0), (389.9, 1.4), (5116.54, 0.28), (0.078, 0.017), (1.5, 1.1)]
+    for value, sigma, (other, error) in zip(values, sigmas, independent, strict=True):
+        assert abs(value - other) < 3.0 * np.hypot(sigma, error)
+    # No wrong identification: every star that the table has at that place is the star of the table.
+    seen, n = found.identification.observations, 0
+    with (real_data / "esa_tetra3_observations.csv").open() as stream:
+        for row in csv.DictReader(stream):
+            near = np.hypot(seen.x_px - float(row["x_px"]), seen.y_px - float(row["y_px"])) < 1.0
+            here = np.flatnonzero((seen.frame == int(row["frame"])) & near)
+            if len(here):
+                n += 1
+                there = unit_vectors(np.array([float(row["ra_deg"])]), np.array([float(row["dec_deg"])]))
+                assert np.linalg.norm(seen.directions_icrs[here] - there) * ARCSEC < 20.0
+    assert n > 300
+    # The controls: without a site f is many sigma off; with the longitude's sign flipped the frames disagree.
+    bare, _, plain = observations_from_images([folder], camera, max_mag=7.0)
+    assert abs(plain.calibration.theta[2] - 5116.54) > 5.0 * np.hypot(plain.calibration.sigmas[2], 0.28)
+    assert bare.meta["observer"] == "unknown"
+    west = replace(NOORDWIJK, longitude_deg=-NOORDWIJK.longitude_deg)
+    flipped = sc.calibrate(make_apparent(found.identification.observations, site=west), camera)
+    assert flipped.sigma > sc.calibrate(make_apparent(found.identification.observations, site=NOORDWIJK), camera).sigma
+
+
+def test_real_frames_of_another_hemisphere_are_refused(esa, tmp_path):
+    folder, camera = esa
+    with pytest.raises(ObservationError, match="below the horizon"):
+        observations_from_images([folder], camera, max_mag=7.0, site=replace(NOORDWIJK, latitude_deg=-52.2))
+    for number, image in enumerate(sorted(folder.iterdir())[2:4]):
+        shutil.copy(image, tmp_path / f"night{number}.tiff")
+    with pytest.raises(ObservationError, match=r"night0.tiff \(and 1 other\): the image has no time"):
+        observations_from_images([tmp_path], camera, max_mag=7.0, site=NOORDWIJK)
+    obs, _, _ = observations_from_images([tmp_path], camera, max_mag=7.0, site=NOORDWIJK, time_utc=TIME)
+    assert obs.meta["observer"] == "ground"
+    obs, _, found = observations_from_images([tmp_path], camera, max_mag=7.0)
+    assert obs.meta["directions"] == "undeclared"
+    assert found.identification.n_identified == 2
