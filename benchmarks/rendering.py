@@ -32,7 +32,7 @@ def milliseconds(run: Callable[[int], object], repeats: int = 15) -> float:
 
 def main() -> None:
     """Print the table."""
-    stars, camera, sensor = sc.load_catalogue(6.0), sc.paper_camera(), Sensor()
+    stars, camera, sensor = sc.load_catalogue(6.0), sc.paper.paper_camera(), Sensor()
     rotations = random_rotations(15, np.random.default_rng(1))
     rng = np.random.default_rng(0)
     shape = camera.height_px, camera.width_px

@@ -50,7 +50,7 @@ def explicit_pairs(obs: sc.Observations) -> np.ndarray:
 
     from starcal_uq.estimation.stages import distortion_stage
 
-    frames, start = StarFrames.from_observations(obs), sc.paper_start()
+    frames, start = StarFrames.from_observations(obs), sc.paper.paper_start()
     theta = np.array(start.theta)
     first = PairObjective(frames, "none")
     joint = PairObjective(frames, "brown")
@@ -104,7 +104,7 @@ def explicit_innovations(frames: StarFrames, theta: np.ndarray, count: int) -> n
 
 def add_baselines(table: Table, obs: sc.Observations, efficient: float, repeats: int) -> None:
     """Rows of the methods that the paper compares itself with, per 1000 frames."""
-    start, thousands = sc.paper_start(), obs.n_frames / 1000.0
+    start, thousands = sc.paper.paper_start(), obs.n_frames / 1000.0
     for label, method, options in (
         ("least squares, distortion ignored", "least_squares", None),
         ("Samaan: filter and linear distortion", "samaan", None),
@@ -159,7 +159,7 @@ def quest_rates(obs: sc.Observations) -> tuple[float, float]:
     r = np.einsum("kji,kmj->kmi", random_rotations(k, rng), b)
     starts = np.arange(k + 1) * m
     flat_b, flat_r = b.reshape(-1, 3), r.reshape(-1, 3)
-    ours = seconds(lambda: sc.quest(flat_b, flat_r, starts, covariance=False), 7)
+    ours = seconds(lambda: sc.attitude.quest(flat_b, flat_r, starts, covariance=False), 7)
     few = 300
     theirs = seconds(lambda: [Rotation.align_vectors(b[i], r[i]) for i in range(few)], 3)
     return k / ours, few / theirs
@@ -172,8 +172,8 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=7)
     options = parser.parse_args()
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
-    obs = sc.simulate(stars, sc.paper_camera(), n_frames=options.frames, sigma_px=0.05, seed=2017)
-    start = sc.paper_start()
+    obs = sc.simulate(stars, sc.paper.paper_camera(), n_frames=options.frames, sigma_px=0.05, seed=2017)
+    start = sc.paper.paper_start()
     n_pairs = PairObjective(StarFrames.from_observations(obs), "brown").n_pairs
     console = Console(width=110)
     console.print(f"{obs.n_frames} frames, {obs.n_stars} stars, {n_pairs} pairs; medians, one core")
@@ -270,7 +270,7 @@ def _three_stages(obs: sc.Observations) -> tuple[np.ndarray, np.ndarray]:
     """The paper's three stages and their sandwich covariance, without the refinement."""
     from starcal_uq.estimation.stages import distortion_stage, joint_stage, optics_stage
 
-    frames, start = StarFrames.from_observations(obs), sc.paper_start()
+    frames, start = StarFrames.from_observations(obs), sc.paper.paper_start()
     optics = optics_stage(frames, start, "lm", 200)
     linear = distortion_stage(frames, start, optics.theta)
     pairs = PairObjective(frames, "brown")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import os
 import re
 import shutil
@@ -10,13 +11,16 @@ import statistics
 import subprocess
 import sys
 import tomllib
+from graphlib import TopologicalSorter
 from pathlib import Path
 
+import grimp
 import nbformat
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 FIND_PYTHON = ROOT / "scripts" / "find_python.sh"
+WINGS = sorted(path.parent.name for path in (ROOT / "starcal_uq").glob("*/__init__.py"))
 HEAVY = ("arviz", "astropy", "casadi", "emcee", "jinja2", "matplotlib", "pandas", "pyarrow", "scipy", "xarray")
 
 
@@ -173,9 +177,19 @@ def test_second_interpreter_is_of_the_other_generation(tmp_path: Path) -> None:
     assert "ALT_PYTHON" in refused.stderr
 
 
-def test_no_public_function_shares_its_name_with_a_module() -> None:
+@pytest.mark.parametrize("wing", ["", *WINGS])
+def test_no_public_name_is_that_of_a_module_beside_it(wing: str) -> None:
     """Importing such a module would put it in the function's place (`sc.calibrate` would no longer be callable)."""
-    import starcal_uq
+    modules = {path.stem for path in (ROOT / "starcal_uq" / wing).iterdir()}
+    namespaces = set(WINGS) if not wing else {"errors"} if wing == "core" else set()
+    package = importlib.import_module(f"starcal_uq.{wing}".rstrip("."))
+    assert not (modules & set(getattr(package, "__all__", ()))) - namespaces
+    assert all(getattr(package, name) is not None for name in getattr(package, "__all__", ()))
 
-    modules = {path.stem for path in (ROOT / "starcal_uq").iterdir()}
-    assert not modules & set(starcal_uq.__all__)
+
+def test_files_do_not_import_each_other_in_circles() -> None:
+    """Neither within wings nor between them; an annotation counts."""
+    graph = grimp.build_graph("starcal_uq", exclude_type_checking_imports=False)
+    sorter = TopologicalSorter({module: graph.find_modules_directly_imported_by(module) for module in graph.modules})
+    sorter.prepare()  # raises CycleError with the circle in its message
+    assert sorter.is_active()

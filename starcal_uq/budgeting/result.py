@@ -377,7 +377,6 @@ def read_csv(path: str | os.PathLike[str]) -> Budget:
     RunFolderError
         If the file is missing or is not a budget.
     """
-    from starcal_uq.budgeting.result import Budget, Outcome
 
     try:
         with open(path, newline="", encoding="utf-8") as file:

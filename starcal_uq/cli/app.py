@@ -33,9 +33,9 @@ app = typer.Typer(
 
 def _print_version(wanted: bool) -> None:
     if wanted:
-        from starcal_uq import __version__
+        from starcal_uq.core.provenance import installed_version
 
-        print(f"starcal-uq {__version__}")
+        print(f"starcal-uq {installed_version('starcal-uq')}")
         raise typer.Exit
 
 

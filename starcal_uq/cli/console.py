@@ -260,8 +260,6 @@ def progress_bar(label: str) -> Iterator[Progress | None]:
     """Yield a function ``(done, total)`` that moves a bar; None where nobody would see it."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    from starcal_uq.cli.console import err
-
     if not err.is_terminal:
         yield None
         return

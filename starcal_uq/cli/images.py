@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.images.centroids import Centroids
     from starcal_uq.observations.table import Observations
-    from starcal_uq.pipeline.refine import Bootstrap
+    from starcal_uq.pipeline.refine import ImageCalibration
 
 _CENTROIDED = ("frame", "image", "n_stars", "n_saturated", "n_blended", "background", "noise")
 _IDENTIFIED = ("frame", "image", "status", "n_centroids", "n_identified", "log10_expected_false", "milliseconds")
@@ -157,7 +157,7 @@ def load_images(
     in_space: bool,
     time_utc: str | None,
     engine: str,
-) -> tuple[Observations, Camera, Centroids, Bootstrap]:
+) -> tuple[Observations, Camera, Centroids, ImageCalibration]:
     """Observations of images, and what is worth telling on the way."""
     from starcal_uq.camera.camera import Camera
     from starcal_uq.cli.console import err, warn_undeclared

@@ -1,1 +1,5 @@
 """What knows no star: types, errors, status, files, records, times, tasks."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -15,7 +15,7 @@ _VERSIONED = ("starcal-uq", "numpy", "scipy", "casadi", "emcee", "arviz")
 
 
 @lru_cache(maxsize=32)
-def _version(distribution: str) -> str | None:
+def installed_version(distribution: str) -> str | None:
     try:
         return version(distribution)
     except PackageNotFoundError:
@@ -42,7 +42,7 @@ def provenance(seed: int | None, settings: Mapping[str, Any], data_hash: str | N
     """
     versions: dict[str, str | None] = {"python": platform.python_version()}
     # Read from the installed metadata: importing casadi or arviz to ask for its version would cost a second.
-    versions.update({name.replace("-", "_"): _version(name) for name in _VERSIONED})
+    versions.update({name.replace("-", "_"): installed_version(name) for name in _VERSIONED})
     return {
         "created_utc": datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%SZ"),
         "seed": seed,

@@ -1,1 +1,5 @@
 """From a calibration to a posterior: priors, sampling, and the checks of the draws."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -309,7 +309,6 @@ def load_replicates(path: str | os.PathLike[str]) -> Replicates:
     RunFolderError
         If the file is missing or is not a set of replicates.
     """
-    from starcal_uq.paper.replicates_result import Replicates
 
     words = {
         "missing": "run `starcal-uq reproduce` first",

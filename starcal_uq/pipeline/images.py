@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from starcal_uq.identification.proposers import Engine
     from starcal_uq.images.centroids import Centroids
     from starcal_uq.observations.table import Observations
-    from starcal_uq.pipeline.refine import Bootstrap
+    from starcal_uq.pipeline.refine import ImageCalibration
     from starcal_uq.sky.site import Site
 
 CENTROIDS, IDENTIFICATION = "centroids.parquet", "identification.csv"
@@ -94,7 +94,7 @@ def observations_from_images(
     engine: Engine = "pyramid",
     tell: Callable[[str], None] | None = None,
     progress: Progress | None = None,
-) -> tuple[Observations, Centroids, Bootstrap]:
+) -> tuple[Observations, Centroids, ImageCalibration]:
     """Find, identify and calibrate with the nominal camera, then identify again with what was learnt.
 
     Parameters
@@ -136,7 +136,7 @@ def observations_from_images(
         When the time is not readable.
     """
     from starcal_uq.images.extract import extract_centroids
-    from starcal_uq.pipeline.refine import bootstrap
+    from starcal_uq.pipeline.refine import identify_and_calibrate
     from starcal_uq.sky.catalogue import load_catalogue
     from starcal_uq.sky.neighbours import without_disturbed
 
@@ -174,7 +174,7 @@ def observations_from_images(
     def to_catalogue(apparent: FloatArray, times: StrArray) -> FloatArray:
         return catalogue_directions(apparent, times, site=site)
 
-    found = bootstrap(
+    found = identify_and_calibrate(
         centroids,
         camera,
         stars,

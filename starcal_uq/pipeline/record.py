@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from starcal_uq.identification.result import Identification
     from starcal_uq.images.centroids import Centroids
     from starcal_uq.observations.table import Observations
-    from starcal_uq.pipeline.refine import Bootstrap
+    from starcal_uq.pipeline.refine import ImageCalibration
 
 # File in the run folder.
 IMAGES = "images.json"
@@ -132,7 +132,7 @@ class ImageRecord:
             ) from error
 
 
-def record_images(centroids: Centroids, found: Bootstrap) -> ImageRecord:
+def record_images(centroids: Centroids, found: ImageCalibration) -> ImageRecord:
     """The record of a bootstrapped run."""
     first, last = found.rounds[0][0], found.rounds[-1][0]
     counted = {frame.frame: frame.n_identified for frame in first.frames}

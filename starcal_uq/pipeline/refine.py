@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class Bootstrap:
+class ImageCalibration:
     """What two rounds of identification and calibration found.
 
     Attributes
@@ -70,7 +70,7 @@ class Bootstrap:
         return f"{words} The estimate moved, in its standard deviations: {moved}."
 
 
-def bootstrap(
+def identify_and_calibrate(
     centroids: Centroids,
     camera: Camera,
     stars: StarCatalogue,
@@ -79,7 +79,7 @@ def bootstrap(
     to_catalogue: ToCatalogue | None = None,
     method: dict[str, Any] | None = None,
     identification: dict[str, Any] | None = None,
-) -> Bootstrap:
+) -> ImageCalibration:
     """Identify with the nominal camera, calibrate, and do both again with what was learnt.
 
     Parameters
@@ -129,7 +129,7 @@ def bootstrap(
         rounds.append((found, obs, known))
         if number == 0:
             found = _again(centroids, found, obs, known, stars, to_catalogue, options)
-    return Bootstrap(tuple(rounds))
+    return ImageCalibration(tuple(rounds))
 
 
 def _again(

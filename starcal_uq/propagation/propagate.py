@@ -60,7 +60,7 @@ def propagate(post: Posterior, obs: Observations, *, n_draws: int = 300, seed: i
         Draws of the camera and the noise.
     obs : Observations
         The frames whose star geometry counts: those of the calibration, or those of a mission
-        (`starcal_uq.mission_frames`, `starcal_uq.profile_frames`).
+        (`starcal_uq.simulation.mission_frames`, `starcal_uq.simulation.profile_frames`).
     n_draws : int
         Draws that go through QUEST; all if there are fewer.
     seed : int

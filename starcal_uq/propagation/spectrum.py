@@ -60,7 +60,7 @@ def error_spectrum(
     post : Posterior
         Draws of the camera and the noise.
     obs : Observations
-        Frames along an attitude profile (`starcal_uq.profile_frames`), or any others that are evenly spaced in time.
+        Frames along an attitude profile (`starcal_uq.simulation.profile_frames`), or any others that are evenly spaced in time.
     times_s : (K,) array, optional
         Time of each frame, s, in the order of frame numbers; those of `profile_frames` by default.
     n_draws : int

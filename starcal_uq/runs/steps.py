@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from starcal_uq.images.centroids import Centroids
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.inference.priors import Priors
-    from starcal_uq.pipeline.refine import Bootstrap
+    from starcal_uq.pipeline.refine import ImageCalibration
     from starcal_uq.propagation.attitude_error import AttitudeError
     from starcal_uq.propagation.coupling import Coupling
     from starcal_uq.propagation.field import FieldMap
@@ -261,7 +261,7 @@ class MissionSky:
     rate_hz : float or None
         Frames per second along the profile; its own instants where it is None.
     scalar, sense
-        Of the profile's quaternions, as for `starcal_uq.load_attitude_profile`.
+        Of the profile's quaternions, as for `starcal_uq.attitude.load_attitude_profile`.
     """
 
     profile: Path | None = None
@@ -505,7 +505,6 @@ def budget_run(
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import load_observations
     from starcal_uq.propagation.attitude_error import AttitudeError
-    from starcal_uq.runs.steps import load_diagnosis
 
     run = RunFolder(run_path)
     stated = file if isinstance(file, BudgetFile) or file is None else load_budget_file(file)
@@ -523,7 +522,7 @@ def budget_run(
     return found
 
 
-def save_image_results(run: RunFolder, centroids: Centroids, found: Bootstrap) -> None:
+def save_image_results(run: RunFolder, centroids: Centroids, found: ImageCalibration) -> None:
     """Keep the centroids and the record of every frame in the run folder."""
     centroids.save(run.path / CENTROIDS, force=True)
     record_images(centroids, found).save(run.path / IMAGES)

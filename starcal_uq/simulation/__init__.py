@@ -1,1 +1,5 @@
 """Data with known truth: stars in frames, and rendered images."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -80,7 +80,7 @@ def profile_frames(
     min_stars: int = 3,
     noise_like: Observations | None = None,
 ) -> Observations:
-    """Noise-free frames along an attitude profile, for `starcal_uq.propagate` and `starcal_uq.error_spectrum`.
+    """Noise-free frames along an attitude profile, for `starcal_uq.propagate` and `starcal_uq.propagation.error_spectrum`.
 
     Parameters
     ----------

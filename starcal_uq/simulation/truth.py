@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from starcal_uq import __version__
 from starcal_uq.attitude.rotations import quaternion_to_rotation, rotation_to_quaternion
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.errors import ImageError, SensorError, StarcalError
 from starcal_uq.core.files import atomic_write_bytes, ensure_new
+from starcal_uq.core.provenance import installed_version
 from starcal_uq.core.types import FloatArray, StrArray
 from starcal_uq.images.image import Image
 from starcal_uq.observations.table import Observations
@@ -244,7 +244,7 @@ def _cards(truth: FrameTruth) -> list[tuple[str, Any, str]]:
     return [
         *cards,
         ("SATURATE", sensor.saturation_counts, "[adu] a pixel with this or more is saturated"),
-        ("CREATOR", f"starcal-uq {__version__}", "program that rendered the frame"),
+        ("CREATOR", f"starcal-uq {installed_version('starcal-uq')}", "program that rendered the frame"),
         ("NUMPY", np.__version__, "version of NumPy, which draws the noise"),
     ]
 

@@ -23,7 +23,8 @@ from starcal_uq.budgeting.rows import AXES, COMMON, FROM_FILE, GAUSSIAN_997, INT
 from starcal_uq.budgeting.shapes import one_axis_factor
 from starcal_uq.core.errors import BudgetError, RunFolderError
 from starcal_uq.diagnostics.misfit import Misfit, MisfitTest
-from starcal_uq.presentation.pages.budgeting import budget_context, tex
+from starcal_uq.presentation.pages.budgeting import budget_context
+from starcal_uq.presentation.tables import tex
 from starcal_uq.propagation.attitude_error import AttitudeError
 from starcal_uq.runs.steps import budget_run, diagnose_run
 from tests.helpers.scenes import observations
@@ -492,10 +493,10 @@ def test_the_figure_draws_limits_of_its_own_confidence_only(tmp_path: Path, line
 
 @pytest.fixture(scope="module")
 def full(tmp_path_factory: pytest.TempPathFactory) -> Any:
-    run = sc.RunFolder(tmp_path_factory.mktemp("budget") / "run").create()
+    run = sc.runs.RunFolder(tmp_path_factory.mktemp("budget") / "run").create()
     obs = observations(n_frames=60)
     obs.save(run.observations)
-    start = sc.paper_start()
+    start = sc.paper.paper_start()
     start.save(run.camera)
     cal = sc.calibrate(obs, start)
     cal.save(run.calibration)

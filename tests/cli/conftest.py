@@ -33,5 +33,5 @@ def inputs(tmp_path):
     folder = tmp_path / "inputs"
     folder.mkdir()
     observations().save(folder / "obs.csv")
-    sc.paper_start().save(folder / "camera.toml")
+    sc.paper.paper_start().save(folder / "camera.toml")
     return folder

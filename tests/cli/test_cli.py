@@ -18,7 +18,7 @@ def test_run_writes_everything_and_prints_the_tables(cli, inputs, tmp_path):
     for heading in ("Calibration", "Posterior", "Attitude error", "Report:"):
         assert heading in out
     assert "Neither time nor observer velocity was declared" in err
-    run = sc.RunFolder(tmp_path / "run")
+    run = sc.runs.RunFolder(tmp_path / "run")
     for path in (run.observations, run.camera, run.calibration, run.posterior, run.coupling, run.attitude, run.report):
         assert path.stat().st_size > 0, path
     page = run.report.read_text(encoding="utf-8")

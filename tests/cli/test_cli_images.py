@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 import starcal_uq as sc
 from starcal_uq.pipeline.images import counted, epoch_of
-from starcal_uq.pipeline.refine import bootstrap
+from starcal_uq.pipeline.refine import identify_and_calibrate
 from starcal_uq.sky.neighbours import disturbed_stars, without_disturbed
 
 ESA = Path(__file__).resolve().parents[3] / "shared" / "data" / "esa-tetra3"
@@ -22,13 +22,15 @@ ESA = Path(__file__).resolve().parents[3] / "shared" / "data" / "esa-tetra3"
 def frames(tmp_path_factory):
     folder = tmp_path_factory.mktemp("frames")
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
-    sc.render_frames(stars, sc.paper_camera(), folder, n_frames=25, seed=3, times_utc=["2026-11-25T00:00:00"] * 25)
+    sc.simulation.render_frames(
+        stars, sc.paper.paper_camera(), folder, n_frames=25, seed=3, times_utc=["2026-11-25T00:00:00"] * 25
+    )
     return folder
 
 
 def test_simulated_images_go_through_the_commands_one_by_one(cli, tmp_path):
-    sc.paper_camera().save(tmp_path / "truth.toml")
-    sc.paper_start().save(tmp_path / "camera.toml")
+    sc.paper.paper_camera().save(tmp_path / "truth.toml")
+    sc.paper.paper_start().save(tmp_path / "camera.toml")
     status, out, _ = cli("simulate", "truth.toml", "-o", "obs.parquet", "--frames", 4, "--images", "img", "--seed", 1)
     assert status == 0
     assert len(list((tmp_path / "img").glob("*.fits"))) == 4
@@ -46,16 +48,16 @@ def test_simulated_images_go_through_the_commands_one_by_one(cli, tmp_path):
 
 
 def test_run_from_images_to_report(cli, frames, tmp_path):
-    sc.paper_start().save(tmp_path / "camera.toml")
+    sc.paper.paper_start().save(tmp_path / "camera.toml")
     options = ("--directions", "apparent", "--max-mag", 6, "--screen", "--steps", 40)
     status, _, err = cli("run", frames, "camera.toml", "-o", "run", *options)
     assert status in (0, 1), err
     assert "with the nominal camera" in err
-    run = sc.RunFolder(tmp_path / "run")
+    run = sc.runs.RunFolder(tmp_path / "run")
     assert "identified anew" in run.report.read_text("utf-8")
     assert len(pd.read_csv(run.path / "identification.csv")) == 25
-    assert sc.Centroids.load(run.path / "centroids.parquet").n_frames == 25
-    cal, truth = sc.Calibration.load(run.calibration), sc.paper_camera().theta
+    assert sc.images.Centroids.load(run.path / "centroids.parquet").n_frames == 25
+    cal, truth = sc.Calibration.load(run.calibration), sc.paper.paper_camera().theta
     assert np.all(np.abs(cal.theta - truth) < 4.0 * cal.sigmas)
     # What centroiding predicted is what the calibration finds.
     assert cal.sigma_name == "sigma_scale"
@@ -63,7 +65,7 @@ def test_run_from_images_to_report(cli, frames, tmp_path):
 
 
 def test_options_of_the_other_kind_are_refused(cli, frames, tmp_path):
-    sc.paper_start().save(tmp_path / "camera.toml")
+    sc.paper.paper_start().save(tmp_path / "camera.toml")
     status, _, err = cli("run", frames, "camera.toml", "-o", "run", "--observer-velocity", "7,0,0")
     assert status == 2
     assert "--observer-velocity belongs to tables" in err
@@ -78,9 +80,9 @@ def test_options_of_the_other_kind_are_refused(cli, frames, tmp_path):
 def test_identify_refuses_the_calibration_of_another_sensor(cli, frames, tmp_path):
     from starcal_uq.runs.steps import calibrate_step
 
-    obs = sc.simulate(sc.load_catalogue(max_mag=6.0, epoch=2026.9), sc.paper_camera(), n_frames=20, seed=1)
-    calibrate_step(sc.RunFolder(tmp_path / "run"), obs, sc.paper_start(), force=True)
-    sc.paper_start().replace(focal_mm=50.0).save(tmp_path / "other.toml")
+    obs = sc.simulate(sc.load_catalogue(max_mag=6.0, epoch=2026.9), sc.paper.paper_camera(), n_frames=20, seed=1)
+    calibrate_step(sc.runs.RunFolder(tmp_path / "run"), obs, sc.paper.paper_start(), force=True)
+    sc.paper.paper_start().replace(focal_mm=50.0).save(tmp_path / "other.toml")
     assert cli("centroid", frames, "-o", "c.parquet")[0] == 0
     status, _, err = cli("identify", "c.parquet", "other.toml", "-o", "o.csv", "--calibration", "run")
     assert status == 2
@@ -89,10 +91,10 @@ def test_identify_refuses_the_calibration_of_another_sensor(cli, frames, tmp_pat
 
 def test_too_few_stars_say_what_was_identified(cli, frames, tmp_path, monkeypatch):
     def stuck(*_arguments, **_options):
-        raise sc.CalibrationError("it went nowhere.")
+        raise sc.errors.CalibrationError("it went nowhere.")
 
     monkeypatch.setattr("starcal_uq.estimation.calibrate.calibrate", stuck)
-    sc.paper_start().save(tmp_path / "camera.toml")
+    sc.paper.paper_start().save(tmp_path / "camera.toml")
     status, _, err = cli("run", frames, "camera.toml", "-o", "run", "--max-mag", 6, "--in-space")
     assert status == 2
     assert "stars in 25 frames were identified, but they do not determine the camera (it went nowhere.)" in err
@@ -102,23 +104,23 @@ def test_too_few_stars_say_what_was_identified(cli, frames, tmp_path, monkeypatc
 
 
 def test_bootstrap_says_what_changed(frames):
-    table = sc.extract_centroids(frames)
+    table = sc.images.extract_centroids(frames)
     stars = sc.load_catalogue(max_mag=6.0, epoch=epoch_of(table))
-    found = bootstrap(table, sc.paper_start(), stars)
+    found = identify_and_calibrate(table, sc.paper.paper_start(), stars)
     assert len(found.rounds) == 2
     assert found.identification.n_identified == 25
     assert "new" in found.summary
     assert "standard deviations" in found.summary
     # The focal length is compared with the data sheet's, not with that of the first calibration.
-    change = 100.0 * abs(found.calibration.camera.focal_px / sc.paper_start().focal_px - 1.0)
+    change = 100.0 * abs(found.calibration.camera.focal_px / sc.paper.paper_start().focal_px - 1.0)
     assert f"{change:.2f} % shorter" in found.identification.summary
     none = table.select_frames([])
-    with pytest.raises(sc.IdentificationError, match="no frame is identified"):
-        bootstrap(none, sc.paper_start(), stars)
+    with pytest.raises(sc.errors.IdentificationError, match="no frame is identified"):
+        identify_and_calibrate(none, sc.paper.paper_start(), stars)
 
 
 def test_bad_input_is_one_sentence(cli, tmp_path):
-    sc.paper_start().save(tmp_path / "camera.toml")
+    sc.paper.paper_start().save(tmp_path / "camera.toml")
     (tmp_path / "broken.fits").write_bytes(b"SIMPLE  =                    T")
     (tmp_path / "text.png").write_text("no image")
     (tmp_path / "empty").mkdir()
@@ -169,7 +171,7 @@ def test_real_frames_from_images_to_observations(cli, tmp_path):
 
 
 def test_stars_beside_a_neighbour_are_left_out():
-    truth = sc.paper_camera()
+    truth = sc.paper.paper_camera()
     stars = sc.load_catalogue(max_mag=7.0)
     obs = sc.simulate(stars, truth, n_frames=40, min_stars=10, seed=2)
     mask = disturbed_stars(obs, stars, truth)
@@ -186,30 +188,34 @@ def test_stars_beside_a_neighbour_are_left_out():
 
 @pytest.mark.slow
 def test_rendered_frames_through_the_whole_chain(tmp_path):
-    truth = sc.paper_camera()
+    truth = sc.paper.paper_camera()
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
-    sc.render_frames(stars, truth, tmp_path, n_frames=300, seed=11)
-    table = sc.extract_centroids(tmp_path)
-    found = bootstrap(table, sc.paper_start(), stars, prepare=lambda obs: without_disturbed(obs, stars, truth))
+    sc.simulation.render_frames(stars, truth, tmp_path, n_frames=300, seed=11)
+    table = sc.images.extract_centroids(tmp_path)
+    found = identify_and_calibrate(
+        table, sc.paper.paper_start(), stars, prepare=lambda obs: without_disturbed(obs, stars, truth)
+    )
     cal = found.calibration
     assert found.identification.n_identified == 300
     assert np.all(np.abs((cal.theta - truth.theta) / cal.sigmas) < 4.0)
     assert cal.sigma == pytest.approx(1.0, abs=0.03)
     # The control: stars where they were eleven years before are not what the camera saw.
     old = sc.load_catalogue(max_mag=6.0, epoch=2016.0)
-    control = bootstrap(table, sc.paper_start(), old, prepare=lambda obs: without_disturbed(obs, old, truth))
+    control = identify_and_calibrate(
+        table, sc.paper.paper_start(), old, prepare=lambda obs: without_disturbed(obs, old, truth)
+    )
     assert control.calibration.sigma > 1.3
 
 
 @pytest.mark.skipif(not ESA.is_dir(), reason="the real frames are not here")
 def test_real_frames_from_images_to_the_report(cli, tmp_path):
     camera = ESA.parent / "esa_tetra3_camera.toml"
-    sc.Site(52.2, 4.42, pressure_hpa=1013.0, temperature_c=20.0, name="Noordwijk").save(tmp_path / "site.toml")
+    sc.sky.Site(52.2, 4.42, pressure_hpa=1013.0, temperature_c=20.0, name="Noordwijk").save(tmp_path / "site.toml")
     status, _, err = cli("run", ESA, camera, "-o", "run", "--site", "site.toml", "--screen")
     # Warnings only: the pixel phase that correction leaves, and a little with magnitude.
     assert status == 0, err
     assert "was added to the noise of every star" in err
-    run = sc.RunFolder(tmp_path / "run")
+    run = sc.runs.RunFolder(tmp_path / "run")
     obs, cal = sc.load_observations(run.observations), sc.Calibration.load(run.calibration)
     assert 0.03 < obs.meta["noise_floor_px"] < 0.05
     assert cal.sigma == pytest.approx(1.0, abs=0.1)
@@ -225,5 +231,5 @@ def test_real_frames_from_images_to_the_report(cli, tmp_path):
     status, _, err = cli("run", ESA, camera, "-o", "bare", "--screen")
     assert status == 1
     assert "conditional on refraction" in err
-    bare = sc.Calibration.load(sc.RunFolder(tmp_path / "bare").calibration)
+    bare = sc.Calibration.load(sc.runs.RunFolder(tmp_path / "bare").calibration)
     assert (bare.theta[2] - 5116.54) / np.hypot(bare.sigmas[2], 0.28) < -5.0

@@ -30,10 +30,10 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with everything but the questions to the model, which take long."""
     from starcal_uq.runs.steps import calibrate_step, propagate_step, sample_step
 
-    run = sc.RunFolder(tmp_path_factory.mktemp("mission") / "run")
+    run = sc.runs.RunFolder(tmp_path_factory.mktemp("mission") / "run")
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
-    obs = sc.simulate(stars, sc.paper_camera(), n_frames=60, min_stars=8, sigma_px=0.05, seed=1)
-    calibrate_step(run, obs, sc.paper_start(), force=True)
+    obs = sc.simulate(stars, sc.paper.paper_camera(), n_frames=60, min_stars=8, sigma_px=0.05, seed=1)
+    calibrate_step(run, obs, sc.paper.paper_start(), force=True)
     sample_step(run, force=True, n_steps=60, seed=1)
     propagate_step(run, n_draws=60, seed=1)
     return run.path
@@ -52,7 +52,7 @@ def test_budget_in_all_formats(cli, run, tmp_path):
     assert "at least" in out
     for name in names:
         assert (tmp_path / name).stat().st_size > 1000
-    kept, copy = (sc.Budget.load(folder / "budget.csv") for folder in (run, tmp_path))
+    kept, copy = (sc.budgeting.Budget.load(folder / "budget.csv") for folder in (run, tmp_path))
     pd.testing.assert_frame_equal(kept.to_dataframe(), copy.to_dataframe())
     status, _, err = cli("budget", "run", "-o", "budget.csv")
     assert status == 2
@@ -99,14 +99,14 @@ def test_starter_file_lists_what_is_open_and_loads(cli, run, tmp_path):
 
 
 def test_mission_sky_takes_the_place_of_the_observed_frames(cli, run):
-    observed = sc.AttitudeError.load(run / "attitude.csv")
+    observed = sc.propagation.AttitudeError.load(run / "attitude.csv")
     cli("budget", "run")
     assert (run / "budget.csv").exists()
     options = ("--attitudes", "random", "--max-mag", 6.5, "--frames", 200, "--draws", 60, "--json")
     status, out, _ = cli("propagate", "run", *options)
     assert status == 0
     assert "random attitudes" in json.loads(out)["frames"]
-    mission = sc.AttitudeError.load(run / "attitude.csv")
+    mission = sc.propagation.AttitudeError.load(run / "attitude.csv")
     # More stars, less noise; and what rested on the old numbers is gone.
     assert mission.nea_arcsec[0] < observed.nea_arcsec[0]
     assert not (run / "budget.csv").exists()
@@ -120,7 +120,7 @@ def test_slew_has_a_spectrum(cli, run, tmp_path):
     status, out, err = cli("propagate", "run", "--attitudes", "slew.csv", "--rate", 1.0, "--draws", 60)
     assert status == 0, err
     assert "correlat" in out or "frequenc" in out
-    spectrum = sc.ErrorSpectrum.load(run / "error_spectrum.npz")
+    spectrum = sc.propagation.ErrorSpectrum.load(run / "error_spectrum.npz")
     assert spectrum.integral_arcsec2 == pytest.approx(spectrum.variance_arcsec2, rel=1e-6)
     for wrong, word in (("none.csv", "none.csv"), ("run/calibration.json", "calibration.json")):
         status, _, err = cli("propagate", "run", "--attitudes", wrong)
@@ -137,7 +137,7 @@ def test_compare_two_runs_and_two_halves(cli, run, tmp_path):
     assert status == 0
     assert "agree" in out
     assert (tmp_path / "page" / "comparison.html").exists()
-    assert sc.CameraComparison.load(tmp_path / "page").tested
+    assert sc.comparison.CameraComparison.load(tmp_path / "page").tested
     status, out, _ = cli("compare", "run", "again", "--labels", "cold,hot", "--json")
     assert status == 0
     # The same data: chance has no part in a difference.
@@ -154,7 +154,7 @@ def test_compare_two_runs_and_two_halves(cli, run, tmp_path):
 
 
 def test_plan_before_any_data(cli, run, tmp_path):
-    sc.paper_start().save(tmp_path / "camera.toml")
+    sc.paper.paper_start().save(tmp_path / "camera.toml")
     options = ("--target-arcsec", 20, "--frames", 30, "--frames", 300, "--choose", 5, "-o", "plan")
     status, out, _ = cli("plan", "camera.toml", *options)
     assert status == 0
@@ -192,7 +192,7 @@ def test_square_brackets_are_no_markup(cli, run, tmp_path):
 
 
 def test_a_runs_own_files_are_not_mixed_with_others(cli, run, tmp_path):
-    sc.paper_start().save(tmp_path / "camera.toml")
+    sc.paper.paper_start().save(tmp_path / "camera.toml")
     before = {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
     for arguments in (
         ("compare", "run", "--split", "halves", "-o", "run", "--force"),
@@ -210,12 +210,12 @@ def test_a_runs_own_files_are_not_mixed_with_others(cli, run, tmp_path):
 
 
 def test_plan_after_a_run_of_another_sensor_is_refused(cli, run, tmp_path):
-    sc.paper_start().replace(width_px=512, height_px=512, x0_px=255.5, y0_px=255.5).save(tmp_path / "other.toml")
+    sc.paper.paper_start().replace(width_px=512, height_px=512, x0_px=255.5, y0_px=255.5).save(tmp_path / "other.toml")
     status, _, err = cli("plan", "other.toml", "--after", "run")
     assert status == 2
     assert "give the file and the run of one sensor" in err
     # A stated noise is not overruled by that of the run.
-    sc.paper_start().save(tmp_path / "camera.toml")
+    sc.paper.paper_start().save(tmp_path / "camera.toml")
     found = []
     for sigma in ((), ("--sigma", 0.5)):
         status, out, _ = cli("plan", "camera.toml", "--after", "run", "--frames", 100, "--json", *sigma)
@@ -226,7 +226,7 @@ def test_plan_after_a_run_of_another_sensor_is_refused(cli, run, tmp_path):
 
 
 def test_plan_refuses_what_it_cannot_mean(cli, run, tmp_path):
-    sc.paper_start().save(tmp_path / "camera.toml")
+    sc.paper.paper_start().save(tmp_path / "camera.toml")
     for wrong, word in (
         (("--after", "run", "--check", 10), "--check"),
         (("--max-mag", 30), "ends at G = 10"),

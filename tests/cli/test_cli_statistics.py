@@ -55,7 +55,7 @@ def test_merge_combines_two_halves(cli, inputs, tmp_path):
     assert status == 0
     assert "The runs agree" in out
     merged = sc.Calibration.load(tmp_path / "both" / "calibration.json")
-    whole = sc.calibrate(obs, sc.paper_start())
+    whole = sc.calibrate(obs, sc.paper.paper_start())
     assert np.max(np.abs(merged.theta - whole.theta) / whole.sigmas) < 0.02
     status, _, err = cli("merge", "a", "b", "-o", "a")
     assert status == 2
@@ -95,7 +95,7 @@ def test_robust_refinement(cli, inputs, tmp_path):
     status, _, _ = cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--robust")
     assert status == 0
     cal = sc.Calibration.load(tmp_path / "run" / "calibration.json")
-    plain = sc.calibrate(observations(), sc.paper_start())
+    plain = sc.calibrate(observations(), sc.paper.paper_start())
     assert np.max(np.abs(cal.theta - plain.theta) / plain.sigmas) < 1.0
     # Sampling takes the likelihood of the calibration unless another is named.
     status, _, _ = cli("sample", "run", "--json", *SMALL)

@@ -14,7 +14,7 @@ from starcal_uq.runs.steps import coupling_step, propagate_step, sample_step
 from starcal_uq.runs.streams import HISTORY, STATE, filter_run
 from tests.helpers.scenes import camera, nominal, observations
 
-ALL = sc.RecursionOptions(parameters="all")
+ALL = sc.estimation.RecursionOptions(parameters="all")
 
 
 @pytest.fixture
@@ -27,7 +27,7 @@ def table(tmp_path):
 def test_run_folder_holds_the_calibration_and_its_history(table, tmp_path):
     cal = filter_run(table, nominal(camera()), tmp_path / "run", options=ALL)
 
-    run = sc.RunFolder(tmp_path / "run")
+    run = sc.runs.RunFolder(tmp_path / "run")
     assert np.array_equal(sc.Calibration.load(run.calibration).theta, cal.theta)
     history = pd.read_csv(run.path / HISTORY)
     assert len(history) == 61
@@ -38,34 +38,34 @@ def test_run_folder_holds_the_calibration_and_its_history(table, tmp_path):
 
 def test_posterior_and_couplings_follow_and_propagation_says_what_it_needs(table, tmp_path):
     filter_run(table, nominal(camera()), tmp_path / "run", options=ALL)
-    run = sc.RunFolder(tmp_path / "run")
+    run = sc.runs.RunFolder(tmp_path / "run")
     batch = sc.calibrate(observations(n_frames=60), nominal(camera()))
 
     assert coupling_step(run).parameter_names == ("x0", "y0", "f", "k1", "k2")
     posterior = sample_step(run, force=False, seed=1)
     assert np.all(np.abs(posterior.mean - batch.theta) < 0.5 * batch.sigmas)
-    with pytest.raises(sc.RunFolderError, match="holds no observations"):
+    with pytest.raises(sc.errors.RunFolderError, match="holds no observations"):
         propagate_step(run, n_draws=10, seed=1)
 
 
 def test_an_interrupted_run_goes_on_bit_for_bit(table, tmp_path, monkeypatch):
     whole = filter_run(table, nominal(camera()), tmp_path / "whole", options=ALL)
 
-    update = sc.RecursiveCalibration.update
+    update = sc.estimation.RecursiveCalibration.update
 
     def stop_at_20(self, frame):
         if self.n_frames == 20:
             raise KeyboardInterrupt
         return update(self, frame)
 
-    monkeypatch.setattr(sc.RecursiveCalibration, "update", stop_at_20)
+    monkeypatch.setattr(sc.estimation.RecursiveCalibration, "update", stop_at_20)
     with pytest.raises(KeyboardInterrupt):
         filter_run(table, nominal(camera()), tmp_path / "run", options=ALL)
     monkeypatch.undo()
-    assert sc.RecursiveCalibration.load(tmp_path / "run" / STATE).n_frames == 20
+    assert sc.estimation.RecursiveCalibration.load(tmp_path / "run" / STATE).n_frames == 20
 
     # Another file under the same name is not what the state was made from.
-    with pytest.raises(sc.RunFolderError, match="unfinished calibration of other data"):
+    with pytest.raises(sc.errors.RunFolderError, match="unfinished calibration of other data"):
         filter_run(table, nominal(camera()), tmp_path / "run", method="samaan")
     resumed = filter_run(table, nominal(camera()), tmp_path / "run", options=ALL)
 
@@ -78,9 +78,9 @@ def test_an_interrupted_run_goes_on_bit_for_bit(table, tmp_path, monkeypatch):
 def test_a_state_is_saved_on_the_way(table, tmp_path, monkeypatch):
     monkeypatch.setattr(filter_runs, "_SAVE_EVERY", 25)
     saved = []
-    save = sc.RecursiveCalibration.save
+    save = sc.estimation.RecursiveCalibration.save
     monkeypatch.setattr(
-        sc.RecursiveCalibration, "save", lambda self, path: (saved.append(self.n_frames), save(self, path))
+        sc.estimation.RecursiveCalibration, "save", lambda self, path: (saved.append(self.n_frames), save(self, path))
     )
 
     filter_run(table, nominal(camera()), tmp_path / "run", options=ALL)
@@ -91,7 +91,7 @@ def test_a_state_is_saved_on_the_way(table, tmp_path, monkeypatch):
 def test_results_are_not_overwritten_unasked(table, tmp_path):
     filter_run(table, nominal(camera()), tmp_path / "run", options=ALL)
     before = (tmp_path / "run" / "calibration.json").read_bytes()
-    with pytest.raises(sc.RunFolderError, match="not empty"):
+    with pytest.raises(sc.errors.RunFolderError, match="not empty"):
         filter_run(table, nominal(camera()), tmp_path / "run", options=ALL)
     assert (tmp_path / "run" / "calibration.json").read_bytes() == before
     filter_run(table, nominal(camera()), tmp_path / "run", method="samaan", force=True)

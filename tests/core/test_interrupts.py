@@ -46,7 +46,7 @@ def test_other_threads_are_left_alone():
 
 def test_sampling_interrupted_by_the_user_says_nothing_and_resumes(tmp_path, capsys):
     obs = observations()
-    cal = sc.calibrate(obs, sc.paper_start())
+    cal = sc.calibrate(obs, sc.paper.paper_start())
     options = {"seed": 4, "n_walkers": 32, "n_steps": 200}
     whole = sc.sample(obs, cal, **options)
 

@@ -27,7 +27,7 @@ def obs():
 
 @pytest.fixture(scope="module")
 def cal(obs):
-    return sc.calibrate(obs, sc.paper_start())
+    return sc.calibrate(obs, sc.paper.paper_start())
 
 
 def clustered(obs, seed=0):
@@ -47,7 +47,7 @@ def test_one_step_equals_refitting_without_a_frame(obs, cal):
     found = jackknife_frames(obs, cal)
     for k in (0, 17, 41, 59):
         rest = obs.select(obs.frame != obs.frame_ids[k])
-        refit = sc.calibrate(rest, sc.paper_start())
+        refit = sc.calibrate(rest, sc.paper.paper_start())
         assert np.max(np.abs(found.left_out[k] - refit.theta) / cal.sigmas) < 0.02, k
     # The control: leaving a frame out moves the estimate by much more than that.
     assert np.sqrt(np.mean(((found.left_out - cal.theta) / cal.sigmas) ** 2)) > 0.05
@@ -55,9 +55,9 @@ def test_one_step_equals_refitting_without_a_frame(obs, cal):
 
 def test_one_step_equals_refitting_with_stated_noise_and_few_frames():
     obs = with_sigmas(observations(n_frames=60, sigma_px=0.0)).select_frames(range(12))
-    cal = sc.calibrate(obs, sc.paper_start())
+    cal = sc.calibrate(obs, sc.paper.paper_start())
     found = jackknife_frames(obs, cal)
-    refits = [sc.calibrate(obs.select(obs.frame != k), sc.paper_start()).theta for k in obs.frame_ids]
+    refits = [sc.calibrate(obs.select(obs.frame != k), sc.paper.paper_start()).theta for k in obs.frame_ids]
     scatter = np.array(refits) - np.mean(refits, axis=0)
     exact = np.sqrt(np.sum(scatter**2, axis=0) * 11 / 12)
     assert np.sqrt(np.diag(found.jackknife_covariance)) == pytest.approx(exact, rel=0.05)
@@ -73,9 +73,9 @@ def test_jackknife_p_values_are_nominal_and_clusters_are_found():
     p, wrong, ratios = [], [], []
     for i in range(60):
         one = sc.simulate(stars, camera(), n_frames=30, min_stars=10, sigma_px=0.05, seed=300 + i)
-        p.append(jackknife_frames(one, sc.calibrate(one, sc.paper_start())).p_values)
+        p.append(jackknife_frames(one, sc.calibrate(one, sc.paper.paper_start())).p_values)
         if i < 10:
-            found = jackknife_frames(bad := clustered(one, i), sc.calibrate(bad, sc.paper_start()))
+            found = jackknife_frames(bad := clustered(one, i), sc.calibrate(bad, sc.paper.paper_start()))
             wrong.append(found.p_values.min())
             ratios.append(found.ratio[2])
     p = np.array(p)
@@ -94,7 +94,7 @@ def test_accepted_inflation_covers_what_formal_errors_do_not():
     for i in range(60):
         one = sc.simulate(stars, camera(), n_frames=40, min_stars=10, sigma_px=0.05, seed=900 + i)
         bad = clustered(one, i)
-        cal = sc.calibrate(bad, sc.paper_start())
+        cal = sc.calibrate(bad, sc.paper.paper_start())
         accepted = accept_inflation(cal, jackknife_frames(bad, cal))
         error = np.abs(cal.theta - camera().theta)
         formal.append((error < 1.96 * cal.sigmas)[2])
@@ -112,11 +112,11 @@ def test_accepting_inflation_is_on_record_and_never_shrinks(obs, cal):
     assert set(accepted.provenance["settings"]["inflation"]) == set(cal.parameter_names)
     assert np.all(np.linalg.eigvalsh(found.inflated_covariance / np.outer(cal.sigmas, cal.sigmas)) > 0.0)
     other = sc.calibrate(obs, nominal(camera("k1")))
-    with pytest.raises(sc.CalibrationError, match="same run"):
+    with pytest.raises(sc.errors.CalibrationError, match="same run"):
         accept_inflation(other, found)
-    with pytest.raises(sc.CalibrationError, match="three or more"):
+    with pytest.raises(sc.errors.CalibrationError, match="three or more"):
         two = obs.select_frames(obs.frame_ids[:2])
-        jackknife_frames(two, sc.calibrate(two, sc.paper_start()))
+        jackknife_frames(two, sc.calibrate(two, sc.paper.paper_start()))
 
 
 # --- comparison of models --------------------------------------------------------------------------------------------
@@ -151,7 +151,7 @@ def test_closed_form_is_the_ratio_of_evidences(obs, cal):
 
 def test_the_right_model_wins_and_richer_ones_are_not_rejected():
     obs = observations("brown", n_frames=200)
-    found = compare_models(obs, sc.calibrate(obs, sc.paper_start()))
+    found = compare_models(obs, sc.calibrate(obs, sc.paper.paper_start()))
     outcome = {score.model: score.rejected for score in found.scores}
     assert outcome["none"] and outcome["k1"]
     assert not any(outcome[m] for m in ("brown", "brown3", "brown_tangential"))
@@ -186,12 +186,12 @@ def test_replicates_look_like_data_of_the_model_and_unlike_others(obs, cal):
     assert not any(s.extreme for s in good.statistics)
     residuals = np.random.default_rng(1).standard_t(3, (2, obs.n_stars)) * 0.05
     tails = dataclasses.replace(obs, x_px=obs.x_px + residuals[0], y_px=obs.y_px + residuals[1])
-    bad = predictive_check(tails, sc.calibrate(tails, sc.paper_start()), n_draws=300)
+    bad = predictive_check(tails, sc.calibrate(tails, sc.paper.paper_start()), n_draws=300)
     assert {s.name for s in bad.statistics if s.extreme} >= {"excess kurtosis"}
     truth = camera("brown3").replace(coefficients=(2e-10, -3.5e-15, 8.0 / camera().corner_radius_px ** 7))
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
     bent = sc.simulate(stars, truth, n_frames=300, min_stars=10, sigma_px=0.05, seed=1)
-    ring = predictive_check(bent, sc.calibrate(bent, sc.paper_start()), n_draws=200)
+    ring = predictive_check(bent, sc.calibrate(bent, sc.paper.paper_start()), n_draws=200)
     assert ring.statistics[3].name.startswith("radial pattern") and ring.statistics[3].p_value < 0.05
 
 
@@ -215,7 +215,7 @@ def test_other_starts_find_the_same_optimum_or_say_so(obs, cal):
 
 
 def test_diagnosis_of_a_run_is_stored_and_belongs_to_its_calibration(obs, cal, tmp_path):
-    run = sc.RunFolder(tmp_path / "run").create()
+    run = sc.runs.RunFolder(tmp_path / "run").create()
     obs.save(run.observations)
     cal.save(run.calibration)
     assert load_diagnosis(run, cal) is None
@@ -233,16 +233,16 @@ def test_diagnosis_of_a_run_is_stored_and_belongs_to_its_calibration(obs, cal, t
     # The control: the diagnosis of another estimate is not shown with this one.
     assert load_diagnosis(run, dataclasses.replace(cal, theta=cal.theta + 1e-9)) is None
     (run.path / FILE).write_text("{}")
-    with pytest.raises(sc.RunFolderError, match="diagnose"):
+    with pytest.raises(sc.errors.RunFolderError, match="diagnose"):
         load_diagnosis(run, cal)
     observations(n_frames=60, seed=4).save(run.observations, force=True)
-    with pytest.raises(sc.RunFolderError, match="other observations"):
+    with pytest.raises(sc.errors.RunFolderError, match="other observations"):
         diagnose_run(run.path)
 
 
 def test_two_frames_have_no_jackknife_but_a_diagnosis(obs):
     few = obs.select_frames(obs.frame_ids[:2])
-    found = diagnose(few, sc.calibrate(few, sc.paper_start()), models=(), n_starts=0)
+    found = diagnose(few, sc.calibrate(few, sc.paper.paper_start()), models=(), n_starts=0)
     assert found.jackknife is None and found.comparison is None and found.starts is None
 
 

@@ -61,7 +61,7 @@ def test_false_alarms_are_nominal_after_refitting():
 def test_control_shapes_that_the_fit_absorbed_are_not_nominal():
     """Without the projection the same statistic is far from uniform: the fit has taken up most of these shapes."""
     obs = observations(n_frames=25)
-    cal = sc.calibrate(obs, sc.paper_start())
+    cal = sc.calibrate(obs, sc.paper.paper_start())
     family = next(s for s in shapes(obs, cal.camera) if s.name.startswith("smooth pattern over radius"))
     likelihood = MarginalLikelihood(obs, "brown")
     state, _ = likelihood.profile(cal.theta)
@@ -108,7 +108,7 @@ def test_score_tests_estimate_the_term_that_is_missing(model, term, value):
     truth = base.replace(distortion=model, coefficients=tuple(coefficients))
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
     obs = sc.simulate(stars, truth, n_frames=200, min_stars=10, sigma_px=0.05, seed=5)
-    poor = sc.calibrate(obs, sc.paper_start())
+    poor = sc.calibrate(obs, sc.paper.paper_start())
     found = misfit_tests(obs, poor)
     amplitude = next(a for t in found.tests for a in t.amplitudes if a.name.startswith(f"{term} "))
     rich = sc.calibrate(obs, nominal(truth))
@@ -123,7 +123,7 @@ def test_score_tests_estimate_the_term_that_is_missing(model, term, value):
 def test_aberration_is_measured_as_a_velocity():
     obs = observations(n_frames=200)
     velocity = np.array([20.0, -15.0, 10.0])
-    ra, dec = (np.degrees(v) for v in _angles(sc.aberrate(obs.directions_icrs, -velocity)))
+    ra, dec = (np.degrees(v) for v in _angles(sc.sky.aberrate(obs.directions_icrs, -velocity)))
     found = refit(dataclasses.replace(obs, ra_deg=ra % 360.0, dec_deg=dec))
     test = named(found, "aberration")
     assert test.p_holm < 1e-6
@@ -192,7 +192,7 @@ def test_one_frame_and_few_stars_leave_out_what_cannot_be_tested():
 
 def test_parts_of_the_table_give_the_same_sums(monkeypatch):
     obs = observations(n_frames=60)
-    cal = sc.calibrate(obs, sc.paper_start())
+    cal = sc.calibrate(obs, sc.paper.paper_start())
     whole = misfit_tests(obs, cal)
     monkeypatch.setattr("starcal_uq.diagnostics.misfit._STARS_AT_ONCE", 100)
     parts = misfit_tests(obs, cal)

@@ -137,7 +137,7 @@ def test_attitude_errors_are_what_quest_finds(stars):
 
     def attitudes(theta):
         b = unproject_theta("brown", theta, obs.xy)
-        return sc.quest(b, obs.directions_icrs, obs.frame_starts, covariance=False).quaternions
+        return sc.attitude.quest(b, obs.directions_icrs, obs.frame_starts, covariance=False).quaternions
 
     found = ARCSEC * left_error(attitudes(cal.theta), attitudes(truth.theta)).mean(axis=0)
     linear = ARCSEC * cal.rotation_per_theta @ (cal.theta - truth.theta)
@@ -232,10 +232,12 @@ def test_failed_replicates_are_counted_and_explained(good):
 
 def test_when_nothing_works_the_reason_is_given(stars, monkeypatch):
     def fail(*_):
-        raise sc.CalibrationError("the stars do not suffice: add some.")
+        raise sc.errors.CalibrationError("the stars do not suffice: add some.")
 
     monkeypatch.setattr("starcal_uq.diagnostics.validation.replicates.calibrate", fail)
-    with pytest.raises(sc.CalibrationError, match="no replicate gave a result; the commonest reason: the stars do not"):
+    with pytest.raises(
+        sc.errors.CalibrationError, match="no replicate gave a result; the commonest reason: the stars do not"
+    ):
         validate_study(study(), stars, 3, workers=0)
 
 
@@ -245,7 +247,7 @@ def test_some_failures_leave_the_other_replicates(stars, monkeypatch):
     def fail_once(*arguments):
         calls.append(0)
         if len(calls) == 2:
-            raise sc.CalibrationError("the stars do not suffice: add some.")
+            raise sc.errors.CalibrationError("the stars do not suffice: add some.")
         return sc.calibrate(*arguments)
 
     monkeypatch.setattr("starcal_uq.diagnostics.validation.replicates.calibrate", fail_once)
@@ -310,7 +312,7 @@ def test_a_script_without_a_guard_ends_with_the_remedy(tmp_path, root):
     script.write_text(
         "import starcal_uq as sc\n"
         "from starcal_uq.diagnostics.validation.validate import validate\n"
-        "validate(sc.paper_camera(), n_replicates=20, n_frames=8, workers=2)\n"
+        "validate(sc.paper.paper_camera(), n_replicates=20, n_frames=8, workers=2)\n"
     )
     environment = {**os.environ, "PYTHONPATH": str(root)}
     done = subprocess.run(
@@ -324,12 +326,12 @@ def test_a_script_without_a_guard_ends_with_the_remedy(tmp_path, root):
 
 
 def test_validate_from_the_camera_alone():
-    found = validate(sc.paper_camera(), n_replicates=2, n_frames=12, workers=0, seed=3)
+    found = validate(sc.paper.paper_camera(), n_replicates=2, n_frames=12, workers=0, seed=3)
     assert found.nominal.coefficients == (0.0, 0.0)
     assert (found.nominal.x0_px, found.nominal.y0_px) == (511.5, 511.5)
     assert found.provenance["seed"] == 3
     assert found.provenance["settings"]["n_frames"] == 12
-    np.testing.assert_array_equal(found.truth[:, :-1], np.tile(sc.paper_camera().theta, (2, 1)))
+    np.testing.assert_array_equal(found.truth[:, :-1], np.tile(sc.paper.paper_camera().theta, (2, 1)))
 
 
 @pytest.mark.parametrize(
@@ -348,16 +350,16 @@ def test_validate_from_the_camera_alone():
 )
 def test_bad_settings_are_one_sentence(options, words):
     with pytest.raises(SamplingError, match=words):
-        validate(sc.paper_camera(), **options)
+        validate(sc.paper.paper_camera(), **options)
 
 
 def test_priors_of_another_model_are_refused():
     with pytest.raises(PriorError, match="make them with"):
-        validate(sc.paper_camera(), priors=sc.Priors.default(camera("none")))
+        validate(sc.paper.paper_camera(), priors=sc.Priors.default(camera("none")))
 
 
 def test_a_field_without_stars_says_so():
-    narrow = sc.paper_camera().replace(focal_mm=2000.0)
+    narrow = sc.paper.paper_camera().replace(focal_mm=2000.0)
     with pytest.raises(CatalogueError, match="raise max_mag"):
         validate(narrow, n_replicates=1, n_frames=5, max_mag=2.0, workers=0)
 

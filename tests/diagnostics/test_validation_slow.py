@@ -20,7 +20,7 @@ COVERED = ("x0", "y0", "f", "k1", "k2", "sigma", "pitch", "yaw", "roll")
 @pytest.fixture(scope="module")
 def fixed():
     """2000 replicates of 50 frames of the paper's camera."""
-    return validate(sc.paper_camera(), n_replicates=2000, seed=1)
+    return validate(sc.paper.paper_camera(), n_replicates=2000, seed=1)
 
 
 def first(found, n):
@@ -53,7 +53,7 @@ def test_ranks_of_a_fixed_truth(fixed):
 
 
 def test_ranks_of_truths_from_the_prior():
-    found = validate(sc.paper_camera(), n_replicates=1000, truth="prior", seed=2)
+    found = validate(sc.paper.paper_camera(), n_replicates=1000, truth="prior", seed=2)
     show("truth from the prior", found)
     assert found.ok, found.verdict
     assert (found.rank_p_value > 0.01).all(), found.rank_p_value
@@ -61,7 +61,7 @@ def test_ranks_of_truths_from_the_prior():
 
 
 def few_frames(**options):
-    truth = sc.paper_camera()
+    truth = sc.paper.paper_camera()
     start = truth.replace(x0_px=511.5, y0_px=511.5, coefficients=(0.0, 0.0))
     return Study(truth, start, sc.Priors.default(start), "fixed", 12, 10, 0.05, 1, **options)
 

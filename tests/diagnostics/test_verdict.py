@@ -22,7 +22,7 @@ from tests.helpers.scenes import camera, observations, with_sigmas
 @pytest.fixture(scope="module")
 def run():
     obs = observations(n_frames=120)
-    cal = sc.calibrate(obs, sc.paper_start())
+    cal = sc.calibrate(obs, sc.paper.paper_start())
     return SimpleNamespace(obs=obs, cal=cal, post=sc.sample(obs, cal, seed=1, n_steps=100), truth=camera())
 
 
@@ -192,10 +192,10 @@ def test_an_unchecked_likelihood_warns(run):
 
 
 def test_an_estimate_that_did_not_converge_fails_with_its_remedy(run):
-    cal = dataclasses.replace(run.cal, status=sc.Status.MAX_ITERATIONS)
+    cal = dataclasses.replace(run.cal, status=sc.core.Status.MAX_ITERATIONS)
     check = outcome("Estimation", run.obs, cal)
     assert check.level is Level.FAIL
-    assert sc.Status.MAX_ITERATIONS.remedy in check.sentence
+    assert sc.core.Status.MAX_ITERATIONS.remedy in check.sentence
 
 
 def test_estimators_that_disagree_fail(run):
@@ -238,7 +238,7 @@ def test_noise_must_be_that_of_centroids(run, sigma, level):
 
 def test_few_frames_and_an_empty_corner_warn(run):
     few = run.obs.select_frames(run.obs.frame_ids[:3])
-    cal = sc.calibrate(few, sc.paper_start())
+    cal = sc.calibrate(few, sc.paper.paper_start())
     assert outcome("Coverage of the field", few, cal).level is Level.WARN
     half = np.asarray(run.obs.x_px < 600)
     cal = dataclasses.replace(run.cal, residuals_px=run.cal.residuals_px[half])
@@ -295,7 +295,7 @@ def test_binned_means_are_means_of_the_cells(run):
 
 def test_stated_noise_is_a_factor():
     obs = with_sigmas(observations(n_frames=60))
-    cal = sc.calibrate(obs, sc.paper_start())
+    cal = sc.calibrate(obs, sc.paper.paper_start())
     assert cal.sigma_name == "sigma_scale"
     assert np.std(normalised_residuals(cal, obs)) == pytest.approx(1.0, abs=0.02)
     verdict = judge(obs, cal)

@@ -30,7 +30,7 @@ def test_every_solver_on_every_model(model, solver):
 
 def test_three_stages_as_the_paper_describes_them():
     obs = observations(n_frames=300)
-    cal = sc.calibrate(obs, sc.paper_start(), method="three_stage")
+    cal = sc.calibrate(obs, sc.paper.paper_start(), method="three_stage")
     assert [stage.name for stage in cal.stages] == ["optics", "distortion", "all"]
     optics, linear, joint = cal.stages
     assert np.array_equal(optics.trajectory[0], [512.0, 512.0, 6000.0, 0.0, 0.0])
@@ -42,7 +42,7 @@ def test_three_stages_as_the_paper_describes_them():
         assert (np.diff(stage.cost) <= 1e-10 * stage.cost[:-1]).all()
     assert np.array_equal(cal.theta, cal.pair_theta)
     assert np.array_equal(cal.covariance, cal.pair_covariance)
-    efficient = sc.calibrate(obs, sc.paper_start())
+    efficient = sc.calibrate(obs, sc.paper.paper_start())
     assert [stage.name for stage in efficient.stages] == ["optics", "distortion", "all", "refinement"]
     # The paper's estimator pays for weighting pairs alike.
     assert (cal.sigmas > efficient.sigmas).all()
@@ -51,7 +51,7 @@ def test_three_stages_as_the_paper_describes_them():
 def test_distortion_ignored_moves_the_focal_length_below_the_truth():
     """Eq. 14 read as ideal to distorted reproduces the paper's stage 1 (70.2122 mm in its Table 2)."""
     obs = observations(n_frames=300)
-    cal = sc.calibrate(obs, sc.paper_start())
+    cal = sc.calibrate(obs, sc.paper.paper_start())
     focal_mm = cal.stages[0].theta[2] * 0.012
     assert 70.205 < focal_mm < 70.2165
     # The linear stage is a start value and nothing else: k1 comes out several times too large.
@@ -60,12 +60,12 @@ def test_distortion_ignored_moves_the_focal_length_below_the_truth():
 
 def test_residuals_and_attitudes_are_those_of_the_estimate():
     obs = observations()
-    cal = sc.calibrate(obs, sc.paper_start())
+    cal = sc.calibrate(obs, sc.paper.paper_start())
     from starcal_uq.attitude.rotations import quaternion_to_rotation
 
     rotations = np.repeat(quaternion_to_rotation(cal.quaternions), obs.stars_per_frame, axis=0)
     b = np.einsum("nij,nj->ni", rotations, obs.directions_icrs)
-    assert np.max(np.abs(obs.xy - sc.project(cal.camera, b) - cal.residuals_px)) < 1e-8
+    assert np.max(np.abs(obs.xy - sc.camera.project(cal.camera, b) - cal.residuals_px)) < 1e-8
     assert cal.chi2 == pytest.approx(np.sum(cal.residuals_px**2), rel=1e-9)
     assert cal.dof == 2 * obs.n_stars - 3 * obs.n_frames - 5
     assert cal.sigma == pytest.approx(np.sqrt(cal.chi2 / cal.dof), rel=1e-6)
@@ -78,10 +78,10 @@ def test_stated_noise_is_used():
     errors, claimed, unweighted = [], [], []
     for seed in range(40):
         obs = with_sigmas(clean, seed)
-        cal = sc.calibrate(obs, sc.paper_start())
+        cal = sc.calibrate(obs, sc.paper.paper_start())
         errors.append(cal.theta - camera().theta)
         claimed.append(cal.sigmas)
-        unweighted.append(sc.calibrate(dataclasses.replace(obs, sigma_px=None), sc.paper_start()).sigmas)
+        unweighted.append(sc.calibrate(dataclasses.replace(obs, sigma_px=None), sc.paper.paper_start()).sigmas)
     assert (np.mean(claimed, axis=0) < 0.65 * np.mean(unweighted, axis=0)).all()
     ratio = np.std(errors, axis=0) / np.mean(claimed, axis=0)
     bound = 4.0 / np.sqrt(2 * 40)
@@ -91,7 +91,7 @@ def test_stated_noise_is_used():
 
 
 def test_saves_itself_without_loss(tmp_path):
-    cal = sc.calibrate(observations(), sc.paper_start())
+    cal = sc.calibrate(observations(), sc.paper.paper_start())
     cal.save(tmp_path / "calibration.json")
     again = sc.Calibration.load(tmp_path / "calibration.json")
     for field in dataclasses.fields(cal):
@@ -112,7 +112,7 @@ def test_saves_itself_without_loss(tmp_path):
 
 def test_repeats_bit_for_bit():
     obs = observations()
-    a, b = (sc.calibrate(obs, sc.paper_start()) for _ in range(2))
+    a, b = (sc.calibrate(obs, sc.paper.paper_start()) for _ in range(2))
     assert np.array_equal(a.theta, b.theta)
     assert np.array_equal(a.covariance, b.covariance)
 
@@ -123,13 +123,13 @@ def test_distortion_of_tens_of_pixels(k1):
     truth = camera("brown").replace(coefficients=(k1, 0.0))
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
     obs = sc.simulate(stars, truth, n_frames=60, min_stars=8, sigma_px=0.05, seed=3)
-    cal = sc.calibrate(obs, sc.paper_start())
+    cal = sc.calibrate(obs, sc.paper.paper_start())
     assert cal.status is Status.CONVERGED
     assert np.max(np.abs(cal.theta - truth.theta) / cal.sigmas) < 4.0
 
 
 def test_data_without_noise_give_the_truth():
-    cal = sc.calibrate(observations(sigma_px=0.0), sc.paper_start())
+    cal = sc.calibrate(observations(sigma_px=0.0), sc.paper.paper_start())
     assert cal.status is Status.CONVERGED
     assert np.allclose(cal.theta[:3], camera().theta[:3], rtol=0, atol=1e-9)
     assert np.allclose(cal.theta[3:], camera().theta[3:], rtol=1e-8)
@@ -139,13 +139,13 @@ def test_too_few_stars_for_the_parameters():
     obs = observations(n_frames=60)
     three = obs.select(np.isin(np.arange(obs.n_stars), [0, 1, 2]))
     with pytest.raises(CalibrationError, match="3 stars in 1 frames"):
-        sc.calibrate(three, sc.paper_start())
+        sc.calibrate(three, sc.paper.paper_start())
 
 
 @pytest.mark.parametrize("keyword", ["method", "solver"])
 def test_unknown_options_are_named(keyword):
     with pytest.raises(CalibrationError, match=r"'magic' is unknown: use one of"):
-        sc.calibrate(observations(), sc.paper_start(), **{keyword: "magic"})
+        sc.calibrate(observations(), sc.paper.paper_start(), **{keyword: "magic"})
 
 
 def test_mirrored_axes_are_not_called_a_calibration():
@@ -153,7 +153,7 @@ def test_mirrored_axes_are_not_called_a_calibration():
     obs = observations()
     mirrored = dataclasses.replace(obs, y_px=1023.0 - obs.y_px)
     with pytest.raises(CalibrationError, match="parity") as caught:
-        sc.calibrate(mirrored, sc.paper_start())
+        sc.calibrate(mirrored, sc.paper.paper_start())
     assert caught.value.status is Status.INCONSISTENT
 
 
@@ -162,7 +162,7 @@ def test_shuffled_identifications_are_not_called_a_calibration():
     shuffled = np.random.default_rng(0).permutation(obs.n_stars)
     wrong = dataclasses.replace(obs, ra_deg=obs.ra_deg[shuffled], dec_deg=obs.dec_deg[shuffled])
     with pytest.raises(CalibrationError):
-        sc.calibrate(wrong, sc.paper_start())
+        sc.calibrate(wrong, sc.paper.paper_start())
 
 
 def test_ipopt_keeps_the_principal_point_on_the_detector():
@@ -184,12 +184,14 @@ def test_ipopt_keeps_the_principal_point_on_the_detector():
 def test_a_thousand_random_starts_reach_one_optimum():
     """Principal point anywhere within 15 % of the width of the centre, focal length within 10 %."""
     obs = observations(n_frames=100)
-    reference = sc.calibrate(obs, sc.paper_start())
+    reference = sc.calibrate(obs, sc.paper.paper_start())
     rng = np.random.default_rng(8)
     failures, worst = 0, 0.0
     for _ in range(1000):
         x, y = 511.5 + rng.uniform(-0.15, 0.15, 2) * 1024
-        start = sc.paper_start().replace(x0_px=x, y0_px=y, focal_mm=sc.paper_camera().focal_mm * rng.uniform(0.9, 1.1))
+        start = sc.paper.paper_start().replace(
+            x0_px=x, y0_px=y, focal_mm=sc.paper.paper_camera().focal_mm * rng.uniform(0.9, 1.1)
+        )
         cal = sc.calibrate(obs, start, throw=False)
         if cal.status.ok:
             worst = max(worst, float(np.max(np.abs(cal.theta - reference.theta) / cal.sigmas)))
@@ -200,11 +202,11 @@ def test_a_thousand_random_starts_reach_one_optimum():
 
 
 def _replicates(seeds, sigma_claimed=1.0):
-    stars, truth = sc.load_catalogue(max_mag=6.0, epoch=2026.9), sc.paper_camera()
+    stars, truth = sc.load_catalogue(max_mag=6.0, epoch=2026.9), sc.paper.paper_camera()
     errors, sigmas, pair_errors, pair_sigmas = [], [], [], []
     for seed in seeds:
         obs = sc.simulate(stars, truth, n_frames=1000, min_stars=10, sigma_px=0.05, seed=seed)
-        cal = sc.calibrate(obs, sc.paper_start())
+        cal = sc.calibrate(obs, sc.paper.paper_start())
         errors.append(cal.theta - truth.theta)
         sigmas.append(cal.sigmas)
         pair_errors.append(cal.pair_theta - truth.theta)

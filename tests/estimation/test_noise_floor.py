@@ -88,5 +88,5 @@ def test_what_is_not_needed_changes_nothing() -> None:
 
 def test_unstated_noise_is_refused() -> None:
     obs = replace(observations(n_frames=12), sigma_px=None)
-    with pytest.raises(sc.CalibrationError, match="sigma_px"):
+    with pytest.raises(sc.errors.CalibrationError, match="sigma_px"):
         noise_floor(sc.calibrate(obs, nominal(camera())), obs)

@@ -275,7 +275,7 @@ def test_from_72_mm_it_lands_on_the_batch_answer(seed):
 def test_all_parameters_land_on_the_batch_answer():
     obs = observations("brown", 300)
     best, sigmas = batch_optimum(obs, "brown", camera().theta)
-    theta, step = filtered_theta(obs, sc.paper_start(), parameters="all")
+    theta, step = filtered_theta(obs, sc.paper.paper_start(), parameters="all")
     assert np.max(np.abs(theta - best) / sigmas) < 0.03
     assert np.allclose(step.sigmas, sigmas, rtol=5e-3)
 
@@ -343,10 +343,10 @@ def test_saved_and_resumed_equals_uninterrupted(tmp_path, method, options, cut):
     """Bit for bit, wherever it is cut: before the first frame, while the start still waits, and in full swing."""
     obs = observations(n_frames=60)
     frames = [obs.select_frames([k]) for k in obs.frame_ids]
-    whole = RecursiveCalibration(sc.paper_start(), method, RecursionOptions(**options))
+    whole = RecursiveCalibration(sc.paper.paper_start(), method, RecursionOptions(**options))
     for frame in frames:
         last = whole.update(frame)
-    first = RecursiveCalibration(sc.paper_start(), method, RecursionOptions(**options))
+    first = RecursiveCalibration(sc.paper.paper_start(), method, RecursionOptions(**options))
     for frame in frames[:cut]:
         first.update(frame)
     first.save(tmp_path / "state.npz")
@@ -371,7 +371,7 @@ def test_grouping_of_frames_does_not_matter(method, options):
     obs = observations(n_frames=60)
     states = []
     for size in (1, 7, 60):
-        steps = RecursiveCalibration(sc.paper_start(), method, RecursionOptions(**options))
+        steps = RecursiveCalibration(sc.paper.paper_start(), method, RecursionOptions(**options))
         for first in range(0, 60, size):
             steps.update(obs.select_frames(obs.frame_ids[first : first + size]))
         states.append(steps)
@@ -379,7 +379,7 @@ def test_grouping_of_frames_does_not_matter(method, options):
         same_state(states[0]._recursion, other._recursion)
         assert states[0]._digest == other._digest
     # Control: another order of the same frames is another computation.
-    backwards = RecursiveCalibration(sc.paper_start(), method, RecursionOptions(**options))
+    backwards = RecursiveCalibration(sc.paper.paper_start(), method, RecursionOptions(**options))
     for k in obs.frame_ids[::-1]:
         backwards.update(obs.select_frames([k]))
     assert not np.array_equal(backwards.step.theta, states[0].step.theta)
@@ -387,7 +387,7 @@ def test_grouping_of_frames_does_not_matter(method, options):
 
 
 def test_a_broken_or_foreign_file_is_named(tmp_path):
-    steps = RecursiveCalibration(sc.paper_start())
+    steps = RecursiveCalibration(sc.paper.paper_start())
     steps.update(observations())
     path = tmp_path / "state.npz"
     steps.save(path)
@@ -447,7 +447,7 @@ def test_history_of_a_long_stream_is_thinned(monkeypatch):
 
 def test_data_without_noise_give_the_truth():
     obs = observations("brown", sigma_px=0.0)
-    step = RecursiveCalibration(sc.paper_start(), options=RecursionOptions(parameters="all")).update(obs)
+    step = RecursiveCalibration(sc.paper.paper_start(), options=RecursionOptions(parameters="all")).update(obs)
     # The start is believed a little: one part in a million of its error stays.
     assert np.allclose(step.theta[:3], camera().theta[:3], rtol=0, atol=5e-5)
     assert np.allclose(step.theta[3:], camera().theta[3:], rtol=1e-4)
@@ -471,7 +471,7 @@ def test_too_little_is_said_to_be_too_little(method):
         RecursiveCalibration(plain_start(), method).result()
     obs = observations()
     three = obs.select(np.isin(np.arange(obs.n_stars), [0, 1, 2]))
-    steps = RecursiveCalibration(sc.paper_start(), method)
+    steps = RecursiveCalibration(sc.paper.paper_start(), method)
     with pytest.raises(CalibrationError) as caught:
         steps.update(three)
         steps.result()
@@ -499,17 +499,17 @@ def test_too_little_is_said_to_be_too_little(method):
 )
 def test_options_that_make_no_sense(method, options, words):
     with pytest.raises(CalibrationError, match=words):
-        RecursiveCalibration(sc.paper_start(), method, RecursionOptions(**options))
+        RecursiveCalibration(sc.paper.paper_start(), method, RecursionOptions(**options))
 
 
 def test_noise_must_be_stated_for_process_noise_and_the_same_way_throughout():
     obs = observations()
     with pytest.raises(CalibrationError, match="process noise needs a stated noise"):
-        RecursiveCalibration(sc.paper_start(), "samaan", RecursionOptions(process_noise=0.1)).update(obs)
+        RecursiveCalibration(sc.paper.paper_start(), "samaan", RecursionOptions(process_noise=0.1)).update(obs)
     stated = with_sigmas(obs)
     with pytest.raises(CalibrationError, match="leave sigma_px out"):
-        RecursiveCalibration(sc.paper_start(), "griffith", RecursionOptions(sigma_px=0.1)).update(stated)
-    steps = RecursiveCalibration(sc.paper_start())
+        RecursiveCalibration(sc.paper.paper_start(), "griffith", RecursionOptions(sigma_px=0.1)).update(stated)
+    steps = RecursiveCalibration(sc.paper.paper_start())
     steps.update(obs)
     with pytest.raises(CalibrationError, match="some frames state the noise"):
         steps.update(stated)

@@ -214,7 +214,7 @@ def test_displays_and_file(found, tmp_path) -> None:
         lines = list(csv.DictReader(stream))
     assert [int(line["row"]) for line in lines] == found.rejected["row"].tolist()
     assert {line["reason"] for line in lines} == set(found.counts)
-    with pytest.raises(sc.RunFolderError, match="exists already"):
+    with pytest.raises(sc.errors.RunFolderError, match="exists already"):
         found.save(path)
     found.save(path, force=True)
 
@@ -275,9 +275,9 @@ def test_a_single_frame() -> None:
 
 def test_nothing_right_is_said() -> None:
     dirty = contaminate(scenes.observations(), deep_catalogue(), TRUTH, 1.0, "random", seed=2)
-    with pytest.raises(sc.CalibrationError, match="stars agree on attitudes") as caught:
+    with pytest.raises(sc.errors.CalibrationError, match="stars agree on attitudes") as caught:
         screen(dirty.observations, uncalibrated())
-    assert caught.value.status is sc.Status.INCONSISTENT
+    assert caught.value.status is sc.core.Status.INCONSISTENT
 
 
 @pytest.mark.parametrize(
@@ -366,7 +366,7 @@ def test_contamination_is_what_it_says() -> None:
             assert distance.max() * TRUTH.focal_px <= 60.0
         else:
             assert np.median(np.degrees(distance[dirty.wrong])) > 45.0
-    with pytest.raises(sc.CatalogueError, match="fainter stars"):
+    with pytest.raises(sc.errors.CatalogueError, match="fainter stars"):
         contaminate(obs, sc.load_catalogue(max_mag=6.0, epoch=2026.9), TRUTH, 0.5, "neighbour")
     with pytest.raises(ValueError, match="kind"):
         contaminate(obs, deep_catalogue(), TRUTH, 0.1, "other")
@@ -466,7 +466,7 @@ def test_estimate_and_coverage_with_wrong_identifications(kind: str, fraction: f
             try:
                 plain = sc.calibrate(dirty, nominal, throw=False)
                 z_control.append(np.abs(plain.theta - clean.theta) / clean.sigmas)
-            except sc.CalibrationError:
+            except sc.errors.CalibrationError:
                 z_control.append(np.full(5, np.inf))
     assert np.all(np.mean(shift, axis=0) < 0.5)
     # 300 intervals, five of a replicate being dependent: 92 % less two standard errors of 120 independent ones.

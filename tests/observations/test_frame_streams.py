@@ -54,8 +54,8 @@ def test_frames_come_one_by_one_and_whole(tmp_path, ending, batch_rows, stated):
 def test_a_file_is_calibrated_without_being_loaded(tmp_path, method):
     obs = observations(n_frames=100)
     obs.save(tmp_path / "table.parquet")
-    cal = sc.calibrate(stream_frames(tmp_path / "table.parquet"), sc.paper_start(), method=method)
-    table = sc.calibrate(obs, sc.paper_start(), method=method)
+    cal = sc.calibrate(stream_frames(tmp_path / "table.parquet"), sc.paper.paper_start(), method=method)
+    table = sc.calibrate(obs, sc.paper.paper_start(), method=method)
     assert np.allclose(cal.theta, table.theta, rtol=1e-9)
     assert cal.n_stars == obs.n_stars
 

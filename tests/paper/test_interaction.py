@@ -62,7 +62,7 @@ def test_crossing():
 
 
 def points(**changes):
-    truth, start = sc.paper_camera(), sc.paper_start()
+    truth, start = sc.paper.paper_camera(), sc.paper.paper_start()
     fields = (5.0, 10.0, 40.0)
     sky = deep_catalogue(truth, 7.0, 6.0, fields)
     base = Condition(truth, start, 100, 10, 6.0)
@@ -106,7 +106,7 @@ def test_a_field_beyond_the_catalogue_says_so(monkeypatch):
     shallow = sc.load_catalogue(max_mag=6.0)
     monkeypatch.setattr("starcal_uq.sky.catalogue.load_catalogue", lambda max_mag: shallow)
     with pytest.raises(SamplingError, match="too few for a field of 5 deg"):
-        deep_catalogue(sc.paper_camera(), 6.0, 6.0, (5.0,))
+        deep_catalogue(sc.paper.paper_camera(), 6.0, 6.0, (5.0,))
 
 
 # --- estimates ---
@@ -115,11 +115,11 @@ def test_a_field_beyond_the_catalogue_says_so(monkeypatch):
 def test_shared_stages_are_the_methods():
     """One calibration stands for three methods: each of them, called by its name, gives the same."""
     obs = observations(n_frames=40)
-    found = dict(zip(HANDLING, estimates(obs, sc.paper_start(), 0.05), strict=True))
+    found = dict(zip(HANDLING, estimates(obs, sc.paper.paper_start(), 0.05), strict=True))
     options = {"samaan": RecursionOptions(sigma_px=0.05)}
     names = {"least squares": "least_squares", "samaan": "samaan", "three stages": "three_stage"}
     for label, name in (names | {"efficient": "efficient"}).items():
-        cal = sc.calibrate(obs, sc.paper_start(), method=name, recursion=options.get(name))
+        cal = sc.calibrate(obs, sc.paper.paper_start(), method=name, recursion=options.get(name))
         np.testing.assert_allclose(found[label], cal.theta[:3], rtol=0.0, atol=1e-9)
 
 
@@ -178,7 +178,7 @@ def test_interrupt_before_the_first_result_is_an_interrupt(monkeypatch):
 def test_a_method_that_fails_is_counted(monkeypatch):
     def fail(obs, start, *, method, **options):
         if method == "samaan":
-            raise sc.CalibrationError("the stars do not suffice: add some.")
+            raise sc.errors.CalibrationError("the stars do not suffice: add some.")
         return sc.calibrate(obs, start, method=method, **options)
 
     monkeypatch.setattr("starcal_uq.paper.interaction.calibrate", fail)

@@ -46,7 +46,7 @@ def found():
 
 def artificial(error, claimed, truth=None, classical=None):
     """Replicates with given errors (M, n, p) and claims; the rest is of the right shape and says nothing."""
-    truth = sc.paper_camera() if truth is None else truth
+    truth = sc.paper.paper_camera() if truth is None else truth
     m, n, p = error.shape
     nothing = np.full((m, n), np.nan)
     return Replicates(
@@ -171,19 +171,19 @@ def test_bound_is_that_of_the_marginal_information():
     noise = np.random.SeedSequence(4, spawn_key=(1,))
     obs = sc.simulate(
         sc.load_catalogue(max_mag=6.0),
-        sc.paper_camera(),
+        sc.paper.paper_camera(),
         n_frames=12,
         min_stars=10,
         sigma_px=0.05,
         seed=int(noise.generate_state(1, np.uint64)[0]),
     )
-    normal = MarginalLikelihood(obs, "brown").evaluate(sc.paper_camera().theta)
+    normal = MarginalLikelihood(obs, "brown").evaluate(sc.paper.paper_camera().theta)
     scale = np.sqrt(np.diag(normal.matrix))
     expected = 0.05 * np.sqrt(np.diag(np.linalg.inv(normal.matrix / np.outer(scale, scale)))) / scale
     np.testing.assert_allclose(found.crlb[1], expected, rtol=1e-12)
     # Every method got these data.
     for i, method in enumerate(PAIRS):
-        cal = method.calibrate(obs, sc.paper_start())
+        cal = method.calibrate(obs, sc.paper.paper_start())
         q = len(cal.theta)
         np.testing.assert_array_equal(found.estimates[i, 1, :q], cal.theta)
         np.testing.assert_array_equal(found.claimed[i, 1, :q], cal.sigmas)
@@ -196,7 +196,7 @@ def test_classical_claims_are_those_of_textbooks(shared):
     obs = observations(n_frames=30)
     frames = StarFrames.from_observations(obs)
     methods = tuple(method for method in METHODS if shared or method.method != "efficient")
-    found = dict(zip((m.label for m in methods), solve_all(methods, obs, frames, sc.paper_start()), strict=True))
+    found = dict(zip((m.label for m in methods), solve_all(methods, obs, frames, sc.paper.paper_start()), strict=True))
     for label, model in (("three stages", "brown"), ("least squares", "none")):
         theta = found[label].camera.theta
         residuals, jacobian = PairObjective(frames, model).residuals(theta)
@@ -204,7 +204,7 @@ def test_classical_claims_are_those_of_textbooks(shared):
         covariance = np.linalg.inv((jacobian / scale).T @ (jacobian / scale)) / np.outer(scale, scale)
         variance = residuals @ residuals / (len(residuals) - len(theta))
         np.testing.assert_allclose(found[label].classical, np.sqrt(np.diag(covariance) * variance), rtol=1e-6)
-    cal = sc.calibrate(obs, sc.paper_start(), method="samaan")
+    cal = sc.calibrate(obs, sc.paper.paper_start(), method="samaan")
     own = next(s for s in cal.stages if s.name == "filter").sigmas[-1][:3]
     np.testing.assert_allclose(found["samaan"].classical[:3], own, rtol=1e-12)
     assert np.isnan(found["samaan"].classical[3:]).all()
@@ -220,9 +220,9 @@ def test_stages_are_not_taken_from_a_calibration_that_failed(monkeypatch):
 
     obs = observations(n_frames=30)
     frames = StarFrames.from_observations(obs)
-    good = solve_all(PAIRS, obs, frames, sc.paper_start())
+    good = solve_all(PAIRS, obs, frames, sc.paper.paper_start())
     monkeypatch.setattr(Method, "calibrate", fail)
-    found = solve_all(PAIRS, obs, frames, sc.paper_start())
+    found = solve_all(PAIRS, obs, frames, sc.paper.paper_start())
     assert isinstance(found[2], CalibrationError)
     for one, other in zip(good[:2], found[:2], strict=True):
         np.testing.assert_array_equal(one.camera.theta, other.camera.theta)
@@ -233,8 +233,8 @@ def test_stages_are_not_taken_from_a_calibration_that_failed(monkeypatch):
 def test_streams_give_filters_the_same(label):
     method = next(method for method in METHODS if method.label == label)
     obs = observations(n_frames=40)
-    stream = method.calibrate(obs, sc.paper_start())
-    table = sc.calibrate(obs, sc.paper_start(), method=method.method, recursion=method.recursion)
+    stream = method.calibrate(obs, sc.paper.paper_start())
+    table = sc.calibrate(obs, sc.paper.paper_start(), method=method.method, recursion=method.recursion)
     np.testing.assert_allclose(stream.theta, table.theta, rtol=1e-12)
     np.testing.assert_allclose(stream.sigmas, table.sigmas, rtol=1e-9)
 
@@ -347,7 +347,7 @@ def test_bad_settings_are_one_sentence(options, words):
 
 
 def test_a_field_without_stars_says_so():
-    narrow = sc.paper_camera().replace(focal_mm=2000.0)
+    narrow = sc.paper.paper_camera().replace(focal_mm=2000.0)
     with pytest.raises(CatalogueError, match="raise max_mag"):
         replicate(truth=narrow, n_replicates=2, n_frames=5, max_mag=2.0, workers=0)
 
@@ -456,7 +456,7 @@ def test_methods_that_ignore_or_decouple_are_biased_by_many_sigmas(many):
         assert "biased by" in row["verdict"]
     for label in ("samaan", "samaan, diagonal"):
         # The distortion that is fitted to the wrong optics is eight times the true one.
-        assert many.row(label, "k1")["bias"] > 5 * sc.paper_camera().coefficients[0]
+        assert many.row(label, "k1")["bias"] > 5 * sc.paper.paper_camera().coefficients[0]
 
 
 @pytest.mark.slow

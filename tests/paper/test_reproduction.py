@@ -62,7 +62,7 @@ def test_the_cameras_are_those_of_the_paper() -> None:
         assert {key: table[key] for key in published.TRUTH} == published.TRUTH
         assert {key: start.to_dict()[key] for key in published.START} == published.START
     assert paper_camera() == paper_camera("eq14")
-    with pytest.raises(sc.CameraError, match="use one of eq14, eq6"):
+    with pytest.raises(sc.errors.CameraError, match="use one of eq14, eq6"):
         paper_camera("eq15")
 
 
@@ -485,17 +485,17 @@ def test_progress_rises_to_the_end(small: tuple[Reproduction, list[tuple[int, in
 
 def test_refusals(small: tuple[Reproduction, list[tuple[int, int]]], tmp_path: Path) -> None:
     found, _ = small
-    with pytest.raises(sc.RunFolderError, match="exists and is not empty"):
+    with pytest.raises(sc.errors.RunFolderError, match="exists and is not empty"):
         command.reproduce(found.path)
     file = tmp_path / "file"
     file.write_text("x")
-    with pytest.raises(sc.RunFolderError, match="is a file"):
+    with pytest.raises(sc.errors.RunFolderError, match="is a file"):
         command.reproduce(file, force=True)
-    with pytest.raises(sc.CalibrationError, match="at least 8"):
+    with pytest.raises(sc.errors.CalibrationError, match="at least 8"):
         command.reproduce(tmp_path / "new", n_replicates=3)
-    with pytest.raises(sc.CalibrationError, match="at least 20"):
+    with pytest.raises(sc.errors.CalibrationError, match="at least 20"):
         command.reproduce(tmp_path / "new", n_frames=3)
-    with pytest.raises(sc.CameraError, match="eq14, eq6"):
+    with pytest.raises(sc.errors.CameraError, match="eq14, eq6"):
         command.reproduce(tmp_path / "new", convention="eq7")
     assert not (tmp_path / "new").exists()
 

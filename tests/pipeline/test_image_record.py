@@ -15,7 +15,7 @@ from starcal_uq.presentation.report.tables import image_context
 @pytest.fixture(scope="module")
 def paper_calibration() -> sc.Calibration:
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
-    return sc.calibrate(sc.simulate(stars, sc.paper_camera(), n_frames=20, seed=1), sc.paper_start())
+    return sc.calibrate(sc.simulate(stars, sc.paper.paper_camera(), n_frames=20, seed=1), sc.paper.paper_start())
 
 
 NAMES = ("x0", "y0", "f", "k1", "k2")
@@ -49,9 +49,9 @@ def test_file_is_lossless(tmp_path: Path) -> None:
 def test_broken_files_are_named(tmp_path: Path, text: str) -> None:
     path = tmp_path / "images.json"
     path.write_text(text)
-    with pytest.raises(sc.RunFolderError, match=r"images\.json: is not a record of images"):
+    with pytest.raises(sc.errors.RunFolderError, match=r"images\.json: is not a record of images"):
         ImageRecord.load(path)
-    with pytest.raises(sc.RunFolderError, match="cannot be read"):
+    with pytest.raises(sc.errors.RunFolderError, match="cannot be read"):
         ImageRecord.load(tmp_path / "none.json")
 
 
@@ -84,6 +84,6 @@ def test_of_many_images_only_those_left_out_are_listed(paper_calibration: sc.Cal
 
 
 def test_pairs_need_names() -> None:
-    obs = sc.simulate(sc.load_catalogue(max_mag=6.0, epoch=2026.9), sc.paper_camera(), n_frames=2, seed=1)
+    obs = sc.simulate(sc.load_catalogue(max_mag=6.0, epoch=2026.9), sc.paper.paper_camera(), n_frames=2, seed=1)
     assert len(identified_pairs(obs)) == obs.n_stars
     assert identified_pairs(replace(obs, star_id=None)) == set()

@@ -101,8 +101,8 @@ def _rotations(cal: sc.Calibration) -> np.ndarray:
 
 def test_noise_of_the_attitude_is_quests():
     found = some_frames()
-    b = sc.unproject(camera(), found.frames.pixel.T)
-    result = sc.quest(b, found.frames.r.T, found.frames.starts, sigma_rad=0.05 / camera().focal_px)
+    b = sc.camera.unproject(camera(), found.frames.pixel.T)
+    result = sc.attitude.quest(b, found.frames.r.T, found.frames.starts, sigma_rad=0.05 / camera().focal_px)
     expected = ARCSEC * np.sqrt(np.diagonal(result.covariance, axis1=1, axis2=2).mean(axis=0))
     assert nea_arcsec(found) == pytest.approx(expected, rel=0.02)
 
@@ -111,8 +111,8 @@ def test_response_of_the_attitude_is_that_of_quest():
     """A parameter that is too large turns the attitude as `response` says."""
     found, cam = some_frames(), camera()
     step = np.array([0.5, 0.0, 0.2, 0.0, 0.0])
-    b = sc.unproject(cam.with_theta(cam.theta + step), found.frames.pixel.T)
-    turned = sc.quest(b, found.frames.r.T, found.frames.starts).rotations
+    b = sc.camera.unproject(cam.with_theta(cam.theta + step), found.frames.pixel.T)
+    turned = sc.attitude.quest(b, found.frames.r.T, found.frames.starts).rotations
     from starcal_uq.attitude.rotations import rotation_vector
 
     phi = rotation_vector(turned @ np.swapaxes(found.rotations, 1, 2))

@@ -262,5 +262,5 @@ def test_settings_of_the_user_stay_untouched(run):
 
 
 def test_importing_plots_imports_no_matplotlib():
-    code = "import sys, starcal_uq.plots; sys.exit('matplotlib' in sys.modules)"
+    code = "import sys, starcal_uq.presentation.views; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

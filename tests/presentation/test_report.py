@@ -65,17 +65,17 @@ class Page(HTMLParser):
 @pytest.fixture(scope="module")
 def full(tmp_path_factory):
     """A complete run folder with its report."""
-    run = sc.RunFolder(tmp_path_factory.mktemp("report") / "run").create()
+    run = sc.runs.RunFolder(tmp_path_factory.mktemp("report") / "run").create()
     obs = observations(n_frames=60)
     obs.save(run.observations)
-    start = sc.paper_start()
+    start = sc.paper.paper_start()
     start.save(run.camera)
     cal = sc.calibrate(obs, start)
     cal.save(run.calibration)
     post = sc.sample(obs, cal, seed=1, n_steps=100)
     post.save(run.posterior)
     sc.propagate(post, obs, n_draws=200, seed=1).save(run.attitude)
-    sc.field_map(post, obs, n=9).save(run.field_map)
+    sc.propagation.field_map(post, obs, n=9).save(run.field_map)
     diagnose_run(run.path, n_starts=1)
     assert sc.report(run.path) == run.report
     return run
@@ -85,7 +85,7 @@ def full(tmp_path_factory):
 def run(full, tmp_path):
     """A copy that a test may change."""
     shutil.copytree(full.path, tmp_path / "run")
-    return sc.RunFolder(tmp_path / "run")
+    return sc.runs.RunFolder(tmp_path / "run")
 
 
 def page(run) -> Page:
@@ -265,7 +265,7 @@ def test_names_from_outside_are_text_and_not_markup(full):
 def test_mixed_runs_are_refused_and_nothing_is_touched(run):
     before = run.report.read_bytes()
     observations(n_frames=60, seed=4).save(run.observations, force=True)
-    with pytest.raises(sc.RunFolderError, match="other observations"):
+    with pytest.raises(sc.errors.RunFolderError, match="other observations"):
         sc.report(run.path)
     assert run.report.read_bytes() == before
 
@@ -274,7 +274,7 @@ def test_a_report_that_fails_leaves_the_old_one(run, monkeypatch):
     before = run.report.read_bytes()
     figures = {path: path.stat().st_mtime_ns for path in run.figures.iterdir()}
     monkeypatch.setattr("starcal_uq.presentation.report.page.draw_figures", lambda _: {"corner": b"new"})
-    monkeypatch.setattr("starcal_uq.presentation.report.page.render", lambda *_: 1 / 0)
+    monkeypatch.setattr("starcal_uq.runs.steps.render", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         sc.report(run.path)
     assert run.report.read_bytes() == before
@@ -282,8 +282,8 @@ def test_a_report_that_fails_leaves_the_old_one(run, monkeypatch):
 
 
 def test_no_calibration_no_report(tmp_path):
-    with pytest.raises(sc.RunFolderError, match="starcal-uq calibrate"):
-        sc.report(sc.RunFolder(tmp_path / "empty").create().path)
+    with pytest.raises(sc.errors.RunFolderError, match="starcal-uq calibrate"):
+        sc.report(sc.runs.RunFolder(tmp_path / "empty").create().path)
 
 
 @pytest.mark.parametrize("model", ["none", "brown_tangential", "inverse"])
@@ -291,7 +291,7 @@ def test_every_model_and_a_given_noise(model, tmp_path):
     """Nothing is written for five parameters: without coefficients, with four, and in the other direction."""
     truth = camera(model)
     obs = observations(model, n_frames=60)
-    run = sc.RunFolder(tmp_path / "run").create()
+    run = sc.runs.RunFolder(tmp_path / "run").create()
     obs.save(run.observations)
     cal = sc.calibrate(obs, nominal(truth))
     cal.save(run.calibration)
@@ -306,7 +306,7 @@ def test_real_data(real_data, tmp_path):
     """Centroids of a real camera: noise and optics as known, and the warning on undeclared directions."""
     start = sc.Camera.load(real_data / "esa_tetra3_camera.toml")
     obs = sc.load_observations(real_data / "esa_tetra3_observations.csv", start)
-    run = sc.RunFolder(tmp_path / "run").create()
+    run = sc.runs.RunFolder(tmp_path / "run").create()
     obs.save(run.observations)
     cal = sc.calibrate(obs, start)
     cal.save(run.calibration)

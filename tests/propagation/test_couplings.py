@@ -11,7 +11,7 @@ from tests.helpers.scenes import camera, nominal, observations
 
 @pytest.fixture(scope="module")
 def found():
-    return sc.coupling(sc.calibrate(observations(n_frames=300), sc.paper_start()))
+    return sc.coupling(sc.calibrate(observations(n_frames=300), sc.paper.paper_start()))
 
 
 def test_correlations_of_the_paper_set_up(found):
@@ -55,7 +55,7 @@ def test_common_rotation_is_what_a_wrong_principal_point_does():
     from starcal_uq.estimation.marginal import MarginalLikelihood
 
     obs = observations(n_frames=40)
-    cal = sc.calibrate(obs, sc.paper_start())
+    cal = sc.calibrate(obs, sc.paper.paper_start())
     likelihood = MarginalLikelihood(obs, "brown")
     base = quaternion_to_rotation(cal.quaternions)
     for index, step in ((0, 0.5), (1, 0.5), (2, 1.0), (3, 1e-9)):

@@ -14,7 +14,7 @@ from tests.helpers.scenes import camera, observations
 
 
 def test_table_1_of_the_paper():
-    cam = sc.paper_camera()
+    cam = sc.paper.paper_camera()
     assert (cam.width_px, cam.height_px, cam.pixel_um) == (1024, 1024, 12.0)
     assert (cam.x0_px, cam.y0_px, cam.focal_mm) == (500.0, 530.0, 70.2262)
     assert cam.coefficients == (2.0e-10, -3.5e-15)
@@ -33,16 +33,16 @@ def test_frames_hold_enough_stars_on_the_detector():
 
 def test_noise_free_pixels_are_projections_at_one_attitude_per_frame():
     obs = observations(sigma_px=0.0)
-    b = sc.unproject(camera(), obs.xy)
-    result = sc.quest(b, obs.directions_icrs, obs.frame_starts)
+    b = sc.camera.unproject(camera(), obs.xy)
+    result = sc.attitude.quest(b, obs.directions_icrs, obs.frame_starts)
     rotated = np.einsum("nij,nj->ni", np.repeat(result.rotations, obs.stars_per_frame, axis=0), obs.directions_icrs)
     assert np.max(np.abs(rotated - b)) < 1e-13
 
 
 def test_noise_is_gaussian_with_the_stated_sigma():
     cam, stars = camera(), sc.load_catalogue(max_mag=6.0, epoch=2026.9)
-    rotations = sc.quest(
-        sc.unproject(cam, observations(sigma_px=0.0).xy),
+    rotations = sc.attitude.quest(
+        sc.camera.unproject(cam, observations(sigma_px=0.0).xy),
         observations(sigma_px=0.0).directions_icrs,
         observations(sigma_px=0.0).frame_starts,
     ).rotations
@@ -75,9 +75,9 @@ def test_attitudes_are_uniform():
 
 def test_impossible_requests_are_named():
     stars = sc.load_catalogue(max_mag=2.0)
-    with pytest.raises(sc.CatalogueError, match="raise max_mag"):
+    with pytest.raises(sc.errors.CatalogueError, match="raise max_mag"):
         sc.simulate(stars, camera(), n_frames=3, min_stars=12)
-    with pytest.raises(sc.CatalogueError, match="index 0"):
+    with pytest.raises(sc.errors.CatalogueError, match="index 0"):
         sc.simulate(stars, camera(), attitudes=np.eye(3)[None], min_stars=12)
     with pytest.raises(ValueError, match="at least 3 stars"):
         sc.simulate(stars, camera(), min_stars=2)
@@ -86,9 +86,9 @@ def test_impossible_requests_are_named():
 def test_a_field_that_hardly_ever_shows_enough_stars_is_refused_at_once() -> None:
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
     # About one attitude in some hundred: each by itself is found, but a thousand would take minutes.
-    narrow = sc.paper_camera().replace(focal_mm=350.0)
+    narrow = sc.paper.paper_camera().replace(focal_mm=350.0)
     clock = perf_counter()
-    with pytest.raises(sc.CatalogueError, match="raise max_mag, or lower min_stars"):
+    with pytest.raises(sc.errors.CatalogueError, match="raise max_mag, or lower min_stars"):
         sc.simulate(stars, narrow, n_frames=3000, min_stars=5, seed=1)
     assert perf_counter() - clock < 20.0
     assert sc.simulate(stars, narrow, n_frames=3, min_stars=4, seed=1).n_frames == 3

@@ -19,7 +19,7 @@ from starcal_uq.diagnostics.verdict.observed import corrected_words
 from starcal_uq.images.image import read_image, time_in_name
 from starcal_uq.pipeline.displacement import as_measured, mirrored, undisplaced
 from starcal_uq.pipeline.images import observations_from_images, with_time
-from starcal_uq.pipeline.refine import bootstrap
+from starcal_uq.pipeline.refine import identify_and_calibrate
 from starcal_uq.sky.apparent import (
     aberrate,
     apparent_directions,
@@ -72,7 +72,7 @@ def test_site_goes_through_its_file(tmp_path):
     # Whole numbers are numbers.
     (tmp_path / "whole.toml").write_text("[site]\nlatitude_deg = 52\nlongitude_deg = 4\npressure_hpa = 1000\n")
     assert Site.load(tmp_path / "whole.toml") == Site(52.0, 4.0, pressure_hpa=1000.0)
-    with pytest.raises(sc.RunFolderError, match="exists"):
+    with pytest.raises(sc.errors.RunFolderError, match="exists"):
         site.save(tmp_path / "site.toml")
 
 
@@ -351,7 +351,7 @@ def test_refraction_moves_f_and_the_site_puts_it_right(stars):
 def _bootstrap(obs, stars, site, *, moved=True, flip=False):
     table = as_centroids(obs)
     table = mirrored(table, CAMERA.width_px) if flip else table
-    return bootstrap(
+    return identify_and_calibrate(
         table,
         NOMINAL,
         stars,
@@ -525,7 +525,7 @@ def test_an_images_own_time_wins(tmp_path):
     header = read_image(tmp_path / "2019-07-29T204726.fits")
     assert header.time_utc == "2020-01-02T03:04:06.000000"
     assert not header.messages
-    table = sc.extract_centroids(tmp_path)
+    table = sc.images.extract_centroids(tmp_path)
     assert table.image.tolist() == ["2019-07-29T204726.fits", "2019-07-29T204726.png", "plain.png"]
     given = with_time(table, "2021-05-06T07:08:09")
     assert given.time_utc.tolist() == ["2020-01-02T03:04:06.000000"] + 2 * ["2021-05-06T07:08:09"]
@@ -533,7 +533,7 @@ def test_an_images_own_time_wins(tmp_path):
     assert with_time(table, None) is table
     # Tables hold UTC without an offset.
     assert with_time(table, "2019-07-29T22:47:26+02:00").time_utc[2] == TIME
-    with pytest.raises(sc.CatalogueError, match="a date without a time of day"):
+    with pytest.raises(sc.errors.CatalogueError, match="a date without a time of day"):
         with_time(table, "2019-07-29")
 
 
@@ -557,23 +557,23 @@ def test_times_as_tables_hold_them(text, expected):
     "text", ["2019-07-29", "2019-02-30", "noon", "", "2019-07-29T25:00", "1858-11-17T00:00:00", "2019-07-29T20:47:61"]
 )
 def test_other_times_are_refused_in_one_sentence(text):
-    with pytest.raises(sc.CatalogueError, match=f"^The time '{text}' is .*; write it as") as caught:
+    with pytest.raises(sc.errors.CatalogueError, match=f"^The time '{text}' is .*; write it as") as caught:
         utc_text(text)
     assert "number 1" not in str(caught.value)
 
 
 def test_a_missing_image_is_left_out_once(stars, tmp_path):
     """With the centroids, not as a frame without them; the control is an image without stars."""
-    dark = sc.Image(np.random.default_rng(0).normal(100.0, 3.0, (768, 1024)), "dark")
-    table = sc.extract_centroids([tmp_path / "missing.png", dark], camera=NOMINAL)
+    dark = sc.images.Image(np.random.default_rng(0).normal(100.0, 3.0, (768, 1024)), "dark")
+    table = sc.images.extract_centroids([tmp_path / "missing.png", dark], camera=NOMINAL)
     assert (table.problem != "").tolist() == [True, False]
-    found = sc.identify(table, NOMINAL, stars)
+    found = sc.identification.identify(table, NOMINAL, stars)
     assert found.n_left_out == 1 and len(found.frames) == 2
     assert found.summary == "0 of 1 frame is identified. Left out: 1 with fewer than four centroids."
 
 
 def test_rendered_images_shine_through_no_air(stars, tmp_path):
-    sc.render_frames(stars, CAMERA, tmp_path, n_frames=6, seed=3, times_utc=["2026-11-25T00:00:00"] * 6)
+    sc.simulation.render_frames(stars, CAMERA, tmp_path, n_frames=6, seed=3, times_utc=["2026-11-25T00:00:00"] * 6)
     obs, _, _ = observations_from_images([tmp_path], NOMINAL, max_mag=6.5)
     assert obs.meta["observer"] == "rendered"
     assert "refraction" not in _first_paragraph(obs)[0]
@@ -586,7 +586,7 @@ def test_images_and_sites_that_do_not_go_together(tmp_path):
         observations_from_images([tmp_path], NOMINAL, max_mag=7.0, site=SITE, in_space=True)
     with pytest.raises(SiteError, match="declared apparent"):
         observations_from_images([tmp_path], NOMINAL, max_mag=7.0, site=SITE, directions="apparent")
-    with pytest.raises(sc.CatalogueError, match="'noon'"):
+    with pytest.raises(sc.errors.CatalogueError, match="'noon'"):
         observations_from_images([tmp_path], NOMINAL, max_mag=7.0, time_utc="noon")
 
 

@@ -291,7 +291,6 @@ def load_validation(path: str | os.PathLike[str]) -> Validation:
     RunFolderError
         If the file is missing or is not a validation.
     """
-    from starcal_uq.diagnostics.validation.result import Validation
 
     words = {
         "missing": "run `starcal-uq validate CAMERA` first",

@@ -27,7 +27,7 @@ from starcal_uq.paper.field.published import (
 )
 from starcal_uq.paper.field.result import FieldExperiment
 from starcal_uq.paper.published import PAPER_METHODS
-from starcal_uq.pipeline.refine import bootstrap
+from starcal_uq.pipeline.refine import identify_and_calibrate
 from starcal_uq.sky.catalogue import load_catalogue
 from starcal_uq.sky.neighbours import without_disturbed
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.core.tasks import Progress
     from starcal_uq.observations.table import Observations
-    from starcal_uq.pipeline.refine import Bootstrap
+    from starcal_uq.pipeline.refine import ImageCalibration
     from starcal_uq.sky.catalogue import StarCatalogue
 
 # What the camera may misplace a star by in the corner of the field. A star tracker in flight takes its calibration for
@@ -186,7 +186,7 @@ def _check(reading: str, n_frames: int, n_calibration_frames: int, n_replicates:
     return READINGS[reading]
 
 
-def _campaign(frames: FieldFrames, reading: FieldReading, stars: StarCatalogue) -> tuple[Bootstrap, str]:
+def _campaign(frames: FieldFrames, reading: FieldReading, stars: StarCatalogue) -> tuple[ImageCalibration, str]:
     """Identify the frames of the calibration from the data sheet; and what became of them, in words."""
     nominal, width_px = reading.nominal(), reading.sensor.psf_sigma_px
 
@@ -194,7 +194,7 @@ def _campaign(frames: FieldFrames, reading: FieldReading, stars: StarCatalogue) 
         # Rendered stars are where the catalogue has them.
         return without_disturbed(obs.with_meta(directions="apparent"), stars, nominal, width_px)
 
-    found = bootstrap(frames.centroids, nominal, stars, prepare=prepare, identification=_FIRST_TOLERANCES)
+    found = identify_and_calibrate(frames.centroids, nominal, stars, prepare=prepare, identification=_FIRST_TOLERANCES)
     obs = found.observations
     place = _true_campaign(frames, obs, reading.truth)
     wrong = int(np.sum(np.hypot(obs.x_px - place[:, 0], obs.y_px - place[:, 1]) > WRONG_PX))

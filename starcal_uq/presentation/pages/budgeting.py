@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -12,59 +11,14 @@ from starcal_uq.budgeting.result import Budget, Outcome, by_contributor
 from starcal_uq.budgeting.rows import AXES, AXIS_LABELS, SCOPES, TOTAL_AXES, Contributor, confidence_text
 from starcal_uq.budgeting.totals import Total
 from starcal_uq.core.files import atomic_path, atomic_write_text
-from starcal_uq.core.formatting import MINUS, decimals_for, fixed, join_words, plural, significant
+from starcal_uq.core.formatting import decimals_for, fixed, join_words, plural, significant
 from starcal_uq.presentation.html import embedded_image, template_environment
+from starcal_uq.presentation.tables import tex
 
 if TYPE_CHECKING:
     from openpyxl.worksheet.worksheet import Worksheet
 
 _RED, _AMBER, _GREEN, _HEAD = "FFFDE6DB", "FFFDF1D6", "FFE3F4EE", "FFDFE4E9"
-
-
-_TEX = {
-    "\\": r"\textbackslash{}",
-    **{sign: f"\\{sign}" for sign in "&%$#_{}"},
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    # After the end of a row, a bracket would be read as the space to leave.
-    "[": "{[}",
-    "]": "{]}",
-    "<": r"\textless{}",
-    ">": r"\textgreater{}",
-    MINUS: "$-$",
-    "×": r"$\times$",
-    "±": r"$\pm$",
-    "≥": r"$\geq$",
-    "≤": r"$\leq$",
-    "σ": r"$\sigma$",
-    "°": r"\textdegree{}",
-    "″": r"$''$",
-    "–": "--",
-    "“": "``",
-    "”": "''",
-    "’": "'",
-    "…": r"\ldots{}",
-    "∞": r"$\infty$",
-    "µ": r"$\mu$",
-    "μ": r"$\mu$",
-    "\N{NO-BREAK SPACE}": "~",
-    "\N{NARROW NO-BREAK SPACE}": r"\,",
-}
-
-
-_SUPERSCRIPTS = "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"
-
-
-_PLAIN = str.maketrans(_SUPERSCRIPTS, "-0123456789")
-
-
-def tex(value: Any) -> str:
-    """Text with everything escaped that LaTeX would read as a command."""
-    parts = re.split(f"([{_SUPERSCRIPTS}]+)", str(value))
-    return "".join(
-        f"$^{{{part.translate(_PLAIN)}}}$" if index % 2 else "".join(_TEX.get(sign, sign) for sign in part)
-        for index, part in enumerate(parts)
-    )
 
 
 def write_tex(budget: Budget, path: str | os.PathLike[str]) -> None:

@@ -1,0 +1,3 @@
+from .distortion import model_names as model_names
+from .projection import project as project
+from .projection import unproject as unproject

@@ -1,0 +1,97 @@
+"""The one door from a result to its figures, its words and its tables, which all stand above it.
+
+A result knows numbers. Whoever stands above registers how its class is shown, and the result finds that here, by its
+class, when somebody asks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+
+@dataclass(frozen=True)
+class View:
+    """How the results of one class are shown; every function takes the result first.
+
+    Attributes
+    ----------
+    text : callable or None
+        The result in a few sentences, plain text.
+    html : callable or None
+        The result for a notebook.
+    figures : mapping of str to callable
+        Functions that draw, by the name that users type after ``result.plot.``.
+    """
+
+    text: Callable[[Any], str] | None = None
+    html: Callable[[Any], str] | None = None
+    figures: Mapping[str, Callable[..., Any]] = field(default_factory=dict)
+
+
+_VIEWS: list[Callable[[], Mapping[type, View]]] = []
+
+
+def register(views: Callable[[], Mapping[type, View]]) -> None:
+    """Add a table of views; `views` is called when a result is first shown, and may import heavily then."""
+    _VIEWS.append(views)
+
+
+def view_of(cls: type) -> View:
+    """The view of a class, or of the nearest class that it derives from.
+
+    Raises
+    ------
+    LookupError
+        If nobody has said how it is shown.
+    """
+    tables = [views() for views in _VIEWS]
+    for ancestor in cls.__mro__:
+        for table in tables:
+            if ancestor in table:
+                return table[ancestor]
+    raise LookupError(f"nothing says how a {cls.__name__} is shown")
+
+
+class Figures:
+    """The figures of one result: ``result.plot.<name>(...)`` draws, and tab completion lists the names."""
+
+    def __init__(self, result: Any, figures: Mapping[str, Callable[..., Any]]) -> None:
+        self._result = result
+        self._figures = figures
+
+    def __getattr__(self, name: str) -> Callable[..., Any]:
+        if name.startswith("_") or name not in self._figures:
+            known = ", ".join(sorted(self._figures)) or "none"
+            raise AttributeError(f"a {type(self._result).__name__} has no figure {name!r}; it has {known}")
+        figure = self._figures[name]
+        bound = partial(figure, self._result)
+        bound.__doc__ = figure.__doc__
+        return bound
+
+    def __dir__(self) -> list[str]:
+        return sorted(self._figures)
+
+    def __repr__(self) -> str:
+        return f"figures of this {type(self._result).__name__}: {', '.join(dir(self))}"
+
+
+class Shown:
+    """What every result can do once somebody above has said how."""
+
+    @property
+    def plot(self) -> Figures:
+        """The figures of this result, by name: ``result.plot.<name>()``."""
+        return Figures(self, view_of(type(self)).figures)
+
+    @property
+    def text(self) -> str:
+        """This result in a few sentences."""
+        text = view_of(type(self)).text
+        return repr(self) if text is None else text(self)
+
+    def _repr_html_(self) -> str | None:
+        html = view_of(type(self)).html
+        return None if html is None else html(self)

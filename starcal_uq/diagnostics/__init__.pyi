@@ -1,0 +1,10 @@
+from .diagnose import Diagnosis as Diagnosis
+from .jackknife import Jackknife as Jackknife
+from .jackknife import accept_inflation as accept_inflation
+from .jackknife import jackknife_frames as jackknife_frames
+from .misfit import Misfit as Misfit
+from .misfit import misfit_tests as misfit_tests
+from .models import ModelComparison as ModelComparison
+from .models import compare_models as compare_models
+from .predictive import predictive_check as predictive_check
+from .validation.result import Validation as Validation

@@ -1,0 +1,155 @@
+"""One table of finished text, for the notebook, the terminal, the page, LaTeX and the workbook.
+
+A table is composed once, where the digits are chosen; the outputs differ in their marks only. The terminal's own
+drawing stands in `starcal_uq.cli.console`, which is the only place that knows the terminal.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from starcal_uq.core.formatting import MINUS, significant
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+@dataclass(frozen=True)
+class TextTable:
+    """Rows of finished text under their heads.
+
+    Attributes
+    ----------
+    heads : tuple of str
+        One for each column.
+    rows : tuple of tuple of str
+        Cells, plain text; digits are chosen already.
+    title : str
+        What the table shows; may be empty.
+    align : str
+        One letter a column: ``l`` for words, ``r`` for numbers.
+    marks : tuple of str
+        One for each row: empty, or ``total``, ``warning``, ``fail``; may be left out altogether.
+    """
+
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    title: str = ""
+    align: str = ""
+    marks: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.align:
+            object.__setattr__(self, "align", "l" + "r" * (len(self.heads) - 1))
+        if {len(row) for row in self.rows} - {len(self.heads)} or len(self.align) != len(self.heads):
+            raise ValueError(f"table {self.title!r}: every row, and the alignment, needs {len(self.heads)} entries")
+
+    @classmethod
+    def of(
+        cls,
+        frame: pd.DataFrame,
+        title: str = "",
+        columns: Sequence[str] | None = None,
+        formats: Mapping[str, Callable[[Any], str]] | None = None,
+        missing: str = "–",
+    ) -> TextTable:
+        """Chosen columns of a data frame; numbers with three digits unless `formats` says otherwise."""
+        import numpy as np
+
+        frame = frame if columns is None else frame[list(columns)]
+        formats = formats or {}
+
+        def cell(name: str, value: Any) -> str:
+            if isinstance(value, float) and math.isnan(value):
+                return missing
+            if name in formats:
+                return formats[name](value)
+            if isinstance(value, (bool, np.bool_)):
+                return "yes" if value else "no"
+            return significant(value, 3) if isinstance(value, float) else str(value)
+
+        names = [str(name) for name in frame.columns]
+        rows = tuple(
+            tuple(cell(name, value) for name, value in zip(names, row, strict=True))
+            for row in frame.itertuples(index=False, name=None)
+        )
+        numbers = [np.issubdtype(np.asarray(frame[name]).dtype, np.number) for name in frame.columns]
+        return cls(
+            tuple(name.replace("_", " ") for name in names), rows, title, "".join("r" if n else "l" for n in numbers)
+        )
+
+    def html(self) -> str:
+        """A ``<table>``; everything is escaped."""
+        classes = ['class="n"' if side == "r" else "" for side in self.align]
+        styles = ['style="text-align:right"' if side == "r" else 'style="text-align:left"' for side in self.align]
+
+        def line(tag: str, cells: Sequence[str], mark: str = "") -> str:
+            parts = (
+                f"<{tag} {' '.join(filter(None, (k, s)))}>{html.escape(cell)}</{tag}>"
+                for cell, k, s in zip(cells, classes, styles, strict=True)
+            )
+            return f"<tr{f' class={mark!r}' if mark else ''}>{''.join(parts)}</tr>"
+
+        caption = f"<caption>{html.escape(self.title)}</caption>" if self.title else ""
+        marks = self.marks or ("",) * len(self.rows)
+        body = "".join(line("td", row, mark) for row, mark in zip(self.rows, marks, strict=True))
+        return f"<table>{caption}<thead>{line('th', self.heads)}</thead><tbody>{body}</tbody></table>"
+
+    def latex(self) -> str:
+        """A ``tabular`` with the rules of booktabs; everything is escaped."""
+
+        def line(cells: Sequence[str]) -> str:
+            return " & ".join(tex(cell) for cell in cells) + r" \\"
+
+        body = "\n".join(line(row) for row in self.rows)
+        return (
+            f"\\begin{{tabular}}{{{self.align}}}\n\\toprule\n{line(self.heads)}\n\\midrule\n{body}\n"
+            "\\bottomrule\n\\end{tabular}"
+        )
+
+
+_TEX = {
+    "\\": r"\textbackslash{}",
+    **{sign: f"\\{sign}" for sign in "&%$#_{}"},
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    # After the end of a row, a bracket would be read as the space to leave.
+    "[": "{[}",
+    "]": "{]}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    MINUS: "$-$",
+    "×": r"$\times$",
+    "±": r"$\pm$",
+    "≥": r"$\geq$",
+    "≤": r"$\leq$",
+    "σ": r"$\sigma$",
+    "°": r"\textdegree{}",
+    "″": r"$''$",
+    "–": "--",
+    "“": "``",
+    "”": "''",
+    "’": "'",
+    "…": r"\ldots{}",
+    "∞": r"$\infty$",
+    "µ": r"$\mu$",
+    "μ": r"$\mu$",
+    "\N{NO-BREAK SPACE}": "~",
+    "\N{NARROW NO-BREAK SPACE}": r"\,",
+}
+_SUPERSCRIPTS = "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"
+_PLAIN = str.maketrans(_SUPERSCRIPTS, "-0123456789")
+
+
+def tex(value: Any) -> str:
+    """Text with everything escaped that LaTeX would read as a command."""
+    parts = re.split(f"([{_SUPERSCRIPTS}]+)", str(value))
+    return "".join(
+        f"$^{{{part.translate(_PLAIN)}}}$" if index % 2 else "".join(_TEX.get(sign, sign) for sign in part)
+        for index, part in enumerate(parts)
+    )

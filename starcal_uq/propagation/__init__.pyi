@@ -1,0 +1,9 @@
+from .attitude_error import Agreement as Agreement
+from .attitude_error import AttitudeError as AttitudeError
+from .coupling import Coupling as Coupling
+from .distortion import DistortionCurve as DistortionCurve
+from .distortion import distortion_curve as distortion_curve
+from .field import FieldMap as FieldMap
+from .field import field_map as field_map
+from .spectrum import ErrorSpectrum as ErrorSpectrum
+from .spectrum import error_spectrum as error_spectrum

@@ -1,0 +1,10 @@
+from .campaign import render_frames as render_frames
+from .contamination import contaminate as contaminate
+from .mission import mission_frames as mission_frames
+from .mission import profile_frames as profile_frames
+from .rendering import render as render
+from .sensor import Sensor as Sensor
+from .truth import FrameTruth as FrameTruth
+from .truth import RenderedFrame as RenderedFrame
+from .truth import read_truth as read_truth
+from .truth import truth_table as truth_table
