@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING
 from starcal_uq.budgeting.file import BudgetFile, checked_confidence, load_budget_file
 from starcal_uq.budgeting.posterior import inflation, posterior_rows
 from starcal_uq.budgeting.result import Budget, by_contributor, judge
-from starcal_uq.budgeting.rows import AXES, AXIS_LABELS, FROM_FILE, Contributor, not_assessed
+from starcal_uq.budgeting.rows import AXIS_LABELS, FROM_FILE, Contributor, not_assessed
 from starcal_uq.budgeting.totals import N_SAMPLES, totals
+from starcal_uq.core.constants import AXES
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.provenance import provenance

@@ -14,8 +14,6 @@ from typing import Any
 
 from starcal_uq.budgeting.rows import (
     ABSORBED,
-    AXES,
-    CROSS_BORESIGHT,
     DISTRIBUTIONS,
     ECSS_CLASSES,
     FROM_FILE,
@@ -28,6 +26,7 @@ from starcal_uq.budgeting.rows import (
     Expected,
 )
 from starcal_uq.budgeting.shapes import HALF_WIDTHS, RAYLEIGH_MEAN
+from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.files import atomic_write_text, ensure_new
 

@@ -8,16 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.budgeting.rows import (
-    AXES,
-    COMMON,
-    FROM_POSTERIOR,
-    GAUSSIAN_997,
-    INTERACTING,
-    NEA,
-    REST,
-    Contributor,
-)
+from starcal_uq.budgeting.rows import COMMON, FROM_POSTERIOR, GAUSSIAN_997, INTERACTING, NEA, REST, Contributor
+from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.formatting import join_words, plural, significant
 from starcal_uq.core.types import FloatArray
 
@@ -27,7 +19,6 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
     from starcal_uq.propagation.attitude_error import AttitudeError
 
-_ARCSEC = 648_000.0 / math.pi
 # The same limits as the verdict of the report.
 _MISFIT_P, _JACKKNIFE_P, _JACKKNIFE_RATIO = 0.05, 0.01, 1.1
 _PIXEL_PHASE = ("pixel phase in x", "pixel phase in y")
@@ -110,7 +101,7 @@ def _pattern(diagnosis: Diagnosis, post: Posterior, obs: Observations) -> tuple[
     worst = max(found, key=lambda test: test.size_px)
     x0, y0, focal_px = post.mean[:3]
     radius_px = float(np.sqrt(np.mean((obs.x_px - x0) ** 2 + (obs.y_px - y0) ** 2)))
-    cross, roll = worst.size_px / focal_px * _ARCSEC, worst.size_px / radius_px * _ARCSEC
+    cross, roll = worst.size_px / focal_px * ARCSEC, worst.size_px / radius_px * ARCSEC
     others = len(found) - 1
     more = f" (the largest of {plural(others + 1, 'rejected test')})" if others else ""
     reason = (

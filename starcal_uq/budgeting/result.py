@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.budgeting.file import Requirement
-from starcal_uq.budgeting.rows import AXES, AXIS_LABELS, CROSS_BORESIGHT, SCOPES, Contributor, confidence_text
+from starcal_uq.budgeting.rows import AXIS_LABELS, SCOPES, Contributor, confidence_text
 from starcal_uq.budgeting.totals import Samples, Total, total
+from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.errors import BudgetError, RunFolderError
 from starcal_uq.core.files import atomic_path
 from starcal_uq.core.formatting import significant

@@ -11,9 +11,8 @@ import math
 from dataclasses import dataclass
 from decimal import Decimal
 
-AXES = ("pitch", "yaw", "roll")
-CROSS_BORESIGHT = "cross-boresight"
-TOTAL_AXES = (*AXES, CROSS_BORESIGHT)
+from starcal_uq.core.constants import CROSS_BORESIGHT, INTERACTION
+
 AXIS_LABELS = {
     "pitch": "X (pitch)",
     "yaw": "Y (yaw)",
@@ -42,7 +41,6 @@ ECSS_CLASSES = (
 NEA = "centroid noise (NEA)"
 COMMON = "calibration, common rotation"
 REST = "calibration, rest"
-INTERACTION = "interaction, calibration and noise"
 _NAN = float("nan")
 # Two-sided 99.7 % quantile of a Gaussian error, standard deviations.
 GAUSSIAN_997 = 2.9677379253417833

@@ -22,17 +22,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from starcal_uq.budgeting.rows import (
-    AXES,
-    CROSS_BORESIGHT,
-    GAUSSIAN_997,
-    INTERPRETATIONS,
-    SCOPES,
-    TOTAL_AXES,
-    Contributor,
-    confidence_text,
-)
+from starcal_uq.budgeting.rows import GAUSSIAN_997, INTERPRETATIONS, SCOPES, Contributor, confidence_text
 from starcal_uq.budgeting.shapes import deviates, half_width, mixture_spread, one_axis_factor, two_axis_radius
+from starcal_uq.core.constants import AXES, CROSS_BORESIGHT, TOTAL_AXES
 from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.words.budgeting import explain
 

@@ -11,8 +11,6 @@ from starcal_uq.core.types import FloatArray
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
 
-ARCSEC = 648_000.0 / np.pi
-
 
 def detector_axes(camera: Camera, n: int) -> tuple[FloatArray, FloatArray]:
     """Grid lines x (n,) and y (n,) in px, from edge to edge of the detector.

@@ -15,6 +15,7 @@ from rich.table import Table
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
+from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import decimals_for, fixed, plural, pretty_unit, significant
 from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import AnyDict
@@ -32,9 +33,6 @@ if TYPE_CHECKING:
 
 # Where the output is not a terminal it has no width of its own; tables then get the room they need.
 _WIDTH = None if sys.stdout.isatty() else 110
-
-
-AXES = ("pitch", "yaw", "roll")
 
 
 # Names of files, runs and requirements may hold square brackets, which are no markup.

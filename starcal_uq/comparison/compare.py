@@ -26,13 +26,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import rotation_vector
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.distortion import get_model, parameters
-from starcal_uq.camera.fields import (
-    ARCSEC,
-    area_weights,
-    detector_axes,
-    grid_points,
-    tangent_axes,
-)
+from starcal_uq.camera.fields import area_weights, detector_axes, grid_points, tangent_axes
 from starcal_uq.camera.projection import project, unproject
 from starcal_uq.comparison.covariance import Rule, difference_rule
 from starcal_uq.comparison.result import CameraComparison
@@ -45,6 +39,7 @@ from starcal_uq.comparison.significance import (
     linearised,
     one_noise,
 )
+from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import ComparisonError
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibrate import calibrate

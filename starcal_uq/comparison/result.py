@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.core.constants import AXES
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_write_bytes, atomic_write_text
 from starcal_uq.core.formatting import significant
@@ -18,7 +19,6 @@ from starcal_uq.core.types import AnyDict, FloatArray
 if TYPE_CHECKING:
     import pandas as pd
 
-AXES = ("pitch", "yaw", "roll")
 FILES = ("comparison.html", "difference.csv", "comparison.json", "difference_map.csv", "difference_map.png")
 _TUPLES = ("labels", "models", "parameter_names", "parameter_units", "messages")
 

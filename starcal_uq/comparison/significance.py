@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.camera.fields import ARCSEC, rotated, rotation_response, tangent_axes
+from starcal_uq.camera.fields import rotated, rotation_response, tangent_axes
 from starcal_uq.camera.projection import unproject_jacobian
 from starcal_uq.comparison.covariance import Rule, is_efficient
+from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.types import FloatArray
 from starcal_uq.maths.quadratic_forms import weighted_chi_square_tail
 

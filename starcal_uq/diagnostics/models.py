@@ -19,6 +19,7 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import left_error, rotation_to_quaternion
 from starcal_uq.camera.distortion import get_model
+from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.formatting import fixed, join_words, significant
 from starcal_uq.core.types import AnyDict, FloatArray
@@ -37,7 +38,6 @@ KHAT_BOUND = 0.7
 # A model is rejected when another one predicts better by this many standard errors, and by more than chance between
 # equal models (Sivula et al. 2020: below four, a difference of elpd says nothing).
 REJECT_SE, REJECT_ELPD = 2.0, 4.0
-_ARCSEC = 648_000.0 / np.pi
 _DRAWS = 1000
 
 
@@ -159,7 +159,7 @@ class ModelComparison:
             row = asdict(score)
             for part in ("common", "rest"):
                 values = row.pop(f"{part}_arcsec")
-                row |= {f"{part}_{axis}_arcsec": v for axis, v in zip(("pitch", "yaw", "roll"), values, strict=True)}
+                row |= {f"{part}_{axis}_arcsec": v for axis, v in zip(AXES, values, strict=True)}
             rows.append(row)
         return pd.DataFrame(rows)
 
@@ -267,7 +267,7 @@ def _fit(obs: Observations, cal: Calibration, name: str) -> Calibration:
 
 
 def _moved(cal: Calibration, normals: FrameNormals) -> tuple[tuple[float, float, float], tuple[float, float, float]]:
-    phi = left_error(rotation_to_quaternion(normals.rotations), cal.quaternions) * _ARCSEC
+    phi = left_error(rotation_to_quaternion(normals.rotations), cal.quaternions) * ARCSEC
     common = phi.mean(axis=0)
     rest = np.sqrt(np.mean((phi - common) ** 2, axis=0))
     c, r = common.tolist(), rest.tolist()

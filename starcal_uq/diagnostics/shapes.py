@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.camera.distortion import get_model, model_names
+from starcal_uq.core.constants import LIGHT_SPEED_KM_S
 from starcal_uq.core.types import FloatArray, StrArray
 from starcal_uq.estimation.marginal import MarginalLikelihood, Profile
 
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.observations.table import Observations
 
-LIGHT_SPEED_KM_S = 299792.458
 _HARMONICS = 2
 _AZIMUTH_ORDERS = 3
 _RADIAL_DEGREE, _TWIST_DEGREE = 6, 3

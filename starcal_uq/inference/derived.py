@@ -12,13 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.camera.distortion import get_model
+from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.types import FloatArray
 from starcal_uq.inference import arviz as arviz_compat
 
 if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
-
-_ARCSEC = 648_000.0 / np.pi
 
 
 @dataclass(frozen=True)
@@ -48,11 +47,11 @@ class Derived:
 def derived_quantities(post: Posterior) -> tuple[Derived, ...]:
     """Focal length in mm, displacement by the distortion at the corner, and the common rotation about each axis."""
     draws = post.theta_draws
-    rotation = (draws - post.mean) @ post.rotation_per_theta.T * _ARCSEC
+    rotation = (draws - post.mean) @ post.rotation_per_theta.T * ARCSEC
     values: dict[tuple[str, str], FloatArray] = {("focal length", "mm"): draws[:, 2] * post.camera.pixel_um / 1000.0}
     if draws.shape[1] > 3:
         values["distortion at the corner", "px"] = corner_displacement_px(post)
-    for i, axis in enumerate(("pitch", "yaw", "roll")):
+    for i, axis in enumerate(AXES):
         values[f"common rotation, {axis}", "arcsec"] = rotation[:, i]
     return tuple(_diagnosed(post, name, unit, v) for (name, unit), v in values.items())
 

@@ -21,11 +21,9 @@ from starcal_uq.attitude.rotations import rotation_vector
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import project, unproject
+from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import DistortionError
 from starcal_uq.core.types import FloatArray
-
-ARCSEC = 648_000.0 / np.pi
-
 
 _GRID = 33
 

@@ -19,12 +19,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.attitude.rotations import random_rotations, rotation_to_quaternion
+from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import PlanningError
 from starcal_uq.core.files import atomic_path
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
-from starcal_uq.planning.forecast import ARCSEC, inverses, quantities, spreads
+from starcal_uq.planning.forecast import inverses, quantities, spreads
 from starcal_uq.planning.information import FrameSet, Noise, look_at, random_frames
 from starcal_uq.planning.plan import HasInformation, start_information
 from starcal_uq.sky.positions import ra_dec_deg

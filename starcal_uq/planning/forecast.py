@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.camera.distortion import get_model, parameters
+from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.errors import PlanningError
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.maths.circular import mixture_radius
@@ -27,8 +28,6 @@ if TYPE_CHECKING:
 
     from starcal_uq.planning.information import FrameSet
 
-ARCSEC = 648_000.0 / np.pi
-AXES = ("pitch", "yaw", "roll")
 # Parts of the attitude error that a target can be set for: what is in the error of one attitude.
 SCOPES = {
     "common": "the common rotation of the calibration",

@@ -16,6 +16,7 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import random_rotations
 from starcal_uq.camera.camera import Camera
+from starcal_uq.core.constants import AXES
 from starcal_uq.core.errors import PlanningError
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.provenance import provenance
@@ -222,7 +223,7 @@ def _sweep(
         forecaster = Forecaster(information, mission.mean_stars, mission, scope=scope, **options)
         row = {"sweep": name, "value": value, "sky_fraction": sky, "mean_stars": mission.mean_stars}
         row |= forecaster.forecast((SWEEP_FRAMES,)).to_dataframe().iloc[0].to_dict()
-        row |= dict(zip((f"nea_{axis}_arcsec" for axis in ("pitch", "yaw", "roll")), nea_arcsec(mission), strict=True))
+        row |= dict(zip((f"nea_{axis}_arcsec" for axis in AXES), nea_arcsec(mission), strict=True))
         if target_arcsec is not None:
             needed = forecaster.frames_needed(target_arcsec)
             row["frames_needed"] = np.inf if needed is None else float(needed)
@@ -418,7 +419,7 @@ class Plan:
         """
         table = self.forecast.to_dataframe()
         place = int(table.columns.get_loc("noise_relative"))
-        for axis, value in zip(("pitch", "yaw", "roll"), self.nea_arcsec, strict=True):
+        for axis, value in zip(AXES, self.nea_arcsec, strict=True):
             table.insert(place, f"nea_{axis}_arcsec", float(value))
             place += 1
         return table

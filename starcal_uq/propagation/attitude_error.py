@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path
 from starcal_uq.core.formatting import percent, significant
@@ -17,10 +18,6 @@ from starcal_uq.core.types import FloatArray
 if TYPE_CHECKING:
     import pandas as pd
 
-AXES = ("pitch", "yaw", "roll")
-CROSS_BORESIGHT = "cross-boresight"
-COLUMNS = (*AXES, CROSS_BORESIGHT)
-INTERACTION = "interaction, calibration and noise"
 CONTRIBUTORS = (
     "centroid noise (NEA)",
     "calibration, common rotation",
@@ -209,13 +206,13 @@ class AttitudeError:
         )
         return pd.DataFrame(
             {
-                "contributor": np.repeat(CONTRIBUTORS, len(COLUMNS)).astype(object),
-                "axis": np.array(COLUMNS * len(CONTRIBUTORS), dtype=object),
+                "contributor": np.repeat(CONTRIBUTORS, len(TOTAL_AXES)).astype(object),
+                "axis": np.array(TOTAL_AXES * len(CONTRIBUTORS), dtype=object),
                 "sigma_arcsec": np.concatenate([with_cross(values) for values in sampled]),
                 "p95_arcsec": self.p95_arcsec.ravel(),
                 "p997_arcsec": self.p997_arcsec.ravel(),
                 "first_order_arcsec": np.concatenate([with_cross(values) for values in analytic]),
-                "absorbed_by_alignment": np.repeat(_ABSORBED, len(COLUMNS)).astype(object),
+                "absorbed_by_alignment": np.repeat(_ABSORBED, len(TOTAL_AXES)).astype(object),
             }
         )
 
@@ -241,8 +238,8 @@ class AttitudeError:
             with open(path, newline="", encoding="utf-8") as file:
                 rows = {(row["contributor"], row["axis"]): row for row in csv.DictReader(file)}
             known = CONTRIBUTORS if (INTERACTION, AXES[0]) in rows else _REQUIRED
-            chosen = [[rows[contributor, axis] for axis in COLUMNS] for contributor in known]
-            table = np.full((len(names), len(CONTRIBUTORS), len(COLUMNS)), np.nan)
+            chosen = [[rows[contributor, axis] for axis in TOTAL_AXES] for contributor in known]
+            table = np.full((len(names), len(CONTRIBUTORS), len(TOTAL_AXES)), np.nan)
             table[:, : len(known)] = [
                 [[float(row[f"{name}_arcsec"] or "nan") for row in line] for line in chosen] for name in names
             ]

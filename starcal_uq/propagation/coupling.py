@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.core.constants import AXES
 from starcal_uq.core.types import FloatArray
 
 if TYPE_CHECKING:
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.inference.posterior import Posterior
 
-AXES = ("pitch", "yaw", "roll")
 # A parameter takes part in a direction when its share of the direction's length exceeds this.
 _PART = 0.25
 # Directions whose variance lies within these bounds are those of uncoupled parameters.

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.camera.distortion import get_model
-from starcal_uq.camera.fields import ARCSEC
 from starcal_uq.camera.projection import unproject, unproject_theta
+from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import DistortionError
 from starcal_uq.core.formatting import percent, significant
 from starcal_uq.core.types import FloatArray

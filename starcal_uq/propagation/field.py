@@ -23,16 +23,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.camera.fields import (
-    ARCSEC,
-    area_weights,
-    detector_axes,
-    grid_points,
-    rotated,
-    rotation_response,
-    tangent_axes,
-)
+from starcal_uq.camera.fields import area_weights, detector_axes, grid_points, rotated, rotation_response, tangent_axes
 from starcal_uq.camera.projection import unproject, unproject_jacobian
+from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path
 from starcal_uq.core.formatting import significant

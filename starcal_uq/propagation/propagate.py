@@ -29,9 +29,10 @@ import numpy as np
 from starcal_uq.attitude.rotations import left_error
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.projection import unproject_jacobian, unproject_theta
+from starcal_uq.core.constants import ARCSEC, AXES, CROSS_BORESIGHT
 from starcal_uq.core.errors import DistortionError, ObservationError, SamplingError
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.propagation.attitude_error import AXES, CONTRIBUTORS, CROSS_BORESIGHT, OBSERVED, AttitudeError
+from starcal_uq.propagation.attitude_error import CONTRIBUTORS, OBSERVED, AttitudeError
 
 if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
 
 __all__ = ["AXES", "CONTRIBUTORS", "CROSS_BORESIGHT", "AttitudeError", "propagate"]
 
-_ARCSEC = 648_000.0 / np.pi
 _LEVELS = (0.95, 0.997)
 _STARS_AT_ONCE = 1_000_000
 _SAMPLES = 400_000
@@ -100,22 +100,22 @@ def propagate(post: Posterior, obs: Observations, *, n_draws: int = 300, seed: i
     half_widths = [_noise_half_widths(nea, seed)]
     sigmas = (np.sqrt(common_variance), _rms(rest_variance))
     half_widths += [*_calibration_half_widths(post, together, apart, sigmas, seed), _half_widths(interaction)]
-    p95, p997 = np.swapaxes(half_widths, 0, 1) * _ARCSEC
+    p95, p997 = np.swapaxes(half_widths, 0, 1) * ARCSEC
     return AttitudeError(
-        nea_arcsec=np.sqrt(np.maximum(_diagonal(nea).mean(axis=0) + noise_excess, 0.0)) * _ARCSEC,
-        common_arcsec=sigmas[0] * _ARCSEC,
-        rest_arcsec=sigmas[1] * _ARCSEC,
+        nea_arcsec=np.sqrt(np.maximum(_diagonal(nea).mean(axis=0) + noise_excess, 0.0)) * ARCSEC,
+        common_arcsec=sigmas[0] * ARCSEC,
+        rest_arcsec=sigmas[1] * ARCSEC,
         p95_arcsec=p95,
         p997_arcsec=p997,
-        analytic_nea_arcsec=_rms(_diagonal(nea)) * _ARCSEC,
-        analytic_common_arcsec=np.sqrt(spread(together, post.covariance)) * _ARCSEC,
-        analytic_rest_arcsec=_rms(spread(apart, post.covariance)) * _ARCSEC,
+        analytic_nea_arcsec=_rms(_diagonal(nea)) * ARCSEC,
+        analytic_common_arcsec=np.sqrt(spread(together, post.covariance)) * ARCSEC,
+        analytic_rest_arcsec=_rms(spread(apart, post.covariance)) * ARCSEC,
         n_draws=count,
         n_frames=obs.n_frames,
-        common_draws_arcsec=common * _ARCSEC,
-        rest_rms_per_frame_arcsec=np.sqrt(rest_variance) * _ARCSEC,
-        nea_per_frame_arcsec=np.sqrt(_diagonal(nea)) * _ARCSEC,
-        interaction_arcsec=_rms(interaction.reshape(-1, 3) ** 2) * _ARCSEC,
+        common_draws_arcsec=common * ARCSEC,
+        rest_rms_per_frame_arcsec=np.sqrt(rest_variance) * ARCSEC,
+        nea_per_frame_arcsec=np.sqrt(_diagonal(nea)) * ARCSEC,
+        interaction_arcsec=_rms(interaction.reshape(-1, 3) ** 2) * ARCSEC,
         frames=str(obs.meta.get("frames", OBSERVED)),
     )
 

@@ -19,11 +19,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.errors import AttitudeProfileError, SamplingError
 from starcal_uq.core.files import reading_archive, write_archive
 from starcal_uq.core.formatting import join_words, percent, significant
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
-from starcal_uq.propagation.attitude_error import AXES, OBSERVED
+from starcal_uq.propagation.attitude_error import OBSERVED
 from starcal_uq.propagation.propagate import FrameGeometry
 
 if TYPE_CHECKING:
@@ -31,8 +32,6 @@ if TYPE_CHECKING:
 
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import Observations
-
-_ARCSEC = 648_000.0 / np.pi
 
 
 MIN_SPECTRUM_FRAMES = 16
@@ -99,18 +98,18 @@ def error_spectrum(
     scale = np.full(len(power), 2.0 * step / size)
     if size % 2 == 0:
         scale[-1] *= 0.5
-    nea = np.sqrt(np.diagonal(frames.noise_covariance, axis1=1, axis2=2).mean(axis=0)) * _ARCSEC
+    nea = np.sqrt(np.diagonal(frames.noise_covariance, axis1=1, axis2=2).mean(axis=0)) * ARCSEC
     lag, correlation = _autocorrelation(first, step)
     return ErrorSpectrum(
         frequency_hz=np.arange(1, len(power) + 1) / (size * step),
-        psd_arcsec2_hz=np.maximum(power, 0.0) * scale[:, None] * _ARCSEC**2,
+        psd_arcsec2_hz=np.maximum(power, 0.0) * scale[:, None] * ARCSEC**2,
         nea_psd_arcsec2_hz=2.0 * step * nea**2,
-        variance_arcsec2=np.maximum(square, 0.0) * _ARCSEC**2,
+        variance_arcsec2=np.maximum(square, 0.0) * ARCSEC**2,
         nea_arcsec=nea,
         lag_s=lag,
         autocorrelation=correlation,
         time_s=time,
-        sigma_arcsec=np.sqrt(np.sum(first * first, axis=-1)) * _ARCSEC,
+        sigma_arcsec=np.sqrt(np.sum(first * first, axis=-1)) * ARCSEC,
         step_s=step,
         gap_share=1.0 - len(index) / size,
         n_draws=len(draws),

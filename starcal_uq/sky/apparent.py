@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.core.constants import ARCSEC, LIGHT_SPEED_KM_S
 from starcal_uq.core.errors import CatalogueError, ObservationError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.times import julian_days
@@ -36,7 +37,6 @@ from starcal_uq.sky.site import Site
 if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
 
-LIGHT_SPEED_KM_S = 299792.458
 AU_PER_DAY_KM_S = 149597870.7 / 86400.0
 # No spacecraft has exceeded 200 km/s; a velocity given in m/s does.
 MAX_VELOCITY_KM_S = 1000.0
@@ -44,7 +44,6 @@ SUN_DISTANCE_AU = 1.0
 # Faster than this relative to the Earth's centre, an observer is in space: the ground moves at 0.46 km/s.
 _IN_SPACE_KM_S = 1.0
 _NO_AIR = ("space", "rendered")
-_ARCSEC = 648000.0 / np.pi
 _STARS_PER_FRAME = 4
 
 
@@ -318,8 +317,8 @@ def _atmosphere(site: Site, constants: tuple[float, float], altitude: FloatArray
         "relative_humidity": site.relative_humidity,
         "wavelength_um": site.wavelength_um,
         "assumed": list(site.assumed),
-        "refraction_a_arcsec": constants[0] * _ARCSEC,
-        "refraction_b_arcsec": constants[1] * _ARCSEC,
+        "refraction_a_arcsec": constants[0] * ARCSEC,
+        "refraction_b_arcsec": constants[1] * ARCSEC,
         "altitude_min_deg": float(altitude.min(initial=90.0)),
         "altitude_max_deg": float(altitude.max(initial=0.0)),
         "shrinking": float(np.mean(shrinking(altitude, constants))) if len(altitude) else 0.0,

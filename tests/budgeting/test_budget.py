@@ -19,8 +19,9 @@ from starcal_uq.budgeting.budget import budget
 from starcal_uq.budgeting.file import load_budget_file
 from starcal_uq.budgeting.posterior import inflation
 from starcal_uq.budgeting.result import Budget, read_csv
-from starcal_uq.budgeting.rows import AXES, COMMON, FROM_FILE, GAUSSIAN_997, INTERACTION, NEA, REST, TOTAL_AXES
+from starcal_uq.budgeting.rows import COMMON, FROM_FILE, GAUSSIAN_997, NEA, REST
 from starcal_uq.budgeting.shapes import one_axis_factor
+from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
 from starcal_uq.core.errors import BudgetError, RunFolderError
 from starcal_uq.diagnostics.misfit import Misfit, MisfitTest
 from starcal_uq.presentation.pages.budgeting import budget_context

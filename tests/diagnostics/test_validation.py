@@ -15,8 +15,9 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.attitude.rotations import left_error
 from starcal_uq.camera.projection import unproject_theta
+from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import CatalogueError, PriorError, RunFolderError, SamplingError
-from starcal_uq.diagnostics.validation.replicates import ARCSEC, LOG_LIKELIHOOD, Study, run_replicate
+from starcal_uq.diagnostics.validation.replicates import LOG_LIKELIHOOD, Study, run_replicate
 from starcal_uq.diagnostics.validation.result import Validation
 from starcal_uq.diagnostics.validation.validate import narrow_priors, validate, validate_study
 from starcal_uq.maths.ranks import (

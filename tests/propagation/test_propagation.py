@@ -14,12 +14,13 @@ import starcal_uq as sc
 from starcal_uq.attitude.rotations import left_error, rotation_to_quaternion, rotation_vector
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.projection import unproject_theta
+from starcal_uq.core.constants import AXES
 from starcal_uq.core.errors import DistortionError, ObservationError, RunFolderError, SamplingError
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.observations.table import Observations
 from starcal_uq.paper.camera import paper_start
-from starcal_uq.propagation.attitude_error import AXES, CONTRIBUTORS, AttitudeError
+from starcal_uq.propagation.attitude_error import CONTRIBUTORS, AttitudeError
 from starcal_uq.propagation.propagate import propagate
 from starcal_uq.simulation.mission import mission_frames, noise_by_magnitude
 from starcal_uq.sky.catalogue import load_catalogue

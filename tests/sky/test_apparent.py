@@ -8,9 +8,10 @@ import erfa
 import numpy as np
 import pytest
 
+from starcal_uq.core.constants import LIGHT_SPEED_KM_S
 from starcal_uq.core.errors import CatalogueError, ObservationError
 from starcal_uq.observations.table import Observations
-from starcal_uq.sky.apparent import LIGHT_SPEED_KM_S, aberrate, earth_velocity_km_s, make_apparent
+from starcal_uq.sky.apparent import aberrate, earth_velocity_km_s, make_apparent
 from starcal_uq.sky.positions import ra_dec_deg, unit_vectors
 
 TIMES = ["2019-07-29T20:47:26", "2026-11-21T03:04:05.678", "2024-02-29"]

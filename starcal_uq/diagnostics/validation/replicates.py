@@ -15,6 +15,7 @@ import numpy as np
 
 from starcal_uq.camera.distortion import parameters, sigma_parameter
 from starcal_uq.camera.projection import fold_radius_px
+from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.errors import CatalogueError, PriorError, SamplingError, StarcalError
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.estimation.calibrate import calibrate
@@ -36,8 +37,6 @@ LikelihoodMaker = Callable[["Observations", "Calibration"], Likelihood]
 
 MARGINAL = "marginal"
 LOG_LIKELIHOOD = "log_likelihood"
-AXES = ("pitch", "yaw", "roll")
-ARCSEC = 648_000.0 / np.pi
 INTERVAL = 0.95
 _MAX_TRUTHS = 1000
 

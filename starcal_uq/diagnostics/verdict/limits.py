@@ -6,10 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.formatting import significant
 from starcal_uq.diagnostics.residuals import bin_residuals
 from starcal_uq.diagnostics.verdict.estimate import MISFIT_P
-from starcal_uq.diagnostics.verdict.observed import ARCSEC_PER_RAD, PATTERN_P, air
+from starcal_uq.diagnostics.verdict.observed import PATTERN_P, air
 
 if TYPE_CHECKING:
     from starcal_uq.diagnostics.diagnose import Diagnosis
@@ -52,7 +53,7 @@ def limits(
 def _systematic(obs: Observations, cal: Calibration) -> str:
     binned = bin_residuals(cal, obs)
     if binned.p_value < PATTERN_P:
-        arcsec = binned.pattern_px / cal.camera.focal_px * ARCSEC_PER_RAD
+        arcsec = binned.pattern_px / cal.camera.focal_px * ARCSEC
         return (
             f"The model: residuals keep a pattern of {significant(arcsec)} arcsec, which more frames will not remove."
         )
@@ -69,7 +70,7 @@ def _structure(cal: Calibration, diagnosis: Diagnosis) -> str:
     if not sized:
         return ""
     worst = max(sized, key=lambda test: test.size_px)
-    arcsec = worst.size_px / cal.camera.focal_px * ARCSEC_PER_RAD
+    arcsec = worst.size_px / cal.camera.focal_px * ARCSEC
     return (
         f"The model: the largest structure that it leaves in the residuals is {worst.name}, "
         f"{significant(worst.size_px)} px ({significant(arcsec)} arcsec) per star."
@@ -86,7 +87,7 @@ def _model_choice(cal: Calibration, diagnosis: Diagnosis) -> str:
     score = max(others, key=lambda s: float(np.hypot(*s.common_arcsec[:2])))
     moved = float(np.hypot(*score.common_arcsec[:2]))
     covariance = cal.rotation_per_theta @ cal.covariance @ cal.rotation_per_theta.T
-    within = float(np.sqrt(np.trace(covariance[:2, :2]))) * ARCSEC_PER_RAD
+    within = float(np.sqrt(np.trace(covariance[:2, :2]))) * ARCSEC
     if moved <= _MODEL_SIGMAS * within:
         return ""
     return (

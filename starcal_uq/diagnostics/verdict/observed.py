@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
+from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.formatting import fixed, percent, plural, significant
 from starcal_uq.core.status import Check, Level, Question, pass_or_warn
 from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals
@@ -18,9 +19,6 @@ if TYPE_CHECKING:
 
 # Earth's orbital speed over that of light: the constant of annual aberration, rad.
 ABERRATION_RAD = 9.94e-5
-
-
-ARCSEC_PER_RAD = 648000.0 / np.pi
 
 
 PLAUSIBLE_NOISE_PX = (0.003, 0.5)
@@ -71,7 +69,7 @@ def aberration_words(cal: Calibration) -> str:
     """What annual aberration can do to this camera if it is not in the directions."""
     camera = cal.camera
     diagonal_rad = 2.0 * np.arctan(np.hypot(camera.width_px, camera.height_px) / 2.0 / camera.focal_px)
-    angle = fixed(ABERRATION_RAD * diagonal_rad * ARCSEC_PER_RAD, 1)
+    angle = fixed(ABERRATION_RAD * diagonal_rad * ARCSEC, 1)
     shift_px = ABERRATION_RAD * camera.focal_px
     ratio = significant(shift_px / float(cal.sigmas[2]))
     return (
@@ -90,7 +88,7 @@ def residual_pattern(obs: Observations, cal: Calibration) -> Check:
         level, sentence = Level.PASS, f"Mean residuals in {plural(cells, 'cell')} of the field are what noise gives."
     else:
         level = Level.FAIL if share > PATTERN_FAIL_SIGMA else Level.WARN
-        arcsec = pattern / cal.camera.focal_px * ARCSEC_PER_RAD
+        arcsec = pattern / cal.camera.focal_px * ARCSEC
         sentence = (
             f"The residuals show a pattern of {significant(pattern)} px per axis ({significant(arcsec)} arcsec) that "
             "the model does not explain; it is not in any interval of this report."

@@ -18,6 +18,7 @@ from starcal_uq.attitude.rotations import left_error, rotation_to_quaternion
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import unproject
+from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import CalibrationError, DistortionError
 from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import FloatArray, IntArray
@@ -30,8 +31,6 @@ from starcal_uq.paper.published import PAPER_METHODS
 if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
     from starcal_uq.sky.catalogue import StarCatalogue
-
-ARCSEC = float(np.degrees(1.0) * 3600.0)
 
 
 # What can be wrong with a camera, by itself.

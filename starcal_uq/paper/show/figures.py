@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.camera.distortion import parameters
+from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.figures import style
@@ -293,9 +294,6 @@ _NAMES = {
 _PARTS = {"common": (style.GREY, "common rotation"), "rest": (style.ORANGE, "rest"), "noise": (style.SKY, "noise")}
 
 
-_AXES = ("pitch", "yaw", "roll")
-
-
 # Cameras of one tolerance stand side by side, so that their bars can be told apart.
 _SPREAD = 1.035
 
@@ -365,7 +363,7 @@ def plot_errors(parts: pd.DataFrame, printed: Mapping[tuple[str, str], float]) -
     figure = style.new_figure(10.4, 4.6)
     panels = figure.subplots(1, 3, sharey=True)
     cameras = [name for name in _COLOURS if name in set(parts["camera"])]
-    for ax, axis in zip(panels, _AXES, strict=True):
+    for ax, axis in zip(panels, AXES, strict=True):
         style.dress(ax, grid=True)
         for place, camera in enumerate(cameras):
             row = parts[(parts["camera"] == camera) & (parts["axis"] == axis)].iloc[0]

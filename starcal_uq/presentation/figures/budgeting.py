@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.budgeting.rows import AXES, CROSS_BORESIGHT, SCOPES, Contributor, confidence_text
+from starcal_uq.budgeting.rows import SCOPES, Contributor, confidence_text
 from starcal_uq.budgeting.shapes import one_axis_factor, two_axis_radius
+from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.formatting import significant
 from starcal_uq.presentation.figures import style
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import count
 from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.figures import style
@@ -26,7 +27,7 @@ _SCOPES = {
     "calibration": "calibration",
     "total": "calibration and centroid noise",
 }
-_CROSS = ("pitch", "yaw")
+_CROSS = AXES[:2]
 _SWEEPS = (
     ("magnitude limit", "faintest magnitude", False),
     ("noise", "centroid noise [px per axis]", True),

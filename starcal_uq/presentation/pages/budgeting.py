@@ -8,8 +8,9 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.budgeting.result import Budget, Outcome, by_contributor
-from starcal_uq.budgeting.rows import AXES, AXIS_LABELS, SCOPES, TOTAL_AXES, Contributor, confidence_text
+from starcal_uq.budgeting.rows import AXIS_LABELS, SCOPES, Contributor, confidence_text
 from starcal_uq.budgeting.totals import Total
+from starcal_uq.core.constants import AXES, TOTAL_AXES
 from starcal_uq.core.files import atomic_path, atomic_write_text
 from starcal_uq.core.formatting import decimals_for, fixed, join_words, plural, significant
 from starcal_uq.presentation.html import embedded_image, template_environment

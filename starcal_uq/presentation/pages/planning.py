@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.core.constants import AXES
 from starcal_uq.core.files import atomic_path, atomic_write_bytes, atomic_write_text, new_folder
 from starcal_uq.core.formatting import count, fixed, significant
 from starcal_uq.presentation.html import embedded_image, template_environment
@@ -29,8 +30,8 @@ _GROUPS = (
         "Parameters",
         (("x0_px", "x₀ [px]"), ("y0_px", "y₀ [px]"), ("f_mm", "f [mm]"), ("distortion_corner_px", "Corner [px]")),
     ),
-    ("Common rotation [arcsec]", tuple((f"common_{axis}_arcsec", axis) for axis in ("pitch", "yaw", "roll"))),
-    ("Rest [arcsec]", tuple((f"rest_{axis}_arcsec", axis) for axis in ("pitch", "yaw", "roll"))),
+    ("Common rotation [arcsec]", tuple((f"common_{axis}_arcsec", axis) for axis in AXES)),
+    ("Rest [arcsec]", tuple((f"rest_{axis}_arcsec", axis) for axis in AXES)),
 )
 
 

@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.camera.distortion import Parameter, parameters, sigma_parameter
+from starcal_uq.core.constants import INTERACTION
 from starcal_uq.core.formatting import count, decimals_for, fixed, percent, plural, pretty_unit, significant, with_sigma
 from starcal_uq.diagnostics.verdict.estimate import truth_z
-from starcal_uq.propagation.attitude_error import CONTRIBUTORS, INTERACTION
+from starcal_uq.propagation.attitude_error import CONTRIBUTORS
 
 if TYPE_CHECKING:
     from markupsafe import Markup

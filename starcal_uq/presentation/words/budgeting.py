@@ -6,8 +6,9 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from starcal_uq.budgeting.rows import CROSS_BORESIGHT, GAUSSIAN_997, Contributor
+from starcal_uq.budgeting.rows import GAUSSIAN_997, Contributor
 from starcal_uq.budgeting.shapes import half_width
+from starcal_uq.core.constants import CROSS_BORESIGHT
 from starcal_uq.core.formatting import join_words, percent, significant
 
 if TYPE_CHECKING:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import fixed, plural, significant, with_sigma
 
 if TYPE_CHECKING:
@@ -44,9 +45,7 @@ def headline(found: CameraComparison) -> str:
 def rotation_words(found: CameraComparison) -> str:
     """The rotation that was removed, with its uncertainty."""
     parts = []
-    for name, value, sigma in zip(
-        ("pitch", "yaw", "roll"), found.rotation_arcsec, found.rotation_sigma_arcsec, strict=True
-    ):
+    for name, value, sigma in zip(AXES, found.rotation_arcsec, found.rotation_sigma_arcsec, strict=True):
         parts.append(f"{name} {_value(float(value), float(sigma))}")
     return f"{parts[0]}, {parts[1]}, {parts[2]} arcsec"
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import MINUS, count, fixed, join_words, percent, plural, significant
 
 if TYPE_CHECKING:
@@ -97,7 +98,7 @@ def choice_verdict(choice: FrameChoice) -> str:
     """What the choice is worth."""
     parts = []
     for name, part in (("common rotation", "common"), ("rest", "rest")):
-        cross = [choice.names.index(f"{part}_{axis}_arcsec") for axis in ("pitch", "yaw")]
+        cross = [choice.names.index(f"{part}_{axis}_arcsec") for axis in AXES[:2]]
         random = np.sqrt(np.mean(choice.random[:, cross] ** 2, axis=1))
         ratio = random / np.sqrt(np.mean(choice.after[cross] ** 2))
         low, high = np.quantile(ratio, (0.05, 0.95))
@@ -106,7 +107,7 @@ def choice_verdict(choice: FrameChoice) -> str:
             f"({fixed(float(low), 2)} to {fixed(float(high), 2)} for 90 % of random sets)"
         )
     main = "rest" if choice.scope == "rest" else "common"
-    cross = [choice.names.index(f"{main}_{axis}_arcsec") for axis in ("pitch", "yaw")]
+    cross = [choice.names.index(f"{main}_{axis}_arcsec") for axis in AXES[:2]]
     richest = fixed(float(np.sqrt(np.mean(choice.richest[cross] ** 2) / np.mean(choice.after[cross] ** 2))), 2)
     aim = "the parameters as a whole" if choice.criterion == "D" else f"the {SCOPE_NAMES[choice.scope]}"
     return (
