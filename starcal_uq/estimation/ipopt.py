@@ -1,4 +1,4 @@
-"""A least-squares problem as IPOPT wants it: CasADi callbacks around normal equations."""
+"""Least squares under constraints by IPOPT: CasADi callbacks around normal equations."""
 
 from __future__ import annotations
 
@@ -123,10 +123,32 @@ class _Recorder(ca.Callback):
         return [0]
 
 
-def solve(
+def ipopt(evaluate: Evaluate, start: FloatArray, constraints: Constraints, *, max_iterations: int = 200) -> Solution:
+    """Minimise a sum of squares under constraints with IPOPT, through CasADi.
+
+    The objective enters as callbacks (value, gradient, Gauss-Newton Hessian), in variables scaled by the curvature at
+    the start so that IPOPT sees numbers of order one.
+
+    Parameters
+    ----------
+    evaluate : callable
+        ``theta -> Normal``.
+    start : (p,) array
+        Start values; moved inside the bounds where needed.
+    constraints : Constraints
+        Bounds, and expressions that must stay positive.
+    """
+    theta = np.clip(np.array(start, dtype=np.float64), constraints.lower, constraints.upper)
+    normal = evaluate(theta)
+    if not (np.isfinite(normal.cost) and np.isfinite(normal.matrix).all()):
+        return Solution(theta, normal, theta[None], np.array([normal.cost]), Status.NOT_FINITE, 1)
+    return _solve(evaluate, theta, normal, constraints, max_iterations)
+
+
+def _solve(
     evaluate: Evaluate, start: FloatArray, normal: Normal, constraints: Constraints, max_iterations: int
 ) -> Solution:
-    """Run IPOPT from a point at which the model is finite; see `starcal_uq.estimation.solvers.ipopt`."""
+    """Run IPOPT from a point at which the model is finite."""
     p = len(start)
     # One unit of a scaled variable raises the cost by about its own size.
     unit = max(normal.cost, np.finfo(float).tiny)

@@ -1,7 +1,7 @@
 """Several calibrations of one camera as one: their compressed likelihoods added up.
 
 The likelihood of all stars is the product over runs, and each run stores its own as a small Gram matrix. Moved to a
-common point (`expansion`), the matrices add: no star is looked at again, and the result is what a calibration on all
+common point (`compressed`), the matrices add: no star is looked at again, and the result is what a calibration on all
 stars gives. Whether the runs show the same camera is tested on the way.
 """
 
@@ -54,7 +54,7 @@ def merge(
         At least two, with the same detector and distortion model, whose frames have nothing in common. The start values
         (`nominal`) of the first become those of the result, and with them the centre of the default priors.
     observations : Observations, optional
-        All stars, from `run_merging.join_observations`. With them, residuals and attitudes are those at the merged
+        All stars, from `join_observations`. With them, residuals and attitudes are those at the merged
         estimate; without, they are the runs' own.
     names : sequence of str, optional
         What the runs are called in messages; ``run 1``... otherwise.
@@ -68,7 +68,7 @@ def merge(
     -------
     Calibration
         ``method`` is ``merged``, the covariance is that of the efficient estimator, and
-        ``consistency.consistency_of`` gives the comparison of the runs.
+        `consistency_of` gives the comparison of the runs.
 
     Raises
     ------

@@ -3,7 +3,7 @@
 Centroiding states the noise of the pixels. Air, the shape of the star images and faint neighbours displace stars by
 amounts that do not shrink with their brightness. With v_i = s^2 sigma_i^2 + F^2 the variance per axis of star i, the
 residuals of a calibration say whether F is needed: bright stars then scatter by F, whatever they state. s and F follow
-from the likelihood of the residuals: t_i = e^T (I - H)^-1 e of a star (`star_tests`), times its variance in the fit, is
+from the likelihood of the residuals: t_i = e^T (I - H)^-1 e of a star (`outliers`), times its variance in the fit, is
 v_i times a chi-square with two degrees of freedom where the weights of the fit are right. Stars beyond 4.5 sigma are
 left out.
 """

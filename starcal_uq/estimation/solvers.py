@@ -1,4 +1,4 @@
-"""Least-squares solvers behind one call: Levenberg-Marquardt on normal equations, MINPACK, and IPOPT.
+"""Least-squares solvers: Levenberg-Marquardt on normal equations and MINPACK; IPOPT stands in `ipopt`.
 
 The Levenberg-Marquardt iteration is that of More (1978), "The Levenberg-Marquardt algorithm: implementation and
 theory", which MINPACK implements on the full Jacobian; here the trust-region step is found from the p x p normal
@@ -271,27 +271,3 @@ def minpack(residuals: Residuals, evaluate: Evaluate, start: FloatArray, *, max_
         status = Status.SINGULAR
     costs = np.array([float(np.sum(value(point) ** 2)) for point in trajectory])
     return Solution(theta, final, trajectory, costs, status, int(info["nfev"]))
-
-
-def ipopt(evaluate: Evaluate, start: FloatArray, constraints: Constraints, *, max_iterations: int = 200) -> Solution:
-    """Minimise a sum of squares under constraints with IPOPT, through CasADi.
-
-    The objective enters as callbacks (value, gradient, Gauss-Newton Hessian), in variables scaled by the curvature at
-    the start so that IPOPT sees numbers of order one.
-
-    Parameters
-    ----------
-    evaluate : callable
-        ``theta -> Normal``.
-    start : (p,) array
-        Start values; moved inside the bounds where needed.
-    constraints : Constraints
-        Bounds, and expressions that must stay positive.
-    """
-    from starcal_uq.estimation.ipopt import solve
-
-    theta = np.clip(np.array(start, dtype=np.float64), constraints.lower, constraints.upper)
-    normal = evaluate(theta)
-    if not (np.isfinite(normal.cost) and np.isfinite(normal.matrix).all()):
-        return Solution(theta, normal, theta[None], np.array([normal.cost]), Status.NOT_FINITE, 1)
-    return solve(evaluate, theta, normal, constraints, max_iterations)

@@ -16,7 +16,7 @@ from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
-from starcal_uq.estimation.solvers import Constraints, Solution, ipopt, levenberg_marquardt, minpack
+from starcal_uq.estimation.solvers import Constraints, Solution, levenberg_marquardt, minpack
 from starcal_uq.observations.frames import StarFrames
 
 # Predicted gain of a pair stage that is not worth an evaluation: 1e-4 sigma or less for 30,000 residuals.
@@ -80,6 +80,9 @@ def constraints_for(camera: Camera, n_parameters: int) -> Constraints:
 
 def _solve(objective: PairObjective, start: FloatArray, camera: Camera, solver: str, max_iterations: int) -> Solution:
     if solver == "ipopt":
+        # CasADi takes a while to load, and few need it.
+        from starcal_uq.estimation.ipopt import ipopt
+
         constraints = constraints_for(camera, objective.n_parameters)
         return ipopt(objective.evaluate, start, constraints, max_iterations=max_iterations)
     if solver == "minpack" and objective.n_pairs <= MAX_EXPLICIT_PAIRS:

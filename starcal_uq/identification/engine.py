@@ -1,7 +1,7 @@
 """Star identification, lost in space: which catalogue star is each centroid?
 
 Frame by frame, patterns give hypotheses (`pyramid`), each is matched with all stars of the field and refined
-(`matching`), and it is accepted when the number of wrong attitudes expected to match as well is small. What the frames
+(`match`), and it is accepted when the number of wrong attitudes expected to match as well is small. What the frames
 say together about the camera narrows the tolerances for a second pass over all of them.
 """
 
@@ -75,7 +75,7 @@ def identify(
     centroids
         Measured stars: arrays `frame`, `x_px`, `y_px`, `flux`, `sigma_px` with a row for each, and `frame_ids`,
         `image`, `time_utc` with a row for each frame. Frames without stars keep their place. Flux is compared with the
-        catalogue's magnitudes frame by frame (`star_brightness`), except where `saturated`, if there, says otherwise;
+        catalogue's magnitudes frame by frame (`brightness`), except where `saturated`, if there, says otherwise;
         equal fluxes say nothing.
     camera
         The nominal camera.

@@ -1,6 +1,6 @@
 """The centroids table: star positions measured in images, frame by frame, before any star has a name.
 
-It is what passes from the images to the identification. Files are read and written in `centroid_files`.
+It is what passes from the images to the identification.
 """
 
 from __future__ import annotations
@@ -40,8 +40,6 @@ COLUMNS: dict[str, tuple[type, str]] = {
     "blended": (np.bool_, "another star is near"),
     "edge": (np.bool_, "the image ends within its light"),
 }
-
-
 FRAME_COLUMNS: dict[str, tuple[type, str]] = {
     "frame_ids": (np.int64, "frame number"),
     "image": (np.str_, "name of the image"),
@@ -275,11 +273,7 @@ def _array(name: str, values: Any, kind: type) -> Any:
 
 
 _KEY = "starcal_uq_centroids"
-
-
 _TRUTH = {"True": True, "False": False}
-
-
 _MARK = f"# {_KEY} "
 
 

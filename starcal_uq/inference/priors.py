@@ -1,8 +1,8 @@
 """Priors, all proper: what was believed before the stars were seen.
 
 Normal on the camera parameters, log-normal on the noise. `Priors` is what every user of a prior relies on; the two
-kinds are `physical_priors.PhysicalPriors` (independent, in physical terms; the default) and
-`gaussian_priors.GaussianPriors` (a full covariance, such as the posterior of an earlier run).
+kinds are `PhysicalPriors` (independent, in physical terms; the default) and
+`GaussianPriors` (a full covariance, such as the posterior of an earlier run).
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class Priors(ABC):
 
     @staticmethod
     def default(camera: Camera, per_star_sigma: bool = False) -> PhysicalPriors:
-        """Wide priors around a nominal camera; see `physical_priors`."""
+        """Wide priors around a nominal camera; see `PhysicalPriors`."""
 
         return PhysicalPriors.around(camera, per_star_sigma)
 

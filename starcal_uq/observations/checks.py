@@ -15,7 +15,7 @@ import numpy as np
 
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray, StrArray
-from starcal_uq.observations.table import COLUMNS
+from starcal_uq.observations.columns import COLUMNS
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera

@@ -1,4 +1,4 @@
-"""File formats of the observations table: CSV, ECSV and Parquet, in and out.
+"""File formats of the observations table: CSV, ECSV and Parquet, as plain columns and metadata, in and out.
 
 CSV and ECSV are read cell by cell with the line each row stands on, so that an error can name it.
 """
@@ -27,7 +27,7 @@ from starcal_uq.observations.checks import (
     parse_whole,
     raise_problems,
 )
-from starcal_uq.observations.table import COLUMNS, Observations
+from starcal_uq.observations.columns import COLUMNS
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -79,8 +79,10 @@ def _read_bytes(path: Path) -> bytes:
     return data
 
 
-def read_observations(path: str | os.PathLike[str], camera: Camera | None, mapping: Mapping[str, str]) -> Observations:
-    """See `starcal_uq.observations.table.load_observations`."""
+def read_table(
+    path: str | os.PathLike[str], camera: Camera | None, mapping: Mapping[str, str]
+) -> tuple[dict[str, Any], AnyDict]:
+    """Checked columns and metadata of a file; see `starcal_uq.observations.table.load_observations`."""
     if unknown := [name for name in mapping if name not in COLUMNS]:
         raise ObservationError(
             f"columns: {unknown[0]!r} is no column of observations; use {', '.join(COLUMNS)}.",
@@ -100,7 +102,7 @@ def read_observations(path: str | os.PathLike[str], camera: Camera | None, mappi
     # A message names the column as it is called in this file.
     named = [replace(p, column=names[p.column] if p.column else None) for p in problems]
     raise_problems(str(path), raw.word, raw.numbers, named)
-    return Observations(**columns, meta=table_meta(path, raw, names, mapping))
+    return columns, table_meta(path, raw, names, mapping)
 
 
 def _read(path: Path, data: bytes, ending: str, wanted: set[str]) -> RawTable:
@@ -303,43 +305,51 @@ def arrow_values(column: Any) -> Any:
     return ["" if value is None else str(value) for value in column.to_pylist()]
 
 
-def write_observations(observations: Observations, path: str | os.PathLike[str], force: bool) -> None:
-    """See `Observations.save`."""
+def astropy_table(columns: Mapping[str, Any], meta: AnyDict) -> Any:
+    """The columns as an astropy Table with units and descriptions."""
+    from astropy.table import Table
+
+    table = Table(dict(columns), meta=dict(meta))
+    for name in columns:
+        table[name].unit = COLUMNS[name].unit or None
+        table[name].description = COLUMNS[name].description
+    return table
+
+
+def write_table(columns: Mapping[str, Any], meta: AnyDict, path: str | os.PathLike[str], force: bool) -> None:
+    """Write columns and metadata; see `starcal_uq.observations.table.Observations.save`."""
     ending = table_ending(Path(path))
     ensure_new(path, force)
     if ending == ".csv":
-        atomic_write_text(path, _csv_text(observations))
+        atomic_write_text(path, _csv_text(columns))
         return
-    meta = json.loads(json.dumps(observations.meta, default=as_plain))
+    plain = json.loads(json.dumps(meta, default=as_plain))
     with atomic_path(path) as temporary:
         if ending == ".ecsv":
-            table = observations.with_meta().to_table()
-            table.meta = meta
-            table.write(temporary, format="ascii.ecsv", delimiter=",")
+            astropy_table(columns, plain).write(temporary, format="ascii.ecsv", delimiter=",")
         else:
-            _write_parquet(observations, temporary, meta)
+            _write_parquet(columns, temporary, plain)
 
 
-def _csv_text(observations: Observations) -> str:
-    columns = []
-    for name, values in observations.columns.items():
+def _csv_text(columns: Mapping[str, Any]) -> str:
+    texts = []
+    for name, values in columns.items():
         cells = values.tolist()
         # An empty cell is how every spreadsheet writes a gap.
-        columns.append(["" if v != v else v for v in cells] if COLUMNS[name].gaps else cells)
+        texts.append(["" if v != v else v for v in cells] if COLUMNS[name].gaps else cells)
     text = io.StringIO(newline="")
     writer = csv.writer(text, lineterminator="\n")  # writes floats by repr, which keeps every digit
-    writer.writerow(observations.columns)
-    writer.writerows(zip(*columns, strict=True))
+    writer.writerow(columns)
+    writer.writerows(zip(*texts, strict=True))
     return text.getvalue()
 
 
-def _write_parquet(observations: Observations, path: Path, meta: AnyDict) -> None:
+def _write_parquet(columns: Mapping[str, Any], path: Path, meta: AnyDict) -> None:
     import pyarrow as pa
     from pyarrow import parquet
 
     arrays = {
-        name: pa.array(values.tolist() if values.dtype.kind == "U" else values)
-        for name, values in observations.columns.items()
+        name: pa.array(values.tolist() if values.dtype.kind == "U" else values) for name, values in columns.items()
     }
     table = pa.table(arrays).replace_schema_metadata({_META_KEY: json.dumps(meta).encode()})
     parquet.write_table(table, path, compression="zstd")

@@ -16,8 +16,9 @@ import numpy as np
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.types import AnyDict, IntArray
 from starcal_uq.observations.checks import check_columns, raise_problems
+from starcal_uq.observations.columns import COLUMNS
 from starcal_uq.observations.files import RawTable, arrow_values, check_names, convert_columns, table_meta
-from starcal_uq.observations.table import COLUMNS, Observations
+from starcal_uq.observations.table import Observations
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera

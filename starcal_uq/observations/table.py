@@ -1,7 +1,6 @@
 """The observations table: measured star positions with the directions they belong to, frame by frame.
 
-It is the only thing that passes from images, or a simulation, to the estimators. Reading is in
-`observation_files`, the checks of every row are in `observation_checks`.
+It is the only thing that passes from images, or a simulation, to the estimators.
 """
 
 from __future__ import annotations
@@ -12,62 +11,21 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray, StrArray
+from starcal_uq.observations.checks import check_columns, raise_problems
+from starcal_uq.observations.columns import COLUMNS
+from starcal_uq.observations.files import astropy_table, read_table, write_table
 from starcal_uq.observations.rows import FrameRows, locked
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
 
-
-@dataclass(frozen=True)
-class Column:
-    """One column of the table, as it is called in files.
-
-    Attributes
-    ----------
-    name : str
-        Name in files and of the attribute.
-    kind : {"whole", "number", "text", "time"}
-        Type of the values.
-    unit : str
-        Unit, empty where there is none.
-    required : bool
-        Whether every table has the column.
-    gaps : bool
-        Whether single values may be missing (NaN, or an empty text).
-    description : str
-        What it holds.
-    """
-
-    name: str
-    kind: Literal["whole", "number", "text", "time"]
-    unit: str
-    required: bool
-    gaps: bool
-    description: str
-
-
-COLUMNS: dict[str, Column] = {
-    column.name: column
-    for column in (
-        Column("frame", "whole", "", True, False, "frame number"),
-        Column("x_px", "number", "pix", True, False, "centroid; 0 is the centre of the first pixel"),
-        Column("y_px", "number", "pix", True, False, "centroid, y downwards; 0 as for x_px"),
-        Column("ra_deg", "number", "deg", True, False, "right ascension, ICRS axes"),
-        Column("dec_deg", "number", "deg", True, False, "declination, ICRS axes"),
-        Column("sigma_px", "number", "pix", False, False, "centroid noise per axis"),
-        Column("star_id", "text", "", False, True, "name of the star in its catalogue"),
-        Column("mag", "number", "mag", False, True, "magnitude"),
-        Column("time_utc", "time", "", False, False, "middle of the exposure, UTC, ISO 8601"),
-        Column("temperature_c", "number", "deg_C", False, True, "temperature of the optics, Celsius"),
-    )
-}
 _DTYPES: dict[str, type] = {"whole": np.int64, "number": np.float64, "text": np.str_, "time": np.str_}
 
 
@@ -211,8 +169,6 @@ class Observations(FrameRows):
         ObservationError
             If a row is bad; rows are numbered from 1 in the order of this table.
         """
-        from starcal_uq.observations.checks import check_columns, raise_problems
-
         rows = np.arange(1, len(self) + 1)
         raise_problems("observations", "row", rows, check_columns(self.columns, camera))
 
@@ -226,13 +182,7 @@ class Observations(FrameRows):
 
     def to_table(self) -> Any:
         """The columns as an astropy Table with units and descriptions; `meta` is in its ``meta``."""
-        from astropy.table import Table
-
-        table = Table(self.columns, meta=dict(self.meta))
-        for name in self.columns:
-            table[name].unit = COLUMNS[name].unit or None
-            table[name].description = COLUMNS[name].description
-        return table
+        return astropy_table(self.columns, self.meta)
 
     def head(self, n: int = 5) -> Any:
         """The first `n` rows as a pandas DataFrame."""
@@ -250,9 +200,7 @@ class Observations(FrameRows):
         RunFolderError
             If the file exists and `force` is false, or cannot be written.
         """
-        from starcal_uq.observations.files import write_observations
-
-        write_observations(self, path, force)
+        write_table(self.columns, self.meta, path, force)
 
     def _repr_html_(self) -> str:
         shown = {name: values[:5].tolist() for name, values in self.columns.items()}
@@ -291,9 +239,8 @@ def load_observations(
         If the file cannot be read or a row is bad; the message names the first bad row and counts the
         others, and ``problems`` of the error lists them all.
     """
-    from starcal_uq.observations.files import read_observations
-
-    return read_observations(path, camera, columns or {})
+    values, meta = read_table(path, camera, columns or {})
+    return Observations(**values, meta=meta)
 
 
 def _shown(value: Any) -> str:

@@ -11,6 +11,7 @@ from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import PathLike, atomic_write_text
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.types import AnyDict
+from starcal_uq.pipeline.refine import identified_pairs
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
@@ -158,13 +159,6 @@ def record_images(centroids: Centroids, found: ImageCalibration) -> ImageRecord:
         before = identification
     disturbed = found.observations.meta.get("disturbed_stars", 0)
     return ImageRecord(tuple(rounds), tuple(rows), int(disturbed), last.parity)
-
-
-def identified_pairs(obs: Observations) -> set[tuple[int, str]]:
-    """Frame number and star of every row, where the stars are named."""
-    if obs.star_id is None:
-        return set()
-    return set(zip(obs.frame.tolist(), obs.star_id.tolist(), strict=True))
 
 
 def _recorded(

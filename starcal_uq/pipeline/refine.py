@@ -15,7 +15,6 @@ from starcal_uq.core.errors import CalibrationError, IdentificationError
 from starcal_uq.core.formatting import plural
 from starcal_uq.identification.engine import identify
 from starcal_uq.pipeline.displacement import ToCatalogue, as_measured, mirrored, undisplaced
-from starcal_uq.pipeline.record import identified_pairs
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -153,3 +152,10 @@ def _again(
     if found.n_identified:
         found = replace(found, observations=as_measured(found.observations, moved, table))
     return replace(found, parity="mirrored") if flipped else found
+
+
+def identified_pairs(obs: Observations) -> set[tuple[int, str]]:
+    """Frame number and star of every row, where the stars are named."""
+    if obs.star_id is None:
+        return set()
+    return set(zip(obs.frame.tolist(), obs.star_id.tolist(), strict=True))

@@ -13,7 +13,8 @@ from starcal_uq.core.types import AnyDict, FloatArray, StrArray
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.compressed import optimum
 from starcal_uq.estimation.merging import merge, renumbered
-from starcal_uq.observations.table import COLUMNS, Observations, load_observations
+from starcal_uq.observations.columns import COLUMNS
+from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.runs.folder import RunFolder
 
 _FILES = (

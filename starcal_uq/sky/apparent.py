@@ -4,7 +4,7 @@ An observer that moves with velocity v sees every star displaced towards v by up
 The attitude absorbs the mean displacement of a frame; its change across the field (3.6 arcsec over 10 degrees)
 stretches the star pattern and would otherwise end up in the focal length.
 
-An observer on the ground also moves with the Earth's rotation and looks through the air (`ground_sky`).
+An observer on the ground also moves with the Earth's rotation and looks through the air (`starcal_uq.sky.site`).
 
 Not modelled: the deflection of light by the Sun (4 mas at 90 degrees from the Sun, 15 mas at 30) and annual parallax
 (0.75 arcsec for the nearest star, below 0.1 arcsec for all but a few dozen stars of naked-eye brightness).

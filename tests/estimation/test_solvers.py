@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from starcal_uq.core.status import Status
-from starcal_uq.estimation.solvers import Constraints, Normal, ipopt, levenberg_marquardt, minpack
+from starcal_uq.estimation.ipopt import ipopt
+from starcal_uq.estimation.solvers import Constraints, Normal, levenberg_marquardt, minpack
 
 # Data, starts and certified values: NIST StRD, https://www.itl.nist.gov/div898/strd/nls/nls_main.shtml
 MISRA1A = (

@@ -12,7 +12,8 @@ import pytest
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import ObservationError, RunFolderError
-from starcal_uq.observations.table import COLUMNS, Observations, load_observations
+from starcal_uq.observations.columns import COLUMNS
+from starcal_uq.observations.table import Observations, load_observations
 
 APPARENT = {"ra_deg": "ra_apparent_deg", "dec_deg": "dec_apparent_deg"}
 CAMERA = Camera(1024, 768, 6.9, 35.0, 511.5, 383.5)

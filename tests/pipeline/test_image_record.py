@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.pipeline.record import ImageRecord, ImageRow, RoundRecord, identified_pairs
+from starcal_uq.pipeline.record import ImageRecord, ImageRow, RoundRecord
+from starcal_uq.pipeline.refine import identified_pairs
 from starcal_uq.presentation.report.tables import image_context
 
 

@@ -1,6 +1,6 @@
 """Recursive estimation of a camera, frame by frame: the iterated extended Kalman filter behind the baselines.
 
-A frame enters as its gradient ``a`` and information ``M`` (`pair_innovations`), so that an update is algebra of p x p
+A frame enters as its gradient ``a`` and information ``M`` (`innovations`), so that an update is algebra of p x p
 matrices. With prior estimate u and covariance P (in units of the noise variance), and the frame linearised at u0,
 
     P+ = (I + P M)^-1 P,    u+ = u + P+ (a - M (u - u0)),

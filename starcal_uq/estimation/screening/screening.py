@@ -2,7 +2,7 @@
 
 Before any calibration the stars of a frame vote on its attitude (`consensus`). Then, in rounds: calibrate on the stars
 in use, vote again with the calibrated camera and the noise it shows, reject the worst star of each frame while it is
-farther from the prediction of the others than chance explains (`star_tests`) or while the frame's TASTE fails, and take
+farther from the prediction of the others than chance explains (`outliers`) or while the frame's TASTE fails, and take
 back stars that pass. The rounds end when they no longer change anything.
 
 Every right star and every right frame takes the same risk of being rejected: with N stars and K frames and an expected
