@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import re
 import shutil
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 HERE = Path(__file__).parent
@@ -79,6 +81,24 @@ def write_command_help(_app: object) -> None:
     (HERE / "reference" / "_commands.txt").write_text("\n\n\n".join(texts) + "\n", encoding="utf-8")
 
 
+def write_reference(_app: object) -> None:
+    """One page a namespace, with what its stub offers: a public name cannot be forgotten here."""
+    folder = HERE / "reference" / "api"
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    wings = sorted(path.parent.name for path in (HERE.parent / "starcal_uq").glob("*/__init__.pyi"))
+    for place in ("", *wings):
+        module = importlib.import_module(f"starcal_uq.{place}".rstrip("."))
+        names = [name for name in module.__all__ if not isinstance(getattr(module, name), ModuleType)]
+        lines = [f"# {f'sc.{place}' if place else 'sc'}", "", (module.__doc__ or "").strip(), "", "```{eval-rst}"]
+        for name in sorted(names, key=lambda name: (not name[0].isupper(), name.lower())):
+            kind = "class" if isinstance(getattr(module, name), type) else "function"
+            lines.append(f".. auto{kind}:: {module.__name__}.{name}")
+        if place == "core":
+            lines.append(".. automodule:: starcal_uq.core.errors")
+        (folder / f"{place or '_top'}.md").write_text("\n".join([*lines, "```", ""]), encoding="utf-8")
+
+
 def escape_formulas(_app: object, _what: str, _name: str, _object: object, _options: object, lines: list[str]) -> None:
     """Keep the bars of |A| and the last underscore of `str_` from being read as markup; literals stay as they are."""
     literal_above: int | None = None
@@ -96,5 +116,6 @@ def escape_formulas(_app: object, _what: str, _name: str, _object: object, _opti
 def setup(app: Any) -> None:
     """Called by Sphinx."""
     app.connect("builder-inited", write_command_help)
+    app.connect("builder-inited", write_reference)
     app.connect("builder-inited", copy_notebooks)
     app.connect("autodoc-process-docstring", escape_formulas, priority=400)  # before napoleon
