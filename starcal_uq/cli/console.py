@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,10 +14,10 @@ from rich.table import Table
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
-from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import decimals_for, fixed, plural, pretty_unit, significant
 from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import AnyDict
+from starcal_uq.presentation.tables import TextTable
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -144,72 +143,38 @@ def show_posterior(posterior: Posterior) -> None:
         out.print(message, style=None if diagnostics.ok else "yellow", highlight=False, soft_wrap=True)
 
 
+def print_table(table: TextTable) -> None:
+    """Draw a table; its marks become colours."""
+    drawn = Table(title=table.title or None, title_justify="left")
+    for place, (head, side) in enumerate(zip(table.heads, table.align, strict=True)):
+        style = "bold" if place == 0 and side == "l" else None
+        drawn.add_column(head, justify="right" if side == "r" else "left", style=style)
+    styles = {"total": "bold", "warning": "yellow", "fail": "red"}
+    for row, mark in zip(table.rows, table.marks or ("",) * len(table.rows), strict=True):
+        drawn.add_row(*row, style=styles.get(mark))
+    out.print(drawn)
+
+
 def show_coupling(found: Coupling) -> None:
     """Sigmas and their inflation, correlations, and the weak directions in words."""
-    table = Table(title="Coupling: what not knowing the others costs", title_justify="left")
-    table.add_column("parameter", style="bold")
-    for heading in ("sigma", "others known", "variance inflation"):
-        table.add_column(heading, justify="right")
-    table.add_column("unit")
-    for index, name in enumerate(found.parameter_names):
-        table.add_row(
-            name,
-            significant(float(found.sigma_marginal[index]), 3),
-            significant(float(found.sigma_conditional[index]), 3),
-            significant(float(found.variance_inflation[index]), 3),
-            pretty_unit(found.units[index]),
-        )
-    out.print(table)
-    table = Table(title="Correlations, with the rotation common to all frames", title_justify="left")
-    table.add_column("", style="bold")
-    for name in found.extended_names:
-        table.add_column(name, justify="right")
-    for name, row in zip(found.extended_names, found.extended_correlation, strict=True):
-        table.add_row(name, *(fixed(float(value), 2) for value in row))
-    out.print(table)
+    from starcal_uq.presentation.words.propagation import correlation_table, coupling_table
+
+    print_table(coupling_table(found))
+    print_table(correlation_table(found))
     for direction in found.weak_directions:
         out.print(f"- {direction.words}", highlight=False, soft_wrap=True)
 
 
 def show_attitude(error: AttitudeError) -> None:
-    """Attitude error by contributor and axis, 1 sigma, with the 95 % half-widths in brackets."""
-    frame = error.to_dataframe()
-    table = Table(title="Attitude error, arcsec, 1 sigma", title_justify="left")
-    table.add_column("contributor", style="bold", no_wrap=True)
-    for axis in AXES:
-        table.add_column(axis, justify="right")
-    table.add_column("two-axis 95 %", justify="right")
-    table.add_column("absorbed by alignment")
-    for contributor, rows in frame.groupby("contributor", sort=False):
-        cells = rows.set_index("axis")
-        shown = [significant(float(cells.at[axis, "sigma_arcsec"]), 2) for axis in AXES]
-        across = [float(row.p95_arcsec) for row in rows.itertuples() if row.axis not in AXES]
-        shown.append(significant(across[0], 2) if across else "")
-        table.add_row(str(contributor), *shown, _word(rows["absorbed_by_alignment"].iloc[0]))
-    out.print(table)
+    """Attitude error by contributor and axis, 1 sigma, and what follows."""
+    from starcal_uq.presentation.words.propagation import attitude_table
 
-
-def _word(value: Any) -> str:
-    return ("yes" if value else "no") if isinstance(value, (bool, np.bool_)) else str(value)
-
-
-def _cell(value: Any) -> str:
-    """A number with three digits, a dash where there is none."""
-    if not isinstance(value, float):
-        return str(value)
-    return "–" if math.isnan(value) else significant(value, 3)
+    print_table(attitude_table(error))
 
 
 def show_table(frame: pd.DataFrame, title: str, columns: Sequence[str] | None = None) -> None:
     """Chosen columns of a data frame, numbers with three digits; files and JSON have the rest."""
-    frame = frame if columns is None else frame[list(columns)]
-    table = Table(title=title, title_justify="left")
-    for column in frame.columns:
-        numbers = np.issubdtype(np.asarray(frame[column]).dtype, np.number)
-        table.add_column(str(column).replace("_", " "), justify="right" if numbers else "left")
-    for row in records(frame):
-        table.add_row(*(_cell(value) for value in row.values()))
-    out.print(table)
+    print_table(TextTable.of(frame, title, columns))
 
 
 def show_screening(screening: Screening) -> None:

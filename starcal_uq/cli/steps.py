@@ -320,13 +320,12 @@ def propagate_command(
     error, _, spectrum = propagate_step(RunFolder(run), n_draws=draws, seed=seed, sky=sky, tell=tell)
     if json:
         document = {"frames": error.frames, "attitude_error": records(error.to_dataframe())}
-        print_json(document if spectrum is None else document | {"spectrum": spectrum.sentence})
+        print_json(document if spectrum is None else document | {"spectrum": spectrum.text})
         return
     show_attitude(error)
-    for sentence in (error.agreement.sentence, error.one_number_sentence):
-        console.print(sentence, highlight=False, soft_wrap=True)
+    console.print(error.text, highlight=False, soft_wrap=True)
     if spectrum is not None:
-        console.print(spectrum.sentence, highlight=False, soft_wrap=True)
+        console.print(spectrum.text, highlight=False, soft_wrap=True)
 
 
 def report_command(run: RunPath) -> None:

@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 import base64
+from html import escape
 from typing import TYPE_CHECKING, Any
+
+from starcal_uq.presentation.tables import TextTable
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+
+
+def card(title: str, text: str, *tables: TextTable) -> str:
+    """A result in a notebook: what it is, what it says, and its tables."""
+    said = f": {escape(text)}" if text else ""
+    return f"<p><b>{escape(title)}</b>{said}</p>" + "".join(table.html() for table in tables)
 
 
 def template_environment() -> Environment:

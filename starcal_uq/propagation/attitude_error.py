@@ -5,14 +5,14 @@ from __future__ import annotations
 import csv
 import os
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path
-from starcal_uq.core.formatting import percent, significant
 from starcal_uq.core.types import FloatArray
 
 if TYPE_CHECKING:
@@ -31,12 +31,10 @@ _ABSORBED = ("no", "yes", "no", "in part", "no")
 _REQUIRED = CONTRIBUTORS[:4]
 # A ratio of sigmas below a microarcsecond means nothing.
 _SMALLEST_ARCSEC = 1e-6
-_ROUNDING_ARCSEC = 1e-9
-_AGREE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class Agreement:
+class Agreement(Shown):
     """Sampled over first-order standard deviations.
 
     Noise, draws and first-order propagation share the same realisations, so that the ratios depart from one by what is
@@ -59,22 +57,6 @@ class Agreement:
         real = self.ratio[np.isfinite(self.ratio)]
         return float(np.max(np.abs(real - 1.0), initial=0.0))
 
-    @property
-    def sentence(self) -> str:
-        """What the ratios mean."""
-        if self.largest <= _AGREE:
-            return (
-                f"Sampled and first-order standard deviations agree within {percent(max(self.largest, 1e-6))}: "
-                "attitude errors are linear in parameters and noise."
-            )
-        distance = np.where(np.isfinite(self.ratio), np.abs(self.ratio - 1.0), 0.0)
-        row, axis = np.unravel_index(int(np.argmax(distance)), distance.shape)
-        return (
-            f"Sampled and first-order standard deviations differ by up to {percent(self.largest)} "
-            f"({self.contributors[row]}, {AXES[axis]}): attitude errors are not linear over this posterior, and the "
-            "sampled values hold."
-        )
-
     def to_dataframe(self) -> pd.DataFrame:
         """One row per contributor and axis: ``contributor``, ``axis``, ``sampled_over_first_order``."""
         import pandas as pd
@@ -87,13 +69,9 @@ class Agreement:
             }
         )
 
-    def _repr_html_(self) -> str:
-        table = self.to_dataframe().to_html(index=False, float_format=lambda v: f"{v:.5f}", border=0)
-        return f"<p>{self.sentence}</p>{table}"
-
 
 @dataclass(frozen=True, eq=False)
-class AttitudeError:
+class AttitudeError(Shown):
     """Attitude error of single frames by contributor, arcsec.
 
     Axes are ``("pitch", "yaw", "roll")``: left rotation vectors about camera +X, +Y and the boresight +Z.
@@ -160,26 +138,6 @@ class AttitudeError:
         real = np.maximum(sampled, first) > _SMALLEST_ARCSEC
         ratio = np.where(real, sampled / np.where(first > 0.0, first, np.nan), np.nan)
         return Agreement(CONTRIBUTORS[:3], ratio)
-
-    @property
-    def one_number_sentence(self) -> str:
-        """What a single number for the calibration would hide."""
-        common, rest = with_cross(self.common_arcsec)[3], with_cross(self.rest_arcsec)[3]
-        # Below this it is rounding: frames that all show the same stars have no part that changes.
-        if not rest > _ROUNDING_ARCSEC:
-            return f"Across the boresight the calibration is a common rotation of {significant(float(common))} arcsec."
-        words = f"{significant(float(np.hypot(common, rest)))} arcsec per axis across the boresight"
-        ratio = float(common / rest)
-        if ratio < 1.0:
-            return (
-                f"The calibration contributes {words}, of which most depends on where the stars are "
-                f"({significant(float(rest))} arcsec) and no alignment absorbs it."
-            )
-        return (
-            f"Whoever reports one number for the calibration, {words}, reports a constant that alignment calibration "
-            f"absorbs: what remains in flight is {significant(float(rest))} arcsec, smaller by a factor of "
-            f"{significant(ratio)}."
-        )
 
     def to_dataframe(self) -> pd.DataFrame:
         """One row per contributor and axis.
@@ -264,20 +222,6 @@ class AttitudeError:
             n_frames=counts["n_frames"],
             interaction_arcsec=sigma[4, :3],
             frames=frames,
-        )
-
-    def plot_attitude(self, **options: Any) -> Any:
-        """Bars per contributor and axis; options as for `starcal_uq.presentation.figures.propagation.plot_attitude`."""
-        from starcal_uq.presentation.figures.propagation import plot_attitude
-
-        return plot_attitude(self, **options)
-
-    def _repr_html_(self) -> str:
-        table = self.to_dataframe().to_html(index=False, float_format=significant, na_rep="not known", border=0)
-        return (
-            f"<p><b>Attitude error</b> of single frames: {self.n_draws} posterior draws through QUEST on "
-            f"{self.n_frames} frames ({self.frames}).</p>{table}<p>{self.agreement.sentence}</p>"
-            f"<p>{self.one_number_sentence}</p>"
         )
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.core.constants import AXES
+from starcal_uq.core.display import Shown
 from starcal_uq.core.types import FloatArray
 
 if TYPE_CHECKING:
@@ -42,7 +43,7 @@ class WeakDirection:
 
 
 @dataclass(frozen=True)
-class Coupling:
+class Coupling(Shown):
     """Coupling of the parameters.
 
     Attributes
@@ -129,19 +130,6 @@ class Coupling:
         for index, name in enumerate(self.extended_names):
             table[f"corr_{name}"] = self.extended_correlation[:p, index]
         return table
-
-    def plot_correlation(self, ax: Any = None) -> Any:
-        """Heat map of the correlations; returns the matplotlib Axes."""
-        from starcal_uq.presentation.figures.coupling import plot_correlation
-
-        return plot_correlation(self, ax=ax)
-
-    def _repr_html_(self) -> str:
-        directions = "".join(f"<li>{direction.words}</li>" for direction in self.weak_directions[:2])
-        table = self.to_dataframe()
-        table = table[[name for name in table.columns if not name.startswith("corr_")]]
-        table = table.to_html(index=False, float_format=lambda value: f"{value:.3g}", border=0)
-        return f"<p><b>Coupling</b></p><ul>{directions}</ul>{table}"
 
 
 def coupling(result: Posterior | Calibration) -> Coupling:

@@ -14,15 +14,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import unproject, unproject_theta
 from starcal_uq.core.constants import ARCSEC
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import DistortionError
-from starcal_uq.core.formatting import percent, significant
 from starcal_uq.core.types import FloatArray
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ _AZIMUTHS_DEG = (0.0, 45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0)
 
 
 @dataclass(frozen=True, eq=False)
-class DistortionCurve:
+class DistortionCurve(Shown):
     """Radial displacement against the radius at which a point is seen.
 
     Attributes
@@ -95,30 +95,6 @@ class DistortionCurve:
                 "mean_arcsec": self.mean_px.ravel() * scale,
                 "sd_arcsec": self.sd_px.ravel() * scale,
             }
-        )
-
-    @property
-    def corner_words(self) -> str:
-        """Displacement at the largest radius, with its standard deviation, in words."""
-        row = int(np.argmax(np.abs(self.mean_px[:, -1])))
-        value, sd = float(self.mean_px[row, -1]), float(self.sd_px[row, -1])
-        scale = float(self.arcsec_per_px[-1])
-        where = "" if len(self.mean_px) == 1 else f" at {self.azimuth_deg[row]:g}° from the x axis"
-        return (
-            f"At {self.radius_px[-1]:.0f} px{where} the distortion is {significant(value, 4)} ± {significant(sd)} px "
-            f"({significant(value * scale, 4)} ± {significant(sd * scale)} arcsec)."
-        )
-
-    def plot_distortion(self, **options: Any) -> Any:
-        """Curve and bands; options as for `starcal_uq.presentation.figures.propagation.plot_distortion_curve`."""
-        from starcal_uq.presentation.figures.propagation import plot_distortion_curve
-
-        return plot_distortion_curve(self, **options)
-
-    def _repr_html_(self) -> str:
-        return (
-            f"<p><b>Distortion</b> ({self.model}), {self.n_draws} draws: {self.corner_words} "
-            f"Bands of {percent(self.level)}; the simultaneous one is ±{self.multiplier:.2f} sd wide.</p>"
         )
 
 

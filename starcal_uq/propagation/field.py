@@ -19,16 +19,16 @@ from __future__ import annotations
 import os
 import zipfile
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.camera.fields import area_weights, detector_axes, grid_points, rotated, rotation_response, tangent_axes
 from starcal_uq.camera.projection import unproject, unproject_jacobian
 from starcal_uq.core.constants import ARCSEC
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path
-from starcal_uq.core.formatting import significant
 from starcal_uq.core.types import FloatArray
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ _LATER = (
 
 
 @dataclass(frozen=True, eq=False)
-class FieldMap:
+class FieldMap(Shown):
     """1-sigma uncertainty of directions on a grid of pixels that spans the detector from edge to edge.
 
     Sigmas are per axis: the root of the mean variance of the two axes of the tangent plane, i.e. of half the trace. The
@@ -138,35 +138,6 @@ class FieldMap:
             raise RunFolderError(
                 f"{path}: is not a field map; run `starcal-uq propagate RUN` to write it again."
             ) from error
-
-    def plot_field_map(self, **options: Any) -> Any:
-        """Both maps; options as for `starcal_uq.presentation.figures.propagation.plot_field_map`."""
-        from starcal_uq.presentation.figures.propagation import plot_field_map
-
-        return plot_field_map(self, **options)
-
-    def _repr_html_(self) -> str:
-        def row(name: str, sigma: FloatArray, worst: FloatArray) -> str:
-            values = (np.min(sigma), np.median(sigma), np.max(sigma), np.max(worst))
-            return f"<tr><td>{name}</td>{''.join(f'<td>{significant(float(v))}</td>' for v in values)}</tr>"
-
-        head = "".join(f"<th>{t}</th>" for t in ("", "least", "median", "largest", "worst direction"))
-        return (
-            "<p><b>Direction uncertainty over the detector</b>, 1 sigma per axis, arcsec.</p>"
-            f"<table><thead><tr>{head}</tr></thead><tbody>"
-            f"{row('absolute', self.sigma_absolute_arcsec, self.worst_absolute_arcsec)}"
-            f"{row('best rotation removed', self.sigma_compensated_arcsec, self.worst_compensated_arcsec)}"
-            f"</tbody></table>{self._equivalent_html()}"
-        )
-
-    def _equivalent_html(self) -> str:
-        pixels, angles = self.equivalent_principal_point_px, self.equivalent_principal_point_arcsec
-        if pixels is None or angles is None:
-            return ""
-        x, y = (
-            f"{significant(float(p))} px ({significant(float(a))} arcsec)" for p, a in zip(pixels, angles, strict=True)
-        )
-        return f"<p>Equivalent principal point, 1 sigma: {x} along x, {y} along y.</p>"
 
 
 def field_map(post: Posterior, obs: Observations, n: int = 25) -> FieldMap:

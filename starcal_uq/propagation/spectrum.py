@@ -7,22 +7,22 @@ profile. Averaging over frames lowers centroid noise, which is white, but hardly
 
 The spectrum is one-sided, PSD_j = 2 dt / K |X_j|^2 at f_j = j / (K dt) for K frames dt apart (without the 2 at the
 Nyquist frequency), averaged over posterior draws, so that its sum times df is the mean square of the error over time.
-As in `starcal_uq.propagation.propagate`, the first-order response of QUEST gives the average over the whole posterior, and draws
-through QUEST give what first order misses.
+As in `starcal_uq.propagation.propagate`, the first-order response of QUEST gives the average over the whole posterior,
+and draws through QUEST give what first order misses.
 """
 
 from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.core.constants import ARCSEC, AXES
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import AttitudeProfileError, SamplingError
 from starcal_uq.core.files import reading_archive, write_archive
-from starcal_uq.core.formatting import join_words, percent, significant
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.propagation.attitude_error import OBSERVED
 from starcal_uq.propagation.propagate import FrameGeometry
@@ -59,7 +59,8 @@ def error_spectrum(
     post : Posterior
         Draws of the camera and the noise.
     obs : Observations
-        Frames along an attitude profile (`starcal_uq.simulation.profile_frames`), or any others that are evenly spaced in time.
+        Frames along an attitude profile (`starcal_uq.simulation.profile_frames`), or any others that are evenly
+        spaced in time.
     times_s : (K,) array, optional
         Time of each frame, s, in the order of frame numbers; those of `profile_frames` by default.
     n_draws : int
@@ -207,11 +208,8 @@ _AVERAGES = 60
 
 
 # Smaller is rounding.
-_ROUNDING_ARCSEC = 1e-9
-
-
 @dataclass(frozen=True, eq=False)
-class ErrorSpectrum:
+class ErrorSpectrum(Shown):
     """Spectrum of the frame-dependent attitude error of a calibration along a series of frames.
 
     Axes are pitch, yaw and roll, as for `AttitudeError`.
@@ -292,7 +290,7 @@ class ErrorSpectrum:
         ValueError
             For less than one frame, or more than a quarter of the duration, over which the spectrum knows nothing.
         """
-        longest = self._longest_s
+        longest = self.longest_average_s
         if not self.step_s * (1.0 - 1e-9) <= seconds <= longest * (1.0 + 1e-9):
             raise ValueError(f"averaging over {seconds:g} s: choose {self.step_s:g} s to {longest:g} s.")
         passed = (np.sinc(self.frequency_hz * seconds) / np.sinc(self.frequency_hz * self.step_s)) ** 2
@@ -302,12 +300,13 @@ class ErrorSpectrum:
     @property
     def dominates_after_s(self) -> FloatArray:
         """Averaging time (3,) from which the frame-dependent part exceeds noise, s; NaN if not within a quarter."""
-        times = np.geomspace(self.step_s, self._longest_s, _AVERAGES)
+        times = np.geomspace(self.step_s, self.longest_average_s, _AVERAGES)
         larger = np.array([np.greater(*self.averaged_arcsec(float(t))) for t in times])
         return np.where(larger.any(axis=0), times[np.argmax(larger, axis=0)], np.nan)
 
     @property
-    def _longest_s(self) -> float:
+    def longest_average_s(self) -> float:
+        """Longest time to average over, s: a quarter of the duration."""
         return 0.25 * self.step_s * len(self.time_s)
 
     def share_below(self, frequency_hz: float) -> FloatArray:
@@ -322,34 +321,6 @@ class ErrorSpectrum:
         low = self.psd_arcsec2_hz[self.frequency_hz <= frequency_hz].sum(axis=0)
         sigma: FloatArray = np.sqrt(low * self.frequency_hz[0])
         return sigma
-
-    @property
-    def sentence(self) -> str:
-        """The spectrum in words."""
-        rest, tau, nyquist = self.rest_arcsec, self.correlation_time_s, float(self.frequency_hz[-1])
-        share = self.share_below(0.1 * nyquist)
-        if not np.all(rest > _ROUNDING_ARCSEC):
-            return "The calibration has no frame-dependent part along this profile: its frames all show the same stars."
-        words = (
-            f"Along {self.frames}, the frame-dependent part of the calibration error is {_listed(rest)} arcsec "
-            f"({', '.join(AXES)}), beside {_listed(self.nea_arcsec)} arcsec of centroid noise in each frame. It keeps "
-            f"its value for about {_listed(tau)} s; {', '.join(percent(float(v)) for v in share)} of its variance lie "
-            f"below a tenth of the highest frequency ({significant(0.1 * nyquist)} Hz). {self._averaging_words()}"
-        )
-        if self.gap_share > 0.0:
-            words += f" {percent(self.gap_share)} of the instants have no frame and were interpolated."
-        return words
-
-    def _averaging_words(self) -> str:
-        after = self.dominates_after_s
-        if np.isfinite(after).any():
-            axes = [f"{axis} after {significant(t)} s" for axis, t in zip(AXES, after, strict=True) if np.isfinite(t)]
-            return f"Where frames are averaged, it comes to exceed centroid noise: {join_words(axes)}."
-        rest, noise = self.averaged_arcsec(self._longest_s)
-        return (
-            f"Averaging of frames, up to {significant(self._longest_s)} s, leaves it below centroid noise: "
-            f"{_listed(rest)} against {_listed(noise)} arcsec."
-        )
 
     def to_dataframe(self) -> pd.DataFrame:
         """One row per frequency and axis: ``frequency_hz``, ``axis``, ``rest_arcsec2_hz``, ``nea_arcsec2_hz``."""
@@ -388,33 +359,6 @@ class ErrorSpectrum:
         ) as (document, arrays):
             return cls(**{name: arrays[name] for name in _ARRAYS}, **document)
 
-    def plot_spectrum(self, **options: Any) -> Any:
-        """The spectrum with the floor of the noise; options as for `starcal_uq.presentation.figures.propagation.plot_spectrum`."""
-        from starcal_uq.presentation.figures.propagation import plot_spectrum
-
-        return plot_spectrum(self, **options)
-
-    def plot_time_series(self, **options: Any) -> Any:
-        """Standard deviation over time; options as for `starcal_uq.presentation.figures.propagation.plot_error_series`."""
-        from starcal_uq.presentation.figures.propagation import plot_error_series
-
-        return plot_error_series(self, **options)
-
-    def _repr_html_(self) -> str:
-        import pandas as pd
-
-        table = pd.DataFrame(
-            {
-                "axis": AXES,
-                "frame-dependent part [arcsec]": self.rest_arcsec,
-                "correlation time [s]": self.correlation_time_s,
-                "centroid noise of a frame [arcsec]": self.nea_arcsec,
-                "exceeds averaged noise after [s]": self.dominates_after_s,
-            }
-        )
-        html = table.to_html(index=False, float_format=significant, na_rep="not known", border=0)
-        return f"<p><b>Error spectrum</b>: {self.n_draws} posterior draws.</p>{html}<p>{self.sentence}</p>"
-
 
 _ARRAYS = (
     "frequency_hz", "psd_arcsec2_hz", "nea_psd_arcsec2_hz", "variance_arcsec2", "nea_arcsec", "lag_s",
@@ -430,7 +374,3 @@ def _crossing(lag: FloatArray, correlation: FloatArray) -> float:
     i = int(np.argmax(below))
     upper, lower = correlation[i - 1], correlation[i]
     return float(lag[i - 1] + (lag[i] - lag[i - 1]) * (upper - np.exp(-1.0)) / (upper - lower))
-
-
-def _listed(values: FloatArray) -> str:
-    return ", ".join(significant(float(v)) if np.isfinite(v) else "an unknown number of" for v in values)

@@ -168,7 +168,7 @@ def main() -> None:
     cal = calibrate(obs, paper_start())
     error = sc.propagate(sc.sample(obs, cal, seed=1), obs)
     print(error.to_dataframe()[["contributor", "axis", "sigma_arcsec", "p95_arcsec"]].to_string(index=False))
-    print(error.agreement.sentence, error.one_number_sentence, sep="\n")
+    print(error.text)
     (flown,) = fly(clean, [error], n=options.campaigns)
     print(f"\n{flown.n} campaigns of {clean.n_frames} frames: pitch, yaw, roll (and across the boresight)")
     for part, sigma in sigmas_of(error).items():

@@ -101,18 +101,18 @@ def test_shows_itself() -> None:
     from matplotlib.figure import Figure
 
     found = paper_curve()
-    assert isinstance(found.plot_distortion(), Figure)
+    assert isinstance(found.plot.curve(), Figure)
     assert "whole" not in found._repr_html_()
-    assert "px" in found.corner_words
-    assert "arcsec" in found.corner_words
+    assert "px" in found.text
+    assert "arcsec" in found.text
     table = found.to_dataframe()
     assert list(table.columns[:4]) == ["azimuth_deg", "radius_px", "mean_px", "sd_px"]
     assert len(table) == 41
     assert 600 < found.star_radius_px < 745
     assert np.isnan(distortion_curve(gaussian_posterior(), n=3, n_draws=50).star_radius_px)
     decentred = distortion_curve(gaussian_posterior("brown_tangential", DECENTRED), n=11, n_draws=100)
-    assert isinstance(decentred.plot_distortion(), Figure)
-    assert "from the x axis" in decentred.corner_words
+    assert isinstance(decentred.plot.curve(), Figure)
+    assert "from the x axis" in decentred.text
 
 
 def test_what_has_no_curve_is_said() -> None:

@@ -129,14 +129,14 @@ def test_averages_are_those_of_the_series() -> None:
         np.testing.assert_allclose(averaged, np.sqrt(np.mean(runs**2, axis=(0, 1))), rtol=0.06)
         np.testing.assert_allclose(noise, found.nea_arcsec / np.sqrt(window))
     assert np.isnan(found.dominates_after_s).all()
-    assert "leaves it below centroid noise" in found.sentence
+    assert "leaves it below centroid noise" in found.text
     # With noise a hundred times smaller it matters soon.
     quiet = dataclasses.replace(found, nea_arcsec=0.01 * found.nea_arcsec)
     after = quiet.dominates_after_s
     assert np.isfinite(after).all()
     for axis, time in enumerate(after):
         assert np.greater(*quiet.averaged_arcsec(time))[axis]
-    assert "it comes to exceed centroid noise: pitch after" in quiet.sentence
+    assert "it comes to exceed centroid noise: pitch after" in quiet.text
     for seconds in (0.5, 200.0):
         with pytest.raises(ValueError, match=r"choose 1 s to 150\.25 s"):
             found.averaged_arcsec(seconds)
@@ -152,8 +152,8 @@ def test_gaps_are_bridged_and_said() -> None:
     assert len(found.time_s) == 601
     np.testing.assert_allclose(found.rest_arcsec, whole.rest_arcsec, rtol=0.02)
     np.testing.assert_allclose(found.below_arcsec(0.02), whole.below_arcsec(0.02), rtol=0.03)
-    assert "were interpolated" in found.sentence
-    assert "interpolated" not in whole.sentence
+    assert "were interpolated" in found.text
+    assert "interpolated" not in whole.text
     # The first frame of a series counts from zero whatever its number.
     late = dataclasses.replace(part, frame=part.frame + 7)
     again = error_spectrum(posterior(), late, 1e3 + np.flatnonzero(kept), n_draws=5)
@@ -204,12 +204,12 @@ def test_shows_itself() -> None:
     found = spectrum()
     assert list(found.to_dataframe().columns) == ["frequency_hz", "axis", "rest_arcsec2_hz", "nea_arcsec2_hz"]
     assert len(found.to_dataframe()) == 3 * len(found.frequency_hz)
-    ax = found.plot_spectrum()
+    ax = found.plot.spectrum()
     assert isinstance(ax, Axes)
     assert ax.get_legend().get_texts()[0].get_text().startswith("calibration, pitch")
-    assert isinstance(found.plot_time_series(), Axes)
-    other = found.plot_time_series()
-    assert found.plot_time_series(ax=other) is other
+    assert isinstance(found.plot.time_series(), Axes)
+    other = found.plot.time_series()
+    assert found.plot.time_series(ax=other) is other
     html = found._repr_html_()
     assert "correlation time [s]" in html
     assert "arcsec (pitch, yaw, roll)" in html
@@ -221,5 +221,5 @@ def test_a_camera_without_error_has_no_spectrum() -> None:
     post.covariance = np.zeros((5, 5))
     found = error_spectrum(post, frames(), n_draws=5)
     assert np.isnan(found.correlation_time_s).all() or (found.rest_arcsec < 1e-6).all()
-    assert "no frame-dependent part" in dataclasses.replace(found, variance_arcsec2=np.zeros(3)).sentence
-    found.plot_spectrum()
+    assert "no frame-dependent part" in dataclasses.replace(found, variance_arcsec2=np.zeros(3)).text
+    found.plot.spectrum()

@@ -127,7 +127,7 @@ def test_shows_itself() -> None:
     assert list(table.columns[:4]) == ["x_px", "y_px", "sigma_absolute_arcsec", "sigma_compensated_arcsec"]
     row = table[(table["x_px"] == found.x_px[3]) & (table["y_px"] == found.y_px[7])]
     assert row["sigma_compensated_arcsec"].item() == found.sigma_compensated_arcsec[7, 3]
-    assert isinstance(found.plot_field_map(), Figure)
+    assert isinstance(found.plot.maps(), Figure)
 
 
 def test_what_cannot_be_mapped_is_said() -> None:
@@ -194,7 +194,7 @@ def test_files_of_earlier_versions_lack_the_ellipses_only(tmp_path: Path) -> Non
     assert loaded.covariance_absolute_arcsec2 is None
     assert loaded.equivalent_principal_point_px is None
     assert "Equivalent" not in loaded._repr_html_()
-    assert isinstance(loaded.plot_field_map(), Figure)
+    assert isinstance(loaded.plot.maps(), Figure)
     loaded.save(tmp_path / "again.npz")
     assert FieldMap.load(tmp_path / "again.npz").covariance_compensated_arcsec2 is None
     assert "compensated_xy_arcsec2" in found.to_dataframe()

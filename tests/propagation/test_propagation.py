@@ -98,7 +98,7 @@ def test_sampled_and_first_order_agree(model: str, stated: bool) -> None:
     found = propagate(post, obs, n_draws=50)
     assert found.agreement.largest < 5e-3
     assert found.agreement.ratio.shape == (3, 3)
-    assert "agree within" in found.agreement.sentence
+    assert "agree within" in found.agreement.text
     # The likelihood's own linearisation weights pixels, QUEST directions: across the boresight hardly a difference.
     common = ARCSEC * np.sqrt(np.diag(post.rotation_per_theta @ post.covariance @ post.rotation_per_theta.T))
     np.testing.assert_allclose(found.common_arcsec[:2], common[:2], rtol=0.01)
@@ -113,11 +113,11 @@ def test_sampling_sees_what_first_order_does_not() -> None:
     raw = found.common_draws_arcsec.std(axis=0, ddof=1)
     np.testing.assert_allclose(found.common_arcsec, raw, rtol=1e-6)
     assert found.agreement.largest > 0.02
-    assert "the sampled values hold" in found.agreement.sentence
+    assert "the sampled values hold" in found.agreement.text
     table = found.agreement.to_dataframe()
     assert list(table.columns) == ["contributor", "axis", "sampled_over_first_order"]
     assert np.nanmax(np.abs(table["sampled_over_first_order"] - 1.0)) == found.agreement.largest
-    assert found.agreement.sentence in found.agreement._repr_html_()
+    assert found.agreement.text in found.agreement._repr_html_()
 
 
 def test_interaction_is_what_the_sum_of_the_parts_misses() -> None:
@@ -336,11 +336,11 @@ def test_file_of_an_earlier_version_is_read_and_the_interaction_not_known(tmp_pa
 
 def test_one_number_is_taken_apart() -> None:
     found = error()
-    assert "smaller by a factor of" in found.one_number_sentence
+    assert "smaller by a factor of" in found.text
     swapped = dataclasses.replace(found, common_arcsec=found.rest_arcsec, rest_arcsec=found.common_arcsec)
-    assert "no alignment absorbs it" in swapped.one_number_sentence
+    assert "no alignment absorbs it" in swapped.text
     none = dataclasses.replace(found, rest_arcsec=np.zeros(3))
-    assert "is a common rotation of" in none.one_number_sentence
+    assert "is a common rotation of" in none.text
 
 
 @pytest.mark.parametrize(
@@ -372,7 +372,7 @@ def test_what_cannot_be_propagated_is_said() -> None:
 def test_plots_itself() -> None:
     from matplotlib.axes import Axes
 
-    assert isinstance(error().plot_attitude(), Axes)
+    assert isinstance(error().plot.contributors(), Axes)
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ import numpy as np
 from starcal_uq.core.formatting import count, fixed, percent, plural, significant
 from starcal_uq.diagnostics.verdict.draws import propagation_difference
 from starcal_uq.diagnostics.verdict.observed import air, conditional_words, corrected_words
+from starcal_uq.presentation.words.propagation import equivalent_shift
 
 if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
@@ -193,15 +194,10 @@ def _plain(value: Any) -> str:
 
 def equivalent_sentence(field: FieldMap | None) -> str:
     """The common rotation as an error of the principal point; empty without a map, or for one that does not hold it."""
-    if field is None:
+    shift = None if field is None else equivalent_shift(field)
+    if shift is None:
         return ""
-    pixels, angles = field.equivalent_principal_point_px, field.equivalent_principal_point_arcsec
-    if pixels is None or angles is None:
-        return ""
-    x, y = (
-        f"{significant(pixel)} px ({significant(angle)} arcsec)"
-        for pixel, angle in zip(pixels.tolist(), angles.tolist(), strict=True)
-    )
+    x, y = shift
     return (
         "Equivalent principal point: the rotation that is removed on the right is what an error of the principal point "
         f"of {x} along x and {y} along y (1 sigma) would do by itself."

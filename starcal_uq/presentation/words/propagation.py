@@ -1,0 +1,243 @@
+"""What a posterior means for attitudes and directions, in sentences and tables."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+
+from starcal_uq.core.constants import AXES
+from starcal_uq.core.formatting import fixed, join_words, percent, pretty_unit, significant
+from starcal_uq.core.types import FloatArray
+from starcal_uq.presentation.html import card
+from starcal_uq.presentation.tables import TextTable
+from starcal_uq.propagation.attitude_error import Agreement, AttitudeError, with_cross
+from starcal_uq.propagation.coupling import Coupling
+from starcal_uq.propagation.distortion import DistortionCurve
+from starcal_uq.propagation.field import FieldMap
+from starcal_uq.propagation.spectrum import ErrorSpectrum
+
+# Ratios of standard deviations that are this close to one agree.
+_AGREE = 0.02
+_ROUNDING_ARCSEC = 1e-9
+
+
+def agreement_text(agreement: Agreement) -> str:
+    """What the ratios of sampled to first-order standard deviations mean."""
+    if agreement.largest <= _AGREE:
+        return (
+            f"Sampled and first-order standard deviations agree within {percent(max(agreement.largest, 1e-6))}: "
+            "attitude errors are linear in parameters and noise."
+        )
+    distance = np.where(np.isfinite(agreement.ratio), np.abs(agreement.ratio - 1.0), 0.0)
+    row, axis = np.unravel_index(int(np.argmax(distance)), distance.shape)
+    return (
+        f"Sampled and first-order standard deviations differ by up to {percent(agreement.largest)} "
+        f"({agreement.contributors[row]}, {AXES[axis]}): attitude errors are not linear over this posterior, and the "
+        "sampled values hold."
+    )
+
+
+def agreement_table(agreement: Agreement) -> TextTable:
+    """One row per contributor and axis."""
+    return TextTable.of(
+        agreement.to_dataframe(), formats={"sampled_over_first_order": lambda v: fixed(v, 5)}, missing="not known"
+    )
+
+
+def agreement_html(agreement: Agreement) -> str:
+    """Ratios, and what they mean."""
+    return card("Sampled over first order", agreement_text(agreement), agreement_table(agreement))
+
+
+def one_number_sentence(error: AttitudeError) -> str:
+    """What a single number for the calibration would hide."""
+    common, rest = with_cross(error.common_arcsec)[3], with_cross(error.rest_arcsec)[3]
+    # Below this it is rounding: frames that all show the same stars have no part that changes.
+    if not rest > _ROUNDING_ARCSEC:
+        return f"Across the boresight the calibration is a common rotation of {significant(float(common))} arcsec."
+    words = f"{significant(float(np.hypot(common, rest)))} arcsec per axis across the boresight"
+    ratio = float(common / rest)
+    if ratio < 1.0:
+        return (
+            f"The calibration contributes {words}, of which most depends on where the stars are "
+            f"({significant(float(rest))} arcsec) and no alignment absorbs it."
+        )
+    return (
+        f"Whoever reports one number for the calibration, {words}, reports a constant that alignment calibration "
+        f"absorbs: what remains in flight is {significant(float(rest))} arcsec, smaller by a factor of "
+        f"{significant(ratio)}."
+    )
+
+
+def attitude_text(error: AttitudeError) -> str:
+    """Whether first order holds, and what a single number would hide."""
+    return f"{agreement_text(error.agreement)} {one_number_sentence(error)}"
+
+
+def attitude_table(error: AttitudeError) -> TextTable:
+    """Contributors by axis, 1 sigma; the half-width across the boresight that holds 95 %."""
+    rows = []
+    for contributor, group in error.to_dataframe().groupby("contributor", sort=False):
+        cells = group.set_index("axis")
+        across = cells.drop(index=list(AXES))["p95_arcsec"].iloc[0]
+        sigmas = (significant(float(cells.at[axis, "sigma_arcsec"])) for axis in AXES)
+        rows.append((str(contributor), *sigmas, significant(float(across)), cells["absorbed_by_alignment"].iloc[0]))
+    heads = ("contributor", *AXES, "two-axis 95 %", "absorbed by alignment")
+    return TextTable(heads, tuple(rows), "Attitude error, arcsec, 1 sigma", "lrrrrl")
+
+
+def attitude_html(error: AttitudeError) -> str:
+    """Contributions, on what they rest, and what follows."""
+    rests = f"{error.n_draws} posterior draws through QUEST on {error.n_frames} frames ({error.frames})."
+    return card(
+        "Attitude error", f"{rests} {attitude_text(error)}", TextTable.of(error.to_dataframe(), missing="not known")
+    )
+
+
+def coupling_text(coupling: Coupling) -> str:
+    """The directions, from the least to the best determined."""
+    return "\n".join(f"{direction.words}." for direction in coupling.weak_directions)
+
+
+def coupling_table(coupling: Coupling) -> TextTable:
+    """Standard deviations with the others unknown and known, and what not knowing them costs."""
+    columns = {
+        "sigma": coupling.sigma_marginal,
+        "others known": coupling.sigma_conditional,
+        "variance inflation": coupling.variance_inflation,
+    }
+    rows = tuple(
+        (name, *(significant(float(column[i]), 3) for column in columns.values()), pretty_unit(unit))
+        for i, (name, unit) in enumerate(zip(coupling.parameter_names, coupling.units, strict=True))
+    )
+    title = "Coupling: what not knowing the others costs"
+    return TextTable(("parameter", *columns, "unit"), rows, title, "l" + "r" * len(columns) + "l")
+
+
+def correlation_table(coupling: Coupling) -> TextTable:
+    """Correlations of the parameters and of the rotation that they cause in every frame."""
+    rows = tuple(
+        (name, *(fixed(float(value), 2) for value in row))
+        for name, row in zip(coupling.extended_names, coupling.extended_correlation, strict=True)
+    )
+    return TextTable(("", *coupling.extended_names), rows, "Correlations, with the rotation common to all frames")
+
+
+def coupling_html(coupling: Coupling) -> str:
+    """The worst determined directions, and what not knowing the other parameters costs."""
+    words = "; ".join(direction.words for direction in coupling.weak_directions[:2])
+    return card("Coupling", f"{words}.", coupling_table(coupling))
+
+
+def field_text(field: FieldMap) -> str:
+    """The middle of both maps, and the common rotation as an error of the principal point."""
+    absolute, rest = (float(np.median(m)) for m in (field.sigma_absolute_arcsec, field.sigma_compensated_arcsec))
+    text = (
+        f"Half of the detector knows its directions to {significant(absolute)} arcsec (1 sigma per axis), or to "
+        f"{significant(rest)} arcsec once the best rotation is removed."
+    )
+    shift = equivalent_shift(field)
+    return (
+        text
+        if shift is None
+        else f"{text} Equivalent principal point, 1 sigma: {shift[0]} along x, {shift[1]} along y."
+    )
+
+
+def equivalent_shift(field: FieldMap) -> tuple[str, str] | None:
+    """Error of the principal point along x and y that alone would cause the common rotation; None if not known."""
+    pixels, angles = field.equivalent_principal_point_px, field.equivalent_principal_point_arcsec
+    if pixels is None or angles is None:
+        return None
+    x, y = (f"{significant(float(p))} px ({significant(float(a))} arcsec)" for p, a in zip(pixels, angles, strict=True))
+    return x, y
+
+
+def field_table(field: FieldMap) -> TextTable:
+    """Least, median and largest uncertainty over the detector, before and after the best rotation is removed."""
+    maps = (
+        ("absolute", field.sigma_absolute_arcsec, field.worst_absolute_arcsec),
+        ("best rotation removed", field.sigma_compensated_arcsec, field.worst_compensated_arcsec),
+    )
+    rows = tuple(
+        (name, *(significant(float(v)) for v in (np.min(sigma), np.median(sigma), np.max(sigma), np.max(worst))))
+        for name, sigma, worst in maps
+    )
+    return TextTable(("", "least", "median", "largest", "worst direction"), rows, "1 sigma per axis, arcsec")
+
+
+def field_html(field: FieldMap) -> str:
+    """Both maps in numbers."""
+    return card("Direction uncertainty over the detector", field_text(field), field_table(field))
+
+
+def distortion_text(curve: DistortionCurve) -> str:
+    """Displacement at the largest radius, with its standard deviation, and what the bands are."""
+    row = int(np.argmax(np.abs(curve.mean_px[:, -1])))
+    value, sd = float(curve.mean_px[row, -1]), float(curve.sd_px[row, -1])
+    scale = float(curve.arcsec_per_px[-1])
+    where = "" if len(curve.mean_px) == 1 else f" at {curve.azimuth_deg[row]:g}° from the x axis"
+    return (
+        f"At {curve.radius_px[-1]:.0f} px{where} the distortion is {significant(value, 4)} ± {significant(sd)} px "
+        f"({significant(value * scale, 4)} ± {significant(sd * scale)} arcsec). "
+        f"Bands of {percent(curve.level)}; the simultaneous one is ±{curve.multiplier:.2f} sd wide."
+    )
+
+
+def distortion_html(curve: DistortionCurve) -> str:
+    """The far end of the curve in numbers."""
+    return card(f"Distortion ({curve.model})", f"{curve.n_draws} draws. {distortion_text(curve)}")
+
+
+def spectrum_text(spectrum: ErrorSpectrum) -> str:
+    """How fast the frame-dependent part changes, and what averaging does to it."""
+    rest, tau, nyquist = spectrum.rest_arcsec, spectrum.correlation_time_s, float(spectrum.frequency_hz[-1])
+    share = spectrum.share_below(0.1 * nyquist)
+    if not np.all(rest > _ROUNDING_ARCSEC):
+        return "The calibration has no frame-dependent part along this profile: its frames all show the same stars."
+    words = (
+        f"Along {spectrum.frames}, the frame-dependent part of the calibration error is {_listed(rest)} arcsec "
+        f"({', '.join(AXES)}), beside {_listed(spectrum.nea_arcsec)} arcsec of centroid noise in each frame. It keeps "
+        f"its value for about {_listed(tau)} s; {', '.join(percent(float(v)) for v in share)} of its variance lie "
+        f"below a tenth of the highest frequency ({significant(0.1 * nyquist)} Hz). {_averaging(spectrum)}"
+    )
+    if spectrum.gap_share > 0.0:
+        words += f" {percent(spectrum.gap_share)} of the instants have no frame and were interpolated."
+    return words
+
+
+def _averaging(spectrum: ErrorSpectrum) -> str:
+    after = spectrum.dominates_after_s
+    if np.isfinite(after).any():
+        axes = [f"{axis} after {significant(t)} s" for axis, t in zip(AXES, after, strict=True) if np.isfinite(t)]
+        return f"Where frames are averaged, it comes to exceed centroid noise: {join_words(axes)}."
+    rest, noise = spectrum.averaged_arcsec(spectrum.longest_average_s)
+    return (
+        f"Averaging of frames, up to {significant(spectrum.longest_average_s)} s, leaves it below centroid noise: "
+        f"{_listed(rest)} against {_listed(noise)} arcsec."
+    )
+
+
+def _listed(values: FloatArray) -> str:
+    return ", ".join(significant(float(v)) if np.isfinite(v) else "an unknown number of" for v in values)
+
+
+def spectrum_table(spectrum: ErrorSpectrum) -> TextTable:
+    """One row per axis."""
+    table = pd.DataFrame(
+        {
+            "axis": AXES,
+            "frame-dependent part [arcsec]": spectrum.rest_arcsec,
+            "correlation time [s]": spectrum.correlation_time_s,
+            "centroid noise of a frame [arcsec]": spectrum.nea_arcsec,
+            "exceeds averaged noise after [s]": spectrum.dominates_after_s,
+        }
+    )
+    return TextTable.of(table, missing="not known")
+
+
+def spectrum_html(spectrum: ErrorSpectrum) -> str:
+    """The spectrum in words, and axis by axis."""
+    return card(
+        "Error spectrum", f"{spectrum.n_draws} posterior draws. {spectrum_text(spectrum)}", spectrum_table(spectrum)
+    )
