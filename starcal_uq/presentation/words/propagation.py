@@ -171,17 +171,22 @@ def field_html(field: FieldMap) -> str:
     return card("Direction uncertainty over the detector", field_text(field), field_table(field))
 
 
-def distortion_text(curve: DistortionCurve) -> str:
-    """Displacement at the largest radius, with its standard deviation, and what the bands are."""
+def corner_sentence(curve: DistortionCurve) -> str:
+    """Displacement at the largest radius, with its standard deviation."""
     row = int(np.argmax(np.abs(curve.mean_px[:, -1])))
     value, sd = float(curve.mean_px[row, -1]), float(curve.sd_px[row, -1])
     scale = float(curve.arcsec_per_px[-1])
     where = "" if len(curve.mean_px) == 1 else f" at {curve.azimuth_deg[row]:g}° from the x axis"
     return (
         f"At {curve.radius_px[-1]:.0f} px{where} the distortion is {significant(value, 4)} ± {significant(sd)} px "
-        f"({significant(value * scale, 4)} ± {significant(sd * scale)} arcsec). "
-        f"Bands of {percent(curve.level)}; the simultaneous one is ±{curve.multiplier:.2f} sd wide."
+        f"({significant(value * scale, 4)} ± {significant(sd * scale)} arcsec)."
     )
+
+
+def distortion_text(curve: DistortionCurve) -> str:
+    """Displacement at the largest radius, and what the bands are."""
+    bands = f"Bands of {percent(curve.level)}; the simultaneous one is ±{curve.multiplier:.2f} sd wide."
+    return f"{corner_sentence(curve)} {bands}"
 
 
 def distortion_html(curve: DistortionCurve) -> str:
