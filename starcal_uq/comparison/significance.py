@@ -12,6 +12,7 @@ from starcal_uq.camera.projection import unproject_jacobian
 from starcal_uq.comparison.covariance import Rule, is_efficient
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.types import FloatArray
+from starcal_uq.maths.linear import scaled_cholesky
 from starcal_uq.maths.quadratic_forms import weighted_chi_square_tail
 
 if TYPE_CHECKING:
@@ -41,9 +42,7 @@ class Estimate:
     @property
     def root(self) -> FloatArray:
         """Square root of the covariance."""
-        sd = np.sqrt(np.diag(self.covariance))
-        root: FloatArray = sd[:, None] * np.linalg.cholesky(self.covariance / np.outer(sd, sd))
-        return root
+        return scaled_cholesky(self.covariance)
 
 
 @dataclass(frozen=True)

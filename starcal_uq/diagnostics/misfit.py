@@ -13,7 +13,7 @@ unequal noise compare the residuals' weighted and unweighted sums of squares wit
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +24,8 @@ from starcal_uq.core.formatting import plural, significant
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.diagnostics.shapes import Shape, View, run_clock, shapes
 from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.maths.intervals import holm
+from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
@@ -201,16 +203,6 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = 8) -> 
     return Misfit(tuple(tests), float(np.sqrt(sums.rss / sums.dof)), obs.n_stars, obs.n_frames)
 
 
-def holm(p_values: Sequence[float]) -> FloatArray:
-    """Holm's step-down correction for several tests."""
-    p = np.asarray(p_values, dtype=np.float64)
-    order = np.argsort(p)
-    stepped = np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1))
-    corrected = np.empty_like(p)
-    corrected[order] = np.minimum(stepped, 1.0)
-    return corrected
-
-
 @dataclass
 class _Sums:
     """Sums over all stars from which every test follows; the table is visited once, some frames at a time."""
@@ -300,9 +292,7 @@ class _Sums:
     @property
     def projection(self) -> FloatArray:
         """Inverse of `parameters`."""
-        scale = 1.0 / np.sqrt(np.diag(self.parameters))
-        inverse: FloatArray = np.linalg.inv(self.parameters * np.outer(scale, scale)) * np.outer(scale, scale)
-        return inverse
+        return scaled_inverse(self.parameters)
 
     @property
     def rss(self) -> float:

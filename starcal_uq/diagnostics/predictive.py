@@ -17,6 +17,7 @@ from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.maths.linear import scaled_cholesky
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -151,9 +152,8 @@ def _draws(
         chosen = post.draws[rng.permutation(len(post.draws))[:n_draws]]
         return chosen[:, :-1], chosen[:, -1]
     noise = np.sqrt(cal.chi2 / rng.chisquare(cal.dof, n_draws))
-    scale = cal.sigmas
-    factor = np.linalg.cholesky(cal.correlation) * scale[:, None]
-    steps = rng.standard_normal((n_draws, len(scale))) @ factor.T
+    factor = scaled_cholesky(cal.covariance)
+    steps = rng.standard_normal((n_draws, len(factor))) @ factor.T
     return cal.theta + steps * (noise / cal.sigma)[:, None], noise
 
 

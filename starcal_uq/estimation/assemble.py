@@ -19,6 +19,7 @@ from starcal_uq.estimation.compressed import compress
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.solvers import is_singular
 from starcal_uq.estimation.stages import Stage
+from starcal_uq.maths.linear import scaled_inverse
 
 if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
@@ -134,10 +135,3 @@ def check_camera(camera: Camera, status: Status) -> Status:
     if fold_radius_px(camera.distortion, camera.theta, camera.corner_radius_px) <= camera.corner_radius_px:
         return Status.FOLDED
     return status
-
-
-def scaled_inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of a symmetric matrix whose entries span many orders of magnitude."""
-    scale = 1.0 / np.sqrt(np.diag(matrix))
-    inverse: FloatArray = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
-    return inverse

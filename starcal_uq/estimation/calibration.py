@@ -18,6 +18,7 @@ from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.estimation.compressed import CompressedLikelihood
 from starcal_uq.estimation.stages import Stage
+from starcal_uq.maths.linear import correlation_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -134,8 +135,7 @@ class Calibration:
     @property
     def correlation(self) -> FloatArray:
         """Correlation matrix, (p, p)."""
-        correlation: FloatArray = self.covariance / np.outer(self.sigmas, self.sigmas)
-        return correlation
+        return correlation_of(self.covariance)[0]
 
     @property
     def n_stars(self) -> int:

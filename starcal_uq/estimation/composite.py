@@ -28,6 +28,7 @@ from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.estimation.solvers import Normal, is_singular
+from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse, unit_inverse
 from starcal_uq.observations.frames import StarFrames
 
 Variability = Literal["auto", "expected", "empirical"]
@@ -172,19 +173,19 @@ def pair_likelihood(
         )
     tau = float(np.sqrt(normal.cost / objective.n_pairs))
     sigma = float(np.sqrt(chi2 / residual_dof))
-    naive = _inverse(normal.matrix) * tau**2
+    naive = scaled_inverse(normal.matrix) * tau**2
     if variability == "auto":
         variability = "expected" if frames.n_frames < _FRAMES_PER_PARAMETER * p else "empirical"
     godambe = (
         expected_godambe(objective, theta_hat, sigma) if variability == "expected" else objective.godambe(theta_hat)
     )
     _check_minimum(normal, godambe)
-    shrink = _cholesky(naive)
+    shrink = scaled_cholesky(naive)
     return PairLikelihood(
         theta_hat=theta_hat,
         covariance=godambe if adjusted else naive,
         shrink=shrink,
-        whitening=_cholesky(godambe) if adjusted else shrink,
+        whitening=scaled_cholesky(godambe) if adjusted else shrink,
         gram=_gram(objective, theta_hat, shrink) / tau**2,
         tau=tau,
         pair_noise=_pair_noise(objective, theta_hat),
@@ -218,7 +219,7 @@ def expected_godambe(objective: PairObjective, theta: FloatArray, sigma: float) 
         Noise, px, or the factor on the stated noise.
     """
     normal = objective.evaluate(theta)
-    scale = 1.0 / np.sqrt(np.diag(normal.matrix))
+    h, scale = unit_inverse(normal.matrix)
     v = np.zeros_like(normal.matrix)
     for first, last in objective.frames.parts(_STARS_AT_ONCE):
         part = objective.frames.part(first, last)
@@ -231,7 +232,6 @@ def expected_godambe(objective: PairObjective, theta: FloatArray, sigma: float) 
         gamma = np.einsum("axn,ixn->ain", turned * scale[:, None, None], db[:2]) * (noise * sigma)
         flat = gamma.reshape(len(gamma), -1)
         v += flat @ flat.T
-    h = np.linalg.inv(normal.matrix * np.outer(scale, scale))
     covariance: FloatArray = (h @ v @ h) * np.outer(scale, scale)
     return covariance
 
@@ -279,22 +279,10 @@ def _gram(objective: PairObjective, theta: FloatArray, whitening: FloatArray) ->
 
 
 def _check_minimum(normal: Normal, covariance: FloatArray) -> None:
-    step = _inverse(normal.matrix) @ normal.gradient
+    step = scaled_inverse(normal.matrix) @ normal.gradient
     off = float(np.max(np.abs(step) / np.sqrt(np.diag(covariance))))
     if not off <= _OFF_MINIMUM:
         raise SamplingError(
             f"the pair estimate of the calibration lies {off:.1f} standard deviations from the minimum of the pair "
             "objective of these observations: calibrate them again with likelihood='marginal', without screening."
         )
-
-
-def _inverse(matrix: FloatArray) -> FloatArray:
-    scale = 1.0 / np.sqrt(np.diag(matrix))
-    inverse: FloatArray = np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale)
-    return inverse
-
-
-def _cholesky(matrix: FloatArray) -> FloatArray:
-    scale = np.sqrt(np.diag(matrix))
-    factor: FloatArray = np.linalg.cholesky(matrix / np.outer(scale, scale)) * scale[:, None]
-    return factor

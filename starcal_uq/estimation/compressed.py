@@ -20,6 +20,7 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.marginal import MarginalLikelihood, Profile
+from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
 
 
 @dataclass(frozen=True)
@@ -158,8 +159,7 @@ def compress(
     rotations : (K, 3, 3) array, optional
         Attitudes to start from.
     """
-    scale = np.sqrt(np.diag(covariance))
-    whitening = np.linalg.cholesky(covariance / np.outer(scale, scale)) * scale[:, None]
+    whitening = scaled_cholesky(covariance)
     frames, p = likelihood.frames, len(theta_hat)
     q = (p + 1) * (p + 2) // 2
     gram, slope, log_determinant = np.zeros((q, q)), np.zeros(p), 0.0
@@ -261,7 +261,7 @@ def scaled(compressed: CompressedLikelihood, unit: float) -> CompressedLikelihoo
 def total(parts: Sequence[CompressedLikelihood]) -> CompressedLikelihood:
     """Sum of likelihoods of different frames, expanded around their precision-weighted mean."""
     theta, covariance = combined([part.theta_hat for part in parts], [_covariance(part) for part in parts])
-    whitening = scaled_factor(covariance)
+    whitening = scaled_cholesky(covariance)
     at = [moved(part, theta, whitening) for part in parts]
     return CompressedLikelihood(
         theta_hat=theta,
@@ -285,12 +285,6 @@ def combined(theta: Sequence[FloatArray], covariance: Sequence[FloatArray]) -> t
     shift = np.sum([w @ ((t - theta[0]) / scale) for w, t in zip(precision, theta, strict=True)], axis=0)
     mean = theta[0] + scale * (reduced @ shift)
     return np.asarray(mean), np.asarray(0.5 * (reduced + reduced.T) * outer)
-
-
-def scaled_factor(covariance: FloatArray) -> FloatArray:
-    """Lower Cholesky factor of a covariance whose units span many powers of ten."""
-    scale = np.sqrt(np.diag(covariance))
-    return np.asarray(np.linalg.cholesky(covariance / np.outer(scale, scale)) * scale[:, None])
 
 
 def _covariance(compressed: CompressedLikelihood) -> FloatArray:
@@ -373,11 +367,9 @@ def optimum(compressed: CompressedLikelihood) -> Optimum:
     unit = np.linalg.inv(here.gram[1 : p + 1, 1 : p + 1])
     root = here.whitening @ np.linalg.cholesky(0.5 * (unit + unit.T))
     covariance = root @ root.T * sigma2
-    scale = np.sqrt(np.diag(covariance))
-    information = np.linalg.inv(covariance / np.outer(scale, scale)) / np.outer(scale, scale)
     return Optimum(
-        compressed=moved(here, here.theta_hat, scaled_factor(covariance)),
-        information=np.asarray(0.5 * (information + information.T)),
+        compressed=moved(here, here.theta_hat, scaled_cholesky(covariance)),
+        information=symmetric_inverse(covariance),
         covariance=np.asarray(covariance),
         sigma=float(np.sqrt(sigma2)),
         sum_of_squares=cost[-1],

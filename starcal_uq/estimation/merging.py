@@ -25,6 +25,7 @@ from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.compressed import Optimum, combined, optimum, scaled, total
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.stages import Stage
+from starcal_uq.maths.linear import correlation_of
 from starcal_uq.observations.table import Observations
 
 if TYPE_CHECKING:
@@ -376,8 +377,7 @@ def compare_runs(
     pooled = own / dof[1]
     statistic = max(merged.sum_of_squares - own, 0.0) / dof[0] / pooled
     distance, run_p, z = [], [], []
-    scale = np.sqrt(np.diag(merged.covariance))
-    reduced = merged.covariance / np.outer(scale, scale)
+    reduced, scale = correlation_of(merged.covariance)
     for run, unit in zip(runs, units, strict=True):
         shift = (run.theta - merged.theta) / scale
         # The run's covariance at the pooled noise; that of its difference from a mean it is part of is the difference.

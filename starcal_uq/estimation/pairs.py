@@ -19,6 +19,7 @@ from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import backward_kernel, backward_root
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.solvers import Normal, is_singular
+from starcal_uq.maths.linear import unit_inverse
 from starcal_uq.observations.frames import StarFrames
 
 # Stars per block: small enough that its arrays stay in cache, large enough to hide the interpreter.
@@ -154,8 +155,7 @@ class PairObjective:
         if is_singular(normal.matrix):
             return np.full((p, p), np.nan)
         # Scaling first: the entries span thirty orders of magnitude.
-        scale = 1.0 / np.sqrt(np.diag(normal.matrix))
-        h = np.linalg.inv(normal.matrix * np.outer(scale, scale))
+        h, scale = unit_inverse(normal.matrix)
         scaled = scores * scale[:, None]
         small_sample = k / max(k - p, 1)
         covariance: FloatArray = small_sample * (h @ scaled @ scaled.T @ h) * np.outer(scale, scale)

@@ -25,6 +25,7 @@ from starcal_uq.estimation.student import (
     StudentState,
     log_excess_prior,
 )
+from starcal_uq.maths.linear import unit_inverse
 from starcal_uq.observations.frames import StarFrames
 
 # A star whose angles to the others are this many times worse than the typical star's is left out of the start.
@@ -188,8 +189,7 @@ class RobustFit:
         """Sandwich covariance (p, p): observed information around the scatter of the stars' scores."""
         p = len(self.information.score)
         n = 2 * int(np.sum(self.state.seen))
-        scale = 1.0 / np.sqrt(np.diag(self.information.matrix))
-        inverse = np.linalg.inv(self.information.matrix * np.outer(scale, scale))
+        inverse, scale = unit_inverse(self.information.matrix)
         middle = self.information.variability * np.outer(scale, scale) * n / (self.state.dof - p)
         covariance: FloatArray = (inverse @ middle @ inverse) * np.outer(scale, scale)
         return covariance

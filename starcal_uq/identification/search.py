@@ -21,6 +21,7 @@ from starcal_uq.identification.pairs import StarPairs
 from starcal_uq.identification.proposers import Proposer, PyramidProposer, prepare_pairs
 from starcal_uq.identification.pyramid import CameraTolerance, FieldGeometry
 from starcal_uq.identification.result import Status
+from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.sky.catalogue import StarCatalogue
 
 # A frame is identified when fewer wrong attitudes than this are expected to match as well.
@@ -241,8 +242,7 @@ class Search:
         last = t.distortion_px / 2.0 if self.radial else 1e-6
         sd = np.array([t.focal / 2.0, t.centre_px / 2.0, t.centre_px / 2.0, last])
         information = np.diag(sd**-2.0) + np.sum([m.information for m in matches], axis=0)
-        scale = 1.0 / np.sqrt(np.diag(information))
-        covariance = np.linalg.inv(information * np.outer(scale, scale)) * np.outer(scale, scale)
+        covariance = scaled_inverse(information)
         return covariance @ np.sum([m.gradient for m in matches], axis=0), covariance
 
 

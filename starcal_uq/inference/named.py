@@ -18,7 +18,8 @@ from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.student import DOF_RANGE, log_excess_prior, parse_dof
-from starcal_uq.inference.target import Extra, Likelihood, LogLikelihood, scaled_cholesky, scaled_inverse
+from starcal_uq.inference.target import Extra, Likelihood, LogLikelihood
+from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
@@ -234,7 +235,7 @@ def _pairs(obs: Observations, cal: Calibration, adjusted: bool) -> Source:
     return Source(
         name="pairs" if adjusted else "pairs_naive",
         theta=found.theta_hat,
-        information=scaled_inverse(found.covariance),
+        information=symmetric_inverse(found.covariance),
         sigma=sigma,
         dof=dof,
         exact=found.exact_log_likelihood,
@@ -255,7 +256,7 @@ class _AdjustedStudent:
     def __init__(self, fit: Any, nu: float | None) -> None:
         self._fit, self._nu = fit, nu
         self._theta = fit.stage.theta
-        self._narrow = scaled_cholesky(scaled_inverse(fit.information.matrix))
+        self._narrow = scaled_cholesky(symmetric_inverse(fit.information.matrix))
         self._wide = scaled_cholesky(fit.covariance)
 
     def log_likelihood(self, theta: FloatArray, sigma: FloatArray, *nu: FloatArray) -> FloatArray:
@@ -287,7 +288,7 @@ def _student(obs: Observations, cal: Calibration, dof: float | str | None) -> So
     return Source(
         name="student_t",
         theta=fit.stage.theta,
-        information=scaled_inverse(fit.covariance),
+        information=symmetric_inverse(fit.covariance),
         sigma=fit.sigma,
         dof=0.5 * (fit.sigma / fit.sigma_std) ** 2,
         exact=_AdjustedStudent(fit, nu).log_likelihood,

@@ -20,6 +20,7 @@ import numpy as np
 from starcal_uq.camera.distortion import get_model, parameter_names, parameters, sigma_parameter
 from starcal_uq.core.errors import PriorError
 from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.maths.linear import correlation_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -134,9 +135,7 @@ class Priors(ABC):
         return np.asarray(np.linalg.inv(correlation) / np.outer(sd, sd))
 
     def _correlation(self) -> FloatArray:
-        covariance = self.theta_moments()[1]
-        sd = np.sqrt(np.diag(covariance))
-        return np.asarray(covariance / np.outer(sd, sd))
+        return correlation_of(self.theta_moments()[1])[0]
 
     def log_density_theta(self, theta: FloatArray) -> FloatArray:
         """Log density (n,) of camera parameters (n, p), per unit of each parameter."""
@@ -457,7 +456,7 @@ class GaussianPriors(Priors):
         variance = np.diag(covariance)
         if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(covariance)) and np.all(variance > 0.0)):
             raise PriorError("the prior's mean and covariance must be finite, with variances above zero.")
-        correlation = covariance / np.sqrt(np.outer(variance, variance))
+        correlation, _ = correlation_of(covariance)
         symmetric = np.allclose(correlation, correlation.T, rtol=0.0, atol=1e-9)
         if not symmetric or np.linalg.eigvalsh(0.5 * (correlation + correlation.T))[0] < 1e-12:
             raise PriorError("the prior's covariance must be symmetric and positive definite.")

@@ -17,6 +17,7 @@ from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.types import FloatArray
 from starcal_uq.inference.posterior import Laplace
 from starcal_uq.inference.priors import Priors
+from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
 
 # Half width of the finite differences in standard deviations: the density is so near to a parabola over it that
 # truncation is below 1e-3, while rounding of a log likelihood of 1e5 stays below 1e-8.
@@ -125,21 +126,6 @@ class Target:
         return np.where(np.isnan(value), -np.inf, value)
 
 
-def scaled_cholesky(matrix: FloatArray) -> FloatArray:
-    """Lower Cholesky factor of a covariance whose units span many powers of ten."""
-    scale = np.sqrt(np.diag(matrix))
-    return np.asarray(scale[:, None] * np.linalg.cholesky(matrix / np.outer(scale, scale)))
-
-
-def scaled_inverse(matrix: FloatArray) -> FloatArray:
-    """Inverse of a positive definite matrix whose units span many powers of ten."""
-    if not np.all(np.diag(matrix) > 0.0):
-        raise np.linalg.LinAlgError("the diagonal is not positive")
-    scale = np.sqrt(np.diag(matrix))
-    inverse = np.linalg.inv(matrix / np.outer(scale, scale)) / np.outer(scale, scale)
-    return np.asarray(0.5 * (inverse + inverse.T))
-
-
 def start_target(
     log_likelihood: LogLikelihood,
     priors: Priors,
@@ -187,7 +173,7 @@ def start_target(
     if extra is not None:
         precision[-1, -1], centre[-1] = extra.log_sd**-2.0, np.log(extra.value - extra.bound)
     try:
-        transform = scaled_cholesky(scaled_inverse(precision))
+        transform = scaled_cholesky(symmetric_inverse(precision))
     except np.linalg.LinAlgError:
         transform = np.full((d, d), np.nan)
     if not np.all(np.isfinite(transform)):

@@ -19,6 +19,7 @@ from starcal_uq.core.provenance import data_hashes
 from starcal_uq.core.types import FloatArray
 from starcal_uq.inference.posterior import Posterior
 from starcal_uq.inference.priors import SIGMA_NAMES, GaussianPriors, Priors, positive_number
+from starcal_uq.maths.linear import correlation_of
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -273,8 +274,8 @@ def shift_test(
     shift = _estimate(after) - _estimate(before)
     extra = (AllowedShift() if allowed is None else allowed).covariance(after.camera)
     covariance = before.covariance + after.covariance + extra
-    sd = np.sqrt(np.diag(covariance))
-    inverse = np.linalg.inv(covariance / np.outer(sd, sd))
+    correlation, sd = correlation_of(covariance)
+    inverse = np.linalg.inv(correlation)
     z, p = shift / sd, len(shift)
     statistic = float(z @ inverse @ z)
     # Share of each run's covariance in the sum, for the effective degrees of freedom.

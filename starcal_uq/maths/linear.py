@@ -1,14 +1,16 @@
-"""Inverse and determinant of many symmetric 3 x 3 matrices at once."""
+"""Linear algebra of covariances and information matrices, whose entries span thirty orders of magnitude."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import BoolArray, FloatArray
 
 # Order of the six unique entries: rows and columns.
 ROWS = (0, 0, 0, 1, 1, 2)
 COLUMNS = (0, 1, 2, 1, 2, 2)
+# Worse than this, digits are lost in the inverse.
+_WORST_CONDITION = 1e13
 
 
 def inverse_symmetric(packed: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -41,3 +43,67 @@ def inverse_symmetric(packed: FloatArray) -> tuple[FloatArray, FloatArray]:
         inverse[i, j] = value
         inverse[j, i] = value
     return inverse, determinant
+
+
+def unit_inverse(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Inverse (p, p) of a symmetric matrix scaled to a unit diagonal, and the scale (p,) of its rows and columns.
+
+    The inverse of the matrix itself is ``inverse * np.outer(scale, scale)``.
+    """
+    scale = 1.0 / np.sqrt(np.diag(matrix))
+    return np.asarray(np.linalg.inv(matrix * np.outer(scale, scale))), scale
+
+
+def scaled_inverse(matrix: FloatArray) -> FloatArray:
+    """Inverse (p, p) of a symmetric matrix whose entries span many orders of magnitude."""
+    inverse, scale = unit_inverse(matrix)
+    return inverse * np.outer(scale, scale)
+
+
+def inverse_diagonal(matrix: FloatArray) -> FloatArray:
+    """Diagonal (p,) of the inverse of such a matrix."""
+    inverse, scale = unit_inverse(matrix)
+    return np.diag(inverse) * scale**2
+
+
+def correlation_of(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Correlations (p, p) and standard deviations (p,) of a covariance."""
+    sd = np.sqrt(np.diag(covariance))
+    return np.asarray(covariance / np.outer(sd, sd)), sd
+
+
+def symmetric_inverse(matrix: FloatArray) -> FloatArray:
+    """Exactly symmetric inverse (p, p) of a covariance or a precision matrix.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        For a diagonal that is not positive, or a singular matrix.
+    """
+    if not np.all(np.diag(matrix) > 0.0):
+        raise np.linalg.LinAlgError("the diagonal is not positive")
+    correlation, sd = correlation_of(matrix)
+    inverse = np.linalg.inv(correlation) / np.outer(sd, sd)
+    return np.asarray(0.5 * (inverse + inverse.T))
+
+
+def scaled_cholesky(covariance: FloatArray) -> FloatArray:
+    """Lower Cholesky factor (p, p) of a covariance whose units span many powers of ten."""
+    correlation, sd = correlation_of(covariance)
+    return np.asarray(sd[:, None] * np.linalg.cholesky(correlation))
+
+
+def inverses(information: FloatArray) -> FloatArray:
+    """Inverses (..., p, p) of matrices whose entries span many orders of magnitude; infinite where singular."""
+    diagonal = np.diagonal(information, axis1=-2, axis2=-1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        scale = 1.0 / np.sqrt(diagonal)
+        scaled = information * scale[..., :, None] * scale[..., None, :]
+    good: BoolArray = np.asarray(np.isfinite(scaled).all(axis=(-2, -1)))
+    p = information.shape[-1]
+    scaled = np.where(good[..., None, None], scaled, np.eye(p))
+    good = np.asarray(good & (np.asarray(np.linalg.cond(scaled)) < _WORST_CONDITION))
+    inverse = np.linalg.inv(np.where(good[..., None, None], scaled, np.eye(p)))
+    with np.errstate(invalid="ignore"):
+        inverse = inverse * scale[..., :, None] * scale[..., None, :]
+    return np.where(good[..., None, None], inverse, np.inf)

@@ -101,16 +101,6 @@ def uniformity_band(n: int, n_values: int, probability: float = 0.95) -> tuple[F
     return np.arange(1, k) / k, lower / n, upper / n
 
 
-def binomial_interval(successes: int, n: int, probability: float = 0.95) -> tuple[float, float]:
-    """Exact interval for a fraction (Clopper & Pearson 1934)."""
-    from scipy.stats import beta
-
-    tail = 0.5 * (1.0 - probability)
-    low = float(beta.ppf(tail, successes, n - successes + 1)) if successes > 0 else 0.0
-    high = float(beta.ppf(1.0 - tail, successes + 1, n - successes)) if successes < n else 1.0
-    return low, high
-
-
 def _limits(n: int, k: int, tail: float) -> tuple[IntArray, IntArray]:
     """Smallest and largest counts at i / K, i = 1 .. K - 1, whose tail probability exceeds `tail`."""
     from scipy.stats import binom

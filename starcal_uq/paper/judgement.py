@@ -18,6 +18,7 @@ from enum import Enum
 import numpy as np
 
 from starcal_uq.core.types import FloatArray
+from starcal_uq.maths.intervals import HALF_WIDTH_95
 from starcal_uq.paper.published import Printed
 
 # Of 24 numbers under the right reading, one in fifteen tables has one beyond.
@@ -26,7 +27,6 @@ MAX_Z = 3.0
 MAX_CHANCE = 0.25
 # Relative scatter of sums that are the same numbers.
 _ROUNDING = 1e-12
-_HALF_WIDTH_95 = 1.959963984540054
 
 
 class Outcome(Enum):
@@ -171,11 +171,11 @@ def trial(number: Printed, reading: str, faithful: bool, draws: FloatArray | Seq
         distance = float(np.log(number.value)) - middle
         mean = float(np.exp(middle))
         spread = mean * width
-        covered = mean * 2.0 * float(np.sinh(_HALF_WIDTH_95 * width))
+        covered = mean * 2.0 * float(np.sinh(HALF_WIDTH_95 * width))
     else:
         mean, spread = float(np.mean(values)), float(np.std(values, ddof=1))
         middle, width, rounding, distance = mean, spread, step, number.value - mean
-        covered = 2.0 * _HALF_WIDTH_95 * spread
+        covered = 2.0 * HALF_WIDTH_95 * spread
     if spread <= _ROUNDING * abs(mean):
         # What does not depend on the seed has no spread, whatever the last bits say.
         width, spread, covered = 0.0, 0.0, 0.0

@@ -20,6 +20,7 @@ from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
+from starcal_uq.maths.linear import inverse_diagonal
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.paper.errors import map_error, reprojection_error_px
@@ -359,12 +360,6 @@ def textbook_sigmas(pairs: PairObjective, theta: FloatArray) -> FloatArray:
     normal = pairs.evaluate(theta)
     variance = normal.cost / (pairs.n_pairs - len(theta))
     return np.sqrt(inverse_diagonal(normal.matrix) * variance)
-
-
-def inverse_diagonal(matrix: FloatArray) -> FloatArray:
-    """Diagonal of the inverse of an information matrix, whose entries may span thirty orders of magnitude."""
-    scale = 1.0 / np.sqrt(np.diag(matrix))
-    return np.asarray(np.diag(np.linalg.inv(matrix * np.outer(scale, scale))) * scale**2)
 
 
 # One in so many replicates for options of a method, which are there to show what they claim.

@@ -14,8 +14,9 @@ from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.files import reading_archive, write_archive
 from starcal_uq.core.formatting import fixed, percent, significant
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
+from starcal_uq.maths.intervals import holm
 from starcal_uq.paper.methods import Method
-from starcal_uq.paper.statistics import classical_words, holm, summarise, words
+from starcal_uq.paper.statistics import FAMILY_LEVEL, classical_words, summarise, words
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -121,7 +122,7 @@ class Replicates:
                 head = {"method": method.label, "parameter": parameter.name, "unit": parameter.unit}
                 rows.append(head | {"truth": float(self.truth.theta[j])} | found)
         # One family: whoever reads the table looks at every test in it.
-        rejected = holm([row[test] for row in rows for test in _TESTS]).reshape(-1, len(_TESTS))
+        rejected = (holm([row[test] for row in rows for test in _TESTS]) <= FAMILY_LEVEL).reshape(-1, len(_TESTS))
         for row, (bias, claim, coverage, classical) in zip(rows, rejected.tolist(), strict=True):
             row["biased"], row["claim_wrong"], row["classical_wrong"] = bias, claim, classical
             row["verdict"] = words(row, bias, claim, coverage)

@@ -9,20 +9,17 @@ Holm's procedure together, so that chance is called a finding in one of a hundre
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from starcal_uq.core.formatting import fixed, percent, significant
-from starcal_uq.core.types import AnyDict, BoolArray, FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.maths.intervals import HALF_WIDTH_95, wilson_interval
 
 # Of one false finding among all tests of a table.
 FAMILY_LEVEL = 0.01
 # With fewer, claims that are half of the spread could go unnoticed.
 ENOUGH_REPLICATES = 50
 _INTERVAL = 0.95
-# Standard deviations of a normal 95 % interval, which is what a sigma is read as.
-_HALF_WIDTH = 1.959963984540054
 # A bias below this fraction of the spread matters to nobody, however surely it is there.
 _SLIGHT = 0.5
 HONEST = "honest"
@@ -76,7 +73,7 @@ def summarise(error: FloatArray, claimed: FloatArray, classical: FloatArray, crl
         for suffix, sigmas in (("", claimed), ("_classical", classical)):
             size = np.sqrt(np.mean(sigmas**2))
             known = bool(np.isfinite(size))
-            held = int(np.sum(np.abs(error) <= _HALF_WIDTH * sigmas))
+            held = int(np.sum(np.abs(error) <= HALF_WIDTH_95 * sigmas))
             wilson = wilson_interval(held, n) if known else (np.nan, np.nan)
             values |= {
                 f"claimed{suffix}": size,
@@ -112,32 +109,6 @@ def chi_p_value(ratio: float, n: int) -> float:
         return float("nan")
     statistic = (n - 1) * ratio**2
     return float(min(1.0, 2.0 * min(chi2.cdf(statistic, n - 1), chi2.sf(statistic, n - 1))))
-
-
-def wilson_interval(successes: int, n: int, z: float = _HALF_WIDTH) -> tuple[float, float]:
-    """Interval for a fraction (Wilson 1927), 95 % by default."""
-    if n == 0:
-        return float("nan"), float("nan")
-    fraction = successes / n
-    centre = fraction + z**2 / (2 * n)
-    half = z * np.sqrt(fraction * (1.0 - fraction) / n + (z / (2 * n)) ** 2)
-    scale = 1.0 + z**2 / n
-    # Rounding must not leave the fraction outside.
-    low = 0.0 if successes == 0 else float((centre - half) / scale)
-    high = 1.0 if successes == n else float((centre + half) / scale)
-    return low, high
-
-
-def holm(p_values: Sequence[float], level: float = FAMILY_LEVEL) -> BoolArray:
-    """Which of many tests are rejected at an overall level (Holm 1979); NaN stands for no test."""
-    p = np.asarray(p_values, dtype=np.float64)
-    rejected = np.zeros(len(p), dtype=np.bool_)
-    order = [i for i in np.argsort(p, kind="stable") if np.isfinite(p[i])]
-    for place, i in enumerate(order):
-        if p[i] > level / (len(order) - place):
-            break
-        rejected[i] = True
-    return rejected
 
 
 def words(row: AnyDict, bias: bool, claim: bool, coverage: bool) -> str:

@@ -16,7 +16,8 @@ from starcal_uq.core.formatting import significant
 from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.estimation.calibrate import calibrate
-from starcal_uq.planning.forecast import Forecast, Forecaster, inverses, spreads
+from starcal_uq.maths.linear import inverses
+from starcal_uq.planning.forecast import Forecast, Forecaster, spreads
 from starcal_uq.planning.information import random_frames
 from starcal_uq.planning.plan import N_FRAMES
 from starcal_uq.simulation.frames import simulate

@@ -25,7 +25,8 @@ from starcal_uq.core.files import atomic_path
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
-from starcal_uq.planning.forecast import inverses, quantities, spreads
+from starcal_uq.maths.linear import inverses
+from starcal_uq.planning.forecast import quantities, spreads
 from starcal_uq.planning.information import FrameSet, Noise, look_at, random_frames
 from starcal_uq.planning.plan import HasInformation, start_information
 from starcal_uq.sky.positions import ra_dec_deg

@@ -20,8 +20,9 @@ import numpy as np
 from starcal_uq.camera.distortion import get_model, parameters
 from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.errors import PlanningError
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.maths.circular import mixture_radius
+from starcal_uq.maths.linear import inverses
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,8 +41,6 @@ N_CAMPAIGNS = 200
 MAX_FRAMES = 10_000_000
 # Attitudes of the mission that quantiles are taken over, and scales of the covariance that they are interpolated from.
 _MISSION_FRAMES, _SCALES = 200, 9
-# Worse than this, digits are lost in the inverse.
-_WORST_CONDITION = 1e13
 _TOLERANCE, _GUESS_FRAMES = 0.002, 1000
 
 
@@ -169,22 +168,6 @@ def campaigns(
     counts = rng.multinomial(n_frames, np.full(m, 1.0 / m), size=n_campaigns)
     total = (counts @ information.reshape(m, -1)).reshape(-1, p, p)
     return inverses(total if start is None else total + start)
-
-
-def inverses(information: FloatArray) -> FloatArray:
-    """Inverses (..., p, p) of matrices whose entries span many orders of magnitude; infinite where singular."""
-    diagonal = np.diagonal(information, axis1=-2, axis2=-1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        scale = 1.0 / np.sqrt(diagonal)
-        scaled = information * scale[..., :, None] * scale[..., None, :]
-    good: BoolArray = np.asarray(np.isfinite(scaled).all(axis=(-2, -1)))
-    p = information.shape[-1]
-    scaled = np.where(good[..., None, None], scaled, np.eye(p))
-    good = np.asarray(good & (np.asarray(np.linalg.cond(scaled)) < _WORST_CONDITION))
-    inverse = np.linalg.inv(np.where(good[..., None, None], scaled, np.eye(p)))
-    with np.errstate(invalid="ignore"):
-        inverse = inverse * scale[..., :, None] * scale[..., None, :]
-    return np.where(good[..., None, None], inverse, np.inf)
 
 
 def spreads(forms: FloatArray, covariances: FloatArray) -> FloatArray:

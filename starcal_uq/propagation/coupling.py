@@ -10,6 +10,7 @@ import numpy as np
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.types import FloatArray
+from starcal_uq.maths.linear import correlation_of, unit_inverse
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -150,12 +151,11 @@ def coupling(result: Posterior | Calibration) -> Coupling:
     specs = parameters(result.camera.distortion)
     names = tuple(spec.name for spec in specs)
     covariance = np.asarray(result.covariance, dtype=np.float64)
-    sigma = np.sqrt(np.diag(covariance))
-    correlation = covariance / np.outer(sigma, sigma)
+    correlation, sigma = correlation_of(covariance)
     conditional = sigma / np.sqrt(np.diag(np.linalg.inv(correlation)))
     information = np.asarray(result.information, dtype=np.float64)
-    scale = 1.0 / np.sqrt(np.diag(information))
-    bound = np.sqrt(np.diag(np.linalg.inv(information * np.outer(scale, scale)))) * scale
+    inverse, scale = unit_inverse(information)
+    bound = np.sqrt(np.diag(inverse)) * scale
     priors = getattr(result, "priors", None)
     prior_sigma = None if priors is None else np.asarray(priors.sd(names), dtype=np.float64)
     response = np.asarray(result.rotation_per_theta, dtype=np.float64)
@@ -185,9 +185,8 @@ def coupling(result: Posterior | Calibration) -> Coupling:
 def _extended(covariance: FloatArray, response: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Correlations of the parameters with the common rotation they cause, and its standard deviations (rad)."""
     joint = np.vstack([np.eye(len(covariance)), response])
-    full = joint @ covariance @ joint.T
-    sigma = np.sqrt(np.diag(full))
-    return full / np.outer(sigma, sigma), sigma[-3:]
+    correlation, sigma = correlation_of(joint @ covariance @ joint.T)
+    return correlation, sigma[-3:]
 
 
 def _directions(correlation: FloatArray, names: tuple[str, ...]) -> tuple[WeakDirection, ...]:

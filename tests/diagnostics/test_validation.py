@@ -20,13 +20,8 @@ from starcal_uq.core.errors import CatalogueError, PriorError, RunFolderError, S
 from starcal_uq.diagnostics.validation.replicates import LOG_LIKELIHOOD, Study, run_replicate
 from starcal_uq.diagnostics.validation.result import Validation
 from starcal_uq.diagnostics.validation.validate import narrow_priors, validate, validate_study
-from starcal_uq.maths.ranks import (
-    binomial_interval,
-    counts_below,
-    evaluation_points,
-    uniformity_band,
-    uniformity_p_value,
-)
+from starcal_uq.maths.intervals import binomial_interval
+from starcal_uq.maths.ranks import counts_below, evaluation_points, uniformity_band, uniformity_p_value
 from starcal_uq.presentation.figures.diagnostics import plot_validation
 from starcal_uq.presentation.figures.style import png_bytes
 from tests.helpers import validation_controls as controls

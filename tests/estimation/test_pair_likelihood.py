@@ -19,7 +19,8 @@ from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.inference.named import NaivePairsWarning
 from starcal_uq.inference.priors import Priors
 from starcal_uq.inference.sample import sample
-from starcal_uq.inference.target import laplace_approximation, scaled_inverse, start_target
+from starcal_uq.inference.target import laplace_approximation, start_target
+from starcal_uq.maths.linear import symmetric_inverse
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.simulation.frames import simulate
 from starcal_uq.sky.catalogue import load_catalogue
@@ -135,13 +136,13 @@ def test_curvature_is_godambes_information(variability: str) -> None:
             likelihood.log_likelihood,
             priors,
             likelihood.theta_hat,
-            scaled_inverse(likelihood.covariance),
+            symmetric_inverse(likelihood.covariance),
             likelihood.sigma,
             float(likelihood.dof),
             True,
         )
         _, laplace = laplace_approximation(start)
-        expected = scaled_inverse(scaled_inverse(likelihood.covariance) + priors.precision(priors.names[:-1]))
+        expected = symmetric_inverse(symmetric_inverse(likelihood.covariance) + priors.precision(priors.names[:-1]))
         # The naive one is scaled by the expected noise of a pair; the observed noise differs by a few percent.
         assert relative(laplace.covariance, expected) < (0.01 if likelihood.adjusted else 0.1)
     assert found.narrowness > 2.5
@@ -221,7 +222,7 @@ def test_pairs_cover_and_naive_pairs_do_not() -> None:
         for adjusted in (True, False):
             found, cal = build(obs, adjusted=adjusted)
             sigma = found.sigma if adjusted else found.tau / found.pair_noise
-            information = scaled_inverse(found.covariance)
+            information = symmetric_inverse(found.covariance)
             priors = Priors.default(cal.nominal)
             dof = found.dof if adjusted else found.n_pairs
             start = start_target(found.log_likelihood, priors, found.theta_hat, information, sigma, float(dof), False)
@@ -244,10 +245,10 @@ def test_godambe_is_the_covariance_of_the_pair_estimate() -> None:
         objective = PairObjective(StarFrames.from_observations(obs), "brown")
         # One Gauss-Newton step from the truth reaches the minimum to second order in the noise.
         normal = objective.evaluate(truth.theta)
-        inverse = scaled_inverse(normal.matrix)
+        inverse = symmetric_inverse(normal.matrix)
         estimate = truth.theta - inverse @ normal.gradient
         normal = objective.evaluate(estimate)
-        estimate = estimate - scaled_inverse(normal.matrix) @ normal.gradient
+        estimate = estimate - symmetric_inverse(normal.matrix) @ normal.gradient
         errors.append(estimate - truth.theta)
         predicted.append(expected_godambe(objective, estimate, 0.05))
         naive.append(inverse * normal.cost / objective.n_pairs)

@@ -11,7 +11,7 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.status import Status
 from starcal_uq.estimation.calibration import Calibration
-from starcal_uq.inference.target import scaled_inverse
+from starcal_uq.maths.linear import symmetric_inverse
 
 SD = np.array([0.15, 0.15, 0.028, 0.39e-10, 0.073e-15])
 CORRELATION = np.eye(5)
@@ -42,7 +42,7 @@ def gaussian_calibration(dof: int = 25_000, sigma: float = 0.05, **changes: Any)
     """What `sample` needs of a calibration."""
     nominal = Camera(1024, 1024, 12.0, 72.0, 511.5, 511.5)
     camera = nominal.with_theta([500.0, 530.0, 5852.0, 2.0e-10, -3.5e-15])
-    information = scaled_inverse(COVARIANCE)
+    information = symmetric_inverse(COVARIANCE)
     values: dict[str, Any] = {
         "theta": camera.theta,
         "information": information,

@@ -16,7 +16,8 @@ from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.inference.checks import check_compression
 from starcal_uq.inference.priors import Priors
 from starcal_uq.inference.sample import sample
-from starcal_uq.inference.target import importance_check, laplace_approximation, scaled_inverse, start_target
+from starcal_uq.inference.target import importance_check, laplace_approximation, start_target
+from starcal_uq.maths.linear import symmetric_inverse
 from tests.helpers.gaussian_camera import COVARIANCE, SD, GaussianLikelihood, gaussian_calibration
 from tests.helpers.scenes import camera, nominal, observations, with_sigmas
 
@@ -32,7 +33,7 @@ def whitened(draws: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> np.
 def conjugate(priors: Priors, cal: Any) -> tuple[np.ndarray, np.ndarray]:
     """Mean and covariance of the posterior with the noise given."""
     names = priors.names[:-1]
-    covariance = scaled_inverse(cal.information + priors.precision(names))
+    covariance = symmetric_inverse(cal.information + priors.precision(names))
     pull = cal.information @ cal.theta + priors.precision(names) @ priors.mean(names)
     return covariance @ pull, covariance
 
@@ -200,7 +201,7 @@ def test_unsound_calibrations_are_refused() -> None:
     with pytest.raises(SamplingError, match="did not converge"):
         sample(None, gaussian_calibration(status=Status.STALLED), **QUICK)
     with pytest.raises(SamplingError, match="not positive definite"):
-        sample(None, gaussian_calibration(information=-scaled_inverse(COVARIANCE)), **QUICK)
+        sample(None, gaussian_calibration(information=-symmetric_inverse(COVARIANCE)), **QUICK)
     priors = Priors.default(gaussian_calibration().nominal.replace(distortion="k1"))
     with pytest.raises(SamplingError, match=r"Priors\.default"):
         sample(None, gaussian_calibration(), priors, **QUICK)

@@ -14,9 +14,10 @@ from starcal_uq.budgeting.shapes import two_axis_radius
 from starcal_uq.core.errors import PlanningError
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.maths.circular import mixture_radius
+from starcal_uq.maths.linear import inverses
 from starcal_uq.planning.check import ForecastCheck, check_forecast
 from starcal_uq.planning.design import choose_frames
-from starcal_uq.planning.forecast import Forecaster, inverses, nea_arcsec, quantities, spreads, student_factor
+from starcal_uq.planning.forecast import Forecaster, nea_arcsec, quantities, spreads, student_factor
 from starcal_uq.planning.information import FrameSet, look_at, random_frames
 from starcal_uq.planning.plan import Plan, plan
 from starcal_uq.presentation.words.planning import frames as frames_words

@@ -57,7 +57,8 @@ def test_greedy_with_exchange_finds_the_best_of_all_sets():
     """Few enough candidates to try every set."""
     from itertools import combinations
 
-    from starcal_uq.planning.forecast import inverses, quantities, spreads
+    from starcal_uq.maths.linear import inverses
+    from starcal_uq.planning.forecast import quantities, spreads
     from starcal_uq.planning.information import look_at, random_frames
 
     rotations = random_rotations(16, np.random.default_rng(4))

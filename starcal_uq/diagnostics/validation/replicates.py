@@ -22,7 +22,8 @@ from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.inference.ensemble import EnsembleSettings, run_ensembles
 from starcal_uq.inference.named import NaivePairsWarning, find_source
-from starcal_uq.inference.target import Likelihood, LogLikelihood, laplace_approximation, scaled_inverse, start_target
+from starcal_uq.inference.target import Likelihood, LogLikelihood, laplace_approximation, start_target
+from starcal_uq.maths.linear import symmetric_inverse
 from starcal_uq.simulation.frames import simulate
 
 if TYPE_CHECKING:
@@ -269,4 +270,4 @@ def _no_result(study: Study, truth: FloatArray, index: int, reason: str) -> Outc
 
 
 def _nees(error: FloatArray, covariance: FloatArray) -> float:
-    return float(error @ scaled_inverse(covariance) @ error)
+    return float(error @ symmetric_inverse(covariance) @ error)

@@ -15,7 +15,8 @@ from starcal_uq.core.formatting import significant
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
 from starcal_uq.diagnostics.validation.replicates import INTERVAL
 from starcal_uq.inference.priors import Priors
-from starcal_uq.maths.ranks import binomial_interval, uniformity_p_value
+from starcal_uq.maths.intervals import binomial_interval, holm
+from starcal_uq.maths.ranks import uniformity_p_value
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -185,11 +186,8 @@ class Validation:
         tests += [(q, "ranks", float(p)) for q, p in zip(self.quantities, self.rank_p_value, strict=True)]
         tests += [(q, "coverage", float(p)) for q, p in zip(self.quantities, self.coverage_p_value, strict=True)]
         tests.sort(key=lambda test: test[2])
-        rejected, findings = True, []
-        for place, test in enumerate(tests):
-            rejected = rejected and test[2] <= FAMILY_LEVEL / (len(tests) - place)
-            findings.append(Finding(*test, rejected))
-        return tuple(findings)
+        corrected = holm([p for *_, p in tests])
+        return tuple(Finding(*test, bool(p <= FAMILY_LEVEL)) for test, p in zip(tests, corrected, strict=True))
 
     @property
     def ok(self) -> bool:

@@ -20,6 +20,7 @@ from starcal_uq.estimation.recursive.filter import FrameSums, Recursion, entry_c
 from starcal_uq.estimation.recursive.innovations import frame_normals
 from starcal_uq.estimation.solvers import is_singular
 from starcal_uq.estimation.stages import Stage
+from starcal_uq.maths.linear import correlation_of
 
 # The scatter of fewer frames than this per parameter says less about the covariance than the model does: less is needed
 # where the distortion is ignored, because the model is then known to be wrong.
@@ -251,8 +252,8 @@ def _quadratic(
 ) -> CompressedLikelihood:
     """The likelihood of the linearised frames; the slope of the attitudes' volume, 0.01 sigma, is left out."""
     p, matrix = len(theta), recursion.sums.gram[1:, 1:]
-    unit = np.sqrt(np.diag(matrix))
-    whitening = np.linalg.cholesky(np.linalg.inv(matrix / np.outer(unit, unit))) / unit[:, None] * sigma
+    reduced, unit = correlation_of(matrix)
+    whitening = np.linalg.cholesky(np.linalg.inv(reduced)) / unit[:, None] * sigma
     q = (p + 1) * (p + 2) // 2
     gram = np.zeros((q, q))
     gram[0, 0] = chi2

@@ -25,6 +25,7 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
@@ -188,8 +189,7 @@ def _compare(
     g = d_theta - np.einsum("pcn,cxn->pxn", response, d_phi)
     used = g[:, :, in_use].reshape(len(theta), -1)
     normal = used @ used.T
-    scale = 1.0 / np.sqrt(np.diag(normal))
-    covariance = np.linalg.inv(normal * np.outer(scale, scale)) * np.outer(scale, scale)
+    covariance = scaled_inverse(normal)
     hat = np.einsum("axn,abn,byn->xyn", d_phi, inverse, d_phi, optimize=True)
     hat += np.einsum("pxn,pyn->xyn", np.tensordot(covariance, g, axes=1), g)
     sign = np.where(in_use, -1.0, 1.0)

@@ -12,6 +12,7 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.types import AnyDict
 from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.maths.intervals import wilson_interval
 from starcal_uq.paper.field.attitudes import (
     SOURCES,
     AttitudeErrors,
@@ -23,7 +24,6 @@ from starcal_uq.paper.field.attitudes import (
 from starcal_uq.paper.field.frames import FieldFrames
 from starcal_uq.paper.field.identification import FieldIdentification
 from starcal_uq.paper.field.published import AXES, FIELD_METHODS, RATE, FieldReading, printed_field
-from starcal_uq.paper.statistics import wilson_interval
 
 if TYPE_CHECKING:
     import pandas as pd

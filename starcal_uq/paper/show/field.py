@@ -12,6 +12,7 @@ import numpy as np
 from starcal_uq.core.files import atomic_path, atomic_write_bytes, atomic_write_text, new_folder
 from starcal_uq.core.formatting import fixed, join_words, percent, plural, significant
 from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.maths.intervals import wilson_interval
 from starcal_uq.paper.field.identification import WRONG_PX
 from starcal_uq.paper.field.published import (
     AXES,
@@ -29,7 +30,6 @@ from starcal_uq.paper.field.published import (
 )
 from starcal_uq.paper.field.result import ALIGNED, AS_IT_STANDS, BOTH, NEITHER
 from starcal_uq.paper.published import PROPOSED
-from starcal_uq.paper.statistics import wilson_interval
 from starcal_uq.presentation.html import embedded_image, template_environment
 
 if TYPE_CHECKING:

@@ -1,0 +1,50 @@
+"""Intervals for fractions, and Holm's correction for many tests.
+
+The closed forms stand here because `scipy.stats.binomtest(...).proportion_ci` finds the exact interval by a search that
+ends at 5e-13, and SciPy has no correction of Holm's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from starcal_uq.core.types import FloatArray
+
+# Standard deviations of a normal 95 % interval.
+HALF_WIDTH_95 = 1.959963984540054
+
+
+def binomial_interval(successes: int, n: int, probability: float = 0.95) -> tuple[float, float]:
+    """Exact interval for a fraction (Clopper & Pearson 1934)."""
+    from scipy.stats import beta
+
+    tail = 0.5 * (1.0 - probability)
+    low = float(beta.ppf(tail, successes, n - successes + 1)) if successes > 0 else 0.0
+    high = float(beta.ppf(1.0 - tail, successes + 1, n - successes)) if successes < n else 1.0
+    return low, high
+
+
+def wilson_interval(successes: int, n: int) -> tuple[float, float]:
+    """95 % interval for a fraction (Wilson 1927)."""
+    if n == 0:
+        return float("nan"), float("nan")
+    z, fraction = HALF_WIDTH_95, successes / n
+    centre = fraction + z**2 / (2 * n)
+    half = z * np.sqrt(fraction * (1.0 - fraction) / n + (z / (2 * n)) ** 2)
+    scale = 1.0 + z**2 / n
+    # Rounding must not leave the fraction outside.
+    low = 0.0 if successes == 0 else float((centre - half) / scale)
+    high = 1.0 if successes == n else float((centre + half) / scale)
+    return low, high
+
+
+def holm(p_values: Sequence[float]) -> FloatArray:
+    """p-values (m,) of several tests after Holm's step-down correction (1979); NaN stands for no test."""
+    p = np.asarray(p_values, dtype=np.float64)
+    order = np.argsort(p)[: np.count_nonzero(np.isfinite(p))]
+    stepped = np.maximum.accumulate(p[order] * np.arange(len(order), 0, -1))
+    corrected = np.full(len(p), np.nan)
+    corrected[order] = np.minimum(stepped, 1.0)
+    return corrected
