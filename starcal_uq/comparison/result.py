@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,13 +13,13 @@ from starcal_uq.core.constants import AXES
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_write_bytes, atomic_write_text
 from starcal_uq.core.formatting import significant
+from starcal_uq.core.records import read_json, to_plain, write_json
 from starcal_uq.core.types import AnyDict, FloatArray
 
 if TYPE_CHECKING:
     import pandas as pd
 
 FILES = ("comparison.html", "difference.csv", "comparison.json", "difference_map.csv", "difference_map.png")
-_TUPLES = ("labels", "models", "parameter_names", "parameter_units", "messages")
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +243,7 @@ class CameraComparison:
                 f"{folder}: the folder cannot be made ({error.strerror}); choose another place."
             ) from error
         image = png_bytes(self.plot_difference())
-        atomic_write_text(folder / "comparison.json", json.dumps(self.to_dict(), indent=1) + "\n")
+        write_json(self.to_dict(), folder / "comparison.json")
         atomic_write_text(folder / "difference.csv", self.to_dataframe().to_csv(index=False))
         atomic_write_text(folder / "difference_map.csv", self.field_dataframe().to_csv(index=False))
         atomic_write_bytes(folder / "difference_map.png", image)
@@ -254,7 +253,7 @@ class CameraComparison:
 
     def to_dict(self) -> AnyDict:
         """Plain values, for JSON; NaN is null."""
-        return {"verdict": self.verdict, **{f.name: _plain(getattr(self, f.name)) for f in fields(self)}}
+        return {"verdict": self.verdict, **to_plain(self, null=True)}
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> CameraComparison:
@@ -269,13 +268,7 @@ class CameraComparison:
         if path.is_dir():
             path = path / "comparison.json"
         remedy = "run `starcal-uq compare RUN_A RUN_B -o DIR` to write it"
-        try:
-            document = json.loads(path.read_text(encoding="utf-8"))
-            return cls(**{f.name: _restored(f.name, f.type, document[f.name]) for f in fields(cls)})
-        except OSError as error:
-            raise RunFolderError(f"{path}: cannot be read ({error.strerror or error}); {remedy}.") from error
-        except (ValueError, KeyError, TypeError) as error:
-            raise RunFolderError(f"{path}: is not a comparison of cameras; {remedy} again.") from error
+        return read_json(cls, path, missing=remedy, wrong=f"is not a comparison of cameras; {remedy} again")
 
     def _repr_html_(self) -> str:
         import html
@@ -284,21 +277,3 @@ class CameraComparison:
             index=False, float_format=lambda v: significant(v, 3), na_rep="", border=0, justify="left"
         )
         return f"<p><b>Comparison</b>: {html.escape(self.words)}</p>{table}"
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    return None if isinstance(value, float) and np.isnan(value) else value
-
-
-def _restored(name: str, kind: Any, value: Any) -> Any:
-    if name in _TUPLES:
-        return tuple(value)
-    if kind == "FloatArray":
-        return np.array(value, dtype=np.float64)
-    if kind == "float":
-        return np.nan if value is None else float(value)
-    return value

@@ -1,13 +1,13 @@
-"""Results as one ``.npz`` file: arrays to the last bit, all else as JSON beside them."""
+"""Files are written whole or not at all, and what is wrong with one that is read is said in a sentence."""
 
 from __future__ import annotations
 
-import json
+import csv
 import os
 import secrets
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.core.errors import ObservationError, RunFolderError, StarcalError
-from starcal_uq.core.types import AnyDict
 
 PathLike = str | os.PathLike[str]
 
@@ -120,45 +119,29 @@ def atomic_write_text(path: PathLike, text: str) -> None:
 
 
 # A file that was cut off, or is something else, shows itself by any of these, depending on where it was cut.
-_UNREADABLE = (KeyError, ValueError, TypeError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error, StarcalError)
-
-
-def write_archive(path: str | os.PathLike[str], kind: str, document: AnyDict, arrays: Mapping[str, Any]) -> None:
-    """Write an archive of a kind, atomically; overwritten."""
-    with atomic_path(path) as temporary, open(temporary, "wb") as file:
-        np.savez_compressed(
-            file, allow_pickle=False, format=np.array(kind), document=np.array(json.dumps(document)), **arrays
-        )
+_UNREADABLE = (
+    KeyError, ValueError, TypeError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error, csv.Error, StarcalError,
+)  # fmt: skip
 
 
 @contextmanager
-def reading_archive(
-    path: str | os.PathLike[str], kind: str, *, missing: str, wrong: str
-) -> Iterator[tuple[AnyDict, dict[str, Any]]]:
-    """Document and arrays of an archive, for a block that makes a result of them.
+def reading(path: PathLike, *, missing: str, wrong: str) -> Iterator[None]:
+    """For a block that makes a result of a file: what goes wrong there, in one sentence.
 
     Parameters
     ----------
     path : path
         File.
-    kind : str
-        What `write_archive` was told.
     missing, wrong : str
-        How the sentence goes on for a file that cannot be read, and for one that is not such a result, also where the
-        block finds that out.
+        How the sentence goes on for a file that cannot be read, and for one that is not such a result.
 
     Raises
     ------
     RunFolderError
-        In one sentence.
+        In place of all errors that a missing, damaged or foreign file causes.
     """
     try:
-        # Opened here: NumPy leaves a file open that turns out not to be what it seems.
-        with open(path, "rb") as file, np.load(file, allow_pickle=False) as content:
-            arrays = {name: content[name] for name in content.files}
-        if str(arrays.pop("format")) != kind:
-            raise ValueError("another format")
-        yield json.loads(str(arrays.pop("document"))), arrays
+        yield
     except OSError as error:
         raise RunFolderError(f"{path}: cannot be read ({error.strerror or error}); {missing}.") from error
     except _UNREADABLE as error:

@@ -6,14 +6,16 @@ other starts take seconds; the report reads what is stored, and leaves out what 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.core.errors import StarcalError
+from starcal_uq.core.files import PathLike
 from starcal_uq.core.provenance import provenance
+from starcal_uq.core.records import read_json, write_json
 from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.jackknife import Jackknife, jackknife_frames
@@ -106,30 +108,21 @@ class Diagnosis:
         same_data = self.provenance.get("data_sha256") == cal.provenance.get("data_sha256")
         return same_data and list(self.theta) == cal.theta.tolist()
 
-    def to_dict(self) -> AnyDict:
-        """Plain values, for JSON."""
-        return {
-            "misfit": self.misfit.to_dict(),
-            "predictive": self.predictive.to_dict(),
-            "jackknife": None if self.jackknife is None else self.jackknife.to_dict(),
-            "comparison": None if self.comparison is None else self.comparison.to_dict(),
-            "starts": None if self.starts is None else asdict(self.starts),
-            "theta": list(self.theta),
-            "provenance": self.provenance,
-        }
+    def save(self, path: PathLike) -> None:
+        """Write everything as JSON, atomically; overwritten."""
+        write_json(self, path)
 
     @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Diagnosis:
-        """Inverse of `to_dict`."""
-        return cls(
-            misfit=Misfit.from_dict(data["misfit"]),
-            predictive=PredictiveCheck.from_dict(data["predictive"]),
-            jackknife=None if data["jackknife"] is None else Jackknife.from_dict(data["jackknife"]),
-            comparison=None if data["comparison"] is None else ModelComparison.from_dict(data["comparison"]),
-            starts=None if data["starts"] is None else MultiStart(**data["starts"]),
-            theta=tuple(data["theta"]),
-            provenance=dict(data["provenance"]),
-        )
+    def load(cls, path: PathLike) -> Diagnosis:
+        """Read what `save` wrote.
+
+        Raises
+        ------
+        RunFolderError
+            If the file is missing or is not a diagnosis.
+        """
+        remedy = "run `starcal-uq diagnose` again"
+        return read_json(cls, path, missing=remedy, wrong=f"cannot be read as a diagnosis: {remedy}")
 
     def _repr_html_(self) -> str:
         parts = (self.misfit, self.jackknife, self.comparison, self.predictive)

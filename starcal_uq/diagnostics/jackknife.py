@@ -6,15 +6,14 @@ together, and differently from frame to frame, shows in the scatter of estimates
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.formatting import fixed, plural
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.normals import FrameNormals
 
 if TYPE_CHECKING:
@@ -118,16 +117,6 @@ class Jackknife:
                 "factor": self.factors,
             }
         )
-
-    def to_dict(self) -> AnyDict:
-        """Plain values, for JSON."""
-        return {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in asdict(self).items()}
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Jackknife:
-        """Inverse of `to_dict`."""
-        arrays = {name: np.asarray(data[name], dtype=np.float64) for name in _ARRAYS}
-        return cls(tuple(data["parameter_names"]), **arrays, n_frames=int(data["n_frames"]))
 
     def _repr_html_(self) -> str:
         numbers = (self.ratio, self.sandwich_ratio, *self.expected())

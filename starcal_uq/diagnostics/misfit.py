@@ -13,7 +13,6 @@ unequal noise compare the residuals' weighted and unweighted sums of squares wit
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +20,7 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.formatting import plural, significant
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.shapes import Shape, View, run_clock, shapes
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.maths.intervals import holm
@@ -139,19 +138,6 @@ class Misfit:
 
         rows = [{**asdict(t), "amplitudes": "; ".join(str(a) for a in t.amplitudes)} for t in self.tests]
         return pd.DataFrame(rows).rename(columns={"name": "test"})
-
-    def to_dict(self) -> AnyDict:
-        """Plain values, for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> Misfit:
-        """Inverse of `to_dict`."""
-        tests = tuple(
-            MisfitTest(**{**test, "amplitudes": tuple(Amplitude(**a) for a in test["amplitudes"])})
-            for test in data["tests"]
-        )
-        return cls(**{**data, "tests": tests})
 
     def plot_misfit(self, **options: Any) -> Any:
         """Corrected p-values of all tests; options as for `starcal_uq.presentation.figures.diagnostics.plot_misfit`."""

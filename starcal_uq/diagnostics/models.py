@@ -11,9 +11,9 @@ parameters, 1 / sigma): normal times scaled inverse chi-square. Two estimates of
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.formatting import fixed, join_words, significant
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.inference.arviz import psis
@@ -162,19 +162,6 @@ class ModelComparison:
                 row |= {f"{part}_{axis}_arcsec": v for axis, v in zip(AXES, values, strict=True)}
             rows.append(row)
         return pd.DataFrame(rows)
-
-    def to_dict(self) -> AnyDict:
-        """Plain values, for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> ModelComparison:
-        """Inverse of `to_dict`."""
-        scores = tuple(
-            ModelScore(**{**s, "common_arcsec": tuple(s["common_arcsec"]), "rest_arcsec": tuple(s["rest_arcsec"])})
-            for s in data["scores"]
-        )
-        return cls(scores, str(data["fitted"]), dict(data["failed"]))
 
     def _repr_html_(self) -> str:
         rows = "".join(

@@ -7,15 +7,14 @@ same statistics of the measured residuals at the same draw are set against them.
 from __future__ import annotations
 
 import html
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.formatting import significant
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_cholesky
 
@@ -82,16 +81,6 @@ class PredictiveCheck:
         import pandas as pd
 
         return pd.DataFrame([asdict(s) for s in self.statistics])
-
-    def to_dict(self) -> AnyDict:
-        """Plain values, for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, data: Mapping[str, Any]) -> PredictiveCheck:
-        """Inverse of `to_dict`."""
-        statistics = tuple(PredictiveStatistic(**s) for s in data["statistics"])
-        return cls(statistics, int(data["n_draws"]), int(data["n_frames"]))
 
     def _repr_html_(self) -> str:
         rows = "".join(

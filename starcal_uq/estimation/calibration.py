@@ -11,9 +11,10 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
-from starcal_uq.core.errors import CalibrationError, RunFolderError
-from starcal_uq.core.files import atomic_path, atomic_write_text
+from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.files import atomic_path, reading
 from starcal_uq.core.formatting import decimals_for, fixed
+from starcal_uq.core.records import Arrays, from_plain, read_arrays, to_plain, write_json
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.estimation.compressed import CompressedLikelihood
@@ -25,19 +26,16 @@ if TYPE_CHECKING:
 
     from starcal_uq.observations.table import Observations
 
-_ARRAYS = (
-    "theta",
-    "covariance",
-    "frame_ids",
-    "quaternions",
-    "residuals_px",
-    "information",
-    "rotation_per_theta",
-    "attitude_noise",
-    "pair_theta",
-    "pair_covariance",
+# Fields whose arrays grow with the data or the iterations: they stand in an archive beside the document.
+_APART = ("frame_ids", "quaternions", "residuals_px", "trajectory", "cost", "sigmas")
+# Fields of the document, in the order in which it is read.
+_DOCUMENT = (
+    *("status", "parameter_names", "method", "solver", "sigma", "sigma_std", "sigma_name", "chi2", "dof", "provenance"),
+    *("theta", "covariance", "information", "rotation_per_theta", "attitude_noise", "pair_theta", "pair_covariance"),
+    *("camera", "nominal", "stages", "compressed"),
 )
-_SCALARS = ("method", "solver", "sigma", "sigma_std", "sigma_name", "chi2", "dof", "provenance")
+# What the document says of a stage; its last estimate is there for readers.
+_STAGE = ("name", "status", "iterations", "evaluations", "seconds", "theta")
 
 
 @dataclass(frozen=True)
@@ -227,33 +225,14 @@ class Calibration:
             File ending in ``.json``; overwritten.
         """
         path = Path(path)
-        arrays: dict[str, FloatArray] = {}
-        stages = []
-        for index, stage in enumerate(self.stages):
-            arrays[f"stage{index}_trajectory"], arrays[f"stage{index}_cost"] = stage.trajectory, stage.cost
-            if stage.sigmas is not None:
-                arrays[f"stage{index}_sigmas"] = stage.sigmas
-            stages.append(
-                {
-                    "name": stage.name,
-                    "status": stage.status.name,
-                    "iterations": len(stage.trajectory) - 1,
-                    "evaluations": stage.evaluations,
-                    "seconds": stage.seconds,
-                    "theta": stage.theta.tolist(),
-                }
-            )
-        large = ("frame_ids", "quaternions", "residuals_px")
-        arrays |= {name: getattr(self, name) for name in large}
-        document: AnyDict = {"status": self.status.name, "parameter_names": list(self.parameter_names)}
-        document |= {name: getattr(self, name) for name in _SCALARS}
-        document |= {name: getattr(self, name).tolist() for name in _ARRAYS if name not in large}
-        document["camera"], document["nominal"] = self.camera.to_dict(), self.nominal.to_dict()
-        document["stages"], document["compressed"] = stages, self.compressed.to_dict()
+        arrays: Arrays = {}
+        plain = to_plain(self, arrays, _APART) | {"parameter_names": list(self.parameter_names)}
+        for stage, kept in zip(self.stages, plain["stages"], strict=True):
+            kept |= {"iterations": stage.iterations, "theta": stage.theta.tolist()}
+        plain["stages"] = [{name: kept[name] for name in _STAGE} for kept in plain["stages"]]
         with atomic_path(path.with_suffix(".npz")) as temporary, temporary.open("wb") as stream:
-            # The archive's writer is typed for arrays only by name.
-            np.savez_compressed(stream, **arrays)  # type: ignore[arg-type]
-        atomic_write_text(path, json.dumps(document, indent=1) + "\n")
+            np.savez_compressed(stream, allow_pickle=False, **arrays)
+        write_json({name: plain[name] for name in _DOCUMENT}, path)
 
     @classmethod
     def load(cls, path: str | Path) -> Calibration:
@@ -264,34 +243,7 @@ class Calibration:
         RunFolderError
             When a file is missing or not a calibration.
         """
-        path = Path(path)
-        try:
-            document: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-            with np.load(path.with_suffix(".npz")) as archive:
-                arrays = {name: archive[name] for name in archive.files}
-            stages = tuple(
-                Stage(
-                    name=stage["name"],
-                    trajectory=arrays[f"stage{index}_trajectory"],
-                    cost=arrays[f"stage{index}_cost"],
-                    status=Status[stage["status"]],
-                    evaluations=stage["evaluations"],
-                    seconds=stage["seconds"],
-                    sigmas=arrays.get(f"stage{index}_sigmas"),
-                )
-                for index, stage in enumerate(document["stages"])
-            )
-            values: AnyDict = {name: arrays[name] if name in arrays else np.asarray(document[name]) for name in _ARRAYS}
-            return cls(
-                camera=Camera.from_dict(document["camera"]),
-                nominal=Camera.from_dict(document["nominal"]),
-                stages=stages,
-                status=Status[document["status"]],
-                compressed=CompressedLikelihood.from_dict(document["compressed"]),
-                **(values | {name: document[name] for name in _SCALARS}),
-            )
-        except (OSError, KeyError, ValueError, TypeError) as error:
-            raise RunFolderError(
-                f"{path}: cannot be read as a calibration ({type(error).__name__}: {error}): "
-                "run `starcal-uq calibrate` again."
-            ) from error
+        path, remedy = Path(path), "run `starcal-uq calibrate` again"
+        with reading(path, missing=remedy, wrong=f"cannot be read as a calibration: {remedy}"):
+            document = json.loads(path.read_text(encoding="utf-8"))
+            return from_plain(cls, document, read_arrays(path.with_suffix(".npz")))

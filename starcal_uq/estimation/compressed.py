@@ -11,14 +11,13 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from starcal_uq.camera.projection import forward_kernel, forward_root, second_index
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.marginal import MarginalLikelihood, Profile
 from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
 
@@ -91,17 +90,6 @@ class CompressedLikelihood:
             - 0.5 * (self.log_determinant + z @ self.log_determinant_slope)
         )
         return value
-
-    def to_dict(self) -> AnyDict:
-        """Plain lists and numbers, lossless."""
-        return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in vars(self).items()}
-
-    @classmethod
-    def from_dict(cls, data: dict[str, Any]) -> CompressedLikelihood:
-        """Inverse of `to_dict`."""
-        arrays = ("theta_hat", "whitening", "gram", "log_determinant_slope")
-        values: AnyDict = {k: np.asarray(v, dtype=np.float64) if k in arrays else v for k, v in data.items()}
-        return cls(**values)
 
 
 @dataclass(frozen=True)

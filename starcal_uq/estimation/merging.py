@@ -11,7 +11,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from time import perf_counter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from starcal_uq.attitude.rotations import rotation_to_quaternion
 from starcal_uq.camera.distortion import sigma_parameter
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.provenance import data_hashes, provenance
+from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.estimation.calibration import Calibration
@@ -235,7 +236,7 @@ def _provenance(
     else:
         data_hash = observations.data_hash
     settings = {"method": "merged", "noise": noise, "distortion": calibrations[0].camera.distortion}
-    record = {"parts": parts, "has_observations": observations is not None, "consistency": found.to_dict()}
+    record = {"parts": parts, "has_observations": observations is not None, "consistency": to_plain(found, null=True)}
     return {**provenance(None, settings, data_hash), "merge": record}
 
 
@@ -313,23 +314,6 @@ class Consistency:
             table[f"z_{name}"] = self.z[:, i]
         return table
 
-    def to_dict(self) -> AnyDict:
-        """Plain lists and numbers; NaN becomes None, which JSON can hold."""
-        values = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in vars(self).items()}
-        values["noise_p_value"] = None if np.isnan(self.noise_p_value) else self.noise_p_value
-        return values
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> Consistency:
-        """Inverse of `to_dict`."""
-        data: AnyDict = dict(values)
-        for name in ("distance_sigma", "run_p_value", "z", "sigma"):
-            data[name] = np.asarray(data[name], dtype=np.float64)
-        for name in ("names", "parameter_names", "dof", "messages"):
-            data[name] = tuple(data[name])
-        data["noise_p_value"] = float("nan") if data["noise_p_value"] is None else data["noise_p_value"]
-        return cls(**data)
-
     def _repr_html_(self) -> str:
         import html
 
@@ -346,7 +330,7 @@ class Consistency:
 def consistency_of(calibration: Calibration) -> Consistency | None:
     """The comparison stored with a merged calibration; None for one that was not merged."""
     record = calibration.provenance.get("merge")
-    return None if record is None else Consistency.from_dict(record["consistency"])
+    return None if record is None else from_plain(Consistency, record["consistency"])
 
 
 def compare_runs(

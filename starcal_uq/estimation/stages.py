@@ -60,6 +60,11 @@ class Stage:
     sigmas: FloatArray | None = None
 
     @property
+    def iterations(self) -> int:
+        """Steps taken; of a filter, frames."""
+        return len(self.trajectory) - 1
+
+    @property
     def theta(self) -> FloatArray:
         """The stage's result, (p,)."""
         last: FloatArray = self.trajectory[-1]

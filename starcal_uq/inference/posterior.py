@@ -5,21 +5,21 @@ Opening a saved posterior needs neither the sampler nor the symbolic model nor a
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import Parameter, parameters, sigma_parameter
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import atomic_path, ensure_new
+from starcal_uq.core.files import atomic_path, ensure_new, reading
+from starcal_uq.core.records import Arrays, from_plain, to_plain
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.inference.priors import SIGMA_NAMES, Priors
 
@@ -293,7 +293,7 @@ class Posterior:
             "draw_order": DRAW_ORDER,
             "n_walkers": self.n_walkers,
             "n_steps": self.n_steps,
-            "provenance": to_json(self.provenance),
+            "provenance": json.dumps(to_plain(self.provenance)),
         }
         if not self.sigma_sampled:
             attrs[f"{self.sigma_name}_given"] = float(self.sigma_draws[0])
@@ -404,47 +404,21 @@ def _listed(messages: Sequence[str]) -> str:
 _FORMAT = "starcal_uq posterior 1"
 
 
-_Record = TypeVar("_Record", Laplace, Diagnostics)
-
-
 _ARRAYS = {
     "draws": ("sample", "parameter"),
     "log_posterior": ("sample",),
     "information": ("camera_parameter", "camera_parameter_2"),
     "rotation_per_theta": ("axis", "camera_parameter"),
     "attitude_noise": ("axis", "axis_2"),
+    # Present only where the likelihood has such a parameter.
+    "dof_draws": ("sample",),
 }
 
 
-# Present only where the likelihood has such a parameter.
-_OPTIONAL = {"dof_draws": ("sample",)}
-
-
-_PLAIN = ("n_ensembles", "n_walkers", "n_steps", "sigma_sampled", "provenance")
-
-
-def to_json(value: Any) -> str:
-    """JSON text with exact floats; arrays become lists."""
-    return json.dumps(value, default=_plain)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return vars(value)
-    return str(value)
-
-
-def _record(cls: type[_Record], values: Mapping[str, Any]) -> _Record:
-    kinds = {field.name: str(field.type) for field in dataclasses.fields(cls)}
-    converted: dict[str, Any] = {}
-    for name, value in values.items():
-        if kinds[name] == "FloatArray":
-            converted[name] = np.asarray(value, dtype=np.float64)
-        else:
-            converted[name] = tuple(value) if kinds[name].startswith("tuple") else value
-    return cls(**converted)
+_RECORD = (
+    *("parameter_names", "camera", "priors", "laplace", "diagnostics"),
+    *("n_ensembles", "n_walkers", "n_steps", "sigma_sampled", "provenance"),
+)
 
 
 def save_posterior(posterior: Posterior, path: str | os.PathLike[str], force: bool) -> None:
@@ -452,18 +426,11 @@ def save_posterior(posterior: Posterior, path: str | os.PathLike[str], force: bo
     import xarray as xr
 
     ensure_new(path, force)
-    record = {
-        "parameter_names": posterior.parameter_names,
-        "camera": posterior.camera.to_dict(),
-        "priors": posterior.priors.to_dict(),
-        "laplace": posterior.laplace,
-        "diagnostics": posterior.diagnostics,
-        **{name: getattr(posterior, name) for name in _PLAIN},
-    }
-    arrays = {name: (dims, getattr(posterior, name)) for name, dims in (_ARRAYS | _OPTIONAL).items()}
+    arrays: Arrays = {}
+    record = to_plain(posterior, arrays, _ARRAYS)
     root = xr.Dataset(
-        {name: value for name, value in arrays.items() if value[1] is not None},
-        attrs={"format": _FORMAT, "record": to_json(record)},
+        {name: (_ARRAYS[name], value) for name, value in arrays.items()},
+        attrs={"format": _FORMAT, "record": json.dumps({name: record[name] for name in _RECORD})},
     )
     tree = xr.DataTree.from_dict({"/": root, **posterior.datasets()})
     with atomic_path(path) as temporary:
@@ -474,26 +441,13 @@ def load_posterior(path: str | os.PathLike[str]) -> Posterior:
     """Read a posterior; see `Posterior.load`."""
     import h5netcdf
 
+    remedy = "run `starcal-uq sample RUN` again"
     if not Path(path).is_file():
         raise RunFolderError(f"{path}: there is no such file; run `starcal-uq sample RUN` first.")
-    try:
+    with reading(path, missing=remedy, wrong=f"is not a posterior of this version; {remedy}"):
         with h5netcdf.File(path, "r") as file:
             if file.attrs.get("format") != _FORMAT:
-                raise RunFolderError(f"{path}: is not a posterior of this version; run `starcal-uq sample RUN` again.")
+                raise ValueError("another format")
             record = json.loads(str(file.attrs["record"]))
-            arrays: dict[str, Any] = {name: np.asarray(file.variables[name][...], dtype=np.float64) for name in _ARRAYS}
-            present = [name for name in _OPTIONAL if name in file.variables]
-            arrays |= {name: np.asarray(file.variables[name][...], dtype=np.float64) for name in present}
-    except (OSError, KeyError, ValueError) as error:
-        raise RunFolderError(
-            f"{path}: cannot be read as a posterior ({error}); run `starcal-uq sample RUN` again."
-        ) from error
-    return Posterior(
-        parameter_names=tuple(record["parameter_names"]),
-        priors=Priors.from_dict(record["priors"]),
-        laplace=_record(Laplace, record["laplace"]),
-        diagnostics=_record(Diagnostics, record["diagnostics"]),
-        camera=Camera.from_dict(record["camera"]),
-        **{name: record[name] for name in _PLAIN},
-        **arrays,
-    )
+            arrays = {name: np.asarray(file.variables[name][...]) for name in _ARRAYS if name in file.variables}
+        return from_plain(Posterior, record, arrays)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import secrets
 from dataclasses import asdict, replace
@@ -14,6 +15,7 @@ import numpy as np
 from starcal_uq.camera.distortion import parameters, sigma_parameter
 from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.provenance import data_hashes, provenance
+from starcal_uq.core.records import to_plain
 from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.inference.checks import (
@@ -34,7 +36,7 @@ from starcal_uq.inference.named import (
     label_of,
     resolved_dof,
 )
-from starcal_uq.inference.posterior import Laplace, Posterior, to_json
+from starcal_uq.inference.posterior import Laplace, Posterior
 from starcal_uq.inference.priors import SIGMA_NAMES, Priors
 from starcal_uq.inference.surrogate import fit_polynomial
 from starcal_uq.inference.target import (
@@ -204,7 +206,7 @@ class _Run:
 
     def fingerprint(self, target: Target, name: str) -> str:
         identity = {k: v for k, v in self.provenance.items() if k != "created_utc"}
-        text = to_json([identity, self.priors.to_dict(), name, target.centre, target.transform])
+        text = json.dumps(to_plain([identity, self.priors, name, target.centre, target.transform]))
         return hashlib.sha256(text.encode()).hexdigest()
 
     def sample(self, name: str, log_likelihood: LogLikelihood, checkpoint: str | os.PathLike[str] | None) -> _Outcome:

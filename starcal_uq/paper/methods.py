@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from starcal_uq.core.types import AnyDict
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.recursive.start import RECURSIVE_METHODS, RecursionOptions
 
@@ -49,20 +48,6 @@ class Method:
         source = [obs] if self.method in RECURSIVE_METHODS else obs
         return calibrate(source, start, method=self.method, recursion=self.recursion)
 
-    def to_dict(self) -> AnyDict:
-        """Plain values, for a file."""
-        recursion = None if self.recursion is None else self.recursion.to_dict()
-        return {name: getattr(self, name) for name in _PLAIN} | {"recursion": recursion}
-
-    @classmethod
-    def from_dict(cls, values: AnyDict) -> Method:
-        """Inverse of `to_dict`."""
-        recursion = values["recursion"]
-        options = None if recursion is None else RecursionOptions.from_dict(recursion)
-        return cls(**{name: values[name] for name in _PLAIN}, recursion=options)
-
-
-_PLAIN = ("label", "description", "method")
 
 METHODS = (
     Method(

@@ -11,8 +11,8 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
-from starcal_uq.core.files import reading_archive, write_archive
 from starcal_uq.core.formatting import fixed, percent, significant
+from starcal_uq.core.records import read, write
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
 from starcal_uq.maths.intervals import holm
 from starcal_uq.paper.methods import Method
@@ -226,8 +226,7 @@ class Replicates:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything to one ``.npz`` file, atomically; overwritten."""
-
-        save_replicates(self, path)
+        write(self, path, _FORMAT)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Replicates:
@@ -238,8 +237,13 @@ class Replicates:
         RunFolderError
             If the file is missing or is not a set of replicates.
         """
-
-        return load_replicates(path)
+        return read(
+            cls,
+            path,
+            _FORMAT,
+            missing="run `starcal-uq reproduce` first",
+            wrong="does not hold replicates; run `starcal-uq reproduce` to write it again",
+        )
 
     def plot(self, **options: Any) -> Any:
         """Bias, spread, claims and bound of every method; options as for `starcal_uq.paper.show.study_figures.plot_replicates`."""
@@ -285,43 +289,3 @@ class Replicates:
 
 
 _FORMAT = "starcal_uq replicates 1"
-
-
-_ARRAYS = ("replicate", "estimates", "claimed", "classical", "crlb", "map_px", "map_arcsec", "reprojection_px")
-
-
-_PLAIN = ("n_requested", "interrupted", "provenance")
-
-
-def save_replicates(found: Replicates, path: str | os.PathLike[str]) -> None:
-    """Write everything, atomically; overwritten."""
-    document: AnyDict = {name: getattr(found, name) for name in (*_PLAIN, "failures")}
-    document["methods"] = [method.to_dict() for method in found.methods]
-    document |= {"truth": found.truth.to_dict(), "start": found.start.to_dict()}
-    arrays = {name: getattr(found, name) for name in _ARRAYS}
-    write_archive(path, _FORMAT, document, arrays)
-
-
-def load_replicates(path: str | os.PathLike[str]) -> Replicates:
-    """Read what `save_replicates` wrote.
-
-    Raises
-    ------
-    RunFolderError
-        If the file is missing or is not a set of replicates.
-    """
-
-    words = {
-        "missing": "run `starcal-uq reproduce` first",
-        "wrong": "does not hold replicates; run `starcal-uq reproduce` to write it again",
-    }
-    with reading_archive(path, _FORMAT, **words) as (document, arrays):
-        values: AnyDict = {name: document[name] for name in _PLAIN}
-        return Replicates(
-            methods=tuple(Method.from_dict(method) for method in document["methods"]),
-            truth=Camera.from_dict(document["truth"]),
-            start=Camera.from_dict(document["start"]),
-            failures=tuple(tuple(reasons) for reasons in document["failures"]),
-            **{name: arrays[name] for name in _ARRAYS},
-            **values,
-        )

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import PathLike, atomic_write_text
+from starcal_uq.core.files import PathLike
 from starcal_uq.core.formatting import plural
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.records import read_json, write_json
 from starcal_uq.pipeline.refine import identified_pairs
 
 if TYPE_CHECKING:
@@ -105,7 +102,7 @@ class ImageRecord:
 
     def save(self, path: PathLike) -> None:
         """Write as JSON, all or nothing."""
-        atomic_write_text(path, json.dumps(asdict(self), indent=1) + "\n")
+        write_json(self, path)
 
     @classmethod
     def load(cls, path: PathLike) -> ImageRecord:
@@ -116,21 +113,8 @@ class ImageRecord:
         RunFolderError
             If the file cannot be read or is something else.
         """
-        try:
-            with open(path, encoding="utf-8") as file:
-                document = json.load(file)
-            return cls(
-                tuple(_round(entry) for entry in document["rounds"]),
-                tuple(ImageRow(**row) for row in document["rows"]),
-                int(document["n_disturbed"]),
-                str(document["parity"]),
-            )
-        except OSError as error:
-            raise RunFolderError(f"{path}: cannot be read ({error.strerror or error}).") from error
-        except (KeyError, TypeError, ValueError) as error:
-            raise RunFolderError(
-                f"{path}: is not a record of images; run `starcal-uq run IMAGES... CAMERA -o RUN` again."
-            ) from error
+        remedy = "run `starcal-uq run IMAGES... CAMERA -o RUN` again"
+        return read_json(cls, path, missing=remedy, wrong=f"is not a record of images; {remedy}")
 
 
 def record_images(centroids: Centroids, found: ImageCalibration) -> ImageRecord:
@@ -176,9 +160,3 @@ def _recorded(
         sigma_name=cal.sigma_name,
         sigma=float(cal.sigma),
     )
-
-
-def _round(entry: Mapping[str, Any]) -> RoundRecord:
-    values: AnyDict = dict(entry)
-    values["parameters"] = {name: (float(v), float(s)) for name, (v, s) in values["parameters"].items()}
-    return RoundRecord(**values)

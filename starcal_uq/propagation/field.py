@@ -17,7 +17,6 @@ the field by the same pitch and yaw.
 from __future__ import annotations
 
 import os
-import zipfile
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
@@ -27,8 +26,7 @@ from starcal_uq.camera.fields import area_weights, detector_axes, grid_points, r
 from starcal_uq.camera.projection import unproject, unproject_jacobian
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
-from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import atomic_path
+from starcal_uq.core.records import read, write
 from starcal_uq.core.types import FloatArray
 
 if TYPE_CHECKING:
@@ -36,14 +34,6 @@ if TYPE_CHECKING:
 
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import Observations
-
-# Fields that files of earlier versions lack.
-_LATER = (
-    "covariance_absolute_arcsec2",
-    "covariance_compensated_arcsec2",
-    "rotation_covariance_arcsec2",
-    "equivalent_covariance_px2",
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,9 +102,7 @@ class FieldMap(Shown):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all arrays to one ``.npz`` file, atomically; overwritten."""
-        arrays = {f.name: getattr(self, f.name) for f in fields(self) if getattr(self, f.name) is not None}
-        with atomic_path(path) as temporary, open(temporary, "wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **arrays)
+        write(self, path, kind="")
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> FieldMap:
@@ -125,19 +113,13 @@ class FieldMap(Shown):
         RunFolderError
             If the file is missing or is not a field map.
         """
-        try:
-            # Opened here: NumPy leaves a file open that turns out not to be what it seems.
-            with open(path, "rb") as file, np.load(file, allow_pickle=False) as arrays:
-                names = [f.name for f in fields(cls) if f.name not in _LATER or f.name in arrays.files]
-                return cls(**{name: arrays[name] for name in names})
-        except OSError as error:
-            raise RunFolderError(
-                f"{path}: cannot be read ({error.strerror or error}); run `starcal-uq propagate RUN` first."
-            ) from error
-        except (KeyError, ValueError, TypeError, EOFError, AttributeError, zipfile.BadZipFile) as error:
-            raise RunFolderError(
-                f"{path}: is not a field map; run `starcal-uq propagate RUN` to write it again."
-            ) from error
+        return read(
+            cls,
+            path,
+            kind="",
+            missing="run `starcal-uq propagate RUN` first",
+            wrong="is not a field map; run `starcal-uq propagate RUN` to write it again",
+        )
 
 
 def field_map(post: Posterior, obs: Observations, n: int = 25) -> FieldMap:

@@ -22,7 +22,7 @@ import numpy as np
 from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import AttitudeProfileError, SamplingError
-from starcal_uq.core.files import reading_archive, write_archive
+from starcal_uq.core.records import read, write
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.propagation.attitude_error import OBSERVED
 from starcal_uq.propagation.propagate import FrameGeometry
@@ -338,9 +338,7 @@ class ErrorSpectrum(Shown):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything to one ``.npz`` file, atomically and without loss; overwritten."""
-        arrays = {name: getattr(self, name) for name in _ARRAYS}
-        document = {name: getattr(self, name) for name in ("step_s", "gap_share", "n_draws", "frames")}
-        write_archive(path, _KIND, document, arrays)
+        write(self, path, _KIND)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> ErrorSpectrum:
@@ -351,19 +349,8 @@ class ErrorSpectrum(Shown):
         RunFolderError
             If the file is missing or is not such a spectrum.
         """
-        with reading_archive(
-            path,
-            _KIND,
-            missing="compute it again with error_spectrum",
-            wrong="is not an error spectrum; compute it again with error_spectrum",
-        ) as (document, arrays):
-            return cls(**{name: arrays[name] for name in _ARRAYS}, **document)
-
-
-_ARRAYS = (
-    "frequency_hz", "psd_arcsec2_hz", "nea_psd_arcsec2_hz", "variance_arcsec2", "nea_arcsec", "lag_s",
-    "autocorrelation", "time_s", "sigma_arcsec",
-)  # fmt: skip
+        remedy = "compute it again with error_spectrum"
+        return read(cls, path, _KIND, missing=remedy, wrong=f"is not an error spectrum; {remedy}")
 
 
 def _crossing(lag: FloatArray, correlation: FloatArray) -> float:

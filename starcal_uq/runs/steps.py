@@ -6,7 +6,6 @@ report) are removed when a step they depend on is done again, so that a folder n
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,7 +18,7 @@ from starcal_uq.budgeting.result import Budget
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import sigma_parameter
 from starcal_uq.core.errors import CalibrationError, ObservationError, RunFolderError
-from starcal_uq.core.files import atomic_path, atomic_write_text, check_new_folder, ensure_new
+from starcal_uq.core.files import atomic_path, check_new_folder, ensure_new
 from starcal_uq.core.tasks import Progress
 from starcal_uq.diagnostics.diagnose import FILE, TABLES, Diagnosis, diagnose
 from starcal_uq.diagnostics.models import MODELS
@@ -451,7 +450,7 @@ def diagnose_run(
         if part is not None:
             with atomic_path(run.path / file_name) as temporary:
                 part.to_dataframe().to_csv(temporary, index=False)
-    atomic_write_text(run.path / FILE, json.dumps(found.to_dict(), indent=1) + "\n")
+    found.save(run.path / FILE)
     return found
 
 
@@ -466,12 +465,7 @@ def load_diagnosis(run: RunFolder, cal: Calibration) -> Diagnosis | None:
     path = run.path / FILE
     if not path.exists():
         return None
-    try:
-        found = Diagnosis.from_dict(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, KeyError, ValueError, TypeError) as error:
-        raise RunFolderError(
-            f"{path}: cannot be read as a diagnosis ({type(error).__name__}: {error}): run `starcal-uq diagnose` again."
-        ) from error
+    found = Diagnosis.load(path)
     return found if found.is_of(cal) else None
 
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path, atomic_write_text, check_new_folder
+from starcal_uq.core.records import to_plain
 from starcal_uq.core.tasks import interrupt_between_steps
 from starcal_uq.core.types import AnyDict
 from starcal_uq.estimation.recursive.start import RecursionOptions
@@ -77,7 +78,7 @@ def filter_run(
         "columns": dict(columns or {}),
         "camera": camera.to_dict(),
         "method": method,
-        "options": options.to_dict(),
+        "options": to_plain(options),
     }
     state = run.path / STATE
     if force:

@@ -11,6 +11,7 @@ import pytest
 from scipy import stats
 
 import starcal_uq as sc
+from starcal_uq.core.records import to_plain
 from starcal_uq.diagnostics.diagnose import FILE, TABLES, Diagnosis, diagnose, multi_start
 from starcal_uq.diagnostics.jackknife import Jackknife, accept_inflation, jackknife_frames
 from starcal_uq.diagnostics.models import ModelComparison, closed_form, compare_models
@@ -224,7 +225,7 @@ def test_diagnosis_of_a_run_is_stored_and_belongs_to_its_calibration(obs, cal, t
     assert steps == [(i, 5) for i in range(1, 6)]
     assert {path.name for path in run.path.iterdir()} >= {FILE, *TABLES.values()}
     again = load_diagnosis(run, sc.Calibration.load(run.calibration))
-    assert json.dumps(again.to_dict()) == json.dumps(found.to_dict())
+    assert json.dumps(to_plain(again)) == json.dumps(to_plain(found))
     assert isinstance(again, Diagnosis) and isinstance(again.jackknife, Jackknife)
     assert isinstance(again.comparison, ModelComparison) and isinstance(again.predictive, PredictiveCheck)
     assert all(word in again._repr_html_() for word in ("Misfit", "Jackknife", "Models", "predictive"))

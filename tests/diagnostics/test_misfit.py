@@ -11,7 +11,8 @@ from scipy import stats
 
 import starcal_uq as sc
 from benchmarks.misfit_power import SCENARIOS, main, power
-from starcal_uq.diagnostics.misfit import Misfit, misfit_tests
+from starcal_uq.core.records import from_plain, to_plain
+from starcal_uq.diagnostics.misfit import Misfit, holm, misfit_tests
 from starcal_uq.diagnostics.shapes import View, shapes
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.maths.intervals import holm
@@ -212,7 +213,7 @@ def test_result_survives_json_and_shows_itself():
     import json
 
     found = refit(observations(n_frames=30))
-    again = Misfit.from_dict(json.loads(json.dumps(found.to_dict())))
+    again = from_plain(Misfit, json.loads(json.dumps(to_plain(found))))
     assert repr(again) == repr(found)
     assert list(found.to_dataframe()["test"]) == [t.name for t in found.tests]
     assert "overall p" in found._repr_html_()

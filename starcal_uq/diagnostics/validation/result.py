@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.core.files import reading_archive, write_archive
 from starcal_uq.core.formatting import significant
+from starcal_uq.core.records import read, write
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
 from starcal_uq.diagnostics.validation.replicates import INTERVAL
 from starcal_uq.inference.priors import Priors
@@ -27,6 +27,9 @@ FAMILY_LEVEL = 0.01
 
 # Below this many replicates, intervals that are half as wide as they should be could go unnoticed.
 ENOUGH_REPLICATES = 100
+
+
+_FORMAT = "starcal_uq validation 1"
 
 
 class Finding(NamedTuple):
@@ -230,8 +233,7 @@ class Validation:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write everything to one ``.npz`` file, atomically; overwritten."""
-
-        save_validation(self, path)
+        write(self, path, _FORMAT)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Validation:
@@ -242,8 +244,13 @@ class Validation:
         RunFolderError
             If the file is missing or is not a validation.
         """
-
-        return load_validation(path)
+        return read(
+            cls,
+            path,
+            _FORMAT,
+            missing="run `starcal-uq validate CAMERA` first",
+            wrong="is not a validation; run `starcal-uq validate CAMERA` to write it again",
+        )
 
     def plot(self, **options: Any) -> Any:
         """Rank curves with their bands, coverage and NEES; options as for `starcal_uq.presentation.figures.diagnostics.plot_validation`."""
@@ -256,51 +263,3 @@ class Validation:
 
         table = self.to_dataframe().to_html(index=False, float_format=lambda v: significant(v, 3), border=0)
         return f"<p><b>Validation</b>: {escape(self.verdict)}</p>{table}"
-
-
-_FORMAT = "starcal_uq validation 1"
-
-
-_ARRAYS = (
-    *("replicate", "truth", "ranks", "covered", "error", "sd"),
-    *("nees", "nees_calibration", "compression_error", "dof"),
-)
-
-
-_PLAIN = ("n_ranked", "n_requested", "interrupted", "provenance")
-
-
-_TUPLES = ("quantities", "units", "failures")
-
-
-def save_validation(found: Validation, path: str | os.PathLike[str]) -> None:
-    """Write everything, atomically; overwritten."""
-    document: AnyDict = {name: getattr(found, name) for name in (*_PLAIN, *_TUPLES)}
-    document |= {name: getattr(found, name).to_dict() for name in ("camera", "nominal", "priors")}
-    arrays = {name: getattr(found, name) for name in _ARRAYS}
-    write_archive(path, _FORMAT, document, arrays)
-
-
-def load_validation(path: str | os.PathLike[str]) -> Validation:
-    """Read what `save_validation` wrote.
-
-    Raises
-    ------
-    RunFolderError
-        If the file is missing or is not a validation.
-    """
-
-    words = {
-        "missing": "run `starcal-uq validate CAMERA` first",
-        "wrong": "is not a validation; run `starcal-uq validate CAMERA` to write it again",
-    }
-    with reading_archive(path, _FORMAT, **words) as (document, arrays):
-        values: AnyDict = {name: document[name] for name in _PLAIN}
-        values |= {name: tuple(document[name]) for name in _TUPLES}
-        return Validation(
-            camera=Camera.from_dict(document["camera"]),
-            nominal=Camera.from_dict(document["nominal"]),
-            priors=Priors.from_dict(document["priors"]),
-            **{name: arrays[name] for name in _ARRAYS},
-            **values,
-        )

@@ -29,7 +29,7 @@ import numpy as np
 
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.recursive.innovations import FrameNormals, PairCovariance, frame_normals
 from starcal_uq.observations.frames import StarFrames
 
@@ -143,6 +143,16 @@ class History:
             self.every *= 2
             for name in ("estimates", "sigmas", "costs"):
                 setattr(self, name, getattr(self, name)[::2])
+
+    def to_dict(self) -> AnyDict:
+        """The lists as arrays, for a file."""
+        return {name: value if name == "every" else np.array(value) for name, value in vars(self).items()}
+
+    @classmethod
+    def from_dict(cls, values: AnyDict) -> History:
+        """Inverse of `to_dict`."""
+        estimates, sigmas, costs = (values[name] for name in ("estimates", "sigmas", "costs"))
+        return cls(values["every"], list(estimates), list(sigmas), costs.tolist())
 
 
 # A linearisation serves while the estimate is within so many of its sigmas of it. The error that this leaves in a

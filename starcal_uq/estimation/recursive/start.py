@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,7 +10,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.recursive.filter import REACH_SIGMAS, FrameSums, Recursion
 from starcal_uq.estimation.recursive.innovations import PAIR_COVARIANCES, PairCovariance
 from starcal_uq.estimation.stages import Stage, optics_stage
@@ -209,16 +208,3 @@ class RecursionOptions:
                 raise CalibrationError("samaan forgets by process_noise: leave forgetting out, or use griffith.")
         elif self.process_noise is not None:
             raise CalibrationError("griffith has no process noise: use forgetting, or samaan.")
-
-    def to_dict(self) -> AnyDict:
-        """Plain values, for a file."""
-        values = asdict(self)
-        if isinstance(self.process_noise, Sequence):
-            values["process_noise"] = list(self.process_noise)
-        return values
-
-    @classmethod
-    def from_dict(cls, values: AnyDict) -> RecursionOptions:
-        """Inverse of `to_dict`."""
-        noise = values.get("process_noise")
-        return cls(**(values | {"process_noise": tuple(noise) if isinstance(noise, list) else noise}))

@@ -12,6 +12,7 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.records import to_plain
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, noise_px
@@ -25,7 +26,7 @@ from starcal_uq.estimation.recursive.result import (
     stream_calibration,
 )
 from starcal_uq.estimation.recursive.start import RECURSIVE_METHODS, RecursionOptions, begin, prior_of
-from starcal_uq.estimation.recursive.state import read_state, recursion_from, recursion_state, write_state
+from starcal_uq.estimation.recursive.state import State, read_state, write_state
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.observations.frames import StarFrames
 
@@ -245,7 +246,7 @@ class RecursiveCalibration:
             "method": self.method,
             "solver": "filter",
             "distortion": self.nominal.distortion,
-            "recursion": self.options.to_dict(),
+            "recursion": to_plain(self.options),
             "covariance": estimate.source,
             "stream": stream,
         }
@@ -300,17 +301,20 @@ class RecursiveCalibration:
         RunFolderError
             When the file cannot be written.
         """
-        header: AnyDict = {
-            "method": self.method,
-            "options": self.options.to_dict(),
-            "nominal": self.nominal.to_dict(),
-            "given_distortion": self._given_distortion,
-            "per_star": self._per_star,
-            "digest": self._digest,
-            "seconds": self._seconds,
-        }
-        frames = {"waiting": self._waiting, "richest": self._richest}
-        write_state(path, header, frames, self._start_stage, recursion_state(self._recursion))
+        state = State(
+            self.method,
+            self.options,
+            self.nominal,
+            self._given_distortion,
+            self._per_star,
+            self._digest,
+            self._seconds,
+            self._waiting,
+            self._richest,
+            self._start_stage,
+            self._recursion,
+        )
+        write_state(state, path)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> RecursiveCalibration:
@@ -321,15 +325,12 @@ class RecursiveCalibration:
         RunFolderError
             When the file is missing, truncated, or something else.
         """
-        header, frames, stage, state = read_state(path)
-        nominal = Camera.from_dict(header["nominal"])
-        loaded = cls(nominal, header["method"], RecursionOptions.from_dict(header["options"]))
-        loaded._given_distortion = header["given_distortion"]
-        loaded._per_star = header["per_star"]
-        loaded._digest, loaded._seconds = header["digest"], header["seconds"]
-        loaded._waiting, loaded._richest = frames.get("waiting"), frames.get("richest")
-        loaded._start_stage = stage
-        loaded._recursion = recursion_from(state)
+        state = read_state(path)
+        loaded = cls(state.nominal, state.method, state.options)
+        loaded._given_distortion, loaded._per_star = state.given_distortion, state.per_star
+        loaded._digest, loaded._seconds = state.digest, state.seconds
+        loaded._waiting, loaded._richest = state.waiting, state.richest
+        loaded._start_stage, loaded._recursion = state.stage, state.recursion
         return loaded
 
 

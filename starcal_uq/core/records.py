@@ -1,0 +1,244 @@
+"""One codec for results: frozen dataclasses of arrays, plain values, enumerations, tuples and other such records.
+
+What a field may hold is what its annotation says; anything else is refused, in writing and in reading. Numbers keep
+every bit. A class that has its own form in files (a camera, a prior) says so by `to_dict` and `from_dict`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Mapping
+from dataclasses import MISSING, fields, is_dataclass
+from enum import Enum
+from functools import cache
+from types import NoneType, UnionType
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from starcal_uq.core.files import PathLike, atomic_path, atomic_write_text, reading
+from starcal_uq.core.types import AnyDict
+
+Record = TypeVar("Record")
+Arrays = dict[str, Any]
+
+_FORMAT, _DOCUMENT = "format", "document"
+_SCALARS: dict[Any, tuple[type, ...]] = {bool: (bool,), int: (int,), float: (int, float), str: (str,)}
+
+
+def to_plain(
+    record: Any, arrays: Arrays | None = None, apart: Collection[str] | None = None, *, null: bool = False
+) -> Any:
+    """A record as dictionaries, lists, numbers and text, for JSON.
+
+    Parameters
+    ----------
+    record : dataclass
+        The record, or anything that a record may hold.
+    arrays : dict, optional
+        Takes arrays under the names of their fields (``stages`` holds ``stage0_cost``, ``stage1_cost``...), which are
+        then left out of the result; by default arrays become lists.
+    apart : collection of str, optional
+        Fields whose arrays go there; all by default.
+    null : bool
+        Write NaN as None, because strict JSON has no other word for it; `from_plain` reads both.
+
+    Raises
+    ------
+    TypeError
+        For a value that no file of ours can hold.
+    """
+    return _Writer(arrays, apart, null).plain(record, "")
+
+
+class _Writer:
+    def __init__(self, arrays: Arrays | None, apart: Collection[str] | None, null: bool) -> None:
+        self.arrays, self.apart, self.null = arrays, apart, null
+
+    def plain(self, value: Any, name: str) -> Any:
+        if isinstance(value, np.ndarray | np.generic):
+            value = value.tolist()
+        if isinstance(value, Enum):
+            return value.name
+        if isinstance(value, float):
+            return None if self.null and value != value else value
+        if value is None or isinstance(value, bool | int | str):
+            return value
+        if isinstance(value, list | tuple):
+            return [self.plain(item, f"{name.removesuffix('s')}{index}") for index, item in enumerate(value)]
+        if isinstance(value, Mapping):
+            return self.items(value, name)
+        if is_dataclass(value) and not isinstance(value, type):
+            # Both: a class that only tells itself in plain values, for readers, is read field by field.
+            own = getattr(value, "to_dict", None) if hasattr(value, "from_dict") else None
+            return self.items({f.name: getattr(value, f.name) for f in fields(value)} if own is None else own(), name)
+        raise TypeError(f"a file cannot hold {name or 'this'}: {type(value).__name__}")
+
+    def items(self, values: Mapping[str, Any], name: str) -> AnyDict:
+        kept: AnyDict = {}
+        for key, value in values.items():
+            if not isinstance(key, str):
+                raise TypeError(f"a file cannot hold the key {key!r} of {name}")
+            place = f"{name}_{key}" if name else key
+            wanted = self.arrays is not None and (self.apart is None or key in self.apart)
+            if wanted and isinstance(value, np.ndarray):
+                self.arrays[place] = value  # type: ignore[index]
+            else:
+                kept[key] = self.plain(value, place)
+        return kept
+
+
+def from_plain(cls: type[Record], data: Any, arrays: Arrays | None = None) -> Record:
+    """Inverse of `to_plain`.
+
+    Parameters
+    ----------
+    cls : type
+        Class of the record.
+    data : dict
+        What `to_plain` gave. A field that is missing has its default; a name that is a property of the class was
+        written for readers and is passed over.
+    arrays : dict, optional
+        What `to_plain` put there.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For a field that is missing, unknown, or holds something else.
+    """
+    made: Record = _value(cls, data, arrays or {}, "")
+    return made
+
+
+def _value(hint: Any, data: Any, arrays: Arrays, name: str) -> Any:
+    origin, args = get_origin(hint), get_args(hint)
+    if hint is Any:
+        return data
+    if hint in _SCALARS:
+        if hint is float and data is None:
+            return float("nan")
+        if not isinstance(data, _SCALARS[hint]) or (isinstance(data, bool) and hint is not bool):
+            raise ValueError(f"{name} is {data!r}, not {hint.__name__}")
+        return data
+    if origin is Literal:
+        if data not in args:
+            raise ValueError(f"{name} is {data!r}, not one of {', '.join(map(str, args))}")
+        return data
+    if origin in (Union, UnionType):
+        return _one_of(args, data, arrays, name)
+    if origin is np.ndarray:
+        if data is None:
+            raise ValueError(f"{name} is missing")
+        return np.asarray(data, dtype=get_args(args[1])[0])
+    if origin in (tuple, list):
+        return _sequence(origin, args, data, arrays, name)
+    if origin is dict:
+        return {key: _value(args[1], item, arrays, f"{name}_{key}") for key, item in _mapping(data, name).items()}
+    if isinstance(hint, type) and issubclass(hint, Enum):
+        return hint[data]
+    if hasattr(hint, "from_dict"):
+        start = f"{name}_"
+        inside = {key.removeprefix(start): value for key, value in arrays.items() if key.startswith(start)}
+        return hint.from_dict({**_mapping(data, name), **inside})
+    if is_dataclass(hint):
+        return _record(hint, _mapping(data, name), arrays, name)
+    raise TypeError(f"no file holds {name}: {hint}")
+
+
+def _mapping(data: Any, name: str) -> Mapping[str, Any]:
+    if not isinstance(data, Mapping):
+        raise ValueError(f"{name or 'the document'} is {type(data).__name__}, not a table")
+    return data
+
+
+def _one_of(kinds: tuple[Any, ...], data: Any, arrays: Arrays, name: str) -> Any:
+    if data is None and NoneType in kinds:
+        return None
+    *others, last = (kind for kind in kinds if kind is not NoneType)
+    for kind in others:
+        try:
+            return _value(kind, data, arrays, name)
+        except (TypeError, ValueError):
+            continue
+    return _value(last, data, arrays, name)
+
+
+def _sequence(kind: Any, items: tuple[Any, ...], data: Any, arrays: Arrays, name: str) -> Any:
+    if not isinstance(data, list | tuple):
+        raise ValueError(f"{name} is {data!r}, not a list")
+    kinds = [items[0]] * len(data) if kind is list or items[-1] is ... else items
+    if len(kinds) != len(data):
+        raise ValueError(f"{name} has {len(data)} entries, not {len(kinds)}")
+    place = name.removesuffix("s")
+    return kind(
+        _value(hint, item, arrays, f"{place}{i}") for i, (hint, item) in enumerate(zip(kinds, data, strict=True))
+    )
+
+
+@cache
+def _hints(cls: type) -> AnyDict:
+    return get_type_hints(cls)
+
+
+def _record(cls: Any, data: Mapping[str, Any], arrays: Arrays, name: str) -> Any:
+    hints, known = _hints(cls), fields(cls)
+    for key in set(data) - {field.name for field in known}:
+        if not isinstance(getattr(cls, key, None), property):
+            raise ValueError(f"{cls.__name__} has no field {key!r}")
+    values: AnyDict = {}
+    for field in known:
+        place = f"{name}_{field.name}" if name else field.name
+        if place in arrays:
+            values[field.name] = _value(hints[field.name], arrays[place], arrays, place)
+        elif field.name in data:
+            values[field.name] = _value(hints[field.name], data[field.name], arrays, place)
+        elif field.default is MISSING and field.default_factory is MISSING:
+            raise ValueError(f"{place} is missing")
+    return cls(**values)
+
+
+def write_json(record: Any, path: PathLike) -> None:
+    """Write a record, or plain values, as JSON for readers too; atomically, overwritten."""
+    atomic_write_text(path, json.dumps(to_plain(record), indent=1) + "\n")
+
+
+def read_json(cls: type[Record], path: PathLike, *, missing: str, wrong: str) -> Record:
+    """Read what `write_json` wrote; the sentences are those of `starcal_uq.core.files.reading`."""
+    with reading(path, missing=missing, wrong=wrong), open(path, encoding="utf-8") as file:
+        return from_plain(cls, json.load(file))
+
+
+def write(record: Any, path: PathLike, kind: str) -> None:
+    """Write a record as one ``.npz`` file: arrays to the last bit, all else as JSON beside them; overwritten.
+
+    Parameters
+    ----------
+    record : dataclass
+        The record.
+    path : path
+        File.
+    kind : str
+        What the file says it is; empty for a record of nothing but arrays, whose file needs no word for it.
+    """
+    arrays: Arrays = {}
+    document = to_plain(record, arrays)
+    if kind:
+        arrays = {_FORMAT: np.array(kind), _DOCUMENT: np.array(json.dumps(document)), **arrays}
+    with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def read(cls: type[Record], path: PathLike, kind: str, *, missing: str, wrong: str) -> Record:
+    """Inverse of `write`; the sentences are those of `starcal_uq.core.files.reading`."""
+    with reading(path, missing=missing, wrong=wrong):
+        arrays = read_arrays(path)
+        if kind and str(arrays.pop(_FORMAT)) != kind:
+            raise ValueError("another format")
+        return from_plain(cls, json.loads(str(arrays.pop(_DOCUMENT))) if kind else {}, arrays)
+
+
+def read_arrays(path: PathLike) -> Arrays:
+    """All arrays of an ``.npz`` file; one that holds Python objects is refused."""
+    # Opened here: NumPy leaves a file open that turns out not to be what it seems.
+    with open(path, "rb") as file, np.load(file, allow_pickle=False) as content:
+        return {name: content[name] for name in content.files}
