@@ -133,7 +133,8 @@ def reading(path: PathLike, *, missing: str, wrong: str) -> Iterator[None]:
     path : path
         File.
     missing, wrong : str
-        How the sentence goes on for a file that cannot be read, and for one that is not such a result.
+        How the sentence goes on for a file that cannot be read, and for one that is not such a result; ``{reason}`` in
+        the latter becomes what was found.
 
     Raises
     ------
@@ -145,7 +146,8 @@ def reading(path: PathLike, *, missing: str, wrong: str) -> Iterator[None]:
     except OSError as error:
         raise RunFolderError(f"{path}: cannot be read ({error.strerror or error}); {missing}.") from error
     except _UNREADABLE as error:
-        raise RunFolderError(f"{path}: {wrong}.") from error
+        reason = f"{type(error).__name__}: {error}".removesuffix(".")
+        raise RunFolderError(f"{path}: {wrong.replace('{reason}', reason)}.") from error
 
 
 ENDINGS = (".csv", ".ecsv", ".parquet")

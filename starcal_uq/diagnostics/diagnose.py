@@ -122,7 +122,7 @@ class Diagnosis:
             If the file is missing or is not a diagnosis.
         """
         remedy = "run `starcal-uq diagnose` again"
-        return read_json(cls, path, missing=remedy, wrong=f"cannot be read as a diagnosis: {remedy}")
+        return read_json(cls, path, missing=remedy, wrong=f"cannot be read as a diagnosis ({{reason}}): {remedy}")
 
     def _repr_html_(self) -> str:
         parts = (self.misfit, self.jackknife, self.comparison, self.predictive)

@@ -440,14 +440,17 @@ def save_posterior(posterior: Posterior, path: str | os.PathLike[str], force: bo
 def load_posterior(path: str | os.PathLike[str]) -> Posterior:
     """Read a posterior; see `Posterior.load`."""
     import h5netcdf
+    import h5py
 
     remedy = "run `starcal-uq sample RUN` again"
     if not Path(path).is_file():
         raise RunFolderError(f"{path}: there is no such file; run `starcal-uq sample RUN` first.")
-    with reading(path, missing=remedy, wrong=f"is not a posterior of this version; {remedy}"):
+    with reading(path, missing=remedy, wrong=f"cannot be read as a posterior ({{reason}}): {remedy}"):
+        if not h5py.is_hdf5(path):
+            raise ValueError("not netCDF")
         with h5netcdf.File(path, "r") as file:
             if file.attrs.get("format") != _FORMAT:
-                raise ValueError("another format")
+                raise ValueError("not a posterior of this version")
             record = json.loads(str(file.attrs["record"]))
             arrays = {name: np.asarray(file.variables[name][...]) for name in _ARRAYS if name in file.variables}
         return from_plain(Posterior, record, arrays)

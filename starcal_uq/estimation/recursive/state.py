@@ -61,7 +61,7 @@ def read_state(path: str | os.PathLike[str]) -> State:
         When the file is missing, truncated, or no such state.
     """
     remedy = "give a file written by RecursiveCalibration.save"
-    wrong = f"is no saved recursive calibration, or an incomplete one: {remedy}"
+    wrong = f"is no saved recursive calibration, or an incomplete one ({{reason}}): {remedy}"
     with reading(path, missing=remedy, wrong=wrong):
         arrays = read_arrays(path)
         header = json.loads(str(arrays.pop("header")))
