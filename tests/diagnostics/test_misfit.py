@@ -12,7 +12,7 @@ from scipy import stats
 import starcal_uq as sc
 from benchmarks.misfit_power import SCENARIOS, main, power
 from starcal_uq.core.records import from_plain, to_plain
-from starcal_uq.diagnostics.misfit import Misfit, holm, misfit_tests
+from starcal_uq.diagnostics.misfit import Misfit, misfit_tests
 from starcal_uq.diagnostics.shapes import View, shapes
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.maths.intervals import holm
