@@ -20,7 +20,7 @@ from starcal_uq.maths.linear import inverses
 from starcal_uq.planning.forecast import Forecast, Forecaster, spreads
 from starcal_uq.planning.information import random_frames
 from starcal_uq.planning.plan import N_FRAMES
-from starcal_uq.simulation.frames import simulate
+from starcal_uq.simulation.frames import Campaign
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -215,7 +215,8 @@ def check_forecast(
         raise PlanningError(f"n_campaigns is {n_campaigns}: give at least 2, and at least one number of frames.")
     mission = random_frames(stars, camera, sigma_px, n_frames=n_geometries, min_stars=min_stars, seed=seed)
     forecaster = Forecaster(mission.information, mission.mean_stars, mission, seed=seed)
-    task = partial(_campaign, _Study(camera, stars, sigma_px, min_stars, tuple(n_frames), n_campaigns, seed))
+    campaigns = [Campaign(n, min_stars, sigma_px) for n in n_frames]
+    task = partial(_campaign, _Study(camera, stars, campaigns, n_campaigns, seed))
     outcomes, interrupted = run_tasks(
         task,
         len(n_frames) * n_campaigns,
@@ -251,9 +252,7 @@ class _Study(NamedTuple):
 
     camera: Camera
     stars: StarCatalogue
-    sigma_px: float
-    min_stars: int
-    n_frames: tuple[int, ...]
+    campaigns: list[Campaign]
     n_campaigns: int
     seed: int
 
@@ -275,14 +274,7 @@ def _campaign(study: _Study, index: int) -> _Outcome:
     # Other streams than those of the forecast.
     seed = np.random.SeedSequence([study.seed, 4], spawn_key=(index,)).generate_state(1, np.uint64)[0]
     try:
-        obs = simulate(
-            study.stars,
-            camera,
-            n_frames=study.n_frames[index // study.n_campaigns],
-            min_stars=study.min_stars,
-            sigma_px=study.sigma_px,
-            seed=int(seed),
-        )
+        obs = study.campaigns[index // study.n_campaigns].simulate(study.stars, camera, seed)
         cal = calibrate(obs, sheet)
     except CatalogueError:
         raise

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -10,8 +11,8 @@ import numpy as np
 from starcal_uq.attitude.rotations import random_rotations
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import fold_radius_px, project, unproject
-from starcal_uq.core.errors import CatalogueError
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.errors import CatalogueError, StarcalError
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.observations.table import Observations
 
 if TYPE_CHECKING:
@@ -30,6 +31,51 @@ _MAX_TRIES = 500_000
 
 # Stars nearer to the edge than this many sigma are left out, so that noise does not decide which stars are seen.
 EDGE_SIGMAS = 6.0
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """Data of one calibration, as simulated studies take them.
+
+    Attributes
+    ----------
+    n_frames, min_stars : int
+        Number of frames, and of stars in each at least (3 or more).
+    sigma_px : float
+        Centroid noise, px per axis.
+    max_mag : float
+        Magnitude limit of the sensor.
+    """
+
+    n_frames: int
+    min_stars: int = 10
+    sigma_px: float = 0.05
+    max_mag: float = 6.0
+
+    def check(self, error: type[StarcalError]) -> None:
+        """Raise `error` for a number that cannot work."""
+        for good, text in (
+            (self.n_frames >= 1, f"n_frames is {self.n_frames}: give at least 1."),
+            (self.min_stars >= 3, f"min_stars is {self.min_stars}: an attitude needs at least 3."),
+            (0.0 < self.sigma_px < np.inf, f"sigma_px is {self.sigma_px:g}: give a noise above zero."),
+        ):
+            if not good:
+                raise error(text)
+
+    def simulate(self, stars: StarCatalogue, camera: Camera, seed: int | np.integer) -> Observations:
+        """`simulate` with these settings; `stars` are those to the magnitude limit."""
+        return simulate(
+            stars,
+            camera,
+            n_frames=self.n_frames,
+            min_stars=self.min_stars,
+            sigma_px=self.sigma_px,
+            seed=int(seed),
+        )
+
+    def settings(self, stars: StarCatalogue | None) -> AnyDict:
+        """Entries of a provenance; `stars` are None where the embedded catalogue is used."""
+        return {**asdict(self), "stars": "embedded" if stars is None else stars.source}
 
 
 def simulate(

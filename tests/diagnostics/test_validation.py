@@ -24,6 +24,7 @@ from starcal_uq.maths.intervals import binomial_interval
 from starcal_uq.maths.ranks import counts_below, evaluation_points, uniformity_band, uniformity_p_value
 from starcal_uq.presentation.figures.diagnostics import plot_validation
 from starcal_uq.presentation.figures.style import png_bytes
+from starcal_uq.simulation.frames import Campaign
 from tests.helpers import validation_controls as controls
 from tests.helpers.scenes import camera, nominal
 
@@ -35,7 +36,15 @@ QUANTITIES = ("x0", "y0", "f", "k1", "k2", "sigma", "log_likelihood", "pitch", "
 def study(model="brown", n_frames=12, seed=5, sigma_px=0.05, **options):
     truth = camera(model)
     start = nominal(truth)
-    return Study(truth, start, sc.Priors.default(start), "fixed", n_frames, 10, sigma_px, seed, **{**LIGHT, **options})
+    return Study(
+        truth,
+        start,
+        sc.Priors.default(start),
+        "fixed",
+        Campaign(n_frames, sigma_px=sigma_px),
+        seed,
+        **{**LIGHT, **options},
+    )
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
@@ -24,7 +24,7 @@ from starcal_uq.inference.ensemble import EnsembleSettings, run_ensembles
 from starcal_uq.inference.named import NaivePairsWarning, find_source
 from starcal_uq.inference.target import Likelihood, LogLikelihood, laplace_approximation, start_target
 from starcal_uq.maths.linear import symmetric_inverse
-from starcal_uq.simulation.frames import simulate
+from starcal_uq.simulation.frames import Campaign
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -56,10 +56,8 @@ class Study:
         Sampled with; with ``truth="prior"`` the truth is drawn from them as well.
     truth : {"fixed", "prior"}
         The same truth in every replicate, or a new one.
-    n_frames, min_stars : int
-        As in `simulate`.
-    sigma_px : float
-        True centroid noise, unless it is drawn from the prior.
+    campaign : Campaign
+        Data of one calibration; the noise may be drawn from the prior instead.
     seed : int
         Replicate i depends on the seed and on i alone.
     assumed_sigma_px : float or None
@@ -78,9 +76,7 @@ class Study:
     nominal: Camera
     priors: Priors
     truth: Truth
-    n_frames: int
-    min_stars: int
-    sigma_px: float
+    campaign: Campaign
     seed: int
     assumed_sigma_px: float | None = None
     likelihood: str | LikelihoodMaker = MARGINAL
@@ -156,14 +152,8 @@ def run_replicate(study: Study, stars: StarCatalogue, index: int) -> Outcome:
     camera, sigma_px = _truth(study, np.random.default_rng(truths))
     truth = np.append(camera.theta, sigma_px)
     try:
-        obs = simulate(
-            stars,
-            camera,
-            n_frames=study.n_frames,
-            min_stars=study.min_stars,
-            sigma_px=sigma_px,
-            seed=int(noise.generate_state(1, np.uint64)[0]),
-        )
+        campaign = replace(study.campaign, sigma_px=sigma_px)
+        obs = campaign.simulate(stars, camera, noise.generate_state(1, np.uint64)[0])
         cal = calibrate(obs, study.nominal)
         draws, likelihood = _sample(study, obs, cal, sampler)
     except CatalogueError:
@@ -180,7 +170,7 @@ def _truth(study: Study, rng: np.random.Generator) -> tuple[Camera, float]:
     probability there.
     """
     if study.truth == "fixed":
-        return study.camera, study.sigma_px
+        return study.camera, study.campaign.sigma_px
     for _ in range(_MAX_TRUTHS):
         draw = study.priors.draw(1, rng)[0]
         theta, sigma_px = draw[:-1], float(draw[-1])

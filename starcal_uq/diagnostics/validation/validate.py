@@ -30,6 +30,7 @@ from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.validation.replicates import MARGINAL, LikelihoodMaker, Outcome, Study, Truth, run_replicate
 from starcal_uq.diagnostics.validation.result import Validation
 from starcal_uq.inference.priors import Priors
+from starcal_uq.simulation.frames import Campaign
 
 if TYPE_CHECKING:
     from starcal_uq.sky.catalogue import StarCatalogue
@@ -123,15 +124,12 @@ def validate(
     nominal = _data_sheet(camera)
     if priors is None:
         priors = narrow_priors(camera, sigma_px) if truth == "prior" else Priors.default(nominal)
-    study = Study(camera, nominal, priors, truth, n_frames, min_stars, sigma_px, seed, assumed_sigma_px, likelihood)
+    campaign = Campaign(n_frames, min_stars, sigma_px, max_mag)
+    study = Study(camera, nominal, priors, truth, campaign, seed, assumed_sigma_px, likelihood)
     _check(study, n_replicates, workers)
     settings: AnyDict = {
         "truth": truth,
-        "n_frames": n_frames,
-        "min_stars": min_stars,
-        "sigma_px": sigma_px,
-        "max_mag": max_mag,
-        "stars": "embedded" if stars is None else stars.source,
+        **campaign.settings(stars),
         "assumed_sigma_px": assumed_sigma_px,
         "likelihood": likelihood if isinstance(likelihood, str) else getattr(likelihood, "__name__", repr(likelihood)),
     }
@@ -217,14 +215,12 @@ def _check(study: Study, n_replicates: int, workers: int | None) -> None:
     for good, text in (
         (study.truth in TRUTHS, f"truth {study.truth!r} is unknown: use one of {', '.join(TRUTHS)}."),
         (n_replicates >= 1, f"n_replicates is {n_replicates}: give at least 1, and at least 100 for a verdict."),
-        (study.n_frames >= 1, f"n_frames is {study.n_frames}: give at least 1."),
-        (study.min_stars >= 3, f"min_stars is {study.min_stars}: an attitude needs at least 3."),
         (workers is None or workers >= 0, f"workers is {workers}: give at least 1, or 0 for this process."),
-        (0.0 < study.sigma_px < np.inf, f"sigma_px is {study.sigma_px:g}: give a noise above zero."),
         (assumed is None or 0.0 < assumed < np.inf, f"assumed_sigma_px is {assumed}: give a noise above zero."),
     ):
         if not good:
             raise SamplingError(text)
+    study.campaign.check(SamplingError)
     if isinstance(study.likelihood, str) and study.likelihood not in LIKELIHOODS:
         raise SamplingError(
             f"the likelihood {study.likelihood!r} cannot be validated: use one of {', '.join(LIKELIHOODS)}, or give a "
