@@ -9,12 +9,14 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import typer
 from rich.console import Console
 from rich.table import Table
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.formatting import decimals_for, fixed, plural, pretty_unit, significant
+from starcal_uq.core.status import Level
 from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import AnyDict
 from starcal_uq.presentation.tables import TextTable
@@ -32,6 +34,9 @@ if TYPE_CHECKING:
 
 # Where the output is not a terminal it has no width of its own; tables then get the room they need.
 _WIDTH = None if sys.stdout.isatty() else 110
+
+
+_STYLES = {Level.PASS: "green", Level.WARN: "yellow", Level.FAIL: "red"}
 
 
 # Names of files, runs and requirements may hold square brackets, which are no markup.
@@ -139,8 +144,8 @@ def show_posterior(posterior: Posterior) -> None:
             unit,
         )
     out.print(table)
-    for message in diagnostics.messages:
-        out.print(message, style=None if diagnostics.ok else "yellow", highlight=False, soft_wrap=True)
+    for check in diagnostics.checks:
+        out.print(f"- {check}", style=_STYLES[check.level], highlight=False, soft_wrap=True)
 
 
 def print_table(table: TextTable) -> None:
@@ -184,11 +189,17 @@ def show_screening(screening: Screening) -> None:
 
 def show_verdict(verdict: Verdict) -> None:
     """The headline, and every check that did not pass."""
-    style = {"pass": "green", "warning": "yellow", "fail": "red"}[verdict.level.value]
+    style = _STYLES[verdict.level]
     out.print(f"Verdict ({verdict.level.value}): {verdict.headline}", style=style, highlight=False, soft_wrap=True)
     for check in verdict.checks:
-        if check.level.value != "pass":
-            out.print(f"- {check.level.value}: {check.sentence}", highlight=False, soft_wrap=True)
+        if check.level is not Level.PASS:
+            out.print(f"- {check}", highlight=False, soft_wrap=True)
+
+
+def end_with(level: Level) -> None:
+    """End the command with the exit status of a level, where that is not 0."""
+    if level.exit_status:
+        raise typer.Exit(level.exit_status)
 
 
 def warn_air(obs: Observations, cal: Calibration) -> None:

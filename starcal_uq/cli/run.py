@@ -213,13 +213,11 @@ def _after_calibration(
 
 def _finish(run: Any, report: Path, found: Budget) -> None:
     """Verdict, then the path of the report; status 1 when a check failed or a requirement is violated."""
-    from starcal_uq.cli.console import show_verdict
-    from starcal_uq.core.status import Level
+    from starcal_uq.cli.console import end_with, show_verdict
     from starcal_uq.runs.steps import verdict_step
 
     verdict = verdict_step(run)
     show_verdict(verdict)
     print(f"Report: {report.resolve()}")
     fail_if_violated(found)
-    if verdict.level is Level.FAIL:
-        raise typer.Exit(1)
+    end_with(verdict.level)

@@ -190,7 +190,7 @@ def sample_command(
     json: Json = False,
 ) -> None:
     """Sample the posterior with emcee from the calibration; an interrupted command goes on where it stopped."""
-    from starcal_uq.cli.console import print_json, records, show_posterior
+    from starcal_uq.cli.console import end_with, print_json, records, show_posterior
     from starcal_uq.runs.folder import RunFolder
 
     posterior = sample_run(
@@ -209,8 +209,7 @@ def sample_command(
         print_json({"ok": posterior.diagnostics.ok, "parameters": records(posterior.summary())})
     else:
         show_posterior(posterior)
-    if not posterior.diagnostics.ok:
-        raise typer.Exit(1)
+    end_with(posterior.diagnostics.level)
 
 
 def sample_run(

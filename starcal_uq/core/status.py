@@ -1,7 +1,8 @@
-"""One status for every solver: how it ended, and what the user can do about it."""
+"""How a solver ended, what a check found, and what the user can do about either."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
 
@@ -53,6 +54,11 @@ class Level(Enum):
         """0, 1 or 2."""
         return list(Level).index(self)
 
+    @property
+    def exit_status(self) -> int:
+        """Exit status of a command that ends with this outcome: 1 for a failed check, 0 otherwise."""
+        return int(self is Level.FAIL)
+
 
 class Question(Enum):
     """What a check helps to answer."""
@@ -63,7 +69,7 @@ class Question(Enum):
 
 @dataclass(frozen=True)
 class Check:
-    """One check.
+    """One check: what was measured, what was asked for, and what follows.
 
     Attributes
     ----------
@@ -73,23 +79,36 @@ class Check:
         What it helps to answer.
     level : Level
         Outcome.
-    value, threshold : str
+    value, bound : str
         What was measured and what was asked for, with units.
     sentence : str
         What it means, in plain words.
+    remedy : str
+        Command or Python call that may mend it, several joined by " or "; empty where it passed or nothing of the kind
+        helps. OBS, CAMERA, SITE and RUN stand for the user's files, ``obs``, ``camera`` and ``cal`` for results.
     """
 
     name: str
     question: Question
     level: Level
     value: str
-    threshold: str
+    bound: str
     sentence: str
+    remedy: str = ""
 
     @property
     def phrase(self) -> str:
         """The name for use within a sentence: no capital, unless it starts with a symbol such as R-hat."""
         return self.name if self.name[1:2] == "-" else self.name[0].lower() + self.name[1:]
+
+    def __str__(self) -> str:
+        remedy = f" Remedy: {self.remedy}" if self.remedy else ""
+        return f"{self.level.value}: {self.name}, {self.value} (asked for: {self.bound}). {self.sentence}{remedy}"
+
+
+def worst(checks: Iterable[Check]) -> Level:
+    """The worst outcome among checks."""
+    return max((check.level for check in checks), key=lambda level: level.rank, default=Level.PASS)
 
 
 def pass_or_fail(good: bool) -> Level:

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Parity: TypeAlias = Literal["normal", "mirrored"]
-Status: TypeAlias = Literal["identified", "not identified", "ambiguous", "too few stars"]
-STATUSES: tuple[Status, ...] = ("identified", "not identified", "ambiguous", "too few stars")
+FrameStatus: TypeAlias = Literal["identified", "not identified", "ambiguous", "too few stars"]
+STATUSES: tuple[FrameStatus, ...] = ("identified", "not identified", "ambiguous", "too few stars")
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ class FrameIdentification:
 
     frame: int
     image: str
-    status: Status
+    status: FrameStatus
     n_centroids: int
     n_identified: int
     n_ambiguous: int
@@ -149,7 +149,7 @@ class Identification:
         return f"<p>{escape(self.summary)}</p>{table}"
 
 
-_REASONS: dict[Status, str] = {
+_REASONS: dict[FrameStatus, str] = {
     "identified": "identified",
     "not identified": "in which no attitude explains the centroids well enough",
     "ambiguous": "that fit more than one attitude",

@@ -20,7 +20,7 @@ from starcal_uq.identification.nearby import Sky
 from starcal_uq.identification.pairs import StarPairs
 from starcal_uq.identification.proposers import Proposer, PyramidProposer, prepare_pairs
 from starcal_uq.identification.pyramid import CameraTolerance, FieldGeometry
-from starcal_uq.identification.result import Status
+from starcal_uq.identification.result import FrameStatus
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.sky.catalogue import StarCatalogue
 
@@ -68,7 +68,7 @@ class CentroidTable(Protocol):
 class Found:
     """What became of a frame."""
 
-    status: Status
+    status: FrameStatus
     match: Match | None
     seconds: float
 
@@ -199,7 +199,7 @@ class Search:
             polished=polished,
         )
 
-    def _look(self, field: FrameTable, k: int) -> tuple[Status, Match | None]:
+    def _look(self, field: FrameTable, k: int) -> tuple[FrameStatus, Match | None]:
         searched = 0
         for n_centroids in self.centroids:
             if len(field.xy[k]) <= searched:

@@ -1,19 +1,27 @@
-"""Whether draws can be trusted: convergence, an independent estimate, the compressed likelihood, the priors' part."""
+"""The only judge of draws: convergence, an independent estimate, the compressed likelihood, bounds, the priors' part.
+
+`measure` computes the numbers and `check_draws` holds them against their bounds, once, while sampling. Everything that
+shows or collects checks takes them from `Diagnostics.checks`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import Parameter
-from starcal_uq.core.formatting import join_words
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.formatting import count, decimals_for, fixed, join_words, percent, significant
+from starcal_uq.core.status import Check, Level, Question, pass_or_fail, pass_or_warn
+from starcal_uq.core.types import BoolArray, FloatArray
+from starcal_uq.estimation.student import DEFAULT_DOF
+from starcal_uq.inference.derived import derived_quantities
 from starcal_uq.inference.ensemble import Chains, autocorrelation
-from starcal_uq.inference.posterior import Diagnostics, Laplace
-from starcal_uq.inference.priors import Priors
+from starcal_uq.inference.named import LIKELIHOODS
+from starcal_uq.inference.posterior import Diagnostics, Laplace, Posterior
 from starcal_uq.inference.target import ImportanceCheck, LogLikelihood, Target
 
 # Vehtari et al. 2021 for R-hat and ESS, Vehtari et al. 2024 for k-hat.
@@ -23,19 +31,33 @@ KHAT_BOUND = 0.7
 ACCEPTANCE_RANGE = (0.1, 0.98)
 # Differences that would matter, in standard deviations; four Monte Carlo errors of the comparison are allowed on top.
 AGREEMENT_BOUND = 0.05
+AGREEMENT_ERRORS = 4.0
 # Largest tolerated difference between compressed and exact log likelihood within three standard deviations, nat.
 COMPRESSED_BOUND = 0.5
 # Weights between exp(-0.1) and exp(0.1) cannot distort anything. k-hat does not know that: it is blind to scale, and
 # the cubic remainder of a good expansion has a heavy tail at 1e-5 nat.
 _HARMLESS = 0.1
-_OFF_DETECTOR_SHARE = 1e-3
-_PRIOR_LIMITS = 0.5
-_PRIOR_CONFLICT = 3.0
+# Tolerated share of draws that no camera can have, and number of draws tried for distortions that fold.
+_BOUNDS_SHARE = 1e-3
+_FOLD_DRAWS = 40
+_PRIOR_SHARE = 0.5
+_PRIOR_PULL = 3.0
+# Options of `starcal_uq.sample` that a remedy repeats: name on the command line, and default.
+_OPTIONS: dict[str, tuple[str, Any]] = {
+    "sigma": ("--sigma", "sampled"),
+    "n_ensembles": ("--ensembles", 4),
+    "n_walkers": ("--walkers", 64),
+    "n_steps": ("--steps", 200),
+    "moves": ("", "mixture"),
+    "likelihood": ("--likelihood", "marginal"),
+    "evaluation": ("--evaluation", "auto"),
+    "dof": ("", DEFAULT_DOF),
+}
 
 
 @dataclass(frozen=True)
 class CompressionCheck:
-    """Compressed against exact log likelihood at posterior draws.
+    """Compressed against exact log likelihood at posterior draws; NaN where they were not compared.
 
     Attributes
     ----------
@@ -43,24 +65,15 @@ class CompressionCheck:
         Largest difference within three standard deviations of the mode, relative to the mode, nat.
     khat : float
         Pareto shape of the weights exact over compressed at all checked draws; 0 where all of them lie within 0.1 nat.
-    n_draws : int
-        Number of checked draws; 0 if there was no check.
-    good : bool
-        True if the compressed likelihood can stand for the exact one.
     """
 
     max_difference: float = float("nan")
     khat: float = float("nan")
-    n_draws: int = 0
-    good: bool = True
 
     @property
-    def words(self) -> str:
-        """The result as a clause."""
-        return (
-            f"compressed and exact log likelihood differ by up to {self.max_difference:.2g} nat within three standard "
-            f"deviations of the mode{f', k-hat {self.khat:.2f}' if self.khat else ''} ({self.n_draws} posterior draws)"
-        )
+    def good(self) -> bool:
+        """True unless the compressed likelihood was seen not to stand for the exact one."""
+        return not (self.max_difference > COMPRESSED_BOUND or self.khat > KHAT_BOUND)
 
 
 def check_compression(
@@ -97,8 +110,7 @@ def check_compression(
     size = np.abs(difference)
     max_difference = float(np.max(size[near])) if np.any(near) else float(np.max(size))
     khat = 0.0 if float(np.max(size)) <= _HARMLESS else psis(difference)[1]
-    good = max_difference <= COMPRESSED_BOUND and khat <= KHAT_BOUND
-    return CompressionCheck(max_difference, khat, len(draws), good)
+    return CompressionCheck(max_difference, khat)
 
 
 def chain_order(values: FloatArray) -> FloatArray:
@@ -115,20 +127,18 @@ def step_order(values: FloatArray, n_steps: int, n_walkers: int) -> FloatArray:
     return np.moveaxis(halves, 2, 3).reshape(e, n_steps, n_walkers, *rest)
 
 
-def diagnose(
+def measure(
     chains: Chains,
     draws: FloatArray,
     shown: Sequence[Parameter],
     laplace: Laplace,
     importance: ImportanceCheck,
     compression: CompressionCheck,
-    priors: Priors,
-    camera: Camera,
+    likelihood: str,
     likelihood_used: str,
     n_evaluations: int,
-    notes: Sequence[str] = (),
 ) -> Diagnostics:
-    """Compute every criterion and say which are missed.
+    """Compute the numbers that `check_draws` judges.
 
     Parameters
     ----------
@@ -140,20 +150,15 @@ def diagnose(
         Names and scales of the columns.
     laplace, importance, compression
         The independent estimates.
-    priors, camera
-        For the parts of prior and detector.
-    likelihood_used : str
-        What was evaluated.
+    likelihood, likelihood_used : str
+        Name of the likelihood, and how it was evaluated.
     n_evaluations : int
         How often.
-    notes : sequence of str
-        Further messages.
     """
     from starcal_uq.inference import arviz as arviz_compat
 
     n_sampled = chains.u.shape[-1]
     n_steps, n_walkers = chains.u.shape[1:3]
-    names = [parameter.name for parameter in shown]
     scale = np.array([parameter.scale for parameter in shown])
     scaled = draws[..., :n_sampled] / scale[:n_sampled]
     columns = [np.ascontiguousarray(scaled[..., i]) for i in range(n_sampled)]
@@ -161,120 +166,289 @@ def diagnose(
     def padded(values: Sequence[float] | FloatArray) -> FloatArray:
         return np.concatenate([values, np.full(len(shown) - n_sampled, np.nan)])
 
-    rhat = padded([arviz_compat.rhat(c) for c in columns])
-    ess_bulk = padded([arviz_compat.ess_bulk(c) for c in columns])
-    ess_tail = padded([arviz_compat.ess_tail(c) for c in columns])
-    mcse = padded([arviz_compat.mcse_mean(c) for c in columns]) * scale
-    acceptance = chains.accepted / (n_steps * n_walkers)
     flat = draws.reshape(-1, draws.shape[-1])
     mean, sd = flat.mean(axis=0), flat.std(axis=0, ddof=1)
     psis_mean, psis_sd = padded(importance.mean[:n_sampled]), padded(importance.sd[:n_sampled])
-    agreement_mean = float(np.max(np.abs(mean - psis_mean)[:n_sampled] / sd[:n_sampled]))
-    agreement_sd = float(np.max(np.abs(psis_sd[:n_sampled] / sd[:n_sampled] - 1.0)))
-    bound = AGREEMENT_BOUND + 4.0 * np.sqrt(1.0 / np.min(ess_bulk[:n_sampled]) + 1.0 / importance.ess)
-    agree = max(agreement_mean, agreement_sd) <= bound
-    agreement = (
-        f"emcee and importance sampling around the Laplace approximation {'agree' if agree else 'disagree'}: means "
-        f"within {agreement_mean:.3f} standard deviations, standard deviations within {100 * agreement_sd:.1f} %, "
-        f"k-hat {importance.khat:.2f}"
-    )
-    failures = [
-        *_convergence_failures(names[:n_sampled], rhat, ess_bulk, ess_tail, acceptance),
-        *_check_failures(importance, agree, agreement, compression, likelihood_used),
-        *_detector_failures(flat, camera),
-    ]
-    messages = [f"{agreement}."] if agree else []
-    if compression.n_draws and compression.good:
-        messages.append(f"The {compression.words}.")
-    if not laplace.converged:
-        messages.append("Newton's method did not settle on the mode; importance sampling starts from its last step.")
-    messages += [*notes, *_prior_messages(names[:n_sampled], mean, sd, priors)]
     return Diagnostics(
-        rhat=rhat,
-        ess_bulk=ess_bulk,
-        ess_tail=ess_tail,
-        mcse=mcse,
-        acceptance=acceptance,
+        rhat=padded([arviz_compat.rhat(c) for c in columns]),
+        ess_bulk=padded([arviz_compat.ess_bulk(c) for c in columns]),
+        ess_tail=padded([arviz_compat.ess_tail(c) for c in columns]),
+        mcse=padded([arviz_compat.mcse_mean(c) for c in columns]) * scale,
+        acceptance=chains.accepted / (n_steps * n_walkers),
         autocorrelation=padded(autocorrelation(step_order(scaled, n_steps, n_walkers))),
         n_evaluations=n_evaluations,
         psis_khat=importance.khat,
+        psis_ess=importance.ess,
         psis_mean=psis_mean,
         psis_sd=psis_sd,
         laplace_mean=padded(laplace.mean),
         laplace_sd=padded(laplace.sd),
-        agreement_mean=agreement_mean,
-        agreement_sd=agreement_sd,
-        agreement=agreement,
+        agreement_mean=float(np.max(np.abs(mean - psis_mean)[:n_sampled] / sd[:n_sampled])),
+        agreement_sd=float(np.max(np.abs(psis_sd[:n_sampled] / sd[:n_sampled] - 1.0))),
         compressed_max_difference=compression.max_difference,
         compressed_khat=compression.khat,
         likelihood_used=likelihood_used,
-        failures=tuple(failures),
-        messages=(*failures, *(m[0].upper() + m[1:] for m in messages)),
+        likelihood=likelihood,
     )
 
 
-def _convergence_failures(
-    names: Sequence[str], rhat: FloatArray, ess_bulk: FloatArray, ess_tail: FloatArray, acceptance: FloatArray
-) -> list[str]:
-    failures = []
-    for values, good, text in (
-        (rhat, rhat < RHAT_BOUND, f"R-hat is not below {RHAT_BOUND}"),
-        (ess_bulk, ess_bulk > ESS_BOUND, f"the bulk effective sample size is not above {ESS_BOUND:g}"),
-        (ess_tail, ess_tail > ESS_BOUND, f"the tail effective sample size is not above {ESS_BOUND:g}"),
-    ):
-        bad = [f"{name} ({values[i]:.4g})" for i, name in enumerate(names) if not good[i]]
-        if bad:
-            failures.append(f"{text[0].upper()}{text[1:]} for {join_words(bad)}: raise n_steps.")
+def check_draws(post: Posterior, notes: Sequence[str] = ()) -> tuple[Check, ...]:
+    """Hold everything that is known of draws against its bound.
+
+    Parameters
+    ----------
+    post : Posterior
+        Draws with the numbers of `measure`; checks that it has already are not looked at.
+    notes : sequence of str
+        Sentences about the likelihood.
+
+    Returns
+    -------
+    tuple of Check
+    """
+    checks = [_rhat(post), _effective_draws(post), _acceptance(post), _derived(post), _digits(post), _bounds(post)]
+    several = (_degrees_of_freedom(post), _independent(post), _evaluation(post), _likelihood(post, notes))
+    return (*checks, *(check for check in several if check is not None), _priors(post))
+
+
+def _rhat(post: Posterior) -> Check:
+    """Do separately seeded ensembles agree?"""
+    values = post.diagnostics.rhat[list(post.sampled)]
+    bad = _names(post, ~(values < RHAT_BOUND))
+    sentence = (
+        f"The ensembles disagree in {join_words(bad)}: raise n_steps before using any interval."
+        if bad
+        else f"The {post.n_ensembles} separately seeded ensembles sampled the same distribution."
+    )
+    return _sampling(post, "R-hat", not bad, fixed(float(np.max(values)), 4), f"< {RHAT_BOUND}", sentence)
+
+
+def _effective_draws(post: Posterior) -> Check:
+    """Is the effective number of draws large enough, bulk and tail?"""
+    bulk, tail = (values[list(post.sampled)] for values in (post.diagnostics.ess_bulk, post.diagnostics.ess_tail))
+    fewest = np.minimum(bulk, tail)
+    bad = _names(post, ~(fewest > ESS_BOUND))
+    sentence = (
+        f"Too few effective draws of {join_words(bad)} for stable interval ends: raise n_steps."
+        if bad
+        else "Enough effective draws for stable means and interval ends."
+    )
+    value = f"{count(int(np.min(bulk)))} bulk, {count(int(np.min(tail)))} tail"
+    longer = ESS_BOUND / float(np.min(fewest))
+    return _sampling(post, "Effective draws", not bad, value, f"> {ESS_BOUND:g} each", sentence, longer)
+
+
+def _acceptance(post: Posterior) -> Check:
+    """Does the sampler move?"""
     low, high = ACCEPTANCE_RANGE
-    if not np.all((acceptance > low) & (acceptance < high)):
-        failures.append(
-            f"The acceptance lies between {acceptance.min():.2f} and {acceptance.max():.2f}, outside {low} to {high}: "
-            "the posterior is far from its Laplace approximation; try moves='stretch' with more steps."
+    rates = post.diagnostics.acceptance
+    good = bool(np.all((rates > low) & (rates < high)))
+    sentence = (
+        "The sampler moves freely."
+        if good
+        else "The sampler hardly moves, or moves in tiny steps: the posterior is far from its Gaussian approximation."
+    )
+    value = f"{fixed(float(np.min(rates)), 2)} to {fixed(float(np.max(rates)), 2)}"
+    remedy = "" if good else resample(post, moves="stretch", n_steps=10 * post.n_steps)
+    level = pass_or_fail(good)
+    return Check("Acceptance", Question.CONVERGED, level, value, f"{low:g} to {high:g}", sentence, remedy)
+
+
+def _derived(post: Posterior) -> Check:
+    """Did what follows from the parameters converge, too?"""
+    derived = derived_quantities(post)
+    rhat = max(derived, key=lambda d: d.rhat)
+    fewest = min(derived, key=lambda d: min(d.ess_bulk, d.ess_tail))
+    ess = min(fewest.ess_bulk, fewest.ess_tail)
+    good = rhat.rhat < RHAT_BOUND and ess > ESS_BOUND
+    sentence = (
+        "Focal length in mm, displacement at the corner and common rotation have converged too."
+        if good
+        else f"{(rhat if rhat.rhat >= RHAT_BOUND else fewest).name.capitalize()} has not converged: raise n_steps."
+    )
+    value = f"R-hat {fixed(rhat.rhat, 4)}, {count(int(ess))} draws"
+    bound = f"< {RHAT_BOUND}, > {ESS_BOUND:g}"
+    return _sampling(post, "Derived quantities", good, value, bound, sentence, ESS_BOUND / ess)
+
+
+def _digits(post: Posterior) -> Check:
+    """Does Monte Carlo error leave the printed digits alone?"""
+    names, d = post.parameter_names, post.diagnostics
+    # Digits are printed to the second one of sigma; the unit of the last is what the error must not exceed.
+    worst, largest = names[0], 0.0
+    for i in post.sampled:
+        scale = post.parameters[i].scale
+        unit = 10.0 ** -decimals_for(float(post.sd[i]) / scale)
+        share = float(d.mcse[i]) / scale / unit
+        if share > largest:
+            worst, largest = names[i], share
+    good = largest <= 1.0
+    sentence = (
+        "Monte Carlo error does not reach the last printed digit of any mean."
+        if good
+        else f"Monte Carlo error reaches the last printed digit of {worst}: raise n_steps before quoting it."
+    )
+    value = f"{fixed(largest, 2)} units of the last digit ({worst})"
+    remedy = "" if good else _longer(post, largest**2)
+    return Check("Digits", Question.CONVERGED, pass_or_warn(good), value, "≤ 1", sentence, remedy)
+
+
+def _degrees_of_freedom(post: Posterior) -> Check | None:
+    """Did the degrees of freedom of a Student-t likelihood converge, where they were free?"""
+    from starcal_uq.inference import arviz as arviz_compat
+
+    if post.dof_draws is None:
+        return None
+    values = post.dof_draws.reshape(post.n_ensembles, -1)
+    rhat, ess = arviz_compat.rhat(values), arviz_compat.ess_bulk(values)
+    low, middle, high = np.quantile(values, (0.025, 0.5, 0.975))
+    good = rhat < RHAT_BOUND and ess > ESS_BOUND
+    sentence = f"dof has the median {middle:.3g} and the 95 % interval {low:.3g} to {high:.3g}."
+    if not good:
+        sentence = "The draws of dof have not converged: raise n_steps."
+    value = f"R-hat {fixed(rhat, 4)}, {count(int(ess))} draws"
+    bound = f"< {RHAT_BOUND}, > {ESS_BOUND:g}"
+    return _sampling(post, "Degrees of freedom", good, value, bound, sentence, ESS_BOUND / ess)
+
+
+def _bounds(post: Posterior) -> Check:
+    """Do draws touch the edges of what a camera can be?"""
+    from starcal_uq.camera.projection import fold_radius_px
+
+    camera, theta = post.camera, post.theta_draws
+    outside = float(np.mean(~camera.contains(theta[:, :2]) | (theta[:, 2] <= 0.0)))
+    few = theta[np.linspace(0, len(theta) - 1, _FOLD_DRAWS).astype(int)]
+    radius = camera.corner_radius_px
+    folded = float(np.mean([fold_radius_px(camera.distortion, draw, radius) <= radius for draw in few]))
+    sd = post.sd[:3]
+    edges = np.array([camera.width_px - 0.5, camera.height_px - 0.5])
+    room = np.concatenate([(post.mean[:2] + 0.5) / sd[:2], (edges - post.mean[:2]) / sd[:2], post.mean[2:3] / sd[2:3]])
+    good = outside <= _BOUNDS_SHARE and folded == 0.0
+    if good:
+        sentence = "No draw has its principal point off the detector, f below zero or a distortion that folds."
+    elif folded > 0.0:
+        sentence = "The distortion of some draws folds over within the field: the data do not determine it."
+    else:
+        sentence = (
+            f"{percent(outside)} of the draws have their principal point off the detector or f below zero: add frames."
         )
-    return failures
+    value = f"nearest bound {significant(float(np.min(room)))} sigma away"
+    bound = f"≤ {percent(_BOUNDS_SHARE, 1)} of draws outside"
+    return Check("Bounds", Question.CONVERGED, pass_or_fail(good), value, bound, sentence)
 
 
-def _check_failures(
-    importance: ImportanceCheck, agree: bool, agreement: str, compression: CompressionCheck, likelihood_used: str
-) -> list[str]:
-    failures = []
-    if not importance.khat < KHAT_BOUND:
-        failures.append(
-            f"The importance weights have a heavy tail (k-hat {importance.khat:.2f}, bound {KHAT_BOUND}): the "
-            "posterior is far from normal, and emcee's draws have no independent check."
+def _independent(post: Posterior) -> Check:
+    """Does importance sampling around the Laplace approximation, which uses no Markov chain, give the same?"""
+    d = post.diagnostics
+    fewest = float(np.min(d.ess_bulk[list(post.sampled)]))
+    tolerance = AGREEMENT_BOUND + AGREEMENT_ERRORS * math.sqrt(1.0 / fewest + 1.0 / d.psis_ess)
+    light, agree = d.psis_khat < KHAT_BOUND, max(d.agreement_mean, d.agreement_sd) <= tolerance
+    if not light:
+        sentence = "The posterior is far from Gaussian, so the independent check by importance sampling says nothing."
+    elif agree:
+        sentence = "Importance sampling, which uses no Markov chain, gives the same means and sigmas."
+    else:
+        sentence = "Importance sampling gives other means or sigmas: at least one of the two is wrong."
+    if not post.laplace.converged:
+        sentence += " Newton's method did not settle on the mode; importance sampling starts from its last step."
+    value = f"means {fixed(d.agreement_mean, 3)} sigma, sigmas {percent(d.agreement_sd)}, k-hat {fixed(d.psis_khat, 2)}"
+    bound = f"{fixed(tolerance, 3)} sigma, {percent(tolerance)}, {KHAT_BOUND:g}"
+    remedy = _longer(post) if light and not agree else ""
+    level = pass_or_fail(light and agree)
+    return Check("Independent posterior", Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
+
+
+def _evaluation(post: Posterior) -> Check | None:
+    """Was the compressed likelihood good enough, where it was used or tried?"""
+    d = post.diagnostics
+    compression = CompressionCheck(d.compressed_max_difference, d.compressed_khat)
+    compressed, compared = d.likelihood_used == "compressed", np.isfinite(compression.max_difference)
+    if not compressed and not compared:
+        return None
+    level, remedy = Level.PASS, ""
+    value = f"{significant(compression.max_difference)} nat, k-hat {fixed(compression.khat, 2)}" if compared else ""
+    if not compressed:
+        sentence = f"The exact likelihood was sampled, because the fast one departs from it by {value}."
+        value = "exact"
+    elif not compared:
+        level, value = Level.WARN, "not checked"
+        sentence = "The compressed likelihood was not compared with the exact one: the observations were not at hand."
+        remedy = "sc.sample(obs, cal)"
+    elif compression.good:
+        sentence = "The fast likelihood equals the exact one at posterior draws."
+    else:
+        level, remedy = Level.FAIL, resample(post, evaluation="exact")
+        sentence = "The fast likelihood departs from the exact one: sample the exact one."
+    bound = f"≤ {COMPRESSED_BOUND:g} nat, ≤ {KHAT_BOUND:g}"
+    return Check("Likelihood", Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
+
+
+def _likelihood(post: Posterior, notes: Sequence[str]) -> Check | None:
+    """Was a likelihood sampled whose intervals are known to be wrong?"""
+    kind = post.diagnostics.likelihood
+    if kind == "marginal":
+        return None
+    good = kind != "pairs_naive"
+    sentence = (
+        f"The posterior is that of the likelihood {kind!r}."
+        if good
+        else "Pairs of stars were taken as independent, which they are not."
+    )
+    sentence, remedy = " ".join([sentence, *notes]), "" if good else resample(post, likelihood="pairs")
+    level = pass_or_fail(good)
+    return Check("Kind of likelihood", Question.TRUSTWORTHY, level, kind, "not 'pairs_naive'", sentence, remedy)
+
+
+def _priors(post: Posterior) -> Check:
+    """Did the data decide, or the prior?"""
+    names = [post.parameter_names[i] for i in post.sampled]
+    prior_mean, prior_sd = post.priors.mean(names), post.priors.sd(names)
+    share = post.sd[: len(names)] / prior_sd
+    pull = np.abs(post.draws.mean(axis=0)[: len(names)] - prior_mean) / prior_sd
+    limited, pulled = _names(post, share > _PRIOR_SHARE), _names(post, pull > _PRIOR_PULL)
+    largest = int(np.argmax(share))
+    if limited:
+        sentence = f"The prior, not the data, decides {join_words(limited)}."
+    elif pulled:
+        furthest = fixed(float(np.max(pull)), 1)
+        sentence = (
+            f"The data put {join_words(pulled)} up to {furthest} prior standard deviations away from the prior's mean: "
+            "check the nominal camera, or widen the prior."
         )
-    elif not agree:
-        failures.append(f"{agreement[0].upper()}{agreement[1:]}.")
-    if compression.n_draws and not compression.good and likelihood_used == "compressed":
-        failures.append(f"The {compression.words}: use evaluation='auto' or 'exact'.")
-    return failures
+    else:
+        sentence = "The data decide every parameter; the priors hardly matter."
+    value = f"sigma {percent(float(share[largest]))} of the prior's ({names[largest]})"
+    level = pass_or_warn(not limited and not pulled)
+    return Check("Influence of the priors", Question.TRUSTWORTHY, level, value, f"≤ {percent(_PRIOR_SHARE)}", sentence)
 
 
-def _detector_failures(flat: FloatArray, camera: Camera) -> list[str]:
-    outside = ~camera.contains(flat[:, :2]) | (flat[:, 2] <= 0.0)
-    share = float(np.mean(outside))
-    if share <= _OFF_DETECTOR_SHARE:
-        return []
-    return [
-        f"{100 * share:.1f} % of the draws have their principal point off the detector or a focal length below zero: "
-        "the data do not determine the optics; add frames."
-    ]
+def _names(post: Posterior, which: BoolArray) -> list[str]:
+    return [post.parameter_names[i] for i, flag in zip(post.sampled, which, strict=True) if flag]
 
 
-def _prior_messages(names: Sequence[str], mean: FloatArray, sd: FloatArray, priors: Priors) -> list[str]:
-    prior_mean, prior_sd = priors.mean(names), priors.sd(names)
-    messages = []
-    for i, name in enumerate(names):
-        ratio = sd[i] / prior_sd[i]
-        if ratio > _PRIOR_LIMITS:
-            messages.append(
-                f"the prior, not the data, limits {name}: its posterior standard deviation is {100 * ratio:.0f} % of "
-                "the prior's."
-            )
-        pull = abs(mean[i] - prior_mean[i]) / prior_sd[i]
-        if pull > _PRIOR_CONFLICT:
-            messages.append(
-                f"the data put {name} {pull:.1f} prior standard deviations away from the prior's mean: check the "
-                "nominal camera, or widen the prior."
-            )
-    return messages
+def _sampling(
+    post: Posterior, name: str, good: bool, value: str, bound: str, sentence: str, longer: float = 1.0
+) -> Check:
+    remedy = "" if good else _longer(post, longer)
+    return Check(name, Question.CONVERGED, pass_or_fail(good), value, bound, sentence, remedy)
+
+
+def _longer(post: Posterior, factor: float = 1.0) -> str:
+    """Sampling again with `factor` times as many steps and some in reserve, at least twice as many."""
+    return resample(post, n_steps=post.n_steps * max(2, math.ceil(1.2 * factor)))
+
+
+def resample(post: Posterior, **changes: Any) -> str:
+    """Sampling again with some settings changed: a command and a call, or the call alone where no command does it."""
+    settings: Mapping[str, Any] = {**post.provenance.get("settings", {}), **changes}
+    kept = {name: settings[name] for name in _OPTIONS if settings.get(name, _OPTIONS[name][1]) != _OPTIONS[name][1]}
+    words = {name: repr(value) for name, value in kept.items()}
+    if kept.get("likelihood", "marginal") not in LIKELIHOODS:
+        # An object that was passed is evaluated as it is, and no command takes it.
+        words["likelihood"] = "likelihood"
+        words.pop("evaluation", None)
+    call = f"sc.sample(obs, cal{''.join(f', {name}={word}' for name, word in words.items())})"
+    options = [(_OPTIONS[name][0], kept[name]) for name in words]
+    if words.get("likelihood") == "likelihood" or not all(option for option, _ in options):
+        return call
+    return f"starcal-uq sample RUN --force{''.join(f' {option} {value}' for option, value in options)} or {call}"

@@ -16,6 +16,7 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.errors import SamplingError
+from starcal_uq.core.status import Check, Level, Question
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.student import DOF_RANGE, log_excess_prior, parse_dof
 from starcal_uq.inference.target import Extra, Likelihood, LogLikelihood
@@ -59,8 +60,10 @@ class Source:
         At a cost independent of the number of stars; None where a polynomial has to be fitted first.
     extra : Extra or None
         A further parameter.
-    failures, notes : tuple of str
-        For the diagnostics.
+    notes : tuple of str
+        Sentences on the likelihood, for the check of its kind.
+    checks : tuple of Check
+        What can be said before sampling.
     """
 
     name: str
@@ -71,8 +74,8 @@ class Source:
     exact: LogLikelihood | None
     fast: LogLikelihood | None
     extra: Extra | None = None
-    failures: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    checks: tuple[Check, ...] = ()
 
 
 def check_names(likelihood: Any, evaluation: Any, dof: Any, has_observations: bool) -> None:
@@ -130,11 +133,20 @@ def find_source(
     source = _named_source(likelihood, obs, cal, dof)
     if (ignored := _settings(cal).get("ignored_distortion")) is None:
         return source
-    failure = (
+    sentence = (
         f"The method {cal.method!r} ignores the distortion (model {ignored!r} was given): this posterior is that of a "
         "camera without any, and neither its centre nor its width holds otherwise; use method='efficient'."
     )
-    return replace(source, failures=(*source.failures, failure))
+    check = Check(
+        "Method of the calibration",
+        Question.TRUSTWORTHY,
+        Level.FAIL,
+        cal.method,
+        "one that fits the distortion",
+        sentence,
+        "starcal-uq calibrate OBS CAMERA -o RUN --force or sc.calibrate(obs, camera)",
+    )
+    return replace(source, checks=(check,))
 
 
 def _named_source(likelihood: str, obs: Observations | None, cal: Calibration, dof: float | str | None) -> Source:
@@ -217,10 +229,10 @@ def _pairs(obs: Observations, cal: Calibration, adjusted: bool) -> Source:
         residual_dof=cal.dof,
         adjusted=adjusted,
     )
-    failures: tuple[str, ...] = ()
+    variability = "the noise of every star" if found.variability == "expected" else "the scatter between frames"
     notes: tuple[str, ...] = (
-        "the likelihood is the composite one over pairs of stars, with Godambe's curvature; its variability comes from "
-        + ("the noise of every star." if found.variability == "expected" else "the scatter between frames."),
+        "It is the composite one over pairs of stars, with Godambe's curvature; its variability comes from "
+        f"{variability}.",
         "sigma is estimated from the pixel residuals at the best attitudes; pairs have no say in it.",
     )
     sigma, dof = found.sigma, float(found.dof)
@@ -231,7 +243,7 @@ def _pairs(obs: Observations, cal: Calibration, adjusted: bool) -> Source:
             f"{found.narrowness:.1f} times too narrow and must not be used; use likelihood='pairs' or 'marginal'."
         )
         warnings.warn(failure, NaivePairsWarning, stacklevel=5)
-        failures, notes = (failure,), ()
+        notes = (failure,)
     return Source(
         name="pairs" if adjusted else "pairs_naive",
         theta=found.theta_hat,
@@ -240,7 +252,6 @@ def _pairs(obs: Observations, cal: Calibration, adjusted: bool) -> Source:
         dof=dof,
         exact=found.exact_log_likelihood,
         fast=found.log_likelihood,
-        failures=failures,
         notes=notes,
     )
 
@@ -295,8 +306,7 @@ def _student(obs: Observations, cal: Calibration, dof: float | str | None) -> So
         fast=None,
         extra=extra,
         notes=(
-            "the likelihood is a bivariate Student t per star, with the curvature that the scatter of the stars' "
-            "scores shows.",
+            "It is a bivariate Student t per star, with the curvature that the scatter of the stars' scores shows.",
             "sigma is the scale of the Student t, which is below the standard deviation of its residuals.",
         ),
     )

@@ -20,6 +20,7 @@ from starcal_uq.camera.distortion import Parameter, parameters, sigma_parameter
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path, ensure_new, reading
 from starcal_uq.core.records import Arrays, from_plain, to_plain
+from starcal_uq.core.status import Check, Level, worst
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.inference.priors import SIGMA_NAMES, Priors
 
@@ -107,6 +108,8 @@ class Diagnostics:
         Points at which the likelihood was evaluated while sampling, burn-in included.
     psis_khat : float
         Pareto shape of the importance weights of draws around the Laplace approximation; good below 0.7.
+    psis_ess : float
+        Equivalent number of independent draws of these weights.
     psis_mean, psis_sd : array (p+1,)
         Moments by those weights, an estimate without a Markov chain.
     laplace_mean, laplace_sd : array (p+1,)
@@ -115,8 +118,6 @@ class Diagnostics:
         Largest difference between sampled and importance-weighted means, in standard deviations.
     agreement_sd : float
         Largest relative difference between their standard deviations.
-    agreement : str
-        The same in words.
     compressed_max_difference : float
         Largest difference between compressed and exact log likelihood over posterior draws within three standard
         deviations of the mode, relative to the mode, nat; NaN where it was not checked.
@@ -125,12 +126,10 @@ class Diagnostics:
         nat, and no tail can matter.
     likelihood_used : str
         How it was evaluated: ``compressed``, ``exact``, or the name of the likelihood that was passed.
-    failures : tuple of str
-        Every criterion that was missed, one sentence each.
-    messages : tuple of str
-        `failures`, then what is worth knowing.
     likelihood : str
         ``marginal``, ``pairs``, ``pairs_naive``, ``student_t``, or the name of the likelihood that was passed.
+    checks : tuple of Check
+        Every check of the draws, made once while sampling.
     """
 
     rhat: FloatArray
@@ -141,24 +140,28 @@ class Diagnostics:
     autocorrelation: FloatArray
     n_evaluations: int
     psis_khat: float
+    psis_ess: float
     psis_mean: FloatArray
     psis_sd: FloatArray
     laplace_mean: FloatArray
     laplace_sd: FloatArray
     agreement_mean: float
     agreement_sd: float
-    agreement: str
     compressed_max_difference: float
     compressed_khat: float
     likelihood_used: str
-    failures: tuple[str, ...]
-    messages: tuple[str, ...]
     likelihood: str = "marginal"
+    checks: tuple[Check, ...] = ()
+
+    @property
+    def level(self) -> Level:
+        """The worst outcome of the checks."""
+        return worst(self.checks)
 
     @property
     def ok(self) -> bool:
-        """True if no criterion was missed."""
-        return not self.failures
+        """True if no check fails."""
+        return self.level is not Level.FAIL
 
 
 @dataclass(frozen=True, eq=False)
@@ -391,7 +394,7 @@ class Posterior:
         verdict = "passes every check" if self.diagnostics.ok else "must not be used as it is"
         return (
             f"<p><b>Posterior</b>: {len(self.draws)} draws of {self.n_ensembles} ensembles; {verdict}.</p>"
-            f"{html}{_listed(self.diagnostics.messages)}"
+            f"{html}{_listed([str(check) for check in self.diagnostics.checks])}"
         )
 
 
@@ -401,7 +404,7 @@ def _listed(messages: Sequence[str]) -> str:
     return f"<ul>{''.join(f'<li>{html.escape(m)}</li>' for m in messages)}</ul>" if messages else ""
 
 
-_FORMAT = "starcal_uq posterior 1"
+_FORMAT = "starcal_uq posterior 2"
 
 
 _ARRAYS = {
@@ -442,7 +445,7 @@ def load_posterior(path: str | os.PathLike[str]) -> Posterior:
     import h5netcdf
     import h5py
 
-    remedy = "run `starcal-uq sample RUN` again"
+    remedy = "run `starcal-uq sample RUN --force` again"
     if not Path(path).is_file():
         raise RunFolderError(f"{path}: there is no such file; run `starcal-uq sample RUN` first.")
     with reading(path, missing=remedy, wrong=f"cannot be read as a posterior ({{reason}}): {remedy}"):

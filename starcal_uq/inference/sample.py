@@ -18,14 +18,7 @@ from starcal_uq.core.provenance import data_hashes, provenance
 from starcal_uq.core.records import to_plain
 from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import AnyDict, FloatArray
-from starcal_uq.inference.checks import (
-    ESS_BOUND,
-    RHAT_BOUND,
-    CompressionCheck,
-    chain_order,
-    check_compression,
-    diagnose,
-)
+from starcal_uq.inference.checks import CompressionCheck, chain_order, check_compression, check_draws, measure
 from starcal_uq.inference.ensemble import PROPOSAL_DF, Chains, EnsembleSettings, Moves, run_ensembles
 from starcal_uq.inference.named import (
     Evaluation,
@@ -164,7 +157,7 @@ def sample(
         outcome, compression = _with_fallback(run, evaluation, checkpoint)
     else:
         outcome, compression = run.sample(label, likelihood.log_likelihood, checkpoint), CompressionCheck()
-    return _assemble(run, outcome, compression, evaluation)
+    return _assemble(run, outcome, compression)
 
 
 class _Run:
@@ -285,40 +278,24 @@ def _compare(run: _Run, outcome: _Outcome, compressed: LogLikelihood, exact: Log
     return check_compression(compressed, exact, outcome.target, picks, outcome.laplace)
 
 
-def _assemble(run: _Run, outcome: _Outcome, compression: CompressionCheck, evaluation: str) -> Posterior:
+def _assemble(run: _Run, outcome: _Outcome, compression: CompressionCheck) -> Posterior:
     cal, settings, target, source = run.cal, run.settings, outcome.target, run.source
     n = _N_IMPORTANCE.get(outcome.name, _N_IMPORTANCE_SLOW)
     importance = importance_check(target, n, PROPOSAL_DF, np.random.default_rng(run.importance_seed))
     shown = (*parameters(cal.camera.distortion), sigma_parameter(cal.sigma_name == SIGMA_NAMES[1]))
-    notes, failures = list(source.notes), list(source.failures)
-    if evaluation == "auto" and outcome.name == "exact":
-        notes.append(f"the exact likelihood was sampled, because {compression.words}.")
-    if outcome.name == "compressed" and source.exact is None:
-        notes.append("the compressed likelihood was not compared with the exact one: the observations were not given.")
     draws, chains, laplace, extra = outcome.draws, outcome.chains, outcome.laplace, None
     if target.extra is not None:
         draws, chains, laplace, extra = _without_extra(outcome)
-        found, missed = _extra_words(target.extra.name, extra)
-        notes += found
-        failures += missed
-    diagnostics = diagnose(
+    diagnostics = measure(
         chains,
         draws,
         shown,
         laplace,
         importance,
         compression,
-        run.priors,
-        cal.camera,
+        source.name,
         outcome.name,
         run.n_ensembles * settings.n_walkers * (settings.n_burn + settings.n_steps),
-        notes,
-    )
-    diagnostics = replace(
-        diagnostics,
-        likelihood=source.name,
-        failures=(*failures, *diagnostics.failures),
-        messages=(*failures, *diagnostics.messages),
     )
     posterior = Posterior(
         parameter_names=tuple(p.name for p in shown),
@@ -338,9 +315,10 @@ def _assemble(run: _Run, outcome: _Outcome, compression: CompressionCheck, evalu
         provenance=run.provenance,
         dof_draws=None if extra is None else extra.reshape(-1),
     )
+    checks = (*source.checks, *check_draws(posterior, source.notes))
     if outcome.checkpoint is not None:
         Path(outcome.checkpoint).unlink(missing_ok=True)
-    return posterior
+    return replace(posterior, diagnostics=replace(diagnostics, checks=checks))
 
 
 def _without_extra(outcome: _Outcome) -> tuple[FloatArray, Chains, Laplace, FloatArray]:
@@ -355,19 +333,6 @@ def _without_extra(outcome: _Outcome) -> tuple[FloatArray, Chains, Laplace, Floa
         transform=laplace.transform[:-1, :-1],
     )
     return outcome.draws[..., :-1], replace(chains, u=chains.u[..., :-1]), inner, outcome.draws[..., -1]
-
-
-def _extra_words(name: str, draws: FloatArray) -> tuple[list[str], list[str]]:
-    """What is worth knowing of a further parameter's draws (ensemble, draw), and which criteria they miss."""
-    from starcal_uq.inference import arviz as arviz_compat
-
-    values = np.ascontiguousarray(draws)
-    rhat, ess = arviz_compat.rhat(values), arviz_compat.ess_bulk(values)
-    low, middle, high = np.quantile(values, (0.025, 0.5, 0.975))
-    words = f"{name} has the median {middle:.3g} and the 95 % interval {low:.3g} to {high:.3g}."
-    if rhat < RHAT_BOUND and ess > ESS_BOUND:
-        return [words], []
-    return [words], [f"The draws of {name} have not converged (R-hat {rhat:.4f}, {ess:.0f} effective): raise n_steps."]
 
 
 def _settings(

@@ -12,9 +12,10 @@ import starcal_uq as sc
 from starcal_uq.core.status import Level, Question
 from starcal_uq.diagnostics.diagnose import diagnose
 from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals, residual_scale
-from starcal_uq.diagnostics.verdict import limits
 from starcal_uq.diagnostics.verdict.draws import propagation_difference
 from starcal_uq.diagnostics.verdict.judge import judge
+from starcal_uq.diagnostics.verdict.limits import limits
+from starcal_uq.inference.checks import check_draws
 from starcal_uq.presentation.report.tables import mean_to_mcse
 from tests.helpers.scenes import camera, observations, with_sigmas
 
@@ -30,8 +31,13 @@ def outcome(name: str, obs, cal, post=None, truth=None):
     return next(check for check in judge(obs, cal, post, truth).checks if check.name == name)
 
 
+def judged(post):
+    """Changed draws with the checks that sampling would have made of them."""
+    return dataclasses.replace(post, diagnostics=dataclasses.replace(post.diagnostics, checks=check_draws(post)))
+
+
 def with_diagnostics(post, **changes):
-    return dataclasses.replace(post, diagnostics=dataclasses.replace(post.diagnostics, **changes))
+    return judged(dataclasses.replace(post, diagnostics=dataclasses.replace(post.diagnostics, **changes)))
 
 
 def test_a_good_run_passes_every_check(run):
@@ -39,7 +45,7 @@ def test_a_good_run_passes_every_check(run):
     assert verdict.level is Level.PASS, verdict.at(Level.FAIL) + verdict.at(Level.WARN)
     assert len(verdict.checks) == 18
     assert {check.question for check in verdict.checks} == set(Question)
-    assert all(check.sentence.endswith(".") and check.value and check.threshold for check in verdict.checks)
+    assert all(check.sentence.endswith(".") and check.value and check.bound for check in verdict.checks)
     assert "every check passed" in verdict.headline
 
 
@@ -58,6 +64,7 @@ def test_without_posterior_the_headline_says_so(run):
         ("Independent posterior", {"psis_khat": 0.9}),
         ("Independent posterior", {"agreement_sd": 0.5}),
         ("Likelihood", {"compressed_max_difference": 3.0}),
+        ("Likelihood", {"compressed_khat": 0.9}),
         ("Kind of likelihood", {"likelihood": "pairs_naive"}),
     ],
 )
@@ -73,7 +80,7 @@ def with_draws(post, change):
     draws = post.draws.copy()
     change(draws)
     # A new object: means and standard deviations are remembered.
-    return dataclasses.replace(post, draws=draws)
+    return judged(dataclasses.replace(post, draws=draws))
 
 
 def test_derived_quantities_have_diagnostics_of_their_own(run):
@@ -133,7 +140,7 @@ class TestDiagnosis:
         names = {check.name for check in verdict.checks}
         assert names >= {"Unexplained structure", "Jackknife over frames", "Distortion model", "Other starts"}
         assert "Posterior predictive check" in names
-        assert all(check.sentence.endswith(".") and check.value and check.threshold for check in verdict.checks)
+        assert all(check.sentence.endswith(".") and check.value and check.bound for check in verdict.checks)
         assert not any(s.startswith("The model") for s in limits(run.obs, run.cal, diagnosis=found))
 
     def reject(self, found, start, p):
@@ -249,11 +256,11 @@ def test_few_frames_and_an_empty_corner_warn(run):
 
 def test_a_tight_prior_is_named(run):
     tight = run.post.priors.replace(focal_fraction=1e-5)
-    check = outcome("Influence of the priors", run.obs, run.cal, dataclasses.replace(run.post, priors=tight))
+    check = outcome("Influence of the priors", run.obs, run.cal, judged(dataclasses.replace(run.post, priors=tight)))
     assert check.level is Level.WARN
     assert check.value.endswith("(f)")
     far = run.post.priors.replace(focal_px=run.post.priors.focal_px * 1.5)
-    check = outcome("Influence of the priors", run.obs, run.cal, dataclasses.replace(run.post, priors=far))
+    check = outcome("Influence of the priors", run.obs, run.cal, judged(dataclasses.replace(run.post, priors=far)))
     assert check.level is Level.WARN
 
 

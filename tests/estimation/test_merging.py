@@ -186,7 +186,7 @@ def test_run_folders_are_merged_with_their_observations(tmp_path: Path) -> None:
     whole = calibrate(obs, NOMINAL)
     assert np.all(np.abs(merged.theta - whole.theta) < 1e-2 * whole.sigmas)
     post = sample(obs, loaded, seed=1)
-    assert post.diagnostics.ok, post.diagnostics.messages
+    assert post.diagnostics.ok, post.diagnostics.checks
     assert post.diagnostics.likelihood_used == "compressed"
     assert post.diagnostics.compressed_max_difference < 0.05
     # Merging twice is merging once.

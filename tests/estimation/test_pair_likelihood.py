@@ -11,6 +11,7 @@ import pytest
 from starcal_uq.camera.distortion import model_names
 from starcal_uq.camera.projection import backward_kernel, backward_root, backward_second_kernel, project, second_index
 from starcal_uq.core.errors import SamplingError
+from starcal_uq.core.status import Level
 from starcal_uq.estimation import composite as module
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.composite import PairLikelihood, expected_godambe, pair_likelihood
@@ -178,7 +179,7 @@ def test_sampling_pairs() -> None:
     found, _ = build(obs)
     post = sample(obs, cal, **QUICK, likelihood="pairs")
     d = post.diagnostics
-    assert d.ok, d.messages
+    assert d.ok, d.checks
     assert (d.likelihood, d.likelihood_used) == ("pairs", "compressed")
     assert d.compressed_max_difference < 0.1
     assert np.max(np.abs(post.mean - cal.pair_theta) / post.sd[:5]) < 0.15
@@ -207,8 +208,8 @@ def test_naive_pairs_warn_and_fail_their_checks() -> None:
         post = sample(obs, cal, **QUICK, likelihood="pairs_naive")
     assert not post.diagnostics.ok
     assert post.diagnostics.likelihood == "pairs_naive"
-    assert any("must not be used" in failure for failure in post.diagnostics.failures)
-    assert any("must not be used" in message for message in post.diagnostics.messages)
+    (failed,) = (check for check in post.diagnostics.checks if check.level is Level.FAIL)
+    assert "must not be used" in failed.sentence and failed.name == "Kind of likelihood"
     ratio = np.sqrt(np.diag(cal.covariance)) / post.sd[:5]
     assert np.all(ratio > 2.0)
 

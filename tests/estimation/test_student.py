@@ -228,7 +228,7 @@ def test_sampling_with_given_degrees_of_freedom(spoilt: tuple[Any, Any]) -> None
     obs, cal = spoilt
     post = sample(obs, cal, **QUICK, likelihood="student_t")
     d = post.diagnostics
-    assert d.ok, d.messages
+    assert d.ok, d.checks
     assert (d.likelihood, d.likelihood_used) == ("student_t", "compressed")
     assert d.compressed_max_difference < 0.2
     assert post.dof_draws is None
@@ -252,7 +252,7 @@ def test_sampling_degrees_of_freedom(spoilt: tuple[Any, Any], tmp_path: Path) ->
     assert post.draws.shape[1] == 6
     assert len(post.diagnostics.rhat) == 6
     assert post.laplace.names[-1] == "log_sigma"
-    assert any(m.startswith("Dof has the median") for m in post.diagnostics.messages)
+    assert any(check.sentence.startswith("dof has the median") for check in post.diagnostics.checks)
     post.save(tmp_path / "posterior.nc")
     again = Posterior.load(tmp_path / "posterior.nc")
     assert np.array_equal(again.dof_draws, post.dof_draws)

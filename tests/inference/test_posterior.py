@@ -159,7 +159,7 @@ def test_html_shows_verdict_and_table(post: Posterior) -> None:
     html = post._repr_html_()
     assert "passes every check" in html
     assert "1e-10 px^-2" in html
-    assert "importance sampling" in html
+    assert "Importance sampling" in html
 
 
 def test_layout_of_draws_matches_chains(post: Posterior) -> None:

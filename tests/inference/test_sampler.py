@@ -11,7 +11,7 @@ import pytest
 from scipy import integrate, stats
 
 from starcal_uq.core.errors import SamplingError
-from starcal_uq.core.status import Status
+from starcal_uq.core.status import Level, Status
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.inference.checks import check_compression
 from starcal_uq.inference.priors import Priors
@@ -38,6 +38,13 @@ def conjugate(priors: Priors, cal: Any) -> tuple[np.ndarray, np.ndarray]:
     return covariance @ pull, covariance
 
 
+def sentence_of(post: Any, name: str, level: Level | None = None) -> str:
+    """What one check of the draws says, at the level that is expected."""
+    (check,) = (check for check in post.diagnostics.checks if check.name == name)
+    assert level is None or check.level is level, check
+    return str(check.sentence)
+
+
 def test_known_posterior_is_recovered_at_extreme_scales() -> None:
     cal = gaussian_calibration()
     post = sample(None, cal, sigma=0.05, seed=1, evaluation="compressed")
@@ -46,7 +53,7 @@ def test_known_posterior_is_recovered_at_extreme_scales() -> None:
     assert np.max(np.abs(z.mean(axis=0))) < 0.04
     assert np.max(np.abs(np.cov(z.T) - np.eye(5))) < 0.05
     assert np.allclose(post.laplace.covariance, covariance, rtol=1e-4)
-    assert post.diagnostics.ok, post.diagnostics.messages
+    assert post.diagnostics.ok, post.diagnostics.checks
 
 
 def test_informative_prior_shifts_the_posterior_as_it_must() -> None:
@@ -58,7 +65,7 @@ def test_informative_prior_shifts_the_posterior_as_it_must() -> None:
     assert abs(mean[3] - cal.theta[3]) > 0.5 * SD[3]
     assert np.max(np.abs(post.mean - mean) / np.sqrt(np.diag(covariance))) < 0.05
     assert np.allclose(np.sqrt(np.diag(post.covariance)), np.sqrt(np.diag(covariance)), rtol=0.03)
-    assert any("prior, not the data, limits f" in m for m in post.diagnostics.messages)
+    assert sentence_of(post, "Influence of the priors") == "The prior, not the data, decides f."
 
 
 def test_noise_has_the_posterior_found_by_quadrature() -> None:
@@ -77,13 +84,14 @@ def test_noise_has_the_posterior_found_by_quadrature() -> None:
 
 
 def test_defaults_give_ten_thousand_effective_draws() -> None:
-    d = sample(None, gaussian_calibration(), seed=5, evaluation="compressed").diagnostics
-    assert d.ok, d.messages
+    post = sample(None, gaussian_calibration(), seed=5, evaluation="compressed")
+    d = post.diagnostics
+    assert d.ok, d.checks
     assert np.min(d.ess_bulk) > 10_000
     assert np.min(d.ess_tail) > 10_000
     assert np.max(d.autocorrelation) < 4.0
     assert d.psis_khat < 0.5
-    assert "agree:" in d.agreement
+    assert "gives the same" in sentence_of(post, "Independent posterior")
 
 
 def test_stretch_move_agrees() -> None:
@@ -277,20 +285,19 @@ def test_compression_check_measures_the_difference() -> None:
 def test_too_short_a_run_fails_its_checks() -> None:
     post = sample(None, gaussian_calibration(), **{**QUICK, "n_steps": 8}, evaluation="compressed")
     assert not post.diagnostics.ok
-    assert any("effective sample size" in failure for failure in post.diagnostics.failures)
-    assert post.diagnostics.messages[0] == post.diagnostics.failures[0]
+    assert "Too few effective draws" in sentence_of(post, "Effective draws", Level.FAIL)
 
 
 def test_surprising_results_are_said() -> None:
     cal = gaussian_calibration()
     priors = Priors.default(cal.nominal).replace(focal_fraction=0.001)
-    messages = sample(None, cal, priors, **QUICK, evaluation="compressed").diagnostics.messages
-    assert any("prior standard deviations away" in m for m in messages)
+    post = sample(None, cal, priors, **QUICK, evaluation="compressed")
+    assert "prior standard deviations away" in sentence_of(post, "Influence of the priors", Level.WARN)
     off = cal.camera.replace(x0_px=-3.0).theta
     likelihood = GaussianLikelihood(off, cal.information, cal.sigma, cal.dof)
     away = gaussian_calibration(theta=off, compressed=likelihood)
-    failures = sample(None, away, **QUICK, evaluation="compressed").diagnostics.failures
-    assert any("off the detector" in f for f in failures)
+    post = sample(None, away, **QUICK, evaluation="compressed")
+    assert "off the detector" in sentence_of(post, "Bounds", Level.FAIL)
 
 
 @pytest.fixture(scope="module")
@@ -304,7 +311,7 @@ def test_compressed_and_exact_posteriors_are_the_same(few_frames: tuple[Any, Any
     auto, exact = (sample(obs, cal, **QUICK, evaluation=name) for name in ("auto", "exact"))
     assert auto.diagnostics.likelihood_used == "compressed"
     assert auto.diagnostics.compressed_max_difference < 0.1
-    assert any("differ by up to" in m for m in auto.diagnostics.messages)
+    assert "equals the exact one" in sentence_of(auto, "Likelihood", Level.PASS)
     assert np.isnan(exact.diagnostics.compressed_max_difference)
     assert exact.diagnostics.likelihood_used == "exact"
     # The same random numbers decide, so the draws themselves agree.
@@ -327,9 +334,9 @@ def test_a_wrong_compressed_likelihood_is_replaced(few_frames: tuple[Any, Any], 
     obs, cal = few_frames
     assert replaced.diagnostics.likelihood_used == "exact"
     assert replaced.diagnostics.compressed_max_difference > 0.5
-    assert any("exact likelihood was sampled" in m for m in replaced.diagnostics.messages)
+    assert "exact likelihood was sampled" in sentence_of(replaced, "Likelihood", Level.PASS)
     kept = sample(obs, spoilt(cal), **QUICK, evaluation="compressed")
-    assert any("use evaluation='auto'" in failure for failure in kept.diagnostics.failures)
+    assert "departs from the exact one" in sentence_of(kept, "Likelihood", Level.FAIL)
 
 
 @pytest.mark.parametrize("stop", [40, 170])

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.core.formatting import fixed, join_words, plural, significant
-from starcal_uq.core.status import Check, Level, Question, pass_or_fail, pass_or_warn
+from starcal_uq.core.status import Check, Level, Question, Status, pass_or_fail, pass_or_warn
+from starcal_uq.diagnostics.verdict.observed import CALIBRATE, SCREEN
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -23,6 +24,17 @@ if TYPE_CHECKING:
 ESTIMATORS_Z = 4.0
 
 
+_IPOPT = f"{CALIBRATE} --solver ipopt or sc.calibrate(obs, camera, solver='ipopt')"
+
+
+_REMEDIES = {
+    Status.MAX_ITERATIONS: "sc.calibrate(obs, camera, max_iterations=1000)",
+    Status.OUTSIDE_DETECTOR: _IPOPT,
+    Status.FOLDED: _IPOPT,
+    Status.INCONSISTENT: SCREEN,
+}
+
+
 TRUTH_Z = 4.0
 
 
@@ -34,8 +46,8 @@ def estimation(cal: Calibration) -> Check:
         sentence = f"All {plural(len(cal.stages), 'stage')} ended at an optimum, after {plural(steps, 'iteration')}."
     else:
         sentence = f"The estimate is not an optimum: {cal.status.remedy}."
-    level = pass_or_fail(cal.status.ok)
-    return Check("Estimation", Question.CONVERGED, level, words, "converged", sentence)
+    level, remedy = pass_or_fail(cal.status.ok), _REMEDIES.get(cal.status, "")
+    return Check("Estimation", Question.CONVERGED, level, words, "converged", sentence, remedy)
 
 
 def estimators_agree(cal: Calibration) -> Check | None:
@@ -98,12 +110,12 @@ def model_checks(found: Diagnosis) -> list[Check]:
 
 def misfit(found: Misfit) -> Check:
     """Is there structure in the residuals?"""
-    name, threshold = "Unexplained structure", f"p ≥ {MISFIT_P:g}"
+    name, bound = "Unexplained structure", f"p ≥ {MISFIT_P:g}"
     value = f"p = {significant(found.p_value)}, corrected for {plural(len(found.tests), 'test')}"
     rejected = found.found(MISFIT_P)
     if not rejected:
         sentence = "The residuals show no structure beyond noise, in any of the ways that were looked for."
-        return Check(name, Question.TRUSTWORTHY, Level.PASS, value, threshold, sentence)
+        return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, sentence)
     bending = [t for t in rejected if t.dof > 0 and t.against not in _LIKE_NOISE and t.p_holm < MISFIT_FAIL_P]
     words = []
     for test in rejected[:3]:
@@ -118,7 +130,7 @@ def misfit(found: Misfit) -> Check:
     else:
         sentence += "No interval of this report holds that."
     level = Level.FAIL if bending else Level.WARN
-    return Check(name, Question.TRUSTWORTHY, level, value, threshold, sentence)
+    return Check(name, Question.TRUSTWORTHY, level, value, bound, sentence)
 
 
 def jackknife(found: Jackknife) -> Check:
@@ -128,7 +140,7 @@ def jackknife(found: Jackknife) -> Check:
     bad = (p_values < JACKKNIFE_P) & (found.ratio > JACKKNIFE_RATIO)
     low, high = float(found.ratio.min()), float(found.ratio.max())
     value = f"ratios {fixed(low, 2)} to {fixed(high, 2)} ({found.parameter_names[worst]})"
-    threshold = f"≤ {fixed(max(float(found.expected(0.998)[1][worst]), JACKKNIFE_RATIO), 2)}"
+    bound = f"≤ {fixed(max(float(found.expected(0.998)[1][worst]), JACKKNIFE_RATIO), 2)}"
     if np.any(bad):
         names = [name for name, flag in zip(found.parameter_names, bad, strict=True) if flag]
         sentence = (
@@ -137,8 +149,9 @@ def jackknife(found: Jackknife) -> Check:
         )
     else:
         sentence = "Estimates that leave one frame out scatter as the formal errors say."
+    remedy = "sc.diagnostics.accept_inflation(cal, sc.diagnostics.jackknife_frames(obs, cal))" if np.any(bad) else ""
     level = pass_or_warn(not np.any(bad))
-    return Check("Jackknife over frames", Question.TRUSTWORTHY, level, value, threshold, sentence)
+    return Check("Jackknife over frames", Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
 
 
 def comparison(found: ModelComparison) -> Check:

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from starcal_uq.core.formatting import join_words
-from starcal_uq.core.status import Check, Level, Question
-from starcal_uq.diagnostics.verdict import draws as sampling
-from starcal_uq.diagnostics.verdict import estimate, observed
+from starcal_uq.core.status import Check, Level, Question, worst
+from starcal_uq.diagnostics.verdict import draws, estimate, observed
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -52,11 +51,6 @@ class Verdict:
         return tuple(check for check in self.checks if check.level is level)
 
 
-def worst(checks: tuple[Check, ...]) -> Level:
-    """The worst outcome among checks."""
-    return max((check.level for check in checks), key=lambda level: level.rank, default=Level.PASS)
-
-
 def judge(
     obs: Observations,
     cal: Calibration,
@@ -84,21 +78,13 @@ def judge(
     if diagnosis is not None and diagnosis.starts is not None:
         checks += [estimate.starts(diagnosis.starts)]
     if post is not None:
-        from starcal_uq.inference.derived import derived_quantities
-
-        checks += [sampling.same_data(post, obs)]
-        checks += [sampling.chains_agree(post), sampling.effective_draws(post), sampling.acceptance(post)]
-        checks += [sampling.derived_converged(derived_quantities(post)), sampling.digits(post), sampling.bounds(post)]
-        checks += [sampling.independent_posterior(post), sampling.likelihood_exact(post)]
-        checks += [sampling.likelihood_kind(post)]
+        checks += [draws.same_data(post, obs), *post.diagnostics.checks]
     checks += [observed.directions(obs, cal), observed.residual_pattern(obs, cal), observed.outliers(obs, cal)]
     checks += [observed.noise(cal), observed.coverage(obs, cal)]
     if diagnosis is not None:
         checks += estimate.model_checks(diagnosis)
-    if post is not None:
-        checks += [sampling.prior_influence(post)]
     if attitude is not None:
-        checks += [sampling.propagation(attitude)]
+        checks += [draws.propagation(attitude)]
     if truth is not None and truth.parameter_names == cal.parameter_names:
         checks += [estimate.against_truth(cal, truth, post)]
     found = tuple(check for check in checks if check is not None)

@@ -42,14 +42,24 @@ COVERED_SHARE = 0.85
 MIN_FRAMES = 5
 
 
+# Commands and calls that checks give as remedies.
+CALIBRATE = "starcal-uq calibrate OBS CAMERA -o RUN --force"
+
+
+SCREEN = f"{CALIBRATE} --screen or sc.estimation.screen(obs, camera)"
+
+
+AIR_REMEDY = f"{CALIBRATE} --site SITE or {CALIBRATE} --in-space"
+
+
 def directions(obs: Observations, cal: Calibration) -> Check:
     """Is annual aberration in the directions, and refraction where there is air?"""
     declared = str(obs.meta.get("directions", "undeclared"))
-    name, threshold = "Catalogue directions", "apparent"
+    name, bound = "Catalogue directions", "apparent"
     seen = air(obs)
     if declared == "apparent" and seen == "unknown":
         sentence = f"Aberration is in the directions, refraction is not. {conditional_words(cal)} {REMEDY}"
-        return Check(name, Question.TRUSTWORTHY, Level.WARN, "without refraction", threshold, sentence)
+        return Check(name, Question.TRUSTWORTHY, Level.WARN, "without refraction", bound, sentence, AIR_REMEDY)
     if declared == "apparent":
         sentence = "The directions are declared as apparent: aberration is in them."
         if obs.meta.get("observer") == "space":
@@ -58,11 +68,11 @@ def directions(obs: Observations, cal: Calibration) -> Check:
             sentence = (
                 f"Aberration and refraction at the site ({Site.from_dict(obs.meta['site'])}) are in the directions."
             )
-        return Check(name, Question.TRUSTWORTHY, Level.PASS, declared, threshold, sentence)
-    sentence = f"{_undeclared(obs)} {aberration_words(cal)}"
+        return Check(name, Question.TRUSTWORTHY, Level.PASS, declared, bound, sentence)
+    sentence, remedy = f"{_undeclared(obs)} {aberration_words(cal)}", f"{CALIBRATE} --directions apparent"
     if seen == "unknown":
-        sentence += f" {conditional_words(cal)} {REMEDY}"
-    return Check(name, Question.TRUSTWORTHY, Level.WARN, declared, threshold, sentence)
+        sentence, remedy = f"{sentence} {conditional_words(cal)} {REMEDY}", f"{remedy} or {AIR_REMEDY}"
+    return Check(name, Question.TRUSTWORTHY, Level.WARN, declared, bound, sentence, remedy)
 
 
 def aberration_words(cal: Calibration) -> str:
@@ -115,8 +125,9 @@ def outliers(obs: Observations, cal: Calibration) -> Check:
         else f"More than Gaussian noise gives ({place}): look for wrong identifications and disturbed centroids."
     )
     value = f"{plural(found, 'star')} beyond {OUTLIER_SIGMA:g} sigma"
-    threshold = f"about {significant(expected)} expected"
-    return Check("Outliers", Question.TRUSTWORTHY, pass_or_warn(good), value, threshold, sentence)
+    bound = f"about {significant(expected)} expected"
+    remedy = "" if good else SCREEN
+    return Check("Outliers", Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, remedy)
 
 
 def noise(cal: Calibration) -> Check:
@@ -135,8 +146,8 @@ def noise(cal: Calibration) -> Check:
     else:
         sentence = "Less scatter than centroids have: the stated noise is too large, or the data are not measurements."
     name = "Factor on the stated noise" if scaled else "Centroid noise per axis"
-    threshold = f"{low:g} to {high:g}{unit}"
-    return Check(name, Question.TRUSTWORTHY, pass_or_warn(good), value, threshold, sentence)
+    bound = f"{low:g} to {high:g}{unit}"
+    return Check(name, Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence)
 
 
 def coverage(obs: Observations, cal: Calibration) -> Check:
@@ -144,14 +155,14 @@ def coverage(obs: Observations, cal: Calibration) -> Check:
     binned = bin_residuals(cal, obs)
     share = len(binned.counts) / max(len(binned.counts) + binned.n_empty, 1)
     value = f"{percent(share, 3)} of the field, {plural(obs.n_frames, 'frame')}"
-    threshold = f"≥ {percent(COVERED_SHARE)}, ≥ {MIN_FRAMES} frames"
+    bound = f"≥ {percent(COVERED_SHARE)}, ≥ {MIN_FRAMES} frames"
     if share < COVERED_SHARE:
         level, sentence = Level.WARN, "Parts of the field hold no stars: the distortion is extrapolated there."
     elif obs.n_frames < MIN_FRAMES:
         level, sentence = Level.WARN, "Few frames: errors common to a whole frame cannot be told from the camera."
     else:
         level, sentence = Level.PASS, "Stars covered the field, so that no part of it is extrapolated."
-    return Check("Coverage of the field", Question.TRUSTWORTHY, level, value, threshold, sentence)
+    return Check("Coverage of the field", Question.TRUSTWORTHY, level, value, bound, sentence)
 
 
 def _noise_px(obs: Observations, cal: Calibration) -> float:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from typing import Any
 
 from starcal_uq.camera.distortion import get_model
-from starcal_uq.core.formatting import MINUS, count, join_words
-from starcal_uq.core.status import Check, Level, Question
-from starcal_uq.diagnostics.verdict.judge import judge, worst
+from starcal_uq.core.formatting import count, join_words
+from starcal_uq.core.status import Check, Level, Question, worst
+from starcal_uq.diagnostics.verdict.judge import judge
 from starcal_uq.diagnostics.verdict.limits import limits
 from starcal_uq.presentation.figures.coupling import plot_correlations, plot_couplings
 from starcal_uq.presentation.figures.diagnostics import plot_diagnosis, plot_residual_profiles
@@ -41,7 +40,6 @@ def render(results: Results, figures: Mapping[str, bytes]) -> str:
     """
     environment = template_environment()
     environment.filters["symbol"] = tables.symbol
-    environment.filters["minus"] = _minus
     return environment.get_template("report.html.j2").render(context(results, figures)) + "\n"
 
 
@@ -76,6 +74,7 @@ def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
         "coupling_rows": [] if results.coupling is None else tables.coupling_rows(results.coupling, results),
         "weak_directions": [] if results.coupling is None else tables.weak_directions(results.coupling),
         "diagnostics_rows": [] if post is None else tables.diagnostics_rows(post),
+        "agreement": next((check.value for check in verdict.checks if check.name == "Independent posterior"), ""),
         "methods_rows": tables.methods_rows(results),
         "derived_rows": [] if post is None else model_tables.derived_rows(post),
         **model_tables.diagnosis_context(results.diagnosis, cal),
@@ -124,11 +123,6 @@ def _answer(checks: tuple[Check, ...]) -> str:
 
 def _listed(checks: tuple[Check, ...]) -> str:
     return join_words([check.phrase for check in checks])
-
-
-def _minus(text: str) -> str:
-    """True minus signs in front of numbers."""
-    return re.sub(r"(?<![\w.])-(?=\d)", MINUS, text)
 
 
 def draw_figures(results: Results) -> dict[str, bytes]:

@@ -1,0 +1,117 @@
+"""Draws are judged once: what a posterior says of itself is what verdict, report and exit status say."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+import starcal_uq as sc
+from starcal_uq.cli import console
+from starcal_uq.core.records import from_plain, to_plain
+from starcal_uq.core.status import Check, Level, Question, worst
+from starcal_uq.diagnostics.verdict.judge import judge
+from starcal_uq.inference.checks import check_draws
+from starcal_uq.presentation.report.page import context
+from starcal_uq.presentation.report.results import Results
+from tests.helpers.scenes import observations
+
+
+@pytest.fixture(scope="module")
+def short():
+    """60 frames, their calibration, and posteriors of runs that are too short to be sure of, by seed."""
+    obs = observations(n_frames=60)
+    cal = sc.calibrate(obs, sc.paper.paper_start())
+    return obs, cal, lambda seed: sc.sample(obs, cal, seed=seed, n_steps=20)
+
+
+def two_judges_of_before(post):
+    """What `diagnostics.ok` and the report decided on when each had criteria of its own; both shared the others."""
+    d = post.diagnostics
+    shared = np.nanmax(d.rhat) < 1.01 and min(np.nanmin(d.ess_bulk), np.nanmin(d.ess_tail)) > 400 and d.psis_khat < 0.7
+    differ = max(d.agreement_mean, d.agreement_sd)
+    of_draws = differ <= 0.05 + 4.0 * np.sqrt(1.0 / np.nanmin(d.ess_bulk) + 1.0 / d.psis_ess)
+    return shared and of_draws, shared and differ <= 0.05
+
+
+def agreements(short, seeds):
+    """Whether both judges of before, and both readers of today, agree on each short run."""
+    obs, cal, sampled = short
+    of_data = set(judge(obs, cal).checks)
+    before, today = [], []
+    for seed in seeds:
+        post = sampled(seed)
+        of_draws = [check for check in judge(obs, cal, post).checks if check not in of_data]
+        first, second = two_judges_of_before(post)
+        before.append(first == second)
+        today.append(post.diagnostics.ok == (worst(of_draws) is not Level.FAIL))
+    return before, today
+
+
+def test_posterior_and_verdict_agree_on_short_runs(short):
+    before, today = agreements(short, (0, 3, 7))
+    assert all(today)
+    # Control: two judges do not.
+    assert not all(before)
+
+
+@pytest.mark.slow
+def test_posterior_and_verdict_agree_on_forty_short_runs(short):
+    before, today = agreements(short, range(40))
+    print(f"\ndisagreements in 40 short runs: {before.count(False)} with two judges, {today.count(False)} with one")
+    assert all(today)
+    assert before.count(False) >= 3
+
+
+@pytest.fixture(scope="module")
+def disputed(short):
+    """Draws that fail a check: an importance estimate far from them."""
+    post = short[2](0)
+    changed = dataclasses.replace(post, diagnostics=dataclasses.replace(post.diagnostics, agreement_mean=0.9))
+    checks = check_draws(changed)
+    return dataclasses.replace(changed, diagnostics=dataclasses.replace(changed.diagnostics, checks=checks))
+
+
+def test_every_reader_shows_the_same_checks(short, disputed, monkeypatch, tmp_path):
+    obs, cal, _ = short
+    assert not disputed.diagnostics.ok and disputed.diagnostics.level.exit_status == 1
+    verdict = judge(obs, cal, disputed)
+    assert set(disputed.diagnostics.checks) <= set(verdict.checks)
+    page = context(Results(name="run", observations=obs, calibration=cal, posterior=disputed), {})
+    assert page["verdict"] == verdict
+    html = disputed._repr_html_()
+    recorded = Console(record=True, width=1000)
+    monkeypatch.setattr(console, "out", recorded)
+    console.show_posterior(disputed)
+    console.show_verdict(verdict)
+    terminal = recorded.export_text()
+    for check in disputed.diagnostics.checks:
+        assert check.sentence in terminal and check.value in terminal
+        assert check.name in html
+    disputed.save(tmp_path / "posterior.nc")
+    assert sc.Posterior.load(tmp_path / "posterior.nc").diagnostics.checks == disputed.diagnostics.checks
+
+
+def test_checks_are_data():
+    check = Check(
+        "R-hat", Question.CONVERGED, Level.FAIL, "1.2", "< 1.01", "Ensembles disagree.", "sc.sample(obs, cal)"
+    )
+    assert from_plain(Check, json.loads(json.dumps(to_plain(check)))) == check
+    assert str(check).startswith("fail: R-hat, 1.2 (asked for: < 1.01). ")
+    assert str(check).endswith("Remedy: sc.sample(obs, cal)")
+    assert [level.exit_status for level in Level] == [0, 0, 1]
+    assert worst(()) is Level.PASS
+
+
+def test_numbers_are_judged_with_their_monte_carlo_error(short):
+    """Four errors of the comparison beside the difference that would matter, and no more."""
+    post = short[2](0)
+    d = post.diagnostics
+    slack = 4.0 * np.sqrt(1.0 / np.min(d.ess_bulk) + 1.0 / d.psis_ess)
+    for factor, level in ((0.99, Level.PASS), (1.01, Level.FAIL)):
+        other = dataclasses.replace(post, diagnostics=dataclasses.replace(d, agreement_sd=(0.05 + slack) * factor))
+        (check,) = (check for check in check_draws(other) if check.name == "Independent posterior")
+        assert check.level is level
