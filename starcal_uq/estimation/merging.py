@@ -86,7 +86,7 @@ def merge(
     parts = [scaled(cal.compressed, unit) for cal, unit in zip(calibrations, units, strict=True)]
     best = optimum(total(parts))
     sigma_name = sigma_parameter(True).name if noise == "own" else calibrations[0].sigma_name
-    found = compare_runs(names, calibrations[0].parameter_names, runs, units, best)
+    found = consistency_between(names, calibrations[0].parameter_names, runs, units, best)
     _check_consistent(found, allow_inconsistent)
     theta = best.theta - 0.5 * best.compressed.whitening @ best.compressed.log_determinant_slope
     stage = Stage("merging", best.trajectory, best.cost, Status.CONVERGED, len(best.cost), perf_counter() - began)
@@ -333,7 +333,7 @@ def consistency_of(calibration: Calibration) -> Consistency | None:
     return None if record is None else from_plain(Consistency, record["consistency"])
 
 
-def compare_runs(
+def consistency_between(
     names: Sequence[str],
     parameter_names: Sequence[str],
     runs: Sequence[Optimum],

@@ -18,7 +18,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.identification.brightness import unlike_brightness
-from starcal_uq.identification.nearby import Sky
+from starcal_uq.identification.nearby import NearbyStars
 from starcal_uq.identification.pyramid import SIGMAS, CameraTolerance, FieldGeometry, Hypothesis
 
 # Parameters after the three of the attitude: ln F, d_x, d_y, kappa.
@@ -96,7 +96,7 @@ def start_state(hypothesis: Hypothesis) -> CameraState:
 def match_frame(
     u: FloatArray,
     sigma_px: FloatArray,
-    sky: Sky,
+    sky: NearbyStars,
     start: CameraState,
     tolerance: CameraTolerance,
     *,
@@ -112,7 +112,7 @@ def match_frame(
         Ideal pixels.
     sigma_px : (n,) array
         Noise per axis.
-    sky : Sky
+    sky : NearbyStars
         The catalogue.
     start : CameraState
         A first state.

@@ -14,7 +14,7 @@ from starcal_uq.identification.pyramid import FieldGeometry
 _STARS_PER_CENTROID, _STARS_MORE = 2.0, 20
 
 
-class Sky:
+class NearbyStars:
     """A catalogue, searched to the depth that suits a frame.
 
     Parameters
@@ -41,9 +41,9 @@ class Sky:
         wanted = (_STARS_PER_CENTROID * n_centroids + _STARS_MORE) * 4.0 * pi / field_sr
         return min(len(self.rows), _step(wanted))
 
-    def seen_by(self, geometry: FieldGeometry) -> Sky:
+    def seen_by(self, geometry: FieldGeometry) -> NearbyStars:
         """The same catalogue for another camera."""
-        other = object.__new__(Sky)
+        other = object.__new__(NearbyStars)
         other.__dict__.update(self.__dict__)
         other.geometry = geometry
         return other

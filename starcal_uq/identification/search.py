@@ -16,7 +16,7 @@ from starcal_uq.camera.projection import unproject
 from starcal_uq.core.types import FloatArray, IntArray, StrArray
 from starcal_uq.identification.brightness import instrumental_mag
 from starcal_uq.identification.match import CameraState, Match, match_frame, start_state
-from starcal_uq.identification.nearby import Sky
+from starcal_uq.identification.nearby import NearbyStars
 from starcal_uq.identification.pairs import StarPairs
 from starcal_uq.identification.proposers import Proposer, PyramidProposer, prepare_pairs
 from starcal_uq.identification.pyramid import CameraTolerance, FieldGeometry
@@ -131,7 +131,7 @@ class Search:
         if proposer is None:
             proposer = PyramidProposer(pairs or prepare_pairs(stars, self.geometry, tolerance, cache, cache_dir))
         self.proposer = proposer
-        self.sky = Sky(stars.directions_icrs, stars.mag, self.geometry)
+        self.sky = NearbyStars(stars.directions_icrs, stars.mag, self.geometry)
 
     @property
     def pairs(self) -> StarPairs:

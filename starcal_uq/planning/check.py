@@ -216,7 +216,7 @@ def check_forecast(
     mission = random_frames(stars, camera, sigma_px, n_frames=n_geometries, min_stars=min_stars, seed=seed)
     forecaster = Forecaster(mission.information, mission.mean_stars, mission, seed=seed)
     campaigns = [Campaign(n, min_stars, sigma_px) for n in n_frames]
-    task = partial(_campaign, _Study(camera, stars, campaigns, n_campaigns, seed))
+    task = partial(_campaign, _Campaigns(camera, stars, campaigns, n_campaigns, seed))
     outcomes, interrupted = run_tasks(
         task,
         len(n_frames) * n_campaigns,
@@ -247,7 +247,7 @@ def check_forecast(
     )
 
 
-class _Study(NamedTuple):
+class _Campaigns(NamedTuple):
     """What all campaigns share; sent once to every process."""
 
     camera: Camera
@@ -257,7 +257,7 @@ class _Study(NamedTuple):
     seed: int
 
 
-class _Outcome(NamedTuple):
+class _Calibrated(NamedTuple):
     """One campaign: why it has no result (or nothing), error (p,), covariance (p, p), degrees of freedom."""
 
     failure: str
@@ -266,7 +266,7 @@ class _Outcome(NamedTuple):
     dof: float
 
 
-def _campaign(study: _Study, index: int) -> _Outcome:
+def _campaign(study: _Campaigns, index: int) -> _Calibrated:
     """Simulate and calibrate campaign number `index`."""
     camera = study.camera
     x0, y0 = camera.centre_px
@@ -280,5 +280,5 @@ def _campaign(study: _Study, index: int) -> _Outcome:
         raise
     except StarcalError as error:
         p = len(camera.theta)
-        return _Outcome(str(error), np.full(p, np.nan), np.full((p, p), np.nan), np.nan)
-    return _Outcome("", cal.theta - camera.theta, cal.covariance, float(cal.dof))
+        return _Calibrated(str(error), np.full(p, np.nan), np.full((p, p), np.nan), np.nan)
+    return _Calibrated("", cal.theta - camera.theta, cal.covariance, float(cal.dof))

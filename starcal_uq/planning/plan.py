@@ -157,8 +157,8 @@ def plan(
     }
     table = None
     if sweeps:
-        scene = _Scene(stars, camera, sigma_px, limit, min_stars, seed)
-        table = _sweep(scene, frames, noise, scope, options | {"n_campaigns": _SWEEP_CAMPAIGNS}, target_arcsec)
+        base = _Base(stars, camera, sigma_px, limit, min_stars, seed)
+        table = _sweep(base, frames, noise, scope, options | {"n_campaigns": _SWEEP_CAMPAIGNS}, target_arcsec)
     return Plan(
         camera=camera,
         sigma_px=noise,
@@ -178,7 +178,7 @@ def plan(
     )
 
 
-class _Scene(NamedTuple):
+class _Base(NamedTuple):
     """What the sweeps vary around."""
 
     stars: StarCatalogue
@@ -209,7 +209,7 @@ def _needs(frames: FrameSet, target_arcsec: float, options: dict[str, Any]) -> t
 
 
 def _sweep(
-    scene: _Scene,
+    base: _Base,
     frames: FrameSet,
     noise_px: float,
     scope: str,
@@ -219,7 +219,7 @@ def _sweep(
     import pandas as pd
 
     rows = []
-    for name, value, information, mission, sky in _points(scene, frames, noise_px):
+    for name, value, information, mission, sky in _points(base, frames, noise_px):
         forecaster = Forecaster(information, mission.mean_stars, mission, scope=scope, **options)
         row = {"sweep": name, "value": value, "sky_fraction": sky, "mean_stars": mission.mean_stars}
         row |= forecaster.forecast((SWEEP_FRAMES,)).to_dataframe().iloc[0].to_dict()
@@ -232,31 +232,29 @@ def _sweep(
     return table.astype({"n_frames": np.int64})
 
 
-def _points(
-    scene: _Scene, frames: FrameSet, noise_px: float
-) -> Iterator[tuple[str, float, FloatArray, FrameSet, float]]:
+def _points(base: _Base, frames: FrameSet, noise_px: float) -> Iterator[tuple[str, float, FloatArray, FrameSet, float]]:
     """Name, value, information, mission and part of the sky of every point of the sweeps."""
-    deepest = float(np.max(scene.stars.mag))
+    deepest = float(np.max(base.stars.mag))
     for step in _MAG_STEPS:
-        limit = scene.max_mag + step
+        limit = base.max_mag + step
         # A catalogue ends at its faintest star, a little above the limit that it was cut at.
         if limit > deepest + 0.1:
             break
-        stars = scene.stars.select(scene.stars.mag <= limit)
-        sky = _sky_fraction(stars, scene.camera, scene.noise, scene.min_stars, scene.seed)
+        stars = base.stars.select(base.stars.mag <= limit)
+        sky = _sky_fraction(stars, base.camera, base.noise, base.min_stars, base.seed)
         if sky < _LEAST_SKY:
             continue
         some = random_frames(
             stars,
-            scene.camera,
-            scene.noise,
+            base.camera,
+            base.noise,
             n_frames=_SWEEP_GEOMETRIES,
-            min_stars=scene.min_stars,
-            seed=scene.seed,
+            min_stars=base.min_stars,
+            seed=base.seed,
         )
         yield "magnitude limit", limit, some.information, some, sky
-    seen = scene.stars.select(scene.stars.mag <= scene.max_mag)
-    sky = _sky_fraction(seen, scene.camera, scene.noise, scene.min_stars, scene.seed)
+    seen = base.stars.select(base.stars.mag <= base.max_mag)
+    sky = _sky_fraction(seen, base.camera, base.noise, base.min_stars, base.seed)
     for factor in _NOISE_FACTORS:
         scaled = replace(frames, information=frames.information / factor**2, noise=frames.noise * factor**2)
         yield "noise", factor * noise_px, scaled.information, scaled, sky

@@ -16,7 +16,7 @@ from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.estimation.recursive import filter as recursion_module
 from starcal_uq.estimation.recursive import filter as recursion_sums
 from starcal_uq.estimation.recursive.filter import FrameSums, Recursion
-from starcal_uq.estimation.recursive.innovations import FrameNormals, frame_normals
+from starcal_uq.estimation.recursive.innovations import PairNormals, frame_normals
 from starcal_uq.estimation.recursive.start import RecursionOptions
 from starcal_uq.estimation.recursive.stream import RecursiveCalibration
 from starcal_uq.estimation.solvers import levenberg_marquardt
@@ -167,7 +167,7 @@ def use_linear(monkeypatch, slopes, d):
         shifted[:, :, 0] -= columns[k, :, 1:] @ theta
         grams = shifted.transpose(0, 2, 1) @ shifted
         n, p = len(k), len(theta)
-        return FrameNormals(grams, grams, np.full(n, float(d.shape[1])), np.zeros((n, 3, p)), np.zeros((n, 3, 3)))
+        return PairNormals(grams, grams, np.full(n, float(d.shape[1])), np.zeros((n, 3, p)), np.zeros((n, 3, 3)))
 
     monkeypatch.setattr(recursion_module, "frame_normals", normals)
 

@@ -104,7 +104,7 @@ class Study:
         return self.n_walkers * (self.n_steps // self.thin) - 1
 
 
-class Outcome(NamedTuple):
+class TrialOutcome(NamedTuple):
     """One replicate, over Q quantities and p parameters.
 
     Attributes
@@ -146,7 +146,7 @@ class Outcome(NamedTuple):
     dof: int
 
 
-def run_replicate(study: Study, stars: StarCatalogue, index: int) -> Outcome:
+def run_replicate(study: Study, stars: StarCatalogue, index: int) -> TrialOutcome:
     """Replicate number `index`; a calibration or posterior that fails is an outcome, a sky without stars an error."""
     truths, noise, sampler = np.random.SeedSequence(study.seed, spawn_key=(index,)).spawn(3)
     camera, sigma_px = _truth(study, np.random.default_rng(truths))
@@ -222,7 +222,7 @@ def _compare(
     log_likelihood: LogLikelihood,
     truth: FloatArray,
     index: int,
-) -> Outcome:
+) -> TrialOutcome:
     p = len(truth) - 1
     flat = draws.reshape(-1, p + 1)
     believed = truth if study.assumed_sigma_px is None else np.append(truth[:-1], study.assumed_sigma_px)
@@ -238,7 +238,7 @@ def _compare(
     exact = np.nan
     if study.likelihood == MARGINAL:
         exact = MarginalLikelihood(obs, cal.camera.distortion).log_likelihood(believed[:-1], float(believed[-1]))
-    return Outcome(
+    return TrialOutcome(
         replicate=index,
         failure="",
         truth=truth,
@@ -253,10 +253,10 @@ def _compare(
     )
 
 
-def _no_result(study: Study, truth: FloatArray, index: int, reason: str) -> Outcome:
+def _no_result(study: Study, truth: FloatArray, index: int, reason: str) -> TrialOutcome:
     q = len(study.quantities)
     nothing, nowhere = np.full(q, np.nan), np.zeros(q, dtype=np.int64)
-    return Outcome(index, reason, truth, nowhere, nowhere > 0, nothing, nothing, np.nan, np.nan, np.nan, 0)
+    return TrialOutcome(index, reason, truth, nowhere, nowhere > 0, nothing, nothing, np.nan, np.nan, np.nan, 0)
 
 
 def _nees(error: FloatArray, covariance: FloatArray) -> float:

@@ -27,7 +27,14 @@ from starcal_uq.core.errors import CalibrationError, PriorError, SamplingError
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import AnyDict
-from starcal_uq.diagnostics.validation.replicates import MARGINAL, LikelihoodMaker, Outcome, Study, Truth, run_replicate
+from starcal_uq.diagnostics.validation.replicates import (
+    MARGINAL,
+    LikelihoodMaker,
+    Study,
+    TrialOutcome,
+    Truth,
+    run_replicate,
+)
 from starcal_uq.diagnostics.validation.result import Validation
 from starcal_uq.inference.priors import Priors
 from starcal_uq.simulation.frames import Campaign
@@ -242,12 +249,12 @@ _CHUNK = 8
 
 def run_replicates(
     study: Study, stars: StarCatalogue, n_replicates: int, workers: int | None, progress: Progress | None
-) -> tuple[list[Outcome], bool]:
+) -> tuple[list[TrialOutcome], bool]:
     """Run replicates 0 .. n_replicates - 1; parameters and exceptions as in `run_tasks`.
 
     Returns
     -------
-    list of Outcome
+    list of TrialOutcome
         In order; all that were complete when Ctrl-C was pressed.
     bool
         True if it was.

@@ -30,7 +30,7 @@ import numpy as np
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray
-from starcal_uq.estimation.recursive.innovations import FrameNormals, PairCovariance, frame_normals
+from starcal_uq.estimation.recursive.innovations import PairCovariance, PairNormals, frame_normals
 from starcal_uq.observations.frames import StarFrames
 
 # Estimates that are kept of a long stream: when they are this many, every second one is dropped.
@@ -44,7 +44,7 @@ class FrameSums:
     Attributes
     ----------
     gram : (1 + p, 1 + p) array
-        Sum of `FrameNormals.grams`: misfit of the pixels.
+        Sum of `PairNormals.grams`: misfit of the pixels.
     moments : (s, s) array
         Sum of products of the frames' entries (gradient and information), from which the scatter of their scores
         follows for any estimate: the meat of the sandwich.
@@ -91,12 +91,12 @@ def entry_count(p: int) -> int:
     return (p + 1) * (p + 2) // 2 - 1
 
 
-def frame_entries(normals: FrameNormals, moved: FloatArray) -> tuple[FloatArray, FloatArray]:
+def frame_entries(normals: PairNormals, moved: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Gram matrices (K, 1 + p, 1 + p) about another point, and the distinct entries of every frame (K, s).
 
     Parameters
     ----------
-    normals : FrameNormals
+    normals : PairNormals
         The frames.
     moved : (p,) array
         The point where they were linearised minus the new one, in the units of `normals`.
@@ -234,7 +234,7 @@ class Recursion:
     sums : FrameSums
         About the origin.
     response, noise : (3, p) and (3, 3) arrays
-        Sums over frames of `FrameNormals.response` and `FrameNormals.noise`.
+        Sums over frames of `PairNormals.response` and `PairNormals.noise`.
     history : History
         Estimates so far.
     """
@@ -314,10 +314,10 @@ class Recursion:
         if determined or self.held.n_frames >= _MAX_HELD:
             self.held, self.starting = None, False
 
-    def _linearise(self, frames: StarFrames, point: FloatArray) -> FrameNormals:
+    def _linearise(self, frames: StarFrames, point: FloatArray) -> PairNormals:
         return frame_normals(frames, self.model_name, self.full(point), self.scale, self.pair_covariance)
 
-    def _about_origin(self, normals: FrameNormals) -> tuple[FloatArray, FloatArray]:
+    def _about_origin(self, normals: PairNormals) -> tuple[FloatArray, FloatArray]:
         moved = np.zeros(len(self.origin))
         moved[: len(self.point)] = self.point
         return frame_entries(normals, moved)
@@ -373,14 +373,14 @@ class Recursion:
         weights: FloatArray = self.forgetting ** np.arange(n - 1.0, -1.0, -1.0)
         return weights
 
-    def _attempt(self, frame: StarFrames, point: FloatArray) -> tuple[FrameNormals, _Step | None]:
+    def _attempt(self, frame: StarFrames, point: FloatArray) -> tuple[PairNormals, _Step | None]:
         before, self.point = self.point, point
         normals = self._linearise(frame, point)
         step = self._step(self._total(normals), self._prior(frame.n_frames))
         self.point = before
         return normals, step
 
-    def _total(self, normals: FrameNormals) -> FloatArray:
+    def _total(self, normals: PairNormals) -> FloatArray:
         """Gram matrix of frames that are taken together."""
         if len(normals.pairs) == 1:
             one: FloatArray = normals.weighted[0]
@@ -388,7 +388,7 @@ class Recursion:
         total: FloatArray = np.sum(self._weights(len(normals.pairs))[:, None, None] * normals.weighted, axis=0)
         return total
 
-    def _misfit(self, normals: FrameNormals, point: FloatArray) -> float:
+    def _misfit(self, normals: PairNormals, point: FloatArray) -> float:
         """Sum of squares of frames at the point of their linearisation, and of the prior there."""
         shift = point - self.offset
         prior = self._prior(len(normals.pairs))
@@ -430,7 +430,7 @@ class Recursion:
         self.chi2 = self.forgetting**n * self.chi2 + step.innovation
         self.numbers = self.forgetting**n * self.numbers + numbers
 
-    def _add(self, gram: FloatArray, entries: FloatArray, normals: FrameNormals, index: int, size: int) -> None:
+    def _add(self, gram: FloatArray, entries: FloatArray, normals: PairNormals, index: int, size: int) -> None:
         """Count a frame."""
         self.sums.add(gram, entries, size, self.forgetting)
         self.response += normals.response[index]

@@ -37,7 +37,7 @@ _RIDGE = 1e-13
 
 
 @dataclass(frozen=True)
-class FrameNormals:
+class PairNormals:
     """Normal equations of K frames at one point, for p parameters.
 
     Attributes
@@ -65,7 +65,7 @@ class FrameNormals:
 
 def frame_normals(
     frames: StarFrames, model_name: str, theta: FloatArray, scale: FloatArray, covariance: PairCovariance = "full"
-) -> FrameNormals:
+) -> PairNormals:
     """Linearise the interstar angles of every frame.
 
     Frames of equal size are treated together; the numbers of a frame do not depend on the others, to the last bit.
@@ -81,11 +81,11 @@ def frame_normals(
     scale : (p,) array
         Units of the parameters in the result; those of the principal point must be 1 px.
     covariance : {"full", "diagonal"}
-        Which covariance of the pairs `FrameNormals.weighted` assumes.
+        Which covariance of the pairs `PairNormals.weighted` assumes.
 
     Returns
     -------
-    FrameNormals
+    PairNormals
         Not finite where the model is not defined at theta, such as at a focal length that is not positive.
     """
     try:
@@ -97,12 +97,12 @@ def frame_normals(
         pass
     k, p = frames.n_frames, len(theta)
     grams = np.full((k, 1 + p, 1 + p), np.nan)
-    return FrameNormals(grams, grams, np.full(k, np.nan), np.full((k, 3, p), np.nan), np.full((k, 3, 3), np.nan))
+    return PairNormals(grams, grams, np.full(k, np.nan), np.full((k, 3, p), np.nan), np.full((k, 3, 3), np.nan))
 
 
 def _frame_normals(
     frames: StarFrames, model_name: str, theta: FloatArray, scale: FloatArray, covariance: PairCovariance
-) -> FrameNormals:
+) -> PairNormals:
     """As `frame_normals`, at a positive focal length."""
     k, p = frames.n_frames, len(theta)
     root = backward_root(model_name, theta, frames.pixel)
@@ -127,7 +127,7 @@ def _frame_normals(
             weighted[index] = group.diagonal()
     counts = sizes.astype(np.float64)
     pairs = 2.0 * counts - 3.0 if covariance == "full" else 0.5 * counts * (counts - 1.0)
-    return FrameNormals(grams, weighted, pairs, response, noise)
+    return PairNormals(grams, weighted, pairs, response, noise)
 
 
 def _left_inverse(by_pixel: FloatArray) -> FloatArray:
@@ -146,7 +146,7 @@ def _cross(u: FloatArray, v: FloatArray) -> FloatArray:
 def _attitudes(
     frames: StarFrames, displaced: FloatArray, rotated: FloatArray, db: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Response and noise of the attitudes, as in `FrameNormals`, from pixels per direction and per rotation."""
+    """Response and noise of the attitudes, as in `PairNormals`, from pixels per direction and per rotation."""
     slopes = np.sum(displaced[:, None] * db, axis=2)
     information = frames.sum(np.sum(rotated[:, :, None] * rotated[:, None], axis=0)).transpose(2, 0, 1)
     shifts = frames.sum(np.sum(rotated[:, :, None] * slopes[:, None], axis=0)).transpose(2, 0, 1)
