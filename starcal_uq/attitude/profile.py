@@ -18,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from starcal_uq.attitude.rotations import left_error
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import AttitudeProfileError, CatalogueError, ObservationError
 from starcal_uq.core.files import table_ending
 from starcal_uq.core.formatting import plural, significant
@@ -48,7 +49,7 @@ Scalar = Literal["first", "last"]
 
 
 @dataclass(frozen=True, eq=False)
-class AttitudeProfile:
+class AttitudeProfile(Shown):
     """Attitudes of the camera over time.
 
     Attributes
@@ -158,15 +159,6 @@ class AttitudeProfile:
 
         components = dict(zip(("qx", "qy", "qz", "qw"), self.quaternions.T, strict=True))
         return pd.DataFrame({"time_s": self.time_s, **components})
-
-    def _repr_html_(self) -> str:
-        speed = self.rate_deg_s
-        notes = "".join(f"<li>{message}</li>" for message in self.messages)
-        return (
-            f"<p><b>Attitude profile</b> {self.name}: {len(self.time_s)} attitudes over "
-            f"{significant(self.duration_s, 3)} s, turning at {significant(float(np.median(speed)), 3)} (median) to "
-            f"{significant(float(speed.max()), 3)} degrees per second.</p>{f'<ul>{notes}</ul>' if notes else ''}"
-        )
 
 
 def load_attitude_profile(

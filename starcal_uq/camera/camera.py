@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import html
 import math
 import operator
 import os
@@ -24,6 +23,7 @@ from numpy.typing import ArrayLike
 
 from starcal_uq.camera.distortion import get_model, model_names, parameter_names
 from starcal_uq.camera.opencv import from_opencv, to_opencv
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CameraError, DistortionError
 from starcal_uq.core.files import atomic_write_text, ensure_new
 from starcal_uq.core.types import BoolArray, FloatArray
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class Camera:
+class Camera(Shown):
     """A star camera with square pixels.
 
     Attributes
@@ -290,20 +290,6 @@ class Camera:
             coefficients=tuple(theta[3:]),
             name=name,
         )
-
-    def _repr_html_(self) -> str:
-        horizontal, vertical = self.fov_deg
-        rows = [
-            ("detector", f"{self.width_px} x {self.height_px} px of {self.pixel_um:g} &micro;m"),
-            ("field", f"{horizontal:.3f} x {vertical:.3f} deg"),
-            ("focal length", f"{self.focal_mm:.6g} mm = {self.focal_px:.3f} px"),
-            ("principal point", f"({self.x0_px:.3f}, {self.y0_px:.3f}) px"),
-            ("distortion", html.escape(self.distortion)),
-        ]
-        coefficients = get_model(self.distortion).coefficients
-        rows += [(c.name, f"{k:.6g} {c.unit}") for c, k in zip(coefficients, self.coefficients, strict=True)]
-        body = "".join(f"<tr><th>{key}</th><td>{value}</td></tr>" for key, value in rows)
-        return f"<table><caption>{html.escape(self.name or 'Camera')}</caption>{body}</table>"
 
 
 def _whole(key: str, value: Any) -> int:

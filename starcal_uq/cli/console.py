@@ -14,8 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import parameters
-from starcal_uq.core.formatting import decimals_for, fixed, plural, pretty_unit, significant
+from starcal_uq.core.formatting import plural, significant
 from starcal_uq.core.status import Level
 from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import AnyDict
@@ -81,69 +80,18 @@ def records(frame: pd.DataFrame) -> list[AnyDict]:
 
 def show_calibration(calibration: Calibration, truth: Camera | None = None) -> None:
     """Table of start, estimate and sigma; with a truth, also truth and z."""
-    table = Table(
-        title=f"Calibration: {calibration.n_stars} stars in {calibration.n_frames} frames", title_justify="left"
-    )
-    table.add_column("parameter", style="bold")
-    for heading in ("start", "estimate", "sigma"):
-        table.add_column(heading, justify="right")
-    if truth is not None:
-        table.add_column("truth", justify="right")
-        table.add_column("z", justify="right")
-    table.add_column("unit")
-    specs = parameters(calibration.camera.distortion)
-    for index, (spec, value, sigma) in enumerate(zip(specs, calibration.theta, calibration.sigmas, strict=True)):
-        decimals = decimals_for(sigma / spec.scale)
-        cells = [fixed(number / spec.scale, decimals) for number in (calibration.nominal.theta[index], value, sigma)]
-        if truth is not None:
-            known = truth.theta[index]
-            cells += [fixed(known / spec.scale, decimals), fixed((value - known) / sigma, 2)]
-        table.add_row(spec.name, *cells, pretty_unit(spec.scaled_unit))
-    blank = ["", ""] if truth is not None else []
-    decimals = decimals_for(calibration.sigma_std)
-    table.add_row(
-        calibration.sigma_name,
-        "",
-        fixed(calibration.sigma, decimals),
-        fixed(calibration.sigma_std, decimals),
-        *blank,
-        "px per axis" if calibration.sigma_name == "sigma" else "times the stated noise",
-    )
-    out.print(table)
-    focal_sigma = calibration.sigmas[2] * calibration.camera.pixel_um * 1e-3
-    decimals = decimals_for(focal_sigma)
-    out.print(
-        f"Focal length {fixed(calibration.camera.focal_mm, decimals)} +- {fixed(focal_sigma, decimals)} mm. "
-        f"Status: {calibration.status.name.lower()}."
-    )
+    from starcal_uq.presentation.words.estimation import calibration_table, focal_length
+
+    print_table(calibration_table(calibration, truth))
+    out.print(f"Focal length {focal_length(calibration)}. Status: {calibration.status.name.lower()}.")
 
 
 def show_posterior(posterior: Posterior) -> None:
     """Table of posterior means, intervals and diagnostics."""
-    table = Table(title=f"Posterior: {len(posterior.draws)} draws", title_justify="left")
-    table.add_column("parameter", style="bold")
-    for heading in ("mean", "sd", "2.5 %", "97.5 %", "R-hat", "ESS bulk", "ESS tail"):
-        table.add_column(heading, justify="right")
-    table.add_column("unit")
-    specs = {spec.name: spec for spec in parameters(posterior.camera.distortion)}
+    from starcal_uq.presentation.words.inference import posterior_table
+
+    print_table(posterior_table(posterior))
     diagnostics = posterior.diagnostics
-    low, high = np.quantile(posterior.draws, [0.025, 0.975], axis=0)
-    for index, name in enumerate(posterior.parameter_names):
-        spec = specs.get(name)
-        scale = 1.0 if spec is None else spec.scale
-        column = posterior.draws[:, index] / scale
-        decimals = decimals_for(float(np.std(column)))
-        numbers = (float(np.mean(column)), float(np.std(column)), low[index] / scale, high[index] / scale)
-        unit = pretty_unit(spec.scaled_unit) if spec is not None else ("px" if name == "sigma" else "")
-        table.add_row(
-            name,
-            *(fixed(number, decimals) for number in numbers),
-            fixed(float(diagnostics.rhat[index]), 4),
-            f"{diagnostics.ess_bulk[index]:.0f}",
-            f"{diagnostics.ess_tail[index]:.0f}",
-            unit,
-        )
-    out.print(table)
     for check in diagnostics.checks:
         out.print(f"- {check}", style=_STYLES[check.level], highlight=False, soft_wrap=True)
 
@@ -184,7 +132,7 @@ def show_table(frame: pd.DataFrame, title: str, columns: Sequence[str] | None = 
 
 def show_screening(screening: Screening) -> None:
     """What was left out, by reason, and what a user should look at."""
-    out.print(screening.summary(), highlight=False, soft_wrap=True)
+    out.print(screening.text, highlight=False, soft_wrap=True)
 
 
 def show_verdict(verdict: Verdict) -> None:

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from starcal_uq.pipeline.refine import ImageCalibration
 
 _CENTROIDED = ("frame", "image", "n_stars", "n_saturated", "n_blended", "background", "noise")
-_IDENTIFIED = ("frame", "image", "status", "n_centroids", "n_identified", "log10_expected_false", "milliseconds")
 
 
 def register(app: typer.Typer) -> None:
@@ -78,10 +77,10 @@ def centroid_command(
     found = with_time(found, time)
     found.save(out, force=force)
     if json:
-        print_json({"summary": found.summary, "frames": records(found.frames_dataframe())})
+        print_json({"summary": found.text, "frames": records(found.frames_dataframe())})
     else:
         _say(counted(found.messages))
-        print(f"{found.summary} Table: {out}")
+        print(f"{found.text} Table: {out}")
     if found.n_left_out == found.n_frames:
         raise typer.Exit(1)
 
@@ -105,11 +104,12 @@ def identify_command(
 ) -> None:
     """Identify the stars of every frame without knowing where the camera pointed; frames that do not fit are named."""
     from starcal_uq.camera.camera import Camera
-    from starcal_uq.cli.console import print_json, records, show_table
+    from starcal_uq.cli.console import print_json, print_table, records
     from starcal_uq.core.files import ensure_new
     from starcal_uq.identification.engine import identify
     from starcal_uq.images.centroids import Centroids
     from starcal_uq.pipeline.images import epoch_of
+    from starcal_uq.presentation.words.images import identification_table
     from starcal_uq.runs.folder import RunFolder
     from starcal_uq.runs.steps import best_calibration
     from starcal_uq.sky.catalogue import load_catalogue
@@ -136,11 +136,11 @@ def identify_command(
     if found.n_identified:
         found.observations.save(out, force=force)
     if json:
-        print_json({"summary": found.summary, "frames": records(found.to_dataframe())})
+        print_json({"summary": found.text, "frames": records(found.to_dataframe())})
     else:
         if len(found.frames) <= 40:
-            show_table(found.to_dataframe(), "Identification", _IDENTIFIED)
-        print(f"{found.summary}{f' Table: {out}' if found.n_identified else ''}")
+            print_table(identification_table(found))
+        print(f"{found.text}{f' Table: {out}' if found.n_identified else ''}")
     if not found.n_identified:
         raise typer.Exit(1)
 
@@ -185,7 +185,7 @@ def load_images(
             progress=progress,
         )
     _say_epoch(centroids, epoch)
-    for words in (found.identification.summary, found.summary):
+    for words in (found.identification.text, found.text):
         err.print(words, highlight=False, soft_wrap=True)
     left_out = obs.meta.get("disturbed_stars", 0)
     if left_out:

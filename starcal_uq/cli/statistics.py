@@ -139,14 +139,15 @@ def merge_command(
 ) -> None:
     """Combine the likelihoods of several runs into one, without going back to the stars; tests that they agree."""
     from starcal_uq.cli.console import out as console
-    from starcal_uq.cli.console import show_calibration, show_table
+    from starcal_uq.cli.console import print_table, show_calibration
     from starcal_uq.estimation.merging import consistency_of
+    from starcal_uq.presentation.words.estimation import consistency_table
     from starcal_uq.runs.merge import merge_runs
 
     merged = merge_runs(runs, out, noise=noise, allow_inconsistent=allow_inconsistent, force=force)
     agreement = consistency_of(merged)
     if agreement is not None:
-        show_table(agreement.to_dataframe(), "Agreement of the runs")
+        print_table(consistency_table(agreement))
         words = agreement.messages or ("The runs agree.",)
         console.print(f"{' '.join(words)} (p = {agreement.p_value:.2g})", highlight=False, soft_wrap=True)
     show_calibration(merged)

@@ -5,15 +5,14 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
-from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.display import Shown
 from starcal_uq.core.files import atomic_path, reading
-from starcal_uq.core.formatting import decimals_for, fixed
 from starcal_uq.core.records import Arrays, from_plain, read_arrays, to_plain, write_json
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
@@ -24,7 +23,6 @@ from starcal_uq.maths.linear import correlation_of
 if TYPE_CHECKING:
     import pandas as pd
 
-    from starcal_uq.observations.table import Observations
 
 # Fields whose arrays grow with the data or the iterations: they stand in an archive beside the document.
 _APART = ("frame_ids", "quaternions", "residuals_px", "trajectory", "cost", "sigmas")
@@ -39,7 +37,7 @@ _STAGE = ("name", "status", "iterations", "evaluations", "seconds", "theta")
 
 
 @dataclass(frozen=True)
-class Calibration:
+class Calibration(Shown):
     """Optics and distortion estimated from star observations.
 
     p is the number of parameters, K of frames, N of stars. A recursive method that was given a stream of frames has
@@ -171,43 +169,6 @@ class Calibration:
             }
         )
         return pd.DataFrame(rows)
-
-    def _repr_html_(self) -> str:
-        rows = []
-        for parameter, value, sigma in zip(parameters(self.camera.distortion), self.theta, self.sigmas, strict=True):
-            scaled, error = value / parameter.scale, sigma / parameter.scale
-            decimals = decimals_for(error)
-            rows.append(
-                f"<tr><th>{parameter.name}</th><td>{fixed(scaled, decimals)}</td><td>{fixed(error, decimals)}</td>"
-                f"<td>{parameter.scaled_unit}</td></tr>"
-            )
-        decimals = decimals_for(self.sigma_std)
-        rows.append(
-            f"<tr><th>{self.sigma_name}</th><td>{fixed(self.sigma, decimals)}</td>"
-            f"<td>{fixed(self.sigma_std, decimals)}</td><td>{'px' if self.sigma_name == 'sigma' else ''}</td></tr>"
-        )
-        return (
-            f"<p><b>Calibration</b> ({self.method}, {self.solver}): {self.status.name.lower().replace('_', ' ')}; "
-            f"{self.n_stars} stars in {self.n_frames} frames; focal length {self.camera.focal_mm:.5f} mm</p>"
-            "<table><thead><tr><th>parameter</th><th>estimate</th><th>sigma</th><th>unit</th></tr></thead>"
-            f"<tbody>{''.join(rows)}</tbody></table>"
-        )
-
-    def plot_convergence(self, **options: Any) -> Any:
-        """Estimates against iteration through the stages (the paper's Fig. 3); returns the matplotlib Figure."""
-        from starcal_uq.presentation.figures.estimation import plot_convergence
-
-        return plot_convergence(self, **options)
-
-    def plot_residuals(self, obs: Observations, **options: Any) -> Any:
-        """Residuals over the field, against radius, and against a Gaussian; returns the matplotlib Figure."""
-        if not self.has_residuals:
-            raise CalibrationError(
-                "this calibration comes from a stream of frames and kept no residuals: calibrate loaded observations."
-            )
-        from starcal_uq.presentation.figures.estimation import plot_residuals
-
-        return plot_residuals(self, obs, **options)
 
     def __repr__(self) -> str:
         values = ", ".join(

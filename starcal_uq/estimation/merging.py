@@ -17,6 +17,7 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import rotation_to_quaternion
 from starcal_uq.camera.distortion import sigma_parameter
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.provenance import data_hashes, provenance
 from starcal_uq.core.records import from_plain, to_plain
@@ -245,7 +246,7 @@ ALPHA = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Consistency:
+class Consistency(Shown):
     """Comparison of R runs with what they give together.
 
     Attributes
@@ -313,18 +314,6 @@ class Consistency:
         for i, name in enumerate(self.parameter_names):
             table[f"z_{name}"] = self.z[:, i]
         return table
-
-    def _repr_html_(self) -> str:
-        import html
-
-        table = self.to_dataframe().to_html(index=False, float_format=lambda v: f"{v:.3g}", border=0)
-        notes = "".join(f"<li>{html.escape(message)}</li>" for message in self.messages)
-        verdict = "show the same camera" if self.p_value >= ALPHA else "do not show the same camera"
-        return (
-            f"<p><b>Consistency</b>: the runs {verdict} (F = {self.statistic:.3g} with {self.dof[0]} and "
-            f"{self.dof[1]} degrees of freedom, p = "
-            f"{self.p_value:.2g}).</p>{table}{f'<ul>{notes}</ul>' if notes else ''}"
-        )
 
 
 def consistency_of(calibration: Calibration) -> Consistency | None:

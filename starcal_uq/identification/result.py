@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
-from html import escape
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.core.formatting import plural
+from starcal_uq.core.display import Shown
 from starcal_uq.core.types import FloatArray
 from starcal_uq.observations.table import Observations
 
@@ -71,7 +69,7 @@ class FrameIdentification:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Identification:
+class Identification(Shown):
     """Identified stars of all frames.
 
     Attributes
@@ -88,7 +86,7 @@ class Identification:
     parity : str
         "normal", or "mirrored" where the images are mirror images of the sky.
     n_left_out : int
-        Frames whose images had been left out before, when the centroids were measured; `summary` is of the others.
+        Frames whose images had been left out before, when the centroids were measured; the text is of the others.
     """
 
     observations: Observations
@@ -103,32 +101,8 @@ class Identification:
         """Frames identified."""
         return sum(frame.status == "identified" for frame in self.frames)
 
-    @property
-    def summary(self) -> str:
-        """The result in a few sentences."""
-        n_frames = len(self.frames) - self.n_left_out
-        if not n_frames:
-            return "There are no frames."
-        counts = Counter(frame.status for frame in self.frames)
-        counts["too few stars"] -= self.n_left_out
-        be = "is" if 1 in (self.n_identified, n_frames) else "are"
-        words = f"{self.n_identified} of {plural(n_frames, 'frame')} {be} identified"
-        if self.n_identified:
-            stars = [frame.n_identified for frame in self.frames if frame.status == "identified"]
-            words += f", with {np.mean(stars):.1f} stars on average"
-        words += "."
-        rest = [f"{counts[status]} {_REASONS[status]}" for status in STATUSES[1:] if counts[status]]
-        if rest:
-            words += f" Left out: {'; '.join(rest)}."
-        unlike = sum(frame.n_unlike_brightness for frame in self.frames)
-        if unlike:
-            words += f" {plural(unlike, 'match', 'matches')} given up, because the brightness is unlike the star's."
-        if self.n_identified:
-            change = 100.0 * (self.camera.focal_px / self.nominal.focal_px - 1.0)
-            words += f" The focal length is {abs(change):.2f} % {'longer' if change >= 0 else 'shorter'} than nominal."
-        if self.parity == "mirrored":
-            words += " The images are mirror images of the sky: x is counted from the right edge."
-        return words
+    def __repr__(self) -> str:
+        return f"Identification({self.n_identified} of {len(self.frames)} frames, {self.observations.n_stars} stars)"
 
     def to_dataframe(self) -> pd.DataFrame:
         """One row for each frame, with the fields of `FrameIdentification`; the quaternion in columns qx to qw."""
@@ -140,18 +114,3 @@ class Identification:
             q = np.full(4, np.nan) if frame.quaternion is None else frame.quaternion
             rows.append(row | dict(zip(("qx", "qy", "qz", "qw"), q.tolist(), strict=True)))
         return pd.DataFrame(rows)
-
-    def __repr__(self) -> str:
-        return f"<Identification: {self.summary}>"
-
-    def _repr_html_(self) -> str:
-        table: str = self.to_dataframe().to_html(index=False, border=0, max_rows=12)
-        return f"<p>{escape(self.summary)}</p>{table}"
-
-
-_REASONS: dict[FrameStatus, str] = {
-    "identified": "identified",
-    "not identified": "in which no attitude explains the centroids well enough",
-    "ambiguous": "that fit more than one attitude",
-    "too few stars": "with fewer than four centroids",
-}

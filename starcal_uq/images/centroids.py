@@ -6,7 +6,6 @@ It is what passes from the images to the identification.
 from __future__ import annotations
 
 import csv
-import html
 import json
 import os
 from dataclasses import dataclass, field, replace
@@ -16,9 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.files import as_plain, atomic_path, ensure_new, table_ending
-from starcal_uq.core.formatting import plural
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, StrArray
 from starcal_uq.observations.rows import FrameRows, locked
 
@@ -52,7 +51,7 @@ FRAME_COLUMNS: dict[str, tuple[type, str]] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Centroids(FrameRows):
+class Centroids(FrameRows, Shown):
     """Star positions with their covariances; one row per star and frame, sorted by frame.
 
     Rows given in another order are sorted by frame; within a frame they keep their order, which
@@ -232,34 +231,8 @@ class Centroids(FrameRows):
 
         return read_centroids(path)
 
-    @property
-    def summary(self) -> str:
-        """One sentence: stars, frames, and how many frames were left out and why."""
-        text = f"{plural(self.n_stars, 'star')} in {plural(self.n_frames - self.n_left_out, 'frame')}"
-        if self.n_left_out:
-            # The reason follows the name of the image, which differs from frame to frame.
-            reasons, counts = np.unique(self.problem[self.problem != ""], return_counts=True)
-            named = [f"{c} because {r}" for r, c in zip(reasons.tolist(), counts.tolist(), strict=True)]
-            was = "was" if self.n_left_out == 1 else "were"
-            text += f"; {plural(self.n_left_out, 'frame')} {was} left out: {', '.join(named)}"
-        return text + "."
-
-    def _repr_html_(self) -> str:
-        table = self.frames_dataframe()
-        names = ["frame", "n_stars", "image", "background", "noise", "psf_sigma_px", "problem"]
-        head = "".join(f"<th>{name}</th>" for name in names)
-        body = "".join(
-            "<tr>" + "".join(f"<td>{html.escape(_shown(value))}</td>" for value in row) + "</tr>"
-            for row in table[names].head(10).itertuples(index=False)
-        )
-        return f"<table><caption>{html.escape(self.summary)}</caption><tr>{head}</tr>{body}</table>"
-
     def __repr__(self) -> str:
         return f"Centroids({self.n_stars} stars, {self.n_frames} frames, {self.n_left_out} left out)"
-
-
-def _shown(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _array(name: str, values: Any, kind: type) -> Any:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,6 +16,7 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import Parameter, parameters, sigma_parameter
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path, ensure_new, reading
 from starcal_uq.core.records import Arrays, from_plain, to_plain
@@ -165,7 +165,7 @@ class Diagnostics:
 
 
 @dataclass(frozen=True, eq=False)
-class Posterior:
+class Posterior(Shown):
     """Draws of the camera parameters and the noise, with their diagnostics.
 
     Attributes
@@ -372,36 +372,6 @@ class Posterior:
         """
 
         return load_posterior(path)
-
-    def plot_corner(self, **options: Any) -> Any:
-        """Corner plot of the draws; options as for `starcal_uq.presentation.figures.inference.plot_corner`."""
-        from starcal_uq.presentation.figures.inference import plot_corner
-
-        return plot_corner(self, **options)
-
-    def plot_prior_posterior(self, **options: Any) -> Any:
-        """Prior beside posterior; options as for `starcal_uq.presentation.figures.inference.plot_prior_posterior`."""
-        from starcal_uq.presentation.figures.inference import plot_prior_posterior
-
-        return plot_prior_posterior(self, **options)
-
-    def _repr_html_(self) -> str:
-        shown = ("mean", "sd", "q2.5", "q97.5", "prior_sd")
-        columns = ["parameter", "scaled_unit", *(f"scaled_{n}" for n in shown), "rhat", "ess_bulk"]
-        table = self.summary()[columns].rename(columns=lambda name: name.removeprefix("scaled_"))
-        formats = {"rhat": "{:.4f}".format, "ess_bulk": "{:.0f}".format}
-        html = table.to_html(index=False, float_format=lambda v: f"{v:.6g}", formatters=formats, border=0)
-        verdict = "passes every check" if self.diagnostics.ok else "must not be used as it is"
-        return (
-            f"<p><b>Posterior</b>: {len(self.draws)} draws of {self.n_ensembles} ensembles; {verdict}.</p>"
-            f"{html}{_listed([str(check) for check in self.diagnostics.checks])}"
-        )
-
-
-def _listed(messages: Sequence[str]) -> str:
-    import html
-
-    return f"<ul>{''.join(f'<li>{html.escape(m)}</li>' for m in messages)}</ul>" if messages else ""
 
 
 _FORMAT = "starcal_uq posterior 2"

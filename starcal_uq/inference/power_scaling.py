@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PriorError
 from starcal_uq.core.types import FloatArray
 
@@ -31,7 +32,7 @@ _CHECKED = (0.8, 1.25)
 
 
 @dataclass(frozen=True, eq=False)
-class PriorSensitivity:
+class PriorSensitivity(Shown):
     """Power-scaling sensitivity of q quantities.
 
     Attributes
@@ -70,20 +71,6 @@ class PriorSensitivity:
         """True if every quantity is fine."""
         return all(word == FINE for word in self.diagnosis)
 
-    @property
-    def words(self) -> str:
-        """The result as a sentence."""
-        if self.ok:
-            return (
-                f"The priors do not matter: largest sensitivity {self.prior.max():.2g}, threshold {self.threshold:g}."
-            )
-        found = [
-            f"{word} for {', '.join(n for n, w in zip(self.names, self.diagnosis, strict=True) if w == word)}"
-            for word in (CONFLICT, WEAK)
-            if word in self.diagnosis
-        ]
-        return f"The priors matter: {'; '.join(found)}."
-
     def to_dataframe(self) -> pd.DataFrame:
         """One row per quantity."""
         import pandas as pd
@@ -100,10 +87,6 @@ class PriorSensitivity:
                 "likelihood_sd_change": self.likelihood_sd_change,
             }
         )
-
-    def _repr_html_(self) -> str:
-        table = self.to_dataframe().to_html(index=False, float_format=lambda v: f"{v:.2g}", border=0)
-        return f"<p><b>Prior sensitivity</b>: {self.words}</p>{table}"
 
 
 def prior_sensitivity(

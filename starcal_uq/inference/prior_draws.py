@@ -16,6 +16,7 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import fold_radius_px, forward_kernel, forward_root, unproject_theta
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PriorError
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
@@ -36,7 +37,7 @@ _GRID = 5
 
 
 @dataclass(frozen=True, eq=False)
-class PriorPredictive:
+class PriorPredictive(Shown):
     """Prior predictive distributions of q quantities, and where the data lie in them.
 
     Attributes
@@ -80,18 +81,6 @@ class PriorPredictive:
         """True if the data are no surprise to the prior."""
         return not self.surprising
 
-    @property
-    def words(self) -> str:
-        """The result as a sentence."""
-        if not np.any(np.isfinite(self.observed)):
-            return "No observations were given to compare with."
-        if self.ok:
-            return "The data lie within what the prior expects."
-        return (
-            f"The prior does not expect the data in {', '.join(self.surprising)}: check the nominal camera, or widen "
-            "the prior."
-        )
-
     def to_dataframe(self) -> pd.DataFrame:
         """One row per quantity: quantiles under the prior, value of the data, tail probability."""
         import pandas as pd
@@ -101,14 +90,6 @@ class PriorPredictive:
         columns: dict[str, Any] = {"quantity": self.names}
         columns |= {f"q{100 * q:g}": quantiles[i] for i, q in enumerate(_QUANTILES)}
         return pd.DataFrame({**columns, "observed": self.observed, "tail_probability": self.tail})
-
-    def _repr_html_(self) -> str:
-        table = self.to_dataframe().to_html(index=False, float_format=lambda v: f"{v:.4g}", border=0, na_rep="")
-        shares = (
-            f"{100 * self.folded:.1f} % of the cameras drawn from the prior fold over inside the field, "
-            f"{100 * self.off_detector:.1f} % have their principal point off the detector."
-        )
-        return f"<p><b>Prior predictive check</b>: {self.words} {shares}</p>{table}"
 
 
 def prior_predictive(

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from starcal_uq.camera.distortion import get_model, parameter_names, parameters, sigma_parameter
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PriorError
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.maths.linear import correlation_of
@@ -33,7 +34,7 @@ SIGMA_NAMES = ("sigma", "sigma_scale")
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
-class Priors(ABC):
+class Priors(Shown, ABC):
     """A proper prior on the parameters of one camera: joint normal, and log-normal for the noise.
 
     Attributes
@@ -213,9 +214,6 @@ class Priors(ABC):
                 "statement": [*(self._statement(name) for name in names[:-1]), noise],
             }
         )
-
-    def _repr_html_(self) -> str:
-        return str(self.to_dataframe().to_html(index=False, float_format=lambda v: f"{v:.4g}"))
 
 
 def positive_number(name: str, value: Any) -> float:

@@ -14,6 +14,7 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model, parameters
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PriorError
 from starcal_uq.core.provenance import data_hashes
 from starcal_uq.core.types import FloatArray
@@ -169,7 +170,7 @@ def _detector(camera: Camera) -> list[float]:
 
 
 @dataclass(frozen=True, eq=False)
-class ShiftTest:
+class ShiftTest(Shown):
     """Did the camera change between two runs?
 
     Attributes
@@ -206,17 +207,6 @@ class ShiftTest:
         """True if chance is no explanation (p below 0.001)."""
         return self.p_value < ALPHA
 
-    @property
-    def words(self) -> str:
-        """The result as a sentence."""
-        largest = int(np.argmax(np.abs(self.z)))
-        where = f"largest change {self.names[largest]}, {self.z[largest]:+.1f} sigma; p = {self.p_value:.2g}"
-        if self.significant:
-            return (
-                f"The camera changed between the runs ({where}): widen the prior by an allowed shift, or start afresh."
-            )
-        return f"Nothing shows that the camera changed between the runs ({where})."
-
     def to_dataframe(self) -> pd.DataFrame:
         """One row per parameter: shift, its sigma, and their ratio."""
         import pandas as pd
@@ -230,10 +220,6 @@ class ShiftTest:
                 "z": self.z,
             }
         )
-
-    def _repr_html_(self) -> str:
-        table = self.to_dataframe().to_html(index=False, float_format=lambda v: f"{v:.3g}", border=0)
-        return f"<p><b>Shift</b>: {self.words}</p>{table}"
 
 
 def shift_test(

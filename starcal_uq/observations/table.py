@@ -6,7 +6,6 @@ It is the only thing that passes from images, or a simulation, to the estimators
 from __future__ import annotations
 
 import hashlib
-import html
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -16,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray, StrArray
 from starcal_uq.observations.checks import check_columns, raise_problems
@@ -30,7 +30,7 @@ _DTYPES: dict[str, type] = {"whole": np.int64, "number": np.float64, "text": np.
 
 
 @dataclass(frozen=True, eq=False)
-class Observations(FrameRows):
+class Observations(FrameRows, Shown):
     """Stars measured in pixels, with their directions; one row per star and frame, sorted by frame.
 
     Rows given in another order are sorted by frame; within a frame they keep their order. The arrays are
@@ -202,16 +202,6 @@ class Observations(FrameRows):
         """
         write_table(self.columns, self.meta, path, force)
 
-    def _repr_html_(self) -> str:
-        shown = {name: values[:5].tolist() for name, values in self.columns.items()}
-        head = "".join(f"<th>{name}</th>" for name in shown)
-        body = "".join(
-            "<tr>" + "".join(f"<td>{html.escape(_shown(value))}</td>" for value in row) + "</tr>"
-            for row in zip(*shown.values(), strict=True)
-        )
-        title = f"{self.n_stars} stars in {self.n_frames} frames, directions {self.meta['directions']}"
-        return f"<table><caption>{title}</caption><tr>{head}</tr>{body}</table>"
-
     def __repr__(self) -> str:
         return f"Observations({self.n_stars} stars, {self.n_frames} frames; {', '.join(self.columns)})"
 
@@ -241,11 +231,6 @@ def load_observations(
     """
     values, meta = read_table(path, camera, columns or {})
     return Observations(**values, meta=meta)
-
-
-def _shown(value: Any) -> str:
-    """A cell for people: five decimals are a hundredth of a milli-pixel and 0.04 arcsec."""
-    return f"{value:.5f}" if isinstance(value, float) else str(value)
 
 
 def _array(name: str, values: Any) -> Any:

@@ -148,7 +148,7 @@ def observations_from_images(
     if tell is not None:
         for message in counted(centroids.messages):
             tell(f"note: {message}")
-        tell(centroids.summary)
+        tell(centroids.text)
     if site is not None:
         _check_times(centroids)
     year = epoch_of(centroids) if epoch is None else epoch

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from starcal_uq.core.display import Shown
 from starcal_uq.core.files import PathLike
-from starcal_uq.core.formatting import plural
 from starcal_uq.core.records import read_json, write_json
 from starcal_uq.pipeline.refine import identified_pairs
 
@@ -62,7 +62,7 @@ class ImageRow:
 
 
 @dataclass(frozen=True)
-class ImageRecord:
+class ImageRecord(Shown):
     """The images of a run.
 
     Attributes
@@ -86,19 +86,6 @@ class ImageRecord:
     def left_out(self) -> tuple[ImageRow, ...]:
         """Images without an identified star."""
         return tuple(row for row in self.rows if not row.n_last)
-
-    @property
-    def summary(self) -> str:
-        """What was used, in two sentences."""
-        used = len(self.rows) - len(self.left_out)
-        found = sum(row.n_centroids for row in self.rows)
-        words = f"{used} of {plural(len(self.rows), 'image')} used; {plural(found, 'star image')} were found in them"
-        words += f", and {sum(row.n_last for row in self.rows)} of these were identified."
-        if self.n_disturbed:
-            words += f" {plural(self.n_disturbed, 'star')} left out, because the light of a neighbour displaces them."
-        if self.parity == "mirrored":
-            words += " The images are mirror images of the sky: x is counted from the right edge."
-        return words
 
     def save(self, path: PathLike) -> None:
         """Write as JSON, all or nothing."""

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError, IdentificationError
 from starcal_uq.core.formatting import plural
 from starcal_uq.identification.engine import identify
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class ImageCalibration:
+class ImageCalibration(Shown):
     """What two rounds of identification and calibration found.
 
     Attributes
@@ -51,22 +52,6 @@ class ImageCalibration:
     def calibration(self) -> Calibration:
         """The last one."""
         return self.rounds[-1][2]
-
-    @property
-    def summary(self) -> str:
-        """What the second round changed, in words."""
-        (before, _, first), (after, _, second) = self.rounds[0], self.rounds[-1]
-        old, new = identified_pairs(before.observations), identified_pairs(after.observations)
-        words = (
-            f"{plural(len(old), 'star')} in {plural(before.n_identified, 'frame')} with the nominal camera, "
-            f"{plural(len(new), 'star')} in {plural(after.n_identified, 'frame')} with the calibrated one: "
-            f"{len(new - old)} new, {len(old - new)} given up."
-        )
-        shift = (second.theta - first.theta) / second.sigmas
-        moved = ", ".join(
-            f"{name} {value:+.1f}" for name, value in zip(second.parameter_names, shift.tolist(), strict=True)
-        )
-        return f"{words} The estimate moved, in its standard deviations: {moved}."
 
 
 def identify_and_calibrate(
@@ -114,7 +99,7 @@ def identify_and_calibrate(
     rounds: list[tuple[Identification, Observations, Calibration]] = []
     for number in range(2):
         if not found.n_identified:
-            raise IdentificationError(f"no frame is identified: {found.summary}")
+            raise IdentificationError(f"no frame is identified: {found.text}")
         obs = found.observations if prepare is None else prepare(found.observations)
         try:
             known = calibrate(obs, found.nominal if number == 0 else rounds[0][0].nominal, **(method or {}))

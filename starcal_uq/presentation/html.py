@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+from collections.abc import Iterable
 from html import escape
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,12 @@ def card(title: str, text: str, *tables: TextTable) -> str:
     """A result in a notebook: what it is, what it says, and its tables."""
     said = f": {escape(text)}" if text else ""
     return f"<p><b>{escape(title)}</b>{said}</p>" + "".join(table.html() for table in tables)
+
+
+def listed(messages: Iterable[str]) -> str:
+    """Sentences as a list; nothing where there are none."""
+    items = "".join(f"<li>{escape(message)}</li>" for message in messages)
+    return f"<ul>{items}</ul>" if items else ""
 
 
 def template_environment() -> Environment:

@@ -4,10 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from starcal_uq.attitude.profile import AttitudeProfile
+from starcal_uq.camera.camera import Camera
 from starcal_uq.core.display import View
 from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.merging import Consistency
+from starcal_uq.estimation.screening.result import Screening
+from starcal_uq.identification.result import Identification
+from starcal_uq.images.centroids import Centroids
+from starcal_uq.inference.posterior import Posterior
+from starcal_uq.inference.power_scaling import PriorSensitivity
+from starcal_uq.inference.prior_draws import PriorPredictive
+from starcal_uq.inference.priors import Priors
+from starcal_uq.inference.update import ShiftTest
+from starcal_uq.observations.table import Observations
+from starcal_uq.pipeline.record import ImageRecord
+from starcal_uq.pipeline.refine import ImageCalibration
 from starcal_uq.presentation.figures.coupling import plot_correlation, plot_correlations, plot_couplings
 from starcal_uq.presentation.figures.estimation import plot_convergence, plot_residuals
+from starcal_uq.presentation.figures.inference import plot_corner, plot_prior_posterior
 from starcal_uq.presentation.figures.propagation import (
     plot_attitude,
     plot_distortion_curve,
@@ -15,15 +30,39 @@ from starcal_uq.presentation.figures.propagation import (
     plot_field_map,
     plot_spectrum,
 )
-from starcal_uq.presentation.words import propagation
+from starcal_uq.presentation.words import estimation, images, inference, inputs, propagation
 from starcal_uq.propagation.attitude_error import Agreement, AttitudeError
 from starcal_uq.propagation.coupling import Coupling
 from starcal_uq.propagation.distortion import DistortionCurve
 from starcal_uq.propagation.field import FieldMap
 from starcal_uq.propagation.spectrum import ErrorSpectrum
+from starcal_uq.sky.catalogue import StarCatalogue
 
 VIEWS: Mapping[type, View] = {
-    Calibration: View(figures={"convergence": plot_convergence, "residuals": plot_residuals}),
+    Camera: View(html=inputs.camera_html),
+    AttitudeProfile: View(inputs.profile_text, inputs.profile_html),
+    Observations: View(inputs.observations_text, inputs.observations_html),
+    StarCatalogue: View(inputs.catalogue_text, inputs.catalogue_html),
+    Centroids: View(images.centroids_text, images.centroids_html),
+    Identification: View(images.identification_text, images.identification_html),
+    ImageCalibration: View(images.image_calibration_text),
+    ImageRecord: View(images.image_record_text),
+    Calibration: View(
+        estimation.calibration_text,
+        estimation.calibration_html,
+        {"convergence": plot_convergence, "residuals": plot_residuals},
+    ),
+    Screening: View(estimation.screening_text, estimation.screening_html),
+    Consistency: View(estimation.consistency_text, estimation.consistency_html),
+    Priors: View(inference.priors_text, inference.priors_html),
+    PriorPredictive: View(inference.predictive_text, inference.predictive_html),
+    PriorSensitivity: View(inference.sensitivity_text, inference.sensitivity_html),
+    ShiftTest: View(inference.shift_text, inference.shift_html),
+    Posterior: View(
+        inference.posterior_text,
+        inference.posterior_html,
+        {"corner": plot_corner, "prior_posterior": plot_prior_posterior},
+    ),
     Agreement: View(propagation.agreement_text, propagation.agreement_html),
     AttitudeError: View(
         propagation.attitude_text,

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CatalogueError
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray, StrArray
 from starcal_uq.sky.apparent import aberrate, check_velocity
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class StarCatalogue:
+class StarCatalogue(Shown):
     """Stars, all at one epoch.
 
     Attributes
@@ -70,7 +70,10 @@ class StarCatalogue:
         return len(self.ra_deg)
 
     def __repr__(self) -> str:
-        return f"<{self._words()}>"
+        kind = "apparent" if self.apparent else "catalogue"
+        missing = int((~self.has_proper_motion).sum())
+        without = f", {missing} without proper motion" if missing else ""
+        return f"<{len(self)} stars, {kind} directions at J{self.epoch:g}, magnitudes in {self.band}{without}>"
 
     @property
     def directions_icrs(self) -> FloatArray:
@@ -123,17 +126,6 @@ class StarCatalogue:
 
         names = ("star_id", "ra_deg", "dec_deg", "mag", "pm_ra_mas_yr", "pm_dec_mas_yr", "has_proper_motion")
         return pd.DataFrame({name: getattr(self, name) for name in names})
-
-    def _words(self) -> str:
-        kind = "apparent" if self.apparent else "catalogue"
-        missing = int((~self.has_proper_motion).sum())
-        without = f", {missing} without proper motion" if missing else ""
-        return f"{len(self)} stars, {kind} directions at J{self.epoch:g}, magnitudes in {self.band}{without}"
-
-    def _repr_html_(self) -> str:
-        head = self.select(np.arange(min(5, len(self))))
-        table: str = head.to_dataframe().to_html(index=False, border=0)
-        return f"<p><b>{escape(self._words())}</b><br>{escape(self.source)}</p>{table}"
 
 
 def load_catalogue(

@@ -109,11 +109,11 @@ def test_bootstrap_says_what_changed(frames):
     found = identify_and_calibrate(table, sc.paper.paper_start(), stars)
     assert len(found.rounds) == 2
     assert found.identification.n_identified == 25
-    assert "new" in found.summary
-    assert "standard deviations" in found.summary
+    assert "new" in found.text
+    assert "standard deviations" in found.text
     # The focal length is compared with the data sheet's, not with that of the first calibration.
     change = 100.0 * abs(found.calibration.camera.focal_px / sc.paper.paper_start().focal_px - 1.0)
-    assert f"{change:.2f} % shorter" in found.identification.summary
+    assert f"{change:.2f} % shorter" in found.identification.text
     none = table.select_frames([])
     with pytest.raises(sc.errors.IdentificationError, match="no frame is identified"):
         identify_and_calibrate(none, sc.paper.paper_start(), stars)

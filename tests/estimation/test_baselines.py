@@ -171,7 +171,7 @@ def test_a_stream_calibration_saves_itself(tmp_path):
     assert (again.n_stars, again.n_frames) == (cal.n_stars, 60)
     assert "focal length" in again._repr_html_()
     with pytest.raises(CalibrationError, match="kept no residuals"):
-        again.plot_residuals(observations())
+        again.plot.residuals(observations())
 
 
 @pytest.mark.parametrize(("method", "options"), BASELINES)

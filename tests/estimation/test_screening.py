@@ -204,8 +204,8 @@ def test_every_rejected_row_is_listed_with_its_reason(dirty, found) -> None:
 
 
 def test_displays_and_file(found, tmp_path) -> None:
-    assert str(found.n_rejected) in found.summary()
-    assert "Limits: a star" in found.summary()
+    assert str(found.n_rejected) in found.text
+    assert "Limits: a star" in found.text
     assert found.rejected["star_id"].iloc[0] in found._repr_html_()
     assert repr(found).startswith(f"Screening({found.n_rejected} of ")
     path = tmp_path / "rejected.csv"

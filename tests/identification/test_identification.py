@@ -93,7 +93,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_random_frames_are_identified(stars: Any, folder: Path, fov_deg: float, focal: float, shift_px: float) -> None:
     table, names, rotations = random_frames(stars, square_camera(fov_deg, focal, shift_px), 60, 1)
     found = identify(table, square_camera(fov_deg), stars, share_camera=False, cache_dir=folder)
-    assert found.n_identified == 60, found.summary
+    assert found.n_identified == 60, found.text
     assert wrong_rows(found, table, names) == 0
     assert len(found.observations) > 0.95 * len(names)
     # The largest accepted expectation of a wrong attitude is far below one.
@@ -122,7 +122,7 @@ def test_no_stars_at_all(stars: Any, folder: Path) -> None:
     assert [frame.status for frame in found.frames] == ["too few stars"] * 2
     for name in ("frame_ids", "image", "time_utc"):
         setattr(table, name, getattr(table, name)[:0])
-    assert identify(table, square_camera(12.0), stars, cache_dir=folder).summary == "There are no frames."
+    assert identify(table, square_camera(12.0), stars, cache_dir=folder).text == "There are no frames."
 
 
 def test_false_and_missing_stars(stars: Any, folder: Path) -> None:
@@ -168,7 +168,7 @@ def test_false_stars_are_known_by_their_brightness(
     assert refused_stars(faint, rows, found)[0] <= kept // 3
     assert refused_stars(faint, rows, found)[1] >= 12
     assert found.n_identified == 40
-    assert "brightness is unlike" in found.summary
+    assert "brightness is unlike" in found.text
     # Where all fluxes are equal they say nothing.
     flat = SimpleNamespace(**vars(table) | {"flux": np.ones(len(flux))})
     assert refused_stars(flat, rows, identify(flat, square_camera(12.0), stars, cache_dir=folder))[1] == 0
@@ -212,7 +212,7 @@ def test_frames_without_a_solution(stars: Any, folder: Path) -> None:
     assert [f.status for f in found.frames] == ["too few stars"] * 2 + ["not identified"] * 5
     assert len(found.observations) == 0
     assert found.n_identified == 0
-    assert "0 of 7 frames" in found.summary and "fewer than four" in found.summary
+    assert "0 of 7 frames" in found.text and "fewer than four" in found.text
     assert found.camera == square_camera(12.0)
     assert len(found.to_dataframe()) == 7
 
@@ -261,7 +261,7 @@ def test_mirrored_images(stars: Any, folder: Path) -> None:
     assert (plain.parity, mirrored.parity) == ("normal", "mirrored")
     assert np.array_equal(plain.observations.star_id, mirrored.observations.star_id)
     assert np.allclose(plain.observations.x_px, mirrored.observations.x_px)
-    assert "mirror" in mirrored.summary and "mirror" not in plain.summary
+    assert "mirror" in mirrored.text and "mirror" not in plain.text
 
 
 def test_deep_catalogue_and_distortion(folder: Path) -> None:

@@ -326,7 +326,7 @@ def test_frames_that_cannot_be_used_are_left_out_and_the_others_go_on(stars, tmp
     assert found.n_frames == 9 and found.n_left_out == 6
     counts = dict(zip(found.image.tolist(), found.stars_per_frame.tolist(), strict=True))
     assert counts["a.fits"] == 64 and counts["h.fits"] <= 1 and counts["i.jpg"] >= 60
-    assert "6 frames were left out: " in found.summary and "1 because every pixel has the value 0" in found.summary
+    assert "6 frames were left out: " in found.text and "1 because every pixel has the value 0" in found.text
     assert any("luminance" in text for text in found.messages) and any("JPEG" in text for text in found.messages)
     assert sum("was left out" in text for text in found.messages) == 6
     alone = extract_centroids(tmp_path / "a.fits", camera=camera)
@@ -449,7 +449,7 @@ def test_files_that_are_no_centroids(tmp_path):
 def test_the_table_and_its_frames(table):
     assert table.n_frames == 3 and table.n_left_out == 1 and table.stars_per_frame.tolist() == [64, 0, 64]
     assert table.frame_starts.tolist() == [0, 64, 64, 128]
-    assert table.summary.startswith("128 stars in 2 frames; 1 frame was left out: 1 because every pixel")
+    assert table.text.startswith("128 stars in 2 frames; 1 frame was left out: 1 because every pixel")
     assert np.isnan(table.noise[1]) and table.time_utc.tolist() == ["2026-11-21T01:02:03", "", ""]
     assert np.all(np.diff(table.flux[:64]) <= 0)
     few = table.brightest(5)
@@ -584,5 +584,5 @@ def test_frames_left_out_before_are_not_counted_again(statuses, n_left_out, word
     )
     camera = Camera(64, 48, 10.0, 50.0, 31.5, 23.5)
     found = Identification(None, frames, camera, camera, "normal", n_left_out)
-    assert words in found.summary
-    assert n_left_out == 0 or len(statuses) > 2 or "Left out" not in found.summary
+    assert words in found.text
+    assert n_left_out == 0 or len(statuses) > 2 or "Left out" not in found.text

@@ -204,7 +204,7 @@ def test_a_prior_of_another_camera_is_refused() -> None:
 def test_shift_test_sees_what_moved() -> None:
     still = shift_test(calibrated(1), calibrated(2))
     assert not still.significant
-    assert "Nothing shows" in still.words
+    assert "Nothing shows" in still.text
     moved = shift_test(calibrated(1), calibrated(3, 40, 1.0))
     assert moved.significant
     assert "widen the prior" in moved._repr_html_()

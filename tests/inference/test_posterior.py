@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.formatting import pretty_unit
 from starcal_uq.inference import arviz as arviz_compat
 from starcal_uq.inference.posterior import DRAW_ORDER, Posterior
 from starcal_uq.inference.sample import sample
@@ -158,7 +159,7 @@ def test_thinning_takes_each_draw_at_most_once(post: Posterior) -> None:
 def test_html_shows_verdict_and_table(post: Posterior) -> None:
     html = post._repr_html_()
     assert "passes every check" in html
-    assert "1e-10 px^-2" in html
+    assert pretty_unit("1e-10 px^-2") in html
     assert "Importance sampling" in html
 
 

@@ -30,7 +30,7 @@ DEFAULT = Priors.default(NOMINAL)
 def test_default_priors_expect_the_paper_s_camera() -> None:
     found = prior_predictive(DEFAULT, NOMINAL, scenes.observations())
     assert found.ok, found.to_dataframe()
-    assert "lie within" in found.words
+    assert "lie within" in found.text
     table = found.to_dataframe().set_index("quantity")
     assert table.loc["fov_h_deg", "q50"] == pytest.approx(NOMINAL.fov_deg[0], rel=0.05)
     # The nominal focal length is 2.5 % too long.
@@ -90,7 +90,7 @@ def test_a_prior_is_calibrated_when_cameras_are_drawn_from_it() -> None:
 def test_without_observations_only_the_prior_is_shown() -> None:
     found = prior_predictive(DEFAULT.replace(principal_point_px=400.0), NOMINAL)
     assert np.all(np.isnan(found.tail))
-    assert "No observations" in found.words
+    assert "No observations" in found.text
     assert found.off_detector > 0.05
     # 20 times the default displacement folds most of these cameras.
     assert prior_predictive(DEFAULT.replace(distortion_corner_px=700.0), NOMINAL).folded > 0.3
@@ -138,7 +138,7 @@ def test_a_tight_prior_is_found() -> None:
     found = prior_sensitivity(posterior(0.03))
     assert found.diagnosis[:2] == (WEAK, WEAK)
     assert set(found.diagnosis[2:]) == {FINE}
-    assert "weak likelihood for x0, y0" in found.words
+    assert "weak likelihood for x0, y0" in found.text
 
 
 def test_a_conflict_is_found_and_its_direction() -> None:

@@ -57,11 +57,11 @@ def test_broken_files_are_named(tmp_path: Path, text: str) -> None:
 
 
 def test_summary_counts_what_was_used_and_what_was_not() -> None:
-    words = record(5).summary
+    words = record(5).text
     assert words.startswith("4 of 5 images used; 48 star images were found in them, and 40 of these were identified.")
     assert "3 stars left out" in words
     assert "mirror images" in words
-    plain = replace(record(5, 0), n_disturbed=0, parity="normal").summary
+    plain = replace(record(5, 0), n_disturbed=0, parity="normal").text
     assert "left out" not in plain
     assert "mirror" not in plain
 

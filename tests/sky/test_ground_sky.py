@@ -569,7 +569,7 @@ def test_a_missing_image_is_left_out_once(stars, tmp_path):
     assert (table.problem != "").tolist() == [True, False]
     found = sc.identification.identify(table, NOMINAL, stars)
     assert found.n_left_out == 1 and len(found.frames) == 2
-    assert found.summary == "0 of 1 frame is identified. Left out: 1 with fewer than four centroids."
+    assert found.text == "0 of 1 frame is identified. Left out: 1 with fewer than four centroids."
 
 
 def test_rendered_images_shine_through_no_air(stars, tmp_path):

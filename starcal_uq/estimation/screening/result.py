@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import html
 import os
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starcal_uq.core.display import Shown
 from starcal_uq.core.files import atomic_path, ensure_new
-from starcal_uq.core.formatting import fixed, join_words, percent, plural, significant
+from starcal_uq.core.formatting import join_words, percent
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
 from starcal_uq.estimation.screening.outliers import MIN_STARS, StarResiduals, star_threshold
 
@@ -33,7 +33,6 @@ REASONS: dict[str, str] = {
 COLUMNS = (
     "row", "frame", "star_id", "x_px", "y_px", "residual_px", "offset_deg", "statistic", "threshold", "reason",
 )  # fmt: skip
-_SHOWN_ROWS = 30
 _MANY_REJECTED = 0.25
 _PATTERN_P, _PATTERN_ROWS = 1e-3, 5
 # Wrong identifications are rarely this near: statistics below this many thresholds are noise with heavy tails.
@@ -63,7 +62,7 @@ class ScreeningRound:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Screening:
+class Screening(Shown):
     """Result of `screen`; N rows were given, K frames.
 
     Attributes
@@ -164,53 +163,9 @@ class Screening:
         with atomic_path(path) as temporary:
             self.rejected.to_csv(temporary, index=False)
 
-    def summary(self) -> str:
-        """What was rejected and why, at which risk, in a few lines of text."""
-        return "\n".join(self._lines())
-
-    def _lines(self) -> list[str]:
-        n = len(self.kept)
-        lines = [
-            f"{plural(self.n_rejected, 'star')} of {n} rejected ({percent(self.n_rejected / n)}), "
-            f"{plural(len(self.dropped_frames), 'frame')} of {len(self.frame_ids)} dropped, "
-            f"{plural(len(self.rounds), 'round')}."
-        ]
-        lines += [f"{plural(number, 'star')}: {REASONS[reason]}." for reason, number in self.counts.items()]
-        lines.append(
-            f"Limits: a star {significant(float(np.sqrt(self.star_threshold)), 3)} sigma from the prediction of the "
-            f"others (p < {significant(self.star_p_value)}), a frame at p < {significant(self.frame_p_value)}; at most "
-            f"{significant(self.expected_false)} right stars are expected among the rejected."
-        )
-        if self.sigma_shrinkage > 1e-3:
-            lines.append(
-                f"The estimated {self.calibration.sigma_name} is {percent(self.sigma_shrinkage)} too small, because "
-                "right stars in the tails were cut off."
-            )
-        return lines + [f"Warning: {text}" for text in self.warnings]
-
     def __repr__(self) -> str:
         reasons = ", ".join(f"{number} {reason}" for reason, number in self.counts.items())
         return f"Screening({self.n_rejected} of {len(self.kept)} stars rejected{': ' if reasons else ''}{reasons})"
-
-    def _repr_html_(self) -> str:
-        text = "".join(f"<p>{html.escape(line)}</p>" for line in self._lines())
-        if not self.n_rejected:
-            return text
-        head = "".join(f"<th>{name}</th>" for name in COLUMNS)
-        shown = self.rejected.head(_SHOWN_ROWS)
-        body = "".join(
-            "<tr>" + "".join(f"<td>{html.escape(_cell(value))}</td>" for value in row) + "</tr>"
-            for row in shown.itertuples(index=False)
-        )
-        more = self.n_rejected - len(shown)
-        end = f"<p>... and {plural(more, 'more row')}.</p>" if more else ""
-        return f"{text}<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{end}"
-
-
-def _cell(value: Any) -> str:
-    if isinstance(value, float):
-        return "" if np.isnan(value) else "∞" if np.isinf(value) else fixed(value, 3)
-    return str(value)
 
 
 def rejected_table(

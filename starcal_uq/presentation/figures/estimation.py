@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.camera.distortion import parameters as camera_parameters
+from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.formatting import pretty_unit, significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals, residual_scale
@@ -138,7 +139,17 @@ _CHI2_2_99 = 9.21
 
 
 def plot_residuals(cal: Calibration, obs: Observations) -> Figure:
-    """Mean residual vectors over the field, residual against radius, and the histogram against a Gaussian."""
+    """Mean residual vectors over the field, residual against radius, and the histogram against a Gaussian.
+
+    Raises
+    ------
+    CalibrationError
+        For the result of a stream of frames, whose stars are gone.
+    """
+    if len(cal.residuals_px) == 0:
+        raise CalibrationError(
+            "this calibration comes from a stream of frames and kept no residuals: calibrate loaded observations."
+        )
     figure = style.new_figure(11.0, 4.1)
     left, middle, right = figure.subplots(1, 3, width_ratios=(1.12, 1.0, 0.95))
     plot_residual_map(cal, obs, left)

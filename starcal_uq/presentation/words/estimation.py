@@ -1,0 +1,117 @@
+"""Calibrations, screenings and the agreement of merged runs in sentences and tables."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import parameters
+from starcal_uq.core.formatting import decimals_for, fixed, percent, plural, pretty_unit, significant
+from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.merging import ALPHA, Consistency
+from starcal_uq.estimation.screening.result import REASONS, Screening
+from starcal_uq.presentation.html import card, listed
+from starcal_uq.presentation.tables import TextTable
+
+_SHOWN_ROWS = 30
+
+
+def focal_length(cal: Calibration) -> str:
+    """The focal length with its sigma, mm."""
+    sigma = cal.sigmas[2] * cal.camera.pixel_um * 1e-3
+    decimals = decimals_for(sigma)
+    return f"{fixed(cal.camera.focal_mm, decimals)} +- {fixed(sigma, decimals)} mm"
+
+
+def calibration_text(cal: Calibration) -> str:
+    """What was calibrated, how it ended, and the focal length."""
+    return (
+        f"{plural(cal.n_stars, 'star')} in {plural(cal.n_frames, 'frame')}, {cal.method} ({cal.solver}): "
+        f"{cal.status.name.lower().replace('_', ' ')}; focal length {focal_length(cal)}."
+    )
+
+
+def calibration_table(cal: Calibration, truth: Camera | None = None) -> TextTable:
+    """Start, estimate and sigma of every parameter; with a truth, also truth and z."""
+    known = () if truth is None else ("truth", "z")
+    rows = []
+    specs = parameters(cal.camera.distortion)
+    for index, (spec, value, sigma) in enumerate(zip(specs, cal.theta, cal.sigmas, strict=True)):
+        decimals = decimals_for(sigma / spec.scale)
+        cells = [fixed(number / spec.scale, decimals) for number in (cal.nominal.theta[index], value, sigma)]
+        if truth is not None:
+            true = truth.theta[index]
+            cells += [fixed(true / spec.scale, decimals), fixed((value - true) / sigma, 2)]
+        rows.append((spec.name, *cells, pretty_unit(spec.scaled_unit)))
+    decimals = decimals_for(cal.sigma_std)
+    unit = "px per axis" if cal.sigma_name == "sigma" else "times the stated noise"
+    noise = (fixed(cal.sigma, decimals), fixed(cal.sigma_std, decimals))
+    rows.append((cal.sigma_name, "", *noise, *("" for _ in known), unit))
+    heads = ("parameter", "start", "estimate", "sigma", *known, "unit")
+    title = f"Calibration: {cal.n_stars} stars in {cal.n_frames} frames"
+    return TextTable(heads, tuple(rows), title, "l" + "r" * (len(heads) - 2) + "l")
+
+
+def calibration_html(cal: Calibration) -> str:
+    """How it ended, and every parameter."""
+    return card("Calibration", calibration_text(cal), calibration_table(cal))
+
+
+def screening_text(screening: Screening) -> str:
+    """What was rejected and why, at which risk, in a few lines."""
+    n = len(screening.kept)
+    lines = [
+        f"{plural(screening.n_rejected, 'star')} of {n} rejected ({percent(screening.n_rejected / n)}), "
+        f"{plural(len(screening.dropped_frames), 'frame')} of {len(screening.frame_ids)} dropped, "
+        f"{plural(len(screening.rounds), 'round')}."
+    ]
+    lines += [f"{plural(number, 'star')}: {REASONS[reason]}." for reason, number in screening.counts.items()]
+    lines.append(
+        f"Limits: a star {significant(float(np.sqrt(screening.star_threshold)), 3)} sigma from the prediction of the "
+        f"others (p < {significant(screening.star_p_value)}), a frame at p < {significant(screening.frame_p_value)}; "
+        f"at most {significant(screening.expected_false)} right stars are expected among the rejected."
+    )
+    if screening.sigma_shrinkage > 1e-3:
+        lines.append(
+            f"The estimated {screening.calibration.sigma_name} is {percent(screening.sigma_shrinkage)} too small, "
+            "because right stars in the tails were cut off."
+        )
+    return "\n".join([*lines, *(f"Warning: {text}" for text in screening.warnings)])
+
+
+def screening_table(screening: Screening) -> TextTable:
+    """The first rejected rows, each with its reason."""
+
+    def number(value: float) -> str:
+        return "∞" if np.isinf(value) else fixed(value, 3)
+
+    rejected = screening.rejected.head(_SHOWN_ROWS)
+    formats = dict.fromkeys(("x_px", "y_px", "residual_px", "offset_deg", "statistic", "threshold"), number)
+    more = f", the first {len(rejected)}" if len(rejected) < screening.n_rejected else ""
+    return TextTable.of(rejected, f"Rejected stars{more}", formats=formats, missing="")
+
+
+def screening_html(screening: Screening) -> str:
+    """What was rejected and why, and the first rows."""
+    first, *others = screening_text(screening).split("\n")
+    tables = [screening_table(screening)] if screening.n_rejected else []
+    return card("Screening", first) + listed(others) + "".join(table.html() for table in tables)
+
+
+def consistency_text(found: Consistency) -> str:
+    """Whether the runs show the same camera."""
+    verdict = "show the same camera" if found.p_value >= ALPHA else "do not show the same camera"
+    return (
+        f"The runs {verdict} (F = {found.statistic:.3g} with {found.dof[0]} and {found.dof[1]} degrees of freedom, "
+        f"p = {found.p_value:.2g})."
+    )
+
+
+def consistency_table(found: Consistency) -> TextTable:
+    """One row per run."""
+    return TextTable.of(found.to_dataframe(), "Agreement of the runs")
+
+
+def consistency_html(found: Consistency) -> str:
+    """Whether the runs agree, each of them, and what deserves attention."""
+    return card("Consistency", consistency_text(found), consistency_table(found)) + listed(found.messages)

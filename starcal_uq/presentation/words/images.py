@@ -1,0 +1,111 @@
+"""Centroids, identifications and runs from images in sentences and tables."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+
+from starcal_uq.core.formatting import plural
+from starcal_uq.identification.result import STATUSES, FrameStatus, Identification
+from starcal_uq.images.centroids import Centroids
+from starcal_uq.pipeline.record import ImageRecord
+from starcal_uq.pipeline.refine import ImageCalibration, identified_pairs
+from starcal_uq.presentation.html import card
+from starcal_uq.presentation.tables import TextTable
+
+_MIRRORED = " The images are mirror images of the sky: x is counted from the right edge."
+_REASONS: dict[FrameStatus, str] = {
+    "identified": "identified",
+    "not identified": "in which no attitude explains the centroids well enough",
+    "ambiguous": "that fit more than one attitude",
+    "too few stars": "with fewer than four centroids",
+}
+_FIRST_FRAMES = 12
+
+
+def centroids_text(centroids: Centroids) -> str:
+    """One sentence: stars, frames, and how many frames were left out and why."""
+    left_out = centroids.n_left_out
+    text = f"{plural(centroids.n_stars, 'star')} in {plural(centroids.n_frames - left_out, 'frame')}"
+    if left_out:
+        # The reason follows the name of the image, which differs from frame to frame.
+        reasons, counts = np.unique(centroids.problem[centroids.problem != ""], return_counts=True)
+        named = [f"{c} because {r}" for r, c in zip(reasons.tolist(), counts.tolist(), strict=True)]
+        text += f"; {plural(left_out, 'frame')} {'was' if left_out == 1 else 'were'} left out: {', '.join(named)}"
+    return text + "."
+
+
+def centroids_table(centroids: Centroids) -> TextTable:
+    """The first frames."""
+    columns = ("frame", "n_stars", "image", "background", "noise", "psf_sigma_px", "problem")
+    formats = dict.fromkeys(("background", "noise", "psf_sigma_px"), "{:.4g}".format)
+    return TextTable.of(centroids.frames_dataframe().head(_FIRST_FRAMES), "", columns, formats)
+
+
+def centroids_html(centroids: Centroids) -> str:
+    """What there is, and the first frames."""
+    return card("Centroids", centroids_text(centroids), centroids_table(centroids))
+
+
+def identification_text(found: Identification) -> str:
+    """How many frames are identified, why the others are not, and what the nominal camera missed."""
+    n_frames = len(found.frames) - found.n_left_out
+    if not n_frames:
+        return "There are no frames."
+    counts = Counter(frame.status for frame in found.frames)
+    counts["too few stars"] -= found.n_left_out
+    be = "is" if 1 in (found.n_identified, n_frames) else "are"
+    words = f"{found.n_identified} of {plural(n_frames, 'frame')} {be} identified"
+    if found.n_identified:
+        stars = [frame.n_identified for frame in found.frames if frame.status == "identified"]
+        words += f", with {np.mean(stars):.1f} stars on average"
+    words += "."
+    rest = [f"{counts[status]} {_REASONS[status]}" for status in STATUSES[1:] if counts[status]]
+    if rest:
+        words += f" Left out: {'; '.join(rest)}."
+    unlike = sum(frame.n_unlike_brightness for frame in found.frames)
+    if unlike:
+        words += f" {plural(unlike, 'match', 'matches')} given up, because the brightness is unlike the star's."
+    if found.n_identified:
+        change = 100.0 * (found.camera.focal_px / found.nominal.focal_px - 1.0)
+        words += f" The focal length is {abs(change):.2f} % {'longer' if change >= 0 else 'shorter'} than nominal."
+    return words + _MIRRORED if found.parity == "mirrored" else words
+
+
+def identification_table(found: Identification, n_rows: int | None = None) -> TextTable:
+    """What became of every frame, or of the first `n_rows`."""
+    columns = ("frame", "image", "status", "n_centroids", "n_identified", "log10_expected_false", "milliseconds")
+    return TextTable.of(found.to_dataframe().head(n_rows or len(found.frames)), "Identification", columns)
+
+
+def identification_html(found: Identification) -> str:
+    """What is identified, and the first frames."""
+    return card("Identification", identification_text(found), identification_table(found, _FIRST_FRAMES))
+
+
+def image_calibration_text(found: ImageCalibration) -> str:
+    """What the second round of identification changed."""
+    (before, _, first), (after, _, second) = found.rounds[0], found.rounds[-1]
+    old, new = identified_pairs(before.observations), identified_pairs(after.observations)
+    words = (
+        f"{plural(len(old), 'star')} in {plural(before.n_identified, 'frame')} with the nominal camera, "
+        f"{plural(len(new), 'star')} in {plural(after.n_identified, 'frame')} with the calibrated one: "
+        f"{len(new - old)} new, {len(old - new)} given up."
+    )
+    shift = (second.theta - first.theta) / second.sigmas
+    moved = ", ".join(
+        f"{name} {value:+.1f}" for name, value in zip(second.parameter_names, shift.tolist(), strict=True)
+    )
+    return f"{words} The estimate moved, in its standard deviations: {moved}."
+
+
+def image_record_text(record: ImageRecord) -> str:
+    """What was used of the images of a run."""
+    used = len(record.rows) - len(record.left_out)
+    measured = sum(row.n_centroids for row in record.rows)
+    words = f"{used} of {plural(len(record.rows), 'image')} used; {plural(measured, 'star image')} were found in them"
+    words += f", and {sum(row.n_last for row in record.rows)} of these were identified."
+    if record.n_disturbed:
+        words += f" {plural(record.n_disturbed, 'star')} left out, because the light of a neighbour displaces them."
+    return words + _MIRRORED if record.parity == "mirrored" else words
