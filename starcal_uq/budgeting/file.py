@@ -5,10 +5,8 @@ from __future__ import annotations
 import difflib
 import math
 import os
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
@@ -29,6 +27,7 @@ from starcal_uq.budgeting.shapes import HALF_WIDTHS, RAYLEIGH_MEAN
 from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.files import atomic_write_text, ensure_new
+from starcal_uq.core.toml import read_toml, unknown_key
 
 # As people write them: X and Y are across the boresight, Z is along it.
 _AXIS_NAMES = {
@@ -131,9 +130,7 @@ class _Table:
         self.data, self.where = data, where
         for key in data:
             if key not in known:
-                close = difflib.get_close_matches(str(key), known, n=1)
-                hint = f"did you mean {close[0]}" if close else f"remove it; known keys are {', '.join(known)}"
-                raise BudgetError(f"{where}: key {key} is not known; {hint}.")
+                raise BudgetError(f"{where}: {unknown_key(key, known)}.".replace("?.", "?"))
 
     def __contains__(self, key: str) -> bool:
         return key in self.data
@@ -195,22 +192,8 @@ def load_budget_file(path: str | os.PathLike[str]) -> BudgetFile:
     BudgetError
         If it cannot be read, or a key is unknown, missing or wrong; the sentence names file, table and key.
     """
-    path = Path(path)
-    try:
-        content = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
-    except FileNotFoundError:
-        raise BudgetError(
-            f"{path}: the budget file does not exist; check the path, or write a starter with "
-            "`starcal-uq budget RUN --template FILE`."
-        ) from None
-    except OSError as error:
-        raise BudgetError(f"{path}: the budget file cannot be read ({error.strerror}); check the path.") from error
-    except UnicodeDecodeError:
-        raise BudgetError(f"{path}: the budget file is not UTF-8 text; save it as TOML in UTF-8.") from None
-    except tomllib.TOMLDecodeError as error:
-        raise BudgetError(f"{path}: the budget file is not valid TOML: {error}; correct that line.") from None
-    except ValueError:
-        raise BudgetError(f"{path}: the budget file holds a number with too many digits; correct it.") from None
+    missing = "check the path, or write a starter with `starcal-uq budget RUN --template FILE`"
+    content = read_toml(path, "budget", BudgetError, missing)
     for key in content:
         if key not in ("budget", "contributor", "requirement"):
             raise BudgetError(
@@ -230,7 +213,7 @@ def load_budget_file(path: str | os.PathLike[str]) -> BudgetFile:
     return BudgetFile(tuple(rows), requirements, head.text("title", ""), confidence, str(path))
 
 
-def _tables(content: Mapping[str, Any], key: str, path: Path) -> list[Any]:
+def _tables(content: Mapping[str, Any], key: str, path: str | os.PathLike[str]) -> list[Any]:
     found = content.get(key, [])
     if not isinstance(found, list):
         raise BudgetError(

@@ -7,16 +7,13 @@ Pixels: x to the right, y down, (0, 0) is the *centre* of the first pixel; the d
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import operator
 import os
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,11 +23,8 @@ from starcal_uq.camera.opencv import from_opencv, to_opencv
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CameraError, DistortionError
 from starcal_uq.core.files import atomic_write_text, ensure_new
+from starcal_uq.core.toml import Key, Section, read_section, unknown_key
 from starcal_uq.core.types import BoolArray, FloatArray
-
-if TYPE_CHECKING:
-    from pydantic import BaseModel
-    from pydantic_core import ErrorDetails
 
 
 @dataclass(frozen=True)
@@ -204,7 +198,7 @@ class Camera(Shown):
         CameraError
             For an unknown or missing key or a value that does not fit.
         """
-        return cls(**parse_table(table, "camera"))
+        return cls(**_checked(table, "camera"))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Camera:
@@ -215,7 +209,7 @@ class Camera(Shown):
         CameraError
             If the file cannot be read or its content does not fit; the message names file, key and remedy.
         """
-        return cls(**read_camera(path))
+        return cls(**_checked(read_section(path, "camera", CameraError), f"{path}, section [camera]"))
 
     def save(self, path: str | os.PathLike[str], force: bool = False) -> None:
         """Write the camera to a TOML file without loss of digits.
@@ -328,133 +322,53 @@ _DIRECTION = {
 }
 
 
-# What to write for a key: said wherever the key is missing or wrong.
-_WANTED = {
-    "width_px": "the width of the detector in pixels, a whole number above 0",
-    "height_px": "the height of the detector in pixels, a whole number above 0",
-    "pixel_um": "the pitch of the square pixels in micrometres, a number above 0",
-    "focal_mm": "the focal length in millimetres, a number above 0",
-    "x0_px": "the principal point along x in pixels, a finite number",
-    "y0_px": "the principal point along y in pixels, a finite number",
-    "distortion": "the name of the distortion model, one of " + ", ".join(model_names()),
-    "name": "a name in quotes",
+_KEYS = {
+    "width_px": Key.of(int, "the width of the detector in pixels, a whole number above 0", required=True, gt=0),
+    "height_px": Key.of(int, "the height of the detector in pixels, a whole number above 0", required=True, gt=0),
+    "pixel_um": Key.of(float, "the pitch of the square pixels in micrometres, a number above 0", required=True, gt=0),
+    "focal_mm": Key.of(float, "the focal length in millimetres, a number above 0", required=True, gt=0),
+    "x0_px": Key.of(float, "the principal point along x in pixels, a finite number", required=True),
+    "y0_px": Key.of(float, "the principal point along y in pixels, a finite number", required=True),
+    "distortion": Key.of(str, "the name of the distortion model, one of " + ", ".join(model_names())),
+    "name": Key.of(str, "a name in quotes"),
 }
 
 
-@lru_cache
-def _schema(distortion: str) -> type[BaseModel]:
-    """Schema of the [camera] table: it depends on the model, which names its own coefficients."""
-    from pydantic import ConfigDict, Field, create_model
+@dataclass(frozen=True)
+class _CameraSection(Section):
+    """Schema of the [camera] table, which names the coefficients of its distortion model."""
 
-    pixels = (int, Field(gt=0))
-    positive = (float, Field(gt=0.0))
-    fields: dict[str, Any] = {
-        "width_px": pixels,
-        "height_px": pixels,
-        "pixel_um": positive,
-        "focal_mm": positive,
-        "x0_px": (float, ...),
-        "y0_px": (float, ...),
-        "distortion": (str, "brown"),
-        "name": (str, ""),
-    }
-    fields.update({c.name: (float, 0.0) for c in get_model(distortion).coefficients})
-    # Strict: a whole number may stand for a float, but no text or truth value for a number.
-    config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-    return create_model("CameraTable", __config__=config, **fields)
+    distortion: str
 
-
-def _problem(error: ErrorDetails, distortion: str) -> str:
-    key = str(error["loc"][0])
-    wanted = _WANTED.get(key, "a finite number")
-    if error["type"] == "missing":
-        return f"key {key} is missing; add {wanted}"
-    if error["type"] != "extra_forbidden":
-        return f"key {key} is {error['input']!r}; write {wanted}"
-    own = [c.name for c in get_model(distortion).coefficients]
-    models = [n for n in model_names() if key in {c.name for c in get_model(n).coefficients}]
-    if models:
+    def unknown(self, key: str) -> str:
+        own = [c.name for c in get_model(self.distortion).coefficients]
+        models = [n for n in model_names() if key in {c.name for c in get_model(n).coefficients}]
+        if not models:
+            return unknown_key(key, self.keys)
         return (
-            f"key {key} is no coefficient of distortion {distortion!r} (it has {', '.join(own) or 'none'}); "
+            f"key {key} is no coefficient of distortion {self.distortion!r} (it has {', '.join(own) or 'none'}); "
             f"remove it or set distortion to {' or '.join(map(repr, models))}"
         )
-    near = difflib.get_close_matches(key, [*_WANTED, *own], n=1)
-    hint = f"did you mean {near[0]}?" if near else f"remove it (known: {', '.join([*_WANTED, *own])})"
-    return f"key {key} is unknown; {hint}"
 
 
-def parse_table(table: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """Arguments of ``Camera`` from a [camera] table.
+@lru_cache
+def _section(distortion: str) -> Section:
+    own = {c.name: Key.of(float, "a finite number") for c in get_model(distortion).coefficients}
+    return _CameraSection({**_KEYS, **own}, CameraError, distortion)
 
-    Parameters
-    ----------
-    table
-        Keys and values of the table.
-    where
-        What to call the table in messages, such as ``"camera.toml, section [camera]"``.
 
-    Raises
-    ------
-    CameraError
-        For an unknown or missing key, or a value of the wrong type, not finite or out of range.
-    """
-    from pydantic import ValidationError
-
+def _checked(table: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """Arguments of ``Camera`` from a [camera] table, which `where` names in messages."""
     distortion = table.get("distortion", "brown")
     if not isinstance(distortion, str):
-        raise CameraError(f"{where}: key distortion is {distortion!r}; write {_WANTED['distortion']}.")
+        raise CameraError(f"{where}: key distortion is {distortion!r}; write {_KEYS['distortion'].wanted}.")
     try:
         coefficients = get_model(distortion).coefficients
     except DistortionError as error:
         raise CameraError(f"{where}: key distortion: {error}") from None
-    try:
-        values = _schema(distortion).model_validate(dict(table)).model_dump()
-    except ValidationError as error:
-        problems = [_problem(e, distortion) for e in error.errors()]
-        others = len(problems) - 1
-        more = f" ({others} more bad key{'s' if others > 1 else ''})" if others else ""
-        end = "" if problems[0].endswith("?") and not more else "."
-        raise CameraError(f"{where}: {problems[0]}{more}{end}") from None
-    values["coefficients"] = tuple(values.pop(c.name) for c in coefficients)
+    values = _section(distortion).check(table, where)
+    values["coefficients"] = tuple(values.pop(c.name, 0.0) for c in coefficients)
     return values
-
-
-def read_camera(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Arguments of ``Camera`` from a TOML file.
-
-    Raises
-    ------
-    CameraError
-        If the file cannot be read, is no TOML, has no [camera] section, or its section is wrong.
-    """
-    path = Path(path)
-    if os.path.isdir(path):
-        raise CameraError(f"{path}: is a directory; name the camera's TOML file.")
-    try:
-        text = path.read_bytes().decode("utf-8-sig")
-    except FileNotFoundError:
-        raise CameraError(f"{path}: the camera file does not exist; check the path.") from None
-    except OSError as error:
-        raise CameraError(
-            f"{path}: the camera file cannot be read ({error.strerror}); check its permissions."
-        ) from error
-    except UnicodeDecodeError:
-        raise CameraError(f"{path}: the camera file is not UTF-8 text; save it as TOML in UTF-8.") from None
-    if not text.strip():
-        raise CameraError(f"{path}: the camera file is empty; write a [camera] section with its keys.")
-    try:
-        content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise CameraError(f"{path}: the camera file is not valid TOML: {error}; correct that line.") from None
-    section = content.pop("camera", None)
-    if section is None:
-        raise CameraError(f"{path}: section [camera] is missing; write [camera] above the camera's keys.")
-    if not isinstance(section, dict):
-        raise CameraError(f"{path}: camera is no section; write [camera] above the camera's keys.")
-    if content:
-        first = next(iter(content))
-        raise CameraError(f"{path}: {first} stands outside section [camera]; remove it or move it below [camera].")
-    return parse_table(section, f"{path}, section [camera]")
 
 
 def camera_text(table: Mapping[str, Any]) -> str:

@@ -20,6 +20,7 @@ import numpy as np
 from starcal_uq.camera.distortion import get_model, parameter_names, parameters, sigma_parameter
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PriorError
+from starcal_uq.core.toml import Key, Section, read_section
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.maths.linear import correlation_of
 
@@ -81,8 +82,8 @@ class Priors(Shown, ABC):
         PriorError
             For a file that cannot be read, an unknown key or a value that is not a proper prior.
         """
-
-        return priors_from_toml(path, camera, per_star_sigma)
+        table = read_section(path, "priors", PriorError, alone=False)
+        return priors_from_table(path, table, camera, per_star_sigma)
 
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> Priors:
@@ -230,26 +231,6 @@ def positive_number(name: str, value: Any) -> float:
     return number
 
 
-def read_priors_table(path: str | Path) -> dict[str, Any]:
-    """The ``[priors]`` table of a TOML file.
-
-    Raises
-    ------
-    PriorError
-        For a file that cannot be read, or without the table.
-    """
-    import tomllib
-
-    try:
-        document = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise PriorError(f"{path}: cannot be read as TOML ({error}).") from error
-    table = document.get("priors")
-    if not isinstance(table, dict):
-        raise PriorError(f"{path}: the section [priors] is missing; add it above the priors.")
-    return table
-
-
 # Wide on purpose: a tenth of the detector, 5 % of the focal length and a twentieth of the image radius cover any camera
 # whose data sheet is not wrong, and are hundreds of times wider than what a night of stars determines.
 _PRINCIPAL_POINT_FRACTION = 0.1
@@ -367,12 +348,17 @@ _FIELDS = tuple(field.name for field in dataclasses.fields(PhysicalPriors))
 _POSITIVE = tuple(name for name in _FIELDS if name not in ("principal_point_centre_px", "distortion", "per_star_sigma"))
 
 
-_IN_FILES = tuple(name for name in _FIELDS if name not in ("distortion", "per_star_sigma"))
+_NUMBER = "a finite number above zero"
 
 
-def priors_from_toml(path: str | Path, camera: Camera, per_star_sigma: bool = False) -> PhysicalPriors:
-    """Read a ``[priors]`` table; see `Priors.from_toml`."""
-    return priors_from_table(path, read_priors_table(path), camera, per_star_sigma)
+PRIORS = Section(
+    {
+        "principal_point_px": Key.of(float, _NUMBER, gt=0.0),
+        "principal_point_centre_px": Key.of(list[float], "two numbers in brackets", min_length=2, max_length=2),
+        **{name: Key.of(float, _NUMBER, gt=0.0) for name in _POSITIVE[1:]},
+    },
+    PriorError,
+)
 
 
 def priors_from_table(
@@ -385,25 +371,8 @@ def priors_from_table(
     PriorError
         For an unknown key or a value that is not a proper prior.
     """
-    _check_table(path, table)
-    values = dict(table)
-    if "principal_point_centre_px" in values:
-        values["principal_point_centre_px"] = tuple(values["principal_point_centre_px"])
-    try:
-        return PhysicalPriors.around(camera, per_star_sigma).replace(**values)
-    except PriorError as error:
-        raise PriorError(f"{path}: {error}") from None
-
-
-def _check_table(path: str | Path, table: Mapping[str, Any]) -> None:
-    for key, value in table.items():
-        if key not in _IN_FILES:
-            raise PriorError(f"{path}: unknown key {key!r} in [priors]; use one of {', '.join(_IN_FILES)}.")
-        numbers = value if isinstance(value, list) else [value]
-        wanted = 2 if key == "principal_point_centre_px" else 1
-        numeric = all(isinstance(v, int | float) and not isinstance(v, bool) for v in numbers)
-        if not numeric or len(numbers) != wanted or isinstance(value, list) != (wanted == 2):
-            raise PriorError(f"{path}: key {key!r} in [priors] must be {'two numbers' if wanted == 2 else 'a number'}.")
+    values = PRIORS.check(table, f"{path}, section [priors]")
+    return PhysicalPriors.around(camera, per_star_sigma).replace(**values)
 
 
 KIND = "gaussian"

@@ -2,37 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import PriorError
 from starcal_uq.core.provenance import data_hashes
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.toml import Key, Section, read_section
 from starcal_uq.inference.posterior import Posterior
-from starcal_uq.inference.priors import GaussianPriors, Priors, priors_from_table, read_priors_table
+from starcal_uq.inference.priors import GaussianPriors, Priors, priors_from_table
 from starcal_uq.inference.update import SHIFT_KEYS, AllowedShift, check_chain, prior_from
 from starcal_uq.runs.folder import RunFolder
 
-_CHAIN_KEYS = ("prior_from", "inflation", "noise", "shift")
-
-
-def _text(table: Mapping[str, Any], key: str) -> str:
-    if not isinstance(table[key], str):
-        raise PriorError(f"key {key!r} in [priors] must be a text.")
-    return str(table[key])
-
-
-def _numbers(table: Any, where: str, keys: Collection[str]) -> dict[str, float]:
-    if not isinstance(table, Mapping):
-        raise PriorError(f"{where!r} in [priors] must be a table with {', '.join(keys)}.")
-    for key, value in table.items():
-        if key not in keys:
-            raise PriorError(f"unknown key {key!r} in [priors.{where}]; use one of {', '.join(keys)}.")
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise PriorError(f"key {key!r} of [priors] must be a number.")
-    return {key: float(value) for key, value in table.items()}
+_CHAIN = Section(
+    {
+        "prior_from": Key.of(str, "the folder of the earlier run, a text in quotes"),
+        "inflation": Key.of(float, "the factor on all standard deviations, a number of at least 1"),
+        "noise": Key.of(str, "default or posterior, a text in quotes"),
+        "shift": Key.of(dict[str, Any], f"a table with {', '.join(SHIFT_KEYS)}"),
+    },
+    PriorError,
+)
+_SHIFT = Section({name: Key.of(float, "a number, zero or more", ge=0.0) for name in SHIFT_KEYS}, PriorError)
 
 
 def prior_from_run(run: str | Path, **options: Any) -> GaussianPriors:
@@ -69,21 +61,14 @@ def load_priors(
     PriorError
         For a file that cannot be read, an unknown key, or an earlier run of another camera or of the same data.
     """
-    table = read_priors_table(path)
+    table = read_section(path, "priors", PriorError, alone=False)
     if "prior_from" not in table:
         return priors_from_table(path, table, camera, per_star_sigma)
-    for key in table:
-        if key not in _CHAIN_KEYS:
-            raise PriorError(
-                f"{path}: unknown key {key!r} in [priors] beside prior_from; use one of {', '.join(_CHAIN_KEYS)}."
-            )
+    options = _CHAIN.check(table, f"{path}, section [priors] with prior_from")
+    shift = _SHIFT.check(options.pop("shift", {}), f"{path}, section [priors.shift]")
+    run = Path(path).parent / options.pop("prior_from")
     try:
-        run = Path(path).parent / _text(table, "prior_from")
-        options: AnyDict = {"shift": AllowedShift(**_numbers(table.get("shift", {}), "shift", SHIFT_KEYS))}
-        options |= _numbers({k: v for k, v in table.items() if k == "inflation"}, "priors", ("inflation",))
-        if "noise" in table:
-            options["noise"] = _text(table, "noise")
-        priors = prior_from_run(run, per_star_sigma=per_star_sigma, **options)
+        priors = prior_from_run(run, per_star_sigma=per_star_sigma, shift=AllowedShift(**shift), **options)
         check_chain(priors, camera, data_sha256)
     except PriorError as error:
         raise PriorError(f"{path}: {error}") from None

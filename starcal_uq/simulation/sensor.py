@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 import os
-import tomllib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from starcal_uq.core.errors import SensorError
 from starcal_uq.core.files import atomic_write_text, ensure_new
+from starcal_uq.core.toml import read_section, unknown_key
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.simulation.psf import KINDS, profiles
 
@@ -204,15 +203,7 @@ class Sensor:
         SensorError
             If the file cannot be read or its content does not fit; the message names file, key and remedy.
         """
-        try:
-            content = tomllib.loads(Path(path).read_text(encoding="utf-8-sig"))
-        except OSError as error:
-            raise SensorError(f"{path}: the sensor file cannot be read ({error.strerror}); check the path.") from None
-        except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-            raise SensorError(f"{path}: the sensor file is not valid TOML ({error}); correct it.") from None
-        section = content.pop("sensor", None)
-        if not isinstance(section, dict) or content:
-            raise SensorError(f"{path}: the sensor file must have one section, [sensor]; write nothing outside it.")
+        section = read_section(path, "sensor", SensorError)
         try:
             return cls.from_dict(section)
         except SensorError as error:
@@ -230,7 +221,7 @@ def _only_known(table: Mapping[str, Any], where: str) -> None:
     known = [field.name for field in fields(Sensor)]
     for key in table:
         if key not in known:
-            raise SensorError(f"{where}: key {key} is unknown; use one of {', '.join(known)}.")
+            raise SensorError(f"{where}: {unknown_key(key, known)}.")
 
 
 def _number(value: Any) -> bool:

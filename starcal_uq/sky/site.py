@@ -2,22 +2,15 @@
 
 from __future__ import annotations
 
-import difflib
 import os
-import tomllib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
-from functools import lru_cache
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from starcal_uq.core.errors import SiteError
 from starcal_uq.core.files import atomic_write_text, ensure_new
+from starcal_uq.core.toml import Key, Section, read_section
 from starcal_uq.core.types import AnyDict
-
-if TYPE_CHECKING:
-    from pydantic import BaseModel
-    from pydantic_core import ErrorDetails
 
 _HEADER = """\
 # Site of a camera on the ground.
@@ -28,26 +21,27 @@ _HEADER = """\
 # relative_humidity: 0 to 1. wavelength_um: effective wavelength of lens and detector, micrometres.
 
 """
-# Range, and what to write: said wherever the key is missing or wrong.
-_RANGES: dict[str, tuple[float, float]] = {
-    "latitude_deg": (-90.0, 90.0),
-    "longitude_deg": (-180.0, 360.0),
-    "height_m": (-500.0, 9000.0),
-    "pressure_hpa": (200.0, 1100.0),
-    "temperature_c": (-90.0, 60.0),
-    "relative_humidity": (0.0, 1.0),
-    "wavelength_um": (0.3, 2.5),
-}
-_WANTED = {
-    "latitude_deg": "the latitude in degrees, north positive, from -90 to 90",
-    "longitude_deg": "the longitude in degrees, east positive, from -180 to 360",
-    "height_m": "the height in metres, from -500 to 9000",
-    "pressure_hpa": "the pressure at the site in hPa, from 200 to 1100, or leave it out",
-    "temperature_c": "the temperature in degrees Celsius, from -90 to 60, or leave it out",
-    "relative_humidity": "the relative humidity, from 0 to 1",
-    "wavelength_um": "the effective wavelength in micrometres, from 0.3 to 2.5",
-    "name": "a name in quotes",
-}
+_SECTION = Section(
+    {
+        "latitude_deg": Key.of(
+            float, "the latitude in degrees, north positive, from -90 to 90", required=True, ge=-90.0, le=90.0
+        ),
+        "longitude_deg": Key.of(
+            float, "the longitude in degrees, east positive, from -180 to 360", required=True, ge=-180.0, le=360.0
+        ),
+        "height_m": Key.of(float, "the height in metres, from -500 to 9000", ge=-500.0, le=9000.0),
+        "pressure_hpa": Key.of(
+            float | None, "the pressure at the site in hPa, from 200 to 1100, or leave it out", ge=200.0, le=1100.0
+        ),
+        "temperature_c": Key.of(
+            float | None, "the temperature in degrees Celsius, from -90 to 60, or leave it out", ge=-90.0, le=60.0
+        ),
+        "relative_humidity": Key.of(float, "the relative humidity, from 0 to 1", ge=0.0, le=1.0),
+        "wavelength_um": Key.of(float, "the effective wavelength in micrometres, from 0.3 to 2.5", ge=0.3, le=2.5),
+        "name": Key.of(str, "a name in quotes"),
+    },
+    SiteError,
+)
 
 
 @dataclass(frozen=True)
@@ -88,7 +82,7 @@ class Site:
 
     def __post_init__(self) -> None:
         table = {name: value for name, value in vars(self).items() if value is not None}
-        for name, value in parse_site(table, "site").items():
+        for name, value in _SECTION.check(table, "site").items():
             object.__setattr__(self, name, value)
 
     @property
@@ -127,7 +121,7 @@ class Site:
         SiteError
             As `load`.
         """
-        return cls(**parse_site(table, "site"))
+        return cls(**_SECTION.check(table, "site"))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Site:
@@ -138,7 +132,7 @@ class Site:
         SiteError
             If the file cannot be read, is no TOML, has no [site] table, or a key is missing, unknown or wrong.
         """
-        return cls(**_read(Path(path)))
+        return cls(**_SECTION.check(read_section(path, "site", SiteError), f"{path}, section [site]"))
 
     def save(self, path: str | os.PathLike[str], force: bool = False) -> None:
         """Write a TOML file without loss of digits.
@@ -152,87 +146,6 @@ class Site:
 
         ensure_new(path, force)
         atomic_write_text(path, _HEADER + tomli_w.dumps({"site": self.to_dict()}))
-
-
-@lru_cache
-def _schema() -> type[BaseModel]:
-    from pydantic import ConfigDict, Field, create_model
-
-    kept: dict[str, Any] = {}
-    for entry in fields(Site):
-        if entry.name == "name":
-            kept["name"] = (str, "")
-            continue
-        low, high = _RANGES[entry.name]
-        required = entry.name in ("latitude_deg", "longitude_deg")
-        kept[entry.name] = (
-            (float, Field(ge=low, le=high))
-            if required
-            else (float | None if entry.default is None else float, Field(default=entry.default, ge=low, le=high))
-        )
-    config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-    return create_model("SiteTable", __config__=config, **kept)
-
-
-def parse_site(table: Mapping[str, Any], where: str) -> AnyDict:
-    """Arguments of `Site` from a [site] table.
-
-    Parameters
-    ----------
-    table
-        Keys and values.
-    where
-        What to call the table in messages, such as "site.toml, section [site]".
-
-    Raises
-    ------
-    SiteError
-        For an unknown or missing key, or a value of the wrong type, not finite or out of range.
-    """
-    from pydantic import ValidationError
-
-    try:
-        return _schema().model_validate(dict(table)).model_dump()
-    except ValidationError as error:
-        problems = [_problem(e) for e in error.errors()]
-        others = len(problems) - 1
-        more = f" ({others} more bad key{'s' if others > 1 else ''})" if others else ""
-        end = "" if problems[0].endswith("?") and not more else "."
-        raise SiteError(f"{where}: {problems[0]}{more}{end}") from None
-
-
-def _problem(error: ErrorDetails) -> str:
-    key = str(error["loc"][0])
-    if error["type"] == "missing":
-        return f"key {key} is missing; add {_WANTED[key]}"
-    if error["type"] != "extra_forbidden":
-        return f"key {key} is {error['input']!r}; write {_WANTED[key]}"
-    near = difflib.get_close_matches(key, _WANTED, n=1)
-    hint = f"did you mean {near[0]}?" if near else f"remove it (known: {', '.join(_WANTED)})"
-    return f"key {key} is unknown; {hint}"
-
-
-def _read(path: Path) -> AnyDict:
-    if os.path.isdir(path):
-        raise SiteError(f"{path}: is a directory; name the site's TOML file.")
-    try:
-        content = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
-    except FileNotFoundError:
-        raise SiteError(f"{path}: the site file does not exist; check the path.") from None
-    except OSError as error:
-        raise SiteError(f"{path}: the site file cannot be read ({error.strerror}); check its permissions.") from error
-    except UnicodeDecodeError:
-        raise SiteError(f"{path}: the site file is not UTF-8 text; save it as TOML in UTF-8.") from None
-    except tomllib.TOMLDecodeError as error:
-        raise SiteError(f"{path}: the site file is not valid TOML: {error}; correct that line.") from None
-    section = content.pop("site", None)
-    if not isinstance(section, dict):
-        raise SiteError(f"{path}: section [site] is missing; write [site] above latitude_deg and longitude_deg.")
-    if content:
-        raise SiteError(
-            f"{path}: {next(iter(content))} stands outside section [site]; remove it or move it below [site]."
-        )
-    return parse_site(section, f"{path}, section [site]")
 
 
 def check_sky(directions: str | None, site: Site | None, in_space: bool) -> None:

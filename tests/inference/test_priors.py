@@ -114,13 +114,13 @@ def test_toml_overrides_defaults(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "match"),
     [
-        ("[priors]\nfocal_frac = 0.1\n", "unknown key 'focal_frac'"),
+        ("[priors]\nfocal_frac = 0.1\n", "key focal_frac is unknown; did you mean focal_fraction"),
         ("[prior]\nfocal_fraction = 0.1\n", r"section \[priors\] is missing"),
-        ("[priors]\nfocal_fraction = 'wide'\n", "must be a number"),
-        ("[priors]\nfocal_fraction = true\n", "must be a number"),
-        ("[priors]\nprincipal_point_centre_px = 500\n", "must be two numbers"),
+        ("[priors]\nfocal_fraction = 'wide'\n", "focal_fraction is 'wide'; write a finite number"),
+        ("[priors]\nfocal_fraction = true\n", "focal_fraction is True; write a finite number"),
+        ("[priors]\nprincipal_point_centre_px = 500\n", "principal_point_centre_px is 500; write two numbers"),
         ("[priors]\nfocal_fraction = -0.1\n", "above zero"),
-        ("[priors\n", "cannot be read"),
+        ("[priors\n", "not valid TOML"),
     ],
 )
 def test_bad_toml_names_file_and_key(tmp_path: Path, text: str, match: str) -> None:
@@ -132,7 +132,7 @@ def test_bad_toml_names_file_and_key(tmp_path: Path, text: str, match: str) -> N
 
 
 def test_missing_toml(tmp_path: Path) -> None:
-    with pytest.raises(PriorError, match="cannot be read"):
+    with pytest.raises(PriorError, match="the priors file does not exist"):
         Priors.from_toml(tmp_path / "none.toml", CAMERA)
 
 

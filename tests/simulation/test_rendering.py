@@ -386,7 +386,7 @@ def test_a_sensor_goes_through_its_file(tmp_path: Path) -> None:
         ('[sensor]\nread_noise_e = "5"', "give a finite number"),
         ('[sensor]\npsf = "moffat"', "use one of gaussian, sampled"),
         ("[sensor]\nread_noise = 5", "key read_noise is unknown"),
-        ("read_noise_e = 5", "one section"),
+        ("read_noise_e = 5", r"section \[sensor\] is missing; write \[sensor\]"),
         ("[sensor", "not valid TOML"),
     ],
 )

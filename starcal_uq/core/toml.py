@@ -1,0 +1,166 @@
+"""Tables of TOML files that people write: read and checked in one way, with one sentence for whatever is wrong."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import tomllib
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from starcal_uq.core.errors import StarcalError
+from starcal_uq.core.files import PathLike
+from starcal_uq.core.types import AnyDict
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+
+def read_toml(path: PathLike, name: str, error: type[StarcalError], missing: str = "check the path") -> AnyDict:
+    """Content of a TOML file in UTF-8, with or without a byte order mark.
+
+    Parameters
+    ----------
+    path : path
+        File.
+    name : str
+        What it describes, such as "camera".
+    error : type
+        What is raised where the file cannot be read.
+    missing : str
+        Remedy for a file that does not exist.
+    """
+    path = Path(path)
+    if os.path.isdir(path):
+        raise error(f"{path}: is a directory; name the TOML file of the {name}.")
+    where = f"{path}: the {name} file"
+    try:
+        return tomllib.loads(path.read_bytes().decode("utf-8-sig"))
+    except FileNotFoundError:
+        raise error(f"{where} does not exist; {missing}.") from None
+    except OSError as problem:
+        raise error(f"{where} cannot be read ({problem.strerror}); check its permissions.") from problem
+    except UnicodeDecodeError:
+        raise error(f"{where} is not UTF-8 text; save it as TOML in UTF-8.") from None
+    except tomllib.TOMLDecodeError as problem:
+        raise error(f"{where} is not valid TOML: {problem}; correct that line.") from None
+    except ValueError:
+        raise error(f"{where} holds a number with too many digits; correct it.") from None
+
+
+def read_section(path: PathLike, name: str, error: type[StarcalError], *, alone: bool = True) -> AnyDict:
+    """The table ``[name]`` of a TOML file; with `alone`, nothing may stand outside it."""
+    content = read_toml(path, name, error)
+    write = f"write [{name}] above its keys"
+    if name not in content:
+        empty = "" if content else f"the {name} file is empty: "
+        raise error(f"{path}: {empty}section [{name}] is missing; {write}.")
+    section = content.pop(name)
+    if not isinstance(section, dict):
+        raise error(f"{path}: {name} is no section; {write}.")
+    if content and alone:
+        first = next(iter(content))
+        raise error(f"{path}: {first} stands outside section [{name}]; remove it or move it below [{name}].")
+    return section
+
+
+def unknown_key(key: str, known: Collection[str]) -> str:
+    """Remedy for a key that is unknown: the most similar one that is known, or all of them."""
+    near = difflib.get_close_matches(key, known, n=1)
+    hint = f"did you mean {near[0]}?" if near else f"remove it (known: {', '.join(known)})"
+    return f"key {key} is unknown; {hint}"
+
+
+@dataclass(frozen=True)
+class Key:
+    """What may stand under a key.
+
+    Attributes
+    ----------
+    kind : type
+        Type; a whole number may stand for a float, but neither text nor a truth value for a number.
+    wanted : str
+        What to write, said wherever the key is missing or wrong.
+    bounds : dict
+        Limits as of `pydantic.Field`, such as ``{"gt": 0}``.
+    required : bool
+        Whether it must be given.
+    """
+
+    kind: Any
+    wanted: str
+    bounds: Mapping[str, Any]
+    required: bool
+
+    @classmethod
+    def of(cls, kind: Any, wanted: str, *, required: bool = False, **bounds: Any) -> Key:
+        """A key; limits as keywords."""
+        return cls(kind, wanted, bounds, required)
+
+
+@dataclass(frozen=True)
+class Section:
+    """Schema of a table.
+
+    Attributes
+    ----------
+    keys : dict
+        Known keys.
+    error : type
+        What is raised.
+    """
+
+    keys: Mapping[str, Key]
+    error: type[StarcalError]
+
+    @cached_property
+    def _schema(self) -> type[BaseModel]:
+        from pydantic import ConfigDict, Field, create_model
+
+        fields: AnyDict = {}
+        for name, key in self.keys.items():
+            options: AnyDict = {**key.bounds} if key.required else {"default": None, **key.bounds}
+            fields[name] = (key.kind, Field(**options))
+        config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+        return create_model("Table", __config__=config, **fields)
+
+    def check(self, table: Mapping[str, Any], where: str) -> AnyDict:
+        """Checked values of the keys that are given.
+
+        Parameters
+        ----------
+        table : mapping
+            Keys and values.
+        where : str
+            What to call the table in messages, such as "camera.toml, section [camera]".
+
+        Raises
+        ------
+        StarcalError
+            Of the section's kind: for a key that is unknown or missing, or a value of the wrong type, not finite or
+            out of range.
+        """
+        from pydantic import ValidationError
+
+        try:
+            return self._schema.model_validate(dict(table)).model_dump(exclude_unset=True)
+        except ValidationError as error:
+            problems = [self._problem(e["type"], str(e["loc"][0]), table) for e in error.errors()]
+        others = len(problems) - 1
+        more = f" ({others} more bad key{'s' if others > 1 else ''})" if others else ""
+        end = "" if problems[0].endswith("?") and not more else "."
+        raise self.error(f"{where}: {problems[0]}{more}{end}")
+
+    def _problem(self, kind: str, key: str, table: Mapping[str, Any]) -> str:
+        if kind == "missing":
+            return f"key {key} is missing; add {self.keys[key].wanted}"
+        if kind == "extra_forbidden":
+            return self.unknown(key)
+        return f"key {key} is {table[key]!r}; write {self.keys[key].wanted}"
+
+    def unknown(self, key: str) -> str:
+        """What is said of a key that the section does not have."""
+        return unknown_key(key, self.keys)
