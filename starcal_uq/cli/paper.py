@@ -57,10 +57,10 @@ def reproduce_command(
         )
     published = found.published()
     if json:
-        print_json({"verdict": found.verdict, "published": records(published)})
+        print_json({"verdict": found.text, "published": records(published)})
     else:
         show_table(_readable(published), "What the paper prints, and what comes out over seeds")
-        console.print(found.verdict, highlight=False, soft_wrap=True)
+        console.print(found.text, highlight=False, soft_wrap=True)
         print(f"Report: {found.report.resolve()}")
 
 
@@ -98,10 +98,10 @@ def field_command(
         )
     table = found.table_3()
     if json:
-        print_json({"verdict": found.verdict, "table_3": records(table)})
+        print_json({"verdict": found.text, "table_3": records(table)})
     else:
         show_table(_readable_table_3(table), "Table 3: rates in %, errors in arcsec, with 95 % ranges")
-        console.print(found.verdict, highlight=False, soft_wrap=True)
+        console.print(found.text, highlight=False, soft_wrap=True)
         print(f"Report: {found.report.resolve()}")
 
 

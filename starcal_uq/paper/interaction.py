@@ -14,16 +14,19 @@ All methods see the same data, and so, as far as the axis allows, do all points 
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from starcal_uq.camera.distortion import get_model
-from starcal_uq.core.errors import SamplingError, StarcalError
+from starcal_uq.core.display import Shown
+from starcal_uq.core.errors import RunFolderError, SamplingError, StarcalError
+from starcal_uq.core.files import atomic_path
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import AnyDict, FloatArray
@@ -31,30 +34,215 @@ from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.recursive.start import RecursionOptions
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.camera import paper_camera, paper_start
-from starcal_uq.paper.interaction_result import HANDLING, InteractionStudy, summary_rows
-from starcal_uq.paper.replicates import crlb_sigmas
+from starcal_uq.paper.replicates import check_settings, crlb_sigmas
+from starcal_uq.paper.statistics import chi_interval
 from starcal_uq.simulation.frames import simulate
+from starcal_uq.sky.catalogue import load_catalogue
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from starcal_uq.camera.camera import Camera
     from starcal_uq.observations.table import Observations
     from starcal_uq.sky.catalogue import StarCatalogue
 
+# Methods of the study, and what they do about the distortion while they estimate the optics.
+HANDLING = {"least squares": "ignores", "samaan": "decouples", "three stages": "couples", "efficient": "couples"}
+REFERENCE = "efficient"
+OPTICS = ("x0", "y0", "f")
+# Axes, and the column that each is drawn and judged against.
+AXES = {"distortion": "corner_size_px", "field": "field_deg", "frames": "n_frames", "stars": "stars_per_frame"}
 # Times the paper's 0.7 px at the corner; the largest is 6 % of the radius there, as for a wide-angle lens.
 DISTORTION_SCALES = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0, 4.0, 15.0, 60.0)
-
-
 FIELDS_DEG = (5.0, 7.0, 10.0, 15.0, 25.0, 40.0)
-
-
 FRAMES = (10, 30, 100, 300, 1000)
-
-
 MAX_MAGS = (5.0, 5.5, 6.0, 6.5, 7.0)
-
-
 # An attitude needs a few stars whatever the axis says.
 LEAST_STARS = 4
+_TEXT = ("axis", "method", "handling", "parameter", "unit")
+_WHOLE = ("n_frames", "min_stars", "seed", "n", "failed")
+_STATISTICS = (
+    *("bias", "bias_se", "design_spread", "noise", "noise_se", "spread", "spread_se", "noise_shift", "noise_shift_se"),
+    *("rmse", "bias_over_noise", "bias_over_noise_low", "bias_over_noise_high"),
+)
+
+
+class Threshold(NamedTuple):
+    """Where along an axis a ratio of a method passes one.
+
+    Attributes
+    ----------
+    kind : str
+        ``bias``: |bias| over noise; ``rmse``: root mean square error over that of the efficient method.
+    axis, method, parameter : str
+        What.
+    side : str
+        ``above`` or ``below`` the value the ratio exceeds one; ``always`` or ``never`` within the range.
+    value : float
+        In the unit of the axis (px at the corner, deg, frames, stars in a frame), interpolated; NaN if there is none.
+    low, high : float
+        Interval of `value` from the 95 % interval of the noise; for ``rmse`` NaN.
+    """
+
+    kind: str
+    axis: str
+    method: str
+    parameter: str
+    side: str
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, eq=False)
+class InteractionStudy(Shown):
+    """Bias and spread of the optics along four axes.
+
+    Attributes
+    ----------
+    table : DataFrame
+        One row per point, method and parameter; its columns below.
+    interrupted : bool
+        Stopped by the user before the last data set.
+    provenance : dict
+        Seed, settings, versions and time; empty when the table was read from a file.
+
+    Columns
+    -------
+    axis, value
+        ``distortion`` (factor on the coefficients), ``field`` (deg), ``frames``, ``stars`` (magnitude limit).
+    corner_px, corner_size_px
+        What the distortion displaces at the farthest corner, px outwards, and its size.
+    field_deg, n_frames, stars_per_frame, max_mag, min_stars, sigma_px, seed
+        The data: `stars_per_frame` is what was found, the others what was asked for.
+    method, handling, parameter, unit
+        Who, what it does about the distortion, and of what.
+    n, failed
+        Replicates with and without a result.
+    bias, bias_se, design_spread
+        Mean error without noise with its standard error, and the standard deviation of that error over designs.
+    noise, noise_se
+        Standard deviation of the difference between the estimates with and without noise: what noise alone does,
+        with its standard error.
+    spread, spread_se
+        Standard deviation of the estimates with noise, over designs and noise, with its standard error.
+    noise_shift, noise_shift_se
+        Mean of that difference, with its standard error.
+    rmse
+        Root mean square error with noise.
+    crlb
+        Cramer-Rao bound on the spread with all parameters unknown.
+    bias_over_noise, bias_over_noise_low, bias_over_noise_high
+        Size of the bias over `noise`, with the 95 % interval that comes from the latter.
+    """
+
+    table: pd.DataFrame
+    interrupted: bool = False
+    provenance: AnyDict = field(default_factory=dict)
+
+    def points(self, axis: str, method: str, parameter: str) -> pd.DataFrame:
+        """Rows of one curve, in the order of the axis."""
+        t = self.table
+        some = t[(t["axis"] == axis) & (t["method"] == method) & (t["parameter"] == parameter)]
+        return some.sort_values(AXES[axis], kind="stable")
+
+    @cached_property
+    def thresholds(self) -> tuple[Threshold, ...]:
+        """Where the bias is one standard deviation of the noise, and where a method falls behind the efficient one."""
+        found = []
+        for axis in AXES:
+            for method in HANDLING:
+                for parameter in OPTICS:
+                    rows = self.points(axis, method, parameter)
+                    rows = rows[np.isfinite(rows["noise"])]
+                    if len(rows) < 2:
+                        continue
+                    at = rows[AXES[axis]].to_numpy()
+                    columns = [f"bias_over_noise{end}" for end in ("", "_low", "_high")]
+                    ratios = [rows[column].to_numpy() for column in columns]
+                    (side, value), *others = (crossing(at, one) for one in ratios)
+                    low, high = (place for _, place in others)
+                    ends = (np.nan, np.nan) if np.isnan(value) else (min(low, high), max(low, high))
+                    found.append(Threshold("bias", axis, method, parameter, side, value, *ends))
+                    if method != REFERENCE:
+                        reference = self.points(axis, REFERENCE, parameter)[["value", "rmse"]]
+                        both = rows.merge(reference, on="value", suffixes=("", "_reference"))
+                        ratio = (both["rmse"] / both["rmse_reference"]).to_numpy()
+                        side, value = crossing(both[AXES[axis]].to_numpy(), ratio)
+                        found.append(Threshold("rmse", axis, method, parameter, side, value, np.nan, np.nan))
+        return tuple(found)
+
+    def thresholds_table(self) -> pd.DataFrame:
+        """One row per threshold, columns as the attributes of `Threshold`."""
+        import pandas as pd
+
+        return pd.DataFrame(list(self.thresholds), columns=list(Threshold._fields))
+
+    def threshold(self, axis: str, method: str, parameter: str, kind: str = "bias") -> Threshold:
+        """One of `thresholds`."""
+        for one in self.thresholds:
+            if (one.axis, one.method, one.parameter, one.kind) == (axis, method, parameter, kind):
+                return one
+        raise ValueError(f"the study has no {kind!r} threshold of {parameter!r} by {method!r} along {axis!r}.")
+
+    def save_csv(self, path: str | os.PathLike[str]) -> None:
+        """Write the table, atomically; overwritten. Numbers keep all digits."""
+        with atomic_path(path) as temporary:
+            self.table.to_csv(temporary, index=False, lineterminator="\n")
+
+    @classmethod
+    def load_csv(cls, path: str | os.PathLike[str]) -> InteractionStudy:
+        """Read what `save_csv` wrote.
+
+        Raises
+        ------
+        RunFolderError
+            If the file is missing or does not hold an interaction study.
+        """
+        import pandas as pd
+
+        try:
+            # As text first: the fast parser of numbers loses the last digit.
+            text = pd.read_csv(path, dtype=str, keep_default_na=False)
+            missing = sorted({*_TEXT, "bias", "spread"} - set(text.columns))
+            if missing:
+                raise ValueError(f"it lacks the column {missing[0]!r}")
+            return cls(pd.DataFrame({name: _column(name, text[name].tolist()) for name in text.columns}))
+        except OSError as error:
+            reason = f"cannot be read ({error.strerror or error})"
+        except ValueError as error:
+            reason = f"is not an interaction study ({error})"
+        raise RunFolderError(f"{path}: {reason}; run `starcal-uq reproduce` to write it again.")
+
+
+def _column(name: str, values: list[str]) -> list[str] | list[int] | list[float]:
+    if name in _TEXT:
+        return values
+    return [int(v) for v in values] if name in _WHOLE else [float(v) if v else np.nan for v in values]
+
+
+def crossing(at: FloatArray, ratio: FloatArray) -> tuple[str, float]:
+    """Where a ratio passes one for good: ``above``, ``below``, ``always`` or ``never``, and the place.
+
+    Interpolated between logarithms, linearly in `at` next to zero.
+    """
+    over = ratio >= 1.0
+    if over.all():
+        return "always", float("nan")
+    if not over.any():
+        return "never", float("nan")
+    if over[-1]:
+        i = int(np.flatnonzero(~over)[-1])
+        side = "above"
+    else:
+        i = int(np.flatnonzero(over)[-1])
+        side = "below"
+    x, y = at[[i, i + 1]], ratio[[i, i + 1]]
+    if x[0] > 0.0 and y.min() > 0.0:
+        share = np.log(y[0]) / (np.log(y[0]) - np.log(y[1]))
+        return side, float(np.exp(np.log(x[0]) + share * (np.log(x[1]) - np.log(x[0]))))
+    share = (1.0 - y[0]) / (y[1] - y[0])
+    return side, float(x[0] + share * (x[1] - x[0]))
 
 
 @dataclass(frozen=True)
@@ -165,8 +353,6 @@ def _count(sky: StarCatalogue, max_mag: float) -> int:
 
 def deep_catalogue(truth: Camera, max_mag: float, base_mag: float, fields_deg: Sequence[float]) -> StarCatalogue:
     """One catalogue of which every condition takes the bright part."""
-    from starcal_uq.sky.catalogue import load_catalogue
-
     sky = load_catalogue(max_mag=max_mag)
     smallest = min([solid_angle_sr(truth), *(solid_angle_sr(_focal_for(truth, field)) for field in fields_deg)])
     needed = _count(sky, base_mag) * solid_angle_sr(truth) / smallest
@@ -270,9 +456,20 @@ def interaction_study(
     CatalogueError
         When a field is too narrow for the catalogue to show enough stars.
     """
+    import pandas as pd
+
     truth = paper_camera() if truth is None else truth
     start = paper_start() if start is None else start
-    _check(truth, start, n_replicates, n_frames, min_stars, sigma_px, workers)
+    check_settings(
+        (bool(truth.coefficients), "the truth has no distortion: give both the same model, with coefficients."),
+        cameras=(truth, start),
+        n_replicates=n_replicates,
+        n_frames=n_frames,
+        min_stars=min_stars,
+        least_stars=LEAST_STARS,
+        sigma_px=sigma_px,
+        workers=workers,
+    )
     sky = deep_catalogue(truth, max([max_mag, *max_mags]), max_mag, fields_deg)
     base = Condition(truth, start, n_frames, min_stars, max_mag)
     points = study_points(base, sky, distortion_scales, fields_deg, frames, max_mags)
@@ -294,7 +491,7 @@ def interaction_study(
             rows += summary_rows(_head(point, some, sigma_px, seed), some)
     settings: AnyDict = {"n_replicates": n_replicates, "n_frames": n_frames, "min_stars": min_stars}
     settings |= {"sigma_px": sigma_px, "max_mag": max_mag}
-    return InteractionStudy.from_rows(rows, interrupted, provenance(seed, settings, None))
+    return InteractionStudy(pd.DataFrame(rows), interrupted, provenance(seed, settings, None))
 
 
 def run_one(plan: Plan, index: int) -> Outcome:
@@ -356,26 +553,35 @@ def _head(point: Point, outcomes: Sequence[Outcome], sigma_px: float, seed: int)
     }
 
 
-def _check(
-    truth: Camera,
-    start: Camera,
-    n_replicates: int,
-    n_frames: int,
-    min_stars: int,
-    sigma_px: float,
-    workers: int | None,
-) -> None:
-    for good, text in (
-        (
-            truth.distortion == start.distortion and bool(truth.coefficients),
-            f"the truth has distortion {truth.distortion!r} and the start {start.distortion!r}: give both the same "
-            "model, with coefficients.",
-        ),
-        (n_replicates >= 2, f"n_replicates is {n_replicates}: a spread needs at least 2."),
-        (n_frames >= 1, f"n_frames is {n_frames}: give at least 1."),
-        (min_stars >= LEAST_STARS, f"min_stars is {min_stars}: give at least {LEAST_STARS}."),
-        (0.0 < sigma_px < np.inf, f"sigma_px is {sigma_px:g}: give a noise above zero."),
-        (workers is None or workers >= 0, f"workers is {workers}: give at least 1, or 0 for this process."),
-    ):
-        if not good:
-            raise SamplingError(text)
+def summary_rows(head: AnyDict, outcomes: Sequence[Outcome]) -> list[AnyDict]:
+    """Rows of one point of an axis: every method and parameter."""
+    noise_free = np.stack([outcome.noise_free for outcome in outcomes], axis=1)
+    noisy = np.stack([outcome.noisy for outcome in outcomes], axis=1)
+    bound = np.sqrt(np.mean(np.stack([outcome.crlb for outcome in outcomes]) ** 2, axis=0))
+    rows = []
+    for (method, handling), clean, full in zip(HANDLING.items(), noise_free, noisy, strict=True):
+        good = np.isfinite(clean[:, 0]) & np.isfinite(full[:, 0])
+        for j, parameter in enumerate(OPTICS):
+            body: AnyDict = {"method": method, "handling": handling, "parameter": parameter, "unit": "px"}
+            body |= {"n": int(np.sum(good)), "failed": int(np.sum(~good))}
+            rows.append(head | body | _summary(clean[good, j], full[good, j]) | {"crlb": float(bound[j])})
+    return rows
+
+
+def _summary(clean: FloatArray, full: FloatArray) -> AnyDict:
+    n = len(clean)
+    if n < 2:
+        return dict.fromkeys(_STATISTICS, np.nan)
+    bias, design = float(np.mean(clean)), float(np.std(clean, ddof=1))
+    change = full - clean
+    noise, spread = float(np.std(change, ddof=1)), float(np.std(full, ddof=1))
+    low, high = chi_interval(n)
+    values = (
+        *(bias, design / np.sqrt(n), design),
+        *(noise, noise / np.sqrt(2.0 * (n - 1))),
+        *(spread, spread / np.sqrt(2.0 * (n - 1))),
+        *(float(np.mean(change)), noise / np.sqrt(n)),
+        float(np.sqrt(np.mean(full**2))),
+        *(abs(bias) / noise, abs(bias) / noise * low, abs(bias) / noise * high),
+    )
+    return dict(zip(_STATISTICS, map(float, values), strict=True))

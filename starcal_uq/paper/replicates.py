@@ -6,55 +6,216 @@ estimates, the sigmas that each method gives, and the Cramer-Rao bound of the de
 
 from __future__ import annotations
 
-import dataclasses
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import parameters
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError, DistortionError, SamplingError, StarcalError
 from starcal_uq.core.provenance import provenance
+from starcal_uq.core.records import read, write
 from starcal_uq.core.tasks import Progress, run_tasks
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
+from starcal_uq.maths.intervals import holm
 from starcal_uq.maths.linear import inverse_diagonal
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.paper.errors import map_error, reprojection_error_px
 from starcal_uq.paper.methods import METHODS, Method
-from starcal_uq.paper.replicates_result import Replicates
+from starcal_uq.paper.statistics import FAMILY_LEVEL, classical_words, summarise, words
 from starcal_uq.simulation.frames import simulate
+from starcal_uq.sky.catalogue import load_catalogue
 
 if TYPE_CHECKING:
-    from starcal_uq.camera.camera import Camera
+    import pandas as pd
+
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.observations.table import Observations
     from starcal_uq.sky.catalogue import StarCatalogue
 
 # A replicate takes about half a second at a thousand frames.
 _CHUNK = 2
+# A slow option of a method, which is there to show what it claims, takes part in one of so many replicates.
+SHARE = 4
+_LEAST = 8
+_TESTS = ("bias_p", "claimed_p", "coverage95_p", "claimed_classical_p")
+_FORMAT = "starcal_uq replicates 1"
+# Arrays with one entry for each method and replicate.
+_BY_METHOD = ("estimates", "claimed", "classical", "map_px", "map_arcsec", "reprojection_px")
+_ARRAYS = ("replicate", "crlb", *_BY_METHOD)
+
+
+@dataclass(frozen=True, eq=False)
+class Replicates(Shown):
+    """Estimates and claims of M methods over n replicates, for p parameters of the truth.
+
+    Attributes
+    ----------
+    methods : tuple of Method
+        Who calibrated; all of them the same data.
+    truth, start : Camera
+        What was simulated, and where every method started.
+    replicate : (n,) array of int
+        Numbers of the replicates.
+    estimates : (M, n, p) array
+        Estimates, px units; NaN for parameters that a method leaves out, and where it failed.
+    claimed : (M, n, p) array
+        The standard deviation that the method gives with each.
+    classical : (M, n, p) array
+        Standard deviations by the formula of the textbooks: ``(J^T J)^-1 s^2`` with pairs taken as independent for
+        least squares over pairs, and a filter's own for filters. NaN where there is none.
+    crlb : (n, p) array
+        Cramer-Rao bound on the standard deviations for each design, at the truth, all p parameters and the attitudes
+        unknown.
+    map_px, map_arcsec : (M, n) arrays
+        Root mean square error over the detector of the directions that an estimated camera gives, the best common
+        rotation removed (`starcal_uq.paper.errors.map_error`); NaN where the estimated distortion folds over.
+    reprojection_px : (M, n) array
+        Eq. 16 of the paper over the detector, without noise
+        (`starcal_uq.paper.errors.reprojection_error_px`): blind to a wrong focal length.
+    failures : tuple of tuple of str
+        For each method and replicate why there is no result; empty where there is one.
+    n_requested : int
+        Replicates asked for.
+    interrupted : bool
+        Stopped by the user before the last one.
+    provenance : dict
+        Seed, settings, versions and time.
+    """
+
+    methods: tuple[Method, ...]
+    truth: Camera
+    start: Camera
+    replicate: IntArray
+    estimates: FloatArray
+    claimed: FloatArray
+    classical: FloatArray
+    crlb: FloatArray
+    map_px: FloatArray
+    map_arcsec: FloatArray
+    reprojection_px: FloatArray
+    failures: tuple[tuple[str, ...], ...]
+    n_requested: int
+    interrupted: bool
+    provenance: AnyDict
+
+    @property
+    def n_replicates(self) -> int:
+        """Number of replicates."""
+        return len(self.replicate)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of the methods."""
+        return tuple(method.label for method in self.methods)
+
+    @property
+    def bound(self) -> FloatArray:
+        """Cramer-Rao bound (p,) on the spread over replicates: root mean square over the designs."""
+        return np.asarray(np.sqrt(np.mean(self.crlb**2, axis=0)))
+
+    def _at(self, label: str) -> int:
+        if label not in self.labels:
+            raise ValueError(f"there is no method {label!r}: use one of {', '.join(self.labels)}.")
+        return self.labels.index(label)
+
+    @cached_property
+    def _rows(self) -> list[AnyDict]:
+        """Statistics of every method and parameter, with verdicts."""
+        rows: list[AnyDict] = []
+        for i, method in enumerate(self.methods):
+            good = np.isfinite(self.estimates[i, :, 0])
+            for j, parameter in enumerate(parameters(self.truth.distortion)):
+                error = self.estimates[i, good, j] - self.truth.theta[j]
+                if not np.isfinite(error).all():
+                    continue
+                found = summarise(error, self.claimed[i, good, j], self.classical[i, good, j], float(self.bound[j]))
+                head = {"method": method.label, "parameter": parameter.name, "unit": parameter.unit}
+                rows.append(head | {"truth": float(self.truth.theta[j])} | found)
+        # One family: whoever reads the table looks at every test in it.
+        rejected = (holm([row[test] for row in rows for test in _TESTS]) <= FAMILY_LEVEL).reshape(-1, len(_TESTS))
+        for row, (bias, claim, coverage, classical) in zip(rows, rejected.tolist(), strict=True):
+            row["biased"], row["claim_wrong"], row["classical_wrong"] = bias, claim, classical
+            row["verdict"] = words(row, bias, claim, coverage)
+            row["verdict_classical"] = classical_words(row, classical)
+        return rows
+
+    def table(self) -> pd.DataFrame:
+        """One row per method and parameter, in px units.
+
+        Columns
+        -------
+        method, parameter, unit, truth, n
+            What, and over how many replicates.
+        bias, bias_se, bias_over_spread
+            Mean error with its standard error, and as a multiple of the spread.
+        spread, spread_se, crlb
+            Standard deviation of the estimates with its standard error, and the Cramer-Rao bound on it.
+        efficiency, efficiency_low, efficiency_high
+            Variance of the bound over that of the estimates, with 95 % interval. It can exceed one for methods that
+            are biased, or that leave parameters out.
+        rmse, rmse_over_crlb
+            Root mean square error, bias and spread together.
+        claimed, claimed_over_spread, .._low, .._high
+            Root mean square of the method's own standard deviations; over the spread, with 95 % interval.
+        claimed_over_rmse
+            The same over the root mean square error: what it claims of its error, bias included.
+        coverage95, coverage95_low, coverage95_high
+            How often the claimed 95 % interval holds the truth, with Wilson interval.
+        claimed_classical, ...
+            The same eight for the formula of the textbooks: pairs taken as independent, or a filter's own covariance.
+        bias_p, claimed_p, coverage95_p, claimed_classical_p, coverage95_classical_p
+            p-values of single tests; the verdicts rest on Holm's procedure over all of them at 1 %.
+        biased, claim_wrong, classical_wrong
+            What the procedure rejects: that the mean error is zero, that the spread is as claimed, and that it is as
+            the formula of the textbooks claims.
+        verdict, verdict_classical
+            In words.
+        """
+        import pandas as pd
+
+        return pd.DataFrame(self._rows)
+
+    def row(self, label: str, parameter: str) -> AnyDict:
+        """The row of the table of one method and parameter."""
+        for row in self._rows:
+            if (row["method"], row["parameter"]) == (label, parameter):
+                return row
+        raise ValueError(f"the method {label!r} has no estimate of {parameter!r}.")
+
+    def n_failed(self, label: str) -> int:
+        """Number of replicates in which a method gave no result."""
+        return sum(map(bool, self.failures[self._at(label)]))
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write everything to one ``.npz`` file, atomically; overwritten."""
+        write(self, path, _FORMAT)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Replicates:
+        """Read what `save` wrote, without loss.
+
+        Raises
+        ------
+        RunFolderError
+            If the file is missing or is not a set of replicates.
+        """
+        missing = "run `starcal-uq reproduce` first"
+        wrong = "does not hold replicates; run `starcal-uq reproduce` to write it again"
+        return read(cls, path, _FORMAT, missing=missing, wrong=wrong)
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """What all replicates share; sent once to every process.
-
-    Attributes
-    ----------
-    stars : StarCatalogue
-        Sky.
-    methods : tuple of Method
-        Who calibrates.
-    truth, start : Camera
-        What is simulated, and where every method starts.
-    n_frames, min_stars, sigma_px
-        As in `simulate`.
-    seed : int
-        Replicate i depends on the seed and on i alone.
-    """
+    """What all replicates share, as in `replicate`, and in how many slow methods take part; sent to every process."""
 
     stars: StarCatalogue
     methods: tuple[Method, ...]
@@ -64,34 +225,12 @@ class Experiment:
     min_stars: int
     sigma_px: float
     seed: int
+    n_slow: int
 
 
-class Outcome(NamedTuple):
-    """One replicate, for M methods and p parameters.
-
-    Attributes
-    ----------
-    replicate : int
-        Its number.
-    estimates, claimed, classical : (M, p) arrays
-        Estimates, their claimed standard deviations, and those of textbooks; NaN where there is none.
-    crlb : (p,) array
-        Cramer-Rao bound on the standard deviations, for this design at the truth.
-    map_px, map_arcsec, reprojection_px : (M,) arrays
-        Errors of the estimated cameras over the field (see `Replicates`); NaN where there is none.
-    failures : tuple of str
-        Why a method has no result; empty where it has.
-    """
-
-    replicate: int
-    estimates: FloatArray
-    claimed: FloatArray
-    classical: FloatArray
-    crlb: FloatArray
-    map_px: FloatArray
-    map_arcsec: FloatArray
-    reprojection_px: FloatArray
-    failures: tuple[str, ...]
+def is_slow(method: Method) -> bool:
+    """Whether a method is a filter that forms every pair."""
+    return method.recursion is not None and method.recursion.pair_covariance == "diagonal"
 
 
 def replicate(
@@ -108,6 +247,7 @@ def replicate(
     workers: int | None = None,
     progress: Progress | None = None,
     stars: StarCatalogue | None = None,
+    share_slow: bool = False,
 ) -> Replicates:
     """Calibrate many simulated data sets with every method, and set their errors against their claims.
 
@@ -131,6 +271,9 @@ def replicate(
         Called as ``progress(done, total)``.
     stars : StarCatalogue, optional
         The sky, instead of the embedded catalogue to `max_mag`.
+    share_slow : bool
+        Run the filter that forms every pair in the first quarter of the replicates only, at least 8; the others hold
+        NaN for it.
 
     Returns
     -------
@@ -146,14 +289,25 @@ def replicate(
     CalibrationError
         When a method never gave a result.
     """
-    from starcal_uq.sky.catalogue import load_catalogue
-
     methods = tuple(methods)
     truth = paper_camera() if truth is None else truth
     start = paper_start() if start is None else start
-    _check(methods, truth, start, n_replicates, n_frames, min_stars, sigma_px, workers)
+    labels = [method.label for method in methods]
+    twice = sorted({label for label in labels if labels.count(label) > 1})
+    check_settings(
+        (bool(methods), "there are no methods to compare: give at least one."),
+        (not twice, f"several methods have the label {' and '.join(map(repr, twice))}: give each its own."),
+        cameras=(truth, start),
+        n_replicates=n_replicates,
+        n_frames=n_frames,
+        min_stars=min_stars,
+        least_stars=3,
+        sigma_px=sigma_px,
+        workers=workers,
+    )
     sky = load_catalogue(max_mag=max_mag) if stars is None else stars
-    experiment = Experiment(sky, methods, truth, start, n_frames, min_stars, sigma_px, seed)
+    n_slow = max(_LEAST, n_replicates // SHARE) if share_slow else n_replicates
+    experiment = Experiment(sky, methods, truth, start, n_frames, min_stars, sigma_px, seed, n_slow)
     outcomes, interrupted = run_tasks(
         partial(run_replicate, experiment),
         n_replicates,
@@ -162,39 +316,64 @@ def replicate(
         workers=workers,
         progress=progress,
     )
-    failures = tuple(zip(*(outcome.failures for outcome in outcomes), strict=True))
-    for method, reasons in zip(methods, failures, strict=True):
-        if all(reasons):
+    arrays = {name: np.stack([one[name] for one in outcomes], axis=int(name in _BY_METHOD)) for name in _ARRAYS}
+    failures = tuple(zip(*(outcome["failures"] for outcome in outcomes), strict=True))
+    for method, values, reasons in zip(methods, arrays["estimates"], failures, strict=True):
+        if not np.isfinite(values[:, 0]).any():
             raise CalibrationError(f"the method {method.label!r} never gave a result; first reason: {reasons[0]}")
-    settings: AnyDict = {
-        "n_replicates": n_replicates,
-        "n_frames": n_frames,
-        "min_stars": min_stars,
-        "sigma_px": sigma_px,
-        "max_mag": max_mag,
-        "stars": "embedded" if stars is None else stars.source,
-    }
+    settings: AnyDict = {"n_replicates": n_replicates, "n_frames": n_frames, "min_stars": min_stars}
+    settings |= {"sigma_px": sigma_px, "max_mag": max_mag, "stars": "embedded" if stars is None else stars.source}
     return Replicates(
         methods=methods,
         truth=truth,
         start=start,
-        replicate=np.array([outcome.replicate for outcome in outcomes]),
-        estimates=np.stack([outcome.estimates for outcome in outcomes], axis=1),
-        claimed=np.stack([outcome.claimed for outcome in outcomes], axis=1),
-        classical=np.stack([outcome.classical for outcome in outcomes], axis=1),
-        crlb=np.stack([outcome.crlb for outcome in outcomes]),
-        map_px=np.stack([outcome.map_px for outcome in outcomes], axis=1),
-        map_arcsec=np.stack([outcome.map_arcsec for outcome in outcomes], axis=1),
-        reprojection_px=np.stack([outcome.reprojection_px for outcome in outcomes], axis=1),
         failures=failures,
         n_requested=n_replicates,
         interrupted=interrupted,
         provenance=provenance(seed, settings, None),
+        **arrays,
     )
 
 
-def run_replicate(experiment: Experiment, index: int) -> Outcome:
-    """Replicate number `index`; a calibration that fails is an outcome, a sky without stars an error."""
+def check_settings(
+    *others: tuple[bool, str],
+    cameras: tuple[Camera, Camera],
+    n_replicates: int,
+    n_frames: int,
+    min_stars: int,
+    least_stars: int,
+    sigma_px: float,
+    workers: int | None,
+) -> None:
+    """Refuse settings of a study over seeds that cannot work; `others` are conditions and what to say without them.
+
+    Raises
+    ------
+    SamplingError
+        In one sentence.
+    """
+    models = [camera.distortion for camera in cameras]
+    for good, text in (
+        *others,
+        (
+            models[0] == models[1],
+            f"the truth has distortion {models[0]!r} and the start {models[1]!r}: give both the same model.",
+        ),
+        (n_replicates >= 2, f"n_replicates is {n_replicates}: a spread needs at least 2."),
+        (n_frames >= 1, f"n_frames is {n_frames}: give at least 1."),
+        (min_stars >= least_stars, f"min_stars is {min_stars}: give at least {least_stars}."),
+        (0.0 < sigma_px < np.inf, f"sigma_px is {sigma_px:g}: give a noise above zero."),
+        (workers is None or workers >= 0, f"workers is {workers}: give at least 1, or 0 for this process."),
+    ):
+        if not good:
+            raise SamplingError(text)
+
+
+def run_replicate(experiment: Experiment, index: int) -> AnyDict:
+    """Replicate number `index`, by the names of the arrays of `Replicates`.
+
+    A calibration that fails is an outcome, a sky without stars an error.
+    """
     noise = np.random.SeedSequence(experiment.seed, spawn_key=(index,))
     truth = experiment.truth
     obs = simulate(
@@ -210,7 +389,9 @@ def run_replicate(experiment: Experiment, index: int) -> Outcome:
     estimates, claimed, classical = (np.full((m, p), np.nan) for _ in range(3))
     errors = np.full((3, m), np.nan)
     failures = [""] * m
-    for i, solved in enumerate(solve_all(experiment.methods, obs, frames, experiment.start)):
+    chosen = [i for i, method in enumerate(experiment.methods) if index < experiment.n_slow or not is_slow(method)]
+    methods = [experiment.methods[i] for i in chosen]
+    for i, solved in zip(chosen, solve_all(methods, obs, frames, experiment.start), strict=True):
         if isinstance(solved, StarcalError):
             failures[i] = str(solved)
             continue
@@ -219,10 +400,9 @@ def run_replicate(experiment: Experiment, index: int) -> Outcome:
         estimates[i, :q], claimed[i, :q], classical[i, :q] = solved.theta, solved.sigmas, solved.classical
         errors[:, i] = field_errors(truth, solved.camera)
     crlb = crlb_sigmas(frames, truth, experiment.sigma_px)
-    map_px, map_arcsec, reprojection_px = errors
-    return Outcome(
-        index, estimates, claimed, classical, crlb, map_px, map_arcsec, reprojection_px, failures=tuple(failures)
-    )
+    arrays = (estimates, claimed, classical, *errors)
+    found: AnyDict = {"replicate": index, "crlb": crlb, "failures": tuple(failures)}
+    return found | dict(zip(_BY_METHOD, arrays, strict=True))
 
 
 def field_errors(truth: Camera, estimate: Camera) -> tuple[float, float, float]:
@@ -250,37 +430,7 @@ def crlb_sigmas(frames: StarFrames, truth: Camera, sigma_px: float) -> FloatArra
     return np.sqrt(inverse_diagonal(likelihood.evaluate(truth.theta).matrix)) * sigma_px
 
 
-def _check(
-    methods: tuple[Method, ...],
-    truth: Camera,
-    start: Camera,
-    n_replicates: int,
-    n_frames: int,
-    min_stars: int,
-    sigma_px: float,
-    workers: int | None,
-) -> None:
-    labels = [method.label for method in methods]
-    twice = sorted({label for label in labels if labels.count(label) > 1})
-    for good, text in (
-        (bool(methods), "there are no methods to compare: give at least one."),
-        (not twice, f"several methods have the label {' and '.join(map(repr, twice))}: give each its own."),
-        (
-            truth.distortion == start.distortion,
-            f"the truth has distortion {truth.distortion!r} and the start {start.distortion!r}: give both the same.",
-        ),
-        (n_replicates >= 2, f"n_replicates is {n_replicates}: a spread needs at least 2."),
-        (n_frames >= 1, f"n_frames is {n_frames}: give at least 1."),
-        (min_stars >= 3, f"min_stars is {min_stars}: an attitude needs at least 3."),
-        (0.0 < sigma_px < np.inf, f"sigma_px is {sigma_px:g}: give a noise above zero."),
-        (workers is None or workers >= 0, f"workers is {workers}: give at least 1, or 0 for this process."),
-    ):
-        if not good:
-            raise SamplingError(text)
-
-
-@dataclass(frozen=True)
-class Solved:
+class Solved(NamedTuple):
     """What a method found.
 
     Attributes
@@ -360,87 +510,3 @@ def textbook_sigmas(pairs: PairObjective, theta: FloatArray) -> FloatArray:
     normal = pairs.evaluate(theta)
     variance = normal.cost / (pairs.n_pairs - len(theta))
     return np.sqrt(inverse_diagonal(normal.matrix) * variance)
-
-
-# One in so many replicates for options of a method, which are there to show what they claim.
-SHARE = 4
-
-
-_LEAST = 8
-
-
-def is_slow(method: Method) -> bool:
-    """Whether a method takes part in one of `SHARE` replicates only: the filter that forms every pair."""
-    return method.recursion is not None and method.recursion.pair_covariance == "diagonal"
-
-
-def replicate_shared(
-    truth: Camera,
-    start: Camera,
-    *,
-    n_replicates: int,
-    n_frames: int,
-    seed: int,
-    workers: int | None,
-    progress: Progress | None,
-    methods: Sequence[Method] = METHODS,
-) -> Replicates:
-    """As `replicate`, but with slow methods in the first replicates only; the others hold NaN for them.
-
-    Raises
-    ------
-    SamplingError
-        If processes cannot be used.
-    CalibrationError
-        When a method never gave a result.
-    """
-    fast, slow = (tuple(m for m in methods if is_slow(m) is kind) for kind in (False, True))
-    options: AnyDict = {"truth": truth, "start": start, "n_frames": n_frames, "seed": seed, "workers": workers}
-    n_few = min(n_replicates, max(_LEAST, n_replicates // SHARE)) if slow else 0
-    total = n_replicates + n_few
-
-    def part(before: int) -> Progress | None:
-        return None if progress is None else lambda done, _: progress(before + done, total)
-
-    most = replicate(methods=fast, n_replicates=n_replicates, progress=part(0), **options)
-    if not slow or most.interrupted:
-        return most
-    few = replicate(methods=slow, n_replicates=n_few, progress=part(n_replicates), **options)
-    return joined(most, few, methods)
-
-
-def joined(most: Replicates, few: Replicates, methods: Sequence[Method]) -> Replicates:
-    """Two sets of replicates with different methods as one.
-
-    Parameters
-    ----------
-    most, few : Replicates
-        Of the same seed, truth and start; the replicates of `few` are the first ones of `most`, with the same data.
-    methods : sequence of Method
-        Those of both, in the order of the result.
-
-    Raises
-    ------
-    ValueError
-        When the replicates of `few` are not the first ones of `most`.
-    """
-    n, k = most.n_replicates, few.n_replicates
-    if not np.array_equal(most.replicate[:k], few.replicate) or not np.allclose(most.crlb[:k], few.crlb):
-        raise ValueError("the replicates to join are not of the same data: give both the same seed and settings.")
-
-    def one(name: str, method: Method) -> FloatArray:
-        if method in most.methods:
-            return np.asarray(getattr(most, name)[most.methods.index(method)])
-        values = getattr(few, name)[few.methods.index(method)]
-        padding = np.full((n - k, *values.shape[1:]), np.nan)
-        return np.concatenate([values, padding])
-
-    arrays = ("estimates", "claimed", "classical", "map_px", "map_arcsec", "reprojection_px")
-    none = ("",) * (n - k)
-    failures = tuple(
-        most.failures[most.methods.index(m)] if m in most.methods else (*few.failures[few.methods.index(m)], *none)
-        for m in methods
-    )
-    changes: AnyDict = {name: np.stack([one(name, method) for method in methods]) for name in arrays}
-    interrupted = most.interrupted or few.interrupted
-    return dataclasses.replace(most, methods=tuple(methods), failures=failures, interrupted=interrupted, **changes)

@@ -3,27 +3,23 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.files import (
-    PathLike,
-    atomic_path,
-    atomic_write_bytes,
-    atomic_write_text,
-    check_new_folder,
-    new_folder,
-)
+from starcal_uq.core.files import PathLike, atomic_write_text, check_new_folder
 from starcal_uq.core.provenance import provenance
+from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import AnyDict
+from starcal_uq.paper.camera import paper_camera, paper_start
+from starcal_uq.paper.checks import paper_checks
+from starcal_uq.paper.commands import Bar, write_tables
+from starcal_uq.paper.experiment import run_paper
+from starcal_uq.paper.interaction import interaction_study
 from starcal_uq.paper.published import PAPER_METHODS
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from starcal_uq.core.tasks import Progress
-    from starcal_uq.paper.experiment import PaperRun
-    from starcal_uq.paper.result import Reproduction
+from starcal_uq.paper.readings import run_readings
+from starcal_uq.paper.replicates import replicate
+from starcal_uq.paper.result import Reproduction
+from starcal_uq.paper.show.pages import reproduction_figures, reproduction_page
+from starcal_uq.paper.table_2 import judge_all
 
 # Replicates of every reading, and of the study: enough for z-values to ten per cent, and for the figure.
 N_READING_DRAWS = 12
@@ -87,19 +83,13 @@ def reproduce(
     KeyboardInterrupt
         After Ctrl-C; nothing is written then.
     """
-    from starcal_uq.paper.camera import paper_camera, paper_start
-    from starcal_uq.paper.checks import paper_checks
-    from starcal_uq.paper.experiment import run_paper
-    from starcal_uq.paper.interaction import interaction_study
-    from starcal_uq.paper.readings import run_readings
-    from starcal_uq.paper.replicates import replicate_shared
-    from starcal_uq.paper.result import Reproduction
-    from starcal_uq.paper.table_2 import judge_all
-
     folder = Path(out)
     check_new_folder(folder, force)
-    _check_sizes(n_replicates, n_frames)
-    bar = _Bar(progress, study)
+    if n_replicates < 8:
+        raise CalibrationError(f"n_replicates is {n_replicates}: a comparison over seeds needs at least 8.")
+    if n_frames < 20:
+        raise CalibrationError(f"n_frames is {n_frames}: the experiment needs at least 20.")
+    bar = Bar(progress, {name: share for name, share in _SHARES.items() if study or name != "study"})
     truth, start = paper_camera(convention), paper_start(convention)
     run = run_paper(convention=convention, n_frames=n_frames, seed=seed)
     bar.finish("run")
@@ -112,9 +102,10 @@ def reproduce(
         progress=bar.part("readings"),
     )
     _stop_if(interrupted)
-    replicates = replicate_shared(
-        truth,
-        start,
+    replicates = replicate(
+        truth=truth,
+        start=start,
+        share_slow=True,
         n_replicates=n_replicates,
         n_frames=n_frames,
         seed=seed,
@@ -135,97 +126,27 @@ def reproduce(
         _stop_if(varied.interrupted)
     settings: AnyDict = {"convention": convention, "n_replicates": n_replicates, "n_frames": n_frames}
     settings |= {"n_reading_draws": readings.n_draws, "study": study}
+    calibrations = {name: run.of(name) for name in PAPER_METHODS}
+    sigmas = {name: dict(zip(c.parameter_names, c.sigmas.tolist(), strict=True)) for name, c in calibrations.items()}
     found = Reproduction(
         path=folder,
         run=run,
         replicates=replicates,
         readings=readings,
         judged=judge_all(readings, replicates),
-        checks=paper_checks(truth, run.observations.xy, _sigmas(run)),
+        checks=paper_checks(truth, run.observations.xy, sigmas),
         study=varied,
         provenance=provenance(seed, settings, run.observations.data_hash),
     )
-    _write(found)
+    figures = reproduction_figures(found)
+    page = reproduction_page(found, figures)
+    write_tables(folder, found.tables(), figures)
+    replicates.save(folder / "replicates.npz")
+    atomic_write_text(found.report, page)
     bar.finish("report")
     return found
-
-
-class _Bar:
-    """One progress bar for several parts."""
-
-    def __init__(self, progress: Progress | None, study: bool) -> None:
-        self.progress = progress
-        self.shares = {name: share for name, share in _SHARES.items() if study or name != "study"}
-        self.total = sum(self.shares.values())
-        self.done = 0
-
-    def part(self, name: str) -> Progress:
-        """A progress callback for one part; the parts come in their order."""
-        before, share = self.done, self.shares[name]
-
-        def move(done: int, total: int) -> None:
-            self.done = before + share * done // max(total, 1)
-            self._show()
-
-        return move
-
-    def finish(self, name: str) -> None:
-        """A part that has no steps is done."""
-        self.done += self.shares[name]
-        self._show()
-
-    def _show(self) -> None:
-        if self.progress is not None:
-            self.progress(self.done, self.total)
-
-
-def _check_sizes(n_replicates: int, n_frames: int) -> None:
-    if n_replicates < 8:
-        raise CalibrationError(f"n_replicates is {n_replicates}: a comparison over seeds needs at least 8.")
-    if n_frames < 20:
-        raise CalibrationError(f"n_frames is {n_frames}: the experiment needs at least 20.")
 
 
 def _stop_if(interrupted: bool) -> None:
     if interrupted:
         raise KeyboardInterrupt
-
-
-def _sigmas(run: PaperRun) -> dict[str, dict[str, float]]:
-    """Claimed standard deviations of the paper's methods, px units."""
-    found = {}
-    for name in PAPER_METHODS:
-        cal = run.of(name)
-        found[name] = dict(zip(cal.parameter_names, cal.sigmas.tolist(), strict=True))
-    return found
-
-
-def _write(found: Reproduction) -> None:
-    """Everything that is computed, the report last: it is there only if all else is."""
-    from starcal_uq.paper.show.reproduction import draw_figures, render
-
-    figures = draw_figures(found)
-    page = render(found, figures)
-    new_folder(found.path)
-    folder = new_folder(found.path / "figures")
-    for name, png in figures.items():
-        atomic_write_bytes(folder / f"{name}.png", png)
-    for name, table in _tables(found).items():
-        with atomic_path(found.path / f"{name}.csv") as temporary:
-            table.to_csv(temporary, index=False, lineterminator="\n")
-    found.replicates.save(found.path / "replicates.npz")
-    if found.study is not None:
-        found.study.save_csv(found.path / "interaction.csv")
-    atomic_write_text(found.report, page)
-
-
-def _tables(found: Reproduction) -> dict[str, pd.DataFrame]:
-    return {
-        "table_2": found.table_2(),
-        "published": found.published(),
-        "trials": found.trials(),
-        "checks": found.checks_frame(),
-        "rows": found.rows_frame(),
-        "errors": found.errors(),
-        "replicates": found.replicates.table(),
-    }

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.paper.errors import REPROJECTION, reprojection_error_px
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.paper.experiment import PaperRun
     from starcal_uq.paper.readings import Readings
-    from starcal_uq.paper.replicates_result import Replicates
+    from starcal_uq.paper.replicates import Replicates
 
 # Parameter of a camera -> quantity as the paper prints it.
 QUANTITIES = {"f": "f_mm", "x0": "x0_px", "y0": "y0_px", "k1": "k1", "k2": "k2"}
@@ -53,7 +52,7 @@ def _replicated(replicates: Replicates, index: int, quantity: str) -> FloatArray
         return np.abs(replicates.estimates[index, :, 1] - replicates.truth.y0_px)
     for parameter, name in QUANTITIES.items():
         if name == quantity:
-            column = replicates.parameter_names.index(parameter)
+            column = replicates.truth.parameter_names.index(parameter)
             return np.asarray(replicates.estimates[index, :, column] * per_px(replicates.truth, parameter))
     return np.empty(0)
 
@@ -257,11 +256,3 @@ def _reprojection_row(run: PaperRun, label: str, camera: Camera, draws: FloatArr
         "sigma_crlb": np.nan,
         "z_truth": np.nan,
     }
-
-
-def scaled_unit(quantity: str) -> tuple[float, str]:
-    """Scale and unit in which a quantity is shown: coefficients are tiny."""
-    for parameter in parameters("brown"):
-        if parameter.name == quantity:
-            return parameter.scale, parameter.scaled_unit
-    return 1.0, quantity.rpartition("_")[2]

@@ -30,9 +30,7 @@ def template_environment() -> Environment:
     import jinja2
 
     return jinja2.Environment(
-        loader=jinja2.ChoiceLoader(
-            [jinja2.PackageLoader(package) for package in ("starcal_uq.presentation", "starcal_uq.paper.show")]
-        ),
+        loader=jinja2.PackageLoader("starcal_uq.presentation"),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -36,7 +36,7 @@ def test_reproduce_field_writes_a_page_and_tables(cli, tmp_path):
     size = ("--replicates", 20, "--frames", 20, "--workers", 1)
     status, out, _ = cli("reproduce-field", "-o", "field", *size)
     assert status == 0
-    assert "after alignment" in out
+    assert "after alignment" in out and "come out" in out
     assert len(pd.read_csv(tmp_path / "field" / "table_3.csv")) == 16
     assert (tmp_path / "field" / "field.html").exists()
     status, _, err = cli("reproduce-field", "-o", "field", *size)

@@ -29,6 +29,7 @@ from starcal_uq.paper.field.published import (
     X0_PX,
     Y0_PX,
     printed_field,
+    printed_sensor,
 )
 from starcal_uq.paper.field.result import ALIGNED, AS_IT_STANDS, BOTH, NEITHER
 
@@ -45,7 +46,8 @@ def test_table_3_is_complete() -> None:
 def test_reading_is_one_consistent_sensor(name: str) -> None:
     reading = READINGS[name]
     truth = reading.truth
-    kept = {fact.name: fact.kept for fact in reading.facts}
+    kept = {fact: good for fact, _, good, _ in printed_sensor(reading)}
+    assert kept["field"] == (name == "window") and len(kept) == 5
     assert (abs(truth.fov_deg[0] - FIELD_DEG) < 0.05) == kept["field"]
     assert (truth.x0_px + reading.offset_px, truth.y0_px + reading.offset_px) == pytest.approx((X0_PX, Y0_PX))
     # The window is the middle of the detector, so that both readings have one centre.
@@ -182,7 +184,7 @@ def test_writes_report_and_tables(small) -> None:
     assert {path.name for path in (found.path / "figures").iterdir()} == {"field_rates.png", "field_errors.png"}
     page = found.report.read_text(encoding="utf-8")
     assert "http" not in page and "<script" not in page and not re.search(r"\b(nan|None)\b", page)
-    assert "127.2" in page and found.verdict.split(".")[0] in page
+    assert "127.2" in page and found.text.split(".")[0] in page
     assert seen == sorted(seen) and seen[-1] == 100
     assert len(pd.read_csv(found.path / "frames.csv")) == 20 * len(FIELD_CAMERAS)
     assert found.provenance["seed"] == 2017 and found.provenance["settings"]["reading"] == "window"

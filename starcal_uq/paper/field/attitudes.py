@@ -20,10 +20,11 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import unproject
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import CalibrationError, DistortionError
-from starcal_uq.core.tasks import Progress, run_tasks
+from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.identification.search import LEAST_SIGMA_PX
+from starcal_uq.paper.commands import run_or_stop
 from starcal_uq.paper.field.frames import FieldFrames
 from starcal_uq.paper.field.identification import FieldIdentification, true_pixels
 from starcal_uq.paper.published import PAPER_METHODS
@@ -32,9 +33,10 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
     from starcal_uq.sky.catalogue import StarCatalogue
 
-
 # What can be wrong with a camera, by itself.
 SOURCES = ("principal point", "focal length", "distortion")
+PARTS = ("rms", "aligned", "common", "rest", "noise")
+_CHUNK = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,12 +181,6 @@ def _rms(error: FloatArray) -> FloatArray:
     return size
 
 
-PARTS = ("rms", "aligned", "common", "rest", "noise")
-
-
-_CHUNK = 4
-
-
 @dataclass(frozen=True, eq=False)
 class FieldReplicates:
     """Errors over repetitions.
@@ -207,21 +203,17 @@ class FieldReplicates:
         return low, high
 
 
+@dataclass(frozen=True, eq=False)
 class _ReplicateTask:
     """One repetition: {camera: {part: (3,)}}, without the methods that failed."""
 
-    def __init__(
-        self,
-        campaign: Observations,
-        campaign_px: FloatArray,
-        scale: float,
-        nominal: Camera,
-        tests: Mapping[str, FieldStars],
-        cameras: Mapping[str, Camera],
-        seed: int,
-    ) -> None:
-        self.campaign, self.campaign_px, self.scale, self.nominal = campaign, campaign_px, scale, nominal
-        self.tests, self.cameras, self.seed = tests, cameras, seed
+    campaign: Observations
+    campaign_px: FloatArray
+    scale: float
+    nominal: Camera
+    tests: Mapping[str, FieldStars]
+    cameras: Mapping[str, Camera]
+    seed: int
 
     def __call__(self, number: int) -> dict[str, dict[str, FloatArray]]:
         rng = np.random.default_rng([self.seed, 2, number])
@@ -259,38 +251,21 @@ def replicate_field(
 ) -> FieldReplicates:
     """Repeat calibration and test with other noise.
 
-    Parameters
-    ----------
-    campaign : Observations
-        What was calibrated.
-    campaign_px : (m, 2) array
-        Where its stars truly are.
-    scale : float
-        Noise over what is stated.
-    nominal : Camera
-        Start of the calibrations.
-    tests : mapping
-        Camera name to the stars that were identified with it.
-    cameras : mapping
-        Camera name to camera; those of the paper's methods are calibrated anew.
-    n_replicates, seed, workers, progress
-        As in `field_experiment`.
+    `campaign_px` (m, 2) is where the stars of the campaign truly are, `scale` its noise over what is stated, `tests`
+    are the stars that each camera identified; those of the paper's methods are calibrated anew from `nominal`.
 
     Raises
     ------
     KeyboardInterrupt
         After Ctrl-C.
     """
-    results, interrupted = run_tasks(
+    results = run_or_stop(
         _ReplicateTask(campaign, campaign_px, scale, nominal, tests, cameras, seed),
         n_replicates,
-        caller="field_experiment",
         chunk=_CHUNK,
         workers=workers,
         progress=progress,
     )
-    if interrupted:
-        raise KeyboardInterrupt
     empty = np.empty((0, 3))
     return FieldReplicates(
         {

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.files import PathLike, check_new_folder
+from starcal_uq.core.files import PathLike, atomic_write_text, check_new_folder
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.paper.commands import Bar, write_tables
 from starcal_uq.paper.field.attitudes import attitude_errors, identified_stars, replicate_field
 from starcal_uq.paper.field.frames import FieldFrames, take_frames
 from starcal_uq.paper.field.identification import WRONG_PX, identify_all, true_pixels
@@ -27,6 +28,7 @@ from starcal_uq.paper.field.published import (
 )
 from starcal_uq.paper.field.result import FieldExperiment
 from starcal_uq.paper.published import PAPER_METHODS
+from starcal_uq.paper.show.pages import field_figures, field_page
 from starcal_uq.pipeline.refine import identify_and_calibrate
 from starcal_uq.sky.catalogue import load_catalogue
 from starcal_uq.sky.neighbours import without_disturbed
@@ -110,11 +112,9 @@ def field_experiment(
     KeyboardInterrupt
         After Ctrl-C; nothing is written then.
     """
-    from starcal_uq.paper.show.field import write_field
-
     check_new_folder(out, force)
     sensor = _check(reading, n_frames, n_calibration_frames, n_replicates)
-    bar = _Bar(progress)
+    bar = Bar(progress, _SHARES)
     stars = load_catalogue(max_mag=sensor.limit_mag + _CATALOGUE_MORE_MAG)
     taken = take_frames(sensor, n_calibration_frames + n_frames, seed, workers, bar.part("frames"))
     campaign, frames = taken.part(0, n_calibration_frames), taken.part(n_calibration_frames, len(taken.rotations))
@@ -132,11 +132,8 @@ def field_experiment(
     jobs += [(cameras[name], tolerance) for name, tolerance in named]
     results = identify_all(frames, sensor.truth, stars, jobs, workers, bar.part("identification"))
     sweep = dict(zip(named, results[len(sheets) :], strict=True))
-    tests = {}
-    for name in FIELD_CAMERAS:
-        chosen = identified_stars(frames, sensor.truth, stars, sweep[name, TOLERANCE_PX])
-        if chosen is not None:
-            tests[name] = chosen
+    seen = {name: identified_stars(frames, sensor.truth, stars, sweep[name, TOLERANCE_PX]) for name in FIELD_CAMERAS}
+    tests = {name: chosen for name, chosen in seen.items() if chosen is not None}
     data_sheets = {}
     for focal_mm, result in zip(sheets, results, strict=False):
         chosen = identified_stars(frames, sensor.truth, stars, result)
@@ -171,8 +168,11 @@ def field_experiment(
         replicates=replicates,
         provenance=provenance(seed, settings, found.observations.data_hash),
     )
-    write_field(experiment)
-    bar.finish()
+    figures = field_figures(experiment)
+    page = field_page(experiment, figures)
+    write_tables(experiment.path, experiment.tables(), figures)
+    atomic_write_text(experiment.report, page)
+    bar.finish("report")
     return experiment
 
 
@@ -209,26 +209,3 @@ def _campaign(frames: FieldFrames, reading: FieldReading, stars: StarCatalogue) 
 def _true_campaign(frames: FieldFrames, obs: Observations, truth: Camera) -> FloatArray:
     """Where the stars of observations truly are, (m, 2) px."""
     return true_pixels(truth, frames.rotations[obs.frame], obs.directions_icrs)
-
-
-class _Bar:
-    """One progress bar for several parts, which come in their order."""
-
-    def __init__(self, progress: Progress | None) -> None:
-        self.progress, self.total, self.before = progress, sum(_SHARES.values()), 0
-
-    def part(self, name: str) -> Progress:
-        """A progress callback for one part."""
-        before, share = self.before, _SHARES[name]
-        self.before += share
-
-        def move(done: int, total: int) -> None:
-            if self.progress is not None:
-                self.progress(before + share * done // max(total, 1), self.total)
-
-        return move
-
-    def finish(self) -> None:
-        """All is done."""
-        if self.progress is not None:
-            self.progress(self.total, self.total)

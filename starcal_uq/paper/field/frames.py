@@ -9,10 +9,11 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import random_rotations
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.tasks import Progress, run_tasks
+from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.images.centroids import COLUMNS, FRAME_COLUMNS, Centroids
 from starcal_uq.images.extract import extract_centroids
+from starcal_uq.paper.commands import run_or_stop
 from starcal_uq.paper.field.published import MORE_THAN_STARS, FieldReading
 from starcal_uq.simulation.frames import Sky
 from starcal_uq.simulation.rendering import Scene
@@ -63,11 +64,14 @@ class FieldFrames:
         return FieldFrames(part, self.rotations[first:last], self.share)
 
 
+@dataclass(frozen=True, eq=False)
 class _RenderTask:
     """Renders candidate attitudes and finds the stars; every number has noise of its own."""
 
-    def __init__(self, scene: Scene, rotations: FloatArray, first: int, seed: int) -> None:
-        self.scene, self.rotations, self.first, self.seed = scene, rotations, first, seed
+    scene: Scene
+    rotations: FloatArray
+    first: int
+    seed: int
 
     def __call__(self, number: int) -> Centroids:
         frame = self.first + number
@@ -103,16 +107,8 @@ def take_frames(
             if progress is not None:
                 progress(min(n_frames, before + number * (n_frames - before) // total), n_frames)
 
-        tables, interrupted = run_tasks(
-            _RenderTask(scene, some, done, seed),
-            len(some),
-            caller="field_experiment",
-            chunk=_CHUNK,
-            workers=workers,
-            progress=move,
-        )
-        if interrupted:
-            raise KeyboardInterrupt
+        task = _RenderTask(scene, some, done, seed)
+        tables = run_or_stop(task, len(some), chunk=_CHUNK, workers=workers, progress=move)
         done += len(some)
         for table, rotation, number in zip(tables, some, ranks, strict=True):
             if len(kept) < n_frames and len(table.frame) > MORE_THAN_STARS:

@@ -14,11 +14,12 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import project
-from starcal_uq.core.tasks import Progress, run_tasks
+from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.identification.proposers import Proposer, prepare_engine
 from starcal_uq.identification.pyramid import CameraTolerance
 from starcal_uq.identification.search import FrameTable, Search, field_geometry
+from starcal_uq.paper.commands import run_or_stop
 from starcal_uq.paper.field.frames import FieldFrames
 
 if TYPE_CHECKING:
@@ -63,18 +64,15 @@ def corner_tolerance(camera: Camera, tolerance_px: float) -> CameraTolerance:
     return CameraTolerance(tolerance_px / camera.corner_radius_px, tolerance_px, tolerance_px)
 
 
+@dataclass(frozen=True, eq=False)
 class _IdentifyTask:
     """Identifies all frames with one camera and one tolerance."""
 
-    def __init__(
-        self,
-        frames: FieldFrames,
-        truth: Camera,
-        stars: StarCatalogue,
-        jobs: list[tuple[Camera, float]],
-        proposer: Proposer,
-    ) -> None:
-        self.frames, self.truth, self.stars, self.jobs, self.proposer = frames, truth, stars, jobs, proposer
+    frames: FieldFrames
+    truth: Camera
+    stars: StarCatalogue
+    jobs: list[tuple[Camera, float]]
+    proposer: Proposer
 
     def __call__(self, number: int) -> FieldIdentification:
         camera, tolerance_px = self.jobs[number]
@@ -128,14 +126,5 @@ def identify_all(
     # One set of pairs serves all cameras, whose fields differ little.
     wide = CameraTolerance(0.03, 0.0, 0.0)
     proposer = prepare_engine("pyramid", stars, field_geometry(truth), wide, False, None)
-    found, interrupted = run_tasks(
-        _IdentifyTask(frames, truth, stars, jobs, proposer),
-        len(jobs),
-        caller="field_experiment",
-        chunk=1,
-        workers=workers,
-        progress=progress,
-    )
-    if interrupted:
-        raise KeyboardInterrupt
-    return found
+    task = _IdentifyTask(frames, truth, stars, jobs, proposer)
+    return run_or_stop(task, len(jobs), chunk=1, workers=workers, progress=progress)

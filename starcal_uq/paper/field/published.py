@@ -43,26 +43,6 @@ _DETECTOR_PX = 2048
 
 
 @dataclass(frozen=True)
-class PrintedFact:
-    """A printed number of the sensor under a reading.
-
-    Attributes
-    ----------
-    name, text : str
-        What is printed.
-    kept : bool
-        Whether the reading keeps it.
-    words : str
-        How, or why not.
-    """
-
-    name: str
-    text: str
-    kept: bool
-    words: str
-
-
-@dataclass(frozen=True)
 class FieldReading:
     """One consistent sensor.
 
@@ -77,8 +57,6 @@ class FieldReading:
     limit_mag : float
         Magnitude (Gaia G) of stars of which half are found. It makes about a third of random attitudes show more than
         six stars, as many as were chosen of the paper's frames, 200 of 600.
-    facts : tuple of PrintedFact
-        Every printed number of the sensor.
     """
 
     name: str
@@ -86,7 +64,6 @@ class FieldReading:
     side_px: int
     offset_px: int
     limit_mag: float
-    facts: tuple[PrintedFact, ...]
 
     @property
     def truth(self) -> Camera:
@@ -125,16 +102,6 @@ class FieldReading:
 # With this the default sensor finds half of the stars of this magnitude.
 _ZERO_POINT_E_S, _ZERO_POINT_MAG = 9.7e4, 4.9
 
-_KEPT = (
-    PrintedFact("pixel", "5.5 µm", True, "as printed"),
-    PrintedFact("focal length", "44.38 mm", True, "as printed"),
-)
-_DISTORTION = PrintedFact(
-    "distortion",
-    "k₁ = −3.7·10⁻⁹, k₂ = 3.93·10⁻¹⁶",
-    True,
-    "in px⁻² and px⁻⁴, by eq. 14; monotonic over the field",
-)
 READINGS: dict[str, FieldReading] = {
     "window": FieldReading(
         "window",
@@ -143,47 +110,32 @@ READINGS: dict[str, FieldReading] = {
         1524,
         262,
         4.7,
-        (
-            PrintedFact("field", "10.8° × 10.8°", True, "10.79°: 1524 px of 5.5 µm at 44.38 mm"),
-            *_KEPT,
-            PrintedFact(
-                "principal point",
-                "(1142.06, 1058.62) px",
-                True,
-                "118.6 and 35.1 px off the centre of the 2048 px, and (880.06, 796.62) in the window",
-            ),
-            _DISTORTION,
-        ),
     ),
-    "full": FieldReading(
-        "full",
-        "All of a 2048 × 2048 detector is read out.",
-        _DETECTOR_PX,
-        0,
-        4.05,
-        (
-            PrintedFact("field", "10.8° × 10.8°", False, "14.46°: 2048 px of 5.5 µm at 44.38 mm"),
-            *_KEPT,
-            PrintedFact("principal point", "(1142.06, 1058.62) px", True, "118.6 and 35.1 px off the centre"),
-            _DISTORTION,
-        ),
-    ),
+    "full": FieldReading("full", "All of a 2048 × 2048 detector is read out.", _DETECTOR_PX, 0, 4.05),
 }
-# Readings that were not simulated, and why.
-REJECTED_READINGS: tuple[tuple[str, str], ...] = (
-    (
-        "A detector of 1525 × 1525 px, the size of 10.8° at 44.38 mm.",
-        "The principal point would lie 380 and 297 px off its centre, a quarter of its side.",
-    ),
-    (
-        "2048 × 2048 px of 5.5 µm that cover 10.8°.",
-        "The focal length would be 59.6 mm, which contradicts the calibrated 44.38 mm.",
-    ),
-    (
-        "2048 × 2048 px that cover 10.8° at 44.38 mm.",
-        "The pixels would be of 4.1 µm, which contradicts the printed 5.5 µm.",
-    ),
-)
+
+
+def printed_sensor(reading: FieldReading) -> tuple[tuple[str, str, bool, str], ...]:
+    """Every printed number of the sensor under a reading: name, text, whether it is kept, and how or why not.
+
+    Other readings contradict more: a detector of the 1525 px that 10.8 deg are at 44.38 mm has its centre 482 px from
+    the printed principal point, and 2048 px over 10.8 deg have another focal length or other pixels.
+    """
+    truth = reading.truth
+    x, y = abs(truth.x0_px - truth.centre_px[0]), abs(truth.y0_px - truth.centre_px[1])
+    field = f"{truth.fov_deg[0]:.2f}°: {reading.side_px} px of 5.5 µm at 44.38 mm"
+    return (
+        ("field", f"{FIELD_DEG}° × {FIELD_DEG}°", bool(abs(truth.fov_deg[0] - FIELD_DEG) < 0.05), field),
+        ("pixel", f"{PIXEL_UM} µm", True, "as printed"),
+        ("focal length", f"{FOCAL_MM} mm", True, "as printed"),
+        ("principal point", f"({X0_PX}, {Y0_PX}) px", True, f"{x:.1f} and {y:.1f} px off the centre of the detector"),
+        (
+            "distortion",
+            "k₁ = −3.7·10⁻⁹, k₂ = 3.93·10⁻¹⁶",
+            True,
+            "px⁻² and px⁻⁴, by eq. 14; monotonic over the field",
+        ),
+    )
 
 
 def printed_field(method: str, quantity: str) -> Printed:

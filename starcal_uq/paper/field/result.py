@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
+from starcal_uq.core.display import Shown
 from starcal_uq.core.types import AnyDict
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.maths.intervals import wilson_interval
@@ -33,7 +34,7 @@ AS_IT_STANDS, ALIGNED, BOTH, NEITHER = "against the true attitude", "after align
 
 
 @dataclass(frozen=True, eq=False)
-class FieldExperiment:
+class FieldExperiment(Shown):
     """The paper's field experiment, simulated.
 
     Attributes
@@ -88,13 +89,6 @@ class FieldExperiment:
     def report(self) -> Path:
         """The report, which needs no other file."""
         return self.path / FIELD_REPORT
-
-    @property
-    def verdict(self) -> str:
-        """What comes out and what does not, in plain words."""
-        from starcal_uq.paper.show.field import findings
-
-        return " ".join(findings(self))
 
     @property
     def tolerances(self) -> tuple[float, ...]:
@@ -242,25 +236,17 @@ class FieldExperiment:
             tables.append(pd.DataFrame(columns))
         return pd.concat(tables, ignore_index=True)
 
-    def plot_rates(self) -> Any:
-        """Identification rate against tolerance; returns the matplotlib Figure."""
-        from starcal_uq.paper.show.figures import plot_rates
-
-        printed = {method: printed_field(method, RATE).value for method in FIELD_METHODS}
-        return plot_rates(self.rates(), printed, self.tolerance_px)
-
-    def plot_errors(self) -> Any:
-        """Attitude errors and their parts beside the printed ones; returns the matplotlib Figure."""
-        from starcal_uq.paper.show.figures import plot_errors
-
-        printed = {(method, axis): printed_field(method, axis).value for method in FIELD_METHODS for axis in AXES}
-        return plot_errors(self.parts(), {(m, axis.removesuffix("_arcsec")): v for (m, axis), v in printed.items()})
-
-    def _repr_html_(self) -> str:
-        from html import escape
-
-        table = self.table_3().to_html(index=False, border=0, float_format=lambda value: f"{value:.4g}")
-        return f"<p><b>Field experiment of Ye &amp; Yang 2017</b>: {escape(self.verdict)}</p>{table}"
+    def tables(self) -> dict[str, pd.DataFrame]:
+        """Every table by the name of its file."""
+        return {
+            "table_3": self.table_3(),
+            "rates": self.rates(),
+            "parts": self.parts(),
+            "sources": self.sources(),
+            "data_sheets": self.other_data_sheets(),
+            "cameras": self.camera_table(),
+            "frames": self.frame_table(),
+        }
 
     def __repr__(self) -> str:
         return f"FieldExperiment({self.reading.name}, {len(self.frames.rotations)} frames; report {str(self.report)!r})"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,7 +10,12 @@ import numpy as np
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import significant
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.paper.errors import detector_grid, map_error, reprojection_error_px
+from starcal_uq.paper.field.published import FIELD_METHODS, RATE, printed_field
+from starcal_uq.paper.published import PAPER_METHODS, printed
+from starcal_uq.paper.show.field import CAMERA_NAMES
+from starcal_uq.paper.show.tables import METHOD_NAMES, NAMES
 from starcal_uq.presentation.figures import style
 
 if TYPE_CHECKING:
@@ -19,44 +24,36 @@ if TYPE_CHECKING:
     from matplotlib.collections import QuadMesh
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
-    from starcal_uq.camera.camera import Camera
     from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.paper.field.result import FieldExperiment
     from starcal_uq.paper.judgement import Judged
+    from starcal_uq.paper.result import Reproduction
 
+# Points along each side of the maps of the error.
+_MAP_POINTS = 49
 # Arrows along each side of the detector.
 _ARROWS = 12
-
-
 # z-values within this are drawn to scale.
 _LINEAR_Z = 3.0
-
-
 _PALETTE = (style.VERMILLION, style.ORANGE, style.BLUE, style.GREEN, style.PURPLE, style.SKY)
-
-
 # Optics in the order of the paper's Fig. 3: unit, px to unit (unless mm), and end of the linear part of the axis.
 _ORDER = {"f": ("mm", 0.0, 1e-3), "x0": ("px", 1.0, 0.1), "y0": ("px", 1.0, 0.1)}
 
 
-def plot_trajectories(
-    calibrations: Mapping[str, Calibration], truth: Camera, printed: Mapping[str, Sequence[float | None]]
-) -> Figure:
+def plot_trajectories(found: Reproduction) -> Figure:
     """The optics on their way to the estimate (the paper's Fig. 3): batch methods by iteration, filters by frame.
 
     Distances from the truth, on axes that are linear near it and logarithmic beyond: the start is far away, and the end
-    is what matters.
-
-    Parameters
-    ----------
-    calibrations : mapping
-        Label to result. Those with a stage ``filter`` are drawn against the number of frames, with the band of one
-        claimed standard deviation.
-    truth : Camera
-        The camera to reach.
-    printed : mapping
-        Label to the paper's final f (mm), x0 and y0, or None: marks at the right edge.
+    is what matters. Filters have the band of one claimed standard deviation; marks at the right edge are printed.
     """
+    run, truth = found.run, found.run.truth
+    calibrations = {run.label(method): run.of(method) for method in PAPER_METHODS}
+    printed_values = {
+        run.label(method): [printed(method, name).value for name in ("f_mm", "x0_px", "y0_px")]
+        for method in PAPER_METHODS
+    }
     filters = [name for name, cal in calibrations.items() if any(s.name == "filter" for s in cal.stages)]
     colours = dict(zip(calibrations, _PALETTE, strict=False))
     names = [p.name for p in parameters("none")]
@@ -84,9 +81,8 @@ def plot_trajectories(
                     linewidth=2.6 if short else 1.3,
                     alpha=0.75 if short else 1.0,
                 )
-            value = printed.get(label, [None] * len(_ORDER))[row]
-            if value is not None:
-                _mark(by_frame if label in filters else by_iteration, value - true * to_unit, colour)
+            value = printed_values[label][row] - true * to_unit
+            _mark(by_frame if label in filters else by_iteration, 1.0, value, colour, edge=True)
         for ax in (by_iteration, by_frame):
             ax.axhline(0.0, color=style.INK, linewidth=1.0, dashes=(4, 2))
         _distance_axis((by_iteration, by_frame), threshold)
@@ -97,7 +93,10 @@ def plot_trajectories(
     style.label(panels[0, 1], "Filter: by frame, with its claimed standard deviation")
     style.label(panels[-1, 0], x="iteration, all stages in a row")
     style.label(panels[-1, 1], x="frames")
-    _trajectory_key(figure, colours, bool(printed))
+    handles = [style.key(label, colour, linewidth=1.6) for label, colour in colours.items()]
+    handles.append(style.key("truth", style.INK, linewidth=1.0, dashes=(4, 2)))
+    handles.append(_printed_key("<"))
+    style.legend_above(figure, handles, fontsize=style.LABEL_SIZE, columnspacing=1.4, handlelength=1.8)
     return figure
 
 
@@ -113,21 +112,23 @@ def _by_frame(ax: Axes, cal: Calibration, index: int, true: float, to_unit: floa
         ax.fill_between(frames, values[1:] - sigma, values[1:] + sigma, color=colour, alpha=0.18, linewidth=0)
 
 
-def _mark(ax: Axes, value: float, colour: str) -> None:
-    """A printed value at the right edge."""
+def _mark(ax: Axes, x: float, y: float, colour: str, *, edge: bool = False) -> None:
+    """A printed value: at a place, or at the right edge for x = 1."""
+    options: AnyDict = {"marker": "<", "transform": ax.get_yaxis_transform(), "clip_on": False, "zorder": 5}
     ax.plot(
-        1.0,
-        value,
-        marker="<",
+        x,
+        y,
         markersize=7.0,
         color=colour,
         markeredgecolor=style.INK,
         markeredgewidth=0.6,
         linestyle="none",
-        clip_on=False,
-        zorder=5,
-        transform=ax.get_yaxis_transform(),
+        **(options if edge else {"marker": ">"}),
     )
+
+
+def _printed_key(marker: str, colour: str = style.GREY, text: str = "printed in the paper") -> Line2D:
+    return style.key(text, colour, marker=marker, markersize=7.0, markeredgecolor=style.INK, linestyle="")
 
 
 def _distance_axis(axes: Sequence[Axes], threshold: float) -> None:
@@ -147,60 +148,28 @@ def _distance_axis(axes: Sequence[Axes], threshold: float) -> None:
     ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}".replace("-", "−")))
 
 
-def _trajectory_key(figure: Figure, colours: Mapping[str, str], printed: bool) -> None:
-    from matplotlib.lines import Line2D
-
-    handles = [Line2D([], [], color=colour, linewidth=1.6, label=label) for label, colour in colours.items()]
-    handles.append(Line2D([], [], color=style.INK, linewidth=1.0, dashes=(4, 2), label="truth"))
-    if printed:
-        handles.append(
-            Line2D(
-                [],
-                [],
-                color=style.GREY,
-                marker="<",
-                markersize=7.0,
-                markeredgecolor=style.INK,
-                linestyle="",
-                label="printed in the paper",
-            )
-        )
-    style.legend_above(
-        figure,
-        handles,
-        fontsize=style.LABEL_SIZE,
-        columnspacing=1.4,
-        handlelength=1.8,
-    )
-
-
-def plot_error_fields(
-    fields: Mapping[str, tuple[FloatArray, FloatArray, FloatArray]],
-    titles: Mapping[str, str],
-    printed: Mapping[str, str],
-) -> Figure:
-    """Errors over the detector without noise (the paper's Figs. 4 to 6): size as colour, direction as arrows.
-
-    Parameters
-    ----------
-    fields : mapping
-        Key to ``(xy (n, 2), eq. 16 (n, 2), best rotation removed (n, 2))`` on a square grid, px.
-    titles, printed : mapping
-        Key to title, and to what the paper prints as its largest residual.
-    """
+def plot_error_fields(found: Reproduction) -> Figure:
+    """Errors over the detector without noise (the paper's Figs. 4 to 6): size as colour, direction as arrows."""
     from matplotlib.colors import LogNorm
 
+    truth, names = found.run.truth, (*PAPER_METHODS, "efficient")
+    xy, _ = detector_grid(truth, _MAP_POINTS)
+    cameras = {name: found.run.of(name).camera for name in names}
+    fields = {
+        name: (reprojection_error_px(truth, camera, xy).error_px, map_error(truth, camera, xy).error_px)
+        for name, camera in cameras.items()
+    }
     figure = style.new_figure(3.55 * len(fields) + 0.9, 8.2)
     panels = figure.subplots(2, len(fields), squeeze=False, sharex=True, sharey=True)
-    sizes = [np.hypot(*part.T) for _, *parts in fields.values() for part in parts]
+    sizes = [np.hypot(*part.T) for parts in fields.values() for part in parts]
     top = 10.0 ** np.ceil(np.log10(max(float(size.max()) for size in sizes)))
     norm = LogNorm(1e-4 * top, top)
     kinds = ("eq. 16", "rotation removed")
-    for column, (key, (xy, *parts)) in enumerate(fields.items()):
+    for column, (name, parts) in enumerate(fields.items()):
         for row, (kind, error) in enumerate(zip(kinds, parts, strict=True)):
             image = _error_panel(panels[row, column], xy, error, norm)
-            note = f" (printed: {printed[key]})" if key in printed else ""
-            title = f"{titles[key]}, {kind}\nlargest {significant(float(np.hypot(*error.T).max()))} px{note}"
+            note = f" (printed: {printed(name, 'max_residual_px').text})" if name in PAPER_METHODS else ""
+            title = f"{found.run.label(name)}, {kind}\nlargest {significant(float(np.hypot(*error.T).max()))} px{note}"
             style.label(panels[row, column], title, "x [px]" if row else "", "y [px]" if column == 0 else "")
     bar = figure.colorbar(image, ax=panels, fraction=0.03, pad=0.015, extend="min")
     style.dress_bar(bar, "size of the error [px]")
@@ -232,11 +201,12 @@ def _error_panel(ax: Axes, xy: FloatArray, error: FloatArray, norm: LogNorm) -> 
     return image
 
 
-def plot_printed_numbers(judged: Sequence[Judged], names: Sequence[str]) -> Figure:
+def plot_printed_numbers(found: Reproduction) -> Figure:
     """Every printed number as a distance from our draws: under the main reading, and under the closest one.
 
     The axis is to scale within three standard deviations and logarithmic beyond.
     """
+    judged = found.judged
     figure = style.new_figure(9.6, 1.5 + 0.285 * len(judged))
     ax = style.dress(figure.add_subplot())
     place = np.arange(len(judged))[::-1]
@@ -256,7 +226,7 @@ def plot_printed_numbers(judged: Sequence[Judged], names: Sequence[str]) -> Figu
     ticks = [*(-powers[::-1]), -3.0, 0.0, 3.0, *powers]
     ax.set_xticks(ticks, [f"{tick:g}".replace("-", "−") for tick in ticks])
     ax.set_xticks([], minor=True)
-    ax.set_yticks(place, names)
+    ax.set_yticks(place, [_axis_name(one) for one in judged])
     ax.tick_params(axis="y", length=0.0)
     ax.set_ylim(-0.7, len(judged) - 0.3)
     ax.grid(True, axis="y", color=style.LIGHT, linewidth=0.5)
@@ -273,6 +243,13 @@ def plot_printed_numbers(judged: Sequence[Judged], names: Sequence[str]) -> Figu
     return figure
 
 
+def _axis_name(one: Judged) -> str:
+    place, quantity = one.printed.place.partition(";")[0], one.printed.quantity
+    latex = {p.name: p.latex for p in parameters("brown")}
+    words = NAMES[quantity] if one.printed.is_error_size else latex[quantity.partition("_")[0]]
+    return f"{place} ({METHOD_NAMES[one.printed.method]}): {words}"
+
+
 _COLOURS = {
     "uncalibrated": style.VERMILLION,
     "least_squares": style.ORANGE,
@@ -280,36 +257,14 @@ _COLOURS = {
     "three_stage": style.BLUE,
     "truth": style.GREEN,
 }
-
-
-_NAMES = {
-    "uncalibrated": "uncalibrated",
-    "least_squares": "least squares",
-    "samaan": "Samaan",
-    "three_stage": "proposed",
-    "truth": "true camera",
-}
-
-
 _PARTS = {"common": (style.GREY, "common rotation"), "rest": (style.ORANGE, "rest"), "noise": (style.SKY, "noise")}
-
-
 # Cameras of one tolerance stand side by side, so that their bars can be told apart.
 _SPREAD = 1.035
 
 
-def plot_rates(rates: pd.DataFrame, printed: Mapping[str, float], main_px: float) -> Figure:
-    """Identification rate against tolerance, with Wilson intervals; the paper's rates at the right edge.
-
-    Parameters
-    ----------
-    rates : DataFrame
-        As of `FieldExperiment.rates`.
-    printed : mapping
-        Camera to the printed rate, per cent.
-    main_px : float
-        The tolerance of the main table.
-    """
+def plot_rates(found: FieldExperiment) -> Figure:
+    """Identification rate against tolerance, with Wilson intervals; the paper's rates at the right edge."""
+    rates, main_px = found.rates(), found.tolerance_px
     figure = style.new_figure(8.6, 4.6)
     ax = style.dress(figure.add_subplot(), grid=True)
     ax.axvline(main_px, color=style.GREY, linewidth=1.0, dashes=(4, 3))
@@ -327,39 +282,25 @@ def plot_rates(rates: pd.DataFrame, printed: Mapping[str, float], main_px: float
         y = 100.0 * rows["rate"].to_numpy()
         error = 100.0 * np.stack([rows["rate"] - rows["low"], rows["high"] - rows["rate"]])
         ax.errorbar(x, y, error, color=colour, marker="o", markersize=4.0, linewidth=1.4, elinewidth=1.0)
-        if name in printed:
-            ax.plot(
-                1.0,
-                printed[name],
-                marker="<",
-                markersize=7.0,
-                color=colour,
-                markeredgecolor=style.INK,
-                markeredgewidth=0.6,
-                clip_on=False,
-                zorder=5,
-                transform=ax.get_yaxis_transform(),
-            )
+        if name in FIELD_METHODS:
+            _mark(ax, 1.0, printed_field(name, RATE).value, colour, edge=True)
     ax.set_xscale("log")
     ticks = sorted(set(rates["tolerance_px"]))
     ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     ax.xaxis.minorticks_off()
     ax.set_ylim(0.0, 102.0)
     style.label(ax, x="tolerance: displacement in the corner that the camera may be wrong by [px]", y="identified [%]")
-    style.legend_above(figure, _camera_keys(tuple(_COLOURS), printed=True))
+    keys = [
+        style.key(CAMERA_NAMES[name], colour, marker="o", markersize=4.0, linewidth=1.4)
+        for name, colour in _COLOURS.items()
+    ]
+    style.legend_above(figure, [*keys, _printed_key("<")])
     return figure
 
 
-def plot_errors(parts: pd.DataFrame, printed: Mapping[tuple[str, str], float]) -> Figure:
-    """Attitude errors about each axis: total, what alignment leaves, the three parts, and the printed number.
-
-    Parameters
-    ----------
-    parts : DataFrame
-        As of `FieldExperiment.parts`.
-    printed : mapping
-        (camera, axis) to the printed error, arcsec.
-    """
+def plot_errors(found: FieldExperiment) -> Figure:
+    """Attitude errors about each axis: total, what alignment leaves, the three parts, and the printed number."""
+    parts = found.parts()
     figure = style.new_figure(10.4, 4.6)
     panels = figure.subplots(1, 3, sharey=True)
     cameras = [name for name in _COLOURS if name in set(parts["camera"])]
@@ -367,19 +308,29 @@ def plot_errors(parts: pd.DataFrame, printed: Mapping[tuple[str, str], float]) -
         style.dress(ax, grid=True)
         for place, camera in enumerate(cameras):
             row = parts[(parts["camera"] == camera) & (parts["axis"] == axis)].iloc[0]
-            _camera_column(ax, place, row, printed.get((camera, axis)))
+            _camera_column(ax, place, row)
+            if camera in FIELD_METHODS:
+                _mark(ax, place - 0.36, printed_field(camera, f"{axis}_arcsec").value, style.VERMILLION)
         ax.set_yscale("log")
         ax.set_ylim(0.03, 9000.0)
         ax.set_xlim(-0.6, len(cameras) - 0.4)
-        ax.set_xticks(range(len(cameras)), [_NAMES[name].replace(" ", "\n") for name in cameras])
+        ax.set_xticks(range(len(cameras)), [CAMERA_NAMES[name].replace(" ", "\n") for name in cameras])
         ax.tick_params(axis="x", labelsize=style.TICK_SIZE - 0.7)
         style.label(ax, axis.capitalize())
     style.label(panels[0], y="error, root mean square [arcsec]")
-    style.legend_above(figure, _error_keys(), columnspacing=1.3, handletextpad=0.5)
+    plain: AnyDict = {"linestyle": "", "markersize": 6.0}
+    keys = [
+        _printed_key(">", style.VERMILLION, "printed"),
+        style.key("against the true attitude", style.INK, marker="s", **plain),
+        style.key("after alignment", style.BLUE, marker="o", **plain),
+    ]
+    bar: AnyDict = {"linestyle": "", "marker": "_", "markersize": 9.0, "markeredgewidth": 2.4}
+    keys += [style.key(words, colour, **bar) for colour, words in _PARTS.values()]
+    style.legend_above(figure, keys, columnspacing=1.3, handletextpad=0.5)
     return figure
 
 
-def _camera_column(ax: Axes, place: int, row: pd.Series, printed: float | None) -> None:
+def _camera_column(ax: Axes, place: int, row: pd.Series) -> None:
     """One camera in one panel."""
     for part, x, colour, marker in (("rms", -0.17, style.INK, "s"), ("aligned", 0.03, style.BLUE, "o")):
         value = float(row[part])
@@ -387,40 +338,3 @@ def _camera_column(ax: Axes, place: int, row: pd.Series, printed: float | None) 
         ax.errorbar(place + x, value, error, color=colour, marker=marker, markersize=5.5, linestyle="", elinewidth=1.2)
     for part, (colour, _) in _PARTS.items():
         ax.plot(place + 0.22, abs(float(row[part])), marker="_", markersize=9.0, markeredgewidth=2.4, color=colour)
-    if printed is not None:
-        ax.plot(
-            place - 0.36,
-            printed,
-            marker=">",
-            markersize=7.0,
-            color=style.VERMILLION,
-            markeredgecolor=style.INK,
-            markeredgewidth=0.6,
-        )
-
-
-def _camera_keys(cameras: tuple[str, ...], printed: bool) -> list[object]:
-    from matplotlib.lines import Line2D
-
-    keys: list[object] = [
-        Line2D([], [], color=_COLOURS[name], marker="o", markersize=4.0, linewidth=1.4, label=_NAMES[name])
-        for name in cameras
-    ]
-    if printed:
-        mark = {"color": style.GREY, "marker": "<", "markersize": 7.0, "markeredgecolor": style.INK, "linestyle": ""}
-        keys.append(Line2D([], [], label="printed in the paper", **mark))  # type: ignore[arg-type]
-    return keys
-
-
-def _error_keys() -> list[object]:
-    from matplotlib.lines import Line2D
-
-    plain = {"linestyle": "", "markersize": 6.0}
-    keys: list[object] = [
-        Line2D([], [], marker=">", color=style.VERMILLION, markeredgecolor=style.INK, label="printed", **plain),  # type: ignore[arg-type]
-        Line2D([], [], marker="s", color=style.INK, label="against the true attitude", **plain),  # type: ignore[arg-type]
-        Line2D([], [], marker="o", color=style.BLUE, label="after alignment", **plain),  # type: ignore[arg-type]
-    ]
-    bar = {"linestyle": "", "marker": "_", "markersize": 9.0, "markeredgewidth": 2.4}
-    keys += [Line2D([], [], color=colour, label=words, **bar) for colour, words in _PARTS.values()]  # type: ignore[arg-type]
-    return keys

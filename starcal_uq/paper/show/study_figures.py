@@ -16,13 +16,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from starcal_uq.paper.interaction_result import InteractionStudy
-    from starcal_uq.paper.replicates_result import Replicates
+    from starcal_uq.paper.interaction import InteractionStudy
+    from starcal_uq.paper.replicates import Replicates
 
 # Errors up to this many bounds are drawn to scale, larger ones on a logarithmic axis.
 _LINEAR = 4.0
-
-
 _RIGHT, _WRONG = style.BLUE, style.VERMILLION
 
 
@@ -125,15 +123,14 @@ def _widths(ax: Axes, rows: list[AnyDict], places: list[int]) -> None:
 
 
 def _legend(figure: Figure, found: Replicates) -> None:
-    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     handles = [
-        Line2D([], [], color=style.INK, marker="o", linestyle="", markersize=4, label="mean error; spread"),
-        Line2D([], [], color=style.SKY, linewidth=4, label="± spread; its 95 % interval"),
-        Line2D([], [], color=_RIGHT, marker="D", markersize=4, label="claimed"),
-        Line2D([], [], color=_RIGHT, marker="x", linestyle="", markersize=5, label="claimed by the textbook's formula"),
-        Line2D([], [], color=_WRONG, linewidth=1.5, label="claims that the tests reject"),
+        style.key("mean error; spread", style.INK, marker="o", linestyle="", markersize=4),
+        style.key("± spread; its 95 % interval", style.SKY, linewidth=4),
+        style.key("claimed", _RIGHT, marker="D", markersize=4),
+        style.key("claimed by the textbook's formula", _RIGHT, marker="x", linestyle="", markersize=5),
+        style.key("claims that the tests reject", _WRONG, linewidth=1.5),
         Patch(color=style.LIGHT, label="Cramer-Rao bound"),
     ]
     frames = found.provenance["settings"].get("n_frames")
@@ -152,23 +149,15 @@ _AXES = (
     ("frames", "n_frames", "frames", "Number of frames"),
     ("stars", "stars_per_frame", "mean stars in a frame", "Stars in a frame"),
 )
-
-
 _COLOURS = {
     "least squares": style.VERMILLION,
     "samaan": style.ORANGE,
     "three stages": style.BLUE,
     "efficient": style.GREEN,
 }
-
-
 _MARKERS = {"least squares": "o", "samaan": "s", "three stages": "^", "efficient": "D"}
-
-
 # Biases this far below the smallest spread are rounding; they are counted in words rather than drawn.
 _FLOOR = 0.2
-
-
 # Spread over noise from which on both are drawn.
 _APART = 1.3
 
@@ -181,7 +170,7 @@ def plot_interaction(study: InteractionStudy) -> Figure:
     noise of its colour, the interaction costs more than noise. Biases far below every spread are not drawn: the methods
     that have them are named in the first panel.
     """
-    table = study.to_dataframe()
+    table = study.table
     optics = [p for p in parameters("none") if p.name in set(table["parameter"])]
     methods = list(dict.fromkeys(table["method"]))
     figure = style.new_figure(12.5, 0.9 + 2.55 * len(optics))
@@ -261,15 +250,7 @@ def _ticks(values: FloatArray) -> FloatArray:
 
 
 def _interaction_legend(figure: Figure, methods: list[str]) -> None:
-    from matplotlib.lines import Line2D
-
-    handles = [
-        Line2D([], [], color=_COLOURS.get(m, style.GREY), marker=_MARKERS.get(m, "o"), markersize=4, label=m)
-        for m in methods
-    ]
-    handles += [
-        Line2D([], [], color=style.INK, linestyle="-", label="bias"),
-        Line2D([], [], color=style.INK, linestyle="--", label="spread"),
-        Line2D([], [], color=style.INK, linestyle=":", label="noise alone, where it differs from the spread"),
-    ]
+    handles = [style.key(m, _COLOURS.get(m, style.GREY), marker=_MARKERS.get(m, "o"), markersize=4) for m in methods]
+    lines = {"-": "bias", "--": "spread", ":": "noise alone, where it differs from the spread"}
+    handles += [style.key(text, style.INK, linestyle=line) for line, text in lines.items()]
     style.legend_above(figure, handles)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
 # Okabe & Ito (2008), "Color Universal Design".
 BLUE, SKY, GREEN = "#0072B2", "#56B4E9", "#009E73"
@@ -76,6 +77,13 @@ def legend(ax: Axes, **keywords: Any) -> None:
     """A legend with a faint white ground, so that data under it do not cross the words."""
     options: dict[str, Any] = {"fontsize": TICK_SIZE, "framealpha": 0.9, "edgecolor": "none", "labelcolor": INK}
     ax.legend(**{**options, **keywords})
+
+
+def key(text: str, colour: str, **keywords: Any) -> Line2D:
+    """An entry of a legend that stands for no artist."""
+    from matplotlib.lines import Line2D
+
+    return Line2D([], [], color=colour, label=text, **keywords)
 
 
 def legend_above(figure: Figure, handles: Any, **keywords: Any) -> None:

@@ -1,0 +1,74 @@
+"""What the paper's commands share: one progress bar for several parts, tasks, and the folder that they write."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+from starcal_uq.core.files import atomic_path, atomic_write_bytes, new_folder
+from starcal_uq.core.tasks import Progress, run_tasks
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+T = TypeVar("T")
+
+
+class Bar:
+    """One progress bar for several parts, which come in their order.
+
+    Parameters
+    ----------
+    progress : callable, optional
+        Called as ``progress(done, total)``.
+    shares : mapping of str to int
+        Work of each part in common units.
+    """
+
+    def __init__(self, progress: Progress | None, shares: Mapping[str, int]) -> None:
+        self.progress, self.shares = progress, shares
+        self.before, self.total = 0, sum(shares.values())
+
+    def part(self, name: str) -> Progress:
+        """A progress callback for one part."""
+        before, share = self.before, self.shares[name]
+        self.before += share
+
+        def move(done: int, total: int) -> None:
+            if self.progress is not None:
+                self.progress(before + share * done // max(total, 1), self.total)
+
+        return move
+
+    def finish(self, name: str) -> None:
+        """A part that has no steps is done."""
+        self.part(name)(1, 1)
+
+
+def run_or_stop(
+    task: Callable[[int], T], n_tasks: int, *, chunk: int, workers: int | None, progress: Progress | None
+) -> list[T]:
+    """Every result of tasks of the field experiment (`run_tasks`), or nothing.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        After Ctrl-C.
+    """
+    found, interrupted = run_tasks(
+        task, n_tasks, caller="field_experiment", chunk=chunk, workers=workers, progress=progress
+    )
+    if interrupted:
+        raise KeyboardInterrupt
+    return found
+
+
+def write_tables(folder: Path, tables: Mapping[str, pd.DataFrame], figures: Mapping[str, bytes]) -> None:
+    """Tables as CSV with all digits, figures as PNG in a folder of their own."""
+    pictures = new_folder(new_folder(folder) / "figures")
+    for name, png in figures.items():
+        atomic_write_bytes(pictures / f"{name}.png", png)
+    for name, table in tables.items():
+        with atomic_path(folder / f"{name}.csv") as temporary:
+            table.to_csv(temporary, index=False, lineterminator="\n")
