@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import os
 import tempfile
 
@@ -16,6 +17,7 @@ os.environ["XDG_CACHE_HOME"] = os.path.join(tempfile.gettempdir(), "starcal_uq-t
 import warnings
 from importlib.metadata import version
 from pathlib import Path
+from typing import IO
 
 import hypothesis
 import pytest
@@ -36,6 +38,36 @@ def pytest_configure(config: pytest.Config) -> None:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             import arviz  # noqa: F401
+
+
+# One white pixel.
+BLANK_PNG = base64.b64decode(
+    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR42mP4DwABAQEAG7buVgAAAABJRU5ErkJggg=="
+)
+
+
+@pytest.fixture
+def unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Figures are made but not painted: a file of one white pixel takes the place of each.
+
+    Painting is most of the time that a report takes, and all of it is Matplotlib's. Every figure is painted in
+    `tests/presentation`, whole pages in the tests of the report and in one run of the command line.
+    """
+    from matplotlib.figure import Figure
+
+    def blank(_figure: Figure, file: IO[bytes] | str | Path, **_options: object) -> None:
+        if isinstance(file, str | Path):
+            Path(file).write_bytes(BLANK_PNG)
+        else:
+            file.write(BLANK_PNG)
+
+    monkeypatch.setattr(Figure, "savefig", blank)
+
+
+@pytest.fixture
+def few_importance_draws(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exact likelihoods, a millisecond each, are weighed with 200 draws instead of 2000; the chains are the same."""
+    monkeypatch.setattr("starcal_uq.inference.sample._N_IMPORTANCE_SLOW", 200)
 
 
 @pytest.fixture(scope="session")

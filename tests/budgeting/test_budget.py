@@ -280,6 +280,14 @@ def test_what_judges_decides_where_rule_and_sampling_disagree(tmp_path: Path, ju
     assert made(path, n_samples=200_000).outcomes[0].verdict == verdict
 
 
+@pytest.fixture(scope="module")
+def resolved(tmp_path_factory: pytest.TempPathFactory) -> Budget:
+    """A budget at a confidence that the samples just resolve."""
+    path = tmp_path_factory.mktemp("resolved") / "complete.toml"
+    path.write_text(complete(60.0).replace("0.997", "0.9999"), encoding="utf-8")
+    return made(path, n_samples=200_000)
+
+
 @pytest.mark.parametrize(
     ("limit", "judged_by", "verdict"),
     [
@@ -291,7 +299,7 @@ def test_what_judges_decides_where_rule_and_sampling_disagree(tmp_path: Path, ju
     ],
 )
 def test_a_confidence_beyond_the_samples_is_not_judged_by_them(
-    tmp_path: Path, limit: float, judged_by: str, verdict: str
+    tmp_path: Path, resolved: Budget, limit: float, judged_by: str, verdict: str
 ) -> None:
     path = tmp_path / "complete.toml"
     path.write_text(complete(limit, judged_by).replace("0.997", "0.9999999"), encoding="utf-8")
@@ -310,9 +318,8 @@ def test_a_confidence_beyond_the_samples_is_not_judged_by_them(
         found.save(tmp_path / f"budget.{ending}")
         assert "not resolved" in (tmp_path / f"budget.{ending}").read_text(encoding="utf-8")
     # Negative control: a confidence that the samples just resolve.
-    path.write_text(complete(60.0).replace("0.997", "0.9999"), encoding="utf-8")
-    resolved = made(path, n_samples=200_000).outcomes[0]
-    assert resolved.verdict == "met" and resolved.total.sampled_se_arcsec > 0.0
+    control = resolved.outcomes[0]
+    assert control.verdict == "met" and control.total.sampled_se_arcsec > 0.0
 
 
 def test_a_budget_beyond_the_samples_is_whole(stated: Path, tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from tests.helpers.scenes import observations
 
 
 @pytest.fixture
-def cli(monkeypatch, capsys, tmp_path):
+def painting_cli(monkeypatch, capsys, tmp_path):
     """Run a command in an empty folder; returns (status, standard output, standard error)."""
     monkeypatch.chdir(tmp_path)
 
@@ -25,6 +25,12 @@ def cli(monkeypatch, capsys, tmp_path):
         return (0 if code is None else code), captured.out, captured.err
 
     return call
+
+
+@pytest.fixture
+def cli(unpainted, painting_cli):
+    """The same, without painting the figures."""
+    return painting_cli
 
 
 @pytest.fixture

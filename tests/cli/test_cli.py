@@ -12,8 +12,8 @@ from tests.helpers.commands import SMALL, files
 from tests.helpers.scenes import observations
 
 
-def test_run_writes_everything_and_prints_the_tables(cli, inputs, tmp_path):
-    status, out, err = cli("run", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", *SMALL)
+def test_run_writes_everything_and_prints_the_tables(painting_cli, inputs, tmp_path, request):
+    status, out, err = painting_cli("run", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", *SMALL)
     assert status in (0, 1)
     for heading in ("Calibration", "Posterior", "Attitude error", "Report:"):
         assert heading in out
@@ -24,8 +24,11 @@ def test_run_writes_everything_and_prints_the_tables(cli, inputs, tmp_path):
     page = run.report.read_text(encoding="utf-8")
     assert page.lstrip().lower().startswith("<!doctype html>")
     assert "http://" not in page.replace("http://www.w3.org", "")
+    for name in ("corner", "residuals"):
+        assert (run.figures / f"{name}.png").stat().st_size > 20_000, "figures are painted"
     # The same seed repeats the posterior bit for bit.
-    cli("run", inputs / "obs.csv", inputs / "camera.toml", "-o", "again", *SMALL)
+    request.getfixturevalue("unpainted")
+    painting_cli("run", inputs / "obs.csv", inputs / "camera.toml", "-o", "again", *SMALL)
     again = sc.Posterior.load(tmp_path / "again" / "posterior.nc")
     assert np.array_equal(again.draws, sc.Posterior.load(run.posterior).draws)
 

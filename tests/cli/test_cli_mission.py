@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,18 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     sample_step(run, force=True, n_steps=60, seed=1)
     propagate_step(run, n_draws=60, seed=1)
     return run.path
+
+
+@pytest.fixture
+def small_plans(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Plans over fewer attitudes and campaigns: what the options mean does not depend on how many there are."""
+    from starcal_uq.planning import check, design, plan
+
+    monkeypatch.setattr(plan, "plan", partial(plan.plan, n_geometries=300, n_campaigns=40))
+    monkeypatch.setattr(design, "choose_frames", partial(design.choose_frames, candidates=300, n_geometries=100))
+    monkeypatch.setattr(check, "check_forecast", partial(check.check_forecast, n_geometries=300))
+    for name in ("_SWEEP_GEOMETRIES", "_TRIED_ATTITUDES"):
+        monkeypatch.setattr(plan, name, 200)
 
 
 @pytest.fixture
@@ -153,7 +166,7 @@ def test_compare_two_runs_and_two_halves(cli, run, tmp_path):
     assert "not empty" in err
 
 
-def test_plan_before_any_data(cli, run, tmp_path):
+def test_plan_before_any_data(cli, run, tmp_path, small_plans):
     sc.paper.paper_start().save(tmp_path / "camera.toml")
     options = ("--target-arcsec", 20, "--frames", 30, "--frames", 300, "--choose", 5, "-o", "plan")
     status, out, _ = cli("plan", "camera.toml", *options)
@@ -191,7 +204,7 @@ def test_square_brackets_are_no_markup(cli, run, tmp_path):
     assert "a[/x] and b [red] agree" in out
 
 
-def test_a_runs_own_files_are_not_mixed_with_others(cli, run, tmp_path):
+def test_a_runs_own_files_are_not_mixed_with_others(cli, run, tmp_path, small_plans):
     sc.paper.paper_start().save(tmp_path / "camera.toml")
     before = {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()}
     for arguments in (
@@ -209,7 +222,7 @@ def test_a_runs_own_files_are_not_mixed_with_others(cli, run, tmp_path):
     assert status == 2
 
 
-def test_plan_after_a_run_of_another_sensor_is_refused(cli, run, tmp_path):
+def test_plan_after_a_run_of_another_sensor_is_refused(cli, run, tmp_path, small_plans):
     sc.paper.paper_start().replace(width_px=512, height_px=512, x0_px=255.5, y0_px=255.5).save(tmp_path / "other.toml")
     status, _, err = cli("plan", "other.toml", "--after", "run")
     assert status == 2
@@ -225,7 +238,7 @@ def test_plan_after_a_run_of_another_sensor_is_refused(cli, run, tmp_path):
     assert found[1] == 0.5
 
 
-def test_plan_refuses_what_it_cannot_mean(cli, run, tmp_path):
+def test_plan_refuses_what_it_cannot_mean(cli, run, tmp_path, small_plans):
     sc.paper.paper_start().save(tmp_path / "camera.toml")
     for wrong, word in (
         (("--after", "run", "--check", 10), "--check"),

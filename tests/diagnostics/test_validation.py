@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -52,9 +53,43 @@ def stars():
     return sc.load_catalogue(max_mag=6.0)
 
 
+def remembering(function):
+    """A function that gives the results of before for arguments of before."""
+    known = {}
+
+    def remembered(first, *arguments, **options):
+        key = (getattr(first, "data_hash", None), arguments, tuple(options.items()))
+        if key not in known:
+            known[key] = function(first, *arguments, **options)
+        return known[key]
+
+    return remembered
+
+
 @pytest.fixture(scope="module")
-def good(stars):
-    return validate_study(study(), stars, 100, workers=0, settings={"n_frames": 12})
+def remembered():
+    """Studies of one camera and seed that differ in the likelihood only share their simulations and calibrations."""
+    return {"simulate": remembering(sc.simulate), "calibrate": remembering(sc.calibrate)}
+
+
+@contextlib.contextmanager
+def data_made_once(remembered):
+    with pytest.MonkeyPatch.context() as patch:
+        for name, function in remembered.items():
+            patch.setattr(f"starcal_uq.diagnostics.validation.replicates.{name}", function)
+        yield
+
+
+@pytest.fixture
+def same_data(remembered):
+    with data_made_once(remembered):
+        yield
+
+
+@pytest.fixture(scope="module")
+def good(stars, remembered):
+    with data_made_once(remembered):
+        return validate_study(study(), stars, 100, workers=0, settings={"n_frames": 12})
 
 
 # --- ranks ---
@@ -185,7 +220,7 @@ def test_other_models_pass_with_truths_from_the_prior(stars, model):
     assert np.log(found.truth[:, -1] / 0.05).std() == pytest.approx(0.2, rel=0.45)
 
 
-def test_attitudes_forgotten_in_the_degrees_of_freedom_are_found(stars):
+def test_attitudes_forgotten_in_the_degrees_of_freedom_are_found(stars, same_data):
     found = validate_study(study(likelihood=controls.forgets_attitudes), stars, 50, workers=0)
     assert not found.ok
     at = found.quantities.index("sigma")
@@ -194,7 +229,7 @@ def test_attitudes_forgotten_in_the_degrees_of_freedom_are_found(stars):
     assert "Estimates of sigma are too low" in found.verdict
 
 
-def test_pairs_taken_as_independent_are_found(stars):
+def test_pairs_taken_as_independent_are_found(stars, same_data):
     found = validate_study(study(likelihood="pairs_naive"), stars, 25, workers=0)
     assert not found.ok
     assert found.coverage[0] < 0.8
@@ -209,7 +244,7 @@ def test_pairs_with_their_curvature_put_right_pass(stars):
     assert np.isnan(found.compression_error).all()
 
 
-def test_noise_understated_by_a_tenth_is_found(stars):
+def test_noise_understated_by_a_tenth_is_found(stars, same_data):
     found = validate_study(study(assumed_sigma_px=0.045), stars, 120, workers=0)
     assert "sigma" not in found.quantities
     assert not found.ok
@@ -217,12 +252,12 @@ def test_noise_understated_by_a_tenth_is_found(stars):
     assert "too narrow" in found.verdict
 
 
-def test_the_right_noise_given_passes(stars):
+def test_the_right_noise_given_passes(stars, same_data):
     found = validate_study(study(assumed_sigma_px=0.05), stars, 40, workers=0)
     assert not any(f.rejected for f in found.findings), found.verdict
 
 
-def test_few_replicates_are_no_verdict(stars):
+def test_few_replicates_are_no_verdict(stars, same_data):
     found = validate_study(study(), stars, 8, workers=0)
     assert not found.ok
     assert "Too few replicates" in found.verdict

@@ -173,6 +173,7 @@ def test_stars_other_than_those_of_the_estimate_are_refused() -> None:
         )
 
 
+@pytest.mark.usefixtures("few_importance_draws")
 def test_sampling_pairs() -> None:
     obs = observations(n_frames=30)
     cal = calibrate(obs, nominal(camera()))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import time
 from dataclasses import replace
 from functools import lru_cache
 
@@ -20,6 +19,7 @@ from starcal_uq.estimation.screening.screening import screen
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.simulation.contamination import contaminate
 from tests.helpers import scenes
+from tests.helpers.speed import times_as_long
 
 TRUTH = scenes.camera()
 
@@ -334,17 +334,14 @@ def test_per_star_noise_is_respected() -> None:
 
 
 def test_a_thousand_frames_are_fast() -> None:
+    """Some four calibrations of clean stars."""
     obs = scenes.observations(n_frames=1000, seed=1)
     dirty = contaminate(obs, deep_catalogue(), TRUTH, 0.1, "neighbour", seed=1)
     screen(dirty.observations.select_frames(np.arange(20)), uncalibrated())
-    best = np.inf
-    for _ in range(3):
-        began = time.process_time()
-        screen(dirty.observations, uncalibrated())
-        best = min(best, time.process_time() - began)
-        if best < 3.0:
-            break
-    assert best < 3.0
+    ratio = times_as_long(
+        lambda: screen(dirty.observations, uncalibrated()), lambda: sc.calibrate(obs, uncalibrated()), repeats=2
+    )
+    assert ratio < 10.0
 
 
 # --- contamination ----------------------------------------------------------------------------------------------------

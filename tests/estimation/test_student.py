@@ -224,6 +224,7 @@ def spoilt() -> tuple[Any, Any]:
     return obs, calibrate(obs, nominal(camera()), likelihood="student_t")
 
 
+@pytest.mark.usefixtures("few_importance_draws")
 def test_sampling_with_given_degrees_of_freedom(spoilt: tuple[Any, Any]) -> None:
     obs, cal = spoilt
     post = sample(obs, cal, **QUICK, likelihood="student_t")

@@ -306,6 +306,7 @@ def few_frames() -> tuple[Any, Any]:
     return obs, calibrate(obs, nominal(camera()))
 
 
+@pytest.mark.usefixtures("few_importance_draws")
 def test_compressed_and_exact_posteriors_are_the_same(few_frames: tuple[Any, Any]) -> None:
     obs, cal = few_frames
     auto, exact = (sample(obs, cal, **QUICK, evaluation=name) for name in ("auto", "exact"))
@@ -339,6 +340,7 @@ def test_a_wrong_compressed_likelihood_is_replaced(few_frames: tuple[Any, Any], 
     assert "departs from the exact one" in sentence_of(kept, "Likelihood", Level.FAIL)
 
 
+@pytest.mark.usefixtures("few_importance_draws")
 @pytest.mark.parametrize("stop", [40, 170])
 def test_a_replaced_likelihood_is_resumed(
     few_frames: tuple[Any, Any], replaced: Any, tmp_path: Path, stop: int

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
-import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import ObservationError, RunFolderError
 from starcal_uq.observations.columns import COLUMNS
 from starcal_uq.observations.table import Observations, load_observations
+from tests.helpers.speed import sort_a_million, times_as_long
 
 APPARENT = {"ra_deg": "ra_apparent_deg", "dec_deg": "dec_apparent_deg"}
 CAMERA = Camera(1024, 768, 6.9, 35.0, 511.5, 383.5)
@@ -619,11 +620,10 @@ def test_save_needs_a_known_ending(tmp_path):
 
 
 def test_large_table_is_read_quickly(tmp_path):
-    """15,000 rows are the paper's experiment; the bound is loose, for machines under load."""
+    """15,000 rows, the paper's experiment: as text as long as sorting a million numbers, in Parquet a sixth of it."""
     obs = Observations(*(getattr(random_table(1000, 15), name) for name in HEADER))
-    for ending in (".csv", ".parquet"):
-        obs.save(tmp_path / f"obs{ending}")
-        load_observations(tmp_path / f"obs{ending}")  # imports
-        start = time.perf_counter()
-        load_observations(tmp_path / f"obs{ending}", CAMERA)
-        assert time.perf_counter() - start < 1.0
+    for ending, sorts in ((".csv", 4.0), (".parquet", 0.6)):
+        path = tmp_path / f"obs{ending}"
+        obs.save(path)
+        load_observations(path)  # imports
+        assert times_as_long(partial(load_observations, path, CAMERA), sort_a_million) < sorts

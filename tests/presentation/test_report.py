@@ -185,7 +185,7 @@ def test_weak_direction_names_the_distortion(full):
     assert str(rows[0]["weights"][0][0]).startswith("<i>")
 
 
-def test_without_posterior_the_report_says_which_command_makes_it(run):
+def test_without_posterior_the_report_says_which_command_makes_it(run, unpainted):
     for path in (run.posterior, run.attitude, run.field_map):
         path.unlink()
     sc.report(run.path)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import re
-import time
 from pathlib import Path
 
 import erfa
@@ -15,6 +14,7 @@ from starcal_uq.core.errors import CatalogueError
 from starcal_uq.sky.catalogue import StarCatalogue, load_catalogue
 from starcal_uq.sky.gaia import completed_proper_motion, holds_proper_motion, read_gaia_records
 from starcal_uq.sky.positions import propagate_proper_motion, ra_dec_deg, unit_vectors
+from tests.helpers.speed import sort_a_million, times_as_long
 
 REFERENCE = Path(__file__).resolve().parents[3] / "shared" / "data" / "bright_star_pm.csv"
 OBSERVED = REFERENCE.with_name("esa_tetra3_observations.csv")
@@ -64,12 +64,8 @@ def test_default_is_the_naked_eye_sky_in_gaia_g(stars: StarCatalogue) -> None:
 
 
 def test_loading_is_fast(stars: StarCatalogue) -> None:
-    seconds = []
-    for _ in range(5):
-        start = time.perf_counter()
-        load_catalogue(6.0, 2026.9, (10.0, 20.0, 5.0))
-        seconds.append(time.perf_counter() - start)
-    assert min(seconds) < 0.05
+    # Half of it.
+    assert times_as_long(lambda: load_catalogue(6.0, 2026.9, (10.0, 20.0, 5.0)), sort_a_million) < 1.5
 
 
 def test_stars_without_proper_motion_are_marked_and_can_be_left_out() -> None:
