@@ -121,7 +121,7 @@ def identify(
         camera, tolerance = calibration.camera, calibrated_tolerance(calibration, tolerance)
     field = FrameTable(centroids, camera)
     proposer = prepare_engine(engine, stars, field_geometry(camera), tolerance, cache, cache_dir)
-    search = Search(camera, stars, tolerance, proposer=proposer)
+    search = Search(camera, stars, tolerance, proposer)
     n = len(field.ids)
     found = []
     for k in range(n):
@@ -133,7 +133,7 @@ def identify(
     if len(failed) > _solved(found):
         # Every frame of a camera has one handedness: the one that more frames have.
         flipped = FrameTable(centroids, camera, mirrored=True)
-        mirror = Search(flipped.camera, stars, tolerance, proposer=proposer)
+        mirror = Search(flipped.camera, stars, tolerance, proposer)
         other = _retry(mirror, flipped, failed)
         if _solved(other.values()) > _solved(found):
             parity, field, search = "mirrored", flipped, mirror

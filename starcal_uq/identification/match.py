@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import lgamma, log, pi
+from typing import TypeAlias
 
 import numpy as np
 
@@ -153,7 +154,7 @@ def match_frame(
         centroid, star, _ = _mutual(u, predicted, limit)
         if len(star) < 4:
             return None
-        state, e = _fit(state, u, sigma_px, r, centroid, star, g, prior)
+        state, e = _fit(state, _linearised(state, u, sigma_px, r, centroid, star, g), prior)
         if number >= len(gates) - 2:
             noise_scale = _noise_scale(e, sigma_px[centroid])
     predicted, _ = _predict(state, r, g)
@@ -170,8 +171,8 @@ def match_frame(
         centroid, star = centroid[~refused], star[~refused]
         if len(star) < 4:
             return None
-        state, e = _fit(state, u, sigma_px, r, centroid, star, g, prior)
-    information, gradient = _information(state, u, sigma_px * noise_scale, r, centroid, star, g)
+        state, e = _fit(state, _linearised(state, u, sigma_px, r, centroid, star, g), prior)
+    information, gradient = _information(state, _linearised(state, u, sigma_px * noise_scale, r, centroid, star, g))
     on_detector = np.all(np.abs(predicted) < 0.5 * np.array([g.width_px, g.height_px]) + 30.0, axis=1)
     density = max(int(on_detector.sum()), 4) / (g.width_px * g.height_px)
     expected = log10_false_matches(len(u), len(star), density, depth, typical * noise_scale, g, tolerance)
@@ -256,6 +257,9 @@ def _jacobian(state: CameraState, r: FloatArray, g: FieldGeometry) -> tuple[Floa
     return u, j
 
 
+_Linear: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
+
+
 def _linearised(
     state: CameraState,
     u: FloatArray,
@@ -264,25 +268,16 @@ def _linearised(
     centroid: IntArray,
     star: IntArray,
     g: FieldGeometry,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+) -> _Linear:
     """Residuals (2, m), their derivatives (2, m, q), weights (m,), and the weighted derivatives as rows (2 m, q)."""
     predicted, j = _jacobian(state, r[star], g)
     weight = 1.0 / sigma_px[centroid]
     return (u[centroid] - predicted).T, j, weight, (j * weight[:, None]).reshape(-1, j.shape[2])
 
 
-def _fit(
-    state: CameraState,
-    u: FloatArray,
-    sigma_px: FloatArray,
-    r: FloatArray,
-    centroid: IntArray,
-    star: IntArray,
-    g: FieldGeometry,
-    prior: FloatArray,
-) -> tuple[CameraState, FloatArray]:
+def _fit(state: CameraState, linear: _Linear, prior: FloatArray) -> tuple[CameraState, FloatArray]:
     """One damped Gauss-Newton step, and the residuals (m, 2) that it predicts."""
-    e, j, weight, a = _linearised(state, u, sigma_px, r, centroid, star, g)
+    e, j, weight, a = linear
     normal = a.T @ a
     normal[np.diag_indices(len(normal))] += prior
     gradient = a.T @ (e * weight).ravel()
@@ -293,17 +288,9 @@ def _fit(
     return CameraState(exp_rotation(step[:3]) @ state.rotation, state.shared + step[3:]), left.T
 
 
-def _information(
-    state: CameraState,
-    u: FloatArray,
-    sigma_px: FloatArray,
-    r: FloatArray,
-    centroid: IntArray,
-    star: IntArray,
-    g: FieldGeometry,
-) -> tuple[FloatArray, FloatArray]:
+def _information(state: CameraState, linear: _Linear) -> tuple[FloatArray, FloatArray]:
     """Normal equations of the shared parameters with the attitude eliminated."""
-    e, _, weight, a = _linearised(state, u, sigma_px, r, centroid, star, g)
+    e, _, weight, a = linear
     attitude, shared = a[:, :3], a[:, 3:]
     e = (e * weight).ravel()
     onto = np.linalg.solve(attitude.T @ attitude, attitude.T @ np.column_stack([shared, e]))

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal, Protocol, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -23,41 +24,11 @@ Engine: TypeAlias = Literal["pyramid", "tetra3rs"]
 ENGINES: tuple[Engine, ...] = ("pyramid", "tetra3rs")
 
 
-class Proposer(Protocol):
-    """A catalogue prepared for a field of view, and a way to find attitudes in it."""
-
-    def hypotheses(
-        self,
-        points: FloatArray,
-        sigma_px: FloatArray,
-        geometry: FieldGeometry,
-        tolerance: CameraTolerance,
-        max_centroids: int,
-        searched: int,
-    ) -> Iterator[list[Hypothesis]]:
-        """Batches of hypotheses, as `pyramid.hypotheses` gives them."""
-        ...
-
-
-class PyramidProposer:
-    """Our own pattern search."""
-
-    def __init__(self, pairs: StarPairs) -> None:
-        from scipy.spatial import cKDTree
-
-        self.pairs, self._tree = pairs, cKDTree(pairs.directions)
-
-    def hypotheses(
-        self,
-        points: FloatArray,
-        sigma_px: FloatArray,
-        geometry: FieldGeometry,
-        tolerance: CameraTolerance,
-        max_centroids: int,
-        searched: int,
-    ) -> Iterator[list[Hypothesis]]:
-        """See `pyramid.hypotheses`."""
-        return hypotheses(points, sigma_px, self.pairs, self._tree, geometry, tolerance, max_centroids, searched)
+# Batches of hypotheses from points, their noise, the camera, its tolerances, the number of centroids to look at, and the
+# number of those that were searched before: `pyramid.hypotheses` with its catalogue, or another solver's.
+Proposer: TypeAlias = Callable[
+    [FloatArray, FloatArray, FieldGeometry, CameraTolerance, int, int], Iterator[list[Hypothesis]]
+]
 
 
 def prepare_engine(
@@ -75,11 +46,14 @@ def prepare_engine(
     IdentificationError
         No such engine, or its package is not installed.
     """
+    from scipy.spatial import cKDTree
+
     if engine == "tetra3rs":
-        return PlateSolver(stars, geometry, tolerance)
+        return PlateSolver(stars, geometry, tolerance).hypotheses
     if engine != "pyramid":
         raise IdentificationError(f"there is no engine {engine!r}: choose {' or '.join(ENGINES)}.")
-    return PyramidProposer(prepare_pairs(stars, geometry, tolerance, cache, cache_dir))
+    pairs = prepare_pairs(stars, geometry, tolerance, cache, cache_dir)
+    return partial(hypotheses, pairs, cKDTree(pairs.directions))
 
 
 def prepare_pairs(

@@ -112,27 +112,27 @@ def remaining_order(n: int, searched: int) -> IntArray:
 
 
 def hypotheses(
-    points: FloatArray,
-    sigma_px: FloatArray,
     pairs: StarPairs,
     tree: object,
+    points: FloatArray,
+    sigma_px: FloatArray,
     geometry: FieldGeometry,
     tolerance: CameraTolerance,
-    max_centroids: int = 12,
-    searched: int = 0,
+    max_centroids: int,
+    searched: int,
 ) -> Iterator[list[Hypothesis]]:
     """For each triangle, the hypotheses that a fourth star supports, best first.
 
     Parameters
     ----------
-    points : (n, 2) array
-        Ideal pixels, brightest first.
-    sigma_px : (n,) array
-        Noise per axis.
     pairs : StarPairs
         Pattern stars.
     tree : scipy.spatial.cKDTree
-        Of ``pairs.directions``.
+        Tree of ``pairs.directions``.
+    points : (n, 2) array
+        Ideal pixels, brightest first.
+    sigma_px : (n,) array
+        Noise per axis, px.
     geometry, tolerance
         The nominal camera, and how far it may be off.
     max_centroids : int

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from os import PathLike
 from time import perf_counter
 from typing import Protocol
 
@@ -17,8 +16,7 @@ from starcal_uq.core.types import FloatArray, IntArray, StrArray
 from starcal_uq.identification.brightness import instrumental_mag
 from starcal_uq.identification.match import CameraState, Match, match_frame, start_state
 from starcal_uq.identification.nearby import NearbyStars
-from starcal_uq.identification.pairs import StarPairs
-from starcal_uq.identification.proposers import Proposer, PyramidProposer, prepare_pairs
+from starcal_uq.identification.proposers import Proposer
 from starcal_uq.identification.pyramid import CameraTolerance, FieldGeometry
 from starcal_uq.identification.result import FrameStatus
 from starcal_uq.maths.linear import scaled_inverse
@@ -118,27 +116,14 @@ class Search:
         camera: Camera,
         stars: StarCatalogue,
         tolerance: CameraTolerance,
-        cache: bool = True,
-        cache_dir: str | PathLike[str] | None = None,
-        pairs: StarPairs | None = None,
-        *,
-        proposer: Proposer | None = None,
+        proposer: Proposer,
     ) -> None:
         self.geometry = field_geometry(camera)
         self.tolerance, self.radial = tolerance, has_radial(camera)
         self.centroids: tuple[int, ...] = _CENTROIDS
         self.triangles = _MAX_TRIANGLES
-        if proposer is None:
-            proposer = PyramidProposer(pairs or prepare_pairs(stars, self.geometry, tolerance, cache, cache_dir))
         self.proposer = proposer
         self.sky = NearbyStars(stars.directions_icrs, stars.mag, self.geometry)
-
-    @property
-    def pairs(self) -> StarPairs:
-        """The pattern stars, for another search in the same catalogue."""
-        if not isinstance(self.proposer, PyramidProposer):
-            raise AttributeError("only the engine `pyramid` has pairs of stars")
-        return self.proposer.pairs
 
     def widened(self, factor: float) -> Search:
         """The same for a lens with more distortion."""
@@ -218,7 +203,7 @@ class Search:
     def _accepted(self, field: FrameTable, k: int, n_centroids: int, searched: int) -> Iterator[Match]:
         """Acceptable matches, up to the first that is beyond doubt and complete, or some triangles more."""
         points, sigma = field.points[k], field.sigma[k]
-        batches = self.proposer.hypotheses(points, sigma, self.geometry, self.tolerance, n_centroids, searched)
+        batches = self.proposer(points, sigma, self.geometry, self.tolerance, n_centroids, searched)
         left = self.triangles
         for batch in batches:
             if left <= 0:

@@ -78,7 +78,7 @@ class _IdentifyTask:
         camera, tolerance_px = self.jobs[number]
         field = FrameTable(self.frames.centroids, camera)
         # `identify` would try failed frames again with wider tolerances and refine the camera over all frames.
-        search = Search(camera, self.stars, corner_tolerance(camera, tolerance_px), proposer=self.proposer)
+        search = Search(camera, self.stars, corner_tolerance(camera, tolerance_px), self.proposer)
         n = len(field.ids)
         matches = [search.frame(field, k).match for k in range(n)]
         solved = [(k, match) for k, match in enumerate(matches) if match is not None]
