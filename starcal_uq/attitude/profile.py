@@ -26,25 +26,13 @@ from starcal_uq.core.times import julian_days
 from starcal_uq.core.types import FloatArray, IntArray
 
 _UNIT = 1e-6
-
-
 _NEARLY_UNIT = 1e-3
-
-
 # Between two samples farther apart than this, the shortest turn need not be the one that was flown.
 _FAR_DEG = 30.0
-
-
 # A step so many times the usual one is told.
 _GAP = 10.0
-
-
 _MAX_FRAMES = 1_000_000
-
-
 Sense = Literal["icrs_to_camera", "camera_to_icrs"]
-
-
 Scalar = Literal["first", "last"]
 
 
@@ -218,11 +206,7 @@ def check_samples(where: str, word: str, numbers: IntArray, time_s: FloatArray, 
 
 
 NAMED = ("qx", "qy", "qz", "qw")
-
-
 _NUMBERED = (("q0", "q1", "q2", "q3"), ("q1", "q2", "q3", "q4"))
-
-
 _DAY_S = 86_400.0
 
 

@@ -315,12 +315,10 @@ _HEADER = """\
 # k1 px^-2, k2 px^-4, k3 px^-6, p1 and p2 px^-1.
 """
 
-
 _DIRECTION = {
     "forward": "# distortion maps ideal (pinhole) points to distorted (measured) points.\n",
     "inverse": "# distortion maps distorted (measured) points to ideal (pinhole) points.\n",
 }
-
 
 _KEYS = {
     "width_px": Key.of(int, "the width of the detector in pixels, a whole number above 0", required=True, gt=0),

@@ -13,25 +13,13 @@ from starcal_uq.images.image import Image
 
 # SExtractor's clipping at 3 sigma takes this part of Gaussian noise.
 _CLIPPED = 0.983
-
-
 _MESH_PX = 64
-
-
 _SATURATED_FRACTION = 0.2
-
-
 # Noise in counts below which an image is coarse: its median is wrong by up to half a count.
 _COARSE = 20.0
-
-
 # Random numbers of the blur, repeated over the image: drawing one for every pixel would take as long as the rest.
 _BLUR_TILE = 65_537
-
-
 _UNEVEN = 1.15
-
-
 # With this part of the pixels at the lowest value, the noise below is cut off.
 _CUT_OFF = 0.05
 
@@ -167,12 +155,8 @@ def _cut_noise(counts: Any) -> tuple[float, float]:
 
 
 _CELL_PX = 64
-
-
 # The slope counts where it is known this well, on so many meshes and with so little scatter about the line.
 _LARGEST_ERROR, _FEWEST_MESHES, _LARGEST_CHI2 = 0.1, 24, 2.0
-
-
 # Variance that is left of Gaussian noise clipped at 3 sigma.
 _CLIPPED_VARIANCE = 0.9733
 

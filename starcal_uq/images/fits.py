@@ -16,11 +16,7 @@ from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.images.background import PreparedImage
 
 _ITERATIONS = 12
-
-
 _TOLERANCE_PX = 1e-4
-
-
 _SQRT_2PI = float(np.sqrt(2.0 * np.pi))
 
 
@@ -248,12 +244,8 @@ def near_pairs(x: FloatArray, y: FloatArray, reach: float) -> IntArray:
 
 # Wide enough to bridge the pixels of an undersampled image.
 _WINDOW_SIGMA_PX = 1.5
-
-
 # Stars whose second moments can be measured one by one, and how many of them it takes.
 _GRADIENT_SNR, _GRADIENT_STARS = 30.0, 4
-
-
 _LEAST_GRADIENT = 0.1
 
 

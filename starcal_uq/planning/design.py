@@ -38,18 +38,10 @@ if TYPE_CHECKING:
     from starcal_uq.sky.catalogue import StarCatalogue
 
 CRITERIA = ("D", "A")
-
-
 CHOICE_SCOPES = ("common", "rest", "calibration")
-
-
 # Without data, a thousandth of a mean frame makes the first steps defined.
 _FAINT = 1e-3
-
-
 _EXACT, _SWAPS_PER_FRAME, _RANDOM_SETS, _RANDOM_PATHS = 48, 3, 200, 20
-
-
 _GAIN = 1e-9
 
 

@@ -35,28 +35,14 @@ if TYPE_CHECKING:
     from starcal_uq.sky.catalogue import StarCatalogue
 
 N_FRAMES = (10, 30, 100, 300, 1000, 3000)
-
-
 SWEEP_FRAMES = 1000
-
-
 _SWEEP_GEOMETRIES, _SWEEP_CAMPAIGNS, _TRIED_ATTITUDES = 1000, 64, 1000
-
-
 # With fewer attitudes than this that show enough stars, a magnitude limit is left out of the sweep.
 _LEAST_SKY = 0.02
-
-
 # More noise than this is a mistake in the units.
 _WORST_NOISE_PX = 20.0
-
-
 _MAG_STEPS = (-2.0, -1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5, 2.0)
-
-
 _NOISE_FACTORS = (0.25, 0.5, 1.0, 2.0, 4.0)
-
-
 _FIELD_PARTS = (0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 
 

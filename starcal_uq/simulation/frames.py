@@ -20,15 +20,9 @@ if TYPE_CHECKING:
 
 # Attitudes drawn at once; also how many are tried before a camera is declared too narrow for its catalogue.
 _BATCH = 256
-
-
 _MAX_TRIES_PER_FRAME = 2000
-
-
 # More attitudes than this take minutes: refused as soon as the first tries say that so many would be needed.
 _MAX_TRIES = 500_000
-
-
 # Stars nearer to the edge than this many sigma are left out, so that noise does not decide which stars are seen.
 EDGE_SIGMAS = 6.0
 

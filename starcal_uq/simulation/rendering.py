@@ -24,11 +24,7 @@ if TYPE_CHECKING:
 # Gauss-Legendre nodes along a smeared image: this many, and more for each sigma of its length. The exposure integral of
 # a Gaussian is then exact to 2e-9 of its peak.
 _NODES = 9
-
-
 _NODES_PER_SIGMA = 1.5
-
-
 # Values of stamps that are held at once.
 _MAX_VALUES = 2_000_000
 
@@ -252,8 +248,6 @@ def render(
 # The unit interval is cut into this many buckets. Nearly all of them lie within one step of the distribution function,
 # so that 16 random bits decide; in the others a further uniform number does.
 _BUCKETS = 1 << 16
-
-
 # Beyond, the steps become as narrow as the buckets, and NumPy's own method takes over.
 _MAX_MEAN = 1000.0
 

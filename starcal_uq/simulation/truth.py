@@ -158,14 +158,12 @@ SENSOR_KEYS = {
     "hot_pixel_seed": ("HOTSEED", "seed of the hot pixels"),
 }
 
-
 _CAMERA_KEYS = {
     "pixel_um": ("PIXUM", "[um] pixel pitch"),
     "focal_mm": ("FOCALMM", "[mm] focal length"),
     "x0_px": ("X0PX", "[px] principal point; 0 = centre of first pixel"),
     "y0_px": ("Y0PX", "[px] principal point, y downwards"),
 }
-
 
 _TRUTH_COLUMNS = {
     "x_px": "pix",
