@@ -47,9 +47,9 @@ class AttitudeProfile(Shown):
     quaternions : (K, 4) array
         Scalar-last unit quaternions of R_cam_icrs, with signs such that neighbours lie in one half.
     name : str
-        Where it comes from.
+        Origin, such as the path of a file.
     messages : tuple of str
-        What was mended or looks doubtful.
+        Sentences on what was mended or looks doubtful.
     """
 
     time_s: FloatArray
@@ -161,7 +161,7 @@ def load_attitude_profile(
     scalar : {"first", "last"}, optional
         Which of numbered columns (``q0`` to ``q3``, or ``q1`` to ``q4``) is the scalar part; refused if not stated.
     sense : {"icrs_to_camera", "camera_to_icrs"}
-        What the quaternions turn into what. The default is b = R r, ICRS vectors into the camera frame.
+        Direction of the quaternions. The default is b = R r, ICRS vectors into the camera frame.
 
     Raises
     ------

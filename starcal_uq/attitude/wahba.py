@@ -120,7 +120,7 @@ def quest(
     covariance : bool
         False saves the time for the covariances.
     on_degenerate : {"raise", "flag"}
-        What to do with frames that do not determine an attitude; flagged frames have NaN and ``ok`` false.
+        Treatment of frames that do not determine an attitude; flagged frames have NaN and ``ok`` false.
 
     Raises
     ------

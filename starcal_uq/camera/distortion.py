@@ -33,7 +33,7 @@ class Parameter:
     latex : str
         Symbol for axis labels.
     description : str
-        What it is, in words.
+        Meaning, in words.
     """
 
     name: str
@@ -58,7 +58,7 @@ class DistortionModel:
     Attributes
     ----------
     name : str
-        What users write in ``distortion = "..."``.
+        Word that users write in ``distortion = "..."``.
     coefficients : tuple of Coefficient
         In the order in which they follow x0, y0 and f.
     direction : {"forward", "inverse"}
@@ -66,7 +66,7 @@ class DistortionModel:
     displacement : callable
         ``(u, v, k) -> (du, dv)``: displacement in pixels at offset (u, v) px from the principal point.
     source : str
-        Where the formula comes from.
+        Source of the formula.
     """
 
     name: str

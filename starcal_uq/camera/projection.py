@@ -201,7 +201,7 @@ def solve_displacement(
     target : (2, n) array
         Offsets from the principal point, px.
     start : (2, n) array, optional
-        Where to start; the target itself by default, from which Newton's method converges monotonically for radial
+        Start; the target itself by default, from which Newton's method converges monotonically for radial
         distortion that does not fold.
 
     Returns

@@ -60,12 +60,12 @@ def julian_year(time_utc: Any) -> float:
     Parameters
     ----------
     time_utc
-        As for `julian_days`.
+        One UTC time or several, ISO 8601.
 
     Raises
     ------
     CatalogueError
-        As `julian_days`.
+        If a time is missing or unreadable.
     """
     tt, _, inverse = julian_days(time_utc)
     return float(2000.0 + (np.mean(tt.sum(axis=1)[inverse]) - 2451545.0) / 365.25)

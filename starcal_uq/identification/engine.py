@@ -92,15 +92,15 @@ def identify(
         Displacement at the detector's corner by distortion that the nominal camera does not have, px. Where less than
         half of the frames are found, the others are tried with four times as much, and as mirror images.
     engine
-        What finds attitudes: "pyramid", this package's pattern search, or "tetra3rs", a solver in Rust, which needs
-        the package of that name (extra `tetra3rs`). Matching and acceptance are the same.
+        Solver that finds attitudes: "pyramid", this package's pattern search, or "tetra3rs", a solver in Rust, which
+        needs the package of that name (extra `tetra3rs`). Matching and acceptance are the same.
     share_camera
         Whether all frames come from one camera, so that those that are found help to find the others. The result does
         not depend on the order of the frames.
     cache
         Whether the catalogue's pairs are kept on disk, which saves about 0.1 s to 1 s.
     cache_dir
-        Where; by default the platform's folder for caches (`$XDG_CACHE_HOME/starcal_uq`).
+        Folder of the cache; by default the platform's folder for caches (`$XDG_CACHE_HOME/starcal_uq`).
     progress
         Called with the number of frames done and to be done.
 

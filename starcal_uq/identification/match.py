@@ -69,7 +69,7 @@ class Match:
     n_unlike_brightness : int
         Centroids left out because they are farther from their star, and less of its brightness, than chance explains.
     information : (4, 4) array, gradient : (4,) array
-        What the frame says about the shared parameters, attitude eliminated: information times their best value is
+        Information on the shared parameters, attitude eliminated: information times their best value is
         ``gradient``.
     """
 

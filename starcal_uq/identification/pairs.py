@@ -47,9 +47,9 @@ class StarPairs:
     neighbour : (2 P,) array of int
         Partners of pattern star 0, then of star 1 and so on; those of one star by increasing angle.
     neighbour_angle : (2 P,) array
-        Their angles, rad.
+        Angles to them, rad.
     neighbour_start : (n + 1,) array of int
-        Where the partners of each star begin.
+        First partner of each star.
     """
 
     star: IntArray
@@ -173,7 +173,7 @@ def cached_star_pairs(
     Parameters
     ----------
     directions, mag, field_sr, max_angle_rad, per_field
-        As for `find_star_pairs`.
+        Stars and their limits as `find_star_pairs` takes them.
     cache_dir : path, optional
         The folder, made when it is missing; `default_cache_dir()` if not given.
     """

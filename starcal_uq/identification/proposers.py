@@ -21,8 +21,8 @@ from starcal_uq.sky.gaia import write_gaia_records
 Engine: TypeAlias = Literal["pyramid", "tetra3rs"]
 ENGINES: tuple[Engine, ...] = ("pyramid", "tetra3rs")
 
-# Batches of hypotheses from points, their noise, the camera, its tolerances, the number of centroids to look at, and the
-# number of those that were searched before: `pyramid.hypotheses` with its catalogue, or another solver's.
+# Batches of hypotheses from points, their noise, the camera, its tolerances, the number of centroids to look at, and
+# the number of those that were searched before: `pyramid.hypotheses` with its catalogue, or another solver's.
 Proposer: TypeAlias = Callable[
     [FloatArray, FloatArray, FieldGeometry, CameraTolerance, int, int], Iterator[list[Hypothesis]]
 ]

@@ -27,7 +27,7 @@ class FrameIdentification:
     Attributes
     ----------
     frame : int
-        Its number.
+        Number of the frame.
     image : str
         Name of its image.
     status : str

@@ -84,7 +84,7 @@ class Centroids(FrameRows, Shown):
     problem : array of str, shape (K,)
         Why the frame was left out; empty where it was used.
     messages : tuple of str
-        What a user should know, one sentence each.
+        Notes for the user, one sentence each.
     meta : dict
         Settings, gain, hash of the images.
 

@@ -55,7 +55,7 @@ class FrameStars:
     measured_gain_e_per_count : float or None
         The gain read off the noise of the background where none was given; it serves the noise of the stars only.
     messages : list of str
-        What was left out, without the name of the image.
+        Notes on what was left out, without the name of the image.
     windowed : bool
         Whether the centroids are windowed because the star images are no round Gaussians.
     """

@@ -62,7 +62,7 @@ class StarFit:
     flux : array, shape (n,)
         Counts.
     covariance : array, shape (n, 3, 3)
-        Of (x, y, flux); infinite where the pixels do not determine the star.
+        Covariance of (x, y, flux), px and counts; infinite where the pixels do not determine the star.
     sigma_px : array, shape (n,)
         Width of the star image, before integration over pixels.
     weight : array, shape (n, m, m)

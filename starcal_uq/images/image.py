@@ -56,11 +56,11 @@ class Image:
     saturation : float or None
         Counts at and above which a pixel is saturated.
     header : dict
-        What the file says of itself: keyword to plain value.
+        Keywords of the file and their plain values.
     gain_e_per_count : float or None
         Electrons per count.
     messages : tuple of str
-        What was done to the pixels in reading, one sentence each.
+        Notes on what was done to the pixels in reading, one sentence each.
     """
 
     data: np.ndarray[Any, Any]

@@ -35,7 +35,7 @@ def weighted_chi_square_tail(weights: FloatArray, x: float, dof: float = np.inf)
     x : float
         Threshold.
     dof : float
-        Of the noise estimate that scales the weights; infinite where the noise is known.
+        Degrees of freedom of the noise that scales the weights; infinite where the noise is known.
 
     Raises
     ------

@@ -81,7 +81,7 @@ def uniformity_band(n: int, n_values: int, probability: float = 0.95) -> tuple[F
     n_values : int
         How many values a rank can take: one more than the number of draws.
     probability : float
-        Of staying inside at all points.
+        Probability of staying inside at all points.
 
     Returns
     -------

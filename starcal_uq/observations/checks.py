@@ -233,12 +233,12 @@ def raise_problems(source: str, word: str, numbers: IntArray, problems: Sequence
     numbers
         Number of each row in the file, shape (N,).
     problems
-        Of several for one cell the first is kept; one for a whole row replaces those of its cells.
+        Problems found; of several for one cell the first is kept; one for a whole row replaces those of its cells.
 
     Raises
     ------
     ObservationError
-        Its message names the first bad row and counts the others.
+        If there is any problem: the message names the first bad row and counts the others.
     """
     whole_rows = {p.row for p in problems if p.column is None}
     kept: dict[tuple[int, str | None], Problem] = {}

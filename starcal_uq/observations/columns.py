@@ -23,7 +23,7 @@ class Column:
     gaps : bool
         Whether single values may be missing (NaN, or an empty text).
     description : str
-        What it holds.
+        Content, in words.
     """
 
     name: str

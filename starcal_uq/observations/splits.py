@@ -30,7 +30,7 @@ def split_frames(obs: Observations, how: str = "odd-even", *, seed: int = 0) -> 
         Every other frame in their order (the first, third... are the odd ones, whatever their numbers); the first and
         the second half; or a random half.
     seed : int
-        Of the random half.
+        Seed of the random half.
 
     Raises
     ------

@@ -29,7 +29,7 @@ class Contaminated:
     observations : Observations
         Same rows, some with the direction, name and magnitude of another star.
     wrong : (N,) bool array
-        Those rows.
+        Rows that were changed.
     """
 
     observations: Observations
@@ -53,9 +53,9 @@ def contaminate(
     obs : Observations
         Right identifications.
     stars : StarCatalogue
-        Where wrong stars are taken from; its directions must be of the same kind as those of the observations.
+        Catalogue that wrong stars are taken from; its directions must be of the same kind as those of the observations.
     camera : Camera
-        Its focal length turns `radius_px` into an angle.
+        Camera whose focal length turns `radius_px` into an angle.
     fraction : float
         Share of the rows that becomes wrong; rounded to whole rows, chosen at random over all frames.
     kind : {"random", "neighbour"}

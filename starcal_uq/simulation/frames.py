@@ -155,7 +155,7 @@ def choose_attitudes(
     rng : numpy.random.Generator
         Source of the attitudes; it is left alone when `attitudes` are given.
     n_frames, min_stars : int
-        As for `simulate`.
+        Number of frames, and of stars in each at least.
     attitudes : (n_frames, 3, 3) array, optional
         R_cam_icrs.
 
@@ -163,7 +163,7 @@ def choose_attitudes(
     -------
     rotations : (n, 3, 3) array
     views : list of (indices, pixels)
-        As `Sky.views` returns them for these rotations.
+        Views that `Sky.views` returns for these rotations.
 
     Raises
     ------

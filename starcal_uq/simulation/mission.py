@@ -80,12 +80,12 @@ def profile_frames(
     min_stars: int = 3,
     noise_like: Observations | None = None,
 ) -> Observations:
-    """Noise-free frames along an attitude profile, for `starcal_uq.propagate` and `starcal_uq.propagation.error_spectrum`.
+    """Noise-free frames along an attitude profile, for `propagate` and `starcal_uq.propagation.error_spectrum`.
 
     Parameters
     ----------
     stars, camera, noise_like
-        As for `mission_frames`.
+        Catalogue, camera and observations as `mission_frames` takes them.
     profile : AttitudeProfile
         Attitudes of the camera over time.
     rate_hz : float, optional

@@ -272,7 +272,7 @@ def uniform_shot_noise(mean: float, shape: tuple[int, int], rng: np.random.Gener
     Parameters
     ----------
     mean : float
-        Their mean, 0 or more.
+        Mean of the numbers, 0 or more.
     shape : tuple of int
         Size of the detector.
     rng : numpy.random.Generator

@@ -59,11 +59,11 @@ class FrameTruth:
     star_id : (n,) array of str
         Names of the stars whose noise-free position at the middle of the exposure lies on the detector.
     ra_deg, dec_deg : (n,) array
-        Their directions, as the camera saw them.
+        Directions as the camera saw them, deg.
     mag : (n,) array
-        Their magnitudes.
+        Magnitudes of the stars.
     x_px, y_px : (n,) array
-        Those positions; (0, 0) is the centre of the first pixel, y grows downwards.
+        Positions at mid-exposure, px; (0, 0) is the centre of the first pixel, y grows downwards.
     electrons : (n,) array
         Expected electrons of each star in the exposure, those beyond the edge or the full well included.
     frame : int
@@ -121,7 +121,7 @@ class RenderedFrame:
     data : (height_px, width_px) array
         Counts, uint16; float64 if they were not quantised. ``data[y, x]`` is the pixel whose centre is (x, y).
     truth : FrameTruth
-        What the frame shows.
+        Truth of what the frame shows.
     """
 
     data: np.ndarray[Any, Any]

@@ -150,7 +150,7 @@ def catalogue_directions(
     apparent
         Unit vectors as seen, ICRS axes, shape (n, 3).
     time_utc, observer_velocity_km_s, site
-        As for `apparent_directions`.
+        Times, velocity (km/s) and site as `apparent_directions` takes them.
 
     Returns
     -------
@@ -183,12 +183,12 @@ def make_apparent(
         Velocity relative to the Earth's centre, ICRS axes, km/s, shape (3,) or one row for each observation; zero by
         default. A low orbit adds 7.6 km/s (5 arcsec), a site on the ground at most 0.47 km/s (0.3 arcsec).
     site
-        Where on the ground the camera stood; it gives the velocity, so that none is given beside it.
+        Place on the ground where the camera stood; it gives the velocity, so that none is given beside it.
 
     Returns
     -------
     Observations
-        The same rows; `meta["directions"]` is "apparent", `meta["observer_velocity_km_s"]` is the mean of the
+        Rows as before; `meta["directions"]` is "apparent", `meta["observer_velocity_km_s"]` is the mean of the
         barycentric velocities that were applied, one for each row; `meta["observer"]` is "ground" with a site, "space"
         with a velocity above 1 km/s or where it said so, else "unknown". With a site, `meta["site"]` holds it and
         `meta["atmosphere"]` the air that was taken and what it does.
@@ -247,7 +247,7 @@ def without_low_stars(obs: Observations, site: Site, least_altitude_deg: float =
     obs
         Observations with catalogue directions and a `time_utc` in every row.
     site
-        Where on the ground the camera stood.
+        Place on the ground where the camera stood.
     least_altitude_deg
         Altitude as seen, refraction included.
 

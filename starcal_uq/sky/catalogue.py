@@ -51,7 +51,7 @@ class StarCatalogue(Shown):
     apparent
         Whether aberration has been applied to the directions.
     source
-        Where the stars come from, in words.
+        Origin of the stars, in words.
     """
 
     star_id: StrArray

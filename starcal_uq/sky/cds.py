@@ -143,8 +143,8 @@ def read_cds(path: Path, kind: CdsFormat, readme: Path | None) -> StarCatalogue:
     kind
         Which catalogue.
     readme
-        Its ReadMe; None takes the file "ReadMe" beside it if that describes the needed columns, else the published
-        layout.
+        ReadMe of the catalogue; None takes the file "ReadMe" beside it if that describes the needed columns, else the
+        published layout.
 
     Raises
     ------

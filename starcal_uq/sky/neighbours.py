@@ -32,7 +32,7 @@ def disturbed_stars(obs: Observations, stars: StarCatalogue, camera: Camera, psf
     obs : Observations
         Identified stars, with magnitudes of the catalogue and their noise.
     stars : StarCatalogue
-        What they were identified in; neighbours fainter than its limit are not known.
+        Catalogue that they were identified in; neighbours fainter than its limit are not known.
     camera : Camera
         For the scale.
     psf_sigma_px : float
