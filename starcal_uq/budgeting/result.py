@@ -12,19 +12,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.budgeting.file import Requirement
-from starcal_uq.budgeting.rows import AXIS_LABELS, SCOPES, Contributor, confidence_text
+from starcal_uq.budgeting.rows import AXIS_LABELS, SCOPES, Contributor
 from starcal_uq.budgeting.totals import Samples, Total, total
 from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import BudgetError, RunFolderError
 from starcal_uq.core.files import atomic_path
-from starcal_uq.core.formatting import significant
 from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
     import pandas as pd
-
-FORMATS = (".csv", ".xlsx", ".tex", ".html")
-
 
 # All that people may call an axis: its name, its letter, its label in the tables.
 _AXIS_NAMES = {
@@ -35,7 +32,7 @@ _AXIS_NAMES = {
 
 
 @dataclass(frozen=True)
-class Outcome:
+class Outcome(Shown):
     """A requirement against the total that it is about.
 
     Attributes
@@ -79,34 +76,9 @@ class Outcome:
         """True if it is open because the samples do not resolve its confidence."""
         return self.total.unresolved and math.isnan(self.bound_arcsec)
 
-    @property
-    def sentence(self) -> str:
-        """The outcome in one sentence."""
-        asked = self.requirement
-        what = f"{AXIS_LABELS[asked.axis]}, {confidence_text(asked.confidence)}, {asked.scope}, {asked.interpretation}"
-        numbers = f"{significant(self.bound_arcsec, 3)} arcsec against a limit of {significant(asked.limit_arcsec, 3)}"
-        if self.unresolved:
-            least = "at least " if self.total.at_least else ""
-            return (
-                f"{asked.name!r} ({what}) is open: {self.total.explanation.removesuffix('.')}. The rule, which knows "
-                f"Gaussian tails only, says {least}{significant(self.total.rule_arcsec, 3)} arcsec against a limit of "
-                f"{significant(asked.limit_arcsec, 3)}; judged_by = 'rule' would let it judge alone."
-            )
-        if math.isnan(self.bound_arcsec):
-            return f"{asked.name!r} ({what}) is open: no contributor is assessed."
-        least = "at least " if self.total.at_least else ""
-        if self.verdict == "violated":
-            cause = f"; {self.total.dominant!r} dominates" if self.total.dominant else ""
-            return f"{asked.name!r} ({what}) is violated: {least}{numbers}{cause}."
-        if self.verdict == "open":
-            count = len(self.total.not_assessed)
-            missing = f"{count} contributors are" if count > 1 else "1 contributor is"
-            return f"{asked.name!r} ({what}) is open: {numbers} so far, but {missing} not assessed."
-        return f"{asked.name!r} ({what}) is met: {numbers}, margin {significant(self.margin_arcsec, 3)} arcsec."
-
 
 @dataclass(frozen=True, eq=False)
-class Budget:
+class Budget(Shown):
     """The attitude error budget of a star sensor.
 
     Attributes
@@ -245,31 +217,44 @@ class Budget:
         }
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the budget, atomically; overwritten. The ending names the format.
-
-        ``.csv`` holds everything to the last digit and is what `load` reads; ``.xlsx``, ``.tex`` and ``.html`` are
-        for people.
+        """Write everything as CSV, to the last digit and atomically; overwritten.
 
         Raises
         ------
         BudgetError
-            For another ending.
+            For another ending than ``.csv``.
         RunFolderError
             If it cannot be written.
         """
-        from starcal_uq.presentation.pages import budgeting as budget_output
-
-        ending = Path(path).suffix.lower()
-        if ending not in FORMATS:
-            raise BudgetError(f"{path}: the ending names the format; use one of {', '.join(FORMATS)}.")
-        if ending == ".csv":
-            write_csv(self, path)
-        else:
-            budget_output.WRITERS[ending](self, path)
+        if Path(path).suffix.lower() != ".csv":
+            raise BudgetError(f"{path}: a budget is saved as .csv; sc.report(budget, path) writes .xlsx, .tex, .html.")
+        records = [{"record": "contributor", **_plain(row), "combination": row.combination} for row in self.rows]
+        records += [{"record": "total", **_plain(entry)} for entry in self.totals]
+        records += [
+            {
+                "record": "requirement",
+                **_plain(outcome.total),
+                **_plain(outcome.requirement),
+                "margin_arcsec": repr(outcome.margin_arcsec),
+                "verdict": outcome.verdict,
+            }
+            for outcome in self.outcomes
+        ]
+        settings = {
+            "confidence": self.confidence,
+            "title": self.title,
+            "notes": list(self.notes),
+            "provenance": self.provenance,
+        }
+        records += [{"record": "setting", "name": key, "value": json.dumps(value)} for key, value in settings.items()]
+        with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, _COLUMNS, lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(records)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Budget:
-        """Read what `save` wrote as CSV, without loss.
+        """Read what `save` wrote, without loss.
 
         Raises
         ------
@@ -278,17 +263,6 @@ class Budget:
         """
 
         return read_csv(path)
-
-    def plot_budget(self, **options: Any) -> Any:
-        """Contributions and totals; options as for `starcal_uq.presentation.figures.budgeting.plot_budget`."""
-        from starcal_uq.presentation.figures.budgeting import plot_budget
-
-        return plot_budget(self, **options)
-
-    def _repr_html_(self) -> str:
-        from starcal_uq.presentation.pages.budgeting import section_html
-
-        return section_html(self)
 
 
 def _unknown(value: Any) -> bool:
@@ -341,33 +315,6 @@ _COLUMNS = tuple(
         ["record", *(f.name for kind in (Contributor, Requirement, Total) for f in fields(kind)), *_DERIVED, "value"]
     )
 )
-
-
-def write_csv(budget: Budget, path: str | os.PathLike[str]) -> None:
-    """Write the file, atomically."""
-    records = [{"record": "contributor", **_plain(row), "combination": row.combination} for row in budget.rows]
-    records += [{"record": "total", **_plain(entry)} for entry in budget.totals]
-    records += [
-        {
-            "record": "requirement",
-            **_plain(outcome.total),
-            **_plain(outcome.requirement),
-            "margin_arcsec": repr(outcome.margin_arcsec),
-            "verdict": outcome.verdict,
-        }
-        for outcome in budget.outcomes
-    ]
-    settings = {
-        "confidence": budget.confidence,
-        "title": budget.title,
-        "notes": list(budget.notes),
-        "provenance": budget.provenance,
-    }
-    records += [{"record": "setting", "name": key, "value": json.dumps(value)} for key, value in settings.items()]
-    with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, _COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(records)
 
 
 def read_csv(path: str | os.PathLike[str]) -> Budget:

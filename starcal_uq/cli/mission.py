@@ -62,9 +62,10 @@ def budget_command(
     json: Json = False,
 ) -> None:
     """Attitude error budget in the terms of ECSS; status 1 when a requirement is violated."""
-    from starcal_uq.budgeting.result import FORMATS
     from starcal_uq.cli.console import print_json
     from starcal_uq.core.files import ensure_new
+    from starcal_uq.presentation.pages.budgeting import FORMATS
+    from starcal_uq.presentation.pages.write import write_page
     from starcal_uq.runs.steps import budget_run
 
     if template is not None and file is not None and template.resolve() == file.resolve():
@@ -81,7 +82,7 @@ def budget_command(
         print(f"Budget file to fill in: {template}. Next: starcal-uq budget {run} --file {template}")
         return
     for path in out or []:
-        found.save(path)
+        write_page(found, path)
     if json:
         print_json(found.to_dict())
     else:
@@ -92,38 +93,17 @@ def budget_command(
 
 def show_budget(found: Budget) -> None:
     """Contributors, totals, requirements and what must be read with them, in the terminal."""
-    import pandas as pd
+    from starcal_uq.cli.console import out, print_table
+    from starcal_uq.presentation.words.budgeting import contributors_table, explanations, totals_table
 
-    from starcal_uq.budgeting.rows import confidence_text
-    from starcal_uq.cli.console import out, show_table
-    from starcal_uq.presentation.pages.budgeting import (
-        NOT_ASSESSED,
-        contributor_rows,
-        explanations,
-        headline,
-        total_rows,
-    )
-
-    contributors = [
-        {
-            "contributor": row["name"],
-            "class": row["ecss_class"],
-            # Said once where it holds for all axes.
-            **dict(zip(("X", "Y", "Z"), row["sigma"] if row["assessed"] else (NOT_ASSESSED, "", ""), strict=True)),
-            "random over": row["interpretation"],
-            "absorbed": row["absorbed"],
-        }
-        for row in contributor_rows(found)
-    ]
-    show_table(pd.DataFrame(contributors), f"{found.title}: contributors, 1 sigma, arcsec")
-    totals = [{name: row[name] for name in ("scope", "axis", "sigma", "rule", "sampled")} for row in total_rows(found)]
-    show_table(pd.DataFrame(totals), f"Totals at {confidence_text(found.confidence)}, mixed interpretation, arcsec")
+    print_table(contributors_table(found))
+    print_table(totals_table(found))
     for sentence in (*explanations(found), *found.notes):
         out.print(sentence, highlight=False, soft_wrap=True)
     for outcome in found.outcomes:
         style = {"violated": "red", "met": "green"}.get(outcome.verdict, "yellow")
-        out.print(outcome.sentence, style=style, highlight=False, soft_wrap=True)
-    out.print(headline(found), highlight=False, soft_wrap=True)
+        out.print(outcome.text, style=style, highlight=False, soft_wrap=True)
+    out.print(found.text, highlight=False, soft_wrap=True)
 
 
 def fail_if_violated(found: Budget) -> None:
@@ -131,7 +111,7 @@ def fail_if_violated(found: Budget) -> None:
     from starcal_uq.cli.console import err
 
     for outcome in found.violations:
-        err.print(f"violated: {outcome.sentence}", style="red", highlight=False, soft_wrap=True)
+        err.print(f"violated: {outcome.text}", style="red", highlight=False, soft_wrap=True)
     if found.violations:
         raise typer.Exit(1)
 
@@ -162,7 +142,9 @@ def compare_command(
 ) -> None:
     """Do two calibrations differ by more than chance? The rotation between them is taken out and stated."""
     from starcal_uq.cli.console import out as console
-    from starcal_uq.cli.console import print_json, show_table
+    from starcal_uq.cli.console import print_json, print_table
+    from starcal_uq.presentation.pages.write import write_page
+    from starcal_uq.presentation.words.comparison import comparison_table
     from starcal_uq.runs.compare import compare_runs, compare_split
 
     if len(runs) != (2 if split is None else 1):
@@ -178,12 +160,12 @@ def compare_command(
         found = compare_runs(*runs, labels=names, same_data=same_data, **options)
     else:
         found = compare_split(runs[0], split, **(options if names is None else options | {"labels": names}))
-    page = None if out is None else found.save(out)
+    page = None if out is None else write_page(found, out)
     if json:
         print_json(found.to_dict())
         return
-    show_table(found.to_dataframe(), f"{found.labels[1]} minus {found.labels[0]}")
-    console.print(found.words, highlight=False, soft_wrap=True)
+    print_table(comparison_table(found))
+    console.print(found.text, highlight=False, soft_wrap=True)
     if page is not None:
         print(f"Page: {page.resolve()}")
 
@@ -239,8 +221,10 @@ def plan_command(
     from starcal_uq.cli.console import print_json, records
     from starcal_uq.planning.check import check_forecast
     from starcal_uq.planning.design import choose_frames
-    from starcal_uq.planning.plan import N_FRAMES, plan
+    from starcal_uq.planning.forecast import N_FRAMES
+    from starcal_uq.planning.plan import plan
     from starcal_uq.presentation.pages.planning import plan_record
+    from starcal_uq.presentation.pages.write import write_page
     from starcal_uq.sky.catalogue import load_catalogue
 
     check_output(out, force)
@@ -295,13 +279,13 @@ def plan_command(
                 seed=seed,
                 progress=progress,
             )
-    page = None if out is None else found.save(out, choice=choice, check=simulated)
+    page = None if out is None else write_page(found, out, choice=choice, check=simulated)
     if json:
         document = plan_record(found)
         if choice is not None:
-            document |= {"choice": {"verdict": choice.verdict, "frames": records(choice.to_dataframe())}}
+            document |= {"choice": {"verdict": choice.text, "frames": records(choice.to_dataframe())}}
         if simulated is not None:
-            document |= {"check": {"verdict": simulated.verdict, "table": records(simulated.to_dataframe())}}
+            document |= {"check": {"verdict": simulated.text, "table": records(simulated.to_dataframe())}}
         print_json(document)
     else:
         _show_plan(found, choice, simulated)
@@ -312,15 +296,16 @@ def plan_command(
 
 
 def _show_plan(found: Plan, choice: FrameChoice | None, simulated: ForecastCheck | None) -> None:
-    from starcal_uq.cli.console import out, show_table
+    from starcal_uq.cli.console import out, print_table
+    from starcal_uq.presentation.words.planning import choice_table, plan_table
 
-    show_table(found.to_dataframe(), "Forecast, standard deviations; the radius holds the stated confidence", _FORECAST)
-    words = [found.verdict, *(f"{need.scope}: {need.words}" for need in found.needs)]
+    print_table(plan_table(found))
+    words = [found.text, *(f"{need.scope}: {need.text}" for need in found.needs)]
     if choice is not None:
-        show_table(choice.to_dataframe().head(_SHOWN), f"The first {min(_SHOWN, len(choice.candidate))} frames to take")
-        words.append(choice.verdict)
+        print_table(choice_table(choice))
+        words.append(choice.text)
     if simulated is not None:
-        words.append(simulated.verdict)
+        words.append(simulated.text)
     for sentence in words:
         out.print(sentence, highlight=False, soft_wrap=True)
 
@@ -336,16 +321,3 @@ def _known(run: Path, sheet: Camera, path: Path) -> tuple[Calibration, float]:
     check_same_sensor(calibration.camera, run, sheet, path)
     stated = 1.0 if obs.sigma_px is None or calibration.sigma_name == "sigma" else float(np.median(obs.sigma_px))
     return calibration, float(calibration.sigma) * stated
-
-
-# Of the chosen frames, so many are shown; the others are in the tables.
-_SHOWN = 20
-_FORECAST = (
-    "n_frames",
-    "x0_px",
-    "f_mm",
-    "common_pitch_arcsec",
-    "rest_pitch_arcsec",
-    "nea_pitch_arcsec",
-    "radius_arcsec",
-)

@@ -11,22 +11,6 @@ from starcal_uq.cli.console import progress_bar
 from starcal_uq.cli.options import CameraFile, Force, Json, NewRun, RunPath, Seed
 from starcal_uq.core.files import check_new_folder
 
-_VALIDATION = ("quantity", "unit", "coverage_95", "coverage_low", "coverage_high", "coverage_p", "rank_p")
-_SHOWN = {
-    "Misfit": ("test", "against", "statistic", "p_value", "p_holm", "size_px"),
-    "Jackknife over frames": (
-        "parameter",
-        "formal_sigma",
-        "jackknife_sigma",
-        "ratio",
-        "expected_low",
-        "expected_high",
-        "p_value",
-    ),
-    "Distortion models": ("model", "n_parameters", "elpd", "difference", "difference_se", "rejected"),
-    "Predictive checks": ("name", "observed", "replicated_low", "replicated_high", "p_value"),
-}
-
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the command line."""
@@ -56,7 +40,7 @@ def validate_command(
     """Show that the intervals are right for this sensor and this volume of data, by simulation-based calibration."""
     from starcal_uq.camera.camera import Camera
     from starcal_uq.cli.console import out as console
-    from starcal_uq.cli.console import print_json, records, show_table
+    from starcal_uq.cli.console import print_json, print_table, records
     from starcal_uq.core.files import atomic_write_bytes
     from starcal_uq.diagnostics.validation.validate import TRUTHS, validate
     from starcal_uq.runs.folder import RunFolder
@@ -81,18 +65,19 @@ def validate_command(
         )
     from starcal_uq.core.files import atomic_path
     from starcal_uq.presentation.figures.style import png_bytes
+    from starcal_uq.presentation.words.diagnostics import validation_table
 
     folder.create()
     found.save(out / "validation.npz")
     table = found.to_dataframe()
     with atomic_path(out / "validation.csv") as temporary:
         table.to_csv(temporary, index=False)
-    atomic_write_bytes(out / "validation.png", png_bytes(found.plot()))
+    atomic_write_bytes(out / "validation.png", png_bytes(found.plot.ranks()))
     if json:
-        print_json({"ok": found.ok, "verdict": found.verdict, "quantities": records(table)})
+        print_json({"ok": found.ok, "verdict": found.text, "quantities": records(table)})
     else:
-        show_table(table, "Validation", _VALIDATION)
-        console.print(found.verdict, style="green" if found.ok else "red", highlight=False, soft_wrap=True)
+        print_table(validation_table(found))
+        console.print(found.text, style="green" if found.ok else "red", highlight=False, soft_wrap=True)
         print(f"Figure: {(out / 'validation.png').resolve()}")
     if not found.ok:
         raise typer.Exit(1)
@@ -105,7 +90,8 @@ def diagnose_command(
     json: Json = False,
 ) -> None:
     """Question the model: misfit, jackknife, other distortion models, predictive checks, other starts."""
-    from starcal_uq.cli.console import print_json, records, show_table
+    from starcal_uq.cli.console import print_json, print_table, records
+    from starcal_uq.presentation.words.diagnostics import jackknife_table, misfit_table, models_table, predictive_table
     from starcal_uq.runs.steps import diagnose_run
 
     with progress_bar("diagnosis") as progress:
@@ -120,10 +106,14 @@ def diagnose_command(
     if json:
         print_json({title: records(table) for title, table in tables.items()})
         return
-    for title, table in tables.items():
-        show_table(table, title, _SHOWN[title])
+    print_table(misfit_table(found.misfit))
+    if found.jackknife is not None:
+        print_table(jackknife_table(found.jackknife))
     if found.comparison is not None:
-        print(found.comparison.statement)
+        print_table(models_table(found.comparison))
+    print_table(predictive_table(found.predictive))
+    if found.comparison is not None:
+        print(found.comparison.text)
 
 
 def merge_command(

@@ -5,25 +5,21 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.core.constants import AXES
-from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import atomic_write_bytes, atomic_write_text
-from starcal_uq.core.formatting import significant
+from starcal_uq.core.display import Shown
 from starcal_uq.core.records import read_json, to_plain, write_json
 from starcal_uq.core.types import AnyDict, FloatArray
 
 if TYPE_CHECKING:
     import pandas as pd
 
-FILES = ("comparison.html", "difference.csv", "comparison.json", "difference_map.csv", "difference_map.png")
-
 
 @dataclass(frozen=True, eq=False)
-class CameraComparison:
+class CameraComparison(Shown):
     """Directions of camera B minus those of camera A at the same pixels, the best rotation removed.
 
     p-values are NaN, and uncertainties of the difference too, where the covariance of the difference is not known.
@@ -148,13 +144,6 @@ class CameraComparison:
         """Standard deviations (3,) of the rotation."""
         return np.sqrt(np.diag(self.rotation_covariance_arcsec2))
 
-    @property
-    def words(self) -> str:
-        """The verdict as a sentence."""
-        from starcal_uq.presentation.words.comparison import verdict_words
-
-        return verdict_words(self)
-
     def to_dataframe(self) -> pd.DataFrame:
         """One row per quantity: ``quantity``, ``unit``, ``difference``, ``expected``, ``ratio``, ``p_value``.
 
@@ -213,43 +202,9 @@ class CameraComparison:
             }
         )
 
-    def plot_difference(self, **options: Any) -> Any:
-        """Difference map beside what was to be expected; options as for `starcal_uq.presentation.figures.comparison.plot_camera_comparison`."""
-        from starcal_uq.presentation.figures.comparison import plot_camera_comparison
-
-        return plot_camera_comparison(self, **options)
-
-    def save(self, folder: str | os.PathLike[str]) -> Path:
-        """Write the page, the tables, the figure and a lossless file into a folder; existing ones are overwritten.
-
-        Returns
-        -------
-        Path
-            ``comparison.html``, which needs no network and no other file.
-
-        Raises
-        ------
-        RunFolderError
-            If the folder cannot be made or written to.
-        """
-        from starcal_uq.presentation.figures.style import png_bytes
-        from starcal_uq.presentation.pages.comparison import render_comparison
-
-        folder = Path(folder)
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise RunFolderError(
-                f"{folder}: the folder cannot be made ({error.strerror}); choose another place."
-            ) from error
-        image = png_bytes(self.plot_difference())
-        write_json(self.to_dict(), folder / "comparison.json")
-        atomic_write_text(folder / "difference.csv", self.to_dataframe().to_csv(index=False))
-        atomic_write_text(folder / "difference_map.csv", self.field_dataframe().to_csv(index=False))
-        atomic_write_bytes(folder / "difference_map.png", image)
-        page = folder / "comparison.html"
-        atomic_write_text(page, render_comparison(self, image))
-        return page
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write everything as JSON, atomically; overwritten."""
+        write_json(self.to_dict(), path)
 
     def to_dict(self) -> AnyDict:
         """Plain values, for JSON; NaN is null."""
@@ -269,11 +224,3 @@ class CameraComparison:
             path = path / "comparison.json"
         remedy = "run `starcal-uq compare RUN_A RUN_B -o DIR` to write it"
         return read_json(cls, path, missing=remedy, wrong=f"is not a comparison of cameras; {remedy} again")
-
-    def _repr_html_(self) -> str:
-        import html
-
-        table = self.to_dataframe().to_html(
-            index=False, float_format=lambda v: significant(v, 3), na_rep="", border=0, justify="left"
-        )
-        return f"<p><b>Comparison</b>: {html.escape(self.words)}</p>{table}"

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.files import PathLike
 from starcal_uq.core.provenance import provenance
@@ -74,7 +75,7 @@ class MultiStart:
 
 
 @dataclass(frozen=True)
-class Diagnosis:
+class Diagnosis(Shown):
     """What questions the model of a run.
 
     Attributes
@@ -123,10 +124,6 @@ class Diagnosis:
         """
         remedy = "run `starcal-uq diagnose` again"
         return read_json(cls, path, missing=remedy, wrong=f"cannot be read as a diagnosis ({{reason}}): {remedy}")
-
-    def _repr_html_(self) -> str:
-        parts = (self.misfit, self.jackknife, self.comparison, self.predictive)
-        return "".join(part._repr_html_() for part in parts if part is not None)
 
 
 def diagnose(

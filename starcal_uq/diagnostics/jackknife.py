@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.formatting import fixed, plural
+from starcal_uq.core.formatting import plural
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.normals import FrameNormals
 
@@ -26,7 +27,7 @@ _ARRAYS = ("formal_covariance", "jackknife_covariance", "sandwich_covariance", "
 
 
 @dataclass(frozen=True, eq=False)
-class Jackknife:
+class Jackknife(Shown):
     """Formal and frame-level uncertainties side by side.
 
     Attributes
@@ -116,19 +117,6 @@ class Jackknife:
                 "p_value": self.p_values,
                 "factor": self.factors,
             }
-        )
-
-    def _repr_html_(self) -> str:
-        numbers = (self.ratio, self.sandwich_ratio, *self.expected())
-        cells = "".join(
-            f"<tr><th>{name}</th><td>{fixed(float(a), 2)}</td><td>{fixed(float(b), 2)}</td>"
-            f"<td>{fixed(float(low), 2)} to {fixed(float(high), 2)}</td></tr>"
-            for name, a, b, low, high in zip(self.parameter_names, *numbers, strict=True)
-        )
-        return (
-            f"<p><b>Jackknife</b> over {plural(self.n_frames, 'frame')}: ratio to the formal sigma</p><table><thead>"
-            "<tr><th>parameter</th><th>jackknife</th><th>cluster-robust</th><th>by chance (95 %)</th></tr></thead>"
-            f"<tbody>{cells}</tbody></table>"
         )
 
 

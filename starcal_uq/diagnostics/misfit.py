@@ -12,14 +12,14 @@ unequal noise compare the residuals' weighted and unweighted sums of squares wit
 
 from __future__ import annotations
 
-import html
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
-from starcal_uq.core.formatting import plural, significant
+from starcal_uq.core.display import Shown
+from starcal_uq.core.formatting import significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.shapes import Shape, View, run_clock, shapes
 from starcal_uq.estimation.marginal import MarginalLikelihood
@@ -105,7 +105,7 @@ class MisfitTest:
 
 
 @dataclass(frozen=True)
-class Misfit:
+class Misfit(Shown):
     """All tests for unexplained structure.
 
     Attributes
@@ -138,25 +138,6 @@ class Misfit:
 
         rows = [{**asdict(t), "amplitudes": "; ".join(str(a) for a in t.amplitudes)} for t in self.tests]
         return pd.DataFrame(rows).rename(columns={"name": "test"})
-
-    def plot_misfit(self, **options: Any) -> Any:
-        """Corrected p-values of all tests; options as for `starcal_uq.presentation.figures.diagnostics.plot_misfit`."""
-        from starcal_uq.presentation.figures.diagnostics import plot_misfit
-
-        return plot_misfit(self, **options)
-
-    def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><th>{html.escape(t.name)}</th><td>{significant(t.p_value)}</td><td>{significant(t.p_holm)}</td>"
-            f"<td>{'' if np.isnan(t.size_px) else significant(t.size_px)}</td>"
-            f"<td>{html.escape('; '.join(str(a) for a in t.amplitudes))}</td></tr>"
-            for t in self.tests
-        )
-        return (
-            f"<p><b>Misfit</b>: {plural(len(self.tests), 'test')}, overall p = {significant(self.p_value)}</p><table>"
-            "<thead><tr><th>looks for</th><th>p</th><th>p (Holm)</th><th>size [px]</th><th>amplitudes</th></tr></thead>"
-            f"<tbody>{rows}</tbody></table>"
-        )
 
 
 def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = 8) -> Misfit:

@@ -10,7 +10,6 @@ parameters, 1 / sigma): normal times scaled inverse chi-square. Two estimates of
 
 from __future__ import annotations
 
-import html
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
@@ -20,8 +19,8 @@ import numpy as np
 from starcal_uq.attitude.rotations import left_error, rotation_to_quaternion
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.constants import ARCSEC, AXES
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StarcalError
-from starcal_uq.core.formatting import fixed, join_words, significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.normals import FrameNormals
@@ -89,7 +88,7 @@ class ModelScore:
 
 
 @dataclass(frozen=True)
-class ModelComparison:
+class ModelComparison(Shown):
     """Models side by side.
 
     Attributes
@@ -120,36 +119,6 @@ class ModelComparison:
         """The score of one model."""
         return next((score for score in self.scores if score.model == model), None)
 
-    @property
-    def statement(self) -> str:
-        """What follows, in sentences."""
-        mine, simplest = self.of(self.fitted), self.simplest
-        if mine is not None and mine.rejected:
-            best = self.scores[0]
-            first = (
-                f"The model {self.fitted!r} predicts left-out frames worse than {best.model!r} by "
-                f"{fixed(-mine.difference, 1)} ± {fixed(mine.difference_se, 1)} nat: use {simplest.model!r}."
-            )
-        elif mine is not None and simplest.n_parameters < mine.n_parameters:
-            extra = [c for c in _names(self.fitted) if c not in _names(simplest.model)]
-            verb = "is" if len(extra) == 1 else "are"
-            first = (
-                f"{join_words(extra)} {verb} not needed: {simplest.model!r} predicts left-out frames no worse than "
-                f"{self.fitted!r}."
-            )
-        else:
-            first = f"No other model predicts left-out frames better than {self.fitted!r} beyond doubt."
-        others = [score for score in self.accepted if score.model != self.fitted]
-        if not others:
-            return first + " All other models are rejected."
-        common = max(float(np.hypot(*score.common_arcsec[:2])) for score in others)
-        rest = max(float(np.hypot(*score.rest_arcsec[:2])) for score in others)
-        return (
-            f"{first} Under the other models that the data do not reject "
-            f"({join_words([score.model for score in others])}), attitudes across the boresight would move by up to "
-            f"{significant(common)} arcsec in common and {significant(rest)} arcsec (rms) frame by frame."
-        )
-
     def to_dataframe(self) -> pd.DataFrame:
         """One row per model, the best first."""
         import pandas as pd
@@ -162,17 +131,6 @@ class ModelComparison:
                 row |= {f"{part}_{axis}_arcsec": v for axis, v in zip(AXES, values, strict=True)}
             rows.append(row)
         return pd.DataFrame(rows)
-
-    def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><th>{html.escape(s.model)}</th><td>{fixed(s.difference, 1)} ± {fixed(s.difference_se, 1)}</td>"
-            f"<td>{'rejected' if s.rejected else 'not rejected'}</td><td>{fixed(s.max_khat, 2)}</td></tr>"
-            for s in self.scores
-        )
-        return (
-            f"<p><b>Models</b>: {html.escape(self.statement)}</p><table><thead><tr><th>model</th>"
-            f"<th>elpd − best [nat]</th><th></th><th>k-hat</th></tr></thead><tbody>{rows}</tbody></table>"
-        )
 
 
 def compare_models(
@@ -242,14 +200,10 @@ def compare_models(
     return ModelComparison(tuple(scores), cal.camera.distortion, failed)
 
 
-def _names(model: str) -> tuple[str, ...]:
-    return tuple(c.name for c in get_model(model).coefficients)
-
-
 def _fit(obs: Observations, cal: Calibration, name: str) -> Calibration:
     if name == cal.camera.distortion:
         return cal
-    start = cal.nominal.replace(distortion=name, coefficients=(0.0,) * len(_names(name)))
+    start = cal.nominal.replace(distortion=name, coefficients=(0.0,) * len(get_model(name).coefficients))
     return calibrate(obs, start)
 
 

@@ -6,14 +6,13 @@ same statistics of the measured residuals at the same draw are set against them.
 
 from __future__ import annotations
 
-import html
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
-from starcal_uq.core.formatting import significant
+from starcal_uq.core.display import Shown
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_cholesky
@@ -59,7 +58,7 @@ class PredictiveStatistic:
 
 
 @dataclass(frozen=True)
-class PredictiveCheck:
+class PredictiveCheck(Shown):
     """Statistics of measured residuals against replicated ones.
 
     Attributes
@@ -81,18 +80,6 @@ class PredictiveCheck:
         import pandas as pd
 
         return pd.DataFrame([asdict(s) for s in self.statistics])
-
-    def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><th>{html.escape(s.name)}</th><td>{significant(s.observed, 3)}</td>"
-            f"<td>{significant(s.replicated_low, 3)} to {significant(s.replicated_high, 3)}</td>"
-            f"<td>{significant(s.p_value)}</td></tr>"
-            for s in self.statistics
-        )
-        return (
-            f"<p><b>Posterior predictive check</b>: {self.n_draws} draws</p><table><thead><tr><th></th><th>data</th>"
-            f"<th>replicates (95 %)</th><th>p</th></tr></thead><tbody>{rows}</tbody></table>"
-        )
 
 
 def predictive_check(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -10,16 +9,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError, CatalogueError, PlanningError, StarcalError
-from starcal_uq.core.files import atomic_path
-from starcal_uq.core.formatting import significant
 from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.maths.linear import inverses
-from starcal_uq.planning.forecast import Forecast, Forecaster, spreads
+from starcal_uq.planning.forecast import N_FRAMES, Forecast, Forecaster, spreads
 from starcal_uq.planning.information import random_frames
-from starcal_uq.planning.plan import N_FRAMES
 from starcal_uq.simulation.frames import Campaign
 
 if TYPE_CHECKING:
@@ -33,7 +30,7 @@ _TOLERANCE, _FAMILY_LEVEL = 0.05, 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class ForecastCheck:
+class ForecastCheck(Shown):
     """Forecast and simulation, for G numbers of frames, C campaigns of each, Q quantities and p parameters.
 
     Attributes
@@ -145,30 +142,6 @@ class ForecastCheck:
                 "nees_high": repeated(high),
             }
         )
-
-    @property
-    def verdict(self) -> str:
-        """What was found, in plain words."""
-        from starcal_uq.presentation.words.planning import check_verdict
-
-        return check_verdict(self)
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the table as CSV, atomically and to the last digit; overwritten."""
-        with atomic_path(path) as temporary:
-            self.to_dataframe().to_csv(temporary, index=False)
-
-    def plot(self, **options: Any) -> Any:
-        """Ratios to the forecast, and squared errors: `starcal_uq.presentation.figures.planning.plot_forecast_check`."""
-        from starcal_uq.presentation.figures.planning import plot_forecast_check
-
-        return plot_forecast_check(self, **options)
-
-    def _repr_html_(self) -> str:
-        from html import escape
-
-        table = self.to_dataframe().to_html(index=False, float_format=lambda v: significant(v, 3), border=0)
-        return f"<p><b>Forecast against simulation</b>: {escape(self.verdict)}</p>{table}"
 
 
 def check_forecast(

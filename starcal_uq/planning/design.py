@@ -12,17 +12,15 @@ evaluated exactly.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.attitude.rotations import random_rotations, rotation_to_quaternion
 from starcal_uq.core.constants import ARCSEC
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PlanningError
-from starcal_uq.core.files import atomic_path
-from starcal_uq.core.formatting import significant
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.maths.linear import inverses
@@ -253,7 +251,7 @@ def _check(n_frames: int, min_stars: int, criterion: str, scope: str) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class FrameChoice:
+class FrameChoice(Shown):
     """Frames to take, in the order of their value, and what they are worth. n frames, Q quantities, S random sets.
 
     Attributes
@@ -368,30 +366,6 @@ class FrameChoice:
                 "factor_high": high,
             }
         )
-
-    @property
-    def verdict(self) -> str:
-        """What was found, in plain words."""
-        from starcal_uq.presentation.words.planning import choice_verdict
-
-        return choice_verdict(self)
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the frames as CSV, atomically and to the last digit; overwritten."""
-        with atomic_path(path) as temporary:
-            self.to_dataframe().to_csv(temporary, index=False)
-
-    def plot(self, **options: Any) -> Any:
-        """Where the frames point, and what they gain; options as for `starcal_uq.presentation.figures.planning.plot_frame_choice`."""
-        from starcal_uq.presentation.figures.planning import plot_frame_choice
-
-        return plot_frame_choice(self, **options)
-
-    def _repr_html_(self) -> str:
-        from html import escape
-
-        html = self.worth().to_html(index=False, float_format=lambda v: significant(v, 3), border=0)
-        return f"<p><b>Frames to take</b>: {escape(self.verdict)}</p>{html}"
 
 
 def _position_angle(rotations: FloatArray) -> FloatArray:

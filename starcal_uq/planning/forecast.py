@@ -37,6 +37,7 @@ SCOPES = {
     "total": "the calibration and the centroid noise of a frame together",
 }
 BAND = (0.05, 0.95)
+N_FRAMES = (10, 30, 100, 300, 1000, 3000)
 N_CAMPAIGNS = 200
 MAX_FRAMES = 10_000_000
 # Attitudes of the mission that quantiles are taken over, and scales of the covariance that they are interpolated from.

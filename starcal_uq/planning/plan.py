@@ -7,7 +7,6 @@ calibrates (`starcal_uq.planning.information`), and campaigns of any number of f
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
@@ -17,24 +16,19 @@ import numpy as np
 from starcal_uq.attitude.rotations import random_rotations
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.constants import AXES
+from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PlanningError
-from starcal_uq.core.formatting import significant
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.types import AnyDict, FloatArray
-from starcal_uq.planning.forecast import N_CAMPAIGNS, SCOPES, Forecast, Forecaster, nea_arcsec
+from starcal_uq.planning.forecast import N_CAMPAIGNS, N_FRAMES, SCOPES, Forecast, Forecaster, nea_arcsec
 from starcal_uq.planning.information import FrameSet, Noise, largest_noise, noise_of, random_frames
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     import pandas as pd
 
-    from starcal_uq.planning.check import ForecastCheck
-    from starcal_uq.planning.design import FrameChoice
     from starcal_uq.sky.catalogue import StarCatalogue
 
-N_FRAMES = (10, 30, 100, 300, 1000, 3000)
 SWEEP_FRAMES = 1000
 _SWEEP_GEOMETRIES, _SWEEP_CAMPAIGNS, _TRIED_ATTITUDES = 1000, 64, 1000
 # With fewer attitudes than this that show enough stars, a magnitude limit is left out of the sweep.
@@ -294,7 +288,7 @@ def _check(
 
 
 @dataclass(frozen=True)
-class Need:
+class Need(Shown):
     """Frames that keep a target, for one part of the attitude error.
 
     Attributes
@@ -314,16 +308,9 @@ class Need:
     frames_surely: int | None
     floor_arcsec: float
 
-    @property
-    def words(self) -> str:
-        """`frames` to three digits, rounded up, as it is printed; or why there is no number."""
-        from starcal_uq.presentation.words.planning import need_words
-
-        return need_words(self, self.frames)
-
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class Plan(Shown):
     """What a calibration will give, before any data.
 
     Attributes
@@ -386,13 +373,6 @@ class Plan:
         """Frames for the target in the scope asked for; None without a target."""
         return next((need for need in self.needs if need.scope == self.scope), None)
 
-    @property
-    def verdict(self) -> str:
-        """What was found, in plain words."""
-        from starcal_uq.presentation.words.planning import verdict
-
-        return verdict(self)
-
     def to_dataframe(self) -> pd.DataFrame:
         """One row per number of frames.
 
@@ -407,50 +387,3 @@ class Plan:
             table.insert(place, f"nea_{axis}_arcsec", float(value))
             place += 1
         return table
-
-    def plot_forecast(self, **options: Any) -> Any:
-        """Attitude error against number of frames; `starcal_uq.presentation.figures.planning.plot_forecast`."""
-        from starcal_uq.presentation.figures.planning import plot_forecast
-
-        return plot_forecast(self, **options)
-
-    def plot_sweeps(self, **options: Any) -> Any:
-        """Magnitude limit, noise and field: `starcal_uq.presentation.figures.planning.plot_plan_sweeps`."""
-        from starcal_uq.presentation.figures.planning import plot_plan_sweeps
-
-        return plot_plan_sweeps(self, **options)
-
-    def save(
-        self,
-        folder: str | os.PathLike[str],
-        *,
-        choice: FrameChoice | None = None,
-        check: ForecastCheck | None = None,
-    ) -> Path:
-        """Write ``plan.html`` (self-contained), ``plan.csv``, ``sweeps.csv``, ``plan.json`` and figures to a folder.
-
-        Parameters
-        ----------
-        folder : path
-            Made if it is missing; files in it are overwritten.
-        choice : FrameChoice, optional
-            Frames to take, for the page and ``frames.csv``.
-        check : ForecastCheck, optional
-            Forecast against simulation, for the page and ``check.csv``.
-
-        Returns
-        -------
-        Path
-            Of the page.
-        """
-        from starcal_uq.presentation.pages.planning import write_plan
-
-        return write_plan(self, folder, choice, check)
-
-    def _repr_html_(self) -> str:
-        from html import escape
-
-        shown = ["n_frames", "x0_px", "f_mm", "common_pitch_arcsec", "rest_pitch_arcsec", "nea_pitch_arcsec"]
-        table = self.to_dataframe()[[*shown, "radius_arcsec"]]
-        html = table.to_html(index=False, float_format=lambda v: significant(v, 3), border=0)
-        return f"<p><b>Plan</b>: {escape(self.verdict)}</p>{html}"

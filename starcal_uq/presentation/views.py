@@ -5,8 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from starcal_uq.attitude.profile import AttitudeProfile
+from starcal_uq.budgeting.result import Budget, Outcome
 from starcal_uq.camera.camera import Camera
+from starcal_uq.comparison.result import CameraComparison
 from starcal_uq.core.display import View
+from starcal_uq.diagnostics.diagnose import Diagnosis
+from starcal_uq.diagnostics.jackknife import Jackknife
+from starcal_uq.diagnostics.misfit import Misfit
+from starcal_uq.diagnostics.models import ModelComparison
+from starcal_uq.diagnostics.predictive import PredictiveCheck
+from starcal_uq.diagnostics.validation.result import Validation
+from starcal_uq.diagnostics.verdict.estimate import models_sentence
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.merging import Consistency
 from starcal_uq.estimation.screening.result import Screening
@@ -20,9 +29,27 @@ from starcal_uq.inference.update import ShiftTest
 from starcal_uq.observations.table import Observations
 from starcal_uq.pipeline.record import ImageRecord
 from starcal_uq.pipeline.refine import ImageCalibration
+from starcal_uq.planning.check import ForecastCheck
+from starcal_uq.planning.design import FrameChoice
+from starcal_uq.planning.plan import Need, Plan
+from starcal_uq.presentation.figures.budgeting import plot_budget
+from starcal_uq.presentation.figures.comparison import plot_camera_comparison
 from starcal_uq.presentation.figures.coupling import plot_correlation, plot_correlations, plot_couplings
+from starcal_uq.presentation.figures.diagnostics import (
+    plot_comparison,
+    plot_diagnosis,
+    plot_jackknife,
+    plot_misfit,
+    plot_validation,
+)
 from starcal_uq.presentation.figures.estimation import plot_convergence, plot_residuals
 from starcal_uq.presentation.figures.inference import plot_corner, plot_prior_posterior
+from starcal_uq.presentation.figures.planning import (
+    plot_forecast,
+    plot_forecast_check,
+    plot_frame_choice,
+    plot_plan_sweeps,
+)
 from starcal_uq.presentation.figures.propagation import (
     plot_attitude,
     plot_distortion_curve,
@@ -30,7 +57,18 @@ from starcal_uq.presentation.figures.propagation import (
     plot_field_map,
     plot_spectrum,
 )
-from starcal_uq.presentation.words import estimation, images, inference, inputs, propagation
+from starcal_uq.presentation.pages.budgeting import section_html
+from starcal_uq.presentation.words import (
+    budgeting,
+    comparison,
+    diagnostics,
+    estimation,
+    images,
+    inference,
+    inputs,
+    planning,
+    propagation,
+)
 from starcal_uq.propagation.attitude_error import Agreement, AttitudeError
 from starcal_uq.propagation.coupling import Coupling
 from starcal_uq.propagation.distortion import DistortionCurve
@@ -63,6 +101,21 @@ VIEWS: Mapping[type, View] = {
         inference.posterior_html,
         {"corner": plot_corner, "prior_posterior": plot_prior_posterior},
     ),
+    Misfit: View(diagnostics.misfit_text, diagnostics.misfit_html, {"p_values": plot_misfit}),
+    Jackknife: View(diagnostics.jackknife_text, diagnostics.jackknife_html, {"ratios": plot_jackknife}),
+    ModelComparison: View(models_sentence, diagnostics.models_html, {"models": plot_comparison}),
+    PredictiveCheck: View(diagnostics.predictive_text, diagnostics.predictive_html),
+    Diagnosis: View(diagnostics.diagnosis_text, diagnostics.diagnosis_html, {"diagnosis": plot_diagnosis}),
+    Validation: View(diagnostics.validation_text, diagnostics.validation_html, {"ranks": plot_validation}),
+    CameraComparison: View(
+        comparison.comparison_text, comparison.comparison_html, {"difference": plot_camera_comparison}
+    ),
+    Need: View(planning.need_text),
+    Plan: View(planning.plan_text, planning.plan_html, {"forecast": plot_forecast, "sweeps": plot_plan_sweeps}),
+    FrameChoice: View(planning.choice_text, planning.choice_html, {"choice": plot_frame_choice}),
+    ForecastCheck: View(planning.check_text, planning.check_html, {"check": plot_forecast_check}),
+    Outcome: View(budgeting.outcome_text),
+    Budget: View(budgeting.headline, section_html, {"contributors": plot_budget}),
     Agreement: View(propagation.agreement_text, propagation.agreement_html),
     AttitudeError: View(
         propagation.attitude_text,

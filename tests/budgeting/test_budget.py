@@ -24,7 +24,7 @@ from starcal_uq.budgeting.shapes import one_axis_factor
 from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
 from starcal_uq.core.errors import BudgetError, RunFolderError
 from starcal_uq.diagnostics.misfit import Misfit, MisfitTest
-from starcal_uq.presentation.pages.budgeting import budget_context
+from starcal_uq.presentation.pages.budgeting import budget_context, write_budget
 from starcal_uq.presentation.tables import tex
 from starcal_uq.propagation.attitude_error import AttitudeError
 from starcal_uq.runs.steps import budget_run, diagnose_run
@@ -243,9 +243,9 @@ def test_a_violated_requirement_is_named_and_the_others_stay_open(stated: Path) 
     assert [outcome.requirement.name for outcome in found.violations] == ["R-1 across"]
     assert [outcome.requirement.name for outcome in found.open_requirements] == ["R-2 about"]
     violated, unproven = found.outcomes
-    assert "'R-1 across'" in violated.sentence and "is violated: at least" in violated.sentence
+    assert "'R-1 across'" in violated.text and "is violated: at least" in violated.text
     assert violated.margin_arcsec == pytest.approx(1.0 - violated.total.larger_arcsec) and violated.margin_arcsec < 0.0
-    assert "not assessed" in unproven.sentence and unproven.margin_arcsec > 0.0
+    assert "not assessed" in unproven.text and unproven.margin_arcsec > 0.0
     table = found.requirements_dataframe()
     assert table["verdict"].tolist() == ["violated", "open"]
 
@@ -268,7 +268,7 @@ def test_met_only_if_everything_is_assessed(tmp_path: Path) -> None:
     path.write_text(complete(30.0), encoding="utf-8")
     found = made(path)
     assert found.outcomes[0].verdict == "met" and not found.not_assessed and not found.violations
-    assert "is met" in found.outcomes[0].sentence
+    assert "is met" in found.outcomes[0].text
     assert not any(entry.at_least for entry in found.totals)
 
 
@@ -307,15 +307,15 @@ def test_a_confidence_beyond_the_samples_is_not_judged_by_them(
     outcome = found.outcomes[0]
     assert outcome.verdict == verdict
     assert math.isnan(outcome.total.sampled_arcsec) and math.isnan(outcome.total.sampled_se_arcsec)
-    assert "99.99999\N{NO-BREAK SPACE}%" in outcome.sentence
+    assert "99.99999\N{NO-BREAK SPACE}%" in outcome.text
     if verdict == "open":
-        assert "200000 samples do not resolve a confidence of 99.99999" in outcome.sentence
-        assert "which knows Gaussian tails only, says 35.2 arcsec" in outcome.sentence
+        assert "200000 samples do not resolve a confidence of 99.99999" in outcome.text
+        assert "which knows Gaussian tails only, says 35.2 arcsec" in outcome.text
         assert "1 requirement open: the samples do not resolve" in budget_context(found)["budget"]["headline"]
     found.save(tmp_path / "budget.csv")
     assert [entry.verdict for entry in Budget.load(tmp_path / "budget.csv").outcomes] == [verdict]
     for ending in ("html", "tex"):
-        found.save(tmp_path / f"budget.{ending}")
+        write_budget(found, tmp_path / f"budget.{ending}")
         assert "not resolved" in (tmp_path / f"budget.{ending}").read_text(encoding="utf-8")
     # Negative control: a confidence that the samples just resolve.
     control = resolved.outcomes[0]
@@ -327,11 +327,11 @@ def test_a_budget_beyond_the_samples_is_whole(stated: Path, tmp_path: Path) -> N
 
     found = made(stated, confidence=0.999999)
     assert math.isnan(found.total("roll").larger_arcsec)
-    found.save(tmp_path / "budget.xlsx")
+    write_budget(found, tmp_path / "budget.xlsx")
     sheet = load_workbook(tmp_path / "budget.xlsx")["Totals"]
     assert sheet["J2"].value == "not resolved" and sheet["D2"].number_format == "0.0000%"
     json.dumps(found.to_dict(), allow_nan=False)
-    found.plot_budget()
+    found.plot.contributors()
     assert "not resolved" in found._repr_html_()
 
 
@@ -395,7 +395,7 @@ def test_excel_has_numbers_units_and_marks(stated: Path, tmp_path: Path) -> None
     from openpyxl import load_workbook
 
     found = made(stated)
-    found.save(tmp_path / "budget.xlsx")
+    write_budget(found, tmp_path / "budget.xlsx")
     book = load_workbook(tmp_path / "budget.xlsx")
     assert book.sheetnames == ["Contributors", "Totals", "Requirements", "Notes"]
     sheet = book["Contributors"]
@@ -411,12 +411,12 @@ def test_excel_has_numbers_units_and_marks(stated: Path, tmp_path: Path) -> None
     requirements = book["Requirements"]
     assert requirements["K2"].value == "violated" and requirements["A2"].fill.fgColor.rgb.endswith("FDE6DB")
     assert all(dimension.width > 5 for dimension in sheet.column_dimensions.values())
-    made().save(tmp_path / "plain.xlsx")
+    write_budget(made(), tmp_path / "plain.xlsx")
     assert "Requirements" not in load_workbook(tmp_path / "plain.xlsx").sheetnames
 
 
 def test_latex_is_balanced_and_escaped(stated: Path, tmp_path: Path) -> None:
-    made(stated).save(tmp_path / "budget.tex")
+    write_budget(made(stated), tmp_path / "budget.tex")
     text = (tmp_path / "budget.tex").read_text(encoding="utf-8")
     assert text.isascii()
     body = re.sub(r"(?<!\\)%.*", "", text)
@@ -446,7 +446,7 @@ def test_a_name_in_brackets_is_no_option_of_the_row_before() -> None:
 
 
 def test_html_stands_alone_and_escapes(stated: Path, tmp_path: Path) -> None:
-    made(stated).save(tmp_path / "budget.html")
+    write_budget(made(stated), tmp_path / "budget.html")
     text = (tmp_path / "budget.html").read_text(encoding="utf-8")
     assert "<title>Test &amp; &lt;budget&gt;_1</title>" in text and "<budget>" not in text
     assert "http" not in re.sub(r"data:image/png;base64,[^\"]*", "", text) and "<script" not in text
@@ -456,7 +456,7 @@ def test_html_stands_alone_and_escapes(stated: Path, tmp_path: Path) -> None:
 
 def test_other_endings_are_refused(tmp_path: Path) -> None:
     with pytest.raises(BudgetError, match=r"use one of \.csv, \.xlsx, \.tex, \.html"):
-        made().save(tmp_path / "budget.doc")
+        write_budget(made(), tmp_path / "budget.doc")
     assert not list(tmp_path.iterdir())
 
 
@@ -472,7 +472,7 @@ def test_the_report_gets_one_name(stated: Path) -> None:
 
 def test_the_figure_names_what_is_not_assessed_and_colours_the_limits(stated: Path) -> None:
     found = made(stated)
-    figure = found.plot_budget()
+    figure = found.plot.contributors()
     left, right = figure.axes
     labels = [text.get_text() for text in left.get_yticklabels()]
     assert labels[-2:] == ["total before alignment", "total after alignment"] and "star catalogue" in labels
@@ -481,7 +481,9 @@ def test_the_figure_names_what_is_not_assessed_and_colours_the_limits(stated: Pa
     assert [text.get_text() for text in right.texts].count("not assessed") == len(FROM_FILE) - 1
     shown = {text.get_text() for legend in figure.legends for text in legend.get_texts()}
     assert "limit, violated" in shown
-    assert "limit" not in {text.get_text() for legend in made().plot_budget().legends for text in legend.get_texts()}
+    assert "limit" not in {
+        text.get_text() for legend in made().plot.contributors().legends for text in legend.get_texts()
+    }
 
 
 @pytest.mark.parametrize(("line", "drawn"), [("", 1), ("confidence = 0.95\n", 0), ('interpretation = "ensemble"\n', 0)])
@@ -489,7 +491,7 @@ def test_the_figure_draws_limits_of_its_own_confidence_only(tmp_path: Path, line
     path = tmp_path / "limit.toml"
     path.write_text('[[requirement]]\nname = "R"\naxis = "Z"\nlimit_arcsec = 7654.0\n' + line, encoding="utf-8")
     found = made(path)
-    right = found.plot_budget().axes[1]
+    right = found.plot.contributors().axes[1]
     assert sum(list(curve.get_xdata()) == [7654.0, 7654.0] for curve in right.lines) == drawn
     page = found._repr_html_()
     assert "Limits are drawn of requirements at this confidence in the mixed interpretation only" in page

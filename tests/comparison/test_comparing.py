@@ -17,13 +17,14 @@ from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.camera.projection import unproject
 from starcal_uq.comparison.compare import compare, compare_halves
 from starcal_uq.comparison.covariance import difference_rule
-from starcal_uq.comparison.result import FILES, CameraComparison
+from starcal_uq.comparison.result import CameraComparison
 from starcal_uq.core.errors import CalibrationError, ComparisonError, DistortionError, RunFolderError
 from starcal_uq.core.status import Status
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.inference.priors import GaussianPriors
 from starcal_uq.observations.splits import shared_frames, split_frames
+from starcal_uq.presentation.pages.comparison import write_comparison
 from starcal_uq.runs.compare import compare_runs, compare_split
 from starcal_uq.runs.folder import RunFolder
 from tests.helpers.gaussian_camera import COVARIANCE
@@ -240,7 +241,7 @@ def test_rule_follows_from_what_the_data_share(a: Any, b: Any, data: str, signs:
     assert np.isfinite(found.rms_arcsec)
     if signs is None:
         assert found.agree is None
-        assert "not tested" in found.words
+        assert "not tested" in found.text
         assert np.isnan(found.rotation_sigma_arcsec).all()
 
 
@@ -293,7 +294,7 @@ def test_other_models_are_compared_by_their_directions() -> None:
     assert any("cannot come from errors of the parameters" in message for message in apart.messages)
     assert apart.outside_arcsec > apart.expected_rms_arcsec
     assert apart.p_map < 1e-12
-    assert "p < 10⁻¹²" in apart.words
+    assert "p < 10⁻¹²" in apart.text
 
 
 # --- halves, files, words ---------------------------------------------------------------------------------------------
@@ -326,7 +327,7 @@ def test_halves_of_one_run_agree() -> None:
     assert found.verdict == "agree"
     assert found.agree is True
     assert found.n_directions == 5
-    assert "Odd frames and even frames agree" in found.words
+    assert "Odd frames and even frames agree" in found.text
     with pytest.raises(CalibrationError, match="stars"):
         obs = observations()
         compare_halves(obs.select(obs.frame < obs.frame_ids[2]).select(few_stars()), nominal(camera()))
@@ -344,8 +345,14 @@ def few_stars() -> np.ndarray:
 
 def test_page_tables_and_file(tmp_path: Path) -> None:
     found = halves()
-    page = found.save(tmp_path / "out")
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(FILES)
+    page = write_comparison(found, tmp_path / "out")
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
+        "comparison.html",
+        "comparison.json",
+        "difference.csv",
+        "difference_map.csv",
+        "difference_map.png",
+    ]
     text = page.read_text(encoding="utf-8")
     assert "http" not in text.replace("http-equiv", "")
     assert "<script" not in text
@@ -369,7 +376,7 @@ def test_page_tables_and_file(tmp_path: Path) -> None:
 
 def test_an_untested_comparison_is_saved_too(tmp_path: Path) -> None:
     found = compare(calibrated(), calibrated(), labels=("<a>", "b & c"))
-    text = found.save(tmp_path).read_text(encoding="utf-8")
+    text = write_comparison(found, tmp_path).read_text(encoding="utf-8")
     assert "was not tested" in text
     assert "&lt;a&gt;" in text
     assert "Is it chance?" not in text
@@ -385,7 +392,7 @@ def test_broken_files_are_named(tmp_path: Path) -> None:
             CameraComparison.load(tmp_path)
     (tmp_path / "file").write_text("")
     with pytest.raises(RunFolderError, match="cannot be made"):
-        halves().save(tmp_path / "file")
+        write_comparison(halves(), tmp_path / "file")
 
 
 def write_run(path: Path, part: str) -> RunFolder:

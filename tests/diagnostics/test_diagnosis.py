@@ -160,15 +160,15 @@ def test_the_right_model_wins_and_richer_ones_are_not_rejected():
     assert found.failed == {}
     poor = compare_models(obs, sc.calibrate(obs, nominal(camera("k1"))), ("k1", "brown"))
     assert poor.of("k1").rejected
-    assert "use 'brown'" in poor.statement
+    assert "use 'brown'" in poor.text
 
 
 def test_a_superfluous_term_is_called_so_and_the_shift_is_stated():
     obs = observations("k1", n_frames=60)
     found = compare_models(obs, sc.calibrate(obs, nominal(camera("brown"))))
     assert found.simplest.model == "k1"
-    assert found.statement.startswith("k2 is not needed")
-    assert "in common and" in found.statement
+    assert found.text.startswith("k2 is not needed")
+    assert "in common and" in found.text
     mine = found.of("brown")
     assert np.hypot(*mine.common_arcsec[:2]) < 1e-3
     # A principal point that moves by a pixel turns every attitude by the angle of a pixel.
@@ -267,7 +267,7 @@ def test_real_stars_need_no_k2_and_show_the_phase_of_the_pixels(real_data, capsy
     low, high = found.jackknife.expected()
     assert np.all((found.jackknife.ratio > low) & (found.jackknife.ratio < high))
     assert found.comparison.simplest.model == "k1"
-    assert found.comparison.statement.startswith("k2 is not needed")
+    assert found.comparison.text.startswith("k2 is not needed")
     assert found.comparison.of("none").rejected
     assert found.misfit.found()[0].name == "error with the pixel phase in x"
     smooth = [t for t in found.misfit.tests if t.dof and not t.against.startswith("pixel phase")]

@@ -194,13 +194,13 @@ def test_right_uncertainties_pass(good):
     assert good.quantities == QUANTITIES
     assert good.n_replicates == 100
     assert good.failures == ()
-    assert good.ok, good.verdict
+    assert good.ok, good.text
     assert (np.abs(good.coverage - 0.95) < 4 * np.sqrt(0.95 * 0.05 / 100)).all()
     assert abs(good.nees_ratio - 1.0) < 4 * np.sqrt(2 / 500)
     assert abs(good.nees_calibration_ratio - good.nees_ratio) < 0.05
     assert (good.rank_p_value > 1e-3).all()
     assert np.abs(good.compression_error).max() < 0.05
-    assert "are right as far as" in good.verdict
+    assert "are right as far as" in good.text
 
 
 @pytest.mark.parametrize("model", ["none", "brown_tangential"])
@@ -212,7 +212,7 @@ def test_other_models_pass_with_truths_from_the_prior(stars, model):
     found = validate_study(settings, stars, 40, workers=0)
     assert found.quantities[:3] == ("x0", "y0", "f")
     assert len(found.quantities) == 3 + len(truth.coefficients) + 5
-    assert not any(f.rejected for f in found.findings), found.verdict
+    assert not any(f.rejected for f in found.findings), found.text
     # The truths are what the priors say.
     expected = found.priors
     z = (found.truth[:, :-1] - expected.mean(expected.names[:-1])) / expected.sd(expected.names[:-1])
@@ -226,7 +226,7 @@ def test_attitudes_forgotten_in_the_degrees_of_freedom_are_found(stars, same_dat
     at = found.quantities.index("sigma")
     assert found.rank_p_value[at] < 1e-5
     assert found.z[:, at].mean() < -1.0
-    assert "Estimates of sigma are too low" in found.verdict
+    assert "Estimates of sigma are too low" in found.text
 
 
 def test_pairs_taken_as_independent_are_found(stars, same_data):
@@ -235,12 +235,12 @@ def test_pairs_taken_as_independent_are_found(stars, same_data):
     assert found.coverage[0] < 0.8
     assert found.nees_ratio > 5.0
     assert found.nees_p_value < 1e-6
-    assert "too narrow" in found.verdict
+    assert "too narrow" in found.text
 
 
 def test_pairs_with_their_curvature_put_right_pass(stars):
     found = validate_study(study(likelihood="pairs", n_frames=20), stars, 40, workers=0)
-    assert not any(f.rejected for f in found.findings), found.verdict
+    assert not any(f.rejected for f in found.findings), found.text
     assert np.isnan(found.compression_error).all()
 
 
@@ -249,25 +249,25 @@ def test_noise_understated_by_a_tenth_is_found(stars, same_data):
     assert "sigma" not in found.quantities
     assert not found.ok
     assert found.nees_p_value < 1e-3
-    assert "too narrow" in found.verdict
+    assert "too narrow" in found.text
 
 
 def test_the_right_noise_given_passes(stars, same_data):
     found = validate_study(study(assumed_sigma_px=0.05), stars, 40, workers=0)
-    assert not any(f.rejected for f in found.findings), found.verdict
+    assert not any(f.rejected for f in found.findings), found.text
 
 
 def test_few_replicates_are_no_verdict(stars, same_data):
     found = validate_study(study(), stars, 8, workers=0)
     assert not found.ok
-    assert "Too few replicates" in found.verdict
+    assert "Too few replicates" in found.text
 
 
 def test_failed_replicates_are_counted_and_explained(good):
     reasons = ("the calibration did not end well (SINGULAR): add frames.",) * 2 + ("another reason.",)
     found = dataclasses.replace(good, failures=reasons)
     assert not found.ok
-    assert "3 of 103 replicates gave no result, 2 of them because the calibration did not end well" in found.verdict
+    assert "3 of 103 replicates gave no result, 2 of them because the calibration did not end well" in found.text
 
 
 def test_when_nothing_works_the_reason_is_given(stars, monkeypatch):
@@ -328,7 +328,7 @@ def test_interrupt_keeps_what_is_done(stars, workers):
     found = validate_study(settings, stars, 200, workers=workers, progress=press)
     assert found.interrupted
     assert 8 <= found.n_replicates < 200
-    assert f"interrupted after {found.n_replicates} of 200" in found.verdict
+    assert f"interrupted after {found.n_replicates} of 200" in found.text
     np.testing.assert_array_equal(found.ranks[0], validate_study(settings, stars, 1, workers=0).ranks[0])
 
 
@@ -424,7 +424,7 @@ def test_save_and_load_lose_nothing(good, tmp_path):
             assert json.dumps(before) == json.dumps(after)
         else:
             assert before == after
-    assert again.verdict == found.verdict
+    assert again.text == found.text
 
 
 @pytest.mark.parametrize("content", [b"", b"no archive", None])

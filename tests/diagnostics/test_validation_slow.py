@@ -32,13 +32,13 @@ def first(found, n):
 
 def show(name, found):
     """Measured values, for those who run the tests with -s."""
-    print(f"\n{name}: {found.verdict}\n{found.to_dataframe().to_string(float_format=lambda v: f'{v:.4g}')}")
+    print(f"\n{name}: {found.text}\n{found.to_dataframe().to_string(float_format=lambda v: f'{v:.4g}')}")
     print(f"NEES/p = {found.nees_ratio:.4f} (calibration {found.nees_calibration_ratio:.4f})")
 
 
 def test_coverage_and_squared_errors(fixed):
     show("fixed truth", fixed)
-    assert fixed.ok, fixed.verdict
+    assert fixed.ok, fixed.text
     coverage = dict(zip(fixed.quantities, fixed.coverage, strict=True))
     assert all(0.935 <= coverage[q] <= 0.965 for q in COVERED), coverage
     assert 0.97 <= fixed.nees_ratio <= 1.03
@@ -56,7 +56,7 @@ def test_ranks_of_a_fixed_truth(fixed):
 def test_ranks_of_truths_from_the_prior():
     found = validate(sc.paper.paper_camera(), n_replicates=1000, truth="prior", seed=2)
     show("truth from the prior", found)
-    assert found.ok, found.verdict
+    assert found.ok, found.text
     assert (found.rank_p_value > 0.01).all(), found.rank_p_value
     assert 0.94 <= found.nees_ratio <= 1.06
 

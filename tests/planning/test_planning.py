@@ -20,6 +20,7 @@ from starcal_uq.planning.design import choose_frames
 from starcal_uq.planning.forecast import Forecaster, nea_arcsec, quantities, spreads, student_factor
 from starcal_uq.planning.information import FrameSet, look_at, random_frames
 from starcal_uq.planning.plan import Plan, plan
+from starcal_uq.presentation.pages.planning import write_plan
 from starcal_uq.presentation.words.planning import frames as frames_words
 from tests.helpers.scenes import COEFFICIENTS, camera, observations
 
@@ -194,10 +195,10 @@ def small_check() -> ForecastCheck:
 
 def test_forecast_is_what_small_campaigns_state_and_do():
     check = small_check()
-    assert check.ok, check.verdict
+    assert check.ok, check.text
     assert not check.failures
     assert check.to_dataframe().shape == (2 * len(check.forecast.names), 9)
-    assert "60 simulated campaigns" in check.verdict
+    assert "60 simulated campaigns" in check.text
 
 
 def test_a_forecast_that_forgets_the_attitudes_fails():
@@ -219,7 +220,7 @@ def test_a_camera_that_errs_more_than_it_states_is_noticed():
     wrong = replace(check, nees=1.25**2 * check.nees)
     assert wrong.nees_rejected.any()
     assert not wrong.ok
-    assert "not what they should be" in wrong.verdict
+    assert "not what they should be" in wrong.text
 
 
 @pytest.mark.slow
@@ -276,7 +277,7 @@ def test_scopes_differ_and_noise_is_a_floor():
     # Centroid noise alone is more than 1 arcsec at 99.7 %.
     assert found["total"].frames is None
     assert found["total"].floor_arcsec > 1.0
-    assert "centroid noise alone" in made(sweeps=False, target_arcsec=1.0, scope="total").verdict
+    assert "centroid noise alone" in made(sweeps=False, target_arcsec=1.0, scope="total").text
 
 
 def test_data_that_are_there_already_count():
@@ -347,19 +348,19 @@ def test_words():
     assert frames_words(1) == "1 frame"
     assert frames_words(667) == "667 frames"
     assert frames_words(None) == "no number of frames"
-    verdict = made(target_arcsec=5.0).verdict
+    verdict = made(target_arcsec=5.0).text
     assert verdict.startswith("To keep 5 arcsec across the boresight at 99.7\xa0% for the common rotation takes")
     assert "only the rest counts: 1 frame" in verdict
-    assert "centroid noise of" in made(sweeps=False).verdict
+    assert "centroid noise of" in made(sweeps=False).text
 
 
 def test_folder_of_a_plan(tmp_path):
     found = made(target_arcsec=5.0)
-    page = found.save(tmp_path / "plan")
+    page = write_plan(found, tmp_path / "plan")
     text = page.read_text(encoding="utf-8")
     assert "http" not in text.replace("http-equiv", "")
     assert text.count("data:image/png") == 2
-    assert found.verdict.split(".")[0] in text
+    assert found.text.split(".")[0] in text
     written = {path.relative_to(page.parent).as_posix() for path in page.parent.rglob("*") if path.is_file()}
     assert written == {
         *("plan.html", "plan.csv", "sweeps.csv", "plan.json", "figures/forecast.png", "figures/sweeps.png")
@@ -373,14 +374,14 @@ def test_folder_of_a_plan(tmp_path):
 def test_a_target_out_of_reach_is_drawn_as_error():
     found = made(target_arcsec=1.0, scope="total")
     assert found.frames_needed is None
-    panel = found.plot_sweeps().axes[0]
+    panel = found.plot.sweeps().axes[0]
     assert "target 1 arcsec" in panel.get_title(loc="left")
     assert all(np.isfinite(line.get_ydata()).all() for line in panel.lines)
 
 
 def test_a_page_with_choice_and_check(tmp_path):
     choice = choose_frames(camera(), sky(), n_frames=5, candidates=200, n_geometries=100)
-    page = made(sweeps=False).save(tmp_path / "plan", choice=choice, check=small_check())
+    page = write_plan(made(sweeps=False), tmp_path / "plan", choice=choice, check=small_check())
     text = page.read_text(encoding="utf-8")
     assert text.count("data:image/png") == 3
     assert "Frames to take" in text
@@ -391,15 +392,15 @@ def test_a_page_with_choice_and_check(tmp_path):
 def test_a_plan_without_target_or_sweeps_is_drawn(tmp_path):
     found = made(sweeps=False)
     assert found.frames_needed is None
-    page = found.save(tmp_path / "plan").read_text(encoding="utf-8")
+    page = write_plan(found, tmp_path / "plan").read_text(encoding="utf-8")
     assert "Frames needed" not in page
     with pytest.raises(ValueError, match="without sweeps"):
-        found.plot_sweeps()
+        found.plot.sweeps()
 
 
 def test_one_distortion_less_one_column_less():
     found = plan(camera("none"), sky(), n_geometries=100, n_campaigns=20, sweeps=False)
     assert "distortion_corner_px" not in found.forecast.names
-    found.plot_forecast()
+    found.plot.forecast()
     tangential = plan(camera("brown_tangential"), sky(), n_geometries=100, n_campaigns=20, sweeps=False)
     assert {"p1_per_px", "p2_per_px", "k2_per_px4"} < set(tangential.forecast.names)

@@ -5,12 +5,12 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.core.formatting import significant
+from starcal_uq.core.display import Shown
 from starcal_uq.core.records import read, write
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
 from starcal_uq.diagnostics.validation.replicates import INTERVAL
@@ -52,7 +52,7 @@ class Finding(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Validation:
+class Validation(Shown):
     """Truths against their posteriors over n replicates, for Q quantities and p parameters.
 
     Attributes
@@ -198,13 +198,6 @@ class Validation:
         few_failed = len(self.failures) <= 0.01 * (self.n_replicates + len(self.failures))
         return few_failed and self.n_replicates >= ENOUGH_REPLICATES and not any(f.rejected for f in self.findings)
 
-    @property
-    def verdict(self) -> str:
-        """What was found, in plain words."""
-        from starcal_uq.presentation.words.diagnostics import verdict
-
-        return verdict(self)
-
     def to_dataframe(self) -> pd.DataFrame:
         """One row per quantity.
 
@@ -251,15 +244,3 @@ class Validation:
             missing="run `starcal-uq validate CAMERA` first",
             wrong="is not a validation; run `starcal-uq validate CAMERA` to write it again",
         )
-
-    def plot(self, **options: Any) -> Any:
-        """Rank curves with their bands, coverage and NEES; options as for `starcal_uq.presentation.figures.diagnostics.plot_validation`."""
-        from starcal_uq.presentation.figures.diagnostics import plot_validation
-
-        return plot_validation(self, **options)
-
-    def _repr_html_(self) -> str:
-        from html import escape
-
-        table = self.to_dataframe().to_html(index=False, float_format=lambda v: significant(v, 3), border=0)
-        return f"<p><b>Validation</b>: {escape(self.verdict)}</p>{table}"

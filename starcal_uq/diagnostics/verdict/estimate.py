@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.formatting import fixed, join_words, plural, significant
 from starcal_uq.core.status import Check, Level, Question, Status, pass_or_fail, pass_or_warn
 from starcal_uq.diagnostics.verdict.observed import CALIBRATE, SCREEN
@@ -163,7 +164,42 @@ def comparison(found: ModelComparison) -> Check:
     else:
         value = f"{fixed(mine.difference, 1)} ± {fixed(mine.difference_se, 1)} nat from {found.scores[0].model!r}"
     level = Level.FAIL if rejected else Level.PASS
-    return Check("Distortion model", Question.TRUSTWORTHY, level, value, "not rejected", found.statement)
+    return Check("Distortion model", Question.TRUSTWORTHY, level, value, "not rejected", models_sentence(found))
+
+
+def models_sentence(found: ModelComparison) -> str:
+    """Whether another model predicts left-out frames better, and what attitudes would do under the others."""
+    mine, simplest = found.of(found.fitted), found.simplest
+    if mine is not None and mine.rejected:
+        best = found.scores[0]
+        first = (
+            f"The model {found.fitted!r} predicts left-out frames worse than {best.model!r} by "
+            f"{fixed(-mine.difference, 1)} ± {fixed(mine.difference_se, 1)} nat: use {simplest.model!r}."
+        )
+    elif mine is not None and simplest.n_parameters < mine.n_parameters:
+        fewer, all_of_them = (_coefficients(model) for model in (simplest.model, found.fitted))
+        extra = [name for name in all_of_them if name not in fewer]
+        verb = "is" if len(extra) == 1 else "are"
+        first = (
+            f"{join_words(extra)} {verb} not needed: {simplest.model!r} predicts left-out frames no worse than "
+            f"{found.fitted!r}."
+        )
+    else:
+        first = f"No other model predicts left-out frames better than {found.fitted!r} beyond doubt."
+    others = [score for score in found.accepted if score.model != found.fitted]
+    if not others:
+        return first + " All other models are rejected."
+    common = max(float(np.hypot(*score.common_arcsec[:2])) for score in others)
+    rest = max(float(np.hypot(*score.rest_arcsec[:2])) for score in others)
+    return (
+        f"{first} Under the other models that the data do not reject "
+        f"({join_words([score.model for score in others])}), attitudes across the boresight would move by up to "
+        f"{significant(common)} arcsec in common and {significant(rest)} arcsec (rms) frame by frame."
+    )
+
+
+def _coefficients(model: str) -> list[str]:
+    return [c.name for c in get_model(model).coefficients]
 
 
 def predictive(found: PredictiveCheck) -> Check:

@@ -10,6 +10,7 @@ from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import count
 from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.figures import style
+from starcal_uq.presentation.words.planning import level, need_words
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,11 +43,6 @@ _CHECKED = (
     ("rest_pitch_arcsec", "rest, pitch", style.GREEN, "v"),
     ("rest_roll_arcsec", "rest, roll", style.SKY, "P"),
 )
-
-
-def _level(confidence: float) -> str:
-    """A confidence in per cent, with all its digits."""
-    return f"{100.0 * confidence:.6g} %"
 
 
 def plot_forecast(plan: Plan) -> Figure:
@@ -93,7 +89,7 @@ def _radius_panel(ax: Axes, plan: Plan, n: FloatArray) -> None:
         needed = plan.frames_needed
         words = f"target {plan.target_arcsec:g} arcsec"
         if needed is not None and plan.need is not None:
-            words += f": {plan.need.words}"
+            words += f": {need_words(plan.need, plan.need.frames)}"
             _continued(ax, plan, n, needed)
             ax.plot(
                 needed, plan.target_arcsec, linestyle="", marker="D", color=style.VERMILLION, markersize=6, zorder=4
@@ -108,7 +104,7 @@ def _radius_panel(ax: Axes, plan: Plan, n: FloatArray) -> None:
             color=style.VERMILLION,
         )
     _plain_ticks(ax)
-    title = f"Two-axis error at {_level(plan.confidence)}, {_SCOPES[plan.scope]}"
+    title = f"Two-axis error at {level(plan.confidence)}, {_SCOPES[plan.scope]}"
     style.label(ax, title, "frames", "error across the boresight [arcsec]")
 
 
@@ -192,9 +188,9 @@ def plot_plan_sweeps(plan: Plan) -> Figure:
         style.label(ax, "", words)
     if of_frames:
         style.label(panels[0], "", "", "frames")
-        title = f"Frames for {plan.target_arcsec:g} arcsec at {_level(plan.confidence)}, {_SCOPES[plan.scope]}"
+        title = f"Frames for {plan.target_arcsec:g} arcsec at {level(plan.confidence)}, {_SCOPES[plan.scope]}"
     else:
-        style.label(panels[0], "", "", f"error at {_level(plan.confidence)} [arcsec]")
+        style.label(panels[0], "", "", f"error at {level(plan.confidence)} [arcsec]")
         title = f"Two-axis error after {count(int(plan.sweeps['n_frames'].iloc[0]))} frames, {_SCOPES[plan.scope]}"
         title += "" if plan.target_arcsec is None else f"; line: target {plan.target_arcsec:g} arcsec"
     style.label(panels[0], title)

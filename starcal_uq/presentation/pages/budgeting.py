@@ -5,16 +5,19 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from starcal_uq.budgeting.result import Budget, Outcome, by_contributor
-from starcal_uq.budgeting.rows import AXIS_LABELS, SCOPES, Contributor, confidence_text
+from starcal_uq.budgeting.result import Budget
+from starcal_uq.budgeting.rows import AXIS_LABELS, confidence_text
 from starcal_uq.budgeting.totals import Total
-from starcal_uq.core.constants import AXES, TOTAL_AXES
+from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.files import atomic_path, atomic_write_text
-from starcal_uq.core.formatting import decimals_for, fixed, join_words, plural, significant
+from starcal_uq.presentation.figures.budgeting import plot_budget
+from starcal_uq.presentation.figures.style import png_bytes
 from starcal_uq.presentation.html import embedded_image, template_environment
 from starcal_uq.presentation.tables import tex
+from starcal_uq.presentation.words.budgeting import NOT_ASSESSED, NOT_RESOLVED, headline, outcome_text, tables
 
 if TYPE_CHECKING:
     from openpyxl.worksheet.worksheet import Worksheet
@@ -145,7 +148,7 @@ def _requirements(sheet: Worksheet, budget: Budget) -> None:
             [
                 *(asked.name, AXIS_LABELS[asked.axis], asked.scope, asked.interpretation, asked.confidence),
                 *(asked.limit_arcsec, *_numbers(outcome.total)[2:], asked.judged_by, outcome.margin_arcsec),
-                *(outcome.verdict, outcome.sentence),
+                *(outcome.verdict, outcome_text(outcome)),
             ]
         )
     colours = [{"violated": _RED, "open": _AMBER, "met": _GREEN}[outcome.verdict] for outcome in budget.outcomes]
@@ -211,233 +214,36 @@ def _format(value: float) -> str:
     return "0.0" if size >= 100.0 else "0.00" if size >= 1.0 else "0.0000" if size >= 0.01 else "0.00E+00"
 
 
-WRITERS: dict[str, Callable[[Budget, str | os.PathLike[str]], None]] = {
+_WRITERS: dict[str, Callable[[Budget, str | os.PathLike[str]], None]] = {
+    ".csv": Budget.save,
     ".xlsx": write_xlsx,
     ".tex": write_tex,
     ".html": write_html,
 }
+FORMATS = tuple(_WRITERS)
 
 
-Row = dict[str, Any]
+def write_budget(budget: Budget, path: str | os.PathLike[str]) -> Path:
+    """Write the budget, atomically; overwritten. The ending names the format.
 
+    ``.csv`` holds everything to the last digit and is what `Budget.load` reads; the others are for people.
 
-NOT_ASSESSED = "not assessed"
-
-
-NOT_RESOLVED = "not resolved"
-
-
-# Above what rounding makes of 2.968.
-_GAUSSIAN_TAIL = 2.98
-
-
-_MIXED, *_OTHERS = ("mixed", "ensemble", "temporal")
-
-
-_MEANING = {
-    "mixed": "a sensor and a moment at random",
-    "ensemble": "a sensor at random, at its worst moment",
-    "temporal": "the worst sensor, at a moment at random",
-}
+    Raises
+    ------
+    BudgetError
+        For another ending.
+    RunFolderError
+        If it cannot be written.
+    """
+    ending = Path(path).suffix.lower()
+    if ending not in _WRITERS:
+        raise BudgetError(f"{path}: the ending names the format; use one of {', '.join(FORMATS)}.")
+    _WRITERS[ending](budget, path)
+    return Path(path)
 
 
 def budget_context(budget: Budget | None) -> dict[str, Any]:
     """What the template ``budget_section.html.j2`` shows, under the one name ``budget``; None where there is none."""
     if budget is None:
         return {"budget": None}
-    from starcal_uq.presentation.figures.budgeting import plot_budget
-    from starcal_uq.presentation.figures.style import png_bytes
-
     return {"budget": {**tables(budget), "image": embedded_image(png_bytes(plot_budget(budget)))}}
-
-
-def tables(budget: Budget) -> dict[str, Any]:
-    """All rows and sentences."""
-    return {
-        "title": budget.title,
-        "confidence": confidence_text(budget.confidence),
-        "rows": contributor_rows(budget),
-        "has_means": any(row.assessed and row.mean_arcsec != 0.0 for row in budget.rows),
-        "totals": total_rows(budget),
-        "interpretations": [{"name": name, "meaning": text} for name, text in _MEANING.items()],
-        "requirements": [_requirement_row(outcome) for outcome in budget.outcomes],
-        "headline": headline(budget),
-        "not_drawn": len(budget.outcomes) - len(budget.comparable),
-        "violated": bool(budget.violations),
-        "open": bool(budget.not_assessed or budget.open_requirements),
-        "explanations": explanations(budget),
-        "notes": list(budget.notes),
-        "factors": factor_sentence(budget),
-    }
-
-
-def headline(budget: Budget) -> str:
-    """The budget in one or two sentences."""
-    parts = []
-    if budget.violations:
-        names = join_words([repr(outcome.requirement.name) for outcome in budget.violations])
-        verb = "requirement is" if len(budget.violations) == 1 else "requirements are"
-        parts.append(f"{len(budget.violations)} {verb} violated: {names}.")
-    met = [outcome for outcome in budget.outcomes if outcome.verdict == "met"]
-    if met:
-        parts.append(f"{plural(len(met), 'requirement')} met.")
-    unresolved = [outcome for outcome in budget.open_requirements if outcome.unresolved]
-    missing = len(budget.open_requirements) - len(unresolved)
-    if missing:
-        parts.append(f"{plural(missing, 'requirement')} open: contributors are missing.")
-    if unresolved:
-        parts.append(f"{plural(len(unresolved), 'requirement')} open: the samples do not resolve so high a confidence.")
-    if budget.not_assessed:
-        every = len(by_contributor(budget.rows))
-        parts.append(
-            f"{len(budget.not_assessed)} of {every} contributors are not assessed on one axis or more, so the totals "
-            "read “at least”."
-        )
-    elif not budget.outcomes:
-        parts.append("Every contributor is assessed; no requirement was given.")
-    return " ".join(parts)
-
-
-def contributor_rows(budget: Budget) -> list[Row]:
-    """One row per contributor, its three axes side by side; what differs between axes is listed."""
-    return [_contributor_row(name, axes) for name, axes in by_contributor(budget.rows).items()]
-
-
-def _contributor_row(name: str, axes: dict[str, Contributor]) -> Row:
-    stated = [row for row in axes.values() if row.assessed]
-    first = next(iter(axes.values()))
-    every = stated or [first]
-
-    def listed(values: list[str]) -> str:
-        return " / ".join(dict.fromkeys(value for value in values if value))
-
-    return {
-        "name": name,
-        "ecss_class": listed([row.ecss_class for row in every]),
-        "sigma": [_sigma(axes.get(axis)) for axis in AXES],
-        "mean": _means(axes),
-        "missing": [axis in axes and not axes[axis].assessed for axis in AXES],
-        "distribution": " / ".join(
-            dict.fromkeys(row.distribution if row.applies else "does not apply" for row in stated)
-        ),
-        "tail": _tails(stated),
-        "time_class": listed([row.time_class for row in every]),
-        "interpretation": listed([row.interpretation for row in every]),
-        "absorbed": listed([row.absorbed_by_alignment for row in every]),
-        "combination": listed([row.combination for row in every]),
-        "group": listed([row.correlation_group for row in every]),
-        "conditions": listed([row.conditions for row in every]),
-        "provenance": listed([row.provenance for row in stated]),
-        "source": listed([row.source for row in axes.values()]),
-        "inflated": any(row.inflated for row in stated),
-        "assessed": bool(stated),
-    }
-
-
-def _sigma(row: Contributor | None) -> str:
-    if row is None:
-        return "–"
-    if not row.assessed:
-        return NOT_ASSESSED
-    return significant(row.sigma_arcsec, 3) if row.applies else "n/a"
-
-
-def _means(axes: dict[str, Contributor]) -> str:
-    """Means of the three axes, or one 0 for all."""
-    values = [axes[axis].mean_arcsec if axis in axes and axes[axis].assessed else None for axis in AXES]
-    if not any(values):
-        return "0" if any(value is not None for value in values) else ""
-    return ", ".join("–" if value is None else significant(value, 3) for value in values)
-
-
-def _tails(rows: list[Contributor]) -> str:
-    """The range of the tails where sigma changes from frame to frame."""
-    tails = [row.tail_997 for row in rows if row.distribution == "gaussian" and row.tail_997 > _GAUSSIAN_TAIL]
-    if not tails:
-        return ""
-    ends = " to ".join(dict.fromkeys(significant(tail, 3) for tail in (min(tails), max(tails))))
-    return f"sigma varies by frame: 99.7 % within {ends} σ"
-
-
-def bound(value: float, at_least: bool, digits: int = 3) -> str:
-    """A bound in arcsec, with "≥" while contributors are missing."""
-    if math.isnan(value):
-        return NOT_ASSESSED
-    return ("≥ " if at_least else "") + significant(value, digits)
-
-
-def total_rows(budget: Budget) -> list[Row]:
-    """One row per scope and axis: mean, sigma, factor and the bounds of all interpretations."""
-    rows = []
-    for scope in SCOPES:
-        for axis in TOTAL_AXES:
-            mixed = budget.total(axis, scope)
-            rows.append(
-                {
-                    "scope": scope,
-                    "axis": AXIS_LABELS[axis],
-                    "mean": "–" if math.isnan(mixed.mean_arcsec) else significant(mixed.mean_arcsec, 3),
-                    "sigma": bound(mixed.sigma_arcsec, mixed.at_least),
-                    "factor": "–" if math.isnan(mixed.factor) else fixed(mixed.factor, 3),
-                    "rule": bound(mixed.rule_arcsec, mixed.at_least),
-                    "sampled": _sampled(mixed),
-                    "others": [_pair(budget.total(axis, scope, kind)) for kind in _OTHERS],
-                    "dominant": mixed.dominant or "–",
-                }
-            )
-    return rows
-
-
-def _sampled(total: Total) -> str:
-    if total.unresolved:
-        return NOT_RESOLVED
-    if math.isnan(total.sampled_arcsec):
-        return NOT_ASSESSED
-    digits = max(decimals_for(total.sampled_se_arcsec, 1), decimals_for(total.sampled_arcsec, 2))
-    digits = min(digits, decimals_for(total.sampled_arcsec, 3))
-    return ("≥ " if total.at_least else "") + fixed(total.sampled_arcsec, digits)
-
-
-def _pair(total: Total) -> dict[str, str]:
-    return {"rule": bound(total.rule_arcsec, total.at_least), "sampled": _sampled(total)}
-
-
-def _requirement_row(outcome: Outcome) -> Row:
-    asked = outcome.requirement
-    return {
-        "name": asked.name,
-        "axis": AXIS_LABELS[asked.axis],
-        "scope": asked.scope,
-        "interpretation": asked.interpretation,
-        "confidence": confidence_text(asked.confidence),
-        "limit": significant(asked.limit_arcsec, 3),
-        "rule": bound(outcome.total.rule_arcsec, outcome.total.at_least),
-        "sampled": _sampled(outcome.total),
-        "margin": "–" if math.isnan(outcome.margin_arcsec) else significant(outcome.margin_arcsec, 3),
-        "judged_by": {"both": "the larger"}.get(asked.judged_by, asked.judged_by),
-        "verdict": outcome.verdict,
-        "level": {"violated": "fail", "open": "warning", "met": "pass"}[outcome.verdict],
-        "sentence": outcome.sentence,
-    }
-
-
-def explanations(budget: Budget) -> list[str]:
-    """Why rule and sampling differ, one line per distinct reason, for the mixed interpretation."""
-    found: dict[str, list[str]] = {}
-    for entry in budget.totals:
-        if entry.interpretation == _MIXED and entry.explanation:
-            found.setdefault(entry.explanation, []).append(f"{AXIS_LABELS[entry.axis]}, {entry.scope}")
-    every = len(SCOPES) * len(TOTAL_AXES)
-    return [f"{'All totals' if len(where) == every else '; '.join(where)}: {text}" for text, where in found.items()]
-
-
-def factor_sentence(budget: Budget) -> str:
-    """Which quantiles the rule took."""
-    from starcal_uq.budgeting.shapes import one_axis_factor, two_axis_radius
-
-    level = budget.confidence
-    return (
-        f"At {confidence_text(level)} a Gaussian error stays within {fixed(one_axis_factor(level), 3)} sigma on one "
-        f"axis, but the angle of two equal axes within {fixed(two_axis_radius(level, 1.0, 1.0), 3)} sigma per axis; "
-        "for unequal ones the factor refers to the root mean square of both."
-    )

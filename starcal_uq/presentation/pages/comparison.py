@@ -1,18 +1,21 @@
-"""One comparison as a self-contained page."""
+"""One comparison as a self-contained page, with its tables and its figure beside it."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+import os
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from starcal_uq.camera.distortion import parameters
+from starcal_uq.comparison.result import CameraComparison
+from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, new_folder
 from starcal_uq.core.formatting import fixed, percent, pretty_unit, significant, with_sigma
+from starcal_uq.presentation.figures.comparison import plot_camera_comparison
+from starcal_uq.presentation.figures.style import png_bytes
 from starcal_uq.presentation.html import embedded_image, template_environment
 from starcal_uq.presentation.words.comparison import headline, p_words, rotation_words
-
-if TYPE_CHECKING:
-    from starcal_uq.comparison.result import CameraComparison
 
 _LEVELS = {"agree": "pass", "parameters differ": "warning", "maps differ": "fail", "not tested": "warning"}
 _BADGES = {
@@ -21,6 +24,30 @@ _BADGES = {
     "maps differ": "✗ differ",
     "not tested": "! not tested",
 }
+
+
+def write_comparison(found: CameraComparison, folder: str | os.PathLike[str]) -> Path:
+    """Write the page, the tables, the figure and a lossless file into a folder; existing ones are overwritten.
+
+    Returns
+    -------
+    Path
+        ``comparison.html``, which needs no network and no other file.
+
+    Raises
+    ------
+    RunFolderError
+        If the folder cannot be made or written to.
+    """
+    path = new_folder(folder)
+    image = png_bytes(plot_camera_comparison(found))
+    found.save(path / "comparison.json")
+    atomic_write_text(path / "difference.csv", found.to_dataframe().to_csv(index=False))
+    atomic_write_text(path / "difference_map.csv", found.field_dataframe().to_csv(index=False))
+    atomic_write_bytes(path / "difference_map.png", image)
+    page = path / "comparison.html"
+    atomic_write_text(page, render_comparison(found, image))
+    return page
 
 
 def render_comparison(found: CameraComparison, image: bytes) -> str:

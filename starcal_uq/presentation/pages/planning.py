@@ -6,20 +6,33 @@ import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.files import atomic_path, atomic_write_bytes, atomic_write_text, new_folder
 from starcal_uq.core.formatting import count, fixed, significant
+from starcal_uq.planning.check import ForecastCheck
+from starcal_uq.planning.design import FrameChoice
+from starcal_uq.planning.plan import Plan
+from starcal_uq.presentation.figures.planning import (
+    plot_forecast,
+    plot_forecast_check,
+    plot_frame_choice,
+    plot_plan_sweeps,
+)
+from starcal_uq.presentation.figures.style import png_bytes
 from starcal_uq.presentation.html import embedded_image, template_environment
-from starcal_uq.presentation.words.planning import SCOPE_NAMES, level, need_words, settings_sentence
-
-if TYPE_CHECKING:
-    from starcal_uq.planning.check import ForecastCheck
-    from starcal_uq.planning.design import FrameChoice
-    from starcal_uq.planning.plan import Plan
+from starcal_uq.presentation.words.planning import (
+    SCOPE_NAMES,
+    check_text,
+    choice_text,
+    level,
+    need_words,
+    plan_text,
+    settings_sentence,
+)
 
 PAGE = "plan.html"
 _TEMPLATE = "plan.html.j2"
@@ -38,21 +51,43 @@ _GROUPS = (
 def write_plan(
     plan: Plan, folder: str | os.PathLike[str], choice: FrameChoice | None = None, check: ForecastCheck | None = None
 ) -> Path:
-    """Tables, figures and the page, which comes last: it is there only if all else is."""
+    """Write ``plan.html`` (self-contained), the tables as CSV, ``plan.json`` and the figures into a folder.
+
+    The page comes last: it is there only if all else is.
+
+    Parameters
+    ----------
+    plan : Plan
+        What was forecast.
+    folder : path
+        Folder, made if it is missing; files in it are overwritten.
+    choice : FrameChoice, optional
+        Frames to take, for the page and ``frames.csv``.
+    check : ForecastCheck, optional
+        Forecast against simulation, for the page and ``check.csv``.
+
+    Returns
+    -------
+    Path
+        The page.
+    """
     path = new_folder(folder)
     images = plan_figures(plan, choice, check)
     page = render_plan(plan, images, choice, check)
     figures = new_folder(path / "figures")
     for name, png in images.items():
         atomic_write_bytes(figures / f"{name}.png", png)
-    tables = {"plan": plan.to_dataframe()} | ({} if plan.sweeps is None else {"sweeps": plan.sweeps})
+    tables = {
+        "plan": plan.to_dataframe(),
+        "sweeps": plan.sweeps,
+        "frames": None if choice is None else choice.to_dataframe(),
+        "check": None if check is None else check.to_dataframe(),
+    }
     for name, table in tables.items():
+        if table is None:
+            continue
         with atomic_path(path / f"{name}.csv") as temporary:
             table.to_csv(temporary, index=False, lineterminator="\n")
-    if choice is not None:
-        choice.save(path / "frames.csv")
-    if check is not None:
-        check.save(path / "check.csv")
     atomic_write_text(path / "plan.json", json.dumps(plan_record(plan), indent=1) + "\n")
     atomic_write_text(path / PAGE, page)
     return path / PAGE
@@ -61,7 +96,7 @@ def write_plan(
 def plan_record(plan: Plan) -> dict[str, Any]:
     """The plan as plain values: settings, what is needed, and the forecast by number of frames."""
     return {
-        "verdict": plan.verdict,
+        "verdict": plan_text(plan),
         "camera": plan.camera.to_dict(),
         "sigma_px": plan.sigma_px,
         "max_mag": plan.max_mag,
@@ -91,15 +126,13 @@ def plan_record(plan: Plan) -> dict[str, Any]:
 
 def plan_figures(plan: Plan, choice: FrameChoice | None = None, check: ForecastCheck | None = None) -> dict[str, bytes]:
     """Every figure as PNG, by name."""
-    from starcal_uq.presentation.figures.style import png_bytes
-
-    figures = {"forecast": plan.plot_forecast()}
+    figures = {"forecast": plot_forecast(plan)}
     if plan.sweeps is not None:
-        figures["sweeps"] = plan.plot_sweeps()
+        figures["sweeps"] = plot_plan_sweeps(plan)
     if choice is not None:
-        figures["choice"] = choice.plot()
+        figures["choice"] = plot_frame_choice(choice)
     if check is not None:
-        figures["check"] = check.plot()
+        figures["check"] = plot_forecast_check(check)
     return {name: png_bytes(figure) for name, figure in figures.items()}
 
 
@@ -111,7 +144,8 @@ def render_plan(
 ) -> str:
     """The page; `images` are PNG by the names of `plan_figures`."""
     context = _context(plan, images)
-    context |= {"choice": None if choice is None else choice.verdict, "check": None if check is None else check.verdict}
+    context |= {"choice": None if choice is None else choice_text(choice)}
+    context |= {"check": None if check is None else check_text(check)}
     context |= {"frame_rows": [] if choice is None else _frame_rows(choice)}
     return template_environment().get_template(_TEMPLATE).render(context) + "\n"
 
@@ -140,7 +174,7 @@ def _context(plan: Plan, images: Mapping[str, bytes]) -> dict[str, Any]:
         "title": plan.camera.name or "Plan of a calibration",
         "created": plan.provenance["created_utc"],
         "version": plan.provenance["versions"].get("starcal_uq") or "",
-        "verdict": plan.verdict,
+        "verdict": plan_text(plan),
         "settings": settings_sentence(plan),
         "level": level(plan.confidence),
         "scope": SCOPE_NAMES[plan.scope],

@@ -8,7 +8,7 @@ import numpy as np
 
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.formatting import count, decimals_for, fixed, percent, plural, pretty_unit, significant
-from starcal_uq.diagnostics.verdict.estimate import MISFIT_P
+from starcal_uq.diagnostics.verdict.estimate import MISFIT_P, models_sentence
 from starcal_uq.inference.derived import derived_quantities
 from starcal_uq.presentation.report.tables import Row, symbol
 
@@ -32,7 +32,7 @@ def diagnosis_context(found: Diagnosis | None, cal: Calibration) -> dict[str, An
         "jackknife_rows": [] if found.jackknife is None else jackknife_rows(found.jackknife, cal),
         "jackknife_sentence": "" if found.jackknife is None else _jackknife_sentence(found.jackknife),
         "comparison_rows": [] if found.comparison is None else comparison_rows(found.comparison, cal),
-        "comparison_sentence": "" if found.comparison is None else found.comparison.statement,
+        "comparison_sentence": "" if found.comparison is None else models_sentence(found.comparison),
         "predictive_rows": predictive_rows(found.predictive),
     }
 

@@ -1,113 +1,273 @@
-"""Why the bound by the rule and the sampled one differ, in words."""
+"""The budget in sentences and tables: contributors, totals, requirements, and why two bounds differ."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
-from starcal_uq.budgeting.rows import GAUSSIAN_997, Contributor
-from starcal_uq.budgeting.shapes import half_width
-from starcal_uq.core.constants import CROSS_BORESIGHT
-from starcal_uq.core.formatting import join_words, percent, significant
+from starcal_uq.budgeting.result import Budget, Outcome, by_contributor
+from starcal_uq.budgeting.rows import AXIS_LABELS, SCOPES, Contributor, confidence_text
+from starcal_uq.budgeting.shapes import one_axis_factor, two_axis_radius
+from starcal_uq.budgeting.totals import Total
+from starcal_uq.core.constants import AXES, TOTAL_AXES
+from starcal_uq.core.formatting import decimals_for, fixed, join_words, plural, significant
+from starcal_uq.presentation.tables import TextTable
 
-if TYPE_CHECKING:
-    from starcal_uq.budgeting.totals import Total
-
-_AGREE = 0.02
-_BOUNDED = ("uniform", "arcsine")
-# A mean of this many sigmas moves the bounds apart.
-_MEAN_COUNTS = 0.05
-_TAILED = 1.01 * GAUSSIAN_997
-# Smaller ones, relative to the largest, are left out of a sentence.
-_WORTH_NAMING = 0.25
+Row = dict[str, Any]
 
 
-def explain(total: Total, counted: Sequence[Contributor], random: Sequence[Contributor], dominant: Contributor) -> str:
-    """One sentence or two on rule against sampling; empty if no error is random."""
-    if not total.rule_arcsec > 0.0:
-        return "No error is left: all rows are zero."
-    difference = total.rule_arcsec / total.sampled_arcsec - 1.0 if total.sampled_arcsec > 0.0 else math.inf
-    within = 3.0 * total.sampled_se_arcsec / max(total.sampled_arcsec, 1e-300)
-    if abs(difference) <= max(_AGREE, within):
-        return f"Both bounds agree within {percent(max(_AGREE, within), 1)}."
-    size = percent(abs(difference), 2)
-    head = f"The rule is {size} {'above' if difference > 0 else 'below'} the sampled bound"
-    reasons = (_below if difference < 0.0 else _above)(total, counted, random, dominant)
-    return f"{head}: {'; '.join(reasons) or 'the rows together are not Gaussian, as the rule takes them to be'}."
+NOT_ASSESSED = "not assessed"
 
 
-def _below(
-    total: Total, counted: Sequence[Contributor], random: Sequence[Contributor], dominant: Contributor
-) -> list[str]:
-    """Why the rule says less."""
-    tailed = dominant if dominant.tail_997 > _TAILED else _heaviest(counted)
-    if tailed is not None:
-        return [
-            f"the sigma of {tailed.name!r} changes from frame to frame, so that 99.7 % of its errors reach "
-            f"{significant(tailed.tail_997, 3)} sigma where a Gaussian error reaches 2.97"
-        ]
-    if dominant.distribution == "rayleigh":
-        return [f"{_share(total, dominant)} and is one-sided (Rayleigh), with a longer tail than a Gaussian error"]
-    if _grouped(random):
-        return ["rows of a correlation group that are not Gaussian add to a longer tail than their sigmas say"]
-    if dominant.distribution in _BOUNDED and dominant in random:
-        return [
-            f"{_share(total, dominant)}; its distribution is {dominant.distribution}, and at this confidence reaches "
-            "further than a Gaussian error of the same sigma"
-        ]
-    return []
+NOT_RESOLVED = "not resolved"
 
 
-def _above(
-    total: Total, counted: Sequence[Contributor], random: Sequence[Contributor], dominant: Contributor
-) -> list[str]:
-    """Why the rule says more; the first reason weighs most."""
-    shape = dominant.distribution
-    if shape in _BOUNDED and dominant in random:
-        return [
-            f"{_share(total, dominant)}; its distribution is {shape} and ends at "
-            f"{significant(half_width(shape, total.confidence), 3)} sigma, where the rule takes "
-            f"{significant(total.factor, 3)}"
-        ]
-    reasons = []
-    if abs(total.mean_arcsec) > _MEAN_COUNTS * total.sigma_arcsec:
-        reasons.append(
-            "the rule adds the whole mean to the spread, as if both always pointed the same way"
-            if total.axis == CROSS_BORESIGHT
-            else "a mean shifts the errors to one side, where fewer sigmas hold the same share than on both sides"
+# Above what rounding makes of 2.968.
+_GAUSSIAN_TAIL = 2.98
+
+
+_MIXED, *_OTHERS = ("mixed", "ensemble", "temporal")
+
+
+_MEANING = {
+    "mixed": "a sensor and a moment at random",
+    "ensemble": "a sensor at random, at its worst moment",
+    "temporal": "the worst sensor, at a moment at random",
+}
+
+
+def tables(budget: Budget) -> dict[str, Any]:
+    """All rows and sentences."""
+    return {
+        "title": budget.title,
+        "confidence": confidence_text(budget.confidence),
+        "rows": contributor_rows(budget),
+        "has_means": any(row.assessed and row.mean_arcsec != 0.0 for row in budget.rows),
+        "totals": total_rows(budget),
+        "interpretations": [{"name": name, "meaning": text} for name, text in _MEANING.items()],
+        "requirements": [_requirement_row(outcome) for outcome in budget.outcomes],
+        "headline": headline(budget),
+        "not_drawn": len(budget.outcomes) - len(budget.comparable),
+        "violated": bool(budget.violations),
+        "open": bool(budget.not_assessed or budget.open_requirements),
+        "explanations": explanations(budget),
+        "notes": list(budget.notes),
+        "factors": factor_sentence(budget),
+    }
+
+
+def headline(budget: Budget) -> str:
+    """The budget in one or two sentences."""
+    parts = []
+    if budget.violations:
+        names = join_words([repr(outcome.requirement.name) for outcome in budget.violations])
+        verb = "requirement is" if len(budget.violations) == 1 else "requirements are"
+        parts.append(f"{len(budget.violations)} {verb} violated: {names}.")
+    met = [outcome for outcome in budget.outcomes if outcome.verdict == "met"]
+    if met:
+        parts.append(f"{plural(len(met), 'requirement')} met.")
+    unresolved = [outcome for outcome in budget.open_requirements if outcome.unresolved]
+    missing = len(budget.open_requirements) - len(unresolved)
+    if missing:
+        parts.append(f"{plural(missing, 'requirement')} open: contributors are missing.")
+    if unresolved:
+        parts.append(f"{plural(len(unresolved), 'requirement')} open: the samples do not resolve so high a confidence.")
+    if budget.not_assessed:
+        every = len(by_contributor(budget.rows))
+        parts.append(
+            f"{len(budget.not_assessed)} of {every} contributors are not assessed on one axis or more, so the totals "
+            "read “at least”."
         )
-        if abs(total.mean_arcsec) > total.sigma_arcsec:
-            return reasons
-    # Small bounded rows explain nothing.
-    bounded = [row for row in random if row.distribution in _BOUNDED]
-    bounded = [row for row in bounded if row.sigma_arcsec >= _WORTH_NAMING * max(r.sigma_arcsec for r in bounded)]
-    if math.hypot(*(row.sigma_arcsec for row in bounded)) >= _WORTH_NAMING * total.sigma_arcsec > 0.0:
-        if total.axis == CROSS_BORESIGHT:
-            reasons.append("bounded distributions on two axes leave less in the corners than Gaussian errors do")
-        else:
-            names = list(dict.fromkeys(repr(row.name) for row in bounded))
-            each = "" if len(names) == 1 else " of each"
-            factor = significant(total.factor, 3)
-            reasons.append(f"{join_words(names)} cannot exceed a fixed size, while the rule takes {factor} sigma{each}")
-    tailed = _heaviest(random)
-    if not reasons and tailed is not None:
-        reasons.append(
-            f"the sigma of {tailed.name!r} changes from frame to frame, so that at this confidence more of its errors "
-            "are small than of a Gaussian error"
+    elif not budget.outcomes:
+        parts.append("Every contributor is assessed; no requirement was given.")
+    return " ".join(parts)
+
+
+def contributor_rows(budget: Budget) -> list[Row]:
+    """One row per contributor, its three axes side by side; what differs between axes is listed."""
+    return [_contributor_row(name, axes) for name, axes in by_contributor(budget.rows).items()]
+
+
+def _contributor_row(name: str, axes: dict[str, Contributor]) -> Row:
+    stated = [row for row in axes.values() if row.assessed]
+    first = next(iter(axes.values()))
+    every = stated or [first]
+
+    def listed(values: list[str]) -> str:
+        return " / ".join(dict.fromkeys(value for value in values if value))
+
+    return {
+        "name": name,
+        "ecss_class": listed([row.ecss_class for row in every]),
+        "sigma": [_sigma(axes.get(axis)) for axis in AXES],
+        "mean": _means(axes),
+        "missing": [axis in axes and not axes[axis].assessed for axis in AXES],
+        "distribution": " / ".join(
+            dict.fromkeys(row.distribution if row.applies else "does not apply" for row in stated)
+        ),
+        "tail": _tails(stated),
+        "time_class": listed([row.time_class for row in every]),
+        "interpretation": listed([row.interpretation for row in every]),
+        "absorbed": listed([row.absorbed_by_alignment for row in every]),
+        "combination": listed([row.combination for row in every]),
+        "group": listed([row.correlation_group for row in every]),
+        "conditions": listed([row.conditions for row in every]),
+        "provenance": listed([row.provenance for row in stated]),
+        "source": listed([row.source for row in axes.values()]),
+        "inflated": any(row.inflated for row in stated),
+        "assessed": bool(stated),
+    }
+
+
+def _sigma(row: Contributor | None) -> str:
+    if row is None:
+        return "–"
+    if not row.assessed:
+        return NOT_ASSESSED
+    return significant(row.sigma_arcsec, 3) if row.applies else "n/a"
+
+
+def _means(axes: dict[str, Contributor]) -> str:
+    """Means of the three axes, or one 0 for all."""
+    values = [axes[axis].mean_arcsec if axis in axes and axes[axis].assessed else None for axis in AXES]
+    if not any(values):
+        return "0" if any(value is not None for value in values) else ""
+    return ", ".join("–" if value is None else significant(value, 3) for value in values)
+
+
+def _tails(rows: list[Contributor]) -> str:
+    """The range of the tails where sigma changes from frame to frame."""
+    tails = [row.tail_997 for row in rows if row.distribution == "gaussian" and row.tail_997 > _GAUSSIAN_TAIL]
+    if not tails:
+        return ""
+    ends = " to ".join(dict.fromkeys(significant(tail, 3) for tail in (min(tails), max(tails))))
+    return f"sigma varies by frame: 99.7 % within {ends} σ"
+
+
+def bound(value: float, at_least: bool, digits: int = 3) -> str:
+    """A bound in arcsec, with "≥" while contributors are missing."""
+    if math.isnan(value):
+        return NOT_ASSESSED
+    return ("≥ " if at_least else "") + significant(value, digits)
+
+
+def total_rows(budget: Budget) -> list[Row]:
+    """One row per scope and axis: mean, sigma, factor and the bounds of all interpretations."""
+    rows = []
+    for scope in SCOPES:
+        for axis in TOTAL_AXES:
+            mixed = budget.total(axis, scope)
+            rows.append(
+                {
+                    "scope": scope,
+                    "axis": AXIS_LABELS[axis],
+                    "mean": "–" if math.isnan(mixed.mean_arcsec) else significant(mixed.mean_arcsec, 3),
+                    "sigma": bound(mixed.sigma_arcsec, mixed.at_least),
+                    "factor": "–" if math.isnan(mixed.factor) else fixed(mixed.factor, 3),
+                    "rule": bound(mixed.rule_arcsec, mixed.at_least),
+                    "sampled": _sampled(mixed),
+                    "others": [_pair(budget.total(axis, scope, kind)) for kind in _OTHERS],
+                    "dominant": mixed.dominant or "–",
+                }
+            )
+    return rows
+
+
+def _sampled(total: Total) -> str:
+    if total.unresolved:
+        return NOT_RESOLVED
+    if math.isnan(total.sampled_arcsec):
+        return NOT_ASSESSED
+    digits = max(decimals_for(total.sampled_se_arcsec, 1), decimals_for(total.sampled_arcsec, 2))
+    digits = min(digits, decimals_for(total.sampled_arcsec, 3))
+    return ("≥ " if total.at_least else "") + fixed(total.sampled_arcsec, digits)
+
+
+def _pair(total: Total) -> dict[str, str]:
+    return {"rule": bound(total.rule_arcsec, total.at_least), "sampled": _sampled(total)}
+
+
+def _requirement_row(outcome: Outcome) -> Row:
+    asked = outcome.requirement
+    return {
+        "name": asked.name,
+        "axis": AXIS_LABELS[asked.axis],
+        "scope": asked.scope,
+        "interpretation": asked.interpretation,
+        "confidence": confidence_text(asked.confidence),
+        "limit": significant(asked.limit_arcsec, 3),
+        "rule": bound(outcome.total.rule_arcsec, outcome.total.at_least),
+        "sampled": _sampled(outcome.total),
+        "margin": "–" if math.isnan(outcome.margin_arcsec) else significant(outcome.margin_arcsec, 3),
+        "judged_by": {"both": "the larger"}.get(asked.judged_by, asked.judged_by),
+        "verdict": outcome.verdict,
+        "level": {"violated": "fail", "open": "warning", "met": "pass"}[outcome.verdict],
+        "sentence": outcome_text(outcome),
+    }
+
+
+def explanations(budget: Budget) -> list[str]:
+    """Why rule and sampling differ, one line per distinct reason, for the mixed interpretation."""
+    found: dict[str, list[str]] = {}
+    for entry in budget.totals:
+        if entry.interpretation == _MIXED and entry.explanation:
+            found.setdefault(entry.explanation, []).append(f"{AXIS_LABELS[entry.axis]}, {entry.scope}")
+    every = len(SCOPES) * len(TOTAL_AXES)
+    return [f"{'All totals' if len(where) == every else '; '.join(where)}: {text}" for text, where in found.items()]
+
+
+def factor_sentence(budget: Budget) -> str:
+    """Which quantiles the rule took."""
+    level = budget.confidence
+    return (
+        f"At {confidence_text(level)} a Gaussian error stays within {fixed(one_axis_factor(level), 3)} sigma on one "
+        f"axis, but the angle of two equal axes within {fixed(two_axis_radius(level, 1.0, 1.0), 3)} sigma per axis; "
+        "for unequal ones the factor refers to the root mean square of both."
+    )
+
+
+def outcome_text(outcome: Outcome) -> str:
+    """A requirement and what became of it, in one sentence."""
+    asked, total = outcome.requirement, outcome.total
+    what = f"{AXIS_LABELS[asked.axis]}, {confidence_text(asked.confidence)}, {asked.scope}, {asked.interpretation}"
+    numbers = f"{significant(outcome.bound_arcsec, 3)} arcsec against a limit of {significant(asked.limit_arcsec, 3)}"
+    least = "at least " if total.at_least else ""
+    if outcome.unresolved:
+        return (
+            f"{asked.name!r} ({what}) is open: {total.explanation.removesuffix('.')}. The rule, which knows "
+            f"Gaussian tails only, says {least}{significant(total.rule_arcsec, 3)} arcsec against a limit of "
+            f"{significant(asked.limit_arcsec, 3)}; judged_by = 'rule' would let it judge alone."
         )
-    return reasons
+    if math.isnan(outcome.bound_arcsec):
+        return f"{asked.name!r} ({what}) is open: no contributor is assessed."
+    if outcome.verdict == "violated":
+        cause = f"; {total.dominant!r} dominates" if total.dominant else ""
+        return f"{asked.name!r} ({what}) is violated: {least}{numbers}{cause}."
+    if outcome.verdict == "open":
+        count = len(total.not_assessed)
+        missing = f"{count} contributors are" if count > 1 else "1 contributor is"
+        return f"{asked.name!r} ({what}) is open: {numbers} so far, but {missing} not assessed."
+    return f"{asked.name!r} ({what}) is met: {numbers}, margin {significant(outcome.margin_arcsec, 3)} arcsec."
 
 
-def _share(total: Total, dominant: Contributor) -> str:
-    return f"{dominant.name!r} has {percent(total.dominant_share, 2)} of the squared half-widths"
+def contributors_table(budget: Budget) -> TextTable:
+    """One row per contributor, 1 sigma on its axes."""
+    rows = tuple(
+        # What is not assessed is said once where it holds for all axes.
+        (
+            *(row["name"], row["ecss_class"]),
+            *(row["sigma"] if row["assessed"] else (NOT_ASSESSED, "", "")),
+            *(row["interpretation"], row["absorbed"]),
+        )
+        for row in contributor_rows(budget)
+    )
+    heads = ("contributor", "class", "X", "Y", "Z", "random over", "absorbed")
+    return TextTable(heads, rows, f"{budget.title}: contributors, 1 sigma, arcsec", "lllllll")
 
 
-def _heaviest(rows: Sequence[Contributor]) -> Contributor | None:
-    tailed = [row for row in rows if row.tail_997 > _TAILED]
-    return max(tailed, key=lambda row: row.sigma_arcsec * (row.tail_997 - GAUSSIAN_997)) if tailed else None
-
-
-def _grouped(rows: Sequence[Contributor]) -> bool:
-    groups = [row.correlation_group for row in rows if row.correlation_group]
-    return len(set(groups)) < len(groups)
+def totals_table(budget: Budget) -> TextTable:
+    """One row per scope and axis, in the mixed interpretation."""
+    heads = ("scope", "axis", "sigma", "rule", "sampled")
+    rows = tuple(tuple(row[name] for name in heads) for row in total_rows(budget))
+    title = f"Totals at {confidence_text(budget.confidence)}, mixed interpretation, arcsec"
+    return TextTable(heads, rows, title, "lllll")

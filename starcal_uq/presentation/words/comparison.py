@@ -1,16 +1,14 @@
-"""The outcome of a comparison in words."""
+"""The outcome of a comparison in sentences and tables."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
+from starcal_uq.comparison.result import CameraComparison
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import fixed, plural, significant, with_sigma
-
-if TYPE_CHECKING:
-    from starcal_uq.comparison.result import CameraComparison
+from starcal_uq.presentation.html import card
+from starcal_uq.presentation.tables import TextTable
 
 _SMALLEST_P = 1e-12
 # Below this, arcsec, no one can tell a difference from none.
@@ -63,7 +61,7 @@ def _value(value: float, sigma: float) -> str:
     return f"{with_sigma(value, sigma)} ± {significant(sigma)}"
 
 
-def verdict_words(found: CameraComparison) -> str:
+def comparison_text(found: CameraComparison) -> str:
     """The verdict, the rotation and both p-values."""
     rotation = f"The rotation removed is {rotation_words(found)}."
     if not found.tested:
@@ -72,3 +70,13 @@ def verdict_words(found: CameraComparison) -> str:
     if np.isfinite(found.p_parameters):
         tests += f"; parameters as a whole: {p_words(found.p_parameters)} ({plural(found.n_directions, 'direction')})"
     return f"{headline(found)} {rotation} {tests}."
+
+
+def comparison_table(found: CameraComparison) -> TextTable:
+    """One row per quantity: the difference, and what was to be expected."""
+    return TextTable.of(found.to_dataframe(), f"{found.labels[1]} minus {found.labels[0]}")
+
+
+def comparison_html(found: CameraComparison) -> str:
+    """Whether chance explains the differences, and each of them."""
+    return card("Comparison", comparison_text(found), comparison_table(found))

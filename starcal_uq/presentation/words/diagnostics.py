@@ -1,18 +1,23 @@
-"""What a validation found, in plain words."""
+"""What questions a result, in sentences and tables: misfit, jackknife, models, predictive checks, validation."""
 
 from __future__ import annotations
 
 from collections import Counter
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.core.formatting import count, fixed, join_words, percent, plural, significant
+from starcal_uq.diagnostics.diagnose import Diagnosis
+from starcal_uq.diagnostics.jackknife import Jackknife
+from starcal_uq.diagnostics.misfit import Misfit
+from starcal_uq.diagnostics.models import ModelComparison
+from starcal_uq.diagnostics.predictive import PredictiveCheck
 from starcal_uq.diagnostics.validation.replicates import LOG_LIKELIHOOD
+from starcal_uq.diagnostics.validation.result import ENOUGH_REPLICATES, Validation
+from starcal_uq.diagnostics.verdict.estimate import models_sentence
 from starcal_uq.inference.checks import COMPRESSED_BOUND
-
-if TYPE_CHECKING:
-    from starcal_uq.diagnostics.validation.result import Validation
+from starcal_uq.presentation.html import card
+from starcal_uq.presentation.tables import TextTable
 
 NBSP = "\N{NO-BREAK SPACE}"
 # Errors this far from one posterior standard deviation are said to be too narrow or too wide; a mean error this far
@@ -21,10 +26,98 @@ _SCALE_NOTED = 0.03
 _BIAS_NOTED = 0.1
 
 
-def verdict(found: Validation) -> str:
-    """One paragraph: is all well, on what evidence, what does not hold, and what else to know."""
-    from starcal_uq.diagnostics.validation.result import ENOUGH_REPLICATES
+def misfit_text(found: Misfit) -> str:
+    """How many tests there are, and what they found."""
+    tests = f"{plural(len(found.tests), 'test')}, overall p = {significant(found.p_value)}"
+    rejected = [test.name for test in found.found()]
+    return f"{tests}: {join_words(rejected)}." if rejected else f"{tests}: no unexplained structure."
 
+
+def misfit_table(found: Misfit) -> TextTable:
+    """One row per test."""
+    columns = ("test", "against", "statistic", "p_value", "p_holm", "size_px", "amplitudes")
+    return TextTable.of(found.to_dataframe(), "Misfit", columns)
+
+
+def jackknife_text(found: Jackknife) -> str:
+    """By how much frames scatter more than the formal errors say."""
+    low, high = float(found.ratio.min()), float(found.ratio.max())
+    frames = plural(found.n_frames, "frame")
+    return f"Jackknife sigmas over {frames} are {fixed(low, 2)} to {fixed(high, 2)} times the formal ones."
+
+
+def jackknife_table(found: Jackknife) -> TextTable:
+    """One row per parameter."""
+    columns = ("parameter", "formal_sigma", "jackknife_sigma", "ratio", "sandwich_ratio")
+    return TextTable.of(
+        found.to_dataframe(), "Jackknife over frames", (*columns, "expected_low", "expected_high", "p_value")
+    )
+
+
+def models_table(found: ModelComparison) -> TextTable:
+    """One row per model, the best first."""
+    columns = ("model", "n_parameters", "elpd", "difference", "difference_se", "max_khat", "rejected")
+    return TextTable.of(found.to_dataframe(), "Distortion models", columns)
+
+
+def predictive_text(found: PredictiveCheck) -> str:
+    """How many statistics of the residuals lie outside what the posterior predicts."""
+    extreme = [s.name for s in found.statistics if s.extreme]
+    asked = f"{len(found.statistics)} statistics of the residuals against {plural(found.n_draws, 'draw')}"
+    return f"{asked}: {'nothing extreme' if not extreme else 'extreme are ' + join_words(extreme)}."
+
+
+def predictive_table(found: PredictiveCheck) -> TextTable:
+    """One row per statistic."""
+    columns = ("name", "observed", "replicated_low", "replicated_high", "p_value")
+    return TextTable.of(found.to_dataframe(), "Predictive checks", columns)
+
+
+def diagnosis_text(found: Diagnosis) -> str:
+    """Every part in its own words."""
+    parts = (found.misfit, found.jackknife, found.comparison, found.predictive)
+    return "\n".join(part.text for part in parts if part is not None)
+
+
+def misfit_html(found: Misfit) -> str:
+    """The tests for structure in the residuals."""
+    return card("Misfit", misfit_text(found), misfit_table(found))
+
+
+def jackknife_html(found: Jackknife) -> str:
+    """The estimates without each of the frames."""
+    return card("Jackknife", jackknife_text(found), jackknife_table(found))
+
+
+def models_html(found: ModelComparison) -> str:
+    """The distortion models side by side."""
+    return card("Models", models_sentence(found), models_table(found))
+
+
+def predictive_html(found: PredictiveCheck) -> str:
+    """The residuals against replicated ones."""
+    return card("Posterior predictive check", predictive_text(found), predictive_table(found))
+
+
+def diagnosis_html(found: Diagnosis) -> str:
+    """Every part, one after the other."""
+    parts = (found.misfit, found.jackknife, found.comparison, found.predictive)
+    return "".join(part._repr_html_() or "" for part in parts if part is not None)
+
+
+def validation_table(found: Validation) -> TextTable:
+    """Coverage and ranks, one row per quantity."""
+    columns = ("quantity", "unit", "coverage_95", "coverage_low", "coverage_high", "coverage_p", "rank_p")
+    return TextTable.of(found.to_dataframe(), "Validation", columns)
+
+
+def validation_html(found: Validation) -> str:
+    """Whether intervals hold the truth as often as they say."""
+    return card("Validation", validation_text(found), TextTable.of(found.to_dataframe()))
+
+
+def validation_text(found: Validation) -> str:
+    """One paragraph: is all well, on what evidence, what does not hold, and what else to know."""
     rejected = [f for f in found.findings if f.rejected]
     if rejected:
         opening = "The uncertainties are not right"

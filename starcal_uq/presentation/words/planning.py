@@ -1,18 +1,16 @@
-"""Plans in words."""
+"""Plans in sentences and tables."""
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import MINUS, count, fixed, join_words, percent, plural, significant
-
-if TYPE_CHECKING:
-    from starcal_uq.planning.check import ForecastCheck
-    from starcal_uq.planning.design import FrameChoice
-    from starcal_uq.planning.plan import Need, Plan
+from starcal_uq.planning.check import ForecastCheck
+from starcal_uq.planning.design import FrameChoice
+from starcal_uq.planning.plan import Need, Plan
+from starcal_uq.presentation.html import card
+from starcal_uq.presentation.tables import TextTable
 
 SCOPE_NAMES = {
     "common": "common rotation",
@@ -37,12 +35,17 @@ def need_words(need: Need, number: int | None) -> str:
     return frames(number)
 
 
+def need_text(need: Need) -> str:
+    """`frames` to three digits, rounded up, as it is printed; or why there is no number."""
+    return need_words(need, need.frames)
+
+
 def level(confidence: float) -> str:
     """A confidence in per cent, with all its digits."""
     return f"{100.0 * confidence:.6g}\N{NO-BREAK SPACE}%"
 
 
-def verdict(plan: Plan) -> str:
+def plan_text(plan: Plan) -> str:
     """The plan in a few sentences: what the target takes, else what the largest campaign gives."""
     if plan.need is None:
         return _largest(plan)
@@ -94,7 +97,7 @@ def settings_sentence(plan: Plan) -> str:
     )
 
 
-def choice_verdict(choice: FrameChoice) -> str:
+def choice_text(choice: FrameChoice) -> str:
     """What the choice is worth."""
     parts = []
     for name, part in (("common rotation", "common"), ("rest", "rest")):
@@ -117,7 +120,7 @@ def choice_verdict(choice: FrameChoice) -> str:
     )
 
 
-def check_verdict(check: ForecastCheck) -> str:
+def check_text(check: ForecastCheck) -> str:
     """Whether forecast and simulation agree."""
     outside = [int(n) for n, bad in zip(check.forecast.n_frames, check.nees_rejected, strict=True) if bad]
     g, q = np.unravel_index(int(np.argmax(np.abs(check.ratio - 1.0))), check.ratio.shape)
@@ -134,3 +137,30 @@ def check_verdict(check: ForecastCheck) -> str:
             + f"squared errors are not what they should be with {join_words([count(n) for n in outside])} frames."
         )
     return sentence + "their squared errors are what they should be."
+
+
+def plan_table(plan: Plan) -> TextTable:
+    """The forecast by number of frames."""
+    columns = ("n_frames", "x0_px", "f_mm", "common_pitch_arcsec", "rest_pitch_arcsec", "nea_pitch_arcsec")
+    title = "Forecast, standard deviations; the radius holds the stated confidence"
+    return TextTable.of(plan.to_dataframe(), title, (*columns, "radius_arcsec"))
+
+
+def choice_table(choice: FrameChoice, n: int = 20) -> TextTable:
+    """The first frames to take, most valuable first."""
+    return TextTable.of(choice.to_dataframe().head(n), f"The first {min(n, len(choice.candidate))} frames to take")
+
+
+def plan_html(plan: Plan) -> str:
+    """What a calibration will give."""
+    return card("Plan", plan_text(plan), plan_table(plan))
+
+
+def choice_html(choice: FrameChoice) -> str:
+    """What the chosen frames are worth."""
+    return card("Frames to take", choice_text(choice), TextTable.of(choice.worth()))
+
+
+def check_html(check: ForecastCheck) -> str:
+    """The forecast beside simulated campaigns."""
+    return card("Forecast against simulation", check_text(check), TextTable.of(check.to_dataframe()))

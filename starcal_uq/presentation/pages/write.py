@@ -1,0 +1,48 @@
+"""One verb for every page that is made from a result in memory."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from starcal_uq.budgeting.result import Budget
+from starcal_uq.comparison.result import CameraComparison
+from starcal_uq.planning.plan import Plan
+from starcal_uq.presentation.pages.budgeting import write_budget
+from starcal_uq.presentation.pages.comparison import write_comparison
+from starcal_uq.presentation.pages.planning import write_plan
+
+
+def write_page(what: Plan | CameraComparison | Budget, to: str | os.PathLike[str], **options: Any) -> Path:
+    """Write a result for people to read.
+
+    Parameters
+    ----------
+    what : Plan, CameraComparison or Budget
+        The result.
+    to : path
+        A folder for a plan or a comparison, made if it is missing; a file for a budget, whose ending names the format
+        (``.html``, ``.xlsx``, ``.tex``, ``.csv``). What is there is overwritten.
+    **options
+        For a plan, ``choice`` and ``check``: frames to take, and the forecast against simulation.
+
+    Returns
+    -------
+    Path
+        The page.
+
+    Raises
+    ------
+    TypeError
+        For anything else.
+    RunFolderError
+        If it cannot be written.
+    """
+    if isinstance(what, Plan):
+        return write_plan(what, to, **options)
+    if isinstance(what, CameraComparison):
+        return write_comparison(what, to, **options)
+    if isinstance(what, Budget):
+        return write_budget(what, to, **options)
+    raise TypeError(f"there is no page for a {type(what).__name__}: give a Plan, a CameraComparison or a Budget.")
