@@ -46,7 +46,7 @@ def budget(
     Parameters
     ----------
     post : Posterior
-        Of the calibration.
+        Posterior of the calibration.
     obs : Observations
         The frames it was made from.
     attitude : AttitudeError, optional
@@ -54,11 +54,11 @@ def budget(
     file : BudgetFile or path, optional
         The user's contributors and requirements.
     confidence : float, optional
-        Of the totals; that of the file, or 0.997. Requirements have their own.
+        Probability of the totals; that of the file, or 0.997. Requirements have their own.
     misfit : Diagnosis, optional
         The tests of the model (`starcal_uq.diagnostics.diagnose.diagnose`), which decide about inflation.
     n_samples, seed : int
-        Of the sampled totals.
+        Number and seed of the sampled totals.
 
     Returns
     -------

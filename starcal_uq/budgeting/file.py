@@ -72,11 +72,11 @@ class Requirement:
     Attributes
     ----------
     name : str
-        Its number or title.
+        Number or title.
     axis : str
         ``pitch``, ``yaw``, ``roll`` or ``cross-boresight`` (the angle of both axes together).
     limit_arcsec : float
-        What the error has to stay below.
+        Limit of the error, arcsec.
     confidence : float
         For this share of all cases.
     scope : str
@@ -107,11 +107,11 @@ class BudgetFile:
     requirements : tuple of Requirement
         In the order of the file.
     title : str
-        Of the budget.
+        Title of the budget.
     confidence : float or None
-        Of the totals; None to leave it to the caller.
+        Probability of the totals; None to leave it to the caller.
     path : str
-        Where it was read from.
+        Path that it was read from.
     """
 
     contributors: tuple[Contributor, ...] = field(default=())

@@ -38,7 +38,7 @@ class Outcome(Shown):
     Attributes
     ----------
     requirement : Requirement
-        What is asked.
+        Requirement that is judged.
     total : Total
         The total at the requirement's confidence.
     """
@@ -90,11 +90,11 @@ class Budget(Shown):
     outcomes : tuple of Outcome
         Requirements against their totals.
     confidence : float
-        Of the totals.
+        Probability of the totals.
     title : str
         Title.
     notes : tuple of str
-        What the reader has to know: inflations, what stays open.
+        Sentences that the reader has to know: inflations, what stays open.
     provenance : dict
         Seed, settings, versions, time and data hash.
     """

@@ -53,7 +53,7 @@ class Contributor:
     Attributes
     ----------
     name : str
-        What it is.
+        Name of the row.
     ecss_class : str
         Class of ECSS-E-ST-60-20C, one of `ECSS_CLASSES`.
     axis : str
@@ -65,7 +65,7 @@ class Contributor:
     time_class : str
         How fast it changes, one of `TIME_CLASSES`; ``field`` as stars move over the field of view.
     interpretation : str
-        What it is random over: ``ensemble`` (of calibrations and units: constant in time), ``temporal`` or ``mixed``.
+        Kind of randomness: ``ensemble`` (of calibrations and units: constant in time), ``temporal`` or ``mixed``.
     absorbed_by_alignment : str
         Does an alignment calibration with the same camera parameters take it up? ``caused by it`` marks what exists
         only after it. ``in part`` counts in full.
@@ -139,9 +139,9 @@ class Expected:
     Attributes
     ----------
     name, ecss_class, time_class, interpretation, absorbed_by_alignment, distribution : str
-        As in `Contributor`; a file may state otherwise.
+        Entries of a `Contributor`; a file may state otherwise.
     what : str
-        What it is and where its number comes from, for people.
+        Description and usual source of the number, for people.
     """
 
     name: str

@@ -127,7 +127,7 @@ def deviates(distribution: str, uniform: FloatArray, log_scale: FloatArray, tail
     log_scale : (n,) array
         Standard normal deviates that decide about sigma where it changes from frame to frame.
     tail_997 : float
-        As in `Contributor`.
+        Half-width at 99.7 % as in `Contributor`.
     """
     from scipy.special import ndtri
 

@@ -53,7 +53,7 @@ class Total:
     scope, axis, interpretation : str
         One of `SCOPES`, `TOTAL_AXES`, `INTERPRETATIONS`.
     confidence : float
-        What the bounds hold, as a fraction.
+        Probability that the bounds hold.
     mean_arcsec : float
         Sum of the means; for both axes together the length of their vector.
     sigma_arcsec : float
@@ -61,7 +61,7 @@ class Total:
     factor : float
         n: sigmas that the bound takes, NaN if nothing is random.
     worst_arcsec : float
-        What does not count as random, by its half-width.
+        Sum of what does not count as random, by its half-width, arcsec.
     rule_arcsec, sampled_arcsec : float
         Bound by the rule, and quantile of the sampled error; NaN if no row is assessed. The sampled one is NaN too if
         fewer than 20 samples lie beyond it.
@@ -72,7 +72,7 @@ class Total:
     dominant : str
         Row with more than half of the squared half-widths, or empty.
     dominant_share : float
-        Its share; of the largest row if none has more than half.
+        Share of the dominant row; of the largest row if none has more than half.
     explanation : str
         Why the two bounds differ, or that they agree.
     """

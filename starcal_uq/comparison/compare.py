@@ -72,9 +72,9 @@ def compare(
     Parameters
     ----------
     a, b : Calibration or Posterior
-        Of detectors with the same number of pixels; their distortion models may differ.
+        Results for detectors with the same number of pixels; their distortion models may differ.
     labels : (str, str)
-        Their names in words and figures.
+        Names of the two in words and figures.
     same_data : bool, optional
         Whether both rest on the same frames. Without it, the hashes of their data say so, and `observations`.
     observations : pair of Observations, optional
@@ -86,7 +86,7 @@ def compare(
     n_draws : int
         Monte Carlo draws for the p-value of the worst pixel.
     seed : int
-        Of these.
+        Seed of the draws.
 
     Raises
     ------
@@ -168,11 +168,11 @@ def compare_halves(
     camera : Camera
         Start of both calibrations.
     how : {"odd-even", "halves", "random"}
-        As for `split_frames`.
+        Rule of `split_frames`.
     seed : int
-        Of a random half, and of the comparison.
+        Seed of a random half, and of the comparison.
     method : str
-        As for `calibrate`.
+        Method of `calibrate`.
     **options
         Further options of `compare`.
 

@@ -56,7 +56,7 @@ def difference_rule(
     a, b : Calibration or Posterior
         The estimates.
     labels : (str, str)
-        Their names.
+        Names of the two.
     same_data : bool or None
         True or False overrules what hashes and frames say.
     observations : pair of Observations or None

@@ -29,9 +29,9 @@ class CameraComparison(Shown):
     labels : (str, str)
         Names of A and B.
     models : (str, str)
-        Their distortion models.
+        Distortion models of the two.
     data : str
-        What their data have in common: ``independent``, ``same``, ``A within B``, ``B within A``, ``overlapping``.
+        Relation of their data: ``independent``, ``same``, ``A within B``, ``B within A``, ``overlapping``.
     rule : str
         How the covariance of the difference was had, in words, or why it is not known.
     level : float
@@ -41,7 +41,7 @@ class CameraComparison(Shown):
     difference_arcsec : (n, n, 2) array
         Difference of directions along camera X and Y after the rotation was removed.
     difference_px : (n, n, 2) array
-        The same as the shift of the image point in camera A, px.
+        Difference as the shift of the image point in camera A, px.
     sigma_arcsec : (n, n) array
         Root mean square length that the joint uncertainty gives the difference at each pixel.
     ratio : (n, n) array
@@ -49,7 +49,7 @@ class CameraComparison(Shown):
     rotation_arcsec : (3,) array
         Rotation removed: pitch, yaw, roll of an attitude by B minus that by A.
     rotation_covariance_arcsec2 : (3, 3) array
-        Its covariance.
+        Covariance of the rotation, arcsec^2.
     rms_arcsec, rms_px, expected_rms_arcsec : float
         Root mean square length over the detector area, and what the joint uncertainty gives on average.
     largest_arcsec, largest_px : float
@@ -66,15 +66,15 @@ class CameraComparison(Shown):
     p_worst, p_worst_error : float
         Probability of a largest `ratio` over the grid beyond the one here, and its Monte Carlo standard error.
     worst_x_px, worst_y_px, worst_ratio : float
-        Where that ratio is largest, and how large.
+        Place where that ratio is largest, px, and the ratio there.
     outside_arcsec : float
         Root mean square of what no error of the parameters explains: models that cannot agree.
     parameter_names, parameter_units : tuple of str
         The q parameters that mean the same in both models.
     theta_a, theta_b, sd_a, sd_b, sd_difference : (q,) array
-        Their estimates, standard deviations, and that of the difference.
+        Estimates of both, standard deviations, and that of the difference.
     messages : tuple of str
-        What should be known when reading this.
+        Sentences that should be known when reading this.
     provenance : dict
         Provenance of both results, by ``a`` and ``b``, and the settings of the comparison.
     """

@@ -119,9 +119,9 @@ class DifferenceTests:
     expected : float
         Root mean square length expected, arcsec.
     p_map, p_parameters, statistic, p_worst, p_worst_error : float
-        As in `CameraComparison`.
+        Numbers of `CameraComparison` with these names.
     n_directions : int
-        As there.
+        Number of directions that were tested.
     """
 
     outside: float

@@ -58,11 +58,11 @@ class MultiStart:
     n : int
         Starts.
     same : int
-        Those that reached the same optimum, within a tenth of a standard deviation of every parameter.
+        Starts that reached the same optimum, within a tenth of a standard deviation of every parameter.
     better : int
-        Those that reached a better one.
+        Starts that reached a better one.
     failed : int
-        Those that did not converge.
+        Starts that did not converge.
     largest_sigma : float
         Largest difference among those that reached the same optimum, standard deviations.
     """
@@ -149,7 +149,7 @@ def diagnose(
     n_starts : int
         Fits from other starts; 0 leaves them out.
     seed : int
-        Of everything random.
+        Seed of everything random.
     progress : callable, optional
         Called with the number of steps done and their total.
     """

@@ -54,7 +54,7 @@ class Amplitude:
     Attributes
     ----------
     name, unit : str
-        What it is.
+        Name and unit.
     value, sigma : float
         Estimate and standard error.
     """
@@ -75,7 +75,7 @@ class MisfitTest:
     Attributes
     ----------
     name, against : str
-        What it looks for, and what the residuals are held against.
+        Pattern that it looks for, and the quantity that the residuals are held against.
     statistic : float
         F, or the standard normal z of a test for unequal noise.
     dof, dof_residual : int
@@ -83,13 +83,13 @@ class MisfitTest:
     p_value : float
         Probability of a statistic at least this large if the model holds.
     p_holm : float
-        The same, corrected for the number of tests (Holm 1979).
+        p-value corrected for the number of tests (Holm 1979).
     size_px : float
         Root mean square per axis of the pattern found, its noise taken off, px; NaN for unequal noise.
     visible : float
         Share of the squared shapes that attitudes and parameters do not absorb; NaN for unequal noise.
     amplitudes : tuple of Amplitude
-        Where they mean something by themselves.
+        Amplitudes, where they mean something by themselves.
     """
 
     name: str

@@ -152,7 +152,7 @@ def compare_models(
     n_draws : int
         Posterior draws of each model.
     seed : int
-        Of the draws.
+        Seed of the draws.
 
     Raises
     ------

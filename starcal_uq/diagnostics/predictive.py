@@ -35,9 +35,9 @@ class PredictiveStatistic:
     Attributes
     ----------
     name : str
-        What it is.
+        Name of the statistic.
     observed : float
-        Its mean over draws for the data.
+        Mean over draws for the data.
     replicated_low, replicated_median, replicated_high : float
         Quantiles (2.5 %, 50 %, 97.5 %) for replicated data.
     p_value : float
@@ -96,7 +96,7 @@ def predictive_check(
     n_draws : int
         Draws, and replicates.
     seed : int
-        Of the draws and the replicates.
+        Seed of the draws and the replicates.
     """
     rng = np.random.default_rng(seed)
     likelihood = MarginalLikelihood(obs, cal.camera.distortion)

@@ -39,9 +39,9 @@ class View:
     Attributes
     ----------
     rows : slice
-        Their rows in the table.
+        Rows of the stars in the table.
     part : MarginalLikelihood
-        Their likelihood.
+        Likelihood of the stars.
     state : Profile
         The model at the best attitudes.
     parameter_columns : (p, 2, n) array

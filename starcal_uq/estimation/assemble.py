@@ -52,7 +52,7 @@ def assemble(
     method, solver : str
         For the record.
     likelihood : MarginalLikelihood
-        Of the same stars and the same model.
+        Likelihood of the same stars and the same model.
     stages : list of Stage
         The last one ends in the estimate; one named ``refinement`` is the maximum of `likelihood`.
     status : Status

@@ -57,11 +57,11 @@ class Calibration(Shown):
     theta : (p,) array
         Estimate in px units, order x0, y0, f, k...
     covariance : (p, p) array
-        Its covariance at the estimated noise.
+        Covariance of `theta` at the estimated noise, px units.
     sigma : float
         Estimated noise: px per axis, or a factor on the stated noise of the stars.
     sigma_std : float
-        Its standard error.
+        Standard error of `sigma`, in its unit.
     sigma_name : str
         ``sigma`` or ``sigma_scale``.
     stages : tuple of Stage
@@ -87,7 +87,7 @@ class Calibration(Shown):
     pair_theta : (p,) array
         Estimate from interstar angles: that of stage 3, the paper's, or of the method itself where it has no other.
     pair_covariance : (p, p) array
-        Its sandwich (Godambe) covariance.
+        Sandwich (Godambe) covariance of `pair_theta`, px units.
     compressed : CompressedLikelihood
         The whole data set's likelihood around the estimate.
     provenance : dict

@@ -52,7 +52,7 @@ class PairLikelihood:
     theta_hat : (p,) array
         Estimate that minimises the objective, px units.
     covariance : (p, p) array
-        Its covariance: Godambe's where `adjusted`, else that of independent pairs.
+        Covariance of `theta_hat`: Godambe's where `adjusted`, else that of independent pairs.
     shrink : (p, p) array
         L_H: from whitened parameters to the point where the objective is evaluated.
     whitening : (p, p) array

@@ -37,7 +37,7 @@ class CompressedLikelihood:
     log_determinant : float
         ``sum_k log |A_k^T A_k|`` at theta_hat.
     log_determinant_slope : (p,) array
-        Its derivative with respect to z.
+        Derivative of `log_determinant` with respect to z.
     dof : int
         ``sum_k (2 m_k - 3)``.
     n_stars, n_frames : int
@@ -290,7 +290,7 @@ class Optimum:
     information : (p, p) array
         Gauss-Newton information at the estimated noise, px units.
     covariance : (p, p) array
-        Its inverse.
+        Inverse of the information.
     sigma : float
         ``sqrt(S / (dof - p))``.
     sum_of_squares : float

@@ -115,7 +115,7 @@ class MarginalLikelihood:
         theta : (p,) array
             Parameters in px units.
         rotations : (K, 3, 3) array, optional
-            Where to start; QUEST otherwise.
+            Attitudes to start from; those of QUEST otherwise.
 
         Returns
         -------

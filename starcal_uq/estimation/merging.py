@@ -60,7 +60,7 @@ def merge(
         All stars, from `join_observations`. With them, residuals and attitudes are those at the merged
         estimate; without, they are the runs' own.
     names : sequence of str, optional
-        What the runs are called in messages; ``run 1``... otherwise.
+        Names of the runs in messages; ``run 1``... otherwise.
     noise : {"common", "own"}
         ``common``: one noise for all runs, estimated anew. ``own``: each run keeps its own estimate as stated noise,
         and the result has a common factor on it (`sigma_scale`), which also allows runs with and without stated noises.
@@ -258,7 +258,7 @@ class Consistency(Shown):
     statistic : float
         F.
     dof : tuple of int
-        Its degrees of freedom: (R - 1) p, and those of the pooled noise.
+        Degrees of freedom of the statistic: (R - 1) p, and those of the pooled noise.
     p_value : float
         Probability of a larger F if all runs show the same camera.
     distance_sigma : array (R,)
@@ -272,7 +272,7 @@ class Consistency(Shown):
     noise_p_value : float
         Probability of noises that differ as much, if they are the same; NaN where each run keeps its own.
     messages : tuple of str
-        What deserves attention, in sentences.
+        Sentences on what deserves attention.
     """
 
     names: tuple[str, ...]
@@ -334,7 +334,7 @@ def consistency_between(
     Parameters
     ----------
     names, parameter_names : sequence of str
-        Of the runs and of the parameters.
+        Names of the runs and of the parameters.
     runs : sequence of Optimum
         Each run's own.
     units : sequence of float

@@ -71,11 +71,11 @@ def noise_floor(cal: Calibration, obs: Observations, stated_px: FloatArray | Non
     Parameters
     ----------
     cal : Calibration
-        Of these observations.
+        Calibration of these observations.
     obs : Observations
         With `sigma_px` in every row: the weights of the calibration.
     stated_px : (N,) array, optional
-        What the stars state, where a floor is in `sigma_px` already.
+        Noise that the stars state, px, where a floor is in `sigma_px` already.
 
     Raises
     ------
@@ -118,7 +118,7 @@ def settle_noise(obs: Observations, cal: Calibration) -> Observations:
     obs : Observations
         With `sigma_px` in every row.
     cal : Calibration
-        Of these observations.
+        Calibration of these observations.
     """
     from starcal_uq.estimation.calibrate import calibrate
 

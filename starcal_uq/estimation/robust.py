@@ -170,7 +170,7 @@ class RobustFit:
     sigma, nu : float
         Scale and degrees of freedom.
     sigma_std, nu_std : float
-        Their standard errors; `nu_std` is 0 where nu was given, and not finite at a bound.
+        Standard errors of both; `nu_std` is 0 where nu was given, and not finite at a bound.
     information : Information
         Derivatives at the maximum.
     """

@@ -59,7 +59,7 @@ class Solution:
     trajectory : (n, p) array
         Accepted points, the start first.
     costs : (n,) array
-        Their costs.
+        Costs of the points.
     status : Status
         Converged, or why not.
     evaluations : int
@@ -234,7 +234,7 @@ def minpack(residuals: Residuals, evaluate: Evaluate, start: FloatArray, *, max_
     residuals : callable
         ``theta -> (r (n,), J (n, p))``.
     evaluate : callable
-        The same cost as normal equations, for the final state and the trajectory.
+        Function that gives the same cost as normal equations, for the final state and the trajectory.
     start : (p,) array
         Start values.
     max_iterations : int

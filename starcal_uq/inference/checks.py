@@ -88,9 +88,9 @@ def check_compression(
     Parameters
     ----------
     compressed, exact : callable
-        As `Target.log_likelihood`.
+        Log likelihoods like `Target.log_likelihood`, nat.
     target : Target
-        Its origin is the mode.
+        Target whose origin is the mode.
     draws : array (n, p+1)
         Posterior draws, px units; with a further column where the likelihood has a further parameter.
     laplace : Laplace
@@ -143,7 +143,7 @@ def measure(
     Parameters
     ----------
     chains : Chains
-        As sampled.
+        Chains as sampled.
     draws : array (n_ensembles, n_draws, p+1)
         In px units, in chain order.
     shown : sequence of Parameter

@@ -27,7 +27,7 @@ class Derived:
     Attributes
     ----------
     name, unit : str
-        What it is.
+        Name and unit.
     mean, sd, mcse : float
         Moments over the draws, and the Monte Carlo standard error of the mean.
     rhat, ess_bulk, ess_tail : float

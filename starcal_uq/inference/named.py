@@ -63,7 +63,7 @@ class Source:
     notes : tuple of str
         Sentences on the likelihood, for the check of its kind.
     checks : tuple of Check
-        What can be said before sampling.
+        Checks that need no draws.
     """
 
     name: str

@@ -181,7 +181,7 @@ class Posterior(Shown):
     sigma_sampled : bool
         False if the noise was given; its column is then constant.
     priors : Priors
-        What the draws rest on besides the data.
+        Priors that the draws rest on besides the data.
     laplace : Laplace
         Gaussian approximation at the mode.
     diagnostics : Diagnostics

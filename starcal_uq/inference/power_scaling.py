@@ -97,7 +97,7 @@ def prior_sensitivity(
     Parameters
     ----------
     posterior : Posterior
-        Its draws, with their log densities.
+        Posterior whose draws have their log densities.
     extra : mapping of str to array (n,), optional
         Further quantities, one value per draw.
     threshold : float

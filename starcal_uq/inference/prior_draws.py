@@ -45,9 +45,9 @@ class PriorPredictive(Shown):
     names : tuple of str
         Quantities; the unit is in the name.
     draws : array (n, q)
-        Their values for cameras drawn from the prior; NaN where a camera has no image of the field.
+        Values for cameras drawn from the prior; NaN where a camera has no image of the field.
     observed : array (q,)
-        Their values for the data; NaN for those that only a camera has.
+        Values for the data; NaN for those that only a camera has.
     tail : array (q,)
         Prior predictive tail probability of the data: two-sided, but for ``residual_px`` that of a larger one, since a
         camera simpler than the prior's is no conflict.
@@ -105,7 +105,7 @@ def prior_predictive(
     Parameters
     ----------
     priors : Priors
-        What to check.
+        Priors to check.
     camera : Camera
         Nominal camera of the same distortion model.
     obs : Observations, optional

@@ -387,7 +387,7 @@ class GaussianPriors(Priors):
     theta_mean : array (p,)
         Means of x0, y0, f, k..., px units.
     theta_covariance : array (p, p)
-        Their covariance.
+        Covariance of the parameters, px units.
     sigma_median : float
         Median of the centroid noise: px, or a factor where every star states its own noise.
     sigma_log_sd : float
@@ -397,7 +397,7 @@ class GaussianPriors(Priors):
     per_star_sigma : bool
         True where the noise parameter is a common factor on stated noises.
     source : dict
-        Where the prior comes from, as plain values: ``name``, ``data_sha256`` (list of hashes of the data that are in
+        Origin of the prior, as plain values: ``name``, ``data_sha256`` (list of hashes of the data that are in
         it already) and what was added to it.
     """
 

@@ -37,7 +37,7 @@ class PolynomialLikelihood:
     exponents : tuple of (n_k, k) arrays of int
         Coordinates multiplied in every monomial, by degree from 0 on.
     coefficients : tuple of (n_k,) arrays
-        Of the monomials.
+        Coefficients of the monomials.
     reach : float
         Radius up to which degrees above two vary.
     """
@@ -82,7 +82,7 @@ def fit_polynomial(target: Target, degree: int, rng: np.random.Generator) -> Pol
     target : Target
         Centred and whitened by `starcal_uq.inference.target.laplace_approximation`.
     degree : int
-        Of the polynomial.
+        Degree of the polynomial.
     rng : numpy.random.Generator
         Draws the points.
 

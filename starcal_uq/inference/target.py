@@ -45,7 +45,7 @@ class Extra:
     Attributes
     ----------
     name : str
-        Of the parameter.
+        Name of the parameter.
     log_prior : callable
         Log prior density of that logarithm.
     value : float

@@ -43,11 +43,11 @@ class AllowedShift:
     Attributes
     ----------
     principal_point_px : float
-        Of x0 and of y0, px.
+        Allowed shift of x0 and of y0, px.
     focal_fraction : float
-        Of the focal length, relative.
+        Allowed relative shift of the focal length.
     distortion_corner_px : float
-        Of the displacement by each distortion term at the corner of the field, px.
+        Allowed shift of the displacement by each distortion term at the corner of the field, px.
     """
 
     principal_point_px: float = 0.0
@@ -83,7 +83,7 @@ def prior_from(
     Parameters
     ----------
     posterior : Posterior
-        Of the earlier run.
+        Posterior of the earlier run.
     inflation : float
         Factor on all standard deviations, at least 1.
     shift : AllowedShift, optional
@@ -94,7 +94,7 @@ def prior_from(
     per_star_sigma : bool, optional
         Whether the next run's stars state their noise; as in the earlier run by default.
     name : str
-        What the earlier run is called in tables.
+        Name of the earlier run in tables.
     data_sha256 : collection of str
         Hashes of the data behind the posterior besides the one it states.
 
@@ -178,11 +178,11 @@ class ShiftTest(Shown):
     names : tuple of str
         The p camera parameters.
     units : tuple of str
-        Their units.
+        Units of the parameters.
     shift : array (p,)
         After minus before, px units.
     covariance : array (p, p)
-        Of the shift if nothing changed (or no more than was allowed for).
+        Covariance of the shift if nothing changed (or no more than was allowed for).
     z : array (p,)
         Shift in its standard deviations.
     statistic : float

@@ -32,7 +32,7 @@ def undisplaced(centroids: Centroids, obs: Observations, camera: Camera, to_cata
     Parameters
     ----------
     centroids : Centroids
-        As measured, counted as `obs` is.
+        Centroids as measured, counted as `obs` is.
     obs : Observations
         Identified stars with apparent directions and times.
     camera : Camera
@@ -73,7 +73,7 @@ def as_measured(obs: Observations, moved: Centroids, measured: Centroids) -> Obs
     obs : Observations
         Identified among `moved`.
     moved, measured : Centroids
-        The same centroids, row by row.
+        Tables of the same centroids, row by row.
     """
     from scipy.spatial import cKDTree
 

@@ -108,7 +108,7 @@ def observations_from_images(
     epoch : float, optional
         Julian year of the star positions; that of the images by default (`epoch_of`).
     gain_e_per_count : float, optional
-        Where the files do not say it.
+        Electrons per count, where the files do not say it.
     directions : {"apparent", "undeclared", "catalogue"}, optional
         By default annual aberration is applied where every image has a time, and nothing is declared where not.
         ``apparent`` takes the catalogue's directions for what the camera saw, as in rendered images.
@@ -120,7 +120,7 @@ def observations_from_images(
     time_utc : str, optional
         Middle of the exposure of all images whose files do not say it; it goes before a time in a file's name.
     engine : {"pyramid", "tetra3rs"}
-        What finds attitudes.
+        Solver that finds attitudes.
     tell : callable, optional
         Gets what a user should know of the images, one sentence each, before anything is made of them.
     progress : callable, optional

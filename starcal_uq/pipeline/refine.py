@@ -75,9 +75,9 @@ def identify_and_calibrate(
     stars : StarCatalogue
         Catalogue.
     prepare : callable, optional
-        What is done to observations before they are calibrated, such as making directions apparent.
+        Function that observations pass before they are calibrated, such as making directions apparent.
     to_catalogue : callable, optional
-        Where `prepare` makes directions apparent, its inverse: apparent directions (n, 3) and their times (n,) to
+        Inverse of `prepare`, where that makes directions apparent: apparent directions (n, 3) and their times (n,) to
         catalogue directions (n, 3). The second identification then looks for stars where they are seen. It is not
         used where `prepare` leaves the directions as they are.
     method : dict, optional

@@ -36,7 +36,7 @@ class ForecastCheck(Shown):
     Attributes
     ----------
     forecast : Forecast
-        What was forecast.
+        Forecast that was checked.
     n_parameters : int
         p.
     stated : (G, C, Q) array
@@ -46,7 +46,7 @@ class ForecastCheck(Shown):
     nees : (G, C) array
         Normalised squared error of the parameters with the covariance that the calibration states.
     nees_forecast : (G, C) array
-        The same with the mean covariance that was forecast.
+        Squared error with the mean covariance that was forecast.
     dof : (G, C) array
         Degrees of freedom of the calibrations.
     failures : tuple of str
@@ -165,7 +165,7 @@ def check_forecast(
     Parameters
     ----------
     camera, stars, sigma_px, n_frames, min_stars, n_geometries
-        As for `plan`; one noise for all stars.
+        Sheet, sky and settings as `plan` takes them; one noise for all stars, px.
     n_campaigns : int
         Campaigns of each number of frames.
     seed : int

@@ -259,11 +259,11 @@ class FrameChoice(Shown):
     rotations : (n, 3, 3) array
         R_cam_icrs.
     candidate : (n,) array of int
-        Their places among the candidates.
+        Places of the frames among the candidates.
     n_stars : (n,) array of int
         Stars that each shows.
     criterion, scope : str
-        What was optimised.
+        Criterion and part of the error that were optimised.
     names : tuple of str
         Quantities, with their units.
     before, after : (Q,) array
@@ -276,7 +276,7 @@ class FrameChoice(Shown):
         Criterion after 1, 2, ... n frames in this order, as 1 sigma: arcsec for ``A``, relative to the whole choice for
         ``D`` (per parameter).
     random_path : (n,) array
-        The same for random frames, on average.
+        Values for random frames, on average.
     n_candidates : int
         Candidates that show enough stars.
     n_refused : int

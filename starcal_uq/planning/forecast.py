@@ -54,7 +54,7 @@ class Quantity:
     name : str
         Column in tables, with the unit.
     form : (p, p) array
-        Its variance is the sum of ``form * covariance``.
+        Matrix by which the variance is the sum of ``form * covariance``.
     """
 
     name: str
@@ -185,13 +185,13 @@ class Forecaster:
     Parameters
     ----------
     information : (M, p, p) array
-        Of each frame that a campaign may take.
+        Information of each frame that a campaign may take.
     n_stars : float
         Stars per frame on average.
     mission : FrameSet
         Frames whose attitudes count.
     confidence : float
-        Of the two-axis radius.
+        Probability of the two-axis radius.
     scope : str
         One of `SCOPES`.
     start : (p, p) array, optional

@@ -300,7 +300,7 @@ class Need(Shown):
     frames_surely : int or None
         Fewest frames with which 95 % of the campaigns keep it.
     floor_arcsec : float
-        What no number of frames goes below.
+        Error that no number of frames goes below, arcsec.
     """
 
     scope: str
@@ -332,7 +332,7 @@ class Plan(Shown):
     nea_arcsec : (3,) array
         Noise-equivalent angle of single frames, 1 sigma per axis, root mean square over frames.
     confidence : float
-        Of two-axis errors.
+        Probability of two-axis errors.
     scope : str
         Part of the attitude error that the radius of the forecast is of.
     target_arcsec : float or None
@@ -340,9 +340,9 @@ class Plan(Shown):
     needs : tuple of Need
         Frames that keep the target, for each part of the error; empty without a target.
     sweeps : pandas.DataFrame or None
-        The same forecast with another magnitude limit, noise or part of the detector.
+        Forecasts with another magnitude limit, noise or part of the detector.
     seed : int
-        Of the drawn geometries.
+        Seed of the drawn geometries.
     provenance : dict
         Versions, settings and time.
     """

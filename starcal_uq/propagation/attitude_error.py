@@ -88,9 +88,9 @@ class AttitudeError(Shown):
         Half-widths that hold 95 % and 99.7 % of the absolute errors: rows are `CONTRIBUTORS`, columns the three axes
         and the angle across the boresight, the root of pitch^2 + yaw^2 (2.45 and 3.41 sigma per axis if Gaussian).
     analytic_nea_arcsec, analytic_common_arcsec, analytic_rest_arcsec : (3,) array
-        The same standard deviations by first-order propagation, on the same frames.
+        Standard deviations by first-order propagation on the same frames, arcsec.
     n_draws, n_frames : int
-        What the numbers rest on.
+        Numbers of draws and frames behind the result.
     common_draws_arcsec : (D, 3) array or None
         Common rotation of every draw; None when read from a file.
     rest_rms_per_frame_arcsec : (K, 3) array or None

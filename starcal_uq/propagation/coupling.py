@@ -35,7 +35,7 @@ class WeakDirection:
     variance : float
         Variance along it, as an eigenvalue of the correlation matrix (they sum to p).
     words : str
-        What it is, in words.
+        Description in words.
     """
 
     weights: FloatArray
@@ -52,7 +52,7 @@ class Coupling(Shown):
     parameter_names : tuple of str
         Optics and distortion, in order (p of them).
     units : tuple of str
-        Their units.
+        Units of the parameters.
     correlation : (p, p) array
         Correlation matrix.
     covariance : (p, p) array

@@ -52,7 +52,7 @@ class FieldMap(Shown):
     worst_absolute_arcsec, worst_compensated_arcsec : (ny, nx) array
         Along the worst direction.
     star_x_px, star_y_px : (N,) array
-        Where stars were observed: beyond them the map is extrapolated.
+        Pixels where stars were observed, px: beyond them the map is extrapolated.
     covariance_absolute_arcsec2, covariance_compensated_arcsec2 : (ny, nx, 2, 2) array or None
         Covariance of each direction along camera X and Y (x and y of the image), from which the 1-sigma ellipses are
         drawn; None when read from a file of an earlier version, which did not keep it.
@@ -128,7 +128,7 @@ def field_map(post: Posterior, obs: Observations, n: int = 25) -> FieldMap:
     Parameters
     ----------
     post : Posterior
-        Its mean and covariance of the camera parameters are used.
+        Posterior, of which mean and covariance of the camera parameters are used.
     obs : Observations
         Only its star positions are kept, to show where the map is extrapolated.
     n : int

@@ -129,7 +129,7 @@ class FrameGeometry:
     Attributes
     ----------
     post, obs : Posterior, Observations
-        What it is made from.
+        Posterior and observations that it is made from.
     weights : (N,) array or None
         Weights of QUEST; None where all stars count alike.
     noise_px : (N,) array

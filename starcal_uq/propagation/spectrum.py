@@ -75,7 +75,7 @@ def error_spectrum(
     SamplingError
         For fewer than two draws.
     DistortionError, ObservationError, DegenerateFrameError
-        As `starcal_uq.propagate`.
+        For the reasons that `starcal_uq.propagate` has.
     """
     time, index = _series(obs, times_s)
     step, size = float((time[-1] - time[0]) / (len(time) - 1)), len(time)

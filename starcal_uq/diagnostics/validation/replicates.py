@@ -55,7 +55,7 @@ class Study:
     priors : Priors
         Sampled with; with ``truth="prior"`` the truth is drawn from them as well.
     truth : {"fixed", "prior"}
-        The same truth in every replicate, or a new one.
+        Whether every replicate has one truth or a new one.
     campaign : Campaign
         Data of one calibration; the noise may be drawn from the prior instead.
     seed : int
@@ -110,7 +110,7 @@ class TrialOutcome(NamedTuple):
     Attributes
     ----------
     replicate : int
-        Its number.
+        Number of the replicate.
     failure : str
         Why there is no result; empty otherwise.
     truth : (p+1,) array
@@ -126,7 +126,7 @@ class TrialOutcome(NamedTuple):
     nees : float
         Normalised squared error of the parameters with mean and covariance of the draws.
     nees_calibration : float
-        The same with the estimate and covariance of the calibration.
+        Normalised squared error with the estimate and covariance of the calibration.
     compression_error : float
         Compressed minus exact log likelihood at the truth, nat.
     dof : int

@@ -79,7 +79,7 @@ class Validation(Shown):
     nees : (n,) array
         Normalised squared error of the camera parameters with mean and covariance of the draws.
     nees_calibration : (n,) array
-        The same with estimate and covariance of `calibrate`.
+        Normalised squared error with estimate and covariance of `calibrate`.
     compression_error : (n,) array
         Compressed minus exact log likelihood at the truth, nat; NaN with a likelihood of one's own.
     dof : (n,) array of int

@@ -72,7 +72,7 @@ def judge(
     attitude
         The propagated attitude error, if there is one.
     diagnosis
-        What questions the model, if it was made.
+        Diagnosis of the model, if it was made.
     """
     checks: list[Check | None] = [estimate.estimation(cal), estimate.estimators_agree(cal)]
     if diagnosis is not None and diagnosis.starts is not None:

@@ -204,15 +204,15 @@ class Recursion:
     offset : (q,) array
         Estimate of the first q parameters; the others stay at the origin.
     point : (q,) array
-        Where frames are linearised.
+        Point at which frames are linearised.
     covariance : (q, q) array
-        Of the estimate, per noise variance.
+        Covariance of the estimate, per noise variance.
     start_covariance : (q, q) array
-        The same at the start.
+        Covariance at the start, per noise variance.
     reference_px : float
         Stated noise: px, or 1 where the stars state their own.
     pair_covariance : {"full", "diagonal"}
-        Of the interstar angles.
+        Covariance of the interstar angles that is assumed.
     process : (q,) array or None
         Variance of each parameter's step from frame to frame, per noise variance.
     forgetting : float

@@ -46,7 +46,7 @@ class PairNormals:
         ``[d, J]^T [d, J]`` of every frame: sum of squares, gradient and information at unit noise (whitened by the
         stated noise where there is one).
     weighted : (K, 1 + p, 1 + p) array
-        The same under the covariance that the filter assumes: `grams` itself for ``full``; for ``diagonal`` the sums
+        Sums under the covariance that the filter assumes: `grams` itself for ``full``; for ``diagonal`` the sums
         over pairs, each divided by its variance.
     pairs : (K,) array
         Number of independent numbers that the filter counts in a frame: 2 m - 3, or m (m - 1) / 2 for ``diagonal``.
@@ -77,7 +77,7 @@ def frame_normals(
     model_name : str
         Distortion model.
     theta : (p,) array
-        Where to linearise, px units.
+        Point of linearisation, px units.
     scale : (p,) array
         Units of the parameters in the result; those of the principal point must be 1 px.
     covariance : {"full", "diagonal"}

@@ -41,7 +41,7 @@ class JointEstimate:
     covariance : (p, p) array
         Px units.
     source : {"scatter of the frames", "filter"}
-        Where the covariance comes from.
+        Origin of the covariance.
     """
 
     theta: FloatArray

@@ -81,7 +81,7 @@ def begin(
     options : RecursionOptions
         Options.
     prior : StartPrior
-        As from `prior_of`.
+        Prior that `prior_of` gives.
     frames : StarFrames
         First frames.
 

@@ -42,7 +42,7 @@ class FilterStep:
     Attributes
     ----------
     parameter_names : tuple of str
-        What the recursion estimates, q parameters.
+        Names of the q parameters that the recursion estimates.
     theta : (q,) array
         Estimate, px units.
     covariance : (q, q) array
@@ -262,7 +262,7 @@ class RecursiveCalibration:
         throw : bool
             Raise when the estimate is not good; otherwise `Calibration.status` says so.
         sums : FrameSums, optional
-            Of a second pass over the frames (``samaan``); the sums of the first pass otherwise.
+            Sums of a second pass over the frames (``samaan``); the sums of the first pass otherwise.
 
         Returns
         -------

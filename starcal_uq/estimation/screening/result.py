@@ -70,7 +70,7 @@ class Screening(Shown):
     kept : (N,) bool array
         Rows that the calibration uses.
     observations : Observations
-        Those rows; ``meta["screening"]`` says what they were taken from.
+        Rows that were kept; ``meta["screening"]`` says what they were taken from.
     rejected : DataFrame
         The other rows, one line each: ``row`` (from 0, in the observations given), ``frame``, ``star_id``, ``x_px``,
         ``y_px``, ``residual_px`` (measurement minus prediction of the other stars, length), ``offset_deg`` (the same as
@@ -81,9 +81,9 @@ class Screening(Shown):
     rounds : tuple of ScreeningRound
         How it went.
     calibration : Calibration
-        Of the kept rows; rows of its residuals are those of `observations`.
+        Calibration of the kept rows; rows of its residuals are those of `observations`.
     significance, control
-        As asked for.
+        Settings of the screening.
     expected_false : float
         Bound on the number of right stars expected to be rejected.
     star_p_value, frame_p_value : float
@@ -106,7 +106,7 @@ class Screening(Shown):
     stable : bool
         Whether the last round changed nothing.
     warnings : tuple of str
-        What a user should look at.
+        Sentences on what a user should look at.
     """
 
     kept: BoolArray

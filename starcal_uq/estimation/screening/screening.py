@@ -86,19 +86,19 @@ def screen(
         identifications; with ``control="star"``, the fraction of right stars that is rejected (at most 0.05). Both are
         bounds: tests that overlap reject less.
     control : {"table", "star"}
-        What `significance` means. Only ``"star"`` shortens the tails of the noise so that it shows in the estimated
+        Meaning of `significance`. Only ``"star"`` shortens the tails of the noise so that it shows in the estimated
         sigma (`Screening.sigma_shrinkage`).
     max_rounds : int
         Limit on the rounds of calibrating and testing.
     throw : bool
-        As for `calibrate`.
+        Whether to raise an error where the calibration does not converge.
     **options
         Passed on to `calibrate`, such as ``solver``.
 
     Returns
     -------
     Screening
-        What is kept, every rejected row with its reason, and the calibration of the kept rows.
+        Rows that are kept, every rejected row with its reason, and the calibration of the kept rows.
 
     Raises
     ------
