@@ -109,7 +109,7 @@ def identify_command(
     from starcal_uq.identification.engine import identify
     from starcal_uq.images.centroids import Centroids
     from starcal_uq.pipeline.images import epoch_of
-    from starcal_uq.presentation.words.images import identification_table
+    from starcal_uq.presentation.words.images import MOST_FRAMES, identification_table
     from starcal_uq.runs.folder import RunFolder
     from starcal_uq.runs.steps import best_calibration
     from starcal_uq.sky.catalogue import load_catalogue
@@ -138,7 +138,7 @@ def identify_command(
     if json:
         print_json({"summary": found.text, "frames": records(found.to_dataframe())})
     else:
-        if len(found.frames) <= 40:
+        if len(found.frames) <= MOST_FRAMES:
             print_table(identification_table(found))
         print(f"{found.text}{f' Table: {out}' if found.n_identified else ''}")
     if not found.n_identified:

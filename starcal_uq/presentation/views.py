@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 from starcal_uq.attitude.profile import AttitudeProfile
 from starcal_uq.budgeting.result import Budget, Outcome
@@ -57,7 +58,9 @@ from starcal_uq.presentation.figures.propagation import (
     plot_field_map,
     plot_spectrum,
 )
+from starcal_uq.presentation.html import card, listed
 from starcal_uq.presentation.pages.budgeting import section_html
+from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words import (
     budgeting,
     comparison,
@@ -76,30 +79,61 @@ from starcal_uq.propagation.field import FieldMap
 from starcal_uq.propagation.spectrum import ErrorSpectrum
 from starcal_uq.sky.catalogue import StarCatalogue
 
+
+def _view(
+    title: str,
+    text: Callable[[Any], str],
+    table: Callable[[Any], TextTable | None],
+    notes: Callable[[Any], Iterable[str]] = lambda result: (),
+    **figures: Callable[..., Any],
+) -> View:
+    """A result with its sentences, its table, what is worth noting, and its figures."""
+
+    def html(result: Any) -> str:
+        tables = filter(None, [table(result)])
+        return card(title, text(result), *tables) + listed(notes(result))
+
+    return View(text, html, figures)
+
+
+def _rows(result: Any) -> TextTable:
+    return TextTable.of(result.to_dataframe())
+
+
+def _messages(result: Any) -> Iterable[str]:
+    messages: Iterable[str] = result.messages
+    return messages
+
+
 VIEWS: Mapping[type, View] = {
-    Camera: View(html=inputs.camera_html),
-    AttitudeProfile: View(inputs.profile_text, inputs.profile_html),
-    Observations: View(inputs.observations_text, inputs.observations_html),
-    StarCatalogue: View(inputs.catalogue_text, inputs.catalogue_html),
-    Centroids: View(images.centroids_text, images.centroids_html),
-    Identification: View(images.identification_text, images.identification_html),
+    Camera: _view("Camera", inputs.camera_text, inputs.camera_table),
+    AttitudeProfile: _view("Attitude profile", inputs.profile_text, lambda profile: None, _messages),
+    Observations: _view("Observations", inputs.observations_text, inputs.observations_table),
+    StarCatalogue: _view("Star catalogue", inputs.catalogue_text, inputs.catalogue_table),
+    Centroids: _view("Centroids", images.centroids_text, images.centroids_table, _messages),
+    Identification: _view("Identification", images.identification_text, images.identification_table),
     ImageCalibration: View(images.image_calibration_text),
     ImageRecord: View(images.image_record_text),
-    Calibration: View(
+    Calibration: _view(
+        "Calibration",
         estimation.calibration_text,
-        estimation.calibration_html,
-        {"convergence": plot_convergence, "residuals": plot_residuals},
+        estimation.calibration_table,
+        convergence=plot_convergence,
+        residuals=plot_residuals,
     ),
-    Screening: View(estimation.screening_text, estimation.screening_html),
-    Consistency: View(estimation.consistency_text, estimation.consistency_html),
-    Priors: View(inference.priors_text, inference.priors_html),
-    PriorPredictive: View(inference.predictive_text, inference.predictive_html),
-    PriorSensitivity: View(inference.sensitivity_text, inference.sensitivity_html),
-    ShiftTest: View(inference.shift_text, inference.shift_html),
-    Posterior: View(
+    Screening: _view("Screening", estimation.screening_text, estimation.screening_table),
+    Consistency: _view("Consistency", estimation.consistency_text, estimation.consistency_table, _messages),
+    Priors: _view("Priors", inference.priors_text, _rows),
+    PriorPredictive: _view("Prior predictive check", inference.predictive_text, _rows),
+    PriorSensitivity: _view("Prior sensitivity", inference.sensitivity_text, _rows),
+    ShiftTest: _view("Shift", inference.shift_text, _rows),
+    Posterior: _view(
+        "Posterior",
         inference.posterior_text,
-        inference.posterior_html,
-        {"corner": plot_corner, "prior_posterior": plot_prior_posterior},
+        inference.posterior_table,
+        lambda post: map(str, post.diagnostics.checks),
+        corner=plot_corner,
+        prior_posterior=plot_prior_posterior,
     ),
     Misfit: View(diagnostics.misfit_text, diagnostics.misfit_html, {"p_values": plot_misfit}),
     Jackknife: View(diagnostics.jackknife_text, diagnostics.jackknife_html, {"ratios": plot_jackknife}),

@@ -10,7 +10,6 @@ from starcal_uq.core.formatting import decimals_for, fixed, percent, plural, pre
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.merging import ALPHA, Consistency
 from starcal_uq.estimation.screening.result import REASONS, Screening
-from starcal_uq.presentation.html import card, listed
 from starcal_uq.presentation.tables import TextTable
 
 _SHOWN_ROWS = 30
@@ -52,11 +51,6 @@ def calibration_table(cal: Calibration, truth: Camera | None = None) -> TextTabl
     return TextTable(heads, tuple(rows), title, "l" + "r" * (len(heads) - 2) + "l")
 
 
-def calibration_html(cal: Calibration) -> str:
-    """How it ended, and every parameter."""
-    return card("Calibration", calibration_text(cal), calibration_table(cal))
-
-
 def screening_text(screening: Screening) -> str:
     """What was rejected and why, at which risk, in a few lines."""
     n = len(screening.kept)
@@ -79,8 +73,10 @@ def screening_text(screening: Screening) -> str:
     return "\n".join([*lines, *(f"Warning: {text}" for text in screening.warnings)])
 
 
-def screening_table(screening: Screening) -> TextTable:
-    """The first rejected rows, each with its reason."""
+def screening_table(screening: Screening) -> TextTable | None:
+    """The first rejected rows, each with its reason; None where none is rejected."""
+    if not screening.n_rejected:
+        return None
 
     def number(value: float) -> str:
         return "∞" if np.isinf(value) else fixed(value, 3)
@@ -89,13 +85,6 @@ def screening_table(screening: Screening) -> TextTable:
     formats = dict.fromkeys(("x_px", "y_px", "residual_px", "offset_deg", "statistic", "threshold"), number)
     more = f", the first {len(rejected)}" if len(rejected) < screening.n_rejected else ""
     return TextTable.of(rejected, f"Rejected stars{more}", formats=formats, missing="")
-
-
-def screening_html(screening: Screening) -> str:
-    """What was rejected and why, and the first rows."""
-    first, *others = screening_text(screening).split("\n")
-    tables = [screening_table(screening)] if screening.n_rejected else []
-    return card("Screening", first) + listed(others) + "".join(table.html() for table in tables)
 
 
 def consistency_text(found: Consistency) -> str:
@@ -110,8 +99,3 @@ def consistency_text(found: Consistency) -> str:
 def consistency_table(found: Consistency) -> TextTable:
     """One row per run."""
     return TextTable.of(found.to_dataframe(), "Agreement of the runs")
-
-
-def consistency_html(found: Consistency) -> str:
-    """Whether the runs agree, each of them, and what deserves attention."""
-    return card("Consistency", consistency_text(found), consistency_table(found)) + listed(found.messages)

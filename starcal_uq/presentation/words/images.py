@@ -11,7 +11,6 @@ from starcal_uq.identification.result import STATUSES, FrameStatus, Identificati
 from starcal_uq.images.centroids import Centroids
 from starcal_uq.pipeline.record import ImageRecord
 from starcal_uq.pipeline.refine import ImageCalibration, identified_pairs
-from starcal_uq.presentation.html import card
 from starcal_uq.presentation.tables import TextTable
 
 _MIRRORED = " The images are mirror images of the sky: x is counted from the right edge."
@@ -21,7 +20,7 @@ _REASONS: dict[FrameStatus, str] = {
     "ambiguous": "that fit more than one attitude",
     "too few stars": "with fewer than four centroids",
 }
-_FIRST_FRAMES = 12
+MOST_FRAMES = 40
 
 
 def centroids_text(centroids: Centroids) -> str:
@@ -40,12 +39,7 @@ def centroids_table(centroids: Centroids) -> TextTable:
     """The first frames."""
     columns = ("frame", "n_stars", "image", "background", "noise", "psf_sigma_px", "problem")
     formats = dict.fromkeys(("background", "noise", "psf_sigma_px"), "{:.4g}".format)
-    return TextTable.of(centroids.frames_dataframe().head(_FIRST_FRAMES), "", columns, formats)
-
-
-def centroids_html(centroids: Centroids) -> str:
-    """What there is, and the first frames."""
-    return card("Centroids", centroids_text(centroids), centroids_table(centroids))
+    return TextTable.of(centroids.frames_dataframe().head(MOST_FRAMES), "", columns, formats)
 
 
 def identification_text(found: Identification) -> str:
@@ -73,15 +67,10 @@ def identification_text(found: Identification) -> str:
     return words + _MIRRORED if found.parity == "mirrored" else words
 
 
-def identification_table(found: Identification, n_rows: int | None = None) -> TextTable:
-    """What became of every frame, or of the first `n_rows`."""
+def identification_table(found: Identification) -> TextTable:
+    """What became of the first frames."""
     columns = ("frame", "image", "status", "n_centroids", "n_identified", "log10_expected_false", "milliseconds")
-    return TextTable.of(found.to_dataframe().head(n_rows or len(found.frames)), "Identification", columns)
-
-
-def identification_html(found: Identification) -> str:
-    """What is identified, and the first frames."""
-    return card("Identification", identification_text(found), identification_table(found, _FIRST_FRAMES))
+    return TextTable.of(found.to_dataframe().head(MOST_FRAMES), "Identification", columns)
 
 
 def image_calibration_text(found: ImageCalibration) -> str:

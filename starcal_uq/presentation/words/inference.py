@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.formatting import decimals_for, fixed, pretty_unit
 from starcal_uq.inference.posterior import Posterior
 from starcal_uq.inference.power_scaling import CONFLICT, WEAK, PriorSensitivity
 from starcal_uq.inference.prior_draws import PriorPredictive
 from starcal_uq.inference.priors import Priors
 from starcal_uq.inference.update import ShiftTest
-from starcal_uq.presentation.html import card, listed
 from starcal_uq.presentation.tables import TextTable
 
 
@@ -23,11 +21,6 @@ def priors_text(priors: Priors) -> str:
     )
 
 
-def priors_html(priors: Priors) -> str:
-    """One row per parameter."""
-    return TextTable.of(priors.to_dataframe(), "Priors").html()
-
-
 def posterior_text(post: Posterior) -> str:
     """How many draws, and whether they can be used."""
     verdict = "passes every check" if post.diagnostics.ok else "must not be used as it is"
@@ -36,57 +29,37 @@ def posterior_text(post: Posterior) -> str:
 
 def posterior_table(post: Posterior) -> TextTable:
     """Mean, spread, interval and convergence of every parameter."""
-    specs = {spec.name: spec for spec in parameters(post.camera.distortion)}
-    diagnostics = post.diagnostics
-    low, high = np.quantile(post.draws, [0.025, 0.975], axis=0)
-    rows = []
-    for index, name in enumerate(post.parameter_names):
-        spec = specs.get(name)
-        scale = 1.0 if spec is None else spec.scale
-        column = post.draws[:, index] / scale
-        decimals = decimals_for(float(np.std(column)))
-        numbers = (float(np.mean(column)), float(np.std(column)), low[index] / scale, high[index] / scale)
+    diagnostics, rows = post.diagnostics, []
+    for index, parameter in enumerate(post.parameters):
+        column = post.draws[:, index] / parameter.scale
+        mean, sd = float(np.mean(column)), float(np.std(column))
+        decimals = decimals_for(sd)
         rows.append(
             (
-                name,
-                *(fixed(number, decimals) for number in numbers),
+                parameter.name,
+                *(fixed(float(number), decimals) for number in (mean, sd, *np.quantile(column, [0.025, 0.975]))),
                 fixed(float(diagnostics.rhat[index]), 4),
                 f"{diagnostics.ess_bulk[index]:.0f}",
                 f"{diagnostics.ess_tail[index]:.0f}",
-                pretty_unit(spec.scaled_unit) if spec is not None else ("px" if name == "sigma" else ""),
+                pretty_unit(parameter.scaled_unit),
             )
         )
     heads = ("parameter", "mean", "sd", "2.5 %", "97.5 %", "R-hat", "ESS bulk", "ESS tail", "unit")
     return TextTable(heads, tuple(rows), f"Posterior: {len(post.draws)} draws", "lrrrrrrrl")
 
 
-def posterior_html(post: Posterior) -> str:
-    """Whether the draws can be used, every parameter, and what is worth knowing."""
-    return card("Posterior", posterior_text(post), posterior_table(post)) + listed(
-        str(check) for check in post.diagnostics.checks
-    )
-
-
 def predictive_text(found: PriorPredictive) -> str:
-    """Whether the data are a surprise to the prior."""
+    """Whether the data are a surprise to the prior, and how the drawn cameras look."""
+    words = "The data lie within what the prior expects."
     if not np.any(np.isfinite(found.observed)):
-        return "No observations were given to compare with."
-    if found.ok:
-        return "The data lie within what the prior expects."
+        words = "No observations were given to compare with."
+    elif not found.ok:
+        names = ", ".join(found.surprising)
+        words = f"The prior does not expect the data in {names}: check the nominal camera, or widen the prior."
     return (
-        f"The prior does not expect the data in {', '.join(found.surprising)}: check the nominal camera, or widen the "
-        "prior."
-    )
-
-
-def predictive_html(found: PriorPredictive) -> str:
-    """Whether the data are a surprise, how the drawn cameras look, and every quantity."""
-    shares = (
-        f"{100 * found.folded:.1f} % of the cameras drawn from the prior fold over inside the field, "
+        f"{words} {100 * found.folded:.1f} % of the cameras drawn from the prior fold over inside the field, "
         f"{100 * found.off_detector:.1f} % have their principal point off the detector."
     )
-    table = TextTable.of(found.to_dataframe(), missing="")
-    return card("Prior predictive check", f"{predictive_text(found)} {shares}", table)
 
 
 def sensitivity_text(found: PriorSensitivity) -> str:
@@ -101,11 +74,6 @@ def sensitivity_text(found: PriorSensitivity) -> str:
     return f"The priors matter: {'; '.join(parts)}."
 
 
-def sensitivity_html(found: PriorSensitivity) -> str:
-    """Whether the priors matter, and every quantity."""
-    return card("Prior sensitivity", sensitivity_text(found), TextTable.of(found.to_dataframe()))
-
-
 def shift_text(found: ShiftTest) -> str:
     """Whether the camera changed between two runs."""
     largest = int(np.argmax(np.abs(found.z)))
@@ -113,8 +81,3 @@ def shift_text(found: ShiftTest) -> str:
     if found.significant:
         return f"The camera changed between the runs ({where}): widen the prior by an allowed shift, or start afresh."
     return f"Nothing shows that the camera changed between the runs ({where})."
-
-
-def shift_html(found: ShiftTest) -> str:
-    """Whether the camera changed, and every parameter."""
-    return card("Shift", shift_text(found), TextTable.of(found.to_dataframe()))

@@ -11,48 +11,42 @@ from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.formatting import pretty_unit, significant
 from starcal_uq.observations.columns import COLUMNS
 from starcal_uq.observations.table import Observations
-from starcal_uq.presentation.html import card, listed
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.sky.catalogue import StarCatalogue
 
 _FIRST_ROWS = 5
 
 
-def camera_table(camera: Camera) -> TextTable:
-    """Detector, field, optics and distortion."""
+def camera_text(camera: Camera) -> str:
+    """Name, focal length and field."""
     horizontal, vertical = camera.fov_deg
+    name = f"{camera.name}, " if camera.name else ""
+    return f"{name}{camera.focal_mm:.6g} mm, {horizontal:.3f} x {vertical:.3f} deg."
+
+
+def camera_table(camera: Camera) -> TextTable:
+    """Detector, optics and distortion."""
     coefficients = get_model(camera.distortion).coefficients
     rows = [
         ("detector", f"{camera.width_px} x {camera.height_px} px of {camera.pixel_um:g} µm"),
-        ("field", f"{horizontal:.3f} x {vertical:.3f} deg"),
         ("focal length", f"{camera.focal_mm:.6g} mm = {camera.focal_px:.3f} px"),
         ("principal point", f"({camera.x0_px:.3f}, {camera.y0_px:.3f}) px"),
         ("distortion", camera.distortion),
         *((c.name, f"{k:.6g} {pretty_unit(c.unit)}") for c, k in zip(coefficients, camera.coefficients, strict=True)),
     ]
-    return TextTable(("", "value"), tuple(rows), camera.name or "Camera", "ll")
-
-
-def camera_html(camera: Camera) -> str:
-    """The camera as a table."""
-    return camera_table(camera).html()
+    return TextTable(("", "value"), tuple(rows), align="ll")
 
 
 def observations_text(obs: Observations) -> str:
     """How much there is, and what its directions are."""
-    return f"{obs.n_stars} stars in {obs.n_frames} frames, directions {obs.meta['directions']}"
+    return f"{obs.n_stars} stars in {obs.n_frames} frames, directions {obs.meta['directions']}."
 
 
 def observations_table(obs: Observations) -> TextTable:
     """The first rows: five decimals are a hundredth of a milli-pixel and 0.04 arcsec."""
     head = pd.DataFrame({name: values[:_FIRST_ROWS] for name, values in obs.columns.items()})
     formats = {name: "{:.5f}".format for name in head if COLUMNS[name].kind == "number"}
-    return TextTable.of(head, observations_text(obs), formats=formats)
-
-
-def observations_html(obs: Observations) -> str:
-    """What it is, and its first rows."""
-    return observations_table(obs).html()
+    return TextTable.of(head, formats=formats)
 
 
 def catalogue_text(stars: StarCatalogue) -> str:
@@ -66,21 +60,12 @@ def catalogue_table(stars: StarCatalogue) -> TextTable:
     return TextTable.of(head, formats=dict.fromkeys(("ra_deg", "dec_deg"), "{:.6f}".format))
 
 
-def catalogue_html(stars: StarCatalogue) -> str:
-    """What it is, and its first stars."""
-    return card("Star catalogue", catalogue_text(stars), catalogue_table(stars))
-
-
 def profile_text(profile: AttitudeProfile) -> str:
     """How long it lasts and how fast it turns."""
     speed = profile.rate_deg_s
+    name = f"{profile.name}: " if profile.name else ""
     return (
-        f"{len(profile.time_s)} attitudes over {significant(profile.duration_s, 3)} s, turning at "
+        f"{name}{len(profile.time_s)} attitudes over {significant(profile.duration_s, 3)} s, turning at "
         f"{significant(float(np.median(speed)), 3)} (median) to {significant(float(speed.max()), 3)} degrees per "
         "second."
     )
-
-
-def profile_html(profile: AttitudeProfile) -> str:
-    """How long it lasts, and what looks doubtful."""
-    return card(f"Attitude profile {profile.name}".rstrip(), profile_text(profile)) + listed(profile.messages)
