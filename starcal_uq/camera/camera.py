@@ -159,6 +159,11 @@ class Camera(Shown):
         focal_mm = f * self.pixel_um / 1000.0
         return self.replace(x0_px=x0, y0_px=y0, focal_mm=focal_mm, coefficients=tuple(coefficients))
 
+    def data_sheet(self) -> Camera:
+        """The camera as its data sheet gives it: principal point in the centre, no distortion."""
+        x0, y0 = self.centre_px
+        return self.replace(x0_px=x0, y0_px=y0, coefficients=(0.0,) * len(self.coefficients))
+
     def replace(self, **changes: Any) -> Camera:
         """A copy with some attributes changed.
 

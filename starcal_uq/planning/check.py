@@ -242,13 +242,11 @@ class _Calibrated(NamedTuple):
 def _campaign(study: _Campaigns, index: int) -> _Calibrated:
     """Simulate and calibrate campaign number `index`."""
     camera = study.camera
-    x0, y0 = camera.centre_px
-    sheet = camera.replace(x0_px=x0, y0_px=y0, coefficients=(0.0,) * len(camera.coefficients))
     # Other streams than those of the forecast.
     seed = np.random.SeedSequence([study.seed, 4], spawn_key=(index,)).generate_state(1, np.uint64)[0]
     try:
         obs = study.campaigns[index // study.n_campaigns].simulate(study.stars, camera, seed)
-        cal = calibrate(obs, sheet)
+        cal = calibrate(obs, camera.data_sheet())
     except CatalogueError:
         raise
     except StarcalError as error:

@@ -128,7 +128,7 @@ def validate(
     """
     from starcal_uq.sky.catalogue import load_catalogue
 
-    nominal = _data_sheet(camera)
+    nominal = camera.data_sheet()
     if priors is None:
         priors = narrow_priors(camera, sigma_px) if truth == "prior" else Priors.default(nominal)
     campaign = Campaign(n_frames, min_stars, sigma_px, max_mag)
@@ -209,12 +209,6 @@ def narrow_priors(camera: Camera, sigma_px: float) -> Priors:
         sigma_median=sigma_px,
         sigma_log_sd=_PRIOR_LOG_SIGMA,
     )
-
-
-def _data_sheet(camera: Camera) -> Camera:
-    x0, y0 = camera.centre_px
-    zeros = (0.0,) * len(camera.coefficients)
-    return camera.replace(x0_px=x0, y0_px=y0, coefficients=zeros)
 
 
 def _check(study: Study, n_replicates: int, workers: int | None) -> None:
