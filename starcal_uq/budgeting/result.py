@@ -16,8 +16,8 @@ from starcal_uq.budgeting.rows import AXIS_LABELS, SCOPES, Contributor
 from starcal_uq.budgeting.totals import Samples, Total, total
 from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.display import Shown
-from starcal_uq.core.errors import BudgetError, RunFolderError
-from starcal_uq.core.files import atomic_path
+from starcal_uq.core.errors import BudgetError
+from starcal_uq.core.files import atomic_path, reading
 from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
@@ -325,8 +325,9 @@ def read_csv(path: str | os.PathLike[str]) -> Budget:
     RunFolderError
         If the file is missing or is not a budget.
     """
-
-    try:
+    missing = "run `starcal-uq budget RUN` first"
+    wrong = "is not an error budget; run `starcal-uq budget RUN` to write it again"
+    with reading(path, missing=missing, wrong=wrong):
         with open(path, newline="", encoding="utf-8") as file:
             records = list(csv.DictReader(file))
         by_kind: dict[str, list[dict[str, str]]] = {}
@@ -344,14 +345,6 @@ def read_csv(path: str | os.PathLike[str]) -> Budget:
             notes=tuple(settings["notes"]),
             provenance=settings["provenance"],
         )
-    except OSError as error:
-        raise RunFolderError(
-            f"{path}: cannot be read ({error.strerror or error}); run `starcal-uq budget RUN` first."
-        ) from error
-    except (KeyError, TypeError, ValueError, csv.Error) as error:
-        raise RunFolderError(
-            f"{path}: is not an error budget; run `starcal-uq budget RUN` to write it again."
-        ) from error
 
 
 def _plain(entry: Contributor | Total | Requirement) -> dict[str, str]:

@@ -22,8 +22,7 @@ from starcal_uq.camera.distortion import get_model, model_names, parameter_names
 from starcal_uq.camera.opencv import from_opencv, to_opencv
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CameraError, DistortionError
-from starcal_uq.core.files import atomic_write_text, ensure_new
-from starcal_uq.core.toml import Key, Section, read_section, unknown_key
+from starcal_uq.core.toml import Key, Section, read_section, unknown_key, write_section
 from starcal_uq.core.types import BoolArray, FloatArray
 
 
@@ -224,8 +223,8 @@ class Camera(Shown):
         RunFolderError
             If the file exists and `force` is false, or cannot be written.
         """
-        ensure_new(path, force)
-        atomic_write_text(path, camera_text(self.to_dict()))
+        header = _HEADER + _DIRECTION[get_model(self.distortion).direction] + "\n"
+        write_section(path, "camera", self.to_dict(), header, force)
 
     def to_opencv(self) -> tuple[FloatArray, FloatArray]:
         """The same camera for OpenCV, whose pixel origin is ours.
@@ -372,11 +371,3 @@ def _checked(table: Mapping[str, Any], where: str) -> dict[str, Any]:
     values = _section(distortion).check(table, where)
     values["coefficients"] = tuple(values.pop(c.name, 0.0) for c in coefficients)
     return values
-
-
-def camera_text(table: Mapping[str, Any]) -> str:
-    """The TOML file of a [camera] table, with the conventions as comments; numbers keep every digit."""
-    import tomli_w
-
-    direction = get_model(table["distortion"]).direction
-    return _HEADER + _DIRECTION[direction] + "\n" + tomli_w.dumps({"camera": dict(table)})

@@ -9,7 +9,7 @@ import typer
 
 from starcal_uq.cli.console import progress_bar
 from starcal_uq.cli.options import CameraFile, Force, Json, NewRun, RunPath, Seed
-from starcal_uq.core.files import check_new_folder
+from starcal_uq.core.files import check_new_folder, write_csv
 
 
 def register(app: typer.Typer) -> None:
@@ -63,15 +63,13 @@ def validate_command(
             truth=truth,  # type: ignore[arg-type]
             progress=progress,
         )
-    from starcal_uq.core.files import atomic_path
     from starcal_uq.presentation.figures.style import png_bytes
     from starcal_uq.presentation.words.diagnostics import validation_table
 
     folder.create()
     found.save(out / "validation.npz")
     table = found.to_dataframe()
-    with atomic_path(out / "validation.csv") as temporary:
-        table.to_csv(temporary, index=False)
+    write_csv(table, out / "validation.csv")
     atomic_write_bytes(out / "validation.png", png_bytes(found.plot.ranks()))
     if json:
         print_json({"ok": found.ok, "verdict": found.text, "quantities": records(table)})

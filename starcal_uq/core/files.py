@@ -10,11 +10,14 @@ import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starcal_uq.core.errors import ObservationError, RunFolderError, StarcalError
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 PathLike = str | os.PathLike[str]
 
@@ -116,6 +119,12 @@ def atomic_write_bytes(path: PathLike, data: bytes) -> None:
 def atomic_write_text(path: PathLike, text: str) -> None:
     """Write `text` to `path` in UTF-8 with line feeds as they are, all or nothing."""
     atomic_write_bytes(path, text.encode("utf-8"))
+
+
+def write_csv(table: pd.DataFrame, path: PathLike) -> None:
+    """Write a table as CSV without its index, to the last digit, all or nothing."""
+    with atomic_path(path) as temporary:
+        table.to_csv(temporary, index=False, lineterminator="\n")
 
 
 # A file that was cut off, or is something else, shows itself by any of these, depending on where it was cut.

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.core.errors import StarcalError
-from starcal_uq.core.files import PathLike
+from starcal_uq.core.files import PathLike, atomic_write_text, ensure_new
 from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
@@ -65,6 +65,20 @@ def read_section(path: PathLike, name: str, error: type[StarcalError], *, alone:
         first = next(iter(content))
         raise error(f"{path}: {first} stands outside section [{name}]; remove it or move it below [{name}].")
     return section
+
+
+def write_section(path: PathLike, name: str, table: Mapping[str, Any], header: str, force: bool) -> None:
+    """Write a table ``[name]`` without loss of digits, below comments that explain its keys.
+
+    Raises
+    ------
+    RunFolderError
+        If the file exists and `force` is false, or cannot be written.
+    """
+    import tomli_w
+
+    ensure_new(path, force)
+    atomic_write_text(path, header + tomli_w.dumps({name: dict(table)}))
 
 
 def unknown_key(key: str, known: Collection[str]) -> str:

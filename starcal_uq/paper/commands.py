@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
-from starcal_uq.core.files import atomic_path, atomic_write_bytes, new_folder
+from starcal_uq.core.files import atomic_write_bytes, new_folder, write_csv
 from starcal_uq.core.tasks import Progress, run_tasks
 
 if TYPE_CHECKING:
@@ -70,5 +70,4 @@ def write_tables(folder: Path, tables: Mapping[str, pd.DataFrame], figures: Mapp
     for name, png in figures.items():
         atomic_write_bytes(pictures / f"{name}.png", png)
     for name, table in tables.items():
-        with atomic_path(folder / f"{name}.csv") as temporary:
-            table.to_csv(temporary, index=False, lineterminator="\n")
+        write_csv(table, folder / f"{name}.csv")

@@ -26,7 +26,7 @@ import numpy as np
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import RunFolderError, SamplingError, StarcalError
-from starcal_uq.core.files import atomic_path
+from starcal_uq.core.files import write_csv
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import AnyDict, FloatArray
@@ -187,8 +187,7 @@ class InteractionStudy(Shown):
 
     def save_csv(self, path: str | os.PathLike[str]) -> None:
         """Write the table, atomically; overwritten. Numbers keep all digits."""
-        with atomic_path(path) as temporary:
-            self.table.to_csv(temporary, index=False, lineterminator="\n")
+        write_csv(self.table, path)
 
     @classmethod
     def load_csv(cls, path: str | os.PathLike[str]) -> InteractionStudy:

@@ -11,8 +11,7 @@ import numpy as np
 
 from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
 from starcal_uq.core.display import Shown
-from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import atomic_path
+from starcal_uq.core.files import reading, write_csv
 from starcal_uq.core.types import FloatArray
 
 if TYPE_CHECKING:
@@ -177,8 +176,7 @@ class AttitudeError(Shown):
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the table as CSV, atomically and to the last digit; overwritten. Single draws are not kept."""
         table = self.to_dataframe().assign(n_draws=self.n_draws, n_frames=self.n_frames, frames=self.frames)
-        with atomic_path(path) as temporary:
-            table.to_csv(temporary, index=False)
+        write_csv(table, path)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> AttitudeError:
@@ -192,7 +190,9 @@ class AttitudeError(Shown):
             If the file is missing or is not such a table.
         """
         names = ("sigma", "p95", "p997", "first_order")
-        try:
+        missing = "run `starcal-uq propagate RUN` first"
+        wrong = "is not a table of attitude errors; run `starcal-uq propagate RUN` to write it again"
+        with reading(path, missing=missing, wrong=wrong):
             with open(path, newline="", encoding="utf-8") as file:
                 rows = {(row["contributor"], row["axis"]): row for row in csv.DictReader(file)}
             known = CONTRIBUTORS if (INTERACTION, AXES[0]) in rows else _REQUIRED
@@ -206,14 +206,6 @@ class AttitudeError(Shown):
             first = chosen[0][0]
             counts = {name: int(first[name]) for name in ("n_draws", "n_frames")}
             frames = first.get("frames") or OBSERVED
-        except OSError as error:
-            raise RunFolderError(
-                f"{path}: cannot be read ({error.strerror or error}); run `starcal-uq propagate RUN` first."
-            ) from error
-        except (KeyError, TypeError, ValueError, csv.Error) as error:
-            raise RunFolderError(
-                f"{path}: is not a table of attitude errors; run `starcal-uq propagate RUN` to write it again."
-            ) from error
         sigma, p95, p997, analytic = table
         return cls(
             *(sigma[0, :3], sigma[1, :3], sigma[2, :3], p95, p997),

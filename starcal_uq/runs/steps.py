@@ -18,7 +18,7 @@ from starcal_uq.budgeting.result import Budget
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import sigma_parameter
 from starcal_uq.core.errors import CalibrationError, ObservationError, RunFolderError
-from starcal_uq.core.files import atomic_path, check_new_folder, ensure_new
+from starcal_uq.core.files import check_new_folder, ensure_new, write_csv
 from starcal_uq.core.tasks import Progress
 from starcal_uq.diagnostics.diagnose import FILE, TABLES, Diagnosis, diagnose
 from starcal_uq.diagnostics.models import MODELS
@@ -168,7 +168,7 @@ def calibrate_step(
     nominal.save(run.camera, force=True)
     calibration.save(run.calibration)
     if found is not None:
-        found.save(run.path / REJECTED, force=True)
+        found.save_rejected(run.path / REJECTED, force=True)
     return calibration, found
 
 
@@ -226,8 +226,7 @@ def coupling_step(run: RunFolder) -> Coupling:
     from starcal_uq.propagation.coupling import coupling
 
     found = coupling(best_calibration(run))
-    with atomic_path(run.coupling) as temporary:
-        found.to_dataframe().to_csv(temporary, index=False)
+    write_csv(found.to_dataframe(), run.coupling)
     return found
 
 
@@ -448,8 +447,7 @@ def diagnose_run(
     for name, file_name in TABLES.items():
         part = getattr(found, name)
         if part is not None:
-            with atomic_path(run.path / file_name) as temporary:
-                part.to_dataframe().to_csv(temporary, index=False)
+            write_csv(part.to_dataframe(), run.path / file_name)
     found.save(run.path / FILE)
     return found
 
@@ -520,5 +518,4 @@ def save_image_results(run: RunFolder, centroids: Centroids, found: ImageCalibra
     """Keep the centroids and the record of every frame in the run folder."""
     centroids.save(run.path / CENTROIDS, force=True)
     record_images(centroids, found).save(run.path / IMAGES)
-    with atomic_path(run.path / IDENTIFICATION) as temporary:
-        found.identification.to_dataframe().to_csv(temporary, index=False)
+    write_csv(found.identification.to_dataframe(), run.path / IDENTIFICATION)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import atomic_path, atomic_write_text, check_new_folder
+from starcal_uq.core.files import atomic_write_text, check_new_folder, write_csv
 from starcal_uq.core.records import to_plain
 from starcal_uq.core.tasks import interrupt_between_steps
 from starcal_uq.core.types import AnyDict
@@ -99,8 +99,7 @@ def filter_run(
     run.create()
     camera.save(run.camera, force=True)
     calibration.save(run.calibration)
-    with atomic_path(run.path / HISTORY) as temporary:
-        history(calibration).to_csv(temporary, index=False)
+    write_csv(history(calibration), run.path / HISTORY)
     for name in (STATE, SOURCE):
         (run.path / name).unlink(missing_ok=True)
     return calibration

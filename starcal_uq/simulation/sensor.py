@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.core.errors import SensorError
-from starcal_uq.core.files import atomic_write_text, ensure_new
-from starcal_uq.core.toml import read_section, unknown_key
+from starcal_uq.core.toml import read_section, unknown_key, write_section
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.simulation.psf import KINDS, profiles
 
@@ -211,10 +210,7 @@ class Sensor:
 
     def save(self, path: str | os.PathLike[str], force: bool = False) -> None:
         """Write the sensor to a TOML file without loss of digits; `force` allows to write over one."""
-        import tomli_w
-
-        ensure_new(path, force)
-        atomic_write_text(path, _HEADER + tomli_w.dumps({"sensor": self.to_dict()}))
+        write_section(path, "sensor", self.to_dict(), _HEADER, force)
 
 
 def _only_known(table: Mapping[str, Any], where: str) -> None:

@@ -8,8 +8,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from starcal_uq.core.errors import SiteError
-from starcal_uq.core.files import atomic_write_text, ensure_new
-from starcal_uq.core.toml import Key, Section, read_section
+from starcal_uq.core.toml import Key, Section, read_section, write_section
 from starcal_uq.core.types import AnyDict
 
 _HEADER = """\
@@ -142,10 +141,7 @@ class Site:
         RunFolderError
             If the file exists and `force` is false, or cannot be written.
         """
-        import tomli_w
-
-        ensure_new(path, force)
-        atomic_write_text(path, _HEADER + tomli_w.dumps({"site": self.to_dict()}))
+        write_section(path, "site", self.to_dict(), _HEADER, force)
 
 
 def check_sky(directions: str | None, site: Site | None, in_space: bool) -> None:

@@ -209,14 +209,14 @@ def test_displays_and_file(found, tmp_path) -> None:
     assert found.rejected["star_id"].iloc[0] in found._repr_html_()
     assert repr(found).startswith(f"Screening({found.n_rejected} of ")
     path = tmp_path / "rejected.csv"
-    found.save(path)
+    found.save_rejected(path)
     with path.open() as stream:
         lines = list(csv.DictReader(stream))
     assert [int(line["row"]) for line in lines] == found.rejected["row"].tolist()
     assert {line["reason"] for line in lines} == set(found.counts)
     with pytest.raises(sc.errors.RunFolderError, match="exists already"):
-        found.save(path)
-    found.save(path, force=True)
+        found.save_rejected(path)
+    found.save_rejected(path, force=True)
 
 
 def test_clean_data_are_left_alone(tmp_path) -> None:
@@ -228,7 +228,7 @@ def test_clean_data_are_left_alone(tmp_path) -> None:
     assert found.warnings == ()
     assert np.array_equal(found.calibration.theta, plain.theta)
     assert found.focal_ratio == pytest.approx(1 / 1.1, abs=2e-3)
-    found.save(tmp_path / "rejected.csv")
+    found.save_rejected(tmp_path / "rejected.csv")
     assert (tmp_path / "rejected.csv").read_text() == ",".join(COLUMNS) + "\n"
     assert "<table>" not in found._repr_html_()
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.core.display import Shown
-from starcal_uq.core.files import atomic_path, ensure_new
+from starcal_uq.core.files import ensure_new, write_csv
 from starcal_uq.core.formatting import join_words, percent
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
 from starcal_uq.estimation.screening.outliers import MIN_STARS, StarResiduals, star_threshold
@@ -151,7 +151,7 @@ class Screening(Shown):
         """The rejected rows."""
         return self.rejected.copy()
 
-    def save(self, path: str | os.PathLike[str], force: bool = False) -> None:
+    def save_rejected(self, path: str | os.PathLike[str], force: bool = False) -> None:
         """Write the rejected rows as CSV; a header alone says that nothing was rejected.
 
         Raises
@@ -160,8 +160,7 @@ class Screening(Shown):
             If the file exists and `force` is false, or cannot be written.
         """
         ensure_new(path, force)
-        with atomic_path(path) as temporary:
-            self.rejected.to_csv(temporary, index=False)
+        write_csv(self.rejected, path)
 
     def __repr__(self) -> str:
         reasons = ", ".join(f"{number} {reason}" for reason, number in self.counts.items())

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.core.constants import AXES
-from starcal_uq.core.files import atomic_path, atomic_write_bytes, atomic_write_text, new_folder
+from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, new_folder, write_csv
 from starcal_uq.core.formatting import count, fixed, significant
 from starcal_uq.planning.check import ForecastCheck
 from starcal_uq.planning.design import FrameChoice
@@ -86,8 +86,7 @@ def write_plan(
     for name, table in tables.items():
         if table is None:
             continue
-        with atomic_path(path / f"{name}.csv") as temporary:
-            table.to_csv(temporary, index=False, lineterminator="\n")
+        write_csv(table, path / f"{name}.csv")
     atomic_write_text(path / "plan.json", json.dumps(plan_record(plan), indent=1) + "\n")
     atomic_write_text(path / PAGE, page)
     return path / PAGE
