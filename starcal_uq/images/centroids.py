@@ -216,8 +216,36 @@ class Centroids(FrameRows, Shown):
         RunFolderError
             If the file exists and `force` is false, or cannot be written.
         """
+        ending = table_ending(Path(path))
+        ensure_new(path, force)
+        frames = {
+            # JSON has no NaN: null stands for it.
+            name: [None if v != v else v for v in getattr(self, name).tolist()]
+            for name in FRAME_COLUMNS
+        }
+        document = {"frames": frames, "messages": list(self.messages), "meta": self.meta}
+        text = json.dumps(document, default=as_plain)
+        with atomic_path(path) as temporary:
+            if ending == ".csv":
+                rows = self.to_dataframe().to_csv(index=False, lineterminator="\n")
+                temporary.write_text(f"{_MARK}{text}\n{rows}", encoding="utf-8", newline="\n")
+            elif ending == ".ecsv":
+                self._table(text).write(temporary, format="ascii.ecsv", delimiter=",")
+            else:
+                import pyarrow as pa
+                from pyarrow import parquet
 
-        write_centroids(self, path, force)
+                arrow = pa.table({name: getattr(self, name) for name in COLUMNS})
+                metadata = {_KEY.encode(): text.encode()}
+                parquet.write_table(arrow.replace_schema_metadata(metadata), temporary, compression="zstd")
+
+    def _table(self, text: str) -> Any:
+        from astropy.table import Table
+
+        table = Table({name: getattr(self, name) for name in COLUMNS}, meta={_KEY: text})
+        for name, (_, description) in COLUMNS.items():
+            table[name].description = description
+        return table
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Centroids:
@@ -228,8 +256,32 @@ class Centroids(FrameRows, Shown):
         ObservationError
             If the file cannot be read or is no table of centroids.
         """
-
-        return read_centroids(path)
+        path = Path(path)
+        ending = table_ending(path)
+        if not os.path.isfile(path):
+            raise ObservationError(f"{path}: the file does not exist; check the path.")
+        read = {".csv": _read_csv, ".ecsv": _read_ecsv, ".parquet": _read_parquet}[ending]
+        try:
+            columns, text = read(path)
+        except Exception as error:  # each format's reader raises errors of its own
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise ObservationError(f"{path}: is no readable table ({reason}); write it again.") from error
+        if text is None:
+            raise ObservationError(
+                f"{path}: the list of frames is missing; give a table that `starcal-uq centroid` or Centroids.save "
+                "wrote."
+            )
+        if missing := [name for name in COLUMNS if name not in columns]:
+            raise ObservationError(f"{path}: column {missing[0]} is missing; write the table again.", column=missing[0])
+        try:
+            document: AnyDict = json.loads(text)
+            frames: AnyDict = {name: document["frames"][name] for name in FRAME_COLUMNS}
+            messages, meta = tuple(document["messages"]), dict(document["meta"])
+        except (ValueError, KeyError, TypeError) as error:
+            raise ObservationError(
+                f"{path}: the list of frames is damaged ({error!r}); write the table again."
+            ) from None
+        return cls(**{name: columns[name] for name in COLUMNS}, **frames, messages=messages, meta=meta)
 
     def __repr__(self) -> str:
         return f"Centroids({self.n_stars} stars, {self.n_frames} frames, {self.n_left_out} left out)"
@@ -248,68 +300,6 @@ def _array(name: str, values: Any, kind: type) -> Any:
 _KEY = "starcal_uq_centroids"
 _TRUTH = {"True": True, "False": False}
 _MARK = f"# {_KEY} "
-
-
-def write_centroids(centroids: Centroids, path: str | os.PathLike[str], force: bool) -> None:
-    """See `Centroids.save`."""
-    ending = table_ending(Path(path))
-    ensure_new(path, force)
-    frames = {
-        # JSON has no NaN: null stands for it.
-        name: [None if v != v else v for v in getattr(centroids, name).tolist()]
-        for name in FRAME_COLUMNS
-    }
-    document = {"frames": frames, "messages": list(centroids.messages), "meta": centroids.meta}
-    text = json.dumps(document, default=as_plain)
-    with atomic_path(path) as temporary:
-        if ending == ".csv":
-            rows = centroids.to_dataframe().to_csv(index=False, lineterminator="\n")
-            temporary.write_text(f"{_MARK}{text}\n{rows}", encoding="utf-8", newline="\n")
-        elif ending == ".ecsv":
-            _table(centroids, text).write(temporary, format="ascii.ecsv", delimiter=",")
-        else:
-            import pyarrow as pa
-            from pyarrow import parquet
-
-            arrow = pa.table({name: getattr(centroids, name) for name in COLUMNS})
-            metadata = {_KEY.encode(): text.encode()}
-            parquet.write_table(arrow.replace_schema_metadata(metadata), temporary, compression="zstd")
-
-
-def _table(centroids: Centroids, text: str) -> Any:
-    from astropy.table import Table
-
-    table = Table({name: getattr(centroids, name) for name in COLUMNS}, meta={_KEY: text})
-    for name, (_, description) in COLUMNS.items():
-        table[name].description = description
-    return table
-
-
-def read_centroids(path: str | os.PathLike[str]) -> Centroids:
-    """See `Centroids.load`."""
-    path = Path(path)
-    ending = table_ending(path)
-    if not os.path.isfile(path):
-        raise ObservationError(f"{path}: the file does not exist; check the path.")
-    read = {".csv": _read_csv, ".ecsv": _read_ecsv, ".parquet": _read_parquet}[ending]
-    try:
-        columns, text = read(path)
-    except Exception as error:  # each format's reader raises errors of its own
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise ObservationError(f"{path}: is no readable table ({reason}); write it again.") from error
-    if text is None:
-        raise ObservationError(
-            f"{path}: the list of frames is missing; give a table that `starcal-uq centroid` or Centroids.save wrote."
-        )
-    if missing := [name for name in COLUMNS if name not in columns]:
-        raise ObservationError(f"{path}: column {missing[0]} is missing; write the table again.", column=missing[0])
-    try:
-        document: AnyDict = json.loads(text)
-        frames: AnyDict = {name: document["frames"][name] for name in FRAME_COLUMNS}
-        messages, meta = tuple(document["messages"]), dict(document["meta"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise ObservationError(f"{path}: the list of frames is damaged ({error!r}); write the table again.") from None
-    return Centroids(**{name: columns[name] for name in COLUMNS}, **frames, messages=messages, meta=meta)
 
 
 def _read_csv(path: Path) -> tuple[Mapping[str, Any], str | None]:

@@ -358,8 +358,18 @@ class Posterior(Shown):
         RunFolderError
             If the file exists and `force` is false, or cannot be written.
         """
+        import xarray as xr
 
-        save_posterior(self, path, force)
+        ensure_new(path, force)
+        arrays: Arrays = {}
+        record = to_plain(self, arrays, _ARRAYS)
+        root = xr.Dataset(
+            {name: (_ARRAYS[name], value) for name, value in arrays.items()},
+            attrs={"format": _FORMAT, "record": json.dumps({name: record[name] for name in _RECORD})},
+        )
+        tree = xr.DataTree.from_dict({"/": root, **self.datasets()})
+        with atomic_path(path) as temporary:
+            tree.to_netcdf(temporary, engine="h5netcdf")
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Posterior:
@@ -370,8 +380,21 @@ class Posterior(Shown):
         RunFolderError
             If the file is missing or is not a posterior.
         """
+        import h5netcdf
+        import h5py
 
-        return load_posterior(path)
+        remedy = "run `starcal-uq sample RUN --force` again"
+        if not Path(path).is_file():
+            raise RunFolderError(f"{path}: there is no such file; run `starcal-uq sample RUN` first.")
+        with reading(path, missing=remedy, wrong=f"cannot be read as a posterior ({{reason}}): {remedy}"):
+            if not h5py.is_hdf5(path):
+                raise ValueError("not netCDF")
+            with h5netcdf.File(path, "r") as file:
+                if file.attrs.get("format") != _FORMAT:
+                    raise ValueError("not a posterior of this version")
+                record = json.loads(str(file.attrs["record"]))
+                arrays = {name: np.asarray(file.variables[name][...]) for name in _ARRAYS if name in file.variables}
+            return from_plain(cls, record, arrays)
 
 
 _FORMAT = "starcal_uq posterior 2"
@@ -392,38 +415,3 @@ _RECORD = (
     *("parameter_names", "camera", "priors", "laplace", "diagnostics"),
     *("n_ensembles", "n_walkers", "n_steps", "sigma_sampled", "provenance"),
 )
-
-
-def save_posterior(posterior: Posterior, path: str | os.PathLike[str], force: bool) -> None:
-    """Write a posterior; see `Posterior.save`."""
-    import xarray as xr
-
-    ensure_new(path, force)
-    arrays: Arrays = {}
-    record = to_plain(posterior, arrays, _ARRAYS)
-    root = xr.Dataset(
-        {name: (_ARRAYS[name], value) for name, value in arrays.items()},
-        attrs={"format": _FORMAT, "record": json.dumps({name: record[name] for name in _RECORD})},
-    )
-    tree = xr.DataTree.from_dict({"/": root, **posterior.datasets()})
-    with atomic_path(path) as temporary:
-        tree.to_netcdf(temporary, engine="h5netcdf")
-
-
-def load_posterior(path: str | os.PathLike[str]) -> Posterior:
-    """Read a posterior; see `Posterior.load`."""
-    import h5netcdf
-    import h5py
-
-    remedy = "run `starcal-uq sample RUN --force` again"
-    if not Path(path).is_file():
-        raise RunFolderError(f"{path}: there is no such file; run `starcal-uq sample RUN` first.")
-    with reading(path, missing=remedy, wrong=f"cannot be read as a posterior ({{reason}}): {remedy}"):
-        if not h5py.is_hdf5(path):
-            raise ValueError("not netCDF")
-        with h5netcdf.File(path, "r") as file:
-            if file.attrs.get("format") != _FORMAT:
-                raise ValueError("not a posterior of this version")
-            record = json.loads(str(file.attrs["record"]))
-            arrays = {name: np.asarray(file.variables[name][...]) for name in _ARRAYS if name in file.variables}
-        return from_plain(Posterior, record, arrays)
