@@ -158,11 +158,11 @@ def difference_tests(
     kept = sizes > (_TOLERANCE if same_model else _TOLERANCE_OTHER) * sizes[0]
     modes, sizes = modes[:, kept], sizes[kept]
     weighted = root_weight * e.ravel()
-    found = modes.T @ weighted
-    outside = float(np.linalg.norm(weighted - modes @ found)) * ARCSEC
+    amplitudes = modes.T @ weighted
+    outside = float(np.linalg.norm(weighted - modes @ amplitudes)) * ARCSEC
     if same_model:
         # The difference of the parameters is free of what the linearisation leaves out.
-        found = modes.T @ (root_weight * (linear[0].map @ (b.theta - a.theta)))
+        amplitudes = modes.T @ (root_weight * (linear[0].map @ (b.theta - a.theta)))
     nothing = np.full(len(weight), np.nan)
     if rule.signs is None:
         return DifferenceTests(outside, nothing, nothing)
@@ -175,9 +175,9 @@ def difference_tests(
     field = modes / root_weight[:, None] * ARCSEC
     independent = rule.signs == (1.0, 1.0)
     if not (independent or (a.efficient and b.efficient)):
-        return _rough_tests(field, joint, found, outside)
+        return _rough_tests(field, joint, amplitudes, outside)
     # Coordinates of unit variance in the directions that can be tested, and the map of each at every point.
-    z = (along.T @ (found / sizes))[counted] / np.sqrt(share[counted])
+    z = (along.T @ (amplitudes / sizes))[counted] / np.sqrt(share[counted])
     root = sizes[:, None] * along[:, counted] * np.sqrt(share[counted])
     sigma, unit = _unit_points(field @ root)
     ratio = np.linalg.norm(unit @ z, axis=1)
@@ -200,7 +200,7 @@ def difference_tests(
     )
 
 
-def _rough_tests(field: FloatArray, joint: FloatArray, found: FloatArray, outside: float) -> DifferenceTests:
+def _rough_tests(field: FloatArray, joint: FloatArray, amplitudes: FloatArray, outside: float) -> DifferenceTests:
     """The map alone, where the covariance (r, r) of the difference in the modes (r,) is known roughly.
 
     All directions count: to choose among them would favour those whose variance came out too large.
@@ -211,9 +211,10 @@ def _rough_tests(field: FloatArray, joint: FloatArray, found: FloatArray, outsid
     return DifferenceTests(
         outside=outside,
         sigma=sigma,
-        ratio=np.linalg.norm((field @ found).reshape(-1, 2), axis=1) / np.maximum(sigma, _LEAST_SIGMA * sigma.max()),
+        ratio=np.linalg.norm((field @ amplitudes).reshape(-1, 2), axis=1)
+        / np.maximum(sigma, _LEAST_SIGMA * sigma.max()),
         expected=float(np.sqrt(variances.sum())) * ARCSEC,
-        p_map=weighted_chi_square_tail(variances, float(found @ found)),
+        p_map=weighted_chi_square_tail(variances, float(amplitudes @ amplitudes)),
     )
 
 

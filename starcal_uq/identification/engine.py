@@ -123,28 +123,28 @@ def identify(
     proposer = prepare_engine(engine, stars, field_geometry(camera), tolerance, cache, cache_dir)
     search = Search(camera, stars, tolerance, proposer)
     n = len(field.ids)
-    found = []
+    results = []
     for k in range(n):
-        found.append(search.frame(field, k))
+        results.append(search.frame(field, k))
         if progress is not None:
             progress(k + 1, n)
-    failed = _failed(found, field)
+    failed = _failed(results, field)
     parity: Parity = "normal"
-    if len(failed) > _solved(found):
+    if len(failed) > _solved(results):
         # Every frame of a camera has one handedness: the one that more frames have.
         flipped = FrameTable(centroids, camera, mirrored=True)
         mirror = Search(flipped.camera, stars, tolerance, proposer)
         other = _retry(mirror, flipped, failed)
-        if _solved(other.values()) > _solved(found):
+        if _solved(other.values()) > _solved(results):
             parity, field, search = "mirrored", flipped, mirror
-            found = [other[k] if k in other else mirror.frame(flipped, k) for k in range(n)]
-    failed = _failed(found, field)
-    if len(failed) > _solved(found):
+            results = [other[k] if k in other else mirror.frame(flipped, k) for k in range(n)]
+    failed = _failed(results, field)
+    if len(failed) > _solved(results):
         worse = search.widened(_WORSE_LENS)
         other = _retry(worse, field, failed)
-        found = [other.get(k, found[k]) for k in range(n)]
+        results = [other.get(k, results[k]) for k in range(n)]
         search = worse if _solved(other.values()) else search
-    useful = [f.match for f in found if f.match is not None and len(f.match) >= _CAMERA_STARS]
+    useful = [f.match for f in results if f.match is not None and len(f.match) >= _CAMERA_STARS]
     refined = field.camera
     if useful:
         shared, covariance = search.common_camera(useful)
@@ -152,11 +152,11 @@ def identify(
         if share_camera and len(useful) > 1:
             second = search.narrowed(refined, covariance)
             again = field.seen_by(refined)
-            found = [second.again(again, k, found[k], shared) for k in range(n)]
-            useful = [f.match for f in found if f.match is not None and len(f.match) >= _CAMERA_STARS]
+            results = [second.again(again, k, results[k], shared) for k in range(n)]
+            useful = [f.match for f in results if f.match is not None and len(f.match) >= _CAMERA_STARS]
             if useful:
                 refined = _moved(refined, second.common_camera(useful)[0])
-    return _result(field, found, refined, stars, parity, centroids)
+    return _result(field, results, refined, stars, parity, centroids)
 
 
 def calibrated_tolerance(calibration: CalibratedCamera, largest: CameraTolerance) -> CameraTolerance:
@@ -175,14 +175,14 @@ def calibrated_tolerance(calibration: CalibratedCamera, largest: CameraTolerance
     )
 
 
-def _failed(found: Iterable[Found], field: FrameTable) -> list[int]:
+def _failed(results: Iterable[Found], field: FrameTable) -> list[int]:
     """Frames with enough stars that are not identified, those with most stars first."""
-    frames = [k for k, f in enumerate(found) if f.match is None and len(field.xy[k]) >= MIN_STARS]
+    frames = [k for k, f in enumerate(results) if f.match is None and len(field.xy[k]) >= MIN_STARS]
     return sorted(frames, key=lambda k: -len(field.xy[k]))
 
 
-def _solved(found: Iterable[Found]) -> int:
-    return sum(f.match is not None for f in found)
+def _solved(results: Iterable[Found]) -> int:
+    return sum(f.match is not None for f in results)
 
 
 def _retry(search: Search, field: FrameTable, frames: list[int]) -> dict[int, Found]:
@@ -209,13 +209,13 @@ def _moved(camera: Camera, shared: FloatArray) -> Camera:
 
 
 def _result(
-    field: FrameTable, found: list[Found], camera: Camera, stars: StarCatalogue, parity: Parity, table: CentroidTable
+    field: FrameTable, results: list[Found], camera: Camera, stars: StarCatalogue, parity: Parity, table: CentroidTable
 ) -> Identification:
     """Attitudes and TASTE with the common camera, and the tables."""
     from scipy.special import chdtrc
 
-    solved = [k for k, f in enumerate(found) if f.match is not None]
-    matches = [m for f in found if (m := f.match) is not None]
+    solved = [k for k, f in enumerate(results) if f.match is not None]
+    matches = [m for f in results if (m := f.match) is not None]
     records, star = [], np.concatenate([m.star for m in matches]) if matches else np.empty(0, dtype=np.int64)
     rows = np.concatenate([field.rows[k][m.centroid] for k, m in zip(solved, matches, strict=True)] or [star])
     xy = np.concatenate([field.xy[k][m.centroid] for k, m in zip(solved, matches, strict=True)] or [np.empty((0, 2))])
@@ -230,7 +230,7 @@ def _result(
         p_value = chdtrc(wahba.dof, taste)
         rotations = wahba.rotations
     place = {k: i for i, k in enumerate(solved)}
-    for k, f in enumerate(found):
+    for k, f in enumerate(results):
         i = place.get(k)
         records.append(
             FrameIdentification(

@@ -308,9 +308,9 @@ def _noise_scale(e: FloatArray, sigma_px: FloatArray) -> float:
     squared = np.sum(e * e, axis=1) / sigma_px**2
     # Chi-square with two degrees of freedom has the median 2 ln 2; seven parameters were fitted, damped.
     share = max(1.0 - 5.0 / (2.0 * m), 0.3)
-    found = float(np.sqrt(np.median(squared) / (2.0 * np.log(2.0) * share)))
-    found /= 1.0 + 0.5 / (np.log(2.0) * np.sqrt(m))
-    return min(max(found, 1.0), 4.0) if m >= 6 else 1.0
+    noise = float(np.sqrt(np.median(squared) / (2.0 * np.log(2.0) * share)))
+    noise /= 1.0 + 0.5 / (np.log(2.0) * np.sqrt(m))
+    return min(max(noise, 1.0), 4.0) if m >= 6 else 1.0
 
 
 def _mutual(

@@ -55,8 +55,8 @@ class NearbyStars:
         if depth not in self._trees:
             self._trees[depth] = cKDTree(self.directions[:depth])
         chord = 2.0 * np.sin(0.5 * min(radius_rad, pi))
-        found = self._trees[depth].query_ball_point(boresight, chord, return_sorted=True)
-        return np.asarray(found, dtype=np.int64)
+        ranks = self._trees[depth].query_ball_point(boresight, chord, return_sorted=True)
+        return np.asarray(ranks, dtype=np.int64)
 
 
 def _step(wanted: float) -> int:

@@ -150,9 +150,9 @@ def hypotheses(
     length = np.hypot(*(u[:, None] - u[None]).transpose(2, 0, 1))
     bases: dict[tuple[int, int], tuple[IntArray, IntArray, FloatArray]] = {}
     for triangle in _sorted_triangles(triangles, length, geometry):
-        found = _look_up(triangle, b, angle, sigma, pairs, geometry, tolerance, bases)
-        if len(found):
-            yield _supported(triangle, found, u, sigma, angle, length, pairs, tree, geometry, tolerance)
+        candidates = _look_up(triangle, b, angle, sigma, pairs, geometry, tolerance, bases)
+        if len(candidates):
+            yield _supported(triangle, candidates, u, sigma, angle, length, pairs, tree, geometry, tolerance)
 
 
 def _sorted_triangles(triangles: IntArray, length: FloatArray, geometry: FieldGeometry) -> list[tuple[int, int, int]]:
@@ -202,18 +202,18 @@ def _look_up(
     second, expected = c[row], scale[row] * far
     keep = np.abs(angle_between(pairs.directions[second], pairs.directions[third]) - expected) < far_tol
     row, second, third = row[keep], second[keep], third[keep]
-    found = np.column_stack([a[row], second, third])
+    candidates = np.column_stack([a[row], second, third])
     # A flat triangle has no handedness beyond the noise.
     height = abs(float(np.linalg.det(b[[i, j, k]]))) / max(base, near, far)
     if height > 2.0 * noise:
         sign = np.sign(np.linalg.det(b[[i, j, k]]))
-        found = found[np.sign(_triple(pairs.directions, found)) == sign]
-    return found
+        candidates = candidates[np.sign(_triple(pairs.directions, candidates)) == sign]
+    return candidates
 
 
 def _supported(
     triangle: tuple[int, int, int],
-    found: IntArray,
+    candidates: IntArray,
     u: FloatArray,
     sigma: FloatArray,
     angle: FloatArray,
@@ -225,7 +225,7 @@ def _supported(
 ) -> list[Hypothesis]:
     """Hypotheses with a fourth star among the bright centroids, those with most of them first."""
     i, j, k = corner = list(triangle)
-    r = pairs.directions[found]
+    r = pairs.directions[candidates]
     perimeter = angle[i, j] + angle[j, k] + angle[k, i]
     measured = (
         angle_between(r[:, 0], r[:, 1]) + angle_between(r[:, 1], r[:, 2]) + angle_between(r[:, 2], r[:, 0])
@@ -245,7 +245,7 @@ def _supported(
     gate_px = gate_px + geometry.relative_bias(tolerance) * (reach + span)
     gate = gate_px / geometry.focal_px
     distance, _ = tree.query(sky.reshape(-1, 3), distance_upper_bound=float(gate.max()))  # type: ignore[attr-defined]
-    support = np.sum(distance.reshape(len(found), -1) < gate, axis=1)
+    support = np.sum(distance.reshape(len(candidates), -1) < gate, axis=1)
     best = np.argsort(-support, kind="stable")
     best = best[support[best] > 0][:_HANDED_ON]
     return [Hypothesis(rotation[m], float(scale[m])) for m in best]
@@ -261,9 +261,9 @@ def _directions(u: FloatArray, focal_px: FloatArray) -> FloatArray:
     return b
 
 
-def _triple(directions: FloatArray, found: IntArray) -> FloatArray:
+def _triple(directions: FloatArray, triangles: IntArray) -> FloatArray:
     """Triple products (m,) of triangles (m, 3)."""
-    a, b, c = (directions[found[:, column]].T for column in range(3))
+    a, b, c = (directions[triangles[:, column]].T for column in range(3))
     product: FloatArray = (
         a[0] * (b[1] * c[2] - b[2] * c[1]) + a[1] * (b[2] * c[0] - b[0] * c[2]) + a[2] * (b[0] * c[1] - b[1] * c[0])
     )

@@ -161,8 +161,8 @@ class Search:
         """The second pass: match anew with the common camera, or search once more."""
         clock = perf_counter()
         if first.match is None:
-            found = self.frame(field, k)
-            return replace(found, seconds=found.seconds + first.seconds)
+            second = self.frame(field, k)
+            return replace(second, seconds=second.seconds + first.seconds)
         state = first.match.state
         start = CameraState(state.rotation, state.shared - shared)
         match = self._matched(field, k, start, polished=True)

@@ -221,7 +221,7 @@ def _marginal(obs: Observations | None, cal: Calibration) -> Source:
 def _pairs(obs: Observations, cal: Calibration, adjusted: bool) -> Source:
     from starcal_uq.estimation.composite import pair_likelihood
 
-    found = pair_likelihood(
+    expanded = pair_likelihood(
         StarFrames.from_observations(obs),
         cal.camera.distortion,
         cal.pair_theta,
@@ -229,29 +229,29 @@ def _pairs(obs: Observations, cal: Calibration, adjusted: bool) -> Source:
         residual_dof=cal.dof,
         adjusted=adjusted,
     )
-    variability = "the noise of every star" if found.variability == "expected" else "the scatter between frames"
+    variability = "the noise of every star" if expanded.variability == "expected" else "the scatter between frames"
     notes: tuple[str, ...] = (
         "It is the composite one over pairs of stars, with Godambe's curvature; its variability comes from "
         f"{variability}.",
         "sigma is estimated from the pixel residuals at the best attitudes; pairs have no say in it.",
     )
-    sigma, dof = found.sigma, float(found.dof)
+    sigma, dof = expanded.sigma, float(expanded.dof)
     if not adjusted:
-        sigma, dof = found.tau / found.pair_noise, float(found.n_pairs)
+        sigma, dof = expanded.tau / expanded.pair_noise, float(expanded.n_pairs)
         failure = (
-            f"The {found.n_pairs} pairs of stars are treated as independent (pairs_naive): the intervals are about "
-            f"{found.narrowness:.1f} times too narrow and must not be used; use likelihood='pairs' or 'marginal'."
+            f"The {expanded.n_pairs} pairs of stars are treated as independent (pairs_naive): the intervals are about "
+            f"{expanded.narrowness:.1f} times too narrow and must not be used; use likelihood='pairs' or 'marginal'."
         )
         warnings.warn(failure, NaivePairsWarning, stacklevel=5)
         notes = (failure,)
     return Source(
         name="pairs" if adjusted else "pairs_naive",
-        theta=found.theta_hat,
-        information=symmetric_inverse(found.covariance),
+        theta=expanded.theta_hat,
+        information=symmetric_inverse(expanded.covariance),
         sigma=sigma,
         dof=dof,
-        exact=found.exact_log_likelihood,
-        fast=found.log_likelihood,
+        exact=expanded.exact_log_likelihood,
+        fast=expanded.log_likelihood,
         notes=notes,
     )
 

@@ -201,14 +201,14 @@ def _check_repeats(columns: Mapping[str, Any], rows: IntArray) -> list[Problem]:
         codes = np.unique(columns["star_id"], return_inverse=True)[1]
         named = rows[columns["star_id"][rows] != ""]
         searches.insert(0, ("star_id", "the same star", named, (codes,)))
-    found: dict[int, Problem] = {}
+    repeats: dict[int, Problem] = {}
     for name, what, among, keys in searches:
         for late, early in _repeats(frame[among], *(key[among] for key in keys)):
             row, other = int(among[late]), int(among[early])
             # A row pasted twice agrees in everything; one reason is enough.
             reason = f"{what} occurs twice in frame {frame[row]}"
-            found.setdefault(row, Problem(row, name, reason, "remove one of them", other))
-    return list(found.values())
+            repeats.setdefault(row, Problem(row, name, reason, "remove one of them", other))
+    return list(repeats.values())
 
 
 def _repeats(*keys: Any) -> list[tuple[int, int]]:

@@ -99,9 +99,9 @@ class ForecastCheck(Shown):
         """Numbers of frames (G,) whose squared errors are not what they should be: Bonferroni over all, at 1 %."""
         from scipy.stats import chi2
 
-        found, _, _ = self.nees_ratio()
+        ratio, _, _ = self.nees_ratio()
         n = np.sum(np.isfinite(self.nees), axis=1) * self.n_parameters
-        p = 2.0 * np.minimum(chi2.cdf(found * n, n), chi2.sf(found * n, n))
+        p = 2.0 * np.minimum(chi2.cdf(ratio * n, n), chi2.sf(ratio * n, n))
         return np.asarray(p < _FAMILY_LEVEL / len(n))
 
     @property
@@ -123,7 +123,7 @@ class ForecastCheck(Shown):
         """
         import pandas as pd
 
-        found, low, high = self.nees_ratio()
+        ratio, low, high = self.nees_ratio()
         n_quantities = len(self.forecast.names)
 
         def repeated(values: Any) -> Any:
@@ -137,7 +137,7 @@ class ForecastCheck(Shown):
                 "stated": np.nanmean(self.stated, axis=1).ravel(),
                 "ratio": self.ratio.ravel(),
                 "ratio_se": self.ratio_se.ravel(),
-                "nees_ratio": repeated(found),
+                "nees_ratio": repeated(ratio),
                 "nees_low": repeated(low),
                 "nees_high": repeated(high),
             }

@@ -115,15 +115,15 @@ def quantities(mission: FrameSet) -> tuple[Quantity, ...]:
     known = parameters(camera.distortion)
     p = len(known)
     unit = np.eye(p)
-    found = [_quantity(f"{k.name}_{_suffix(k.unit)}", unit[i : i + 1]) for i, k in enumerate(known)]
-    found.append(_quantity("f_mm", unit[2:3] * camera.pixel_um / 1000.0))
+    chosen = [_quantity(f"{k.name}_{_suffix(k.unit)}", unit[i : i + 1]) for i, k in enumerate(known)]
+    chosen.append(_quantity("f_mm", unit[2:3] * camera.pixel_um / 1000.0))
     if p > 3:
-        found.append(_quantity("distortion_corner_px", _corner_displacement(mission)))
+        chosen.append(_quantity("distortion_corner_px", _corner_displacement(mission)))
     for axis, name in enumerate(AXES):
-        found.append(_quantity(f"common_{name}_arcsec", ARCSEC * mission.common[axis : axis + 1]))
+        chosen.append(_quantity(f"common_{name}_arcsec", ARCSEC * mission.common[axis : axis + 1]))
     for axis, name in enumerate(AXES):
-        found.append(_quantity(f"rest_{name}_arcsec", ARCSEC * mission.rest[:, axis] / np.sqrt(mission.n_frames)))
-    return tuple(found)
+        chosen.append(_quantity(f"rest_{name}_arcsec", ARCSEC * mission.rest[:, axis] / np.sqrt(mission.n_frames)))
+    return tuple(chosen)
 
 
 def _suffix(unit: str) -> str:

@@ -174,10 +174,10 @@ def _forecaster(frames: FrameSet, scope: str, options: dict[str, Any]) -> Foreca
 
 
 def _needs(frames: FrameSet, target_arcsec: float, options: dict[str, Any]) -> tuple[Need, ...]:
-    found = []
+    needs = []
     for scope in SCOPES:
         forecaster = _forecaster(frames, scope, options)
-        found.append(
+        needs.append(
             Need(
                 scope,
                 forecaster.frames_needed(target_arcsec),
@@ -185,7 +185,7 @@ def _needs(frames: FrameSet, target_arcsec: float, options: dict[str, Any]) -> t
                 forecaster.floor_arcsec(),
             )
         )
-    return tuple(found)
+    return tuple(needs)
 
 
 def _sweep(

@@ -103,12 +103,12 @@ class Coupling(Shown):
     def pairs(self, at_least: float = 0.5) -> list[tuple[str, str, float]]:
         """Pairs of parameters with a correlation of at least this size, the strongest first."""
         i, j = np.triu_indices(len(self.parameter_names), 1)
-        found = [
+        strong = [
             (self.parameter_names[a], self.parameter_names[b], float(self.correlation[a, b]))
             for a, b in zip(i, j, strict=True)
             if abs(self.correlation[a, b]) >= at_least
         ]
-        return sorted(found, key=lambda pair: -abs(pair[2]))
+        return sorted(strong, key=lambda pair: -abs(pair[2]))
 
     def to_dataframe(self) -> pd.DataFrame:
         """One row per parameter: sigmas, inflation, bound, contraction and its row of the extended correlations."""
@@ -191,11 +191,11 @@ def _extended(covariance: FloatArray, response: FloatArray) -> tuple[FloatArray,
 
 def _directions(correlation: FloatArray, names: tuple[str, ...]) -> tuple[WeakDirection, ...]:
     values, vectors = np.linalg.eigh(correlation)
-    found = []
+    directions = []
     for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):
         weights = vector * np.sign(vector[np.argmax(np.abs(vector))])
-        found.append(WeakDirection(weights, float(value), _words(weights, float(value), names)))
-    return tuple(found)
+        directions.append(WeakDirection(weights, float(value), _words(weights, float(value), names)))
+    return tuple(directions)
 
 
 def _words(weights: FloatArray, variance: float, names: tuple[str, ...]) -> str:

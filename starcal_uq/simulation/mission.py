@@ -177,7 +177,7 @@ def noise_by_magnitude(like: Observations, mag: FloatArray) -> FloatArray:
     groups = np.array_split(order, min(_MAG_GROUPS, max(1, len(order) // 20)))
     middle = np.array([np.median(like.mag[known][group]) for group in groups])
     level = np.array([np.median(np.log10(like.sigma_px[known][group])) for group in groups])
-    found = np.interp(mag, middle, level)
-    found += _PHOTON_DEX_PER_MAG * np.maximum(np.nan_to_num(mag, nan=-99.0) - middle[-1], 0.0)
-    sigma: FloatArray = np.where(np.isfinite(mag), 10.0**found, float(np.median(like.sigma_px)))
+    exponent = np.interp(mag, middle, level)
+    exponent += _PHOTON_DEX_PER_MAG * np.maximum(np.nan_to_num(mag, nan=-99.0) - middle[-1], 0.0)
+    sigma: FloatArray = np.where(np.isfinite(mag), 10.0**exponent, float(np.median(like.sigma_px)))
     return sigma

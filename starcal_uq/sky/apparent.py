@@ -157,11 +157,11 @@ def catalogue_directions(
     ndarray, shape (n, 3)
         Unit vectors; good to 1e-4 arcsec from an altitude of ten degrees upwards.
     """
-    found = apparent
+    directions = apparent
     for _ in range(4):
-        found = found + apparent - apparent_directions(found, time_utc, observer_velocity_km_s, site)
-        found = found / np.linalg.norm(found, axis=-1, keepdims=True)
-    return found
+        directions = directions + apparent - apparent_directions(directions, time_utc, observer_velocity_km_s, site)
+        directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+    return directions
 
 
 def make_apparent(

@@ -294,20 +294,20 @@ def _needed(section: str, layout: _Layout) -> list[str] | None:
     In it, every number may be blank. The ReadMe files say so as "*?" or "?Hours", which astropy's reader takes for a
     number that is never blank, or for one whose blank is written "Hours". Fewer columns are also read faster.
     """
-    found: dict[str, str] = {}
+    lines: dict[str, str] = {}
     for line in section.split("\n"):
         match = _COLUMN.match(line)
         if match is None:
             continue
         label = _OTHER_LABELS.get(match["label"], match["label"])
-        if label in layout.labels and label not in found:
+        if label in layout.labels and label not in lines:
             is_text = match["kind"] == "A"
             kind, note = ("A", "-") if is_text else ("F", "? -")
-            found[label] = f"{match['bytes']:>8}  {kind}{match['width']}  {match['unit']}  {label}  {note}"
-    if len(found) < len(layout.labels):
+            lines[label] = f"{match['bytes']:>8}  {kind}{match['width']}  {match['unit']}  {label}  {note}"
+    if len(lines) < len(layout.labels):
         return None
     head = "   Bytes Format Units   Label    Explanations"
-    return [f"{_MARK} data", _RULE, head, _RULE, *found.values(), _RULE]
+    return [f"{_MARK} data", _RULE, head, _RULE, *lines.values(), _RULE]
 
 
 def _text(path: Path) -> str:

@@ -91,11 +91,11 @@ def completed_proper_motion(records: GaiaRecords, in_file: bool) -> tuple[FloatA
     known = motion.any(axis=1)
     table = _proper_motion_table()
     place = np.minimum(np.searchsorted(table["id"], records["id"]), len(table) - 1)
-    found = (table["id"][place] == records["id"]) & ~known
-    entries = table[place[found]]
-    motion[found] = np.stack([entries["pm_ra"], entries["pm_dec"]], axis=-1)
-    years[found] = CATALOGUE_EPOCH - entries["epoch"]
-    return motion, known | found, years
+    matched = (table["id"][place] == records["id"]) & ~known
+    entries = table[place[matched]]
+    motion[matched] = np.stack([entries["pm_ra"], entries["pm_dec"]], axis=-1)
+    years[matched] = CATALOGUE_EPOCH - entries["epoch"]
+    return motion, known | matched, years
 
 
 @lru_cache(maxsize=1)

@@ -242,20 +242,20 @@ def _find_columns(path: Path, present: list[str], given: dict[str, str]) -> dict
         if column not in present:
             raise CatalogueError(f"{path}: has no column {column!r} for {name}; it has {listing}.")
     lower = {column.lower(): column for column in reversed(present)}
-    found = dict(given)
+    columns = dict(given)
     for name, guesses in _GUESSES.items():
         hit = next((lower[guess] for guess in guesses if guess in lower), None)
-        if name not in found and hit is not None:
-            found[name] = hit
+        if name not in columns and hit is not None:
+            columns[name] = hit
     for name in ("ra_deg", "dec_deg"):
-        if name not in found:
+        if name not in columns:
             raise CatalogueError(
                 f'{path}: no column is known as {name}; name it with columns={{"{name}": ...}}, among {listing}.'
             )
-    if ("pm_ra_mas_yr" in found) != ("pm_dec_mas_yr" in found):
-        missing = "pm_dec_mas_yr" if "pm_ra_mas_yr" in found else "pm_ra_mas_yr"
+    if ("pm_ra_mas_yr" in columns) != ("pm_dec_mas_yr" in columns):
+        missing = "pm_dec_mas_yr" if "pm_ra_mas_yr" in columns else "pm_ra_mas_yr"
         raise CatalogueError(f"{path}: has half of a proper motion but no {missing}; name it, among {listing}.")
-    return found
+    return columns
 
 
 def _as_floats(source: _Source, name: str, column: Any) -> Any:
