@@ -1,7 +1,7 @@
 # Each target makes what it needs, on a machine that has Python 3.11 or newer and nothing else.
 #
 #   PYTHON=...      the interpreter to use (default: the newest of python3.13, python3.12, python3.11, python3)
-#   ALT_PYTHON=...  the second interpreter for `make test`; `none` leaves the second run out
+#   ALT_PYTHON=...  the second interpreter for `make test-other`; `none` leaves that run out
 #   WORKERS=...     processes that share the tests (0: one, without sharing)
 #   DEMO_OUT=...    the folder that `make demo` writes
 
@@ -13,12 +13,15 @@ DEMO_OUT ?= starcal-demo
 BIN := .venv/bin
 ALT_BIN := .venv-alt/bin
 PIP_INSTALL := -m pip install --quiet --disable-pip-version-check --constraint constraints.txt
-# Tests of one file stay in one process, so that what they share is computed once.
-PYTEST := -m pytest --numprocesses=$(WORKERS) --dist=loadfile
+# Tests of one file stay in one process, so that what they share is computed once; long files come first.
+PYTEST := -m pytest --numprocesses=$(WORKERS) --dist=loadfile --no-loadscope-reorder
+# What depends on the generation of ArviZ (0.23 with Python 3.11, 1 with 3.12 and newer) or on Python itself: sampling and
+# posteriors, run folders, the report, whole runs at the command line, and how the package is put together.
+OTHER_TESTS := tests/inference tests/runs tests/presentation/test_report.py tests/cli/test_cli.py tests/test_project.py
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-other test-slow lint docs bench clean
+.PHONY: help demo test test-other test-second test-slow lint docs bench clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -26,15 +29,17 @@ help: ## show this list
 demo: .venv/.installed ## the paper's experiment, from a star catalogue to a finished report
 	$(BIN)/starcal-uq demo --out $(DEMO_OUT) --force
 
-test: lint ## linters, types, layers and the fast tests, on two interpreters where two are found
+test: lint ## linters, types, layers and the fast tests
+	$(BIN)/python $(PYTEST) -m "not slow"
+
+test-other: .venv/.made ## fast tests of what depends on Python and ArviZ, on a second interpreter where one is found
 	@sh scripts/find_python.sh --other $(BIN)/python "$(ALT_PYTHON)" > .venv/other
 	@if [ -s .venv/other ]; then echo "second interpreter: $$(cat .venv/other)"; \
+	$(MAKE) --no-print-directory test-second OTHER="$$(cat .venv/other)"; \
 	else echo "second interpreter: none, so only one generation of ArviZ is tested"; fi
-	$(BIN)/python $(PYTEST) -m "not slow"
-	@if [ -s .venv/other ]; then $(MAKE) --no-print-directory test-other OTHER="$$(cat .venv/other)"; fi
 
-test-other: .venv-alt/.installed
-	$(ALT_BIN)/python $(PYTEST) -m "not slow"
+test-second: .venv-alt/.installed
+	$(ALT_BIN)/python $(PYTEST) -m "not slow" $(OTHER_TESTS)
 
 test-slow: .venv/.installed-test ## the Monte Carlo tests
 	$(BIN)/python $(PYTEST) -m slow

@@ -64,10 +64,48 @@ def unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Figure, "savefig", blank)
 
 
+@pytest.fixture(scope="session")
+def known_centroids() -> dict[str, object]:
+    """Centroids of the real frames, by what they were extracted with."""
+    return {}
+
+
+@pytest.fixture
+def centroids_once(monkeypatch: pytest.MonkeyPatch, known_centroids: dict[str, object]) -> None:
+    """The real frames, which do not change, are searched for stars once for all tests of a process."""
+    from starcal_uq.images import extract
+
+    search = extract.extract_centroids
+
+    def remembered(images: object, **options: object) -> object:
+        if "esa-tetra3" not in str(images):
+            return search(images, **options)
+        key = repr((images, {name: value for name, value in options.items() if name != "progress"}))
+        if key not in known_centroids:
+            known_centroids[key] = search(images, **options)
+        return known_centroids[key]
+
+    monkeypatch.setattr(extract, "extract_centroids", remembered)
+
+
 @pytest.fixture
 def few_importance_draws(monkeypatch: pytest.MonkeyPatch) -> None:
     """Exact likelihoods, a millisecond each, are weighed with 200 draws instead of 2000; the chains are the same."""
     monkeypatch.setattr("starcal_uq.inference.sample._N_IMPORTANCE_SLOW", 200)
+
+
+# Files that take long, so that no process is left with one of them at the end.
+LONG = ("test_notebook.py", "paper/", "cli/", "diagnostics/", "planning/", "estimation/", "presentation/")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Long files first."""
+
+    def rank(item: pytest.Item) -> int:
+        name = item.path.relative_to(ROOT / "tests").as_posix()
+        return next((i for i, start in enumerate(LONG) if name.startswith(start)), len(LONG))
+
+    items.sort(key=rank)
 
 
 @pytest.fixture(scope="session")

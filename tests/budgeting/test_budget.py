@@ -284,10 +284,11 @@ def test_what_judges_decides_where_rule_and_sampling_disagree(tmp_path: Path, ju
 def resolved(tmp_path_factory: pytest.TempPathFactory) -> Budget:
     """A budget at a confidence that the samples just resolve."""
     path = tmp_path_factory.mktemp("resolved") / "complete.toml"
-    path.write_text(complete(60.0).replace("0.997", "0.9999"), encoding="utf-8")
-    return made(path, n_samples=200_000)
+    path.write_text(complete(60.0).replace("0.997", "0.999"), encoding="utf-8")
+    return made(path, n_samples=20_000)
 
 
+@pytest.mark.usefixtures("unpainted")
 @pytest.mark.parametrize(
     ("limit", "judged_by", "verdict"),
     [
@@ -303,13 +304,13 @@ def test_a_confidence_beyond_the_samples_is_not_judged_by_them(
 ) -> None:
     path = tmp_path / "complete.toml"
     path.write_text(complete(limit, judged_by).replace("0.997", "0.9999999"), encoding="utf-8")
-    found = made(path, n_samples=200_000)
+    found = made(path, n_samples=20_000)
     outcome = found.outcomes[0]
     assert outcome.verdict == verdict
     assert math.isnan(outcome.total.sampled_arcsec) and math.isnan(outcome.total.sampled_se_arcsec)
     assert "99.99999\N{NO-BREAK SPACE}%" in outcome.text
     if verdict == "open":
-        assert "200000 samples do not resolve a confidence of 99.99999" in outcome.text
+        assert "20000 samples do not resolve a confidence of 99.99999" in outcome.text
         assert "which knows Gaussian tails only, says 35.2 arcsec" in outcome.text
         assert "1 requirement open: the samples do not resolve" in budget_context(found)["budget"]["headline"]
     found.save(tmp_path / "budget.csv")

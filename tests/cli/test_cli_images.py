@@ -207,6 +207,7 @@ def test_rendered_frames_through_the_whole_chain(tmp_path):
     assert control.calibration.sigma > 1.3
 
 
+@pytest.mark.usefixtures("centroids_once")
 @pytest.mark.skipif(not ESA.is_dir(), reason="the real frames are not here")
 def test_real_frames_from_images_to_the_report(cli, tmp_path):
     camera = ESA.parent / "esa_tetra3_camera.toml"
@@ -228,7 +229,7 @@ def test_real_frames_from_images_to_the_report(cli, tmp_path):
     assert "Noordwijk" in report
     assert "8 of 8 images used" in report
     # The control: without the site f is too short, and the report neither believes nor hides it.
-    status, _, err = cli("run", ESA, camera, "-o", "bare", "--screen")
+    status, _, err = cli("run", ESA, camera, "-o", "bare", "--screen", "--steps", 200)
     assert status == 1
     assert "conditional on refraction" in err
     bare = sc.Calibration.load(sc.runs.RunFolder(tmp_path / "bare").calibration)

@@ -306,11 +306,11 @@ def _same(a, b):
 
 def test_workers_do_not_change_a_bit_and_progress_is_told(stars):
     settings, calls = study(seed=11), []
-    alone = validate_study(settings, stars, 20, workers=0)
-    both = validate_study(settings, stars, 20, workers=2, progress=lambda done, total: calls.append((done, total)))
+    alone = validate_study(settings, stars, 10, workers=0)
+    both = validate_study(settings, stars, 10, workers=2, progress=lambda done, total: calls.append((done, total)))
     _same(alone, both)
-    _same(alone, validate_study(settings, stars, 20, workers=1))
-    assert calls[-1] == (20, 20)
+    _same(alone, validate_study(settings, stars, 10, workers=1))
+    assert calls[-1] == (10, 10)
     assert [done for done, _ in calls] == sorted(done for done, _ in calls)
     # A longer run begins with the shorter one.
     np.testing.assert_array_equal(validate_study(settings, stars, 4, workers=0).ranks, alone.ranks[:4])

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError, RunFolderError
@@ -296,30 +295,6 @@ def test_record_survives_json() -> None:
     plain = to_plain(found, null=True)
     assert to_plain(from_plain(Consistency, plain), null=True) == plain
     assert consistency_of(calibrated(1)) is None
-
-
-def p_values(n: int, shift_f_px: float = 0.0) -> np.ndarray:
-    found = []
-    for i in range(n):
-        runs = [calibrated.__wrapped__(1000 + 3 * i + k, 12, shift_f_px * (k == 2)) for k in range(3)]
-        compared = consistency_of(merge(runs, allow_inconsistent=True))
-        found.append((compared.p_value, compared.run_p_value[1], compared.noise_p_value))
-    return np.array(found)
-
-
-def test_p_values_are_uniform_when_nothing_differs() -> None:
-    values = p_values(25)
-    for column in values.T:
-        assert stats.kstest(column, "uniform").pvalue > 1e-3
-    # The control: a focal length off by 0.3 px, one marginal sigma, in one of three runs.
-    assert stats.kstest(p_values(8, 0.3)[:, 0], "uniform").pvalue < 1e-3
-
-
-@pytest.mark.slow
-def test_p_values_are_uniform_in_a_long_run() -> None:
-    values = p_values(200)
-    for column in values.T:
-        assert stats.kstest(column, "uniform").pvalue > 1e-3
 
 
 def test_total_of_one_part_is_the_part() -> None:

@@ -224,20 +224,3 @@ def test_shift_test_refuses_what_is_not_independent() -> None:
         shift_test(calibrated(3), chained)
     with pytest.raises(PriorError, match="do not compare"):
         shift_test(calibrated(1), calibrate(scenes.observations("k1"), scenes.nominal(scenes.camera("k1"))))
-
-
-def shift_p_values(n: int, shift_f_px: float = 0.0, n_frames: int = 12) -> np.ndarray:
-    pairs = ((fresh(5000 + 2 * i, n_frames), fresh(5001 + 2 * i, n_frames, shift_f_px)) for i in range(n))
-    return np.array([shift_test(before, after).p_value for before, after in pairs])
-
-
-def test_shift_p_values_are_uniform_when_nothing_moved() -> None:
-    assert stats.kstest(shift_p_values(40), "uniform").pvalue > 1e-3
-    # The control: a focal length that moved by one of its marginal sigmas.
-    assert stats.kstest(shift_p_values(10, 0.3), "uniform").pvalue < 1e-3
-
-
-@pytest.mark.slow
-def test_shift_p_values_are_uniform_in_a_long_run() -> None:
-    values = shift_p_values(300, n_frames=5)
-    assert stats.kstest(values, "uniform").pvalue > 1e-3

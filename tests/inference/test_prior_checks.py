@@ -97,7 +97,7 @@ def test_without_observations_only_the_prior_is_shown() -> None:
 
 
 def test_predictive_check_repeats_and_refuses() -> None:
-    obs = scenes.observations()
+    obs = scenes.observations(n_frames=20)
     a, b = (prior_predictive(DEFAULT, NOMINAL, obs, n_draws=100, seed=4) for _ in range(2))
     assert np.array_equal(a.draws, b.draws, equal_nan=True)
     with pytest.raises(PriorError, match="at least 100"):

@@ -22,6 +22,8 @@ from tests.helpers.gaussian_camera import COVARIANCE, SD, GaussianLikelihood, ga
 from tests.helpers.scenes import camera, nominal, observations, with_sigmas
 
 QUICK: dict[str, Any] = {"n_ensembles": 2, "n_walkers": 16, "n_steps": 60, "n_burn": 5, "seed": 3}
+# 50 steps of both ensembles together.
+QUICKER = {**QUICK, "n_steps": 20}
 
 
 def whitened(draws: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
@@ -328,7 +330,7 @@ def spoilt(cal: Any) -> Any:
 @pytest.fixture(scope="module")
 def replaced(few_frames: tuple[Any, Any]) -> Any:
     obs, cal = few_frames
-    return sample(obs, spoilt(cal), **QUICK)
+    return sample(obs, spoilt(cal), **QUICKER)
 
 
 def test_a_wrong_compressed_likelihood_is_replaced(few_frames: tuple[Any, Any], replaced: Any) -> None:
@@ -336,12 +338,12 @@ def test_a_wrong_compressed_likelihood_is_replaced(few_frames: tuple[Any, Any], 
     assert replaced.diagnostics.likelihood_used == "exact"
     assert replaced.diagnostics.compressed_max_difference > 0.5
     assert "exact likelihood was sampled" in sentence_of(replaced, "Likelihood", Level.PASS)
-    kept = sample(obs, spoilt(cal), **QUICK, evaluation="compressed")
+    kept = sample(obs, spoilt(cal), **QUICKER, evaluation="compressed")
     assert "departs from the exact one" in sentence_of(kept, "Likelihood", Level.FAIL)
 
 
 @pytest.mark.usefixtures("few_importance_draws")
-@pytest.mark.parametrize("stop", [40, 170])
+@pytest.mark.parametrize("stop", [20, 70])
 def test_a_replaced_likelihood_is_resumed(
     few_frames: tuple[Any, Any], replaced: Any, tmp_path: Path, stop: int
 ) -> None:
@@ -356,10 +358,10 @@ def test_a_replaced_likelihood_is_resumed(
             raise KeyboardInterrupt
 
     checkpoint = tmp_path / "run.ckpt"
-    # 40 is in the compressed run, 170 in the exact run that follows it.
+    # 20 is in the compressed run, 70 in the exact run that follows it.
     with pytest.raises(KeyboardInterrupt):
-        sample(obs, wrong, **QUICK, progress=interrupt, checkpoint=checkpoint)
-    post = sample(obs, wrong, **QUICK, checkpoint=checkpoint)
+        sample(obs, wrong, **QUICKER, progress=interrupt, checkpoint=checkpoint)
+    post = sample(obs, wrong, **QUICKER, checkpoint=checkpoint)
     assert np.array_equal(post.draws, replaced.draws)
     assert list(tmp_path.iterdir()) == []
 

@@ -404,7 +404,7 @@ def test_moved_centroids_are_where_the_catalogue_has_them(stars):
     # The pixels of the catalogue's directions through the true camera, at the best attitude.
     for number in (0, 1):
         rows = table.frame == number
-        b = sc.projection.unproject(CAMERA, np.column_stack([moved.x_px[rows], moved.y_px[rows]]))
+        b = sc.camera.unproject(CAMERA, np.column_stack([moved.x_px[rows], moved.y_px[rows]]))
         r = obs.directions_icrs[obs.frame == number]
         left = np.linalg.norm(rotated_onto(r, b) - b, axis=1) * CAMERA.focal_px
         assert np.median(left) < 1e-5
@@ -595,6 +595,7 @@ def esa(real_data):
     return real_data / "esa-tetra3", sc.Camera.load(real_data / "esa_tetra3_camera.toml")
 
 
+@pytest.mark.usefixtures("centroids_once")
 def test_real_frames_with_a_site_agree_with_the_independent_fit(esa, real_data):
     folder, camera = esa
     obs, table, found = observations_from_images([folder], camera, max_mag=7.0, site=NOORDWIJK)
@@ -629,6 +630,7 @@ def test_real_frames_with_a_site_agree_with_the_independent_fit(esa, real_data):
     assert flipped.sigma > sc.calibrate(make_apparent(found.identification.observations, site=NOORDWIJK), camera).sigma
 
 
+@pytest.mark.usefixtures("centroids_once")
 def test_real_frames_of_another_hemisphere_are_refused(esa, tmp_path):
     folder, camera = esa
     with pytest.raises(ObservationError, match="below the horizon"):
