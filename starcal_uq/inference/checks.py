@@ -434,8 +434,8 @@ def _sampling(
 
 
 def _longer(post: Posterior, factor: float = 1.0) -> str:
-    """Sampling again with `factor` times as many steps and some in reserve, at least twice as many."""
-    return resample(post, n_steps=post.n_steps * max(2, math.ceil(1.2 * factor)))
+    """Sampling again with `factor` times as many steps and some in reserve, but 2 to 20 times as many."""
+    return resample(post, n_steps=post.n_steps * min(max(2, math.ceil(1.2 * factor)), 20))
 
 
 def resample(post: Posterior, **changes: Any) -> str:

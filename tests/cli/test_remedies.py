@@ -1,0 +1,254 @@
+"""Every remedy that is printed as a command or a call is executed, and none is printed that is not listed here."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import re
+import shlex
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.core.status import Level, Status
+from starcal_uq.diagnostics.verdict import draws, estimate, observed
+from starcal_uq.inference import checks
+from starcal_uq.runs.folder import RunFolder
+from starcal_uq.runs.steps import calibrate_step, propagate_step, sample_step
+from tests.helpers.ground_scenes import NOMINAL, SITE, ground_frames
+from tests.helpers.scenes import observations
+
+PACKAGE = Path(sc.__file__).parent
+SHORT = {"n_ensembles": 2, "n_walkers": 14, "n_steps": 20}
+
+
+def changed(post, **changes):
+    return dataclasses.replace(post, diagnostics=dataclasses.replace(post.diagnostics, **changes))
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    """Short runs with their files, and observations from the ground."""
+    folder = tmp_path_factory.mktemp("small")
+    camera = sc.paper.paper_start()
+    camera.save(folder / "CAMERA.toml")
+    NOMINAL.save(folder / "GROUND_CAMERA.toml")
+    SITE.save(folder / "SITE.toml")
+    ground_frames(sc.load_catalogue(max_mag=6.5, epoch=2026.9), np.linspace(20.0, 80.0, 12)).save(
+        folder / "GROUND_OBS.csv"
+    )
+    for name, seed in (("RUN_B", 5), ("RUN_A", 3)):
+        obs = observations(n_frames=12, seed=seed)
+        run = RunFolder(folder / name)
+        cal, _ = calibrate_step(run, obs, camera, force=False)
+        post = sample_step(run, force=False, seed=0, **SHORT)
+        propagate_step(run, n_draws=50, seed=0)
+    obs.save(folder / "OBS.csv")
+    shutil.copytree(folder / "RUN_A", folder / "RUN")
+    return SimpleNamespace(folder=folder, obs=obs, camera=camera, cal=cal, post=post)
+
+
+def short_of(kind, small):
+    with pytest.warns(sc.inference.NaivePairsWarning):
+        return sc.sample(small.obs, small.cal, seed=0, likelihood=kind, **SHORT)
+
+
+# What makes each function that can give a remedy do so; the remedies of all of them are executed.
+EXAMPLES = {
+    "inference.checks._rhat": lambda s: [checks._rhat(changed(s.post, rhat=np.full(6, 1.1)))],
+    "inference.checks._effective_draws": lambda s: [
+        checks._effective_draws(changed(s.post, ess_tail=np.full(6, 90.0)))
+    ],
+    "inference.checks._acceptance": lambda s: [checks._acceptance(changed(s.post, acceptance=np.full(2, 0.01)))],
+    "inference.checks._derived": lambda s: [checks._derived(dataclasses.replace(s.post, draws=s.drifting))],
+    "inference.checks._digits": lambda s: [checks._digits(changed(s.post, mcse=0.1 * s.post.sd))],
+    "inference.checks._degrees_of_freedom": lambda s: [
+        checks._degrees_of_freedom(dataclasses.replace(s.post, dof_draws=np.arange(float(len(s.post.draws)))))
+    ],
+    "inference.checks._independent": lambda s: [checks._independent(changed(s.post, agreement_sd=2.0))],
+    "inference.checks._evaluation": lambda s: [
+        checks._evaluation(changed(s.post, compressed_max_difference=value)) for value in (9.0, float("nan"))
+    ],
+    "inference.checks._likelihood": lambda s: [checks._likelihood(short_of("pairs_naive", s), ())],
+    "inference.named.find_source": lambda s: list(
+        sc.sample(
+            s.obs, sc.calibrate(s.obs, s.camera, method="least_squares"), seed=0, likelihood="pairs", **SHORT
+        ).diagnostics.checks[:1]
+    ),
+    "diagnostics.verdict.draws.same_data": lambda s: [
+        draws.same_data(dataclasses.replace(s.post, provenance={"data_sha256": "0"}), s.obs)
+    ],
+    "diagnostics.verdict.draws.propagation": lambda s: [
+        draws.propagation(
+            SimpleNamespace(
+                n_draws=50,
+                **dict.fromkeys(("common_arcsec", "rest_arcsec"), np.ones(3)),
+                **dict.fromkeys(("analytic_common_arcsec", "analytic_rest_arcsec"), np.full(3, 9.0)),
+            )
+        )
+    ],
+    "diagnostics.verdict.estimate.estimation": lambda s: [
+        estimate.estimation(dataclasses.replace(s.cal, status=status)) for status in Status if not status.ok
+    ],
+    "diagnostics.verdict.estimate.jackknife": lambda s: [
+        estimate.jackknife(dataclasses.replace(s.jackknife, jackknife_covariance=9.0 * s.jackknife.formal_covariance))
+    ],
+    "diagnostics.verdict.observed.directions": lambda s: [
+        observed.directions(dataclasses.replace(s.obs, meta=meta), s.cal)
+        for meta in ({"directions": "undeclared"}, {"directions": "apparent", "observer": "unknown"})
+    ],
+    "diagnostics.verdict.observed.outliers": lambda s: [
+        observed.outliers(s.obs, dataclasses.replace(s.cal, residuals_px=s.cal.residuals_px * 9.0))
+    ],
+}
+
+# Commands that sentences name, and what makes them small where they stand alone.
+COMMANDS = {
+    "budget RUN": "",
+    "budget RUN --template FILE": "",
+    "calibrate": "OBS CAMERA -o RUN --force",
+    "calibrate OBS CAMERA -o RUN": "--force",
+    "compare RUN_A RUN_B -o DIR": "",
+    "coupling RUN": "",
+    "propagate RUN": "--draws 50",
+    "report RUN": "",
+    "sample RUN": "--force --steps 20",
+    "sample RUN --force": "--steps 20",
+}
+# These take long or files of their own; the tests that execute them stand beside them.
+ELSEWHERE = {
+    "centroid": "tests/cli/test_cli_images.py",
+    "demo": "tests/cli/test_cli.py",
+    "diagnose": "tests/cli/test_cli_statistics.py",
+    "diagnose RUN": "tests/cli/test_cli_statistics.py",
+    "propagate RUN --attitudes PROFILE": "tests/cli/test_cli_mission.py",
+    "reproduce": "tests/cli/test_cli_paper.py",
+    "run IMAGES... CAMERA -o RUN": "tests/cli/test_cli_images.py",
+    "validate CAMERA": "tests/cli/test_cli_statistics.py",
+    "--help": "tests/cli/test_cli.py",
+}
+
+# Arguments that sentences advise, and a call with each.
+ARGUMENTS = {
+    "evaluation='compressed'": "sc.sample(None, cal, n_ensembles=2, n_walkers=14, n_steps=20, {})",
+    "evaluation='exact'": "sc.sample(obs, cal, n_ensembles=2, n_walkers=14, n_steps=20, {})",
+    "likelihood='marginal'": "sc.sample(obs, cal, n_ensembles=2, n_walkers=14, n_steps=20, {})",
+    "likelihood='pairs'": "sc.sample(obs, cal, n_ensembles=2, n_walkers=14, n_steps=20, {})",
+    "likelihood='student_t'": "sc.calibrate(obs, camera, {})",
+    "method='efficient'": "sc.calibrate(obs, camera, {})",
+    "method='griffith'": "sc.calibrate(obs, camera, {})",
+    "method='three_stage'": "sc.calibrate(obs, camera, {})",
+    "parameters='all'": "sc.calibrate(obs, camera, method='griffith', recursion=sc.estimation.RecursionOptions({}))",
+    "solver='ipopt'": "sc.calibrate(obs, camera, {})",
+}
+
+
+def trees():
+    for path in sorted(PACKAGE.rglob("*.py")):
+        yield ".".join(path.relative_to(PACKAGE).with_suffix("").parts), ast.parse(path.read_text(encoding="utf-8"))
+
+
+def sentences(tree):
+    """All texts of a module but its docstrings, with {} for what is put in."""
+    docstrings = {
+        id(node.body[0].value)
+        for node in ast.walk(tree)
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef))
+        and isinstance(node.body[0], ast.Expr)
+        and isinstance(node.body[0].value, ast.Constant)
+    }
+    parts = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.JoinedStr):
+            yield "".join(str(p.value) if isinstance(p, ast.Constant) else "{}" for p in node.values)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and not {id(node)} & (docstrings | parts):
+            yield node.value
+
+
+def test_every_check_that_gives_a_remedy_has_an_example():
+    """A check function that is added with a remedy is missing here until it has one."""
+    giving = set()
+    for module, tree in trees():
+        for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
+            for call in (node for node in ast.walk(function) if isinstance(node, ast.Call)):
+                name = getattr(call.func, "id", "")
+                with_remedy = len(call.args) > 6 or any(keyword.arg == "remedy" for keyword in call.keywords)
+                if (name == "Check" and with_remedy) or (name == "_sampling" and module == "inference.checks"):
+                    giving.add(f"{module}.{function.name}")
+    assert giving - {"inference.checks._sampling"} == set(EXAMPLES)
+
+
+@pytest.fixture(scope="module")
+def remedies(small):
+    """All remedies, each once."""
+    small.jackknife = sc.diagnostics.jackknife_frames(small.obs, small.cal)
+    small.drifting = small.post.draws.copy()
+    small.drifting[: len(small.drifting) // 2] += small.post.sd
+    found = {}
+    for name, make in EXAMPLES.items():
+        given = {check.remedy for check in make(small) if check.level is not Level.PASS and check.remedy}
+        assert given, f"{name} gave no remedy"
+        found |= dict.fromkeys(one for remedy in given for one in remedy.split(" or "))
+    return list(found)
+
+
+@pytest.fixture
+def execute(small, cli, tmp_path):
+    """Run a command as a user would, on a copy of the files; its words in capitals stand for them."""
+
+    def run(command, more=""):
+        folder = tmp_path / f"files{len(list(tmp_path.iterdir()))}"
+        shutil.copytree(small.folder, folder)
+        words = [*shlex.split(command), *shlex.split(more)]
+        ground = "GROUND_" if "SITE" in words else ""
+        files = {"OBS": f"{ground}OBS.csv", "CAMERA": f"{ground}CAMERA.toml", "SITE": "SITE.toml", "FILE": "new.toml"}
+        files |= {name: name for name in ("RUN", "RUN_A", "RUN_B", "DIR")}
+        status, out, err = cli(*(folder / files[word] if word in files else word for word in words))
+        # 1 is the verdict on so short a run; 2 is a command that cannot be.
+        assert status in (0, 1) and "error:" not in err, (command, out, err)
+
+    return run
+
+
+def test_every_remedy_of_a_check_can_be_executed(small, remedies, execute):
+    assert len(remedies) > 15
+    names = {"sc": sc, "obs": small.obs, "camera": small.camera, "cal": small.cal}
+    for remedy in remedies:
+        program, _, command = remedy.partition(" ")
+        if program == "starcal-uq":
+            execute(command, "--ensembles 2 --walkers 14 --steps 20" if command.startswith("sample") else "")
+        else:
+            assert remedy.startswith("sc."), remedy
+            eval(remedy, names)
+
+
+def named(pattern):
+    return {match for _, tree in trees() for text in sentences(tree) for match in re.findall(pattern, text)}
+
+
+def test_every_command_in_a_sentence_can_be_executed(execute, root):
+    commands = {re.sub(r"\{\}", "RUN", command) for command in named(r"`starcal-uq ([^`]*)`")}
+    assert commands == COMMANDS.keys() | ELSEWHERE.keys()
+    for command, more in COMMANDS.items():
+        execute(command, more)
+    for command, file in ELSEWHERE.items():
+        assert f'"{command.split()[0]}"' in (root / file).read_text(encoding="utf-8"), command
+
+
+def test_every_argument_in_a_sentence_can_be_given(small):
+    clauses = named(r"\b(?:evaluation|likelihood|method|solver|parameters|moves|recursion)='[a-z_]+'")
+    assert clauses == set(ARGUMENTS)
+    names = {"sc": sc, "obs": small.obs, "camera": small.camera, "cal": small.cal}
+    for clause, call in ARGUMENTS.items():
+        eval(call.format(clause), names)
+
+
+def test_control_a_remedy_that_names_no_option_is_refused(small, execute):
+    with pytest.raises(sc.errors.SamplingError, match="evaluation='exact'"):
+        sc.sample(small.obs, small.cal, likelihood="exact")
+    with pytest.raises(AssertionError):
+        execute("sample RUN --force --likelihood exact")
