@@ -37,30 +37,19 @@ _AXIS_NAMES = {
     "all": AXES,
 }
 
-
 _REQUIREMENT_AXES = {key: names for key, names in _AXIS_NAMES.items() if key != "all"}
-
-
 # A full turn; no error is larger.
 _FULL_TURN_ARCSEC = 1_296_000.0
-
-
 # What the starter's names bring along, and nobody can guess for others.
 _OWN_KEYS = ("ecss_class", "time_class", "interpretation", "absorbed_by_alignment")
-
-
 # Names as similar as this are one name mistyped.
 _SAME_NAME = 0.9
-
-
 JUDGED_BY = ("both", "rule", "sampling")
-
 
 _CONTRIBUTOR_KEYS = (
     *("name", "ecss_class", "axis", "mean_arcsec", "sigma_arcsec", "half_width_arcsec", "distribution", "time_class"),
     *("interpretation", "absorbed_by_alignment", "correlation_group", "conditions", "provenance", "applies"),
 )
-
 
 _REQUIREMENT_KEYS = ("name", "axis", "limit_arcsec", "confidence", "scope", "interpretation", "judged_by")
 
@@ -342,7 +331,6 @@ def _requirement(table: _Table, confidence: float | None) -> Requirement:
 
 
 _LETTERS = dict(zip(AXES, "XYZ", strict=True))
-
 
 _HEADER = f"""\
 # Error budget: what the calibration cannot know, and what is required.

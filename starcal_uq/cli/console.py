@@ -33,17 +33,10 @@ if TYPE_CHECKING:
 
 # Where the output is not a terminal it has no width of its own; tables then get the room they need.
 _WIDTH = None if sys.stdout.isatty() else 110
-
-
 _STYLES = {Level.PASS: "green", Level.WARN: "yellow", Level.FAIL: "red"}
-
-
 # Names of files, runs and requirements may hold square brackets, which are no markup.
 out = Console(width=_WIDTH, markup=False)
-
-
 err = Console(stderr=True, markup=False)
-
 
 UNDECLARED = (
     "Neither time nor observer velocity was declared: annual aberration stretches a 10 degree field by up to "

@@ -18,21 +18,11 @@ from typing import Any, TypeVar
 from starcal_uq.core.errors import SamplingError
 
 Progress = Callable[[int, int], None]
-
-
 T = TypeVar("T")
-
-
 # Numbers of the tasks and their results.
 Numbered = list[tuple[int, T]]
-
-
 _WAIT_S = 0.2
-
-
 _THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-
-
 _shared: list[Callable[[int], Any]] = []
 
 

@@ -36,14 +36,8 @@ if TYPE_CHECKING:
 
 # Directions of which the fit absorbs all but this share of the square are not there to be tested.
 _ABSORBED = 1e-8
-
-
 _STARS_AT_ONCE = 10_000
-
-
 _LEAST_DOF = 10
-
-
 ALPHA = 0.05
 
 

@@ -171,11 +171,7 @@ def compress(
 
 
 _STEPS = 50
-
-
 _HALVINGS = 20
-
-
 # A further Newton step would gain less than this, nat: the optimum is then known to a millionth of a sigma.
 _GAIN = 1e-12
 

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     import pandas as pd
 
 NOISES = ("common", "own")
-
-
 # Up to this many sigmas of a run, its quadratic expansion was never wrong by more than 0.15 nat, even with five frames.
 # Runs of one camera stay within five.
 MAX_DISTANCE = 8.0

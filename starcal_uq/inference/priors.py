@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
 
 SIGMA_NAMES = ("sigma", "sigma_scale")
-
-
 _LOG_2PI = math.log(2.0 * math.pi)
 
 
@@ -234,17 +232,9 @@ def positive_number(name: str, value: Any) -> float:
 # Wide on purpose: a tenth of the detector, 5 % of the focal length and a twentieth of the image radius cover any camera
 # whose data sheet is not wrong, and are hundreds of times wider than what a night of stars determines.
 _PRINCIPAL_POINT_FRACTION = 0.1
-
-
 _FOCAL_FRACTION = 0.05
-
-
 _DISTORTION_FRACTION = 0.05
-
-
 _SIGMA_PX = (0.1, 1.5)
-
-
 _SIGMA_SCALE = (1.0, 0.7)
 
 
@@ -343,13 +333,8 @@ class PhysicalPriors(Priors):
 
 
 _FIELDS = tuple(field.name for field in dataclasses.fields(PhysicalPriors))
-
-
 _POSITIVE = tuple(name for name in _FIELDS if name not in ("principal_point_centre_px", "distortion", "per_star_sigma"))
-
-
 _NUMBER = "a finite number above zero"
-
 
 PRIORS = Section(
     {

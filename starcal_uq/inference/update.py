@@ -28,11 +28,7 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
 
 NOISES = ("default", "posterior")
-
-
 SHIFT_KEYS = ("principal_point_px", "focal_fraction", "distortion_corner_px")
-
-
 ALPHA = 1e-3
 
 

@@ -28,15 +28,9 @@ if TYPE_CHECKING:
     from starcal_uq.sky.site import Site
 
 CENTROIDS, IDENTIFICATION = "centroids.parquet", "identification.csv"
-
-
 # Where the embedded catalogue has its stars; images without a time are compared with these.
 _CATALOGUE_EPOCH = 2016.0
-
-
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
-
-
 # Magnitudes; the embedded catalogue ends at the second.
 _FAINTER_NEIGHBOURS, _FAINTEST = 1.5, 10.0
 

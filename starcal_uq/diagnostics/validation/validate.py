@@ -43,22 +43,12 @@ if TYPE_CHECKING:
     from starcal_uq.sky.catalogue import StarCatalogue
 
 TRUTHS = ("fixed", "prior")
-
-
 # Student t is for stars that are not where they should be; its sigma is not the noise that is simulated here.
 LIKELIHOODS = (MARGINAL, "pairs", "pairs_naive")
-
-
 # What truth="prior" draws from by default: narrow enough that every draw is a camera that sees the same sky.
 _PRIOR_POINT_PX = 5.0
-
-
 _PRIOR_FOCAL = 1e-3
-
-
 _PRIOR_CORNER_PX = 1.0
-
-
 _PRIOR_LOG_SIGMA = 0.2
 
 

@@ -23,10 +23,7 @@ if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
 
 ESTIMATORS_Z = 4.0
-
-
 _IPOPT = f"{CALIBRATE} --solver ipopt or sc.calibrate(obs, camera, solver='ipopt')"
-
 
 _REMEDIES = {
     Status.MAX_ITERATIONS: "sc.calibrate(obs, camera, max_iterations=1000)",
@@ -34,7 +31,6 @@ _REMEDIES = {
     Status.FOLDED: _IPOPT,
     Status.INCONSISTENT: SCREEN,
 }
-
 
 TRUTH_Z = 4.0
 
@@ -92,11 +88,7 @@ def truth_z(cal: Calibration, truth: Camera, post: Posterior | None = None) -> F
 
 
 MISFIT_P, MISFIT_FAIL_P = 0.05, 1e-4
-
-
 JACKKNIFE_P, JACKKNIFE_RATIO = 0.01, 1.1
-
-
 # Patterns that repeat on the scale of a pixel act like more noise; they do not bend the map of the field.
 _LIKE_NOISE = ("pixel phase in x", "pixel phase in y")
 

@@ -19,36 +19,16 @@ if TYPE_CHECKING:
 
 # Earth's orbital speed over that of light: the constant of annual aberration, rad.
 ABERRATION_RAD = 9.94e-5
-
-
 PLAUSIBLE_NOISE_PX = (0.003, 0.5)
-
-
 PLAUSIBLE_SCALE = (0.7, 1.5)
-
-
 PATTERN_P, OUTLIER_P = 1e-3, 1e-3
-
-
 PATTERN_FAIL_SIGMA = 0.5
-
-
 OUTLIER_SIGMA = 4.5
-
-
 COVERED_SHARE = 0.85
-
-
 MIN_FRAMES = 5
-
-
 # Commands and calls that checks give as remedies.
 CALIBRATE = "starcal-uq calibrate OBS CAMERA -o RUN --force"
-
-
 SCREEN = f"{CALIBRATE} --screen or sc.estimation.screen(obs, camera)"
-
-
 AIR_REMEDY = f"{CALIBRATE} --site SITE or {CALIBRATE} --in-space"
 
 
@@ -182,14 +162,8 @@ def _undeclared(obs: Observations) -> str:
 
 
 REMEDY = "State the site (--site) and the times, or that the camera was in space (--in-space)."
-
-
 Air: TypeAlias = Literal["corrected", "none", "unknown"]
-
-
 _HIGH_DEG, _MIDDLE_DEG = 90.0, 45.0
-
-
 # What pressure and temperature of a place may differ from the standard atmosphere: 1.5 % and 4 %.
 _WEATHER = 0.04
 

@@ -159,33 +159,19 @@ class History:
 # frame's innovation is of second order: a sigma of a single frame is some pixels in thousands. Where pairs are taken as
 # independent these sigmas are a third of the spread, and the same reach is three times as many of them.
 REACH_SIGMAS = {"full": 2.0, "diagonal": 6.0}
-
-
 # Data without noise leave no sigma; this far, in px, every model is linear to rounding.
 _REACH_PX = 1e-6
-
-
 # Frames linearised at once at most: their arrays stay in the cache.
 _WINDOW = 256
-
-
 # Halvings of a step that makes matters worse.
 _HALVINGS = 8
-
-
 # Linearisations of the held frames each time another one comes: they go on where the last ones stopped.
 _HELD_ITERATIONS = 4
-
-
 # Degrees of freedom from which on the noise is estimated rather than taken as stated.
 _ENOUGH_DOF = 30.0
-
-
 # A parameter counts as determined when its sigma is this share of the start's; until all are, frames are held and
 # taken together, but no more than so many.
 _DETERMINED = 0.005
-
-
 _MAX_HELD = 64
 
 

@@ -18,18 +18,10 @@ from starcal_uq.observations.frames import StarFrames
 
 # What is believed of a start before the first star: next to nothing. A hundred frames outweigh it a million times.
 _PRINCIPAL_POINT_WIDTHS = 1.0
-
-
 _FOCAL_FRACTION = 0.3
-
-
 _DISTORTION_WIDTHS = 0.08
-
-
 # Noise that sets the weight of that belief where none is stated, px.
 _REFERENCE_PX = 0.1
-
-
 _START_ITERATIONS = 200
 
 

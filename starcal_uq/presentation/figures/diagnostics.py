@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
 
 _ALPHA = 0.05
-
-
 _SMALLEST_P = 1e-12
 
 
@@ -147,11 +145,7 @@ def _plot_profile(ax: Axes, profile: Profile1D) -> None:
 
 
 _BAND = 0.95
-
-
 _COLUMNS = 4
-
-
 _NEES_BINS = 30
 
 

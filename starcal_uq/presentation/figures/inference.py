@@ -254,8 +254,6 @@ def _unit(text: str) -> str:
 
 
 BINS = 44
-
-
 HALF_WIDTH_SD = 3.6
 
 

@@ -68,12 +68,8 @@ def _interaction_words(error: AttitudeError) -> str:
 
 
 _STARS_SHOWN = 600
-
-
 # Ellipses along each side (about), and the share of the space between them that the largest semi-axis takes.
 _ELLIPSES = 6
-
-
 _FILL = 0.46
 
 
@@ -171,14 +167,8 @@ def _key(ax: Axes, scale: float, largest: float) -> None:
 
 
 _COLOURS = (style.BLUE, style.VERMILLION, style.GREEN)
-
-
 _DASHES = ("-", "--", "-")
-
-
 _BINS_PER_DECADE = 10
-
-
 # A spectrum is shown over so many decades below its top; what lies deeper is rounding.
 _DECADES = 9.0
 

@@ -25,8 +25,6 @@ if TYPE_CHECKING:
     from starcal_uq.propagation.coupling import Coupling
 
 Row = dict[str, Any]
-
-
 # Two-sided 95 % quantile of the normal distribution.
 Z_95 = 1.959964
 

@@ -14,20 +14,11 @@ from starcal_uq.core.formatting import decimals_for, fixed, join_words, plural, 
 from starcal_uq.presentation.tables import TextTable
 
 Row = dict[str, Any]
-
-
 NOT_ASSESSED = "not assessed"
-
-
 NOT_RESOLVED = "not resolved"
-
-
 # Above what rounding makes of 2.968.
 _GAUSSIAN_TAIL = 2.98
-
-
 _MIXED, *_OTHERS = ("mixed", "ensemble", "temporal")
-
 
 _MEANING = {
     "mixed": "a sensor and a moment at random",
