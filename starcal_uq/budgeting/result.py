@@ -325,9 +325,7 @@ def read_csv(path: str | os.PathLike[str]) -> Budget:
     RunFolderError
         If the file is missing or is not a budget.
     """
-    missing = "run `starcal-uq budget RUN` first"
-    wrong = "is not an error budget; run `starcal-uq budget RUN` to write it again"
-    with reading(path, missing=missing, wrong=wrong):
+    with reading(path, "an error budget", "run `starcal-uq budget RUN` to write it"):
         with open(path, newline="", encoding="utf-8") as file:
             records = list(csv.DictReader(file))
         by_kind: dict[str, list[dict[str, str]]] = {}

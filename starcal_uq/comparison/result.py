@@ -223,4 +223,4 @@ class CameraComparison(Shown):
         if path.is_dir():
             path = path / "comparison.json"
         remedy = "run `starcal-uq compare RUN_A RUN_B -o DIR` to write it"
-        return read_json(cls, path, missing=remedy, wrong=f"is not a comparison of cameras; {remedy} again")
+        return read_json(cls, path, "a comparison of cameras", remedy)

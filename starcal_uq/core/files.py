@@ -134,16 +134,17 @@ _UNREADABLE = (
 
 
 @contextmanager
-def reading(path: PathLike, *, missing: str, wrong: str) -> Iterator[None]:
+def reading(path: PathLike, what: str, remedy: str) -> Iterator[None]:
     """For a block that makes a result of a file: what goes wrong there, in one sentence.
 
     Parameters
     ----------
     path : path
         File.
-    missing, wrong : str
-        How the sentence goes on for a file that cannot be read, and for one that is not such a result; ``{reason}`` in
-        the latter becomes what was found.
+    what : str
+        What the file should hold, such as "a field map".
+    remedy : str
+        How to get such a file, as an order.
 
     Raises
     ------
@@ -153,10 +154,10 @@ def reading(path: PathLike, *, missing: str, wrong: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise RunFolderError(f"{path}: cannot be read ({error.strerror or error}); {missing}.") from error
+        raise RunFolderError(f"{path}: cannot be read ({error.strerror or error}); {remedy}.") from error
     except _UNREADABLE as error:
         reason = f"{type(error).__name__}: {error}".removesuffix(".")
-        raise RunFolderError(f"{path}: {wrong.replace('{reason}', reason)}.") from error
+        raise RunFolderError(f"{path}: is not {what} ({reason}); {remedy}.") from error
 
 
 ENDINGS = (".csv", ".ecsv", ".parquet")

@@ -202,9 +202,9 @@ def write_json(record: Any, path: PathLike) -> None:
     atomic_write_text(path, json.dumps(to_plain(record), indent=1) + "\n")
 
 
-def read_json(cls: type[Record], path: PathLike, *, missing: str, wrong: str) -> Record:
-    """Read what `write_json` wrote; the sentences are those of `starcal_uq.core.files.reading`."""
-    with reading(path, missing=missing, wrong=wrong), open(path, encoding="utf-8") as file:
+def read_json(cls: type[Record], path: PathLike, what: str, remedy: str) -> Record:
+    """Read what `write_json` wrote; `what` and `remedy` as for `starcal_uq.core.files.reading`."""
+    with reading(path, what, remedy), open(path, encoding="utf-8") as file:
         return from_plain(cls, json.load(file))
 
 
@@ -228,9 +228,9 @@ def write(record: Any, path: PathLike, kind: str) -> None:
         np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
-def read(cls: type[Record], path: PathLike, kind: str, *, missing: str, wrong: str) -> Record:
-    """Inverse of `write`; the sentences are those of `starcal_uq.core.files.reading`."""
-    with reading(path, missing=missing, wrong=wrong):
+def read(cls: type[Record], path: PathLike, kind: str, what: str, remedy: str) -> Record:
+    """Inverse of `write`; `what` and `remedy` as for `starcal_uq.core.files.reading`."""
+    with reading(path, what, remedy):
         arrays = read_arrays(path)
         if kind and str(arrays.pop(_FORMAT)) != kind:
             raise ValueError("another format")

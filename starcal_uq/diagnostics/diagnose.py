@@ -122,8 +122,7 @@ class Diagnosis(Shown):
         RunFolderError
             If the file is missing or is not a diagnosis.
         """
-        remedy = "run `starcal-uq diagnose` again"
-        return read_json(cls, path, missing=remedy, wrong=f"cannot be read as a diagnosis ({{reason}}): {remedy}")
+        return read_json(cls, path, "a diagnosis", "run `starcal-uq diagnose` again")
 
 
 def diagnose(

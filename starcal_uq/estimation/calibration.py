@@ -204,7 +204,7 @@ class Calibration(Shown):
         RunFolderError
             When a file is missing or not a calibration.
         """
-        path, remedy = Path(path), "run `starcal-uq calibrate` again"
-        with reading(path, missing=remedy, wrong=f"cannot be read as a calibration ({{reason}}): {remedy}"):
+        path = Path(path)
+        with reading(path, "a calibration", "run `starcal-uq calibrate` again"):
             document = json.loads(path.read_text(encoding="utf-8"))
             return from_plain(cls, document, read_arrays(path.with_suffix(".npz")))

@@ -386,12 +386,12 @@ class Posterior(Shown):
         remedy = "run `starcal-uq sample RUN --force` again"
         if not Path(path).is_file():
             raise RunFolderError(f"{path}: there is no such file; run `starcal-uq sample RUN` first.")
-        with reading(path, missing=remedy, wrong=f"cannot be read as a posterior ({{reason}}): {remedy}"):
+        with reading(path, "a posterior of this version", remedy):
             if not h5py.is_hdf5(path):
                 raise ValueError("not netCDF")
             with h5netcdf.File(path, "r") as file:
                 if file.attrs.get("format") != _FORMAT:
-                    raise ValueError("not a posterior of this version")
+                    raise ValueError("another format")
                 record = json.loads(str(file.attrs["record"]))
                 arrays = {name: np.asarray(file.variables[name][...]) for name in _ARRAYS if name in file.variables}
             return from_plain(cls, record, arrays)

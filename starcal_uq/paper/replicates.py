@@ -208,9 +208,7 @@ class Replicates(Shown):
         RunFolderError
             If the file is missing or is not a set of replicates.
         """
-        missing = "run `starcal-uq reproduce` first"
-        wrong = "does not hold replicates; run `starcal-uq reproduce` to write it again"
-        return read(cls, path, _FORMAT, missing=missing, wrong=wrong)
+        return read(cls, path, _FORMAT, "a set of replicates", "run `starcal-uq reproduce` to write it")
 
 
 @dataclass(frozen=True)

@@ -100,8 +100,7 @@ class ImageRecord(Shown):
         RunFolderError
             If the file cannot be read or is something else.
         """
-        remedy = "run `starcal-uq run IMAGES... CAMERA -o RUN` again"
-        return read_json(cls, path, missing=remedy, wrong=f"is not a record of images; {remedy}")
+        return read_json(cls, path, "a record of images", "run `starcal-uq run IMAGES... CAMERA -o RUN` again")
 
 
 def record_images(centroids: Centroids, found: ImageCalibration) -> ImageRecord:

@@ -190,9 +190,7 @@ class AttitudeError(Shown):
             If the file is missing or is not such a table.
         """
         names = ("sigma", "p95", "p997", "first_order")
-        missing = "run `starcal-uq propagate RUN` first"
-        wrong = "is not a table of attitude errors; run `starcal-uq propagate RUN` to write it again"
-        with reading(path, missing=missing, wrong=wrong):
+        with reading(path, "a table of attitude errors", "run `starcal-uq propagate RUN` to write it"):
             with open(path, newline="", encoding="utf-8") as file:
                 rows = {(row["contributor"], row["axis"]): row for row in csv.DictReader(file)}
             known = CONTRIBUTORS if (INTERACTION, AXES[0]) in rows else _REQUIRED

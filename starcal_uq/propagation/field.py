@@ -102,7 +102,7 @@ class FieldMap(Shown):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write all arrays to one ``.npz`` file, atomically; overwritten."""
-        write(self, path, kind="")
+        write(self, path, "")
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> FieldMap:
@@ -113,13 +113,7 @@ class FieldMap(Shown):
         RunFolderError
             If the file is missing or is not a field map.
         """
-        return read(
-            cls,
-            path,
-            kind="",
-            missing="run `starcal-uq propagate RUN` first",
-            wrong="is not a field map; run `starcal-uq propagate RUN` to write it again",
-        )
+        return read(cls, path, "", "a field map", "run `starcal-uq propagate RUN` to write it")
 
 
 def field_map(post: Posterior, obs: Observations, n: int = 25) -> FieldMap:

@@ -349,8 +349,7 @@ class ErrorSpectrum(Shown):
         RunFolderError
             If the file is missing or is not such a spectrum.
         """
-        remedy = "compute it again with error_spectrum"
-        return read(cls, path, _KIND, missing=remedy, wrong=f"is not an error spectrum; {remedy}")
+        return read(cls, path, _KIND, "an error spectrum", "compute it with error_spectrum")
 
 
 def _crossing(lag: FloatArray, correlation: FloatArray) -> float:

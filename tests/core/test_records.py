@@ -16,7 +16,7 @@ from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
 from tests.helpers.scenes import camera
 
-WORDS = {"missing": "make it", "wrong": "is no record ({reason}); make it again"}
+WORDS = {"what": "a record", "remedy": "make it"}
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def test_damaged_files_are_one_sentence(tmp_path: Path) -> None:
     data = path.read_bytes()
     for length in (0, 10, len(data) // 2, len(data) - 1):
         path.write_bytes(data[:length])
-        with pytest.raises(RunFolderError, match=r"whole\.npz: is no record \(.*\); make it again\.$"):
+        with pytest.raises(RunFolderError, match=r"whole\.npz: is not a record \(.*\); make it\.$"):
             read(Whole, path, "whole 1", **WORDS)
     path.write_bytes(data)
     with pytest.raises(RunFolderError, match="another format"):
@@ -145,5 +145,5 @@ def test_damaged_files_are_one_sentence(tmp_path: Path) -> None:
     text = tmp_path / "whole.json"
     for content in ("", "[]", "{", '{"parts": []}', "\x00"):
         text.write_text(content, encoding="utf-8")
-        with pytest.raises(RunFolderError, match=r"whole\.json: is no record \(.*\); make it again\.$"):
+        with pytest.raises(RunFolderError, match=r"whole\.json: is not a record \(.*\); make it\.$"):
             read_json(Whole, text, **WORDS)

@@ -394,13 +394,13 @@ def test_a_broken_or_foreign_file_is_named(tmp_path):
     data = path.read_bytes()
     for length in (0, 10, 1000, len(data) // 2, len(data) - 1):
         path.write_bytes(data[:length])
-        with pytest.raises(RunFolderError, match=r"state\.npz: is no saved recursive calibration, or an incomplete"):
+        with pytest.raises(RunFolderError, match=r"state\.npz: is not a saved recursive calibration, or is incomplete"):
             RecursiveCalibration.load(path)
     np.savez(path, a=np.zeros(3))
     with pytest.raises(RunFolderError, match=r"give a file written by RecursiveCalibration\.save"):
         RecursiveCalibration.load(path)
     np.savez(path, header=np.array('{"kind": "something else", "version": 1}'))
-    with pytest.raises(RunFolderError, match=r"incomplete one \(ValueError: another kind or version\)"):
+    with pytest.raises(RunFolderError, match=r"incomplete \(ValueError: another kind or version\); give"):
         RecursiveCalibration.load(path)
     (tmp_path / "note.npz").write_text("hello")
     with pytest.raises(RunFolderError, match=r"note\.npz"):

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from starcal_uq.paper.replicates import Replicates
 
 from starcal_uq.budgeting.result import Budget
 from starcal_uq.camera.camera import Camera
@@ -21,6 +20,7 @@ from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.merging import Consistency
 from starcal_uq.estimation.recursive.stream import RecursiveCalibration
 from starcal_uq.observations.table import load_observations
+from starcal_uq.paper.replicates import Replicates
 from starcal_uq.pipeline.record import ImageRecord
 from starcal_uq.propagation.attitude_error import AttitudeError
 from starcal_uq.propagation.field import FieldMap

@@ -237,10 +237,4 @@ class Validation(Shown):
         RunFolderError
             If the file is missing or is not a validation.
         """
-        return read(
-            cls,
-            path,
-            _FORMAT,
-            missing="run `starcal-uq validate CAMERA` first",
-            wrong="is not a validation; run `starcal-uq validate CAMERA` to write it again",
-        )
+        return read(cls, path, _FORMAT, "a validation", "run `starcal-uq validate CAMERA` to write it")

@@ -60,9 +60,8 @@ def read_state(path: str | os.PathLike[str]) -> State:
     RunFolderError
         When the file is missing, truncated, or no such state.
     """
-    remedy = "give a file written by RecursiveCalibration.save"
-    wrong = f"is no saved recursive calibration, or an incomplete one ({{reason}}): {remedy}"
-    with reading(path, missing=remedy, wrong=wrong):
+    what = "a saved recursive calibration, or is incomplete"
+    with reading(path, what, "give a file written by RecursiveCalibration.save"):
         arrays = read_arrays(path)
         header = json.loads(str(arrays.pop("header")))
         kind, version = header.pop("kind"), header.pop("version")
