@@ -261,8 +261,25 @@ class Budget(Shown):
         RunFolderError
             If the file is missing or is not a budget.
         """
-
-        return read_csv(path)
+        with reading(path, "an error budget", "run `starcal-uq budget RUN` to write it"):
+            with open(path, newline="", encoding="utf-8") as file:
+                records = list(csv.DictReader(file))
+            by_kind: dict[str, list[dict[str, str]]] = {}
+            for record in records:
+                by_kind.setdefault(record["record"], []).append(record)
+            settings = {record["name"]: json.loads(record["value"]) for record in by_kind["setting"]}
+            return Budget(
+                rows=tuple(_made(Contributor, record) for record in by_kind["contributor"]),
+                totals=tuple(_made(Total, record) for record in by_kind["total"]),
+                outcomes=tuple(
+                    Outcome(_made(Requirement, record), _made(Total, record))
+                    for record in by_kind.get("requirement", [])
+                ),
+                confidence=float(settings["confidence"]),
+                title=settings["title"],
+                notes=tuple(settings["notes"]),
+                provenance=settings["provenance"],
+            )
 
 
 def _unknown(value: Any) -> bool:
@@ -315,34 +332,6 @@ _COLUMNS = tuple(
         ["record", *(f.name for kind in (Contributor, Requirement, Total) for f in fields(kind)), *_DERIVED, "value"]
     )
 )
-
-
-def read_csv(path: str | os.PathLike[str]) -> Budget:
-    """Read the file.
-
-    Raises
-    ------
-    RunFolderError
-        If the file is missing or is not a budget.
-    """
-    with reading(path, "an error budget", "run `starcal-uq budget RUN` to write it"):
-        with open(path, newline="", encoding="utf-8") as file:
-            records = list(csv.DictReader(file))
-        by_kind: dict[str, list[dict[str, str]]] = {}
-        for record in records:
-            by_kind.setdefault(record["record"], []).append(record)
-        settings = {record["name"]: json.loads(record["value"]) for record in by_kind["setting"]}
-        return Budget(
-            rows=tuple(_made(Contributor, record) for record in by_kind["contributor"]),
-            totals=tuple(_made(Total, record) for record in by_kind["total"]),
-            outcomes=tuple(
-                Outcome(_made(Requirement, record), _made(Total, record)) for record in by_kind.get("requirement", [])
-            ),
-            confidence=float(settings["confidence"]),
-            title=settings["title"],
-            notes=tuple(settings["notes"]),
-            provenance=settings["provenance"],
-        )
 
 
 def _plain(entry: Contributor | Total | Requirement) -> dict[str, str]:

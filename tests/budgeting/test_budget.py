@@ -18,7 +18,7 @@ import starcal_uq as sc
 from starcal_uq.budgeting.budget import budget
 from starcal_uq.budgeting.file import load_budget_file
 from starcal_uq.budgeting.posterior import inflation
-from starcal_uq.budgeting.result import Budget, read_csv
+from starcal_uq.budgeting.result import Budget
 from starcal_uq.budgeting.rows import COMMON, FROM_FILE, GAUSSIAN_997, NEA, REST
 from starcal_uq.budgeting.shapes import one_axis_factor
 from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
@@ -387,9 +387,9 @@ def test_what_is_no_budget_is_refused(tmp_path: Path, text: str) -> None:
     path = tmp_path / "budget.csv"
     path.write_text(text, encoding="utf-8")
     with pytest.raises(RunFolderError, match="is not an error budget"):
-        read_csv(path)
+        Budget.load(path)
     with pytest.raises(RunFolderError, match="cannot be read"):
-        read_csv(tmp_path / "none.csv")
+        Budget.load(tmp_path / "none.csv")
 
 
 def test_excel_has_numbers_units_and_marks(stated: Path, tmp_path: Path) -> None:
