@@ -76,13 +76,13 @@ class Check:
     name : str
         Short name.
     question : Question
-        What it helps to answer.
+        Question that it helps to answer.
     level : Level
         Outcome.
     value, bound : str
-        What was measured and what was asked for, with units.
+        Measured value and what was asked for, with units.
     sentence : str
-        What it means, in plain words.
+        Meaning, in plain words.
     remedy : str
         Command or Python call that may mend it, several joined by " or "; empty where it passed or nothing of the kind
         helps. OBS, CAMERA, SITE and RUN stand for the user's files, ``obs``, ``camera`` and ``cal`` for results.

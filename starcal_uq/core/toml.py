@@ -27,9 +27,9 @@ def read_toml(path: PathLike, name: str, error: type[StarcalError], missing: str
     path : path
         File.
     name : str
-        What it describes, such as "camera".
+        Subject of the file, such as "camera".
     error : type
-        What is raised where the file cannot be read.
+        Error to raise where the file cannot be read.
     missing : str
         Remedy for a file that does not exist.
     """
@@ -97,7 +97,7 @@ class Key:
     kind : type
         Type; a whole number may stand for a float, but neither text nor a truth value for a number.
     wanted : str
-        What to write, said wherever the key is missing or wrong.
+        Text of what to write, said wherever the key is missing or wrong.
     bounds : dict
         Limits as of `pydantic.Field`, such as ``{"gt": 0}``.
     required : bool
@@ -124,7 +124,7 @@ class Section:
     keys : dict
         Known keys.
     error : type
-        What is raised.
+        Error to raise.
     """
 
     keys: Mapping[str, Key]
@@ -149,7 +149,7 @@ class Section:
         table : mapping
             Keys and values.
         where : str
-            What to call the table in messages, such as "camera.toml, section [camera]".
+            Name of the table in messages, such as "camera.toml, section [camera]".
 
         Raises
         ------

@@ -195,7 +195,8 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
     n : int
         Number of starts.
     seed : int
-        Of the starts: focal length within 5 %, principal point within a tenth of the detector (standard deviations).
+        Seed of the starts: focal length within 5 %, principal point within a tenth of the detector (one standard
+        deviation).
     """
     rng = np.random.default_rng((seed, 11))
     nominal = cal.nominal

@@ -122,7 +122,7 @@ class Profile1D:
     Attributes
     ----------
     title, label : str
-        What they are held against, and the axis label with its unit.
+        Quantity that they are held against, and the axis label with its unit.
     names : tuple of str
         The two components.
     centres : (n,) array

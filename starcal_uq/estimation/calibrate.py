@@ -73,11 +73,11 @@ def calibrate(
     throw : bool
         Raise when the estimate is not good; otherwise `Calibration.status` says so, as long as there is an estimate.
     likelihood : {"marginal", "student_t"}
-        What the refinement maximises: Gaussian noise, or a Student t per star for tables with wrong identifications.
-        With ``student_t`` the stages see only stars whose angles agree with those of their frame, the refinement sees
-        all that can be in the field, `covariance` is the sandwich one, `information` the observed one, `sigma` the
-        scale of the t, `chi2` is summed with the stars' weights, and `compressed` is the Gaussian likelihood of the
-        reweighted stars.
+        Likelihood that the refinement maximises: Gaussian noise, or a Student t per star for tables with wrong
+        identifications. With ``student_t`` the stages see only stars whose angles agree with those of their frame, the
+        refinement sees all that can be in the field, `covariance` is the sandwich one, `information` the observed one,
+        `sigma` the scale of the t, `chi2` is summed with the stars' weights, and `compressed` is the Gaussian
+        likelihood of the reweighted stars.
     dof : float or "free", optional
         Degrees of freedom of ``student_t``, 2 to 200, by default 4; "free" estimates them, with the gamma prior of
         Juarez & Steel (2010) on what exceeds 2.

@@ -47,7 +47,7 @@ class Stage:
     seconds : float
         Wall time.
     sigmas : (n, p) array or None
-        Of a filter, the standard deviations that it claims after each frame, px units; zero where a parameter is not
+        Standard deviations that a filter claims after each frame, px units; zero where a parameter is not
         estimated.
     """
 

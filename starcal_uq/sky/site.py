@@ -118,7 +118,7 @@ class Site:
         Raises
         ------
         SiteError
-            As `load`.
+            For the reasons that `load` has.
         """
         return cls(**_SECTION.check(table, "site"))
 

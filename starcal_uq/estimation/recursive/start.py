@@ -141,7 +141,7 @@ class RecursionOptions:
         Covariance of the interstar angles of a frame: with the correlations of pairs that share a star, or, as in the
         historical filters, as if pairs were independent.
     parameters : {"optics", "all"}
-        What the recursion estimates: x0, y0 and f as in its source, or the distortion as well (``griffith`` only).
+        Parameters to estimate: x0, y0 and f as in its source, or the distortion as well (``griffith`` only).
     process_noise : float or tuple of float, optional
         ``samaan`` only: standard deviation of each parameter's random walk from frame to frame, px; needs a stated
         noise. One number stands for all three.
