@@ -81,7 +81,9 @@ def test_stated_noise_is_used():
         cal = sc.calibrate(obs, sc.paper.paper_start())
         errors.append(cal.theta - camera().theta)
         claimed.append(cal.sigmas)
-        unweighted.append(sc.calibrate(dataclasses.replace(obs, sigma_px=None), sc.paper.paper_start()).sigmas)
+        # These hardly change from seed to seed: ten give their mean.
+        if seed < 10:
+            unweighted.append(sc.calibrate(dataclasses.replace(obs, sigma_px=None), sc.paper.paper_start()).sigmas)
     assert (np.mean(claimed, axis=0) < 0.65 * np.mean(unweighted, axis=0)).all()
     ratio = np.std(errors, axis=0) / np.mean(claimed, axis=0)
     bound = 4.0 / np.sqrt(2 * 40)

@@ -572,6 +572,7 @@ def test_a_missing_image_is_left_out_once(stars, tmp_path):
     assert found.text == "0 of 1 frame is identified. Left out: 1 with fewer than four centroids."
 
 
+@pytest.mark.usefixtures("centroids_once")
 def test_rendered_images_shine_through_no_air(stars, tmp_path):
     sc.simulation.render_frames(stars, CAMERA, tmp_path, n_frames=6, seed=3, times_utc=["2026-11-25T00:00:00"] * 6)
     obs, _, _ = observations_from_images([tmp_path], NOMINAL, max_mag=6.5)
