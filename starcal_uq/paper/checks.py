@@ -31,20 +31,9 @@ YES, WITHIN_NOISE, NO = "yes", "within noise", "no"
 
 @dataclass(frozen=True)
 class PaperCheck:
-    """A printed statement, and what the paper's other numbers make of it.
+    """A printed statement, its place and text, what follows from the paper's other numbers, and whether it agrees.
 
-    Attributes
-    ----------
-    statement : str
-        In words, with the method's row.
-    place : str
-        Where it is printed.
-    text : str
-        As printed.
-    follows : str
-        What follows from the paper's other numbers.
-    agrees : str
-        ``yes``, ``within noise`` or ``no``.
+    `agrees` is ``yes``, ``within noise`` or ``no``.
     """
 
     statement: str
@@ -67,14 +56,8 @@ def printed_camera(truth: Camera, method: str, coefficients_from: str = "Table 2
 def paper_checks(truth: Camera, xy_px: FloatArray, sigmas: Mapping[str, Mapping[str, float]]) -> tuple[PaperCheck, ...]:
     """Every printed error and claim against the paper's own numbers.
 
-    Parameters
-    ----------
-    truth : Camera
-        The paper's Table 1.
-    xy_px : (N, 2) array
-        Where stars are seen, for errors that are means over stars.
-    sigmas : mapping
-        Method to parameter to standard deviation of one run, px units: what two runs may differ by.
+    `xy_px` (N, 2) is where stars are seen, for errors that are means over stars; `sigmas` are the standard deviations
+    of one run, px units, by method and parameter: what two runs may differ by.
     """
     return (
         *(_reprojection(truth, xy_px, method) for method in PAPER_METHODS),

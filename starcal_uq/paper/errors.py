@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -26,32 +26,16 @@ from starcal_uq.core.errors import DistortionError
 from starcal_uq.core.types import FloatArray
 
 _GRID = 33
-
-
 _FIXED_POINT_STEPS = 40
-
-
 Undistortion = Literal["model", "eq14", "eq14_measured", "eq6"]
-
-
 UNDISTORTIONS: tuple[Undistortion, ...] = ("model", "eq14", "eq14_measured", "eq6")
-
-
 Optics = Literal["truth", "focal", "estimate"]
-
-
 OPTICS: tuple[Optics, ...] = ("truth", "focal", "estimate")
 
 
 @dataclass(frozen=True)
 class PointErrors:
-    """Errors of points of the image.
-
-    Attributes
-    ----------
-    error_px : (N, 2) array
-        Estimated minus true, px.
-    """
+    """Errors of points of the image, estimated minus true, (N, 2) px."""
 
     error_px: FloatArray
 
@@ -59,11 +43,6 @@ class PointErrors:
     def rms_px(self) -> float:
         """Root mean square length, px: eq. 16, whose sum runs over points and not over coordinates."""
         return float(np.sqrt(np.mean(np.sum(self.error_px**2, axis=1))))
-
-    @property
-    def rms_per_axis_px(self) -> float:
-        """Root mean square of a coordinate, px."""
-        return float(np.sqrt(np.mean(self.error_px**2)))
 
     @property
     def max_px(self) -> float:
@@ -275,28 +254,12 @@ def reprojection_error_px(
     return PointErrors(corrected - offset - (truth if optics == "focal" else estimate).theta[:2])
 
 
-@dataclass(frozen=True)
-class ErrorReading:
+class ErrorReading(NamedTuple):
     """One way to compute an error of a calibrated camera in pixels.
 
-    Attributes
-    ----------
-    key : str
-        Short name, in tables.
-    words : str
-        In words.
-    faithful : bool
-        Whether the paper's text allows it.
-    undistortion, optics
-        As in `reprojection_error_px`; the undistortion ``crossed`` puts the coefficients into the other equation.
-    noisy : bool
-        With centroid noise.
-    rotated : bool
-        After the best rotation of the field instead (`map_error`).
-    per_axis : bool
-        Per coordinate instead of per star.
-    whole_field : bool
-        Over the detector instead of over the stars.
+    `faithful` says whether the paper's text allows it; undistortion and optics are as in `reprojection_error_px`, and
+    the undistortion ``crossed`` puts the coefficients into the other equation. Errors may be taken with centroid noise,
+    after the best rotation of the field, per coordinate instead of per star, or over the whole detector.
     """
 
     key: str
@@ -322,8 +285,6 @@ REPROJECTION = (
     ErrorReading("map", "best rotation removed", False, rotated=True),
     ErrorReading("map per axis", "best rotation removed, per coordinate", False, rotated=True, per_axis=True),
 )
-
-
 # Figs. 4 to 6: the largest. The text allows all of them.
 MAXIMUM = (
     ErrorReading("eq16 field", "eq. 16 over the detector", True, whole_field=True),
@@ -342,16 +303,7 @@ def point_errors(
 ) -> tuple[PointErrors, FloatArray]:
     """Errors of one reading, and the weights (n,) of the points, which sum to one.
 
-    Parameters
-    ----------
-    reading : ErrorReading
-        What to compute.
-    truth, estimate : Camera
-        The cameras.
-    xy_px : (N, 2) array
-        Where stars are seen without noise.
-    noise_px : (N, 2) array, optional
-        Their noise, for readings that have some; none is added without it.
+    Stars are seen at `xy_px` (N, 2) without noise; `noise_px` is added for readings that have some.
     """
     points, weight = np.asarray(xy_px, dtype=np.float64), np.full(len(xy_px), 1.0 / len(xy_px))
     if reading.whole_field:
@@ -363,14 +315,8 @@ def point_errors(
         how = "eq6" if truth.distortion == "brown" else "eq14"
     elif reading.undistortion == "eq14_measured" and truth.distortion == "brown":
         how = "eq14_measured"
-    found = reprojection_error_px(
-        truth,
-        estimate,
-        points,
-        noise_px=noise_px if reading.noisy else None,
-        undistortion=how,
-        optics=reading.optics,
-    )
+    noise = noise_px if reading.noisy else None
+    found = reprojection_error_px(truth, estimate, points, noise_px=noise, undistortion=how, optics=reading.optics)
     return found, weight
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -15,11 +14,11 @@ from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.table import Observations
 from starcal_uq.paper.camera import paper_camera, paper_start
-from starcal_uq.paper.errors import MapError, PointErrors, map_error, reprojection_error_px
+from starcal_uq.paper.errors import PointErrors, map_error, reprojection_error_px
 from starcal_uq.paper.methods import METHODS, Method
 from starcal_uq.paper.published import MAX_MAG, MIN_STARS, N_FRAMES, SIGMA_PX
 from starcal_uq.paper.replicates import crlb_sigmas
-from starcal_uq.simulation.frames import simulate
+from starcal_uq.simulation.frames import Campaign
 from starcal_uq.sky.catalogue import load_catalogue
 
 if TYPE_CHECKING:
@@ -38,13 +37,11 @@ class PaperRun:
     convention : str
         Equation of the paper that the simulated distortion follows.
     truth, start : Camera
-        What is simulated, and where every method starts.
+        Camera that is simulated, and the one from which every method starts.
     observations : Observations
-        The stars.
-    methods : tuple of Method
-        The methods.
-    calibrations : tuple of Calibration
-        Their results, in the same order.
+        Simulated stars.
+    methods, calibrations : tuple
+        Methods and their results.
     crlb : (p,) array
         Cramer-Rao bound on the standard deviations with all parameters and attitudes unknown, px units.
     noise_px : (N, 2) array
@@ -61,26 +58,12 @@ class PaperRun:
     noise_px: FloatArray
 
     def of(self, name: str) -> Calibration:
-        """The calibration of the first method with this name in `calibrate`.
-
-        Raises
-        ------
-        KeyError
-            When it was not run.
-        """
-        for method, calibration in zip(self.methods, self.calibrations, strict=True):
-            if method.method == name:
-                return calibration
-        raise KeyError(f"the method {name!r} was not run.")
+        """The calibration of the first method with this name in `calibrate`."""
+        return next(c for m, c in zip(self.methods, self.calibrations, strict=True) if m.method == name)
 
     def label(self, name: str) -> str:
         """The label of that method."""
         return next(method.label for method in self.methods if method.method == name)
-
-    def reprojection(self, calibration: Calibration, *, noisy: bool = False) -> PointErrors:
-        """The paper's eq. 16 at the places of the stars, without or with centroid noise."""
-        noise = self.noise_px if noisy else None
-        return reprojection_error_px(self.truth, calibration.camera, self.observations.xy, noise_px=noise)
 
     def errors(self) -> pd.DataFrame:
         """Errors of every method in px and arcsec, without and with noise.
@@ -105,15 +88,20 @@ class PaperRun:
 
         rows = []
         for method, calibration in zip(self.methods, self.calibrations, strict=True):
-            found, at_stars = self.reprojection(calibration), self._map(calibration, stars=True)
-            over_field = self._map(calibration)
+            xy = self.observations.xy
+            found, noisy = (
+                reprojection_error_px(self.truth, calibration.camera, xy, noise_px=noise)
+                for noise in (None, self.noise_px)
+            )
+            at_stars = map_error(self.truth, calibration.camera, xy)
+            over_field = map_error(self.truth, calibration.camera)
             pitch, yaw, roll = over_field.rotation_arcsec.tolist()
             rows.append(
                 {
                     "method": method.label,
                     "eq16_px": found.rms_px,
                     "eq16_max_px": found.max_px,
-                    "eq16_noisy_px": self.reprojection(calibration, noisy=True).rms_px,
+                    "eq16_noisy_px": noisy.rms_px,
                     "residual_px": PointErrors(calibration.residuals_px).rms_px,
                     "map_stars_px": at_stars.rms_px,
                     "map_px": over_field.rms_px,
@@ -127,29 +115,9 @@ class PaperRun:
             )
         return pd.DataFrame(rows)
 
-    def _map(self, calibration: Calibration, stars: bool = False) -> MapError:
-        return map_error(self.truth, calibration.camera, self.observations.xy if stars else None)
 
-
-def run_paper(
-    *,
-    convention: str = "eq14",
-    n_frames: int = N_FRAMES,
-    min_stars: int = MIN_STARS,
-    sigma_px: float = SIGMA_PX,
-    seed: int = 2017,
-    methods: Sequence[Method] = METHODS,
-) -> PaperRun:
-    """Run the paper's experiment once.
-
-    Parameters
-    ----------
-    convention : {"eq14", "eq6"}
-        As in `paper_camera`.
-    n_frames, min_stars, sigma_px, seed
-        As in `simulate`.
-    methods : sequence of Method
-        What to run.
+def run_paper(*, convention: str = "eq14", n_frames: int = N_FRAMES, seed: int = 2017) -> PaperRun:
+    """Run the paper's experiment once, with its noise and its least number of stars.
 
     Raises
     ------
@@ -157,17 +125,16 @@ def run_paper(
         When a method gives no good result.
     """
     truth, start = paper_camera(convention), paper_start(convention)
-    stars = load_catalogue(max_mag=MAX_MAG)
-    obs = simulate(stars, truth, n_frames=n_frames, min_stars=min_stars, sigma_px=sigma_px, seed=seed)
+    obs = Campaign(n_frames, MIN_STARS, SIGMA_PX, MAX_MAG).simulate(load_catalogue(max_mag=MAX_MAG), truth, seed)
     rng = np.random.default_rng((seed, _NOISE_STREAM))
     return PaperRun(
         convention=convention,
         truth=truth,
         start=start,
         observations=obs,
-        methods=tuple(methods),
+        methods=METHODS,
         # As tables, not as streams: the residuals of every method are wanted.
-        calibrations=tuple(calibrate(obs, start, method=m.method, recursion=m.recursion) for m in methods),
-        crlb=crlb_sigmas(StarFrames.from_observations(obs), truth, sigma_px),
-        noise_px=sigma_px * rng.standard_normal((obs.n_stars, 2)),
+        calibrations=tuple(calibrate(obs, start, method=m.method, recursion=m.recursion) for m in METHODS),
+        crlb=crlb_sigmas(StarFrames.from_observations(obs), truth, SIGMA_PX),
+        noise_px=SIGMA_PX * rng.standard_normal((obs.n_stars, 2)),
     )

@@ -19,7 +19,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -36,7 +36,7 @@ from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.paper.replicates import check_settings, crlb_sigmas
 from starcal_uq.paper.statistics import chi_interval
-from starcal_uq.simulation.frames import simulate
+from starcal_uq.simulation.frames import Campaign
 from starcal_uq.sky.catalogue import load_catalogue
 
 if TYPE_CHECKING:
@@ -68,20 +68,19 @@ _STATISTICS = (
 
 
 class Threshold(NamedTuple):
-    """Where along an axis a ratio of a method passes one.
+    """Where along an axis a ratio of a method passes one: |bias| over noise, or the error over the efficient method's.
 
     Attributes
     ----------
-    kind : str
-        ``bias``: |bias| over noise; ``rmse``: root mean square error over that of the efficient method.
+    kind : {"bias", "rmse"}
+        Ratio of bias and noise, or of root mean square errors.
     axis, method, parameter : str
-        What.
+        Axis, method and parameter.
     side : str
-        ``above`` or ``below`` the value the ratio exceeds one; ``always`` or ``never`` within the range.
-    value : float
-        In the unit of the axis (px at the corner, deg, frames, stars in a frame), interpolated; NaN if there is none.
-    low, high : float
-        Interval of `value` from the 95 % interval of the noise; for ``rmse`` NaN.
+        Side of the value on which the ratio exceeds one (``above``, ``below``), or ``always``, ``never``.
+    value, low, high : float
+        Place in the unit of the axis (px at the corner, deg, frames, stars in a frame), interpolated, and its interval
+        from the 95 % interval of the noise; NaN where there is none.
     """
 
     kind: str
@@ -172,12 +171,6 @@ class InteractionStudy(Shown):
                         found.append(Threshold("rmse", axis, method, parameter, side, value, np.nan, np.nan))
         return tuple(found)
 
-    def thresholds_table(self) -> pd.DataFrame:
-        """One row per threshold, columns as the attributes of `Threshold`."""
-        import pandas as pd
-
-        return pd.DataFrame(list(self.thresholds), columns=list(Threshold._fields))
-
     def threshold(self, axis: str, method: str, parameter: str, kind: str = "bias") -> Threshold:
         """One of `thresholds`."""
         for one in self.thresholds:
@@ -226,16 +219,10 @@ def crossing(at: FloatArray, ratio: FloatArray) -> tuple[str, float]:
     Interpolated between logarithms, linearly in `at` next to zero.
     """
     over = ratio >= 1.0
-    if over.all():
-        return "always", float("nan")
-    if not over.any():
-        return "never", float("nan")
-    if over[-1]:
-        i = int(np.flatnonzero(~over)[-1])
-        side = "above"
-    else:
-        i = int(np.flatnonzero(over)[-1])
-        side = "below"
+    if over.all() or not over.any():
+        return "always" if over.all() else "never", float("nan")
+    i = int(np.flatnonzero(over != over[-1])[-1])
+    side = "above" if over[-1] else "below"
     x, y = at[[i, i + 1]], ratio[[i, i + 1]]
     if x[0] > 0.0 and y.min() > 0.0:
         share = np.log(y[0]) / (np.log(y[0]) - np.log(y[1]))
@@ -246,23 +233,11 @@ def crossing(at: FloatArray, ratio: FloatArray) -> tuple[str, float]:
 
 @dataclass(frozen=True)
 class Condition:
-    """What is simulated.
-
-    Attributes
-    ----------
-    truth, start : Camera
-        What is simulated, and where every method starts.
-    n_frames, min_stars : int
-        As in `simulate`.
-    max_mag : float
-        Limiting magnitude.
-    """
+    """What is simulated, where every method starts, and how much data there is."""
 
     truth: Camera
     start: Camera
-    n_frames: int
-    min_stars: int
-    max_mag: float
+    campaign: Campaign
 
     @property
     def field_deg(self) -> float:
@@ -276,19 +251,8 @@ class Condition:
         return float(model.displacement(radius, 0.0, self.truth.coefficients)[0])
 
 
-@dataclass(frozen=True)
-class Point:
-    """A point of an axis.
-
-    Attributes
-    ----------
-    axis : str
-        ``distortion``, ``field``, ``frames`` or ``stars``.
-    value : float
-        Factor on the distortion, full field of view in deg, number of frames, or limiting magnitude.
-    condition : Condition
-        What is simulated there; the axes cross in one condition.
-    """
+class Point(NamedTuple):
+    """A point of an axis; `value` is a factor on the distortion, a field in deg, frames, or a limiting magnitude."""
 
     axis: str
     value: float
@@ -307,14 +271,17 @@ def study_points(
     return (
         *(Point("distortion", float(scale), _distorted(base, scale)) for scale in distortion_scales),
         *(Point("field", float(field), _with_field(base, field, sky)) for field in fields_deg),
-        *(Point("frames", float(k), dataclasses.replace(base, n_frames=int(k))) for k in frames),
+        *(Point("frames", float(k), _with_campaign(base, n_frames=int(k))) for k in frames),
         *(Point("stars", float(mag), _with_mag(base, mag, sky)) for mag in max_mags),
     )
 
 
+def _with_campaign(base: Condition, **changes: Any) -> Condition:
+    return dataclasses.replace(base, campaign=dataclasses.replace(base.campaign, **changes))
+
+
 def _distorted(base: Condition, scale: float) -> Condition:
-    coefficients = tuple(scale * k for k in base.truth.coefficients)
-    truth = base.truth.replace(coefficients=coefficients)
+    truth = base.truth.replace(coefficients=tuple(scale * k for k in base.truth.coefficients))
     return dataclasses.replace(base, truth=truth)
 
 
@@ -324,15 +291,15 @@ def _with_field(base: Condition, field_deg: float, sky: StarCatalogue) -> Condit
     if np.isclose(truth.focal_mm, base.truth.focal_mm, rtol=1e-6):
         return base
     start = base.start.replace(focal_mm=truth.focal_mm * base.start.focal_mm / base.truth.focal_mm)
-    n_stars = _count(sky, base.max_mag) * solid_angle_sr(base.truth) / solid_angle_sr(truth)
+    n_stars = _count(sky, base.campaign.max_mag) * solid_angle_sr(base.truth) / solid_angle_sr(truth)
     limit = float(np.sort(sky.mag)[round(n_stars) - 1])
-    return dataclasses.replace(base, truth=truth, start=start, max_mag=limit)
+    return _with_campaign(dataclasses.replace(base, truth=truth, start=start), max_mag=limit)
 
 
 def _with_mag(base: Condition, max_mag: float, sky: StarCatalogue) -> Condition:
     """Another magnitude limit; frames hold at least the same fraction of the mean number of stars."""
-    least = round(base.min_stars * _count(sky, max_mag) / _count(sky, base.max_mag))
-    return dataclasses.replace(base, max_mag=float(max_mag), min_stars=max(LEAST_STARS, least))
+    least = round(base.campaign.min_stars * _count(sky, max_mag) / _count(sky, base.campaign.max_mag))
+    return _with_campaign(base, max_mag=float(max_mag), min_stars=max(LEAST_STARS, least))
 
 
 def _focal_for(camera: Camera, field_deg: float) -> Camera:
@@ -367,30 +334,16 @@ def deep_catalogue(truth: Camera, max_mag: float, base_mag: float, fields_deg: S
     return sky
 
 
-@dataclass(frozen=True)
-class Plan:
+class Plan(NamedTuple):
     """What all tasks share; sent once to every process."""
 
     stars: StarCatalogue
     conditions: tuple[Condition, ...]
-    sigma_px: float
     seed: int
 
 
 class Outcome(NamedTuple):
-    """One replicate of one condition, for M methods and the three optical parameters.
-
-    Attributes
-    ----------
-    condition : int
-        Its number.
-    noise_free, noisy : (M, 3) arrays
-        Estimates minus truth, px; NaN where a method failed.
-    crlb : (3,) array
-        Cramer-Rao bound on the standard deviations of this design.
-    stars_per_frame : float
-        Mean number of stars.
-    """
+    """One replicate of one condition: estimates minus truth (methods, 3), bound (3,), px; NaN where a method failed."""
 
     condition: int
     noise_free: FloatArray
@@ -459,22 +412,21 @@ def interaction_study(
 
     truth = paper_camera() if truth is None else truth
     start = paper_start() if start is None else start
+    campaign = Campaign(n_frames, min_stars, sigma_px, max_mag)
     check_settings(
         (bool(truth.coefficients), "the truth has no distortion: give both the same model, with coefficients."),
+        (min_stars >= LEAST_STARS, f"min_stars is {min_stars}: give at least {LEAST_STARS}."),
         cameras=(truth, start),
         n_replicates=n_replicates,
-        n_frames=n_frames,
-        min_stars=min_stars,
-        least_stars=LEAST_STARS,
-        sigma_px=sigma_px,
+        campaign=campaign,
         workers=workers,
     )
     sky = deep_catalogue(truth, max([max_mag, *max_mags]), max_mag, fields_deg)
-    base = Condition(truth, start, n_frames, min_stars, max_mag)
+    base = Condition(truth, start, campaign)
     points = study_points(base, sky, distortion_scales, fields_deg, frames, max_mags)
     # Where the axes cross they share their data.
     conditions = tuple(dict.fromkeys(point.condition for point in points))
-    plan = Plan(sky, conditions, sigma_px, seed)
+    plan = Plan(sky, conditions, seed)
     outcomes, interrupted = run_tasks(
         partial(run_one, plan),
         n_replicates * len(conditions),
@@ -487,9 +439,8 @@ def interaction_study(
     for point in points:
         some = [outcome for outcome in outcomes if conditions[outcome.condition] == point.condition]
         if some:
-            rows += summary_rows(_head(point, some, sigma_px, seed), some)
-    settings: AnyDict = {"n_replicates": n_replicates, "n_frames": n_frames, "min_stars": min_stars}
-    settings |= {"sigma_px": sigma_px, "max_mag": max_mag}
+            rows += summary_rows(_head(point, some, seed), some)
+    settings: AnyDict = {"n_replicates": n_replicates, **dataclasses.asdict(campaign)}
     return InteractionStudy(pd.DataFrame(rows), interrupted, provenance(seed, settings, None))
 
 
@@ -500,23 +451,19 @@ def run_one(plan: Plan, index: int) -> Outcome:
     """
     replicate, number = divmod(index, len(plan.conditions))
     condition = plan.conditions[number]
+    campaign, sigma_px = condition.campaign, condition.campaign.sigma_px
     design, noise = np.random.SeedSequence(plan.seed, spawn_key=(replicate,)).spawn(2)
-    clean = simulate(
-        plan.stars.select(plan.stars.mag <= condition.max_mag),
-        condition.truth,
-        n_frames=condition.n_frames,
-        min_stars=condition.min_stars,
-        sigma_px=0.0,
-        seed=int(design.generate_state(1, np.uint64)[0]),
-    )
-    dx, dy = plan.sigma_px * np.random.default_rng(noise).standard_normal((clean.n_stars, 2)).T
+    stars = plan.stars.select(plan.stars.mag <= campaign.max_mag)
+    exact = dataclasses.replace(campaign, sigma_px=0.0)
+    clean = exact.simulate(stars, condition.truth, design.generate_state(1, np.uint64)[0])
+    dx, dy = sigma_px * np.random.default_rng(noise).standard_normal((clean.n_stars, 2)).T
     noisy = dataclasses.replace(clean, x_px=clean.x_px + dx, y_px=clean.y_px + dy)
     optics = condition.truth.theta[:3]
     return Outcome(
         condition=number,
-        noise_free=estimates(clean, condition.start, plan.sigma_px) - optics,
-        noisy=estimates(noisy, condition.start, plan.sigma_px) - optics,
-        crlb=crlb_sigmas(StarFrames.from_observations(clean), condition.truth, plan.sigma_px)[:3],
+        noise_free=estimates(clean, condition.start, sigma_px) - optics,
+        noisy=estimates(noisy, condition.start, sigma_px) - optics,
+        crlb=crlb_sigmas(StarFrames.from_observations(clean), condition.truth, sigma_px)[:3],
         stars_per_frame=clean.n_stars / clean.n_frames,
     )
 
@@ -534,7 +481,7 @@ def estimates(obs: Observations, start: Camera, sigma_px: float) -> FloatArray:
     return found
 
 
-def _head(point: Point, outcomes: Sequence[Outcome], sigma_px: float, seed: int) -> AnyDict:
+def _head(point: Point, outcomes: Sequence[Outcome], seed: int) -> AnyDict:
     """The columns that say what a row is about."""
     condition = point.condition
     return {
@@ -543,11 +490,11 @@ def _head(point: Point, outcomes: Sequence[Outcome], sigma_px: float, seed: int)
         "corner_px": condition.corner_px,
         "corner_size_px": abs(condition.corner_px),
         "field_deg": condition.field_deg,
-        "n_frames": condition.n_frames,
+        "n_frames": condition.campaign.n_frames,
         "stars_per_frame": float(np.mean([outcome.stars_per_frame for outcome in outcomes])),
-        "max_mag": condition.max_mag,
-        "min_stars": condition.min_stars,
-        "sigma_px": sigma_px,
+        "max_mag": condition.campaign.max_mag,
+        "min_stars": condition.campaign.min_stars,
+        "sigma_px": condition.campaign.sigma_px,
         "seed": seed,
     }
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,26 +40,21 @@ class Outcome(Enum):
     NOT_REPRODUCED = "does not come out"
 
 
-@dataclass(frozen=True)
-class Trial:
+class Trial(NamedTuple):
     """A printed number under one reading.
 
     Attributes
     ----------
-    reading : str
-        The reading, in words.
-    faithful : bool
-        Whether the paper's text allows it.
-    n : int
-        Draws.
-    mean, spread : float
-        Of the draws; of error sizes, the geometric mean and the standard deviation of the logarithm times it.
+    reading, faithful : str, bool
+        Reading in words, and whether the paper's text allows it.
+    n, mean, spread : int, float, float
+        Number of draws and what they are; of error sizes, the geometric mean and the spread of the logarithm times it.
     middle, scale : float
         Mean of the draws, and standard deviation of a new one, rounding included: of the logarithm for error sizes.
     z : float
         Distance of the printed number, in units of `scale`.
     noise_digits : int
-        How many of the printed digits are noise under this reading.
+        Number of printed digits that are noise under this reading.
     """
 
     reading: str
@@ -79,15 +75,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Judged:
-    """A printed number and every reading tried.
-
-    Attributes
-    ----------
-    printed : Printed
-        The number.
-    trials : tuple of Trial
-        The main reading first.
-    """
+    """A printed number and every reading tried, the main one first."""
 
     printed: Printed
     trials: tuple[Trial, ...]

@@ -50,11 +50,7 @@ class Method:
 
 
 METHODS = (
-    Method(
-        "least squares",
-        "optics by least squares on interstar angles, distortion ignored",
-        "least_squares",
-    ),
+    Method("least squares", "optics by least squares on interstar angles, distortion ignored", "least_squares"),
     Method(
         "samaan",
         "optics by a Kalman filter on interstar angles with their full covariance, distortion linearly afterwards",
@@ -72,10 +68,7 @@ METHODS = (
         "griffith",
     ),
     Method(
-        "griffith, all",
-        "the same for optics and distortion together",
-        "griffith",
-        RecursionOptions(parameters="all"),
+        "griffith, all", "the same for optics and distortion together", "griffith", RecursionOptions(parameters="all")
     ),
     Method(
         "three stages",

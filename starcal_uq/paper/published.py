@@ -19,19 +19,10 @@ ERROR_SIZES = ("reprojection_px", "max_residual_px", "y0_error_px")
 
 @dataclass(frozen=True)
 class Printed:
-    """A number of the paper.
+    """A number of the paper, as text, with its place.
 
-    Attributes
-    ----------
-    method : str
-        The method it belongs to, by its name in `calibrate`.
-    quantity : str
-        ``f_mm``, ``x0_px``, ``y0_px``, ``k1``, ``k2`` (px^-2, px^-4), ``reprojection_px``, ``max_residual_px`` or
-        ``y0_error_px``.
-    text : str
-        As printed.
-    place : str
-        Where.
+    The method is a name in `calibrate`; the quantity is ``f_mm``, ``x0_px``, ``y0_px``, ``k1``, ``k2`` (px^-2, px^-4),
+    ``reprojection_px``, ``max_residual_px`` or ``y0_error_px``.
     """
 
     method: str

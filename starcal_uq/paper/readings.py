@@ -10,46 +10,37 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.projection import unproject_jacobian
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.status import Status
 from starcal_uq.core.tasks import Progress, run_tasks
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.estimation.recursive.start import RecursionOptions
 from starcal_uq.estimation.stages import distortion_stage, joint_stage, optics_stage
 from starcal_uq.observations.frames import StarFrames
-from starcal_uq.paper.angles import fit_angles
 from starcal_uq.paper.camera import CONVENTIONS, paper_camera, paper_start
 from starcal_uq.paper.errors import MAXIMUM, REPROJECTION, error_sizes, undistorted
 from starcal_uq.paper.published import LEAST_SQUARES, MAX_MAG, N_FRAMES, N_STARS, PROPOSED, SAMAAN, Printed
-from starcal_uq.simulation.frames import simulate
+from starcal_uq.simulation.frames import Campaign
 from starcal_uq.sky.catalogue import load_catalogue
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from starcal_uq.observations.table import Observations
     from starcal_uq.sky.catalogue import StarCatalogue
 
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """Draws of every reading over seeds.
-
-    Attributes
-    ----------
-    keys : tuple of Key
-        What is drawn.
-    draws : (len(keys), n) array
-        Values in the units of `Printed.quantity`; NaN where a method gave no result.
-    """
+    """Draws (keys, n) of every reading over seeds, in the units of `Printed.quantity`; NaN where a method failed."""
 
     keys: tuple[Key, ...]
     draws: FloatArray
@@ -79,44 +70,20 @@ class Readings:
                     text = "; ".join(part for part in (reading.words, words) if part) or "as printed"
                     yield text, reading.faithful and allowed, draws
 
-    def to_dataframe(self) -> pd.DataFrame:
-        """One row per key: reading, method, quantity, error, n, mean, spread."""
-        import pandas as pd
-
-        rows = []
-        for key, values in zip(self.keys, self.draws, strict=True):
-            good = values[np.isfinite(values)]
-            spread = float(np.std(good, ddof=1)) if len(good) > 1 else np.nan
-            mean = float(np.mean(good)) if len(good) else np.nan
-            rows.append({**key._asdict(), "n": len(good), "mean": mean, "spread": spread})
-        return pd.DataFrame(rows)
-
 
 def run_readings(
     *,
     convention: str = "eq14",
     n_draws: int = 24,
     n_frames: int = N_FRAMES,
-    min_stars: int = 10,
-    sigma_px: float = 0.05,
     seed: int = 2017,
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> tuple[Readings, bool]:
-    """Repeat the experiment over seeds under every reading.
+    """Repeat the experiment over seeds under every reading; parameters as in `replicate`.
 
-    Parameters
-    ----------
-    convention : {"eq14", "eq6"}
-        The main reading of the distortion.
-    n_draws : int
-        Seeds.
-    n_frames, min_stars, sigma_px
-        As in `simulate`.
-    seed : int
-        Draw i depends on the seed and on i alone, and is none of the replicates of the same seed.
-    workers, progress
-        As in `replicate`.
+    `convention` is the main reading of the distortion. Draw i depends on the seed and on i alone, and is none of the
+    replicates of the same seed.
 
     Returns
     -------
@@ -133,7 +100,7 @@ def run_readings(
     stars = load_catalogue(max_mag=MAX_MAG)
     # As many as the paper's, by the embedded catalogue's band.
     sparse = stars.select(np.sort(np.argsort(stars.mag, kind="stable")[:N_STARS]))
-    plan = Plan(stars, sparse, convention, n_frames, min_stars, sigma_px, seed)
+    plan = Plan(stars, sparse, convention, Campaign(n_frames), seed)
     found, interrupted = run_tasks(
         partial(draw, plan), n_draws, caller="reproduce", chunk=1, workers=workers, progress=progress
     )
@@ -142,37 +109,18 @@ def run_readings(
 
 
 AS_PRINTED, OTHER_EQUATION, DIAGONAL = "as printed", "other equation", "diagonal"
-
-
 FEW_FRAMES = 100
-
-
 _PROCESS_NOISE_PX = 0.1
-
-
 _MAX_ITERATIONS = 200
-
-
 _SOLVER = "lm"
-
-
+_MAX_STEPS = 20
+_TOLERANCE_PX = 1e-7
 # An estimate of a method, None where it failed.
 Estimates = Mapping[str, Camera | None]
 
 
-@dataclass(frozen=True)
-class Reading:
-    """A reading of the experiment.
-
-    Attributes
-    ----------
-    key : str
-        Short name, in tables.
-    words : str
-        In words; empty for what is printed.
-    faithful : bool
-        Whether the paper's text allows it.
-    """
+class Reading(NamedTuple):
+    """A reading of the experiment: in words (empty for what is printed), and whether the paper's text allows it."""
 
     key: str
     words: str
@@ -204,32 +152,21 @@ class Key(NamedTuple):
     error: str
 
 
-@dataclass(frozen=True)
-class Plan:
+class Plan(NamedTuple):
     """What all draws share; sent once to every process."""
 
     stars: StarCatalogue
     sparse: StarCatalogue
     convention: str
-    n_frames: int
-    min_stars: int
-    sigma_px: float
+    campaign: Campaign
     seed: int
 
 
-@dataclass(frozen=True)
-class Scene:
+class Scene(NamedTuple):
     """One simulated data set.
 
-    Attributes
-    ----------
-    truth, start : Camera
-        What was simulated, and where every method starts.
-    obs : Observations
-        The stars.
-    noise_px : (N, 2) array
-        Centroid noise for the measures of error, which take the observed places for noise-free ones: it must not be
-        that of the observations, which moved these places already.
+    `noise_px` (N, 2) is for the measures of error, which take the observed places for noise-free ones: it must not be
+    the noise of the observations, which moved these places already.
     """
 
     truth: Camera
@@ -252,10 +189,8 @@ def draw(plan: Plan, index: int) -> dict[Key, float]:
         ("sparse sky", plan.convention, plan.sparse, seeds[2]),
     ):
         truth, start = paper_camera(convention), paper_start(convention)
-        obs = simulate(
-            stars, truth, n_frames=plan.n_frames, min_stars=plan.min_stars, sigma_px=plan.sigma_px, seed=seed
-        )
-        scene = Scene(truth, start, obs, plan.sigma_px * rng.standard_normal((obs.n_stars, 2)))
+        obs = plan.campaign.simulate(stars, truth, seed)
+        scene = Scene(truth, start, obs, plan.campaign.sigma_px * rng.standard_normal((obs.n_stars, 2)))
         printed = paper_methods(obs, start)
         found |= measured(scene, reading, printed)
         if reading == AS_PRINTED:
@@ -363,3 +298,41 @@ def measured(scene: Scene, reading: str, estimates: Estimates) -> dict[Key, floa
         for quantity, choice, value in error_sizes(scene.truth, camera, scene.obs.xy, scene.noise_px):
             found[Key(reading, method, quantity, choice.key)] = value
     return found
+
+
+def fit_angles(obs: Observations, model: str, start: FloatArray) -> FloatArray:
+    """Gauss-Newton on the differences of all angles between stars of a frame, all pairs alike; (p,) px units.
+
+    The paper's objective (its eqs. 5 and 13) compares cosines, whose errors are those of the angles times their sine:
+    wide pairs count most. An implementation that compares angles weighs all pairs alike, and, where distortion is
+    ignored, ends at another focal length. `start` (p,) is near enough for full steps, such as the solution for the
+    cosines.
+    """
+    i, j = _pairs(obs.frame_starts)
+    r = obs.directions_icrs
+    given = _angle(r[i], r[j])[0]
+    theta = np.asarray(start, dtype=np.float64)
+    for _ in range(_MAX_STEPS):
+        b, db = unproject_jacobian(model, theta, obs.xy)
+        angle, sine = _angle(b[i], b[j])
+        slope = -(np.einsum("ni,nip->np", b[j], db[i]) + np.einsum("ni,nip->np", b[i], db[j])) / sine[:, None]
+        scale = np.linalg.norm(slope, axis=0)
+        slope /= scale
+        step = np.linalg.solve(slope.T @ slope, slope.T @ (given - angle)) / scale
+        theta = theta + step
+        if float(np.max(np.abs(step[:3]))) < _TOLERANCE_PX:
+            break
+    return theta
+
+
+def _pairs(starts: IntArray) -> tuple[IntArray, IntArray]:
+    """Rows of the two stars of every pair within a frame."""
+    blocks = [np.stack(np.triu_indices(b - a, 1)) + a for a, b in pairwise(starts.tolist())]
+    i, j = np.concatenate(blocks, axis=1)
+    return i, j
+
+
+def _angle(a: FloatArray, b: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Angles between unit vectors (n, 3), rad, and their sines; both good for small angles."""
+    sine = np.linalg.norm(np.cross(a, b), axis=1)
+    return np.arctan2(sine, np.einsum("ni,ni->n", a, b)), sine

@@ -31,7 +31,7 @@ from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.paper.errors import map_error, reprojection_error_px
 from starcal_uq.paper.methods import METHODS, Method
 from starcal_uq.paper.statistics import FAMILY_LEVEL, classical_words, summarise, words
-from starcal_uq.simulation.frames import simulate
+from starcal_uq.simulation.frames import Campaign
 from starcal_uq.sky.catalogue import load_catalogue
 
 if TYPE_CHECKING:
@@ -211,17 +211,14 @@ class Replicates(Shown):
         return read(cls, path, _FORMAT, "a set of replicates", "run `starcal-uq reproduce` to write it")
 
 
-@dataclass(frozen=True)
-class Experiment:
+class Experiment(NamedTuple):
     """What all replicates share, as in `replicate`, and in how many slow methods take part; sent to every process."""
 
     stars: StarCatalogue
     methods: tuple[Method, ...]
     truth: Camera
     start: Camera
-    n_frames: int
-    min_stars: int
-    sigma_px: float
+    campaign: Campaign
     seed: int
     n_slow: int
 
@@ -292,20 +289,18 @@ def replicate(
     start = paper_start() if start is None else start
     labels = [method.label for method in methods]
     twice = sorted({label for label in labels if labels.count(label) > 1})
+    campaign = Campaign(n_frames, min_stars, sigma_px, max_mag)
     check_settings(
         (bool(methods), "there are no methods to compare: give at least one."),
         (not twice, f"several methods have the label {' and '.join(map(repr, twice))}: give each its own."),
         cameras=(truth, start),
         n_replicates=n_replicates,
-        n_frames=n_frames,
-        min_stars=min_stars,
-        least_stars=3,
-        sigma_px=sigma_px,
+        campaign=campaign,
         workers=workers,
     )
     sky = load_catalogue(max_mag=max_mag) if stars is None else stars
     n_slow = max(_LEAST, n_replicates // SHARE) if share_slow else n_replicates
-    experiment = Experiment(sky, methods, truth, start, n_frames, min_stars, sigma_px, seed, n_slow)
+    experiment = Experiment(sky, methods, truth, start, campaign, seed, n_slow)
     outcomes, interrupted = run_tasks(
         partial(run_replicate, experiment),
         n_replicates,
@@ -319,8 +314,7 @@ def replicate(
     for method, values, reasons in zip(methods, arrays["estimates"], failures, strict=True):
         if not np.isfinite(values[:, 0]).any():
             raise CalibrationError(f"the method {method.label!r} never gave a result; first reason: {reasons[0]}")
-    settings: AnyDict = {"n_replicates": n_replicates, "n_frames": n_frames, "min_stars": min_stars}
-    settings |= {"sigma_px": sigma_px, "max_mag": max_mag, "stars": "embedded" if stars is None else stars.source}
+    settings: AnyDict = {"n_replicates": n_replicates, **campaign.settings(stars)}
     return Replicates(
         methods=methods,
         truth=truth,
@@ -337,10 +331,7 @@ def check_settings(
     *others: tuple[bool, str],
     cameras: tuple[Camera, Camera],
     n_replicates: int,
-    n_frames: int,
-    min_stars: int,
-    least_stars: int,
-    sigma_px: float,
+    campaign: Campaign,
     workers: int | None,
 ) -> None:
     """Refuse settings of a study over seeds that cannot work; `others` are conditions and what to say without them.
@@ -358,13 +349,11 @@ def check_settings(
             f"the truth has distortion {models[0]!r} and the start {models[1]!r}: give both the same model.",
         ),
         (n_replicates >= 2, f"n_replicates is {n_replicates}: a spread needs at least 2."),
-        (n_frames >= 1, f"n_frames is {n_frames}: give at least 1."),
-        (min_stars >= least_stars, f"min_stars is {min_stars}: give at least {least_stars}."),
-        (0.0 < sigma_px < np.inf, f"sigma_px is {sigma_px:g}: give a noise above zero."),
         (workers is None or workers >= 0, f"workers is {workers}: give at least 1, or 0 for this process."),
     ):
         if not good:
             raise SamplingError(text)
+    campaign.check(SamplingError)
 
 
 def run_replicate(experiment: Experiment, index: int) -> AnyDict:
@@ -374,14 +363,7 @@ def run_replicate(experiment: Experiment, index: int) -> AnyDict:
     """
     noise = np.random.SeedSequence(experiment.seed, spawn_key=(index,))
     truth = experiment.truth
-    obs = simulate(
-        experiment.stars,
-        truth,
-        n_frames=experiment.n_frames,
-        min_stars=experiment.min_stars,
-        sigma_px=experiment.sigma_px,
-        seed=int(noise.generate_state(1, np.uint64)[0]),
-    )
+    obs = experiment.campaign.simulate(experiment.stars, truth, noise.generate_state(1, np.uint64)[0])
     frames = StarFrames.from_observations(obs)
     p, m = len(truth.theta), len(experiment.methods)
     estimates, claimed, classical = (np.full((m, p), np.nan) for _ in range(3))
@@ -397,7 +379,7 @@ def run_replicate(experiment: Experiment, index: int) -> AnyDict:
         q = len(solved.sigmas)
         estimates[i, :q], claimed[i, :q], classical[i, :q] = solved.theta, solved.sigmas, solved.classical
         errors[:, i] = field_errors(truth, solved.camera)
-    crlb = crlb_sigmas(frames, truth, experiment.sigma_px)
+    crlb = crlb_sigmas(frames, truth, experiment.campaign.sigma_px)
     arrays = (estimates, claimed, classical, *errors)
     found: AnyDict = {"replicate": index, "crlb": crlb, "failures": tuple(failures)}
     return found | dict(zip(_BY_METHOD, arrays, strict=True))

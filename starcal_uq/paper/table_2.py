@@ -59,20 +59,10 @@ def _replicated(replicates: Replicates, index: int, quantity: str) -> FloatArray
 
 @dataclass(frozen=True)
 class RowTest:
-    """Whether the parameters of one printed row can be one draw, all taken together.
+    """Whether the p parameters of one printed row can be one draw, all taken together, by n replicates.
 
-    Attributes
-    ----------
-    method : str
-        Of the row.
-    place : str
-        Where it is printed.
-    n, p : int
-        Replicates and parameters.
-    t2 : float
-        Hotelling's T^2 of the row as a new draw, with the variance of rounding.
-    p_value : float
-        From its F distribution.
+    `t2` is Hotelling's T^2 of the row as a new draw, with the variance of rounding; `p_value` is from its F
+    distribution.
     """
 
     method: str
@@ -151,9 +141,8 @@ def published_frame(judged: tuple[Judged, ...]) -> pd.DataFrame:
 
     rows = []
     for one in judged:
-        main, best, number = one.main, one.best, one.printed
-        row: AnyDict = {"place": number.place, "method": number.method, "quantity": number.quantity}
-        row |= {"printed": number.text, "outcome": one.outcome.value, "noise_digits": one.noise_digits}
+        main, best = one.main, one.best
+        row = _place(one.printed) | {"outcome": one.outcome.value, "noise_digits": one.noise_digits}
         row |= {"n_readings": len(one.trials), "by_chance": one.by_chance}
         row |= {f"main_{name}": getattr(main, name) for name in ("mean", "spread", "n", "z")}
         row |= {f"best_{name}": getattr(best, name) for name in ("reading", "mean", "spread", "n", "z", "faithful")}
@@ -165,25 +154,15 @@ def trials_frame(judged: tuple[Judged, ...]) -> pd.DataFrame:
     """One row per printed number and reading: what was tried, in the units of the printed number."""
     import pandas as pd
 
+    names = ("reading", "faithful", "n", "mean", "spread", "z", "accepted")
     return pd.DataFrame(
-        [
-            {
-                "place": one.printed.place,
-                "method": one.printed.method,
-                "quantity": one.printed.quantity,
-                "printed": one.printed.text,
-                "reading": t.reading,
-                "faithful": t.faithful,
-                "n": t.n,
-                "mean": t.mean,
-                "spread": t.spread,
-                "z": t.z,
-                "accepted": t.accepted,
-            }
-            for one in judged
-            for t in one.trials
-        ]
+        [_place(one.printed) | {name: getattr(t, name) for name in names} for one in judged for t in one.trials]
     )
+
+
+def _place(number: Printed) -> AnyDict:
+    row = {name: getattr(number, name) for name in ("place", "method", "quantity")}
+    return row | {"printed": number.text}
 
 
 def table_2(run: PaperRun, replicates: Replicates, readings: Readings, judged: tuple[Judged, ...]) -> pd.DataFrame:

@@ -163,16 +163,26 @@ def test_ctrl_c_leaves_nothing(tmp_path) -> None:
     assert not (tmp_path / "out").exists()
 
 
+# A small experiment for the tests, smaller than users are let: its parts are those of a large one.
+SMALL = {"n_frames": 10, "n_calibration_frames": 12, "n_replicates": 20}
+
+
 @pytest.fixture(scope="module")
-def small(tmp_path_factory):
+def small_sizes():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("starcal_uq.paper.field.experiment._LEAST", 10)
+        patch.setattr("starcal_uq.paper.field.experiment.TOLERANCES_PX", (0.1, 0.5, 2.0))
+        yield
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory, small_sizes):
     seen: list[int] = []
     found = field_experiment(
         tmp_path_factory.mktemp("field") / "out",
-        n_frames=20,
-        n_calibration_frames=20,
-        n_replicates=20,
         workers=0,
         progress=lambda done, total: seen.append(100 * done // total),
+        **SMALL,
     )
     return found, seen
 
@@ -186,7 +196,7 @@ def test_writes_report_and_tables(small) -> None:
     assert "http" not in page and "<script" not in page and not re.search(r"\b(nan|None)\b", page)
     assert "127.2" in page and found.text.split(".")[0] in page
     assert seen == sorted(seen) and seen[-1] == 100
-    assert len(pd.read_csv(found.path / "frames.csv")) == 20 * len(FIELD_CAMERAS)
+    assert len(pd.read_csv(found.path / "frames.csv")) == SMALL["n_frames"] * len(FIELD_CAMERAS)
     assert found.provenance["seed"] == 2017 and found.provenance["settings"]["reading"] == "window"
 
 
@@ -212,7 +222,7 @@ def test_control_has_noise_alone(small) -> None:
 @pytest.mark.slow
 def test_does_not_depend_on_processes(small, tmp_path) -> None:
     found = small[0]
-    again = field_experiment(tmp_path / "out", n_frames=20, n_calibration_frames=20, n_replicates=20, workers=2)
+    again = field_experiment(tmp_path / "out", workers=2, **SMALL)
     for name in ("table_3", "rates", "parts", "frames", "cameras"):
         assert (found.path / f"{name}.csv").read_bytes() == (again.path / f"{name}.csv").read_bytes()
 

@@ -24,6 +24,7 @@ from starcal_uq.paper.interaction import (
     solid_angle_sr,
     study_points,
 )
+from starcal_uq.simulation.frames import Campaign
 from tests.helpers.scenes import camera, observations
 
 SMALL = {
@@ -69,7 +70,7 @@ def points(**changes):
     truth, start = sc.paper.paper_camera(), sc.paper.paper_start()
     fields = (5.0, 10.0, 40.0)
     sky = deep_catalogue(truth, 7.0, 6.0, fields)
-    base = Condition(truth, start, 100, 10, 6.0)
+    base = Condition(truth, start, Campaign(100, 10, 0.05, 6.0))
     return sky, base, study_points(base, sky, (0.0, 1.0, 60.0), fields, (10, 100), (5.0, 6.0, 7.0))
 
 
@@ -86,12 +87,12 @@ def test_each_axis_varies_what_it_says_and_nothing_else():
         if point.axis != "distortion":
             assert c.corner_px == pytest.approx(base.corner_px, rel=1e-12)
         if point.axis != "frames":
-            assert c.n_frames == 100
+            assert c.campaign.n_frames == 100
         if point.axis == "field":
             assert c.field_deg == pytest.approx(point.value)
             assert (c.truth.width_px, c.truth.pixel_um) == (1024, 12.0)
             # As many stars on average.
-            density = np.sum(sky.mag <= c.max_mag) * solid_angle_sr(c.truth)
+            density = np.sum(sky.mag <= c.campaign.max_mag) * solid_angle_sr(c.truth)
             assert density == pytest.approx(np.sum(sky.mag <= 6.0) * solid_angle_sr(base.truth), rel=2e-3)
             assert c.start.focal_mm / c.truth.focal_mm == pytest.approx(72.0 / 70.2262)
         else:
@@ -102,7 +103,7 @@ def test_each_axis_varies_what_it_says_and_nothing_else():
     r = np.hypot(523.5, 530.5)
     assert corner[1.0] == pytest.approx(2e-10 * r**3 - 3.5e-15 * r**5)
     assert corner[60.0] == pytest.approx(60.0 * corner[1.0])
-    least = [p.condition.min_stars for p in found if p.axis == "stars"]
+    least = [p.condition.campaign.min_stars for p in found if p.axis == "stars"]
     assert least == sorted(least) and least[1] == 10
 
 

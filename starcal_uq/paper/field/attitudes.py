@@ -46,13 +46,13 @@ class FieldStars:
     Attributes
     ----------
     xy_px, true_px : (m, 2) array
-        Measured, and where the stars truly are.
+        Places measured, and true ones.
     directions : (m, 3) array
-        Of the catalogue.
+        Directions of the catalogue.
     sigma_px : (m,) array
         Stated noise, px per axis.
     starts : (k + 1,) array of int
-        Where the stars of each frame begin, and their number.
+        First star of each frame, and the number of stars.
     quaternions : (k, 4) array
         True attitudes.
     """
@@ -92,15 +92,7 @@ class FieldStars:
 
 @dataclass(frozen=True, eq=False)
 class AttitudeErrors:
-    """Attitude errors of k frames with one camera, arcsec; columns pitch, yaw, roll.
-
-    Attributes
-    ----------
-    total : (k, 3) array
-        Estimated against true attitude.
-    camera : (k, 3) array
-        The same without noise.
-    """
+    """Attitude errors (k, 3) of frames with one camera, and without noise, arcsec; columns pitch, yaw, roll."""
 
     total: FloatArray
     camera: FloatArray
@@ -183,13 +175,9 @@ def _rms(error: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class FieldReplicates:
-    """Errors over repetitions.
+    """Errors (n, 3) over repetitions by camera and part, arcsec, columns pitch, yaw, roll.
 
-    Attributes
-    ----------
-    draws : dict
-        Camera name -> part -> (n, 3) array, arcsec, columns pitch, yaw, roll. The common rotation has its sign. A
-        repetition in which a method failed is missing from its arrays.
+    The common rotation has its sign. A repetition in which a method failed is missing from its arrays.
     """
 
     draws: Mapping[str, Mapping[str, FloatArray]]

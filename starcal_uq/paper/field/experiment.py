@@ -9,7 +9,6 @@ import numpy as np
 
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.files import PathLike, atomic_write_text, check_new_folder
-from starcal_uq.core.formatting import plural
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibrate import calibrate
@@ -113,12 +112,18 @@ def field_experiment(
         After Ctrl-C; nothing is written then.
     """
     check_new_folder(out, force)
-    sensor = _check(reading, n_frames, n_calibration_frames, n_replicates)
+    if reading not in READINGS:
+        raise CalibrationError(f"reading {reading!r} of the field unit is unknown: use one of {', '.join(READINGS)}.")
+    sizes = {"n_frames": n_frames, "n_calibration_frames": n_calibration_frames, "n_replicates": n_replicates}
+    for name, number in sizes.items():
+        if number < _LEAST:
+            raise CalibrationError(f"{name} is {number}: the field experiment needs at least {_LEAST}.")
+    sensor = READINGS[reading]
     bar = Bar(progress, _SHARES)
     stars = load_catalogue(max_mag=sensor.limit_mag + _CATALOGUE_MORE_MAG)
     taken = take_frames(sensor, n_calibration_frames + n_frames, seed, workers, bar.part("frames"))
     campaign, frames = taken.part(0, n_calibration_frames), taken.part(n_calibration_frames, len(taken.rotations))
-    found, words = _campaign(campaign, sensor, stars)
+    found, counts = _campaign(campaign, sensor, stars)
     calibrations = {name: calibrate(found.observations, sensor.nominal(), method=name) for name in PAPER_METHODS}
     cameras = {
         UNCALIBRATED: sensor.nominal().replace(distortion="none"),
@@ -160,7 +165,7 @@ def field_experiment(
         frames=frames,
         calibrations=calibrations,
         cameras=cameras,
-        campaign_words=words,
+        campaign_counts=counts,
         sweep=sweep,
         data_sheets=data_sheets,
         stars=tests,
@@ -176,18 +181,10 @@ def field_experiment(
     return experiment
 
 
-def _check(reading: str, n_frames: int, n_calibration_frames: int, n_replicates: int) -> FieldReading:
-    if reading not in READINGS:
-        raise CalibrationError(f"reading {reading!r} of the field unit is unknown: use one of {', '.join(READINGS)}.")
-    sizes = {"n_frames": n_frames, "n_calibration_frames": n_calibration_frames, "n_replicates": n_replicates}
-    for name, number in sizes.items():
-        if number < _LEAST:
-            raise CalibrationError(f"{name} is {number}: the field experiment needs at least {_LEAST}.")
-    return READINGS[reading]
-
-
-def _campaign(frames: FieldFrames, reading: FieldReading, stars: StarCatalogue) -> tuple[ImageCalibration, str]:
-    """Identify the frames of the calibration from the data sheet; and what became of them, in words."""
+def _campaign(
+    frames: FieldFrames, reading: FieldReading, stars: StarCatalogue
+) -> tuple[ImageCalibration, dict[str, int]]:
+    """Identify the frames of the calibration from the data sheet; and how many of them it is."""
     nominal, width_px = reading.nominal(), reading.sensor.psf_sigma_px
 
     def prepare(obs: Observations) -> Observations:
@@ -198,12 +195,8 @@ def _campaign(frames: FieldFrames, reading: FieldReading, stars: StarCatalogue) 
     obs = found.observations
     place = _true_campaign(frames, obs, reading.truth)
     wrong = int(np.sum(np.hypot(obs.x_px - place[:, 0], obs.y_px - place[:, 1]) > WRONG_PX))
-    n = len(frames.rotations)
-    words = (
-        f"{found.identification.n_identified} of {plural(n, 'frame')} of the calibration are identified from the data "
-        f"sheet; {plural(obs.n_stars, 'star')} are calibrated, {wrong if wrong else 'none'} of them wrong."
-    )
-    return found, words
+    counts = {"frames": len(frames.rotations), "identified": found.identification.n_identified}
+    return found, counts | {"stars": obs.n_stars, "wrong": wrong}
 
 
 def _true_campaign(frames: FieldFrames, obs: Observations, truth: Camera) -> FloatArray:

@@ -36,16 +36,9 @@ _CHUNK = 8
 
 @dataclass(frozen=True, eq=False)
 class FieldFrames:
-    """Frames with more than six stars.
+    """Centroids of frames 0 .. n - 1 with more than six stars, true R_cam_icrs (n, 3, 3), and how rare such frames are.
 
-    Attributes
-    ----------
-    centroids : Centroids
-        Stars found in frames 0 .. n - 1.
-    rotations : (n, 3, 3) array
-        True R_cam_icrs.
-    share : float
-        Part of random attitudes that gave such a frame.
+    `share` is the part of random attitudes that gave one.
     """
 
     centroids: Centroids

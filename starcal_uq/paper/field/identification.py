@@ -33,16 +33,8 @@ WRONG_PX = 3.0
 class FieldIdentification:
     """Every frame identified with one camera and one tolerance.
 
-    Attributes
-    ----------
-    camera : Camera
-        The camera.
-    tolerance_px : float
-        The tolerance.
-    frame, row, star : (m,) array of int
-        Of every star named: its frame, its row in the table of centroids and in the catalogue.
-    correct, wrong : (n,) array of bool
-        Frames with an attitude and no wrong star; with one.
+    Of each of m stars that were named there is its frame, its row in the table of centroids and in the catalogue;
+    `correct` and `wrong` (n,) mark frames with an attitude and no wrong star, and with one.
     """
 
     camera: Camera

@@ -49,11 +49,10 @@ class FieldReading:
     Attributes
     ----------
     name, words : str
-        Its name here, and what it says.
-    side_px : int
-        Pixels that are read out, per side.
-    offset_px : int
-        First of them on the detector: a pixel coordinate of the paper is ours plus this.
+        Name and what it says.
+    side_px, offset_px : int
+        Pixels that are read out, per side, and the first of them on the detector: a pixel coordinate of the paper is
+        ours plus this.
     limit_mag : float
         Magnitude (Gaia G) of stars of which half are found. It makes about a third of random attitudes show more than
         six stars, as many as were chosen of the paper's frames, 200 of 600.
@@ -129,12 +128,7 @@ def printed_sensor(reading: FieldReading) -> tuple[tuple[str, str, bool, str], .
         ("pixel", f"{PIXEL_UM} µm", True, "as printed"),
         ("focal length", f"{FOCAL_MM} mm", True, "as printed"),
         ("principal point", f"({X0_PX}, {Y0_PX}) px", True, f"{x:.1f} and {y:.1f} px off the centre of the detector"),
-        (
-            "distortion",
-            "k₁ = −3.7·10⁻⁹, k₂ = 3.93·10⁻¹⁶",
-            True,
-            "px⁻² and px⁻⁴, by eq. 14; monotonic over the field",
-        ),
+        ("distortion", "k₁ = −3.7·10⁻⁹, k₂ = 3.93·10⁻¹⁶", True, "px⁻² and px⁻⁴, by eq. 14; monotonic over the field"),
     )
 
 

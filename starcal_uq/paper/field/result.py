@@ -15,6 +15,7 @@ from starcal_uq.core.types import AnyDict
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.maths.intervals import wilson_interval
 from starcal_uq.paper.field.attitudes import (
+    PARTS,
     SOURCES,
     AttitudeErrors,
     FieldReplicates,
@@ -42,30 +43,24 @@ class FieldExperiment(Shown):
     path : Path
         Folder of the report, the tables and the figures.
     reading : FieldReading
-        How the printed sensor is read.
+        Reading of the printed sensor.
     tolerance_px : float
         Tolerance of the identification in the main table.
-    campaign : FieldFrames
-        Frames of the calibration.
-    frames : FieldFrames
-        Frames of the test.
-    calibrations : mapping
-        Method to `Calibration`.
-    cameras : mapping
-        Name of each camera to it: ``uncalibrated``, the three methods, ``truth``.
-    campaign_words : str
-        What became of the campaign's identification.
+    campaign, frames : FieldFrames
+        Frames of the calibration, and of the test.
+    campaign_counts : mapping of str to int
+        Frames of the calibration, those ``identified``, and the ``stars`` of these, of which so many are ``wrong``.
+    calibrations, cameras : mapping
+        Calibration of each method; each camera by its name: ``uncalibrated``, the three methods, ``truth``.
     sweep : mapping
-        (camera name, tolerance in px) to its `FieldIdentification`.
+        Identifications by camera and tolerance in px.
     data_sheets : mapping
-        Nominal focal length (mm) to the `FieldIdentification` and the `AttitudeErrors` of a camera with it, at the
-        tolerance of the main table; no errors where no frame was identified.
-    stars : mapping
-        Camera name to the stars identified with it, in the main table's frames.
-    errors : mapping
-        Camera name to its `AttitudeErrors`.
+        Identification and attitude errors of a camera with another nominal focal length (mm), at the tolerance of the
+        main table; no errors where no frame was identified.
+    stars, errors : mapping
+        Stars identified with each camera in the main table's frames, and the attitude errors.
     replicates : FieldReplicates
-        The errors over repetitions.
+        Errors over repetitions.
     provenance : dict
         Seed, settings, versions, time and hash of the campaign.
     """
@@ -77,7 +72,7 @@ class FieldExperiment(Shown):
     frames: FieldFrames
     calibrations: Mapping[str, Calibration]
     cameras: Mapping[str, Camera]
-    campaign_words: str
+    campaign_counts: Mapping[str, int]
     sweep: Mapping[tuple[str, float], FieldIdentification]
     data_sheets: Mapping[float, tuple[FieldIdentification, AttitudeErrors | None]]
     stars: Mapping[str, FieldStars]
@@ -115,15 +110,10 @@ class FieldExperiment(Shown):
         number = printed_field(method, quantity)
         row: AnyDict = {"method": method, "quantity": quantity, "printed": number.text}
         if quantity == RATE:
-            found = self.identified(method)
-            low, high = (100.0 * end for end in wilson_interval(int(found.correct.sum()), found.n_frames))
-            agrees = AS_IT_STANDS if _within(number.value, low, high) else NEITHER
-            return row | {
-                "ours": 100.0 * float(np.mean(found.correct)),
-                "low": low,
-                "high": high,
-                "agrees": "yes" if agrees == AS_IT_STANDS else NEITHER,
-            }
+            counts = _counts(self.identified(method))
+            rate, low, high = (100.0 * counts[name] for name in ("rate", "low", "high"))
+            agrees = "yes" if low <= number.value <= high else NEITHER
+            return row | {"ours": rate, "low": low, "high": high, "agrees": agrees}
         if method not in self.errors:
             return row | {"agrees": NEITHER}
         axis, errors = AXES.index(quantity), self.errors[method]
@@ -134,19 +124,20 @@ class FieldExperiment(Shown):
             row[f"{prefix}low"], row[f"{prefix}high"] = float(low3[axis]), float(high3[axis])
         for part in ("common", "rest", "noise"):
             row[part] = float(getattr(errors, part)[axis])
-        stands = _within(number.value, row["low"], row["high"])
-        aligned = _within(number.value, row["aligned_low"], row["aligned_high"])
-        outcome = {(True, True): BOTH, (True, False): AS_IT_STANDS, (False, True): ALIGNED, (False, False): NEITHER}
-        return row | {"agrees": outcome[stands, aligned]}
+        stands = row["low"] <= number.value <= row["high"]
+        aligned = row["aligned_low"] <= number.value <= row["aligned_high"]
+        return row | {"agrees": (BOTH if aligned else AS_IT_STANDS) if stands else ALIGNED if aligned else NEITHER}
 
     def rates(self) -> pd.DataFrame:
         """Identification against tolerance: camera, tolerance_px, n_frames, correct, wrong, rate, low, high."""
         import pandas as pd
 
-        rows = []
-        for (camera, tolerance), found in self.sweep.items():
-            rows.append({"camera": camera, "tolerance_px": tolerance, **_counts(found)})
-        return pd.DataFrame(rows)
+        return pd.DataFrame(
+            [
+                {"camera": camera, "tolerance_px": tolerance, **_counts(found)}
+                for (camera, tolerance), found in self.sweep.items()
+            ]
+        )
 
     def parts(self) -> pd.DataFrame:
         """What the errors consist of: a row for each camera and axis, arcsec.
@@ -161,7 +152,7 @@ class FieldExperiment(Shown):
             for index, axis in enumerate(AXES):
                 row: AnyDict = {"camera": camera, "axis": axis.removesuffix("_arcsec")}
                 row["sum_of_squares"] = float(errors.sum_of_squares[index])
-                for part in ("rms", "aligned", "common", "rest", "noise"):
+                for part in PARTS:
                     low, high = self.replicates.interval(camera, part)
                     row[part] = float(getattr(errors, part)[index])
                     row[f"{part}_low"], row[f"{part}_high"] = float(low[index]), float(high[index])
@@ -176,21 +167,13 @@ class FieldExperiment(Shown):
         import pandas as pd
 
         rows = []
-        truth = self.reading.truth
         for camera, stars in self.stars.items():
-            faults = single_faults(truth, self.cameras[camera])
+            faults = single_faults(self.reading.truth, self.cameras[camera])
             for source in SOURCES:
                 errors = attitude_errors(stars, faults[source])
-                for index, axis in enumerate(AXES):
-                    rows.append(
-                        {
-                            "camera": camera,
-                            "source": source,
-                            "axis": axis.removesuffix("_arcsec"),
-                            "common": float(errors.common[index]),
-                            "rest": float(errors.rest[index]),
-                        }
-                    )
+                for axis, common, rest in zip(AXES, errors.common.tolist(), errors.rest.tolist(), strict=True):
+                    row = {"camera": camera, "source": source, "axis": axis.removesuffix("_arcsec")}
+                    rows.append(row | {"common": common, "rest": rest})
         return pd.DataFrame(rows)
 
     def other_data_sheets(self) -> pd.DataFrame:
@@ -255,15 +238,5 @@ class FieldExperiment(Shown):
 def _counts(found: FieldIdentification) -> AnyDict:
     correct = int(found.correct.sum())
     low, high = wilson_interval(correct, found.n_frames)
-    return {
-        "n_frames": found.n_frames,
-        "correct": correct,
-        "wrong": int(found.wrong.sum()),
-        "rate": correct / found.n_frames,
-        "low": low,
-        "high": high,
-    }
-
-
-def _within(value: float, low: float, high: float) -> bool:
-    return bool(low <= value <= high)
+    counts = {"n_frames": found.n_frames, "correct": correct, "wrong": int(found.wrong.sum())}
+    return counts | {"rate": correct / found.n_frames, "low": low, "high": high}

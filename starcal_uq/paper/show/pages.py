@@ -120,6 +120,7 @@ def reproduction_page(found: Reproduction, figures: Mapping[str, bytes]) -> str:
 
 def field_page(found: FieldExperiment, figures: Mapping[str, bytes]) -> str:
     """The report; `figures` are PNG images by the names of `field_figures`."""
+    counts = found.campaign_counts
     noise = significant(found.stars[TRUE_CAMERA].noise_scale, 3)
     sections = [
         Section("Table 3", (field.table_3(found),)),
@@ -141,7 +142,9 @@ def field_page(found: FieldExperiment, figures: Mapping[str, bytes]) -> str:
         Section(
             "The cameras",
             (field.cameras(found),),
-            f"{found.campaign_words} Their noise is {noise} times what is stated.",
+            f"{counts['identified']} of {plural(counts['frames'], 'frame')} of the calibration are identified from the "
+            f"data sheet, with {plural(counts['stars'], 'star')}, {counts['wrong']} of them wrong, and {noise} times the "
+            "noise that is stated.",
         ),
         Section(
             "The sensor",
