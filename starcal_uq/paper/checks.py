@@ -142,15 +142,11 @@ def _ratios() -> tuple[PaperCheck, ...]:
     for quantity, what in (("max_residual_px", "largest residuals"), ("reprojection_px", "reprojection errors")):
         best = printed(PROPOSED, quantity).value
         ratios = [printed(method, quantity).value / best for method in (LEAST_SQUARES, SAMAAN)]
-        checks.append(
-            PaperCheck(
-                f"“Two orders of magnitude” better than both other methods: ratio of the {what}",
-                "abstract, section 3.3, conclusion",
-                f"{CLAIMED_RATIO:g}",
-                " and ".join(fixed(ratio, 0) for ratio in ratios),
-                YES if min(ratios) >= 0.5 * CLAIMED_RATIO else NO,
-            )
-        )
+        statement = f"“Two orders of magnitude” better than both other methods: ratio of the {what}"
+        follows = " and ".join(fixed(ratio, 0) for ratio in ratios)
+        agrees = YES if min(ratios) >= 0.5 * CLAIMED_RATIO else NO
+        place = "abstract, section 3.3, conclusion"
+        checks.append(PaperCheck(statement, place, f"{CLAIMED_RATIO:g}", follows, agrees))
     return tuple(checks)
 
 

@@ -16,15 +16,7 @@ T = TypeVar("T")
 
 
 class Bar:
-    """One progress bar for several parts, which come in their order.
-
-    Parameters
-    ----------
-    progress : callable, optional
-        Called as ``progress(done, total)``.
-    shares : mapping of str to int
-        Work of each part in common units.
-    """
+    """One progress bar for several parts, which come in their order; `shares` are their work in common units."""
 
     def __init__(self, progress: Progress | None, shares: Mapping[str, int]) -> None:
         self.progress, self.shares = progress, shares

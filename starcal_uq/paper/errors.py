@@ -52,20 +52,11 @@ class PointErrors:
 
 @dataclass(frozen=True)
 class MapError:
-    """Difference of the direction maps of two cameras, the best common rotation removed.
+    """Difference of the direction maps of two cameras at places (N, 2) px, the best common rotation removed.
 
-    Attributes
-    ----------
-    xy_px : (N, 2) array
-        Where they are compared.
-    error_px : (N, 2) array
-        By how much the true camera would have to displace the point to give the estimated direction, px.
-    error_arcsec : (N,) array
-        Angle between the two directions.
-    weight : (N,) array
-        Share of each point in the mean squares; sums to one.
-    rotation_arcsec : (3,) array
-        The rotation removed: pitch, yaw and roll that the wrong camera adds to every attitude.
+    `error_px` (N, 2) is what the true camera would have to displace the point by to give the estimated direction,
+    `error_arcsec` (N,) the angle between the two; `weight` (N,) sums to one; `rotation_arcsec` (3,) is the pitch, yaw
+    and roll that were removed, and that the wrong camera adds to every attitude.
     """
 
     xy_px: FloatArray
@@ -120,14 +111,8 @@ def detector_grid(camera: Camera, n: int = _GRID) -> tuple[FloatArray, FloatArra
 def map_error(truth: Camera, estimate: Camera, xy_px: FloatArray | None = None, *, n: int = _GRID) -> MapError:
     """Compare the directions that two cameras give to the same pixels, the best common rotation removed.
 
-    Parameters
-    ----------
-    truth, estimate : Camera
-        The cameras; their distortion models may differ.
-    xy_px : (N, 2) array, optional
-        Where, such as the places of stars, with equal weights; without it, a grid over the detector, weighted by area.
-    n : int
-        Grid points along each side.
+    At places `xy_px` (N, 2), such as those of stars, with equal weights; without them on a grid of `n` points along
+    each side of the detector, weighted by area.
 
     Raises
     ------
@@ -154,30 +139,18 @@ def map_error(truth: Camera, estimate: Camera, xy_px: FloatArray | None = None, 
 def aligned(estimated: FloatArray, true: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Turn directions (N, 3) by the rotation that brings them closest to others, in weighted least squares.
 
-    Returns
-    -------
-    (N, 3) array
-        The turned directions.
-    (3, 3) array
-        The rotation that was taken off: ``estimated = R true`` but for what remains.
+    Returns the turned directions, and the rotation (3, 3) taken off: ``estimated = R true`` but for what remains.
     """
     rotation = quest(estimated, true, np.array([0, len(true)]), weight, covariance=False).rotations[0]
     return estimated @ rotation, rotation
 
 
 def undistorted(camera: Camera, xy_px: FloatArray, how: Undistortion = "model") -> FloatArray:
-    """Points (N, 2) freed of distortion.
+    """Points (N, 2) freed of distortion; a camera without coefficients leaves them where they are.
 
-    Parameters
-    ----------
-    camera : Camera
-        Principal point and coefficients; a camera without coefficients leaves the points where they are.
-    xy_px : (N, 2) array
-        Measured points.
-    how : {"model", "eq14", "eq14_measured", "eq6"}
-        ``model``: as the camera's own distortion model says. The others take its first two coefficients as those of one
-        equation of the paper: eq. 14 with r of the ideal point, which makes it implicit; eq. 14 with r of the measured
-        point; eq. 6.
+    With `how` ``model`` as the camera's own distortion model says. The others take its first two coefficients as those
+    of one equation of the paper: eq. 14 with r of the ideal point, which makes it implicit; eq. 14 with r of the
+    measured point; eq. 6.
 
     Raises
     ------
@@ -222,21 +195,14 @@ def reprojection_error_px(
     Parameters
     ----------
     truth, estimate : Camera
-        The cameras.
-    xy_px : (N, 2) array
-        Where the true camera sees the stars without noise.
-    noise_px : (N, 2) array, optional
-        Centroid noise added to the points before they are undistorted.
+        Cameras.
+    xy_px, noise_px : (N, 2) arrays
+        Places where the true camera sees the stars, and centroid noise added before they are undistorted.
     undistortion : {"model", "eq14", "eq14_measured", "eq6"}
-        How the estimated coefficients are applied (`undistorted`).
+        Use of the estimated coefficients (`undistorted`).
     optics : {"truth", "focal", "estimate"}
-        Whose f and principal point make the ideal points of eq. 15, under the true attitude: those of Table 1, the
-        estimated f with the principal point of Table 1, or both estimated.
-
-    Returns
-    -------
-    PointErrors
-        Undistorted minus ideal points.
+        Origin of the ideal points of eq. 15, under the true attitude: f and principal point of Table 1, the estimated f
+        with the principal point of Table 1, or both estimated.
 
     Raises
     ------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -30,22 +31,11 @@ _NOISE_STREAM = 16
 
 @dataclass(frozen=True, eq=False)
 class PaperRun:
-    """One run.
+    """One run of every method on the same stars.
 
-    Attributes
-    ----------
-    convention : str
-        Equation of the paper that the simulated distortion follows.
-    truth, start : Camera
-        Camera that is simulated, and the one from which every method starts.
-    observations : Observations
-        Simulated stars.
-    methods, calibrations : tuple
-        Methods and their results.
-    crlb : (p,) array
-        Cramer-Rao bound on the standard deviations with all parameters and attitudes unknown, px units.
-    noise_px : (N, 2) array
-        Centroid noise of the noisy error measures, which take the measured places for noise-free ones.
+    `crlb` (p,) is the Cramer-Rao bound on the standard deviations with all parameters and attitudes unknown, px units;
+    `noise_px` (N, 2) the centroid noise of the noisy error measures, which take the measured places for noise-free
+    ones.
     """
 
     convention: str
@@ -68,31 +58,18 @@ class PaperRun:
     def errors(self) -> pd.DataFrame:
         """Errors of every method in px and arcsec, without and with noise.
 
-        Columns
-        -------
-        method
-            Label.
-        eq16_px, eq16_max_px, eq16_noisy_px
-            The paper's eq. 16 at the stars: root mean square and largest without noise, root mean square with noise.
-        residual_px
-            Root mean square length of what each method's fit leaves over, with noise and fitted attitudes.
-        map_stars_px, map_px, map_max_px
-            Directions against the true ones after the best rotation: root mean square at the stars, over the detector,
-            and the largest on the detector.
-        map_arcsec, map_max_arcsec
-            The same over the detector, as angles.
-        pitch_arcsec, yaw_arcsec, roll_arcsec
-            The rotation removed, which every attitude takes up.
+        ``eq16_*``: the paper's eq. 16 at the stars, root mean square and largest without noise, and with it.
+        ``residual_px``: what each method's fit leaves over, with noise and fitted attitudes. ``map_*``: directions
+        against the true ones after the best rotation, at the stars and over the detector. ``pitch_arcsec`` and so on:
+        the rotation removed, which every attitude takes up.
         """
         import pandas as pd
 
         rows = []
         for method, calibration in zip(self.methods, self.calibrations, strict=True):
             xy = self.observations.xy
-            found, noisy = (
-                reprojection_error_px(self.truth, calibration.camera, xy, noise_px=noise)
-                for noise in (None, self.noise_px)
-            )
+            errors = partial(reprojection_error_px, self.truth, calibration.camera, xy)
+            found, noisy = errors(), errors(noise_px=self.noise_px)
             at_stars = map_error(self.truth, calibration.camera, xy)
             over_field = map_error(self.truth, calibration.camera)
             pitch, yaw, roll = over_field.rotation_arcsec.tolist()

@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from itertools import product
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -114,23 +115,16 @@ class InteractionStudy(Shown):
         What the distortion displaces at the farthest corner, px outwards, and its size.
     field_deg, n_frames, stars_per_frame, max_mag, min_stars, sigma_px, seed
         The data: `stars_per_frame` is what was found, the others what was asked for.
-    method, handling, parameter, unit
-        Who, what it does about the distortion, and of what.
-    n, failed
-        Replicates with and without a result.
+    method, handling, parameter, unit, n, failed
+        Who, what it does about the distortion, of what, and replicates with and without a result.
     bias, bias_se, design_spread
         Mean error without noise with its standard error, and the standard deviation of that error over designs.
-    noise, noise_se
-        Standard deviation of the difference between the estimates with and without noise: what noise alone does,
-        with its standard error.
-    spread, spread_se
-        Standard deviation of the estimates with noise, over designs and noise, with its standard error.
-    noise_shift, noise_shift_se
-        Mean of that difference, with its standard error.
-    rmse
-        Root mean square error with noise.
-    crlb
-        Cramer-Rao bound on the spread with all parameters unknown.
+    noise, noise_se, noise_shift, noise_shift_se
+        Standard deviation and mean of the difference between the estimates with and without noise: what noise alone
+        does, with their standard errors.
+    spread, spread_se, rmse, crlb
+        Standard deviation of the estimates with noise, over designs and noise, with its standard error; root mean
+        square error; Cramer-Rao bound with all parameters unknown.
     bias_over_noise, bias_over_noise_low, bias_over_noise_high
         Size of the bias over `noise`, with the 95 % interval that comes from the latter.
     """
@@ -149,26 +143,21 @@ class InteractionStudy(Shown):
     def thresholds(self) -> tuple[Threshold, ...]:
         """Where the bias is one standard deviation of the noise, and where a method falls behind the efficient one."""
         found = []
-        for axis in AXES:
-            for method in HANDLING:
-                for parameter in OPTICS:
-                    rows = self.points(axis, method, parameter)
-                    rows = rows[np.isfinite(rows["noise"])]
-                    if len(rows) < 2:
-                        continue
-                    at = rows[AXES[axis]].to_numpy()
-                    columns = [f"bias_over_noise{end}" for end in ("", "_low", "_high")]
-                    ratios = [rows[column].to_numpy() for column in columns]
-                    (side, value), *others = (crossing(at, one) for one in ratios)
-                    low, high = (place for _, place in others)
-                    ends = (np.nan, np.nan) if np.isnan(value) else (min(low, high), max(low, high))
-                    found.append(Threshold("bias", axis, method, parameter, side, value, *ends))
-                    if method != REFERENCE:
-                        reference = self.points(axis, REFERENCE, parameter)[["value", "rmse"]]
-                        both = rows.merge(reference, on="value", suffixes=("", "_reference"))
-                        ratio = (both["rmse"] / both["rmse_reference"]).to_numpy()
-                        side, value = crossing(both[AXES[axis]].to_numpy(), ratio)
-                        found.append(Threshold("rmse", axis, method, parameter, side, value, np.nan, np.nan))
+        for axis, method, parameter in product(AXES, HANDLING, OPTICS):
+            rows = self.points(axis, method, parameter)
+            rows = rows[np.isfinite(rows["noise"])]
+            if len(rows) < 2:
+                continue
+            ratios = (rows[f"bias_over_noise{end}"].to_numpy() for end in ("", "_low", "_high"))
+            (side, value), *ends = (crossing(rows[AXES[axis]].to_numpy(), ratio) for ratio in ratios)
+            low, high = (np.nan, np.nan) if np.isnan(value) else sorted(place for _, place in ends)
+            found.append(Threshold("bias", axis, method, parameter, side, value, low, high))
+            if method != REFERENCE:
+                reference = self.points(axis, REFERENCE, parameter)[["value", "rmse"]]
+                both = rows.merge(reference, on="value", suffixes=("", "_reference"))
+                ratio = (both["rmse"] / both["rmse_reference"]).to_numpy()
+                side, value = crossing(both[AXES[axis]].to_numpy(), ratio)
+                found.append(Threshold("rmse", axis, method, parameter, side, value, np.nan, np.nan))
         return tuple(found)
 
     def threshold(self, axis: str, method: str, parameter: str, kind: str = "bias") -> Threshold:

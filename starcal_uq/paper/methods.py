@@ -16,19 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Method:
-    """A way to calibrate.
-
-    Attributes
-    ----------
-    label : str
-        What it is called in tables and figures.
-    description : str
-        What it does, in one line.
-    method : str
-        As in `calibrate`.
-    recursion : RecursionOptions, optional
-        As in `calibrate`.
-    """
+    """A way to calibrate: its label in tables and figures, what it does in one line, and arguments of `calibrate`."""
 
     label: str
     description: str

@@ -85,12 +85,7 @@ def run_readings(
     `convention` is the main reading of the distortion. Draw i depends on the seed and on i alone, and is none of the
     replicates of the same seed.
 
-    Returns
-    -------
-    Readings
-        Of the seeds that were complete.
-    bool
-        Whether Ctrl-C was pressed.
+    Also returns whether Ctrl-C was pressed; the readings are then of the seeds that were complete.
 
     Raises
     ------
@@ -191,13 +186,12 @@ def draw(plan: Plan, index: int) -> dict[Key, float]:
         truth, start = paper_camera(convention), paper_start(convention)
         obs = plan.campaign.simulate(stars, truth, seed)
         scene = Scene(truth, start, obs, plan.campaign.sigma_px * rng.standard_normal((obs.n_stars, 2)))
-        printed = paper_methods(obs, start)
-        found |= measured(scene, reading, printed)
+        readings = {reading: paper_methods(obs, start)}
         if reading == AS_PRINTED:
-            few = obs.select_frames(obs.frame_ids[:FEW_FRAMES])
-            found |= measured(scene, "few frames", paper_methods(few, start))
-            for key, estimates in alternatives(scene, printed).items():
-                found |= measured(scene, key, estimates)
+            readings["few frames"] = paper_methods(obs.select_frames(obs.frame_ids[:FEW_FRAMES]), start)
+            readings |= alternatives(scene, readings[AS_PRINTED])
+        for key, estimates in readings.items():
+            found |= measured(scene, key, estimates)
     return found
 
 

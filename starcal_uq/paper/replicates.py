@@ -155,30 +155,23 @@ class Replicates(Shown):
         -------
         method, parameter, unit, truth, n
             What, and over how many replicates.
-        bias, bias_se, bias_over_spread
-            Mean error with its standard error, and as a multiple of the spread.
-        spread, spread_se, crlb
-            Standard deviation of the estimates with its standard error, and the Cramer-Rao bound on it.
-        efficiency, efficiency_low, efficiency_high
-            Variance of the bound over that of the estimates, with 95 % interval. It can exceed one for methods that
-            are biased, or that leave parameters out.
-        rmse, rmse_over_crlb
-            Root mean square error, bias and spread together.
-        claimed, claimed_over_spread, .._low, .._high
-            Root mean square of the method's own standard deviations; over the spread, with 95 % interval.
-        claimed_over_rmse
-            The same over the root mean square error: what it claims of its error, bias included.
-        coverage95, coverage95_low, coverage95_high
+        bias, spread, rmse
+            Mean error, standard deviation and root mean square error, ``_se``, ``_over_spread``, ``_over_crlb``.
+        crlb, efficiency
+            Cramer-Rao bound on the spread, and its variance over that of the estimates, with 95 % interval. It can
+            exceed one for methods that are biased, or that leave parameters out.
+        claimed, claimed_over_spread, claimed_over_rmse
+            Root mean square of the method's own standard deviations; over the spread, with 95 % interval, and over the
+            root mean square error, bias included.
+        coverage95
             How often the claimed 95 % interval holds the truth, with Wilson interval.
         claimed_classical, ...
             The same eight for the formula of the textbooks: pairs taken as independent, or a filter's own covariance.
         bias_p, claimed_p, coverage95_p, claimed_classical_p, coverage95_classical_p
-            p-values of single tests; the verdicts rest on Holm's procedure over all of them at 1 %.
-        biased, claim_wrong, classical_wrong
-            What the procedure rejects: that the mean error is zero, that the spread is as claimed, and that it is as
-            the formula of the textbooks claims.
-        verdict, verdict_classical
-            In words.
+            p-values of single tests.
+        biased, claim_wrong, classical_wrong, verdict, verdict_classical
+            What Holm's procedure over all of them rejects at 1 %: that the mean error is zero, that the spread is as
+            claimed, and that it is as the textbooks claim; and in words.
         """
         import pandas as pd
 
@@ -388,12 +381,7 @@ def run_replicate(experiment: Experiment, index: int) -> AnyDict:
 def field_errors(truth: Camera, estimate: Camera) -> tuple[float, float, float]:
     """Root mean square errors over the detector without noise; NaN where the estimated distortion folds over.
 
-    Returns
-    -------
-    map_px, map_arcsec : float
-        Of the directions, best common rotation removed (`map_error`).
-    reprojection_px : float
-        Eq. 16 of the paper (`reprojection_error_px`).
+    Of the directions in px and arcsec, best common rotation removed (`map_error`), and by eq. 16 of the paper.
     """
     try:
         directions = map_error(truth, estimate)
@@ -411,20 +399,11 @@ def crlb_sigmas(frames: StarFrames, truth: Camera, sigma_px: float) -> FloatArra
 
 
 class Solved(NamedTuple):
-    """What a method found.
+    """What a method found: camera, parameters, and standard deviations as claimed and by textbooks, (p,) px units.
 
-    Attributes
-    ----------
-    camera : Camera
-        The estimate.
-    theta : (p,) array
-        Its parameters, px units.
-    sigmas : (p,) array
-        Its standard deviations, as the method claims them.
-    classical : (p,) array
-        Those of textbooks: for least squares over pairs ``(J^T J)^-1 s^2``, which presumes that pairs are independent,
-        although the m (m - 1) / 2 pairs of m stars hold 2 m - 3 independent numbers; for a filter its own, which
-        presume that its model holds. NaN where there is none, or where it is what the method claims anyway.
+    The latter are ``(J^T J)^-1 s^2`` for least squares over pairs, which presumes that pairs are independent, although
+    the m (m - 1) / 2 pairs of m stars hold 2 m - 3 independent numbers; for a filter its own, which presume that its
+    model holds. NaN where there is none, or where it is what the method claims anyway.
     """
 
     camera: Camera

@@ -27,23 +27,10 @@ TOO_FEW = "too few replicates to judge"
 
 
 def summarise(error: FloatArray, claimed: FloatArray, classical: FloatArray, crlb: float) -> AnyDict:
-    """Statistics of one parameter of one method.
+    """Statistics of one parameter of one method, as the columns of `Replicates.table`.
 
-    Parameters
-    ----------
-    error : (n,) array
-        Estimate minus truth.
-    claimed : (n,) array
-        Standard deviations that the method gives.
-    classical : (n,) array
-        Standard deviations by the formula of the textbooks; NaN where there is none.
-    crlb : float
-        The bound on the standard deviation.
-
-    Returns
-    -------
-    dict
-        As the columns of `Replicates.table`, and the p-values of the tests, in keys that end in ``_p``.
+    From errors, the standard deviations that the method gives, those by the formula of the textbooks (NaN where there
+    is none), each (n,), and the bound. Keys of p-values end in ``_p``.
     """
     from scipy.stats import binomtest, t
 

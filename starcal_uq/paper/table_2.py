@@ -120,22 +120,9 @@ def judge_all(readings: Readings, replicates: Replicates) -> tuple[Judged, ...]:
 
 
 def published_frame(judged: tuple[Judged, ...]) -> pd.DataFrame:
-    """One row per printed number.
+    """One row per printed number: place, outcome, and its main and best reading.
 
-    Columns
-    -------
-    place, method, quantity, printed
-        What and where; `printed` as text, with all its digits.
-    outcome
-        In words.
-    noise_digits
-        Printed digits that are noise (`Judged.noise_digits`).
-    n_readings, by_chance
-        Readings tried, and `Judged.by_chance`.
-    main_mean, main_spread, main_n, main_z
-        The main reading.
-    best_reading, best_mean, best_spread, best_n, best_z, best_faithful
-        The best one.
+    `noise_digits` are printed digits that are noise, `n_readings` readings were tried, `by_chance` as in `Judged`.
     """
     import pandas as pd
 
@@ -168,21 +155,10 @@ def _place(number: Printed) -> AnyDict:
 def table_2(run: PaperRun, replicates: Replicates, readings: Readings, judged: tuple[Judged, ...]) -> pd.DataFrame:
     """The paper's Table 2 for every method: one row per method and quantity, in the units of the paper.
 
-    Columns
-    -------
-    method, quantity, truth
-        What.
-    printed, z_printed
-        The paper's number as text, and its distance from our mean in standard deviations of a new draw; empty where it
-        prints none.
-    ours, sigma_claimed
-        The one run, and the standard deviation that the method claims.
-    mean, spread, n
-        Over the replicates; of the reprojection error over the draws of the main reading, for the paper's methods.
-    sigma_crlb
-        Cramer-Rao bound of the run's design.
-    z_truth
-        (ours - truth) / claimed.
+    `ours` with `sigma_claimed` is the one run, `z_truth` its distance from the truth in these; `mean` and `spread` are
+    over the replicates, of the reprojection error over the draws of the main reading; `z_printed` is the distance of
+    the printed number from our mean in standard deviations of a new draw, and `sigma_crlb` the bound of the run's
+    design.
     """
     import pandas as pd
 

@@ -8,7 +8,9 @@ import pandas as pd
 import pytest
 
 
-def test_reproduce_writes_a_report_and_tables(cli, tmp_path):
+def test_reproduce_writes_a_report_and_tables(cli, tmp_path, monkeypatch):
+    monkeypatch.setattr("starcal_uq.paper.reproduction.N_READING_DRAWS", 2)
+    monkeypatch.setattr("starcal_uq.paper.show.pages.DPI", 60)
     size = ("--replicates", 8, "--frames", 20, "--no-study", "--workers", 1)
     status, out, _ = cli("reproduce", "-o", "paper", *size, "--json")
 

@@ -371,9 +371,12 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Reproduction, list[
     """A reproduction of few frames, and what its progress callback was told."""
     told: list[tuple[int, int]] = []
     folder = tmp_path_factory.mktemp("reproduction") / "out"
-    found = command.reproduce(
-        folder, n_replicates=8, n_frames=40, seed=3, workers=0, study=False, progress=lambda *n: told.append(n)
-    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(command, "N_READING_DRAWS", 3)
+        patch.setattr("starcal_uq.paper.show.pages.DPI", 60)
+        found = command.reproduce(
+            folder, n_replicates=8, n_frames=40, seed=3, workers=0, study=False, progress=lambda *n: told.append(n)
+        )
     return found, told
 
 

@@ -43,18 +43,8 @@ _CHUNK = 4
 class FieldStars:
     """Identified stars of frames, ready for QUEST; m stars in k frames.
 
-    Attributes
-    ----------
-    xy_px, true_px : (m, 2) array
-        Places measured, and true ones.
-    directions : (m, 3) array
-        Directions of the catalogue.
-    sigma_px : (m,) array
-        Stated noise, px per axis.
-    starts : (k + 1,) array of int
-        First star of each frame, and the number of stars.
-    quaternions : (k, 4) array
-        True attitudes.
+    Places measured and true (m, 2), catalogue directions (m, 3), stated noise (m,) px per axis, the first star of each
+    frame and their number (k + 1,), and true attitudes (k, 4).
     """
 
     xy_px: FloatArray

@@ -71,7 +71,7 @@ def reproduction_page(found: Reproduction, figures: Mapping[str, bytes]) -> str:
         )
     )
     sections = [
-        Section("Table 2, every method", (tables.table_2(found), tables.row_tests(found))),
+        Section("Table 2, every method", (tables.table_2(found), tables.row_tests(found), tables.methods(found))),
         Section(
             "Every printed number",
             (tables.printed_numbers(found.judged),),
@@ -143,8 +143,8 @@ def field_page(found: FieldExperiment, figures: Mapping[str, bytes]) -> str:
             "The cameras",
             (field.cameras(found),),
             f"{counts['identified']} of {plural(counts['frames'], 'frame')} of the calibration are identified from the "
-            f"data sheet, with {plural(counts['stars'], 'star')}, {counts['wrong']} of them wrong, and {noise} times the "
-            "noise that is stated.",
+            f"data sheet, with {plural(counts['stars'], 'star')}, {counts['wrong']} of them wrong, and {noise} times "
+            "the noise that is stated.",
         ),
         Section(
             "The sensor",

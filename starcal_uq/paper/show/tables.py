@@ -164,6 +164,12 @@ def table_2(found: Reproduction) -> TextTable:
     )
 
 
+def methods(found: Reproduction) -> TextTable:
+    """What each method does."""
+    rows = tuple((method.label, method.description) for method in found.run.methods)
+    return TextTable(("Method", "What it does"), rows, align="ll")
+
+
 def row_tests(found: Reproduction) -> TextTable:
     """Each row of Table 2 as one draw."""
     return TextTable(
@@ -214,25 +220,16 @@ def checks(found: Reproduction) -> TextTable:
 def errors(found: Reproduction) -> TextTable:
     """Errors of the one run, in px and arcsec."""
     heads = {
-        "eq16_px": "Eq. 16 [px]",
-        "eq16_max_px": "largest",
-        "eq16_noisy_px": "with noise",
-        "residual_px": "Residuals [px]",
-        "map_px": "Directions [px]",
-        "map_max_px": "largest",
-        "map_arcsec": "Directions [arcsec]",
-        "map_max_arcsec": "largest",
+        **{"method": "Method", "eq16_px": "Eq. 16 [px]", "eq16_max_px": "largest", "eq16_noisy_px": "with noise"},
+        **{"residual_px": "Residuals [px]", "map_px": "Directions [px]", "map_max_px": "largest [px]"},
+        **{"map_arcsec": "Directions [arcsec]", "map_max_arcsec": "largest [arcsec]"},
+        **{"across": "Rotation across [arcsec]", "roll_arcsec": "roll [arcsec]"},
     }
-    rows = []
-    for row in found.errors().to_dict("records"):
-        across = np.hypot(row["pitch_arcsec"], row["yaw_arcsec"])
-        values = (*(row[name] for name in heads), across, row["roll_arcsec"])
-        rows.append((row["method"], *(significant(float(value)) for value in values)))
-    return TextTable(
-        ("Method", *heads.values(), "Rotation across [arcsec]", "roll"),
-        tuple(rows),
-        "Errors of the camera without noise, unless it is named; directions over the detector, best rotation removed.",
-    )
+    frame = found.errors()
+    frame["across"] = np.hypot(frame["pitch_arcsec"], frame["yaw_arcsec"])
+    frame = frame.rename(columns=heads)[list(heads.values())]
+    title = "Errors without noise, unless it is named; directions over the detector, best rotation removed."
+    return TextTable.of(frame, title)
 
 
 def replicates_text(found: Replicates) -> str:
