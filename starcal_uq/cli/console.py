@@ -101,13 +101,13 @@ def print_table(table: TextTable) -> None:
     out.print(drawn)
 
 
-def show_coupling(found: Coupling) -> None:
+def show_coupling(coupling: Coupling) -> None:
     """Sigmas and their inflation, correlations, and the weak directions in words."""
     from starcal_uq.presentation.words.propagation import correlation_table, coupling_table
 
-    print_table(coupling_table(found))
-    print_table(correlation_table(found))
-    for direction in found.weak_directions:
+    print_table(coupling_table(coupling))
+    print_table(correlation_table(coupling))
+    for direction in coupling.weak_directions:
         out.print(f"- {direction.words}", highlight=False, soft_wrap=True)
 
 

@@ -162,7 +162,7 @@ def jackknife_frames(obs: Observations, cal: Calibration, normals: FrameNormals 
     )
 
 
-def accept_inflation(cal: Calibration, found: Jackknife) -> Calibration:
+def accept_inflation(cal: Calibration, jackknife: Jackknife) -> Calibration:
     """The calibration with the inflated covariance; provenance says so.
 
     Raises
@@ -170,12 +170,12 @@ def accept_inflation(cal: Calibration, found: Jackknife) -> Calibration:
     CalibrationError
         When the jackknife is of another model.
     """
-    if found.parameter_names != cal.parameter_names:
+    if jackknife.parameter_names != cal.parameter_names:
         raise CalibrationError(
-            f"the jackknife is of the parameters {', '.join(found.parameter_names)}, the calibration of "
+            f"the jackknife is of the parameters {', '.join(jackknife.parameter_names)}, the calibration of "
             f"{', '.join(cal.parameter_names)}: make both from the same run."
         )
-    factors = dict(zip(found.parameter_names, found.factors.tolist(), strict=True))
+    factors = dict(zip(jackknife.parameter_names, jackknife.factors.tolist(), strict=True))
     settings = {**cal.provenance.get("settings", {}), "inflation": factors}
-    covariance = cal.covariance * np.outer(found.factors, found.factors)
+    covariance = cal.covariance * np.outer(jackknife.factors, jackknife.factors)
     return replace(cal, covariance=covariance, provenance={**cal.provenance, "settings": settings})

@@ -175,20 +175,20 @@ def _check_mergeable(calibrations: Sequence[Calibration], names: Sequence[str], 
             seen[value] = name
 
 
-def _check_consistent(found: Consistency, allow_inconsistent: bool) -> None:
-    worst = int(np.argmax(found.distance_sigma))
-    if found.distance_sigma[worst] > MAX_DISTANCE:
+def _check_consistent(consistency: Consistency, allow_inconsistent: bool) -> None:
+    worst = int(np.argmax(consistency.distance_sigma))
+    if consistency.distance_sigma[worst] > MAX_DISTANCE:
         raise CalibrationError(
-            f"{found.names[worst]}: its optimum is {found.distance_sigma[worst]:.1f} of its own sigmas from the "
-            f"merged one, beyond the {MAX_DISTANCE:g} within which its compressed likelihood holds (p = "
-            f"{found.p_value:.2g} that the runs show the same camera): leave it out, or calibrate all observations "
-            "together.",
+            f"{consistency.names[worst]}: its optimum is {consistency.distance_sigma[worst]:.1f} of its own sigmas "
+            f"from the merged one, beyond the {MAX_DISTANCE:g} within which its compressed likelihood holds (p = "
+            f"{consistency.p_value:.2g} that the runs show the same camera): leave it out, or calibrate all "
+            "observations together.",
             Status.INCONSISTENT,
         )
-    if found.p_value < ALPHA and not allow_inconsistent:
+    if consistency.p_value < ALPHA and not allow_inconsistent:
         raise CalibrationError(
-            f"the runs do not show the same camera (p = {found.p_value:.2g}; {found.odd_one_out}): merge only runs "
-            "between which nothing has moved, or allow inconsistent runs, whose sigmas are then too small.",
+            f"the runs do not show the same camera (p = {consistency.p_value:.2g}; {consistency.odd_one_out}): merge "
+            "only runs between which nothing has moved, or allow inconsistent runs, whose sigmas are then too small.",
             Status.INCONSISTENT,
         )
 
@@ -214,7 +214,7 @@ def _provenance(
     observations: Observations | None,
     names: Sequence[str],
     noise: str,
-    found: Consistency,
+    consistency: Consistency,
     shifts: Sequence[int],
     runs: Sequence[Optimum],
 ) -> AnyDict:
@@ -235,7 +235,11 @@ def _provenance(
     else:
         data_hash = observations.data_hash
     settings = {"method": "merged", "noise": noise, "distortion": calibrations[0].camera.distortion}
-    record = {"parts": parts, "has_observations": observations is not None, "consistency": to_plain(found, null=True)}
+    record = {
+        "parts": parts,
+        "has_observations": observations is not None,
+        "consistency": to_plain(consistency, null=True),
+    }
     return {**provenance(None, settings, data_hash), "merge": record}
 
 
@@ -376,22 +380,24 @@ def consistency_between(
     return _with_messages(found)
 
 
-def _with_messages(found: Consistency) -> Consistency:
+def _with_messages(consistency: Consistency) -> Consistency:
     import dataclasses
 
     messages = []
-    if found.p_value < ALPHA:
+    if consistency.p_value < ALPHA:
         messages.append(
-            f"The runs do not show the same camera (p = {found.p_value:.2g}): {found.odd_one_out}; the merged sigmas "
-            f"are too small by a factor of about {np.sqrt(found.statistic):.2g}."
+            f"The runs do not show the same camera (p = {consistency.p_value:.2g}): {consistency.odd_one_out}; the "
+            f"merged sigmas are too small by a factor of about {np.sqrt(consistency.statistic):.2g}."
         )
-    if found.noise_p_value < ALPHA:
-        values = ", ".join(f"{name} {sigma:.3g}" for name, sigma in zip(found.names, found.sigma, strict=True))
+    if consistency.noise_p_value < ALPHA:
+        values = ", ".join(
+            f"{name} {sigma:.3g}" for name, sigma in zip(consistency.names, consistency.sigma, strict=True)
+        )
         messages.append(
-            f"The runs differ in noise (p = {found.noise_p_value:.2g}; {values}): merge with noise 'own', which "
+            f"The runs differ in noise (p = {consistency.noise_p_value:.2g}; {values}): merge with noise 'own', which "
             "weights each run by its own."
         )
-    return dataclasses.replace(found, messages=tuple(messages))
+    return dataclasses.replace(consistency, messages=tuple(messages))
 
 
 def _bartlett(runs: Sequence[Optimum]) -> float:

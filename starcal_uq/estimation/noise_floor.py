@@ -135,12 +135,12 @@ def settle_noise(obs: Observations, cal: Calibration) -> Observations:
     return raised
 
 
-def with_noise_floor(obs: Observations, found: NoiseFloor) -> Observations:
+def with_noise_floor(obs: Observations, floor: NoiseFloor) -> Observations:
     """The observations with the floor in every star's noise, where it is needed; ``meta["noise_floor_px"]`` says it."""
-    if not found.needed or obs.sigma_px is None:
+    if not floor.needed or obs.sigma_px is None:
         return obs
-    raised: FloatArray = np.hypot(obs.sigma_px, found.floor_px / found.scale)
-    return replace(obs, sigma_px=raised, meta={**obs.meta, "noise_floor_px": found.floor_px})
+    raised: FloatArray = np.hypot(obs.sigma_px, floor.floor_px / floor.scale)
+    return replace(obs, sigma_px=raised, meta={**obs.meta, "noise_floor_px": floor.floor_px})
 
 
 def _cost(squares: FloatArray, variance: FloatArray) -> float:

@@ -271,13 +271,18 @@ def refine(
 
 
 def _step(
-    likelihood: StudentLikelihood, theta: FloatArray, sigma: float, nu: float, state: StudentState, found: Information
+    likelihood: StudentLikelihood,
+    theta: FloatArray,
+    sigma: float,
+    nu: float,
+    state: StudentState,
+    information: Information,
 ) -> tuple[FloatArray, float]:
     """Newton's step where the observed information allows it, the reweighted one elsewhere; halved until it gains."""
-    scale = 1.0 / np.sqrt(np.diag(found.reweighted))
-    observed = found.matrix * np.outer(scale, scale)
-    reweighted = found.reweighted * np.outer(scale, scale)
-    slope = found.score * scale
+    scale = 1.0 / np.sqrt(np.diag(information.reweighted))
+    observed = information.matrix * np.outer(scale, scale)
+    reweighted = information.reweighted * np.outer(scale, scale)
+    slope = information.score * scale
     sound = np.linalg.eigvalsh(observed)[0] > 0.1 * np.linalg.eigvalsh(reweighted)[0]
     step = np.linalg.solve(observed if sound else reweighted, slope)
     gain = 0.5 * float(step @ slope)

@@ -103,9 +103,9 @@ class ImageRecord(Shown):
         return read_json(cls, path, "a record of images", "run `starcal-uq run IMAGES... CAMERA -o RUN` again")
 
 
-def record_images(centroids: Centroids, found: ImageCalibration) -> ImageRecord:
+def record_images(centroids: Centroids, images: ImageCalibration) -> ImageRecord:
     """The record of a bootstrapped run."""
-    first, last = found.rounds[0][0], found.rounds[-1][0]
+    first, last = images.rounds[0][0], images.rounds[-1][0]
     counted = {frame.frame: frame.n_identified for frame in first.frames}
     by_frame = {frame.frame: frame for frame in last.frames}
     rows = []
@@ -124,10 +124,10 @@ def record_images(centroids: Centroids, found: ImageCalibration) -> ImageRecord:
             )
         )
     rounds, before = [], None
-    for identification, obs, calibration in found.rounds:
+    for identification, obs, calibration in images.rounds:
         rounds.append(_recorded(identification, obs, calibration, before))
         before = identification
-    disturbed = found.observations.meta.get("disturbed_stars", 0)
+    disturbed = images.observations.meta.get("disturbed_stars", 0)
     return ImageRecord(tuple(rounds), tuple(rows), int(disturbed), last.parity)
 
 

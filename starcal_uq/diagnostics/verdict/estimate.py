@@ -93,12 +93,12 @@ JACKKNIFE_P, JACKKNIFE_RATIO = 0.01, 1.1
 _LIKE_NOISE = ("pixel phase in x", "pixel phase in y")
 
 
-def model_checks(found: Diagnosis) -> list[Check]:
+def model_checks(diagnosis: Diagnosis) -> list[Check]:
     """Every check that a diagnosis allows."""
-    checks = [misfit(found.misfit)]
-    checks += [] if found.jackknife is None else [jackknife(found.jackknife)]
-    checks += [] if found.comparison is None else [comparison(found.comparison)]
-    return [*checks, predictive(found.predictive)]
+    checks = [misfit(diagnosis.misfit)]
+    checks += [] if diagnosis.jackknife is None else [jackknife(diagnosis.jackknife)]
+    checks += [] if diagnosis.comparison is None else [comparison(diagnosis.comparison)]
+    return [*checks, predictive(diagnosis.predictive)]
 
 
 def misfit(found: Misfit) -> Check:
@@ -147,38 +147,38 @@ def jackknife(found: Jackknife) -> Check:
     return Check("Jackknife over frames", Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
 
 
-def comparison(found: ModelComparison) -> Check:
+def comparison(models: ModelComparison) -> Check:
     """Does another distortion model predict left-out frames better?"""
-    mine = found.of(found.fitted)
+    mine = models.of(models.fitted)
     rejected = mine is not None and mine.rejected
     if mine is None or mine.difference == 0.0:
-        value = f"{found.fitted!r} predicts best"
+        value = f"{models.fitted!r} predicts best"
     else:
-        value = f"{fixed(mine.difference, 1)} ± {fixed(mine.difference_se, 1)} nat from {found.scores[0].model!r}"
+        value = f"{fixed(mine.difference, 1)} ± {fixed(mine.difference_se, 1)} nat from {models.scores[0].model!r}"
     level = Level.FAIL if rejected else Level.PASS
-    return Check("Distortion model", Question.TRUSTWORTHY, level, value, "not rejected", models_sentence(found))
+    return Check("Distortion model", Question.TRUSTWORTHY, level, value, "not rejected", models_sentence(models))
 
 
-def models_sentence(found: ModelComparison) -> str:
+def models_sentence(models: ModelComparison) -> str:
     """Whether another model predicts left-out frames better, and what attitudes would do under the others."""
-    mine, simplest = found.of(found.fitted), found.simplest
+    mine, simplest = models.of(models.fitted), models.simplest
     if mine is not None and mine.rejected:
-        best = found.scores[0]
+        best = models.scores[0]
         first = (
-            f"The model {found.fitted!r} predicts left-out frames worse than {best.model!r} by "
+            f"The model {models.fitted!r} predicts left-out frames worse than {best.model!r} by "
             f"{fixed(-mine.difference, 1)} ± {fixed(mine.difference_se, 1)} nat: use {simplest.model!r}."
         )
     elif mine is not None and simplest.n_parameters < mine.n_parameters:
-        fewer, all_of_them = (_coefficients(model) for model in (simplest.model, found.fitted))
+        fewer, all_of_them = (_coefficients(model) for model in (simplest.model, models.fitted))
         extra = [name for name in all_of_them if name not in fewer]
         verb = "is" if len(extra) == 1 else "are"
         first = (
             f"{join_words(extra)} {verb} not needed: {simplest.model!r} predicts left-out frames no worse than "
-            f"{found.fitted!r}."
+            f"{models.fitted!r}."
         )
     else:
-        first = f"No other model predicts left-out frames better than {found.fitted!r} beyond doubt."
-    others = [score for score in found.accepted if score.model != found.fitted]
+        first = f"No other model predicts left-out frames better than {models.fitted!r} beyond doubt."
+    others = [score for score in models.accepted if score.model != models.fitted]
     if not others:
         return first + " All other models are rejected."
     common = max(float(np.hypot(*score.common_arcsec[:2])) for score in others)

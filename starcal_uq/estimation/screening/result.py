@@ -170,7 +170,7 @@ class Screening(Shown):
 def rejected_table(
     obs: Observations,
     camera: Camera,
-    found: StarResiduals,
+    residuals: StarResiduals,
     star_p_value: float,
     frame_p_value: float,
     shrinkage: float,
@@ -179,17 +179,17 @@ def rejected_table(
     import pandas as pd
 
     sizes = obs.stars_per_frame
-    rows = np.flatnonzero(~found.in_use)
+    rows = np.flatnonzero(~residuals.in_use)
     frame = np.repeat(np.arange(obs.n_frames), sizes)[rows]
-    statistic, dof = found.studentised(shrinkage)
+    statistic, dof = residuals.studentised(shrinkage)
     statistic, threshold = statistic[rows], star_threshold(star_p_value, dof[rows])
     reason = np.full(len(rows), "displaced", dtype=object)
     reason[np.isinf(statistic)] = "elsewhere"
     by_frame = statistic <= threshold
     reason[by_frame] = "taste"
-    taste, limit = _taste_with(found, rows, frame, frame_p_value, shrinkage)
+    taste, limit = _taste_with(residuals, rows, frame, frame_p_value, shrinkage)
     statistic[by_frame], threshold[by_frame] = taste[by_frame], limit[by_frame]
-    dropped = found.frame_count[frame] == 0
+    dropped = residuals.frame_count[frame] == 0
     reason[dropped] = np.where(sizes[frame[dropped]] < MIN_STARS, "frame_too_small", "frame_dropped")
     statistic[dropped] = threshold[dropped] = np.nan
     data: AnyDict = {
@@ -198,8 +198,8 @@ def rejected_table(
         "star_id": [""] * len(rows) if obs.star_id is None else obs.star_id[rows].tolist(),
         "x_px": obs.x_px[rows],
         "y_px": obs.y_px[rows],
-        "residual_px": found.residual_px[rows],
-        "offset_deg": np.degrees(found.offset_rad[rows]),
+        "residual_px": residuals.residual_px[rows],
+        "offset_deg": np.degrees(residuals.offset_rad[rows]),
         "statistic": statistic,
         "threshold": threshold,
         "reason": reason,
@@ -240,13 +240,13 @@ def add_dropped_frames(
 
 
 def _taste_with(
-    found: StarResiduals, rows: IntArray, frame: IntArray, frame_p_value: float, shrinkage: float
+    residuals: StarResiduals, rows: IntArray, frame: IntArray, frame_p_value: float, shrinkage: float
 ) -> tuple[FloatArray, FloatArray]:
     """TASTE of the rows' frames with the star put back, and its limit."""
     from scipy.special import chdtri
 
-    taste = (found.frame_cost[frame] + found.t[rows]) / found.variance(shrinkage)
-    limit = chdtri(np.maximum(2 * found.frame_count[frame] - 1, 1), frame_p_value)
+    taste = (residuals.frame_cost[frame] + residuals.t[rows]) / residuals.variance(shrinkage)
+    limit = chdtri(np.maximum(2 * residuals.frame_count[frame] - 1, 1), frame_p_value)
     return taste, np.asarray(limit, dtype=np.float64)
 
 

@@ -271,14 +271,14 @@ def _settled(
     return found.in_use, disturbed
 
 
-def _passing(frames: StarFrames, found: StarResiduals, candidates: BoolArray, rates: _Rates) -> BoolArray:
+def _passing(frames: StarFrames, residuals: StarResiduals, candidates: BoolArray, rates: _Rates) -> BoolArray:
     """Stars not in use, in frames that are, which pass and with which their frame passes as well."""
     from scipy.special import chdtrc
 
-    candidates = candidates & ~found.in_use & np.isfinite(found.t)
-    together = frames.spread(found.frame_cost) + np.where(candidates, found.t, 0.0)
-    together = together / found.variance(rates.shrinkage)
-    dof = frames.spread(np.maximum(2 * found.frame_count - 1, 1))
+    candidates = candidates & ~residuals.in_use & np.isfinite(residuals.t)
+    together = frames.spread(residuals.frame_cost) + np.where(candidates, residuals.t, 0.0)
+    together = together / residuals.variance(rates.shrinkage)
+    dof = frames.spread(np.maximum(2 * residuals.frame_count - 1, 1))
     passing: BoolArray = candidates & (chdtrc(dof, together) >= rates.frame)
     return passing
 

@@ -26,28 +26,30 @@ _NOTHING = 1e-9
 _TIMES = (1.0, 2.0, 3.0)
 
 
-def plot_camera_comparison(found: CameraComparison) -> Figure:
+def plot_camera_comparison(comparison: CameraComparison) -> Figure:
     """Arrows and size of the difference, and beside it the size that the joint uncertainty gives, in the same colours.
 
     White lines in the left panel are where the difference is one, two and three times the joint standard deviation of
     its length. Without a covariance there is the left panel alone.
     """
-    tall = 1.0 + 4.05 * float(np.ptp(found.y_px) / np.ptp(found.x_px))
-    figure = style.new_figure(11.0 if found.tested else 6.6, tall)
-    panels = figure.subplots(1, 2 if found.tested else 1, squeeze=False)[0]
-    length = np.linalg.norm(found.difference_arcsec, axis=-1)
+    tall = 1.0 + 4.05 * float(np.ptp(comparison.y_px) / np.ptp(comparison.x_px))
+    figure = style.new_figure(11.0 if comparison.tested else 6.6, tall)
+    panels = figure.subplots(1, 2 if comparison.tested else 1, squeeze=False)[0]
+    length = np.linalg.norm(comparison.difference_arcsec, axis=-1)
     if length.max() < _NOTHING:
         length = np.zeros_like(length)
-    both = np.stack([length, found.sigma_arcsec]) if found.tested else length
+    both = np.stack([length, comparison.sigma_arcsec]) if comparison.tested else length
     # Lengths vanish at points; what is a small share of the largest has one colour.
     foot = _FOOT * float(both.max())
     levels, norm = round_levels(np.maximum(both, foot))
-    a, b = found.labels
-    image = _filled(panels[0], found, length, levels, norm, f"{b} minus {a}")
-    if found.tested:
-        _multiples(panels[0], found)
-        _filled(panels[1], found, found.sigma_arcsec, levels, norm, "Expected from both uncertainties (1 sigma)")
-    _arrows(panels[0], found)
+    a, b = comparison.labels
+    image = _filled(panels[0], comparison, length, levels, norm, f"{b} minus {a}")
+    if comparison.tested:
+        _multiples(panels[0], comparison)
+        _filled(
+            panels[1], comparison, comparison.sigma_arcsec, levels, norm, "Expected from both uncertainties (1 sigma)"
+        )
+    _arrows(panels[0], comparison)
     bar = figure.colorbar(image, ax=list(panels), fraction=0.046, pad=0.02)
     style.dress_bar(bar, "difference of directions [arcsec]")
     ticks_at_levels(bar, levels)
@@ -55,10 +57,10 @@ def plot_camera_comparison(found: CameraComparison) -> Figure:
 
 
 def _filled(
-    ax: Axes, found: CameraComparison, values: FloatArray, levels: FloatArray, norm: Normalize | None, title: str
+    ax: Axes, comparison: CameraComparison, values: FloatArray, levels: FloatArray, norm: Normalize | None, title: str
 ) -> Any:
     style.dress(ax)
-    x, y = found.x_px, found.y_px
+    x, y = comparison.x_px, comparison.y_px
     image = ax.contourf(x, y, np.maximum(values, levels[0]), levels=levels, norm=norm, cmap="cividis")
     ax.set_xlim(x[0], x[-1])
     ax.set_ylim(y[-1], y[0])
@@ -67,22 +69,24 @@ def _filled(
     return image
 
 
-def _multiples(ax: Axes, found: CameraComparison) -> None:
+def _multiples(ax: Axes, comparison: CameraComparison) -> None:
     """Contours of the difference in its standard deviations."""
-    lines = ax.contour(found.x_px, found.y_px, found.ratio, levels=_TIMES, colors="white", linewidths=(0.9, 1.3, 1.8))
+    lines = ax.contour(
+        comparison.x_px, comparison.y_px, comparison.ratio, levels=_TIMES, colors="white", linewidths=(0.9, 1.3, 1.8)
+    )
     ax.clabel(lines, fmt=lambda v: f"{v:g}σ", fontsize=style.TICK_SIZE, colors="white")
 
 
-def _arrows(ax: Axes, found: CameraComparison) -> None:
-    step = max(1, (len(found.x_px) - 1) // (_ARROWS - 1))
+def _arrows(ax: Axes, comparison: CameraComparison) -> None:
+    step = max(1, (len(comparison.x_px) - 1) // (_ARROWS - 1))
     some = slice(step // 2, None, step)
-    d = found.difference_arcsec[some, some]
-    x, y = np.meshgrid(found.x_px[some], found.y_px[some])
+    d = comparison.difference_arcsec[some, some]
+    x, y = np.meshgrid(comparison.x_px[some], comparison.y_px[some])
     # The largest are in the corners and would leave nothing to see elsewhere.
     typical = float(np.percentile(np.linalg.norm(d, axis=-1), 85.0))
     if typical < _NOTHING:
         return
-    spacing = float(found.x_px[step] - found.x_px[0])
+    spacing = float(comparison.x_px[step] - comparison.x_px[0])
     arrows = ax.quiver(
         x,
         y,

@@ -48,39 +48,39 @@ def plot_misfit(misfit: Misfit, ax: Axes | None = None, *, alpha: float = _ALPHA
     return ax
 
 
-def plot_jackknife(found: Jackknife, ax: Axes | None = None) -> Axes:
+def plot_jackknife(jackknife: Jackknife, ax: Axes | None = None) -> Axes:
     """Jackknife over formal sigma of every parameter, with the range that chance gives."""
     if ax is None:
         ax = style.new_axes(4.2, 3.2)
     style.dress(ax, grid=True)
-    rows = np.arange(len(found.ratio))
-    low, high = found.expected()
+    rows = np.arange(len(jackknife.ratio))
+    low, high = jackknife.expected()
     ax.bar(rows, high - low, bottom=low, width=0.62, color=style.LIGHT, label="chance (95 %)")
-    ax.scatter(rows - 0.08, found.ratio, color=style.BLUE, s=32, zorder=3, label="jackknife")
+    ax.scatter(rows - 0.08, jackknife.ratio, color=style.BLUE, s=32, zorder=3, label="jackknife")
     ax.scatter(
-        rows + 0.08, found.sandwich_ratio, color=style.ORANGE, marker="s", s=26, zorder=3, label="cluster-robust"
+        rows + 0.08, jackknife.sandwich_ratio, color=style.ORANGE, marker="s", s=26, zorder=3, label="cluster-robust"
     )
     ax.axhline(1.0, color=style.INK, linewidth=0.9)
-    ax.set_xticks(rows, found.parameter_names)
-    top = max(float(np.max([high, found.ratio, found.sandwich_ratio])), 1.2)
+    ax.set_xticks(rows, jackknife.parameter_names)
+    top = max(float(np.max([high, jackknife.ratio, jackknife.sandwich_ratio])), 1.2)
     ax.set_ylim(min(0.5, float(low.min()) - 0.05), 1.0 + 1.8 * (top - 1.0))
     style.legend(ax, loc="upper left", ncols=2, columnspacing=0.7, handletextpad=0.2, handlelength=1.0)
     style.label(ax, "Frames against formal errors", "", "ratio to formal sigma")
     return ax
 
 
-def plot_comparison(found: ModelComparison, ax: Axes | None = None) -> Axes:
+def plot_comparison(models: ModelComparison, ax: Axes | None = None) -> Axes:
     """Loss in predicting left-out frames against the best model, with two standard errors."""
     if ax is None:
         ax = style.new_axes(4.6, 3.2)
     style.dress(ax, grid=True)
-    scores = found.scores[::-1]
+    scores = models.scores[::-1]
     rows = np.arange(len(scores))
     for row, score in zip(rows, scores, strict=True):
         colour = style.VERMILLION if score.rejected else style.BLUE
         spread = 2.0 * score.difference_se
         ax.errorbar(-score.difference, row, xerr=spread, color=colour, marker="o", markersize=5, elinewidth=1.4)
-    names = [f"{s.model} (fitted)" if s.model == found.fitted else s.model for s in scores]
+    names = [f"{s.model} (fitted)" if s.model == models.fitted else s.model for s in scores]
     ax.set_yticks(rows, names, fontsize=style.TICK_SIZE)
     ax.set_ylim(-0.6, len(scores) - 0.4)
     ax.axvline(0.0, color=style.INK, linewidth=0.9)
@@ -92,17 +92,17 @@ def plot_comparison(found: ModelComparison, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def plot_diagnosis(found: Diagnosis) -> Figure:
+def plot_diagnosis(diagnosis: Diagnosis) -> Figure:
     """Tests for misfit, jackknife and comparison of models side by side."""
     figure = style.new_figure(11.0, 5.4)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1.0))
-    plot_misfit(found.misfit, figure.add_subplot(grid[:, 0]))
+    plot_misfit(diagnosis.misfit, figure.add_subplot(grid[:, 0]))
     upper, lower = figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1, 1])
-    if found.jackknife is not None:
-        plot_jackknife(found.jackknife, upper)
-    if found.comparison is not None:
-        plot_comparison(found.comparison, lower)
-    for panel, result in ((upper, found.jackknife), (lower, found.comparison)):
+    if diagnosis.jackknife is not None:
+        plot_jackknife(diagnosis.jackknife, upper)
+    if diagnosis.comparison is not None:
+        plot_comparison(diagnosis.comparison, lower)
+    for panel, result in ((upper, diagnosis.jackknife), (lower, diagnosis.comparison)):
         panel.set_visible(result is not None)
     return figure
 
@@ -149,86 +149,88 @@ _COLUMNS = 4
 _NEES_BINS = 30
 
 
-def plot_validation(found: Validation) -> Figure:
+def plot_validation(validation: Validation) -> Figure:
     """Rank curves of every quantity with their simultaneous 95 % bands, coverage, and NEES against chi-square.
 
     A rank curve is the empirical distribution of the truth's rank minus the uniform one. High on the left and low on
     the right means that intervals are too narrow, the reverse that they are too wide; a curve to one side, that
     estimates are too high (above zero) or too low.
     """
-    n_panels = len(found.quantities) + 2
+    n_panels = len(validation.quantities) + 2
     rows = -(-n_panels // _COLUMNS)
     figure = style.new_figure(11.0, 0.5 + 2.35 * rows)
     panels = figure.subplots(rows, _COLUMNS, squeeze=False).ravel()
-    names = _symbols(found)
+    names = _symbols(validation)
     for i, name in enumerate(names):
-        _rank_panel(panels[i], found, i, name)
+        _rank_panel(panels[i], validation, i, name)
         if i % _COLUMNS == 0:
             style.label(panels[i], y="fraction below − expected")
-    _coverage_panel(panels[len(names)], found, names)
-    _nees_panel(panels[len(names) + 1], found)
+    _coverage_panel(panels[len(names)], validation, names)
+    _nees_panel(panels[len(names) + 1], validation)
     for spare in panels[n_panels:]:
         spare.set_axis_off()
     return figure
 
 
-def _symbols(found: Validation) -> list[str]:
-    known = {p.name: p.latex for p in (*parameters(found.camera.distortion), sigma_parameter(False))}
-    return [known.get(q, q.replace("_", " ")) for q in found.quantities]
+def _symbols(validation: Validation) -> list[str]:
+    known = {p.name: p.latex for p in (*parameters(validation.camera.distortion), sigma_parameter(False))}
+    return [known.get(q, q.replace("_", " ")) for q in validation.quantities]
 
 
-def _rank_panel(ax: Axes, found: Validation, i: int, name: str) -> None:
+def _rank_panel(ax: Axes, validation: Validation, i: int, name: str) -> None:
     style.dress(ax)
-    n, n_values = found.n_replicates, found.n_ranked + 1
+    n, n_values = validation.n_replicates, validation.n_ranked + 1
     z, lower, upper = uniformity_band(n, n_values, _BAND)
     at = np.concatenate([[0.0], z, [1.0]])
 
     def ended(values: FloatArray) -> FloatArray:
         return np.concatenate([[0.0], values - z, [0.0]])
 
-    outside = bool(found.rank_p_value[i] < 1.0 - _BAND)
+    outside = bool(validation.rank_p_value[i] < 1.0 - _BAND)
     ax.fill_between(at, ended(lower), ended(upper), color=style.LIGHT, linewidth=0)
     ax.axhline(0.0, color=style.GREY, linewidth=0.7)
-    curve = ended(counts_below(found.ranks[:, i], n_values) / n)
+    curve = ended(counts_below(validation.ranks[:, i], n_values) / n)
     ax.plot(at, curve, color=style.VERMILLION if outside else style.BLUE, linewidth=1.3)
     reach = 1.15 * max(float(np.max(np.abs(curve))), float(np.max(upper - z)))
     ax.set_xlim(0.0, 1.0)
     ax.set_ylim(-reach, reach)
-    style.label(ax, f"{name}:  p {_p(found.rank_p_value[i])}", "rank of the truth / draws")
+    style.label(ax, f"{name}:  p {_p(validation.rank_p_value[i])}", "rank of the truth / draws")
 
 
-def _coverage_panel(ax: Axes, found: Validation, names: list[str]) -> None:
+def _coverage_panel(ax: Axes, validation: Validation, names: list[str]) -> None:
     style.dress(ax)
     place = np.arange(len(names))[::-1]
-    low, high = 100.0 * found.coverage_interval.T
+    low, high = 100.0 * validation.coverage_interval.T
     outside = (low > 95.0) | (high < 95.0)
     ax.axvline(95.0, color=style.GREY, linewidth=0.9)
     for some, colour in ((~outside, style.BLUE), (outside, style.VERMILLION)):
         ax.hlines(place[some], low[some], high[some], color=colour, linewidth=1.3)
-        ax.plot(100.0 * found.coverage[some], place[some], "o", color=colour, markersize=3.5)
+        ax.plot(100.0 * validation.coverage[some], place[some], "o", color=colour, markersize=3.5)
     ax.set_yticks(place, [name.replace("log likelihood", "log lik.") for name in names])
     ax.set_ylim(-0.6, len(names) - 0.4)
     style.label(ax, "Coverage of 95 % intervals", "replicates [%], with 95 % interval")
 
 
-def _nees_panel(ax: Axes, found: Validation) -> None:
+def _nees_panel(ax: Axes, validation: Validation) -> None:
     from scipy.stats import chi2
 
     style.dress(ax)
-    p = found.n_parameters
+    p = validation.n_parameters
     # What lies beyond is counted in the last bar, so that one outlier does not flatten all others.
     end = float(chi2.ppf(1.0 - 1e-4, p))
     edges = np.linspace(0.0, end, _NEES_BINS + 1)
-    counts, _ = np.histogram(np.minimum(found.nees, end * (1.0 - 1e-9)), edges)
+    counts, _ = np.histogram(np.minimum(validation.nees, end * (1.0 - 1e-9)), edges)
     width = edges[1]
-    ax.bar(edges[:-1], counts / (found.n_replicates * width), width, align="edge", color=style.SKY, edgecolor="white")
+    ax.bar(
+        edges[:-1], counts / (validation.n_replicates * width), width, align="edge", color=style.SKY, edgecolor="white"
+    )
     grid = np.linspace(0.0, end, 200)
     ax.plot(grid, chi2.pdf(grid, p), color=style.INK, linewidth=1.2, label=f"chi-square, {p} d.o.f.")
     ax.set_xlim(0.0, end)
     ax.set_yticks([])
     style.legend(ax, loc="upper right")
-    ratio = fixed(found.nees_ratio, 3 if found.nees_ratio < 2.0 else 1)
-    style.label(ax, f"NEES/{p} = {ratio}:  p {_p(found.nees_p_value)}", "normalised squared error")
+    ratio = fixed(validation.nees_ratio, 3 if validation.nees_ratio < 2.0 else 1)
+    style.label(ax, f"NEES/{p} = {ratio}:  p {_p(validation.nees_p_value)}", "normalised squared error")
 
 
 def _p(value: float) -> str:

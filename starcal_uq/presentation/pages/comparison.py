@@ -26,7 +26,7 @@ _BADGES = {
 }
 
 
-def write_comparison(found: CameraComparison, folder: str | os.PathLike[str]) -> Path:
+def write_comparison(comparison: CameraComparison, folder: str | os.PathLike[str]) -> Path:
     """Write the page, the tables, the figure and a lossless file into a folder; existing ones are overwritten.
 
     Returns
@@ -40,93 +40,101 @@ def write_comparison(found: CameraComparison, folder: str | os.PathLike[str]) ->
         If the folder cannot be made or written to.
     """
     path = new_folder(folder)
-    image = png_bytes(plot_camera_comparison(found))
-    found.save(path / "comparison.json")
-    atomic_write_text(path / "difference.csv", found.to_dataframe().to_csv(index=False))
-    atomic_write_text(path / "difference_map.csv", found.field_dataframe().to_csv(index=False))
+    image = png_bytes(plot_camera_comparison(comparison))
+    comparison.save(path / "comparison.json")
+    atomic_write_text(path / "difference.csv", comparison.to_dataframe().to_csv(index=False))
+    atomic_write_text(path / "difference_map.csv", comparison.field_dataframe().to_csv(index=False))
     atomic_write_bytes(path / "difference_map.png", image)
     page = path / "comparison.html"
-    atomic_write_text(page, render_comparison(found, image))
+    atomic_write_text(page, render_comparison(comparison, image))
     return page
 
 
-def render_comparison(found: CameraComparison, image: bytes) -> str:
+def render_comparison(comparison: CameraComparison, image: bytes) -> str:
     """The page as one HTML document; `image` is the figure as PNG."""
     environment = template_environment()
     context = {
-        "found": found,
-        "level": _LEVELS[found.verdict],
-        "badge": _BADGES[found.verdict],
-        "headline": headline(found),
-        "rotation": rotation_words(found),
-        "false_alarms": percent(found.level, 1),
-        "map_rows": _map_rows(found),
-        "test_rows": _test_rows(found),
-        "parameter_rows": _parameter_rows(found),
+        "found": comparison,
+        "level": _LEVELS[comparison.verdict],
+        "badge": _BADGES[comparison.verdict],
+        "headline": headline(comparison),
+        "rotation": rotation_words(comparison),
+        "false_alarms": percent(comparison.level, 1),
+        "map_rows": _map_rows(comparison),
+        "test_rows": _test_rows(comparison),
+        "parameter_rows": _parameter_rows(comparison),
         "sources": [
-            _source(label, found.provenance.get(key, {})) for label, key in zip(found.labels, "ab", strict=True)
+            _source(label, comparison.provenance.get(key, {}))
+            for label, key in zip(comparison.labels, "ab", strict=True)
         ],
         "image": embedded_image(image),
     }
     return environment.get_template("comparison.html.j2").render(context) + "\n"
 
 
-def _map_rows(found: CameraComparison) -> list[dict[str, str]]:
+def _map_rows(comparison: CameraComparison) -> list[dict[str, str]]:
     return [
         {
             "name": "Root mean square over the detector",
-            "arcsec": significant(found.rms_arcsec),
-            "px": significant(found.rms_px),
-            "expected": significant(found.expected_rms_arcsec) if found.tested else "not known",
+            "arcsec": significant(comparison.rms_arcsec),
+            "px": significant(comparison.rms_px),
+            "expected": significant(comparison.expected_rms_arcsec) if comparison.tested else "not known",
         },
         {
             "name": "Largest",
-            "arcsec": significant(found.largest_arcsec),
-            "px": significant(found.largest_px),
+            "arcsec": significant(comparison.largest_arcsec),
+            "px": significant(comparison.largest_px),
             "expected": "",
         },
     ]
 
 
-def _test_rows(found: CameraComparison) -> list[dict[str, str]]:
-    if not found.tested:
+def _test_rows(comparison: CameraComparison) -> list[dict[str, str]]:
+    if not comparison.tested:
         return []
     worst = (
-        f"{significant(found.worst_ratio)} times its 1 sigma at x = {found.worst_x_px:.0f} px, y = "
-        f"{found.worst_y_px:.0f} px"
+        f"{significant(comparison.worst_ratio)} times its 1 sigma at x = {comparison.worst_x_px:.0f} px, y = "
+        f"{comparison.worst_y_px:.0f} px"
     )
-    error = f" (Monte Carlo, ±\N{NO-BREAK SPACE}{significant(found.p_worst_error, 1)})"
+    error = f" (Monte Carlo, ±\N{NO-BREAK SPACE}{significant(comparison.p_worst_error, 1)})"
     rows = [
         {
             "name": "Map",
             "asks": "Do the directions differ by more than they should, on average over the detector?",
-            "statistic": f"{significant(found.rms_arcsec)} arcsec, {significant(found.expected_rms_arcsec)} expected",
-            "p": p_words(found.p_map),
+            "statistic": f"{significant(comparison.rms_arcsec)} arcsec, "
+            f"{significant(comparison.expected_rms_arcsec)} expected",
+            "p": p_words(comparison.p_map),
         },
         {
             "name": "Parameters",
             "asks": "Can the two be the same camera, every direction weighed by its own uncertainty?",
-            "statistic": f"χ² = {significant(found.statistic, 3)} for {found.n_directions}",
-            "p": p_words(found.p_parameters),
+            "statistic": f"χ² = {significant(comparison.statistic, 3)} for {comparison.n_directions}",
+            "p": p_words(comparison.p_parameters),
         },
         {
             "name": "Worst place",
             "asks": "Is the place that stands out most worse than the worst of so many by chance?",
             "statistic": worst,
-            "p": p_words(found.p_worst) + error,
+            "p": p_words(comparison.p_worst) + error,
         },
     ]
-    return rows if np.isfinite(found.p_parameters) else rows[:1]
+    return rows if np.isfinite(comparison.p_parameters) else rows[:1]
 
 
-def _parameter_rows(found: CameraComparison) -> list[dict[str, str]]:
-    specs = {p.name: p for model in found.models for p in parameters(model)}
+def _parameter_rows(comparison: CameraComparison) -> list[dict[str, str]]:
+    specs = {p.name: p for model in comparison.models for p in parameters(model)}
     rows = []
-    for i, name in enumerate(found.parameter_names):
+    for i, name in enumerate(comparison.parameter_names):
         spec = specs[name]
         a, b, sd_a, sd_b, sd = (
             float(values[i]) / spec.scale
-            for values in (found.theta_a, found.theta_b, found.sd_a, found.sd_b, found.sd_difference)
+            for values in (
+                comparison.theta_a,
+                comparison.theta_b,
+                comparison.sd_a,
+                comparison.sd_b,
+                comparison.sd_difference,
+            )
         )
         known = np.isfinite(sd) and sd > 0.0
         rows.append(

@@ -22,25 +22,25 @@ if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
 
 
-def diagnosis_context(found: Diagnosis | None, cal: Calibration) -> dict[str, Any]:
+def diagnosis_context(diagnosis: Diagnosis | None, cal: Calibration) -> dict[str, Any]:
     """What the misfit section shows; empty where there is no diagnosis."""
-    if found is None:
+    if diagnosis is None:
         return {}
     return {
-        "misfit_rows": misfit_rows(found.misfit),
-        "misfit_sentence": _misfit_sentence(found),
-        "jackknife_rows": [] if found.jackknife is None else jackknife_rows(found.jackknife, cal),
-        "jackknife_sentence": "" if found.jackknife is None else _jackknife_sentence(found.jackknife),
-        "comparison_rows": [] if found.comparison is None else comparison_rows(found.comparison, cal),
-        "comparison_sentence": "" if found.comparison is None else models_sentence(found.comparison),
-        "predictive_rows": predictive_rows(found.predictive),
+        "misfit_rows": misfit_rows(diagnosis.misfit),
+        "misfit_sentence": _misfit_sentence(diagnosis),
+        "jackknife_rows": [] if diagnosis.jackknife is None else jackknife_rows(diagnosis.jackknife, cal),
+        "jackknife_sentence": "" if diagnosis.jackknife is None else _jackknife_sentence(diagnosis.jackknife),
+        "comparison_rows": [] if diagnosis.comparison is None else comparison_rows(diagnosis.comparison, cal),
+        "comparison_sentence": "" if diagnosis.comparison is None else models_sentence(diagnosis.comparison),
+        "predictive_rows": predictive_rows(diagnosis.predictive),
     }
 
 
-def misfit_rows(found: Misfit) -> list[Row]:
+def misfit_rows(misfit: Misfit) -> list[Row]:
     """One row per test."""
     rows = []
-    for test in found.tests:
+    for test in misfit.tests:
         kind = f"F({count(test.dof)}, {count(test.dof_residual)}) = {fixed(test.statistic, 2)}"
         rows.append(
             {
@@ -57,50 +57,50 @@ def misfit_rows(found: Misfit) -> list[Row]:
     return rows
 
 
-def _misfit_sentence(found: Diagnosis) -> str:
-    rejected = found.misfit.found(MISFIT_P)
-    several = f"{plural(len(found.misfit.tests), 'test')}, overall p = {significant(found.misfit.p_value)}"
+def _misfit_sentence(diagnosis: Diagnosis) -> str:
+    rejected = diagnosis.misfit.found(MISFIT_P)
+    several = f"{plural(len(diagnosis.misfit.tests), 'test')}, overall p = {significant(diagnosis.misfit.p_value)}"
     if not rejected:
         return f"None found anything ({several})."
     return f"{len(rejected)} of {several}."
 
 
-def jackknife_rows(found: Jackknife, cal: Calibration) -> list[Row]:
+def jackknife_rows(jackknife: Jackknife, cal: Calibration) -> list[Row]:
     """One row per parameter."""
-    formal, robust = (np.sqrt(np.diag(c)) for c in (found.formal_covariance, found.jackknife_covariance))
-    low, high = found.expected()
-    p_values = found.p_values
+    formal, robust = (np.sqrt(np.diag(c)) for c in (jackknife.formal_covariance, jackknife.jackknife_covariance))
+    low, high = jackknife.expected()
+    p_values = jackknife.p_values
     return [
         {
             "symbol": symbol(p.name),
             "unit": pretty_unit(p.scaled_unit),
             "formal": significant(float(formal[i]) / p.scale),
             "jackknife": significant(float(robust[i]) / p.scale),
-            "ratio": fixed(float(found.ratio[i]), 2),
+            "ratio": fixed(float(jackknife.ratio[i]), 2),
             "expected": f"{fixed(float(low[i]), 2)} to {fixed(float(high[i]), 2)}",
-            "sandwich": fixed(float(found.sandwich_ratio[i]), 2),
+            "sandwich": fixed(float(jackknife.sandwich_ratio[i]), 2),
             "p": significant(float(p_values[i])),
-            "factor": fixed(float(found.factors[i]), 2),
+            "factor": fixed(float(jackknife.factors[i]), 2),
         }
         for i, p in enumerate(parameters(cal.camera.distortion))
     ]
 
 
-def _jackknife_sentence(found: Jackknife) -> str:
-    low, high = float(found.ratio.min()), float(found.ratio.max())
-    return f"Here the ratios are {fixed(low, 2)} to {fixed(high, 2)}, over {plural(found.n_frames, 'frame')}."
+def _jackknife_sentence(jackknife: Jackknife) -> str:
+    low, high = float(jackknife.ratio.min()), float(jackknife.ratio.max())
+    return f"Here the ratios are {fixed(low, 2)} to {fixed(high, 2)}, over {plural(jackknife.n_frames, 'frame')}."
 
 
-def comparison_rows(found: ModelComparison, cal: Calibration) -> list[Row]:
+def comparison_rows(models: ModelComparison, cal: Calibration) -> list[Row]:
     """One row per model, the best first."""
     unit = " px" if cal.sigma_name == "sigma" else ""
     rows = []
-    for score in found.scores:
+    for score in models.scores:
         parts = [
             f"{significant(float(np.hypot(*part[:2])))} / {significant(abs(part[2]))}"
             for part in (score.common_arcsec, score.rest_arcsec)
         ]
-        mine = score.model == found.fitted
+        mine = score.model == models.fitted
         best = score.difference == 0.0
         rows.append(
             {
@@ -119,10 +119,10 @@ def comparison_rows(found: ModelComparison, cal: Calibration) -> list[Row]:
     return rows
 
 
-def predictive_rows(found: PredictiveCheck) -> list[Row]:
+def predictive_rows(predictive: PredictiveCheck) -> list[Row]:
     """One row per statistic."""
     rows = []
-    for s in found.statistics:
+    for s in predictive.statistics:
         decimals = decimals_for(s.replicated_high - s.replicated_low)
         low, high = fixed(s.replicated_low, decimals), fixed(s.replicated_high, decimals)
         rows.append(

@@ -87,15 +87,15 @@ def screening_table(screening: Screening) -> TextTable | None:
     return TextTable.of(rejected, f"Rejected stars{more}", formats=formats, missing="")
 
 
-def consistency_text(found: Consistency) -> str:
+def consistency_text(consistency: Consistency) -> str:
     """Whether the runs show the same camera."""
-    verdict = "show the same camera" if found.p_value >= ALPHA else "do not show the same camera"
+    verdict = "show the same camera" if consistency.p_value >= ALPHA else "do not show the same camera"
     return (
-        f"The runs {verdict} (F = {found.statistic:.3g} with {found.dof[0]} and {found.dof[1]} degrees of freedom, "
-        f"p = {found.p_value:.2g})."
+        f"The runs {verdict} (F = {consistency.statistic:.3g} with {consistency.dof[0]} and {consistency.dof[1]} "
+        f"degrees of freedom, p = {consistency.p_value:.2g})."
     )
 
 
-def consistency_table(found: Consistency) -> TextTable:
+def consistency_table(consistency: Consistency) -> TextTable:
     """One row per run."""
-    return TextTable.of(found.to_dataframe(), "Agreement of the runs")
+    return TextTable.of(consistency.to_dataframe(), "Agreement of the runs")

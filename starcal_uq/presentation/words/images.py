@@ -42,40 +42,40 @@ def centroids_table(centroids: Centroids) -> TextTable:
     return TextTable.of(centroids.frames_dataframe().head(MOST_FRAMES), "", columns, formats)
 
 
-def identification_text(found: Identification) -> str:
+def identification_text(identification: Identification) -> str:
     """How many frames are identified, why the others are not, and what the nominal camera missed."""
-    n_frames = len(found.frames) - found.n_left_out
+    n_frames = len(identification.frames) - identification.n_left_out
     if not n_frames:
         return "There are no frames."
-    counts = Counter(frame.status for frame in found.frames)
-    counts["too few stars"] -= found.n_left_out
-    be = "is" if 1 in (found.n_identified, n_frames) else "are"
-    words = f"{found.n_identified} of {plural(n_frames, 'frame')} {be} identified"
-    if found.n_identified:
-        stars = [frame.n_identified for frame in found.frames if frame.status == "identified"]
+    counts = Counter(frame.status for frame in identification.frames)
+    counts["too few stars"] -= identification.n_left_out
+    be = "is" if 1 in (identification.n_identified, n_frames) else "are"
+    words = f"{identification.n_identified} of {plural(n_frames, 'frame')} {be} identified"
+    if identification.n_identified:
+        stars = [frame.n_identified for frame in identification.frames if frame.status == "identified"]
         words += f", with {np.mean(stars):.1f} stars on average"
     words += "."
     rest = [f"{counts[status]} {_REASONS[status]}" for status in STATUSES[1:] if counts[status]]
     if rest:
         words += f" Left out: {'; '.join(rest)}."
-    unlike = sum(frame.n_unlike_brightness for frame in found.frames)
+    unlike = sum(frame.n_unlike_brightness for frame in identification.frames)
     if unlike:
         words += f" {plural(unlike, 'match', 'matches')} given up, because the brightness is unlike the star's."
-    if found.n_identified:
-        change = 100.0 * (found.camera.focal_px / found.nominal.focal_px - 1.0)
+    if identification.n_identified:
+        change = 100.0 * (identification.camera.focal_px / identification.nominal.focal_px - 1.0)
         words += f" The focal length is {abs(change):.2f} % {'longer' if change >= 0 else 'shorter'} than nominal."
-    return words + _MIRRORED if found.parity == "mirrored" else words
+    return words + _MIRRORED if identification.parity == "mirrored" else words
 
 
-def identification_table(found: Identification) -> TextTable:
+def identification_table(identification: Identification) -> TextTable:
     """What became of the first frames."""
     columns = ("frame", "image", "status", "n_centroids", "n_identified", "log10_expected_false", "milliseconds")
-    return TextTable.of(found.to_dataframe().head(MOST_FRAMES), "Identification", columns)
+    return TextTable.of(identification.to_dataframe().head(MOST_FRAMES), "Identification", columns)
 
 
-def image_calibration_text(found: ImageCalibration) -> str:
+def image_calibration_text(images: ImageCalibration) -> str:
     """What the second round of identification changed."""
-    (before, _, first), (after, _, second) = found.rounds[0], found.rounds[-1]
+    (before, _, first), (after, _, second) = images.rounds[0], images.rounds[-1]
     old, new = identified_pairs(before.observations), identified_pairs(after.observations)
     words = (
         f"{plural(len(old), 'star')} in {plural(before.n_identified, 'frame')} with the nominal camera, "

@@ -48,36 +48,37 @@ def posterior_table(post: Posterior) -> TextTable:
     return TextTable(heads, tuple(rows), f"Posterior: {len(post.draws)} draws", "lrrrrrrrl")
 
 
-def predictive_text(found: PriorPredictive) -> str:
+def predictive_text(predictive: PriorPredictive) -> str:
     """Whether the data are a surprise to the prior, and how the drawn cameras look."""
     words = "The data lie within what the prior expects."
-    if not np.any(np.isfinite(found.observed)):
+    if not np.any(np.isfinite(predictive.observed)):
         words = "No observations were given to compare with."
-    elif not found.ok:
-        names = ", ".join(found.surprising)
+    elif not predictive.ok:
+        names = ", ".join(predictive.surprising)
         words = f"The prior does not expect the data in {names}: check the nominal camera, or widen the prior."
     return (
-        f"{words} {100 * found.folded:.1f} % of the cameras drawn from the prior fold over inside the field, "
-        f"{100 * found.off_detector:.1f} % have their principal point off the detector."
+        f"{words} {100 * predictive.folded:.1f} % of the cameras drawn from the prior fold over inside the field, "
+        f"{100 * predictive.off_detector:.1f} % have their principal point off the detector."
     )
 
 
-def sensitivity_text(found: PriorSensitivity) -> str:
+def sensitivity_text(sensitivity: PriorSensitivity) -> str:
     """Whether the priors matter, and for which parameters."""
-    if found.ok:
-        return f"The priors do not matter: largest sensitivity {found.prior.max():.2g}, threshold {found.threshold:g}."
+    if sensitivity.ok:
+        largest = f"{sensitivity.prior.max():.2g}"
+        return f"The priors do not matter: largest sensitivity {largest}, threshold {sensitivity.threshold:g}."
     parts = [
-        f"{word} for {', '.join(n for n, w in zip(found.names, found.diagnosis, strict=True) if w == word)}"
+        f"{word} for {', '.join(n for n, w in zip(sensitivity.names, sensitivity.diagnosis, strict=True) if w == word)}"
         for word in (CONFLICT, WEAK)
-        if word in found.diagnosis
+        if word in sensitivity.diagnosis
     ]
     return f"The priors matter: {'; '.join(parts)}."
 
 
-def shift_text(found: ShiftTest) -> str:
+def shift_text(shift: ShiftTest) -> str:
     """Whether the camera changed between two runs."""
-    largest = int(np.argmax(np.abs(found.z)))
-    where = f"largest change {found.names[largest]}, {found.z[largest]:+.1f} sigma; p = {found.p_value:.2g}"
-    if found.significant:
+    largest = int(np.argmax(np.abs(shift.z)))
+    where = f"largest change {shift.names[largest]}, {shift.z[largest]:+.1f} sigma; p = {shift.p_value:.2g}"
+    if shift.significant:
         return f"The camera changed between the runs ({where}): widen the prior by an allowed shift, or start afresh."
     return f"Nothing shows that the camera changed between the runs ({where})."
