@@ -33,7 +33,8 @@ from .observations.table import load_observations as load_observations
 from .planning.plan import plan as plan
 from .propagation.coupling import coupling as coupling
 from .propagation.propagate import propagate as propagate
-from .runs.steps import report as report
+from .runs.report import report as report
+from .runs.run import Run as Run
 from .simulation.frames import simulate as simulate
 from .sky.catalogue import StarCatalogue as StarCatalogue
 from .sky.catalogue import load_catalogue as load_catalogue

@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+import starcal_uq as sc
+from starcal_uq.cli.console import print_json, records, show_calibration
 from starcal_uq.cli.options import CameraFile, Columns, Force, Json, NewRun, parse_columns
 
 
@@ -44,17 +46,14 @@ def filter_command(
     json: Json = False,
 ) -> None:
     """Calibrate frame by frame, with an estimate after each; stars may exceed memory, an interrupted call goes on."""
-    from starcal_uq.camera.camera import Camera
-    from starcal_uq.cli.console import print_json, records, show_calibration
     from starcal_uq.estimation.recursive.innovations import PAIR_COVARIANCES
-    from starcal_uq.estimation.recursive.start import RecursionOptions
     from starcal_uq.runs.streams import HISTORY, filter_run
 
     if pair_covariance not in PAIR_COVARIANCES:
         raise typer.BadParameter(
             f"--pair-covariance {pair_covariance!r} is unknown: use one of {', '.join(PAIR_COVARIANCES)}."
         )
-    options = RecursionOptions(
+    options = sc.estimation.RecursionOptions(
         pair_covariance=pair_covariance,
         parameters="optics" if method == "samaan" else parameters,
         forgetting=forgetting,
@@ -63,7 +62,7 @@ def filter_command(
     )
     calibration = filter_run(
         observations,
-        Camera.load(camera),
+        sc.Camera.load(camera),
         out,
         method=method,
         options=options,

@@ -8,8 +8,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from starcal_uq.cli.console import progress_bar
+import starcal_uq as sc
+from starcal_uq.cli.console import err, print_json, print_table, progress_bar, records, warn_undeclared
 from starcal_uq.cli.options import CameraFile, Engine, Force, Json, TimeUtc, check_same_sensor, parse_engine
+from starcal_uq.cli.settings import ImageSettings, SkySettings
+from starcal_uq.core.files import ensure_new
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -50,19 +53,15 @@ def centroid_command(
     json: Json = False,
 ) -> None:
     """Find the stars in images, with a covariance for each; a frame that cannot be used is named and left out."""
-    from starcal_uq.camera.camera import Camera
-    from starcal_uq.cli.console import print_json, records
-    from starcal_uq.core.files import ensure_new
     from starcal_uq.core.times import utc_text
-    from starcal_uq.images.extract import extract_centroids
     from starcal_uq.pipeline.images import counted, with_time
 
     ensure_new(out, force)
     if time is not None:
         time = utc_text(time)
-    sensor = None if camera is None else Camera.load(camera)
+    sensor = None if camera is None else sc.Camera.load(camera)
     with progress_bar("images") as progress:
-        found = extract_centroids(
+        found = sc.images.extract_centroids(
             images,
             camera=sensor,
             gain_e_per_count=gain,
@@ -103,27 +102,19 @@ def identify_command(
     json: Json = False,
 ) -> None:
     """Identify the stars of every frame without knowing where the camera pointed; frames that do not fit are named."""
-    from starcal_uq.camera.camera import Camera
-    from starcal_uq.cli.console import print_json, print_table, records
-    from starcal_uq.core.files import ensure_new
-    from starcal_uq.identification.engine import identify
-    from starcal_uq.images.centroids import Centroids
     from starcal_uq.pipeline.images import epoch_of
     from starcal_uq.presentation.words.images import MOST_FRAMES, identification_table
-    from starcal_uq.runs.folder import RunFolder
-    from starcal_uq.runs.steps import best_calibration
-    from starcal_uq.sky.catalogue import load_catalogue
 
     ensure_new(out, force)
-    table = Centroids.load(centroids)
-    nominal = Camera.load(camera)
-    known = None if calibration is None else best_calibration(RunFolder(calibration))
+    table = sc.images.Centroids.load(centroids)
+    nominal = sc.Camera.load(camera)
+    known = None if calibration is None else sc.Run(calibration).best
     if calibration is not None and known is not None:
         check_same_sensor(known.camera, calibration, nominal, camera)
-    stars = load_catalogue(max_mag=max_mag, epoch=epoch_of(table) if epoch is None else epoch)
+    stars = sc.load_catalogue(max_mag=max_mag, epoch=epoch_of(table) if epoch is None else epoch)
     _say_epoch(table, epoch)
     with progress_bar("frames") as progress:
-        found = identify(
+        found = sc.identification.identify(
             table,
             nominal,
             stars,
@@ -146,45 +137,26 @@ def identify_command(
 
 
 def load_images(
-    images: list[Path],
-    camera_path: Path,
-    *,
-    max_mag: float,
-    epoch: float | None,
-    gain: float | None,
-    directions: str | None,
-    site: Path | None,
-    in_space: bool,
-    time_utc: str | None,
-    engine: str,
+    images: list[Path], camera_path: Path, settings: ImageSettings, sky: SkySettings
 ) -> tuple[Observations, Camera, Centroids, ImageCalibration]:
-    """Observations of images, and what is worth telling on the way."""
-    from starcal_uq.camera.camera import Camera
-    from starcal_uq.cli.console import err, warn_undeclared
+    """Observations of images with the nominal camera, and what is worth telling on the way."""
     from starcal_uq.pipeline.images import observations_from_images
-    from starcal_uq.runs.steps import DIRECTIONS
-    from starcal_uq.sky.site import Site
 
-    if directions is not None and directions not in DIRECTIONS:
-        raise typer.BadParameter(f"--directions {directions!r} is unknown: use one of {', '.join(DIRECTIONS)}.")
-    camera = Camera.load(camera_path)
-    place = None if site is None else Site.load(site)
+    known, camera = sky.options(), sc.Camera.load(camera_path)
     with progress_bar("images") as progress:
         obs, centroids, found = observations_from_images(
             images,
             camera,
-            max_mag=max_mag,
-            epoch=epoch,
-            gain_e_per_count=gain,
-            directions=directions,
-            site=place,
-            in_space=in_space,
-            time_utc=time_utc,
-            engine=parse_engine(engine),
+            max_mag=7.0 if settings.max_mag is None else settings.max_mag,
+            epoch=settings.epoch,
+            gain_e_per_count=settings.gain,
+            time_utc=settings.time,
+            engine=parse_engine(settings.engine),
             tell=lambda message: err.print(message, style=_style(message), highlight=False, soft_wrap=True),
             progress=progress,
+            **known,
         )
-    _say_epoch(centroids, epoch)
+    _say_epoch(centroids, settings.epoch)
     for words in (found.identification.text, found.text):
         err.print(words, highlight=False, soft_wrap=True)
     left_out = obs.meta.get("disturbed_stars", 0)
@@ -205,7 +177,5 @@ def _style(message: str) -> str | None:
 
 
 def _say(messages: Sequence[str]) -> None:
-    from starcal_uq.cli.console import err
-
     for message in messages:
         err.print(f"note: {message}", style="yellow", highlight=False, soft_wrap=True)

@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from starcal_uq.cli.console import progress_bar
+import starcal_uq as sc
+from starcal_uq.cli.console import err, print_json, print_table, progress_bar, records
+from starcal_uq.cli.console import out as console
 from starcal_uq.cli.options import FAINTEST, CameraFile, Force, Json, RunPath, Seed, check_same_sensor
-from starcal_uq.core.files import check_new_folder
+from starcal_uq.core.files import check_new_folder, ensure_new
 
 if TYPE_CHECKING:
     from starcal_uq.budgeting.result import Budget
@@ -29,15 +31,14 @@ def register(app: typer.Typer) -> None:
 
 def check_output(out: Path | None, force: bool) -> None:
     """Refuse a folder that holds something, and a run's own folder even with `force`: its results would be mixed."""
-    from starcal_uq.core.errors import RunFolderError
-    from starcal_uq.runs.folder import RunFolder
 
     if out is None:
         return
-    run = RunFolder(out)
-    if run.calibration.exists():
-        raise RunFolderError(f"{out}: is the folder of a run, whose files would be mixed with these; name another.")
-    check_new_folder(run.path, force)
+    if sc.Run(out).has("calibration"):
+        raise sc.errors.RunFolderError(
+            f"{out}: is the folder of a run, whose files would be mixed with these; name another."
+        )
+    check_new_folder(out, force)
 
 
 def budget_command(
@@ -62,11 +63,8 @@ def budget_command(
     json: Json = False,
 ) -> None:
     """Attitude error budget in the terms of ECSS; status 1 when a requirement is violated."""
-    from starcal_uq.cli.console import print_json
-    from starcal_uq.core.files import ensure_new
     from starcal_uq.presentation.pages.budgeting import FORMATS
     from starcal_uq.presentation.pages.write import write_page
-    from starcal_uq.runs.steps import budget_run
 
     if template is not None and file is not None and template.resolve() == file.resolve():
         raise typer.BadParameter(f"--template would write over {file}: name another file.")
@@ -74,11 +72,9 @@ def budget_command(
         if path.suffix.lower() not in FORMATS:
             raise typer.BadParameter(f"{path}: the ending names the format; use one of {', '.join(FORMATS)}.")
         ensure_new(path, force)
-    found = budget_run(run, file=file, confidence=confidence, seed=seed)
+    found = sc.Run(run).budget(file=file, confidence=confidence, seed=seed)
     if template is not None:
-        from starcal_uq.budgeting.file import write_budget_template
-
-        write_budget_template(template, found.rows, force=force)
+        sc.budgeting.write_budget_template(template, found.rows, force=force)
         print(f"Budget file to fill in: {template}. Next: starcal-uq budget {run} --file {template}")
         return
     for path in out or []:
@@ -93,22 +89,20 @@ def budget_command(
 
 def show_budget(found: Budget) -> None:
     """Contributors, totals, requirements and what must be read with them, in the terminal."""
-    from starcal_uq.cli.console import out, print_table
     from starcal_uq.presentation.words.budgeting import contributors_table, explanations, totals_table
 
     print_table(contributors_table(found))
     print_table(totals_table(found))
     for sentence in (*explanations(found), *found.notes):
-        out.print(sentence, highlight=False, soft_wrap=True)
+        console.print(sentence, highlight=False, soft_wrap=True)
     for outcome in found.outcomes:
         style = {"violated": "red", "met": "green"}.get(outcome.verdict, "yellow")
-        out.print(outcome.text, style=style, highlight=False, soft_wrap=True)
-    out.print(found.text, highlight=False, soft_wrap=True)
+        console.print(outcome.text, style=style, highlight=False, soft_wrap=True)
+    console.print(found.text, highlight=False, soft_wrap=True)
 
 
 def fail_if_violated(found: Budget) -> None:
     """Status 1, with the violated lines on standard error."""
-    from starcal_uq.cli.console import err
 
     for outcome in found.violations:
         err.print(f"violated: {outcome.text}", style="red", highlight=False, soft_wrap=True)
@@ -141,11 +135,8 @@ def compare_command(
     json: Json = False,
 ) -> None:
     """Do two calibrations differ by more than chance? The rotation between them is taken out and stated."""
-    from starcal_uq.cli.console import out as console
-    from starcal_uq.cli.console import print_json, print_table
     from starcal_uq.presentation.pages.write import write_page
     from starcal_uq.presentation.words.comparison import comparison_table
-    from starcal_uq.runs.compare import compare_runs, compare_split
 
     if len(runs) != (2 if split is None else 1):
         raise typer.BadParameter(
@@ -157,9 +148,9 @@ def compare_command(
     options: dict[str, Any] = {"level": level, "seed": seed}
     names = _two_labels(labels)
     if split is None:
-        found = compare_runs(*runs, labels=names, same_data=same_data, **options)
+        found = sc.runs.compare_runs(*runs, labels=names, same_data=same_data, **options)
     else:
-        found = compare_split(runs[0], split, **(options if names is None else options | {"labels": names}))
+        found = sc.runs.compare_split(runs[0], split, **(options if names is None else options | {"labels": names}))
     page = None if out is None else write_page(found, out)
     if json:
         print_json(found.to_dict())
@@ -217,20 +208,14 @@ def plan_command(
     json: Json = False,
 ) -> None:
     """What a calibration of this camera will give, and the frames it needs, before any data."""
-    from starcal_uq.camera.camera import Camera
-    from starcal_uq.cli.console import print_json, records
-    from starcal_uq.planning.check import check_forecast
-    from starcal_uq.planning.design import choose_frames
     from starcal_uq.planning.forecast import N_FRAMES
-    from starcal_uq.planning.plan import plan
     from starcal_uq.presentation.pages.planning import plan_record
     from starcal_uq.presentation.pages.write import write_page
-    from starcal_uq.sky.catalogue import load_catalogue
 
     check_output(out, force)
     if after is not None and check is not None:
         raise typer.BadParameter("--check simulates campaigns from nothing: leave it out with --after.")
-    sheet, known, noise = Camera.load(camera), None, 0.05
+    sheet, known, noise = sc.Camera.load(camera), None, 0.05
     if after is not None:
         known, noise = _known(after, sheet, camera)
         sheet = known.camera
@@ -238,10 +223,10 @@ def plan_command(
     if max_mag > FAINTEST:
         raise typer.BadParameter(f"--max-mag {max_mag:g}: the embedded catalogue ends at G = {FAINTEST:g}.")
     # Deeper than the sensor, so that the sweep over the magnitude limit has somewhere to go.
-    deep = load_catalogue(max_mag=min(max_mag + 1.0, FAINTEST), epoch=epoch)
+    deep = sc.load_catalogue(max_mag=min(max_mag + 1.0, FAINTEST), epoch=epoch)
     stars = deep.select(deep.mag <= max_mag)
     sizes = tuple(frames or N_FRAMES)
-    found = plan(
+    found = sc.plan(
         sheet,
         deep,
         sigma_px=sigma,
@@ -256,7 +241,7 @@ def plan_command(
     )
     choice = simulated = None
     if choose is not None:
-        choice = choose_frames(
+        choice = sc.planning.choose_frames(
             sheet,
             stars,
             n_frames=choose,
@@ -269,7 +254,7 @@ def plan_command(
         )
     if check is not None:
         with progress_bar("simulated campaigns") as progress:
-            simulated = check_forecast(
+            simulated = sc.planning.check_forecast(
                 sheet,
                 stars,
                 sigma_px=sigma,
@@ -296,7 +281,6 @@ def plan_command(
 
 
 def _show_plan(found: Plan, choice: FrameChoice | None, simulated: ForecastCheck | None) -> None:
-    from starcal_uq.cli.console import out, print_table
     from starcal_uq.presentation.words.planning import choice_table, plan_table
 
     print_table(plan_table(found))
@@ -307,17 +291,15 @@ def _show_plan(found: Plan, choice: FrameChoice | None, simulated: ForecastCheck
     if simulated is not None:
         words.append(simulated.text)
     for sentence in words:
-        out.print(sentence, highlight=False, soft_wrap=True)
+        console.print(sentence, highlight=False, soft_wrap=True)
 
 
 def _known(run: Path, sheet: Camera, path: Path) -> tuple[Calibration, float]:
     """Calibration of a run of this sensor, and its noise in px: the median where stars state their own."""
     import numpy as np
 
-    from starcal_uq.runs.folder import RunFolder
-    from starcal_uq.runs.steps import load_run
-
-    obs, calibration = load_run(RunFolder(run))
+    known = sc.Run(run)
+    obs, calibration = known.observations, known.calibration
     check_same_sensor(calibration.camera, run, sheet, path)
     stated = 1.0 if obs.sigma_px is None or calibration.sigma_name == "sigma" else float(np.median(obs.sigma_px))
     return calibration, float(calibration.sigma) * stated

@@ -36,41 +36,10 @@ NewRun = Annotated[Path, typer.Option("-o", "--out", metavar="RUN", help="Folder
 Force = Annotated[bool, typer.Option("--force", help="Replace results that exist.")]
 Json = Annotated[bool, typer.Option("--json", help="Print the table as JSON.")]
 Seed = Annotated[int, typer.Option(help="Seed; the same seed repeats the result bit for bit.")]
-Method = Annotated[
-    str,
-    typer.Option(
-        help="efficient (three stages, then the attitude-marginalised likelihood), three_stage (Ye & Yang 2017), or a "
-        "baseline: least_squares, samaan (Kalman filter), griffith (recursive least squares)."
-    ),
-]
-Solver = Annotated[str, typer.Option(help="lm, minpack, or ipopt (keeps the optics within physical bounds).")]
 Columns = Annotated[
     list[str] | None,
     typer.Option("--column", metavar="NAME=IN_FILE", help="A column that is called otherwise in the file; repeatable."),
 ]
-Directions = Annotated[
-    str | None,
-    typer.Option(
-        help="What ra_deg and dec_deg are: apparent (as seen by the moving sensor), catalogue (aberration is then "
-        "applied at time_utc), or undeclared.",
-    ),
-]
-Velocity = Annotated[
-    str | None,
-    typer.Option(
-        "--observer-velocity", metavar="VX,VY,VZ", help="Velocity relative to the Earth's centre, km/s, ICRS axes."
-    ),
-]
-SiteFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--site",
-        metavar="SITE",
-        help="Where on the ground the camera stood (TOML with a [site] table): refraction and daily aberration are "
-        "applied.",
-    ),
-]
-InSpace = Annotated[bool, typer.Option("--in-space", help="The camera was above the air; refraction does not matter.")]
 TimeUtc = Annotated[
     str | None,
     typer.Option(
@@ -80,30 +49,6 @@ TimeUtc = Annotated[
     ),
 ]
 Engine = Annotated[str, typer.Option(help="What finds attitudes: pyramid, or tetra3rs (extra of that name).")]
-EngineChoice = Annotated[
-    str | None,
-    typer.Option("--engine", help="Images: what finds attitudes: pyramid, or tetra3rs (extra of that name)."),
-]
-Ensembles = Annotated[int, typer.Option(min=2, help="Separately seeded ensembles of walkers.")]
-Walkers = Annotated[int, typer.Option(min=14, help="Walkers in each ensemble.")]
-Steps = Annotated[int, typer.Option(min=20, help="Steps kept of each walker.")]
-Sigma = Annotated[float | None, typer.Option(help="Centroid noise in px per axis, if it is known; sampled otherwise.")]
-PriorFile = Annotated[
-    Path | None, typer.Option("--priors", help="TOML file with a [priors] table; wide defaults otherwise.")
-]
-Likelihood = Annotated[
-    str | None,
-    typer.Option(
-        help="marginal (Gaussian, attitudes marginalised), pairs (interstar angles, Godambe's curvature), "
-        "student_t (heavy tails, for wrong identifications), or pairs_naive (to see what goes wrong); by default that "
-        "of the calibration."
-    ),
-]
-Evaluation = Annotated[str, typer.Option(help="auto (compressed, checked against exact), compressed, or exact.")]
-Screen = Annotated[bool, typer.Option("--screen", help="Leave out wrong identifications first; they are listed.")]
-Robust = Annotated[
-    bool, typer.Option("--robust", help="Refine with Student-t tails, which wrong identifications hardly move.")
-]
 Draws = Annotated[int, typer.Option(min=50, help="Posterior draws that go through QUEST.")]
 
 
@@ -117,8 +62,8 @@ def parse_choice(option: str, given: str | None, choices: Sequence[ChoiceT]) -> 
     raise typer.BadParameter(f"{option} {given!r} is unknown: use one of {', '.join(choices)}.")
 
 
-def parse_engine(name: str) -> EngineName:
-    """The engine of that name."""
+def parse_engine(name: str | None) -> EngineName:
+    """The engine of that name, or the usual one."""
     from starcal_uq.identification.proposers import ENGINES
 
     return parse_choice("--engine", name, ENGINES) or "pyramid"

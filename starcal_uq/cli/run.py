@@ -3,49 +3,44 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from starcal_uq.cli.console import progress_bar
+import starcal_uq as sc
+from starcal_uq.cli.console import (
+    end_with,
+    err,
+    progress_bar,
+    show_attitude,
+    show_calibration,
+    show_posterior,
+    show_screening,
+    show_verdict,
+    warn_air,
+)
 from starcal_uq.cli.images import load_images
 from starcal_uq.cli.mission import fail_if_violated, show_budget
-from starcal_uq.cli.options import (
-    CameraFile,
-    Columns,
-    Directions,
-    Draws,
-    EngineChoice,
-    Ensembles,
-    Evaluation,
-    Force,
-    InSpace,
-    Likelihood,
-    Method,
-    NewRun,
-    PriorFile,
-    Robust,
-    Screen,
-    Seed,
-    Sigma,
-    SiteFile,
-    Solver,
-    Steps,
-    TimeUtc,
-    Velocity,
-    Walkers,
+from starcal_uq.cli.options import CameraFile, Draws, Force, NewRun, Seed
+from starcal_uq.cli.settings import (
+    EstimationSettings,
+    ImageSettings,
+    SamplingSettings,
+    SkySettings,
+    refuse_others,
+    unfolded,
 )
-from starcal_uq.cli.steps import estimator, load_table, sample_run
+from starcal_uq.cli.steps import load_table, sample_run
 from starcal_uq.core.files import check_new_folder
 
 if TYPE_CHECKING:
-    from starcal_uq.budgeting.result import Budget
+    from starcal_uq.runs.run import Run
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the command line."""
     app.command("demo")(demo)
-    app.command("run")(run_command)
+    app.command("run")(unfolded(run_command))
 
 
 def demo(
@@ -57,25 +52,15 @@ def demo(
     force: Force = False,
 ) -> None:
     """The experiment of Ye & Yang 2017, end to end, ending in DIR/report.html."""
-    from starcal_uq.cli.console import err, show_calibration
-    from starcal_uq.paper.camera import paper_camera, paper_start
-    from starcal_uq.runs.folder import RunFolder
-    from starcal_uq.runs.steps import calibrate_step
-    from starcal_uq.simulation.frames import simulate
-    from starcal_uq.sky.catalogue import load_catalogue
-
-    run = RunFolder(out)
-    check_new_folder(run.path, force)
+    run = sc.Run(out)
+    check_new_folder(out, force)
     err.print(f"Simulating {frames} frames of the paper's sensor (Gaia G <= 6, 0.05 px noise, seed {seed}) ...")
-    truth = paper_camera()
-    obs = simulate(
-        load_catalogue(max_mag=6.0, epoch=2026.9), truth, n_frames=frames, min_stars=10, sigma_px=0.05, seed=seed
-    )
+    stars, truth = sc.load_catalogue(max_mag=6.0, epoch=2026.9), sc.paper.paper_camera()
+    obs = sc.simulate(stars, truth, n_frames=frames, min_stars=10, sigma_px=0.05, seed=seed)
     err.print("Calibrating from f = 72 mm and the detector's centre ...")
-    calibration, _ = calibrate_step(run, obs, paper_start(), force=force)
-    show_calibration(calibration, truth)
+    show_calibration(run.calibrate(obs, sc.paper.paper_start(), force=force), truth)
     err.print("Sampling the posterior, couplings, attitude error, then questioning the model ...")
-    _after_calibration(run, seed, 300)
+    _after_calibration(run, SamplingSettings(seed=seed))
 
 
 def run_command(
@@ -89,32 +74,10 @@ def run_command(
     ],
     camera: CameraFile,
     out: NewRun,
-    method: Method = "efficient",
-    solver: Solver = "lm",
-    screen: Screen = False,
-    robust: Robust = False,
-    column: Columns = None,
-    directions: Directions = None,
-    observer_velocity: Velocity = None,
-    site: SiteFile = None,
-    in_space: InSpace = False,
-    max_mag: Annotated[
-        float | None, typer.Option(help="Images: magnitude limit of the catalogue, Gaia G; 7 by default.")
-    ] = None,
-    epoch: Annotated[
-        float | None, typer.Option(help="Images: Julian year of the star positions; the images' own by default.")
-    ] = None,
-    gain: Annotated[float | None, typer.Option(help="Images: electrons per count, where they do not say it.")] = None,
-    time: TimeUtc = None,
-    engine: EngineChoice = None,
-    seed: Seed = 0,
-    sigma: Sigma = None,
-    priors: PriorFile = None,
-    ensembles: Ensembles = 4,
-    walkers: Walkers = 64,
-    steps: Steps = 200,
-    likelihood: Likelihood = None,
-    evaluation: Evaluation = "auto",
+    estimation: EstimationSettings,
+    sky: SkySettings,
+    images: ImageSettings,
+    sampling: SamplingSettings,
     draws: Draws = 300,
     budget: Annotated[
         Path | None,
@@ -123,101 +86,48 @@ def run_command(
     force: Force = False,
 ) -> None:
     """Calibrate, sample, couple, propagate, budget and report: all from stars or images to RUN/report.html."""
-    from starcal_uq.budgeting.file import load_budget_file
-    from starcal_uq.cli.console import show_calibration, show_screening, warn_air
     from starcal_uq.pipeline.images import are_images
-    from starcal_uq.runs.folder import RunFolder
-    from starcal_uq.runs.steps import calibrate_step, save_image_results, truth_of
 
-    folder = RunFolder(out)
-    check_new_folder(folder.path, force)
+    run = sc.Run(out)
+    check_new_folder(out, force)
     if budget is not None:
         # A mistake in it should not show after the work.
-        load_budget_file(budget)
-    images = are_images(inputs)
-    _refuse_others(
-        images,
-        {"--column": column, "--observer-velocity": observer_velocity},
-        {"--max-mag": max_mag, "--epoch": epoch, "--gain": gain, "--time": time, "--engine": engine},
-    )
-    if images:
-        obs, nominal, centroids, found = load_images(
-            inputs,
-            camera,
-            max_mag=7.0 if max_mag is None else max_mag,
-            epoch=epoch,
-            gain=gain,
-            directions=directions,
-            site=site,
-            in_space=in_space,
-            time_utc=time,
-            engine=engine or "pyramid",
-        )
+        sc.budgeting.load_budget_file(budget)
+    from_images = are_images(inputs)
+    refuse_others(from_images, sky, images)
+    if from_images:
+        obs, nominal, centroids, identified = load_images(inputs, camera, images, sky)
     elif len(inputs) == 1:
-        obs, nominal = load_table(inputs[0], camera, column, directions, observer_velocity, site, in_space)
+        obs, nominal = load_table(inputs[0], camera, sky)
     else:
         raise typer.BadParameter(f"{inputs[1]} is no image: give one table of observations, or images only.")
-    calibration, screening = calibrate_step(
-        folder, obs, nominal, force=force, screening=screen, **estimator(method, solver, robust)
-    )
-    if images:
-        save_image_results(folder, centroids, found)
-    if screening is not None:
-        show_screening(screening)
-    show_calibration(calibration, truth_of(obs))
+    calibration = run.calibrate(obs, nominal, force=force, **estimation.options())
+    if from_images:
+        run.keep_images(centroids, identified)
+    if run.screening is not None:
+        show_screening(run.screening)
+    show_calibration(calibration, run.truth)
     warn_air(obs, calibration)
-    _after_calibration(
-        folder,
-        seed,
-        draws,
-        show=True,
-        budget=budget,
-        sigma=sigma,
-        priors=priors,
-        ensembles=ensembles,
-        walkers=walkers,
-        steps=steps,
-        likelihood=likelihood,
-        evaluation=evaluation,
-    )
-
-
-def _refuse_others(images: bool, of_tables: dict[str, Any], of_images: dict[str, Any]) -> None:
-    """An option that would be ignored is a mistake of the user's that should show."""
-    for option, value in (of_tables if images else of_images).items():
-        if value not in (None, []):
-            kind = "tables of stars, not to images" if images else "images, not to a table of stars"
-            raise typer.BadParameter(f"{option} belongs to {kind}: leave it out.")
+    _after_calibration(run, sampling, draws, budget, show=True)
 
 
 def _after_calibration(
-    run: Any, seed: int, draws: int, *, show: bool = False, budget: Path | None = None, **sampling: Any
+    run: Run, sampling: SamplingSettings, draws: int = 300, budget: Path | None = None, *, show: bool = False
 ) -> None:
     """Sample, couple, propagate, question the model, budget, report; status 1 when a check or a requirement failed."""
-    from starcal_uq.cli.console import show_attitude, show_posterior
-    from starcal_uq.runs.steps import budget_run, coupling_step, diagnose_run, propagate_step, report_step
-
-    posterior = sample_run(run, seed, force=True, **sampling)
-    coupling_step(run)
-    error, _, _ = propagate_step(run, n_draws=draws, seed=seed)
+    posterior = sample_run(run, sampling, force=True)
+    run.couple()
+    error, _, _ = run.propagate(n_draws=draws, seed=sampling.seed)
     if show:
         show_posterior(posterior)
         show_attitude(error)
     with progress_bar("diagnosis") as progress:
-        diagnose_run(run.path, seed=seed, progress=progress)
-    found = budget_run(run.path, file=budget, seed=seed)
+        run.diagnose(seed=sampling.seed, progress=progress)
+    made = run.budget(file=budget, seed=sampling.seed)
     if show:
-        show_budget(found)
-    _finish(run, report_step(run), found)
-
-
-def _finish(run: Any, report: Path, found: Budget) -> None:
-    """Verdict, then the path of the report; status 1 when a check failed or a requirement is violated."""
-    from starcal_uq.cli.console import end_with, show_verdict
-    from starcal_uq.runs.steps import verdict_step
-
-    verdict = verdict_step(run)
-    show_verdict(verdict)
+        show_budget(made)
+    report = run.report()
+    show_verdict(run.verdict)
     print(f"Report: {report.resolve()}")
-    fail_if_violated(found)
-    end_with(verdict.level)
+    fail_if_violated(made)
+    end_with(run.verdict.level)

@@ -7,9 +7,11 @@ from typing import Annotated
 
 import typer
 
-from starcal_uq.cli.console import progress_bar
+import starcal_uq as sc
+from starcal_uq.cli.console import out as console
+from starcal_uq.cli.console import print_json, print_table, progress_bar, records, show_calibration
 from starcal_uq.cli.options import CameraFile, Force, Json, NewRun, RunPath, Seed
-from starcal_uq.core.files import check_new_folder, write_csv
+from starcal_uq.core.files import atomic_write_bytes, check_new_folder, new_folder, write_csv
 
 
 def register(app: typer.Typer) -> None:
@@ -38,20 +40,14 @@ def validate_command(
     json: Json = False,
 ) -> None:
     """Show that the intervals are right for this sensor and this volume of data, by simulation-based calibration."""
-    from starcal_uq.camera.camera import Camera
-    from starcal_uq.cli.console import out as console
-    from starcal_uq.cli.console import print_json, print_table, records
-    from starcal_uq.core.files import atomic_write_bytes
-    from starcal_uq.diagnostics.validation.validate import TRUTHS, validate
-    from starcal_uq.runs.folder import RunFolder
+    from starcal_uq.diagnostics.validation.validate import TRUTHS
 
     if truth not in TRUTHS:
         raise typer.BadParameter(f"--truth {truth!r} is unknown: use one of {', '.join(TRUTHS)}.")
-    sensor = Camera.load(camera)
-    folder = RunFolder(out)
-    check_new_folder(folder.path, force)
+    sensor = sc.Camera.load(camera)
+    check_new_folder(out, force)
     with progress_bar("replicates") as progress:
-        found = validate(
+        found = sc.validate(
             sensor,
             n_replicates=replicates,
             n_frames=frames,
@@ -66,7 +62,7 @@ def validate_command(
     from starcal_uq.presentation.figures.style import png_bytes
     from starcal_uq.presentation.words.diagnostics import validation_table
 
-    folder.create()
+    new_folder(out)
     found.save(out / "validation.npz")
     table = found.to_dataframe()
     write_csv(table, out / "validation.csv")
@@ -88,12 +84,10 @@ def diagnose_command(
     json: Json = False,
 ) -> None:
     """Question the model: misfit, jackknife, other distortion models, predictive checks, other starts."""
-    from starcal_uq.cli.console import print_json, print_table, records
     from starcal_uq.presentation.words.diagnostics import jackknife_table, misfit_table, models_table, predictive_table
-    from starcal_uq.runs.steps import diagnose_run
 
     with progress_bar("diagnosis") as progress:
-        found = diagnose_run(run, n_starts=starts, seed=seed, progress=progress)
+        found = sc.Run(run).diagnose(n_starts=starts, seed=seed, progress=progress)
     parts = {
         "Misfit": found.misfit,
         "Jackknife over frames": found.jackknife,
@@ -126,14 +120,10 @@ def merge_command(
     force: Force = False,
 ) -> None:
     """Combine the likelihoods of several runs into one, without going back to the stars; tests that they agree."""
-    from starcal_uq.cli.console import out as console
-    from starcal_uq.cli.console import print_table, show_calibration
-    from starcal_uq.estimation.merging import consistency_of
     from starcal_uq.presentation.words.estimation import consistency_table
-    from starcal_uq.runs.merge import merge_runs
 
-    merged = merge_runs(runs, out, noise=noise, allow_inconsistent=allow_inconsistent, force=force)
-    agreement = consistency_of(merged)
+    merged = sc.runs.merge_runs(runs, out, noise=noise, allow_inconsistent=allow_inconsistent, force=force)
+    agreement = sc.estimation.consistency_of(merged)
     if agreement is not None:
         print_table(consistency_table(agreement))
         words = agreement.messages or ("The runs agree.",)

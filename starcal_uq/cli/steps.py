@@ -2,86 +2,73 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from starcal_uq.cli.console import progress_bar
+import starcal_uq as sc
+from starcal_uq.cli.console import (
+    end_with,
+    err,
+    print_json,
+    progress_bar,
+    records,
+    show_attitude,
+    show_calibration,
+    show_coupling,
+    show_posterior,
+    show_screening,
+    warn_air,
+    warn_undeclared,
+)
+from starcal_uq.cli.console import out as console
 from starcal_uq.cli.options import (
     FAINTEST,
     CameraFile,
-    Columns,
-    Directions,
     Draws,
-    Ensembles,
-    Evaluation,
     Force,
-    InSpace,
     Json,
-    Likelihood,
-    Method,
     NewRun,
     ObsFile,
-    PriorFile,
-    Robust,
     RunPath,
-    Screen,
     Seed,
-    Sigma,
-    SiteFile,
-    Solver,
-    Steps,
-    Velocity,
-    Walkers,
     parse_choice,
     parse_columns,
     parse_velocity,
 )
-from starcal_uq.core.files import check_new_folder
+from starcal_uq.cli.settings import EstimationSettings, SamplingSettings, SkySettings, unfolded
+from starcal_uq.core.files import check_new_folder, ensure_new
+
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.observations.table import Observations
+    from starcal_uq.runs.run import Run
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the command line."""
     app.command("simulate")(simulate_command)
-    app.command("calibrate")(calibrate_command)
-    app.command("sample")(sample_command)
+    app.command("calibrate")(unfolded(calibrate_command))
+    app.command("sample")(unfolded(sample_command))
     app.command("coupling")(coupling_command)
     app.command("propagate")(propagate_command)
     app.command("report")(report_command)
 
 
-def estimator(method: str, solver: str, robust: bool) -> dict[str, Any]:
-    """Options of `calibrate`."""
-    options: dict[str, Any] = {"method": method, "solver": solver}
-    return options | {"likelihood": "student_t"} if robust else options
+def load_table(path: Path, camera_path: Path, sky: SkySettings) -> tuple[Observations, Camera]:
+    """Observations of a table with the nominal camera, and what is worth telling on the way."""
+    from starcal_uq.pipeline.tables import observations_from_table
 
-
-def load_table(
-    obs_path: Path,
-    camera_path: Path,
-    columns: Any,
-    directions: str | None,
-    velocity: str | None,
-    site: Path | None,
-    in_space: bool,
-) -> Any:
-    from starcal_uq.camera.camera import Camera
-    from starcal_uq.cli.console import warn_undeclared
-    from starcal_uq.runs.steps import DIRECTIONS, read_observations
-    from starcal_uq.sky.site import Site
-
-    if directions is not None and directions not in DIRECTIONS:
-        raise typer.BadParameter(f"--directions {directions!r} is unknown: use one of {', '.join(DIRECTIONS)}.")
-    camera = Camera.load(camera_path)
-    obs = read_observations(
-        obs_path,
+    known, camera = sky.options(), sc.Camera.load(camera_path)
+    obs = observations_from_table(
+        path,
         camera,
-        columns=parse_columns(columns),
-        directions=directions,
-        observer_velocity_km_s=parse_velocity(velocity),
-        site=None if site is None else Site.load(site),
-        in_space=in_space,
+        columns=parse_columns(sky.column),
+        observer_velocity_km_s=parse_velocity(sky.observer_velocity),
+        **known,
     )
     warn_undeclared(obs)
     return obs, camera
@@ -106,28 +93,20 @@ def simulate_command(
     force: Force = False,
 ) -> None:
     """Simulate identified stars with the embedded catalogue; directions are written as the sensor saw them."""
-    from starcal_uq.camera.camera import Camera
-    from starcal_uq.core.files import ensure_new
-    from starcal_uq.simulation.frames import simulate
-    from starcal_uq.sky.catalogue import load_catalogue
-
     ensure_new(out, force)
     if sensor is not None and images is None:
         raise typer.BadParameter("--sensor describes the detector of images: give --images DIR as well.")
-    stars, truth = load_catalogue(max_mag=max_mag, epoch=epoch), Camera.load(camera)
-    obs = simulate(stars, truth, n_frames=frames, min_stars=min_stars, sigma_px=sigma, seed=seed)
+    stars, truth = sc.load_catalogue(max_mag=max_mag, epoch=epoch), sc.Camera.load(camera)
+    obs = sc.simulate(stars, truth, n_frames=frames, min_stars=min_stars, sigma_px=sigma, seed=seed)
     if images is not None:
-        from starcal_uq.simulation.campaign import render_frames
-        from starcal_uq.simulation.sensor import Sensor
-
         with progress_bar("images") as progress:
-            paths = render_frames(
+            paths = sc.simulation.render_frames(
                 stars,
                 truth,
                 images,
                 n_frames=frames,
                 min_stars=min_stars,
-                sensor=Sensor() if sensor is None else Sensor.load(sensor),
+                sensor=sc.simulation.Sensor() if sensor is None else sc.simulation.Sensor.load(sensor),
                 seed=seed,
                 sigma_px=sigma,
                 force=force,
@@ -144,67 +123,29 @@ def calibrate_command(
     observations: ObsFile,
     camera: CameraFile,
     out: NewRun,
-    method: Method = "efficient",
-    solver: Solver = "lm",
-    screen: Screen = False,
-    robust: Robust = False,
-    column: Columns = None,
-    directions: Directions = None,
-    observer_velocity: Velocity = None,
-    site: SiteFile = None,
-    in_space: InSpace = False,
+    estimation: EstimationSettings,
+    sky: SkySettings,
     force: Force = False,
     json: Json = False,
 ) -> None:
     """Estimate optics and distortion: three stages and refinement, with covariance."""
-    from starcal_uq.cli.console import print_json, records, show_calibration, show_screening, warn_air
-    from starcal_uq.runs.folder import RunFolder
-    from starcal_uq.runs.steps import calibrate_step, truth_of
-
+    run = sc.Run(out)
     check_new_folder(out, force)
-    obs, nominal = load_table(observations, camera, column, directions, observer_velocity, site, in_space)
-    calibration, screening = calibrate_step(
-        RunFolder(out), obs, nominal, force=force, screening=screen, **estimator(method, solver, robust)
-    )
-    if screening is not None:
-        show_screening(screening)
+    obs, nominal = load_table(observations, camera, sky)
+    calibration = run.calibrate(obs, nominal, force=force, **estimation.options())
+    if run.screening is not None:
+        show_screening(run.screening)
     warn_air(obs, calibration)
     if json:
         print_json({"status": calibration.status.name, "parameters": records(calibration.to_dataframe())})
     else:
-        show_calibration(calibration, truth_of(obs))
+        show_calibration(calibration, run.truth)
         print(f"Run folder: {out}. Next: starcal-uq sample {out}")
 
 
-def sample_command(
-    run: RunPath,
-    seed: Seed = 0,
-    sigma: Sigma = None,
-    priors: PriorFile = None,
-    ensembles: Ensembles = 4,
-    walkers: Walkers = 64,
-    steps: Steps = 200,
-    likelihood: Likelihood = None,
-    evaluation: Evaluation = "auto",
-    force: Force = False,
-    json: Json = False,
-) -> None:
+def sample_command(run: RunPath, sampling: SamplingSettings, force: Force = False, json: Json = False) -> None:
     """Sample the posterior with emcee from the calibration; an interrupted command goes on where it stopped."""
-    from starcal_uq.cli.console import end_with, print_json, records, show_posterior
-    from starcal_uq.runs.folder import RunFolder
-
-    posterior = sample_run(
-        RunFolder(run),
-        seed,
-        sigma=sigma,
-        priors=priors,
-        ensembles=ensembles,
-        walkers=walkers,
-        steps=steps,
-        likelihood=likelihood,
-        evaluation=evaluation,
-        force=force,
-    )
+    posterior = sample_run(sc.Run(run), sampling, force=force)
     if json:
         print_json({"ok": posterior.diagnostics.ok, "parameters": records(posterior.summary())})
     else:
@@ -212,39 +153,12 @@ def sample_command(
     end_with(posterior.diagnostics.level)
 
 
-def sample_run(
-    run: Any,
-    seed: int,
-    *,
-    sigma: float | None = None,
-    priors: Path | None = None,
-    ensembles: int = 4,
-    walkers: int = 64,
-    steps: int = 200,
-    likelihood: str | None = None,
-    evaluation: str = "auto",
-    force: bool = False,
-) -> Any:
-    import warnings
-
-    from starcal_uq.cli.console import err
-    from starcal_uq.inference.named import NaivePairsWarning
-    from starcal_uq.runs.steps import read_priors, sample_step
-
-    options: dict[str, Any] = {
-        "seed": seed,
-        "sigma": "sampled" if sigma is None else sigma,
-        "n_ensembles": ensembles,
-        "n_walkers": walkers,
-        "n_steps": steps,
-        "likelihood": likelihood,
-        "evaluation": evaluation,
-    }
-    if priors is not None:
-        options["priors"] = read_priors(run, priors)
+def sample_run(run: Run, sampling: SamplingSettings, *, force: bool) -> Posterior:
+    """Sample with a bar, and print what the likelihood warns of."""
+    options = sampling.options(run)
     with progress_bar("sampling") as progress, warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", NaivePairsWarning)
-        posterior = sample_step(run, force=force, progress=progress, **options)
+        warnings.simplefilter("always", sc.inference.NaivePairsWarning)
+        posterior = run.sample(force=force, progress=progress, **options)
     for warning in caught:
         err.print(f"warning: {warning.message}", style="yellow", highlight=False, soft_wrap=True)
     return posterior
@@ -252,16 +166,12 @@ def sample_run(
 
 def coupling_command(run: RunPath, json: Json = False) -> None:
     """Correlations, variance inflation, weak directions and the principal point's near-gauge with the boresight."""
-    from starcal_uq.cli.console import print_json, records, show_coupling
-    from starcal_uq.runs.folder import RunFolder
-    from starcal_uq.runs.steps import coupling_step
-
-    found = coupling_step(RunFolder(run))
+    coupling = sc.Run(run).couple()
     if json:
-        words = [direction.words for direction in found.weak_directions]
-        print_json({"parameters": records(found.to_dataframe()), "directions": words})
+        words = [direction.words for direction in coupling.weak_directions]
+        print_json({"parameters": records(coupling.to_dataframe()), "directions": words})
     else:
-        show_coupling(found)
+        show_coupling(coupling)
 
 
 def propagate_command(
@@ -291,14 +201,9 @@ def propagate_command(
     json: Json = False,
 ) -> None:
     """Attitude error that the calibration contributes, through QUEST: common rotation, the rest, and centroid noise."""
-    from starcal_uq.cli.console import err, print_json, records, show_attitude
-    from starcal_uq.cli.console import out as console
-    from starcal_uq.runs.folder import RunFolder
-    from starcal_uq.runs.steps import MissionSky, propagate_step
-
     sky = None
     if attitudes != "observed":
-        sky = MissionSky(
+        sky = sc.runs.MissionSky(
             profile=None if attitudes == "random" else Path(attitudes),
             max_mag=max_mag,
             epoch=epoch,
@@ -316,7 +221,7 @@ def propagate_command(
     def tell(message: str) -> None:
         err.print(f"note: {message}", style="yellow", highlight=False, soft_wrap=True)
 
-    error, _, spectrum = propagate_step(RunFolder(run), n_draws=draws, seed=seed, sky=sky, tell=tell)
+    error, _, spectrum = sc.Run(run).propagate(n_draws=draws, seed=seed, sky=sky, tell=tell)
     if json:
         document = {"frames": error.frames, "attitude_error": records(error.to_dataframe())}
         print_json(document if spectrum is None else document | {"spectrum": spectrum.text})
@@ -329,7 +234,4 @@ def propagate_command(
 
 def report_command(run: RunPath) -> None:
     """Write RUN/report.html, one self-contained file, from whatever the run holds."""
-    from starcal_uq.runs.folder import RunFolder
-    from starcal_uq.runs.steps import report_step
-
-    print(f"Report: {report_step(RunFolder(run)).resolve()}")
+    print(f"Report: {sc.Run(run).report().resolve()}")

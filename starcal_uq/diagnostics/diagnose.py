@@ -31,17 +31,6 @@ if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import Observations
 
-FILE = "diagnosis.json"
-
-
-TABLES = {
-    "misfit": "misfit.csv",
-    "jackknife": "jackknife.csv",
-    "comparison": "comparison.csv",
-    "predictive": "predictive.csv",
-}
-
-
 # How far the other starts are from the nominal camera: of its focal length, and of the detector's longer side.
 _START_FOCAL, _START_CENTRE = 0.05, 0.1
 

@@ -4,4 +4,4 @@ from .folder import RunFolder as RunFolder
 from .merge import merge_runs as merge_runs
 from .priors import load_priors as load_priors
 from .priors import prior_from_run as prior_from_run
-from .steps import diagnose_run as diagnose_run
+from .run import MissionSky as MissionSky

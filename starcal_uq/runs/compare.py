@@ -6,14 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 from starcal_uq.comparison.compare import compare, compare_halves
 from starcal_uq.core.errors import ComparisonError, RunFolderError
-from starcal_uq.estimation.calibration import Calibration
-from starcal_uq.observations.table import load_observations
-from starcal_uq.runs.folder import RunFolder
+from starcal_uq.runs.run import Run
 
 if TYPE_CHECKING:
     from starcal_uq.comparison.result import CameraComparison
     from starcal_uq.core.files import PathLike
-    from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import Observations
 
 
@@ -45,17 +42,16 @@ def compare_runs(
     ComparisonError
         If the two cannot be compared.
     """
-    folders = RunFolder(run_a), RunFolder(run_b)
-    if folders[0].path.resolve() == folders[1].path.resolve():
+    first, second = Run(run_a), Run(run_b)
+    if first.path.resolve() == second.path.resolve():
         raise ComparisonError(f"{run_a}: both runs are the same folder; name two, or split one with --split odd-even.")
-    first, second = (Calibration.load(folder.require("calibration")) for folder in folders)
+    calibrations = first.calibration, second.calibration
     if labels is None:
-        names = [folder.path.resolve().name for folder in folders]
-        labels = (names[0], names[1]) if names[0] != names[1] else (str(run_a), str(run_b))
-    tables = [_table(folder) for folder in folders]
-    observations = (tables[0], tables[1]) if tables[0] is not None and tables[1] is not None else None
-    posteriors = _posteriors(folders)
-    pair: tuple[Any, Any] = (first, second) if posteriors is None else posteriors
+        labels = (first.name, second.name) if first.name != second.name else (str(run_a), str(run_b))
+    table_a, table_b = _table(first), _table(second)
+    observations = None if table_a is None or table_b is None else (table_a, table_b)
+    sampled = first.has("posterior") and second.has("posterior")
+    pair: tuple[Any, Any] = (first.posterior, second.posterior) if sampled else calibrations
     return compare(*pair, labels=labels, same_data=same_data, observations=observations, **options)
 
 
@@ -69,7 +65,7 @@ def compare_split(run: PathLike, how: str = "odd-even", *, seed: int = 0, **opti
     how : {"odd-even", "halves", "random"}
         As for `split_frames`.
     seed : int
-        Of a random half.
+        Seed of a random half.
     **options
         Further options of `compare`.
 
@@ -82,26 +78,14 @@ def compare_split(run: PathLike, how: str = "odd-even", *, seed: int = 0, **opti
     CalibrationError
         When a half does not determine the camera.
     """
-    folder = RunFolder(run)
-    cal = Calibration.load(folder.require("calibration"))
-    obs = _table(folder)
+    whole = Run(run)
+    cal = whole.calibration
+    obs = _table(whole)
     if obs is None:
         raise RunFolderError(f"{run}: holds no observations to split; calibrate a table that it can keep.")
     return compare_halves(obs, cal.nominal, how, seed=seed, method=cal.method, **options)
 
 
-def _table(folder: RunFolder) -> Observations | None:
+def _table(run: Run) -> Observations | None:
     """The observations of a run; None for those of a stream, which kept none."""
-    if not folder.observations.exists():
-        return None
-    table = load_observations(folder.observations)
-    return table if table.n_stars else None
-
-
-def _posteriors(folders: tuple[RunFolder, RunFolder]) -> tuple[Posterior, Posterior] | None:
-    from starcal_uq.inference.posterior import Posterior
-
-    if not all(folder.posterior.exists() for folder in folders):
-        return None
-    first, second = (Posterior.load(folder.posterior) for folder in folders)
-    return first, second
+    return run.observations if run.has("observations") and run.observations.n_stars else None

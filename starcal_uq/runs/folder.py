@@ -28,9 +28,23 @@ _FILES: dict[str, tuple[str, str]] = {
     "field_map": ("field_map.npz", "run `starcal-uq propagate RUN` first"),
     "spectrum": ("error_spectrum.npz", "run `starcal-uq propagate RUN --attitudes PROFILE` first"),
     "budget": ("budget.csv", "run `starcal-uq budget RUN` first"),
+    "diagnosis": ("diagnosis.json", "run `starcal-uq diagnose RUN` first"),
+    "rejected": ("rejected.csv", "run `starcal-uq calibrate OBS CAMERA -o RUN --screen` first"),
     "figures": ("figures", "run `starcal-uq report RUN` first"),
     "report": ("report.html", "run `starcal-uq report RUN` first"),
 }
+
+# Part of a diagnosis -> its table.
+DIAGNOSIS_TABLES = {
+    "misfit": "misfit.csv",
+    "jackknife": "jackknife.csv",
+    "comparison": "comparison.csv",
+    "predictive": "predictive.csv",
+}
+
+# Files that rest on the draws, and all files that rest on the calibration, which is among them.
+DERIVED = ("coupling", "attitude", "field_map", "spectrum", "budget", "report")
+RESULTS = ("observations", "camera", "calibration", "arrays", "posterior", "rejected", "diagnosis", *DERIVED)
 
 
 @dataclass(frozen=True)
@@ -111,6 +125,16 @@ class RunFolder:
     def budget(self) -> Path:
         """Error budget (CSV)."""
         return self._file("budget")
+
+    @property
+    def diagnosis(self) -> Path:
+        """Tests for misfit, jackknife, comparison of models (JSON)."""
+        return self._file("diagnosis")
+
+    @property
+    def rejected(self) -> Path:
+        """Rows that screening left out, with their reasons (CSV)."""
+        return self._file("rejected")
 
     @property
     def figures(self) -> Path:

@@ -14,21 +14,8 @@ from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.compressed import optimum
 from starcal_uq.estimation.merging import merge, renumbered
 from starcal_uq.observations.columns import COLUMNS
-from starcal_uq.observations.table import Observations, load_observations
-from starcal_uq.runs.folder import RunFolder
-
-_FILES = (
-    "observations",
-    "camera",
-    "calibration",
-    "arrays",
-    "posterior",
-    "coupling",
-    "attitude",
-    "field_map",
-    "budget",
-    "report",
-)
+from starcal_uq.observations.table import Observations
+from starcal_uq.runs.run import Run
 
 
 def merge_runs(
@@ -68,13 +55,13 @@ def merge_runs(
     CalibrationError
         If the runs cannot be merged.
     """
-    folders = [RunFolder(path) for path in paths]
-    target = None if out is None else RunFolder(out)
+    runs = [Run(path) for path in paths]
+    target = None if out is None else Run(out)
     if target is not None:
-        _check_target(target, folders, force)
-    calibrations = [Calibration.load(folder.require("calibration")) for folder in folders]
-    names = _names(folders)
-    tables = [_own_observations(folder, cal) for folder, cal in zip(folders, calibrations, strict=True)]
+        _check_target(target, runs, force)
+    calibrations = [run.calibration for run in runs]
+    names = _names(runs)
+    tables = [_own_observations(run) for run in runs]
     present = [table for table in tables if table is not None]
     joined = None
     if len(present) == len(tables) and len(present) > 1:
@@ -82,13 +69,7 @@ def merge_runs(
         joined = join_observations(present, names, stated)
     merged = merge(calibrations, joined, names=names, noise=noise, allow_inconsistent=allow_inconsistent)
     if target is not None:
-        target.create()
-        for name in _FILES:
-            getattr(target, name).unlink(missing_ok=True)
-        if joined is not None:
-            joined.save(target.observations, force=True)
-        merged.nominal.save(target.camera, force=True)
-        merged.save(target.calibration)
+        target.write(merged, joined)
     return merged
 
 
@@ -173,21 +154,21 @@ def _check_disjoint(columns: AnyDict, tables: Sequence[Observations], names: Seq
         )
 
 
-def _own_observations(folder: RunFolder, calibration: Calibration) -> Observations | None:
+def _own_observations(run: Run) -> Observations | None:
     """The observations of a run; None where they are missing or no longer those of its calibration."""
-    if not folder.observations.is_file():
+    try:
+        return run.observations
+    except RunFolderError:
         return None
-    table = load_observations(folder.observations)
-    return table if table.data_hash == calibration.provenance.get("data_sha256") else None
 
 
-def _names(folders: Sequence[RunFolder]) -> list[str]:
-    short = [folder.path.resolve().name for folder in folders]
-    return short if len(set(short)) == len(short) else [str(folder.path) for folder in folders]
+def _names(runs: Sequence[Run]) -> list[str]:
+    short = [run.name for run in runs]
+    return short if len(set(short)) == len(short) else [str(run.path) for run in runs]
 
 
-def _check_target(target: RunFolder, folders: Sequence[RunFolder], force: bool) -> None:
+def _check_target(target: Run, runs: Sequence[Run], force: bool) -> None:
     place: Path = target.path.resolve()
-    if any(folder.path.resolve() == place for folder in folders):
+    if any(run.path.resolve() == place for run in runs):
         raise RunFolderError(f"{target.path}: is one of the runs to merge; name another folder for the result.")
     check_new_folder(target.path, force)

@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import sigma_parameter
 from starcal_uq.core.errors import PriorError
 from starcal_uq.core.provenance import data_hashes
 from starcal_uq.core.toml import Key, Section, read_section
-from starcal_uq.inference.posterior import Posterior
 from starcal_uq.inference.priors import GaussianPriors, Priors, priors_from_table
 from starcal_uq.inference.update import SHIFT_KEYS, AllowedShift, check_chain, prior_from
-from starcal_uq.runs.folder import RunFolder
+from starcal_uq.runs.run import Run
 
 _CHAIN = Section(
     {
@@ -29,12 +29,17 @@ _SHIFT = Section({name: Key.of(float, "a number, zero or more", ge=0.0) for name
 
 def prior_from_run(run: str | Path, **options: Any) -> GaussianPriors:
     """The posterior of a run folder as a prior; options as for `prior_from`."""
-    from starcal_uq.estimation.calibration import Calibration
+    earlier = Run(run)
+    posterior = earlier.posterior
+    hashes = data_hashes(earlier.calibration.provenance) if earlier.has("calibration") else set()
+    return prior_from(posterior, name=earlier.name, data_sha256=hashes, **options)
 
-    folder = RunFolder(run)
-    posterior = Posterior.load(folder.require("posterior"))
-    hashes = data_hashes(Calibration.load(folder.calibration).provenance) if folder.calibration.exists() else set()
-    return prior_from(posterior, name=folder.path.resolve().name, data_sha256=hashes, **options)
+
+def read_priors(run: Run, path: str | Path) -> Priors:
+    """Priors of a TOML file for the camera and the data of a run; see `load_priors`."""
+    cal = run.calibration
+    per_star = cal.sigma_name == sigma_parameter(True).name
+    return load_priors(path, cal.nominal, per_star, data_hashes(cal.provenance))
 
 
 def load_priors(

@@ -1,92 +1,547 @@
-"""Read what a run folder holds."""
+"""A run: the results in a folder, each loaded once, and the steps that add to them.
+
+A step takes results and gives one, and writes it. What rests on a result of before (couplings, attitude error, report)
+is removed when a step is done again, so that a folder never mixes two runs.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import sigma_parameter
 from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.files import (
+    PathLike,
+    atomic_write_bytes,
+    atomic_write_text,
+    check_new_folder,
+    ensure_new,
+    write_csv,
+)
+from starcal_uq.core.tasks import Progress
 from starcal_uq.estimation.calibration import Calibration
-from starcal_uq.observations.table import load_observations
+from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.presentation.report.results import Missing, Results
+from starcal_uq.runs.folder import DERIVED, DIAGNOSIS_TABLES, RESULTS, RunFolder
 
 if TYPE_CHECKING:
+    from starcal_uq.attitude.profile import Scalar, Sense
+    from starcal_uq.budgeting.file import BudgetFile
     from starcal_uq.budgeting.result import Budget
-    from starcal_uq.pipeline.record import ImageRecord
-    from starcal_uq.propagation.attitude_error import AttitudeError
-    from starcal_uq.propagation.field import FieldMap
-    from starcal_uq.runs.folder import RunFolder
-
-
-def load_results(run: RunFolder, truth: Camera | None = None) -> Results:
-    """Load every result of a run.
-
-    Raises
-    ------
-    RunFolderError
-        If there is no calibration, or its data are not those of the run.
-    """
+    from starcal_uq.diagnostics.diagnose import Diagnosis
+    from starcal_uq.diagnostics.verdict.judge import Verdict
+    from starcal_uq.estimation.screening.result import Screening
+    from starcal_uq.images.centroids import Centroids
     from starcal_uq.inference.posterior import Posterior
-    from starcal_uq.propagation.coupling import coupling
-    from starcal_uq.runs.steps import load_diagnosis
-
-    calibration = Calibration.load(run.require("calibration"))
-    observations = load_observations(run.require("observations"))
-    if observations.data_hash != calibration.provenance.get("data_sha256"):
-        raise RunFolderError(
-            f"{run.path}: the calibration was made from other observations than {run.observations.name} holds; run "
-            "`starcal-uq calibrate` again."
-        )
-    missing = []
-    posterior = Posterior.load(run.posterior) if run.posterior.exists() else None
-    if posterior is None:
-        missing.append(Missing("The posterior", f"starcal-uq sample {run.path}"))
-    attitude, field_map = _attitude(run)
-    if attitude is None or field_map is None:
-        missing.append(Missing("The attitude error and the map over the field", f"starcal-uq propagate {run.path}"))
-    diagnosis = load_diagnosis(run, calibration)
-    if diagnosis is None:
-        what = "The tests for misfit, the jackknife and the comparison of distortion models"
-        missing.append(Missing(what, f"starcal-uq diagnose {run.path}"))
-    if posterior is not None and attitude is not None and not run.budget.exists():
-        missing.append(Missing("The error budget", f"starcal-uq budget {run.path}"))
-    if truth is None and "truth" in observations.meta:
-        truth = Camera.from_dict(observations.meta["truth"])
-    return Results(
-        name=run.path.resolve().name,
-        observations=observations,
-        calibration=calibration,
-        posterior=posterior,
-        coupling=coupling(calibration if posterior is None else posterior),
-        attitude=attitude,
-        field_map=field_map,
-        diagnosis=diagnosis,
-        truth=truth if truth is not None and truth.parameter_names == calibration.parameter_names else None,
-        images=load_image_record(run),
-        budget=_budget(run),
-        missing=tuple(missing),
-    )
-
-
-def _budget(run: RunFolder) -> Budget | None:
-    from starcal_uq.budgeting.result import Budget
-
-    return Budget.load(run.budget) if run.budget.exists() else None
-
-
-def load_image_record(run: RunFolder) -> ImageRecord | None:
-    """The record of the images that a run started from, if it did."""
-    from starcal_uq.pipeline.record import IMAGES, ImageRecord
-
-    path = run.path / IMAGES
-    return ImageRecord.load(path) if path.exists() else None
-
-
-def _attitude(run: RunFolder) -> tuple[AttitudeError | None, FieldMap | None]:
+    from starcal_uq.pipeline.record import ImageRecord
+    from starcal_uq.pipeline.refine import ImageCalibration
     from starcal_uq.propagation.attitude_error import AttitudeError
+    from starcal_uq.propagation.coupling import Coupling
     from starcal_uq.propagation.field import FieldMap
+    from starcal_uq.propagation.spectrum import ErrorSpectrum
 
-    return (
-        AttitudeError.load(run.attitude) if run.attitude.exists() else None,
-        FieldMap.load(run.field_map) if run.field_map.exists() else None,
-    )
+
+@dataclass(frozen=True)
+class MissionSky:
+    """Frames that a mission will see, in place of the observed ones.
+
+    Attributes
+    ----------
+    profile : Path or None
+        Attitudes over time; random ones where it is None.
+    max_mag : float
+        Magnitude limit of the sensor in flight, Gaia G.
+    epoch : float
+        Julian year of the star positions.
+    n_frames : int
+        Number of random attitudes.
+    min_stars : int or None
+        Least stars of a frame that gives an attitude; 5 at random attitudes and 3 along a profile by default.
+    rate_hz : float or None
+        Frames per second along the profile; its own instants where it is None.
+    scalar, sense
+        Conventions of the profile's quaternions, as for `starcal_uq.attitude.load_attitude_profile`.
+    """
+
+    profile: Path | None = None
+    max_mag: float = 6.0
+    epoch: float = 2026.9
+    n_frames: int = 1000
+    min_stars: int | None = None
+    rate_hz: float | None = None
+    scalar: Scalar | None = None
+    sense: Sense = "icrs_to_camera"
+
+    def frames(self, posterior: Posterior, obs: Observations, seed: int) -> Observations:
+        """Noise-free frames, with the noise of the observed ones by magnitude where it is stated."""
+        from starcal_uq.attitude.profile import load_attitude_profile
+        from starcal_uq.simulation.mission import mission_frames, profile_frames
+        from starcal_uq.sky.catalogue import load_catalogue
+
+        stars = load_catalogue(max_mag=self.max_mag, epoch=self.epoch)
+        camera = posterior.camera.with_theta(posterior.mean)
+        like = obs if posterior.sigma_name == sigma_parameter(True).name else None
+        if self.profile is None:
+            return mission_frames(
+                stars, camera, n_frames=self.n_frames, min_stars=self.min_stars or 5, seed=seed, noise_like=like
+            )
+        profile = load_attitude_profile(self.profile, scalar=self.scalar, sense=self.sense)
+        frames = profile_frames(stars, camera, profile, self.rate_hz, min_stars=self.min_stars or 3, noise_like=like)
+        return frames.with_meta(messages=[*profile.messages])
+
+
+class Run:
+    """A run folder with what it holds; a result is loaded when it is first asked for.
+
+    A result that is not there raises `RunFolderError`, whose message names the command that makes it.
+
+    Parameters
+    ----------
+    path : path
+        The folder, which need not exist before the first step.
+    truth : Camera, optional
+        The camera of a simulation, shown beside the estimate; that of the observations by default.
+
+    Attributes
+    ----------
+    folder : RunFolder
+        The folder and the paths of its files.
+    screening : Screening or None
+        What the last `calibrate` of this object left out, if it screened.
+    """
+
+    def __init__(self, path: PathLike, truth: Camera | None = None) -> None:
+        self.folder = RunFolder(path)
+        self._truth = truth
+        self.screening: Screening | None = None
+
+    def __repr__(self) -> str:
+        return f"Run({str(self.folder.path)!r})"
+
+    @property
+    def path(self) -> Path:
+        """The folder."""
+        return self.folder.path
+
+    @property
+    def name(self) -> str:
+        """Name of the folder."""
+        return self.path.resolve().name
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The nominal camera, as it was given."""
+        return Camera.load(self.folder.require("camera"))
+
+    @cached_property
+    def calibration(self) -> Calibration:
+        """The estimate."""
+        return Calibration.load(self.folder.require("calibration"))
+
+    @cached_property
+    def observations(self) -> Observations:
+        """The data that the calibration was made from.
+
+        Raises
+        ------
+        RunFolderError
+            If the file is missing, or holds other data.
+        """
+        calibration = self.calibration
+        table = load_observations(self.folder.require("observations"))
+        if table.data_hash != calibration.provenance.get("data_sha256"):
+            raise RunFolderError(
+                f"{self.path}: the calibration was made from other observations than {self.folder.observations.name} "
+                "holds; run `starcal-uq calibrate` again."
+            )
+        return table
+
+    @cached_property
+    def posterior(self) -> Posterior:
+        """The draws."""
+        from starcal_uq.inference.posterior import Posterior
+
+        return Posterior.load(self.folder.require("posterior"))
+
+    @property
+    def best(self) -> Calibration | Posterior:
+        """What the run knows of the camera: the posterior, or the calibration where there is no posterior yet."""
+        return self.posterior if self.has("posterior") else self.calibration
+
+    @cached_property
+    def coupling(self) -> Coupling:
+        """The couplings of the posterior, or of the calibration where there is no posterior yet."""
+        from starcal_uq.propagation.coupling import coupling
+
+        return coupling(self.best)
+
+    @cached_property
+    def attitude(self) -> AttitudeError:
+        """The attitude error, without its single draws."""
+        from starcal_uq.propagation.attitude_error import AttitudeError
+
+        return AttitudeError.load(self.folder.require("attitude"))
+
+    @cached_property
+    def field_map(self) -> FieldMap:
+        """The direction uncertainty over the field."""
+        from starcal_uq.propagation.field import FieldMap
+
+        return FieldMap.load(self.folder.require("field_map"))
+
+    @cached_property
+    def spectrum(self) -> ErrorSpectrum:
+        """The spectrum of the frame-dependent error along an attitude profile."""
+        from starcal_uq.propagation.spectrum import ErrorSpectrum
+
+        return ErrorSpectrum.load(self.folder.require("spectrum"))
+
+    @cached_property
+    def diagnosis(self) -> Diagnosis | None:
+        """What questions the model; None if there is none, or it is of another calibration.
+
+        Raises
+        ------
+        RunFolderError
+            If the file cannot be read.
+        """
+        from starcal_uq.diagnostics.diagnose import Diagnosis
+
+        path = self.folder.diagnosis
+        if not path.exists():
+            return None
+        stored = Diagnosis.load(path)
+        return stored if stored.is_of(self.calibration) else None
+
+    @cached_property
+    def error_budget(self) -> Budget:
+        """The attitude error budget."""
+        from starcal_uq.budgeting.result import Budget
+
+        return Budget.load(self.folder.require("budget"))
+
+    @cached_property
+    def images(self) -> ImageRecord | None:
+        """What became of the images that the run started from; None where it started from a table."""
+        from starcal_uq.pipeline.record import IMAGES, ImageRecord
+
+        path = self.path / IMAGES
+        return ImageRecord.load(path) if path.exists() else None
+
+    @property
+    def truth(self) -> Camera | None:
+        """The camera of a simulation: the one given, or that of the observations."""
+        simulated = self.observations.meta.get("truth")
+        return self._truth if self._truth is not None or simulated is None else Camera.from_dict(simulated)
+
+    @property
+    def missing(self) -> tuple[Missing, ...]:
+        """What the run does not hold, each with the command that makes it."""
+        parts = (
+            ("sample", "The posterior", self.has("posterior")),
+            (
+                "propagate",
+                "The attitude error and the map over the field",
+                self.has("attitude") and self.has("field_map"),
+            ),
+            (
+                "diagnose",
+                "The tests for misfit, the jackknife and the comparison of distortion models",
+                self.diagnosis is not None,
+            ),
+            # Before these two there can be no budget.
+            ("budget", "The error budget", self.has("budget") or not (self.has("posterior") and self.has("attitude"))),
+        )
+        return tuple(Missing(what, f"starcal-uq {command} {self.path}") for command, what, there in parts if not there)
+
+    @cached_property
+    def results(self) -> Results:
+        """Everything that the run holds, for the report.
+
+        Raises
+        ------
+        RunFolderError
+            If there is no calibration, or its data are not those of the run.
+        """
+        truth = self.truth
+        return Results(
+            name=self.name,
+            observations=self.observations,
+            calibration=self.calibration,
+            posterior=self.posterior if self.has("posterior") else None,
+            coupling=self.coupling,
+            attitude=self.attitude if self.has("attitude") else None,
+            field_map=self.field_map if self.has("field_map") else None,
+            diagnosis=self.diagnosis,
+            truth=truth if truth is not None and truth.parameter_names == self.calibration.parameter_names else None,
+            images=self.images,
+            budget=self.error_budget if self.has("budget") else None,
+            missing=self.missing,
+        )
+
+    @property
+    def verdict(self) -> Verdict:
+        """The verdict on whatever the run holds, as the report states it."""
+        return self.results.verdict
+
+    def has(self, name: str) -> bool:
+        """Whether the folder holds a file, such as ``"posterior"``."""
+        path: Path = getattr(self.folder, name)
+        return path.exists()
+
+    def calibrate(
+        self, obs: Observations, camera: Camera, *, screening: bool = False, force: bool = False, **options: Any
+    ) -> Calibration:
+        """Calibrate and write observations, camera and calibration; nothing is written when the estimate fails.
+
+        Parameters
+        ----------
+        obs : Observations
+            Identified stars.
+        camera : Camera
+            The nominal camera.
+        screening : bool
+            Whether to leave out wrong identifications first. The run then holds the kept rows, ``rejected.csv`` the
+            others with their reasons, and `screening` of this object all about it.
+        force : bool
+            Whether to replace what the folder holds.
+        **options
+            Further options of `starcal_uq.calibrate`.
+
+        Raises
+        ------
+        RunFolderError
+            If the folder is not empty.
+        CalibrationError
+            If the data do not determine the camera.
+        """
+        screened: Screening | None = None
+        if screening:
+            from starcal_uq.estimation.screening.screening import screen
+
+            screened = screen(obs, camera, **options)
+            obs, calibration = screened.observations, screened.calibration
+        else:
+            from starcal_uq.estimation.calibrate import calibrate
+
+            calibration = calibrate(obs, camera, **options)
+        check_new_folder(self.path, force)
+        self.write(calibration, obs)
+        if screened is not None:
+            screened.save_rejected(self.folder.rejected, force=True)
+        self.screening = screened
+        return calibration
+
+    def write(self, calibration: Calibration, obs: Observations | None) -> None:
+        """Write a calibration with its nominal camera and its observations, if there are any; all else is removed."""
+        self._remove(RESULTS)
+        self.folder.create()
+        if obs is not None:
+            obs.save(self.folder.observations, force=True)
+            self.observations = obs
+        calibration.nominal.save(self.folder.camera, force=True)
+        calibration.save(self.folder.calibration)
+        self.camera, self.calibration = calibration.nominal, calibration
+
+    def keep_images(self, centroids: Centroids, images: ImageCalibration) -> None:
+        """Keep the centroids and the record of every image that the run started from."""
+        from starcal_uq.pipeline.images import CENTROIDS, IDENTIFICATION
+        from starcal_uq.pipeline.record import IMAGES, record_images
+
+        centroids.save(self.path / CENTROIDS, force=True)
+        record_images(centroids, images).save(self.path / IMAGES)
+        write_csv(images.identification.to_dataframe(), self.path / IDENTIFICATION)
+        self._forget("images")
+
+    def sample(self, *, force: bool = False, progress: Progress | None = None, **options: Any) -> Posterior:
+        """Sample the posterior and write it; an interrupted call goes on from its checkpoint.
+
+        Parameters
+        ----------
+        force : bool
+            Whether to replace the posterior of before.
+        progress, **options
+            As for `starcal_uq.sample`.
+        """
+        from starcal_uq.inference.sample import sample
+
+        obs = self.observations if self._keeps_observations else None
+        ensure_new(self.folder.posterior, force)
+        if options.get("likelihood") is None:
+            # A calibration knows which likelihood its estimate maximises.
+            options["likelihood"] = self.calibration.provenance.get("settings", {}).get("likelihood", "marginal")
+        checkpoint = self.path / "sampling.checkpoint.npz"
+        posterior = sample(obs, self.calibration, progress=progress, checkpoint=checkpoint, **options)
+        posterior.save(self.folder.posterior, force=True)
+        checkpoint.unlink(missing_ok=True)
+        self._remove(DERIVED)
+        self.posterior = posterior
+        return posterior
+
+    def couple(self) -> Coupling:
+        """Write the table of the couplings."""
+        write_csv(self.coupling.to_dataframe(), self.folder.coupling)
+        return self.coupling
+
+    def propagate(
+        self,
+        *,
+        n_draws: int = 300,
+        seed: int = 0,
+        sky: MissionSky | None = None,
+        tell: Callable[[str], None] | None = None,
+    ) -> tuple[AttitudeError, FieldMap, ErrorSpectrum | None]:
+        """Carry the posterior through QUEST on the observed frames or a mission's, and over the field; write all of it.
+
+        Along an attitude profile the spectrum of the frame-dependent part is written as well.
+
+        Parameters
+        ----------
+        n_draws, seed
+            As for `starcal_uq.propagate`.
+        sky : MissionSky, optional
+            Frames in place of the observed ones.
+        tell : callable, optional
+            Function that gets what a user should know, one sentence each.
+        """
+        posterior = self.posterior
+        if not self._keeps_observations and not self.has("observations"):
+            raise RunFolderError(
+                f"{self.path}: holds no observations, so that there are no frames to propagate to: calibrate a table "
+                "that fits into memory with `starcal-uq calibrate`."
+            )
+        from starcal_uq.propagation.field import field_map
+        from starcal_uq.propagation.propagate import propagate
+
+        frames = self.observations if sky is None else sky.frames(posterior, self.observations, seed)
+        error = propagate(posterior, frames, n_draws=n_draws, seed=seed)
+        fields = field_map(posterior, self.observations)
+        spectrum = None
+        told = [str(message) for message in frames.meta.get("messages", ())]
+        if sky is not None and sky.profile is not None:
+            from starcal_uq.propagation.spectrum import MIN_SPECTRUM_FRAMES, error_spectrum
+
+            if frames.n_frames >= MIN_SPECTRUM_FRAMES:
+                spectrum = error_spectrum(posterior, frames, n_draws=min(n_draws, 100), seed=seed)
+            else:
+                told.append(
+                    f"the profile has {frames.n_frames} frames, too few for a spectrum ({MIN_SPECTRUM_FRAMES})."
+                )
+        if self.has("budget"):
+            told.append(
+                f"the budget rested on the numbers of before and was removed: run `starcal-uq budget {self.path}`."
+            )
+        # What rests on the attitude error of before goes with it.
+        self._remove(("spectrum", "budget"))
+        error.save(self.folder.attitude)
+        fields.save(self.folder.field_map)
+        if spectrum is not None:
+            spectrum.save(self.folder.spectrum)
+        # The file of the attitude error holds less than the result, and a report shows what is in the file.
+        self._forget("attitude")
+        self.field_map = fields
+        if tell is not None:
+            for message in told:
+                tell(message)
+        return error, fields, spectrum
+
+    def diagnose(self, **options: Any) -> Diagnosis:
+        """Question the model; writes ``diagnosis.json``, with the tables as CSV beside it.
+
+        Options are those of `starcal_uq.diagnose`.
+        """
+        from starcal_uq.diagnostics.diagnose import diagnose
+
+        posterior = self.posterior if self.has("posterior") else None
+        diagnosis = diagnose(self.observations, self.calibration, posterior, **options)
+        for name, file_name in DIAGNOSIS_TABLES.items():
+            part = getattr(diagnosis, name)
+            if part is not None:
+                write_csv(part.to_dataframe(), self.path / file_name)
+        diagnosis.save(self.folder.diagnosis)
+        self._forget("diagnosis")
+        return diagnosis
+
+    def budget(
+        self, *, file: BudgetFile | PathLike | None = None, confidence: float | None = None, seed: int = 0
+    ) -> Budget:
+        """Make the attitude error budget and write it.
+
+        The attitude errors are those of ``attitude.csv``, and the tests of the model those of ``diagnosis.json`` if the
+        run was diagnosed.
+
+        Parameters
+        ----------
+        file, confidence, seed
+            As for `starcal_uq.budget`.
+
+        Raises
+        ------
+        RunFolderError
+            If a part is missing, or the data are not those of the run.
+        BudgetError
+            If the file is wrong.
+        """
+        from starcal_uq.budgeting.budget import budget
+        from starcal_uq.budgeting.file import BudgetFile, load_budget_file
+
+        stated = file if isinstance(file, BudgetFile) or file is None else load_budget_file(file)
+        posterior, attitude = self.posterior, self.attitude
+        made = budget(
+            posterior,
+            self.observations,
+            attitude,
+            file=stated,
+            confidence=confidence,
+            misfit=self.diagnosis,
+            seed=seed,
+        )
+        made.save(self.folder.budget)
+        self._forget()
+        self.error_budget = made
+        return made
+
+    def report(self) -> Path:
+        """Write ``RUN/report.html`` of whatever the run holds, and the figures in ``RUN/figures``.
+
+        Raises
+        ------
+        RunFolderError
+            If there is no calibration, a file cannot be read, or files of different runs are mixed.
+        """
+        from starcal_uq.presentation.report.page import draw_figures, render
+
+        figures = draw_figures(self.results)
+        page = render(self.results, figures)
+        self.folder.figures.mkdir(exist_ok=True)
+        for name, png in figures.items():
+            atomic_write_bytes(self.folder.figures / f"{name}.png", png)
+        atomic_write_text(self.folder.report, page)
+        return self.folder.report
+
+    @property
+    def _keeps_observations(self) -> bool:
+        """Whether it has stars: merged runs may have none, streams have none, and sampling can do without them."""
+        record = self.calibration.provenance
+        merged = record.get("merge", {}).get("has_observations") is False
+        return not merged and not record["settings"].get("stream", False)
+
+    def _remove(self, names: Sequence[str]) -> None:
+        """Remove files, and what was loaded from them."""
+        for name in names:
+            path: Path = getattr(self.folder, name)
+            path.unlink(missing_ok=True)
+        if "calibration" in names:
+            for file_name in DIAGNOSIS_TABLES.values():
+                (self.path / file_name).unlink(missing_ok=True)
+        self._forget(*names, "error_budget")
+
+    def _forget(self, *names: str) -> None:
+        """Load results again when they are next asked for."""
+        for name in ("results", *names):
+            vars(self).pop(name, None)

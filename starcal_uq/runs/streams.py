@@ -21,7 +21,7 @@ from starcal_uq.core.types import AnyDict
 from starcal_uq.estimation.recursive.start import RecursionOptions
 from starcal_uq.estimation.recursive.stream import RecursiveCalibration
 from starcal_uq.observations.streams import FrameStream, stream_frames
-from starcal_uq.runs.folder import RunFolder
+from starcal_uq.runs.run import Run
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -70,7 +70,7 @@ def filter_run(
     KeyboardInterrupt
         After Ctrl-C; the state is kept, and the same call goes on from it.
     """
-    run, stream = RunFolder(out), stream_frames(path, camera, columns)
+    run, stream = Run(out), stream_frames(path, camera, columns)
     options = options or RecursionOptions()
     filtering = RecursiveCalibration(camera, method, options)
     identity: AnyDict = {
@@ -90,15 +90,13 @@ def filter_run(
         check_new_folder(run.path, force)
 
     def keep() -> None:
-        run.create()
+        run.folder.create()
         atomic_write_text(run.path / SOURCE, json.dumps(identity) + "\n")
         filtering.save(state)
 
     _feed(filtering, stream, keep)
     calibration = filtering.result()
-    run.create()
-    camera.save(run.camera, force=True)
-    calibration.save(run.calibration)
+    run.write(calibration, None)
     write_csv(history(calibration), run.path / HISTORY)
     for name in (STATE, SOURCE):
         (run.path / name).unlink(missing_ok=True)

@@ -27,7 +27,6 @@ from starcal_uq.diagnostics.misfit import Misfit, MisfitTest
 from starcal_uq.presentation.pages.budgeting import budget_context, write_budget
 from starcal_uq.presentation.tables import tex
 from starcal_uq.propagation.attitude_error import AttitudeError
-from starcal_uq.runs.steps import budget_run, diagnose_run
 from tests.helpers.scenes import observations
 
 FILE = """
@@ -518,7 +517,7 @@ def full(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 def test_the_budget_of_a_run_is_written_to_its_folder(full: Any, stated: Path) -> None:
-    found = budget_run(full.path, file=stated)
+    found = sc.Run(full.path).budget(file=stated)
     back = Budget.load(full.budget)
     assert repr(back.totals) == repr(found.totals) and len(found.violations) == 1
     error = AttitudeError.load(full.attitude)
@@ -538,14 +537,14 @@ def test_the_budget_of_a_run_is_written_to_its_folder(full: Any, stated: Path) -
 
 def test_a_diagnosed_run_is_inflated_or_says_that_nothing_was_found(full: Any, tmp_path: Path) -> None:
     shutil.copytree(full.path, tmp_path / "run")
-    diagnose_run(tmp_path / "run", n_starts=0)
-    assert not any("not tested" in note for note in budget_run(tmp_path / "run").notes)
+    sc.Run(tmp_path / "run").diagnose(n_starts=0)
+    assert not any("not tested" in note for note in sc.Run(tmp_path / "run").budget().notes)
 
 
 def test_a_missing_part_is_named_with_its_command(full: Any, tmp_path: Path) -> None:
     shutil.copytree(full.path, tmp_path / "run")
     (tmp_path / "run" / "attitude.csv").unlink()
     with pytest.raises(RunFolderError, match="starcal-uq propagate RUN"):
-        budget_run(tmp_path / "run")
+        sc.Run(tmp_path / "run").budget()
     with pytest.raises(BudgetError, match="does not exist"):
-        budget_run(full.path, file=tmp_path / "none.toml")
+        sc.Run(full.path).budget(file=tmp_path / "none.toml")

@@ -78,10 +78,8 @@ def test_options_of_the_other_kind_are_refused(cli, frames, tmp_path):
 
 
 def test_identify_refuses_the_calibration_of_another_sensor(cli, frames, tmp_path):
-    from starcal_uq.runs.steps import calibrate_step
-
     obs = sc.simulate(sc.load_catalogue(max_mag=6.0, epoch=2026.9), sc.paper.paper_camera(), n_frames=20, seed=1)
-    calibrate_step(sc.runs.RunFolder(tmp_path / "run"), obs, sc.paper.paper_start(), force=True)
+    sc.Run(tmp_path / "run").calibrate(obs, sc.paper.paper_start(), force=True)
     sc.paper.paper_start().replace(focal_mm=50.0).save(tmp_path / "other.toml")
     assert cli("centroid", frames, "-o", "c.parquet")[0] == 0
     status, _, err = cli("identify", "c.parquet", "other.toml", "-o", "o.csv", "--calibration", "run")

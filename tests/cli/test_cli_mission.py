@@ -29,14 +29,12 @@ limit_arcsec = 1000.0
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run with everything but the questions to the model, which take long."""
-    from starcal_uq.runs.steps import calibrate_step, propagate_step, sample_step
-
-    run = sc.runs.RunFolder(tmp_path_factory.mktemp("mission") / "run")
+    run = sc.Run(tmp_path_factory.mktemp("mission") / "run")
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
     obs = sc.simulate(stars, sc.paper.paper_camera(), n_frames=60, min_stars=8, sigma_px=0.05, seed=1)
-    calibrate_step(run, obs, sc.paper.paper_start(), force=True)
-    sample_step(run, force=True, n_steps=60, seed=1)
-    propagate_step(run, n_draws=60, seed=1)
+    run.calibrate(obs, sc.paper.paper_start(), force=True)
+    run.sample(force=True, n_steps=60, seed=1)
+    run.propagate(n_draws=60, seed=1)
     return run.path
 
 

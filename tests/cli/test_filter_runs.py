@@ -10,7 +10,6 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.runs import streams as filter_runs
-from starcal_uq.runs.steps import coupling_step, propagate_step, sample_step
 from starcal_uq.runs.streams import HISTORY, STATE, filter_run
 from tests.helpers.scenes import camera, nominal, observations
 
@@ -38,14 +37,14 @@ def test_run_folder_holds_the_calibration_and_its_history(table, tmp_path):
 
 def test_posterior_and_couplings_follow_and_propagation_says_what_it_needs(table, tmp_path):
     filter_run(table, nominal(camera()), tmp_path / "run", options=ALL)
-    run = sc.runs.RunFolder(tmp_path / "run")
+    run = sc.Run(tmp_path / "run")
     batch = sc.calibrate(observations(n_frames=60), nominal(camera()))
 
-    assert coupling_step(run).parameter_names == ("x0", "y0", "f", "k1", "k2")
-    posterior = sample_step(run, force=False, seed=1)
+    assert run.couple().parameter_names == ("x0", "y0", "f", "k1", "k2")
+    posterior = run.sample(seed=1)
     assert np.all(np.abs(posterior.mean - batch.theta) < 0.5 * batch.sigmas)
     with pytest.raises(sc.errors.RunFolderError, match="holds no observations"):
-        propagate_step(run, n_draws=10, seed=1)
+        run.propagate(n_draws=10, seed=1)
 
 
 def test_an_interrupted_run_goes_on_bit_for_bit(table, tmp_path, monkeypatch):

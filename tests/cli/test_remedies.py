@@ -17,8 +17,6 @@ import starcal_uq as sc
 from starcal_uq.core.status import Level, Status
 from starcal_uq.diagnostics.verdict import draws, estimate, observed
 from starcal_uq.inference import checks
-from starcal_uq.runs.folder import RunFolder
-from starcal_uq.runs.steps import calibrate_step, propagate_step, sample_step
 from tests.helpers.ground_scenes import NOMINAL, SITE, ground_frames
 from tests.helpers.scenes import observations
 
@@ -43,10 +41,10 @@ def small(tmp_path_factory):
     )
     for name, seed in (("RUN_B", 5), ("RUN_A", 3)):
         obs = observations(n_frames=12, seed=seed)
-        run = RunFolder(folder / name)
-        cal, _ = calibrate_step(run, obs, camera, force=False)
-        post = sample_step(run, force=False, seed=0, **SHORT)
-        propagate_step(run, n_draws=50, seed=0)
+        run = sc.Run(folder / name)
+        cal = run.calibrate(obs, camera)
+        post = run.sample(seed=0, **SHORT)
+        run.propagate(n_draws=50, seed=0)
     obs.save(folder / "OBS.csv")
     shutil.copytree(folder / "RUN_A", folder / "RUN")
     return SimpleNamespace(folder=folder, obs=obs, camera=camera, cal=cal, post=post)
@@ -112,6 +110,7 @@ COMMANDS = {
     "budget RUN --template FILE": "",
     "calibrate": "OBS CAMERA -o RUN --force",
     "calibrate OBS CAMERA -o RUN": "--force",
+    "calibrate OBS CAMERA -o RUN --screen": "--force",
     "compare RUN_A RUN_B -o DIR": "",
     "coupling RUN": "",
     "propagate RUN": "--draws 50",

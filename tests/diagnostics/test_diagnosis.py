@@ -12,12 +12,12 @@ from scipy import stats
 
 import starcal_uq as sc
 from starcal_uq.core.records import to_plain
-from starcal_uq.diagnostics.diagnose import FILE, TABLES, Diagnosis, diagnose, multi_start
+from starcal_uq.diagnostics.diagnose import Diagnosis, diagnose, multi_start
 from starcal_uq.diagnostics.jackknife import Jackknife, accept_inflation, jackknife_frames
 from starcal_uq.diagnostics.models import ModelComparison, closed_form, compare_models
 from starcal_uq.diagnostics.predictive import PredictiveCheck, predictive_check
 from starcal_uq.estimation.normals import FrameNormals
-from starcal_uq.runs.steps import diagnose_run, load_diagnosis
+from starcal_uq.runs.folder import DIAGNOSIS_TABLES
 from tests.helpers.scenes import camera, nominal, observations, with_sigmas
 
 
@@ -219,26 +219,28 @@ def test_diagnosis_of_a_run_is_stored_and_belongs_to_its_calibration(obs, cal, t
     run = sc.runs.RunFolder(tmp_path / "run").create()
     obs.save(run.observations)
     cal.save(run.calibration)
-    assert load_diagnosis(run, cal) is None
+    assert sc.Run(run.path).diagnosis is None
     steps = []
-    found = diagnose_run(run.path, models=("k1",), n_starts=1, progress=lambda done, total: steps.append((done, total)))
+    whole = sc.Run(run.path)
+    found = whole.diagnose(models=("k1",), n_starts=1, progress=lambda done, total: steps.append((done, total)))
     assert steps == [(i, 5) for i in range(1, 6)]
-    assert {path.name for path in run.path.iterdir()} >= {FILE, *TABLES.values()}
-    again = load_diagnosis(run, sc.Calibration.load(run.calibration))
+    assert {path.name for path in run.path.iterdir()} >= {run.diagnosis.name, *DIAGNOSIS_TABLES.values()}
+    again = whole.diagnosis
     assert json.dumps(to_plain(again)) == json.dumps(to_plain(found))
     assert isinstance(again, Diagnosis) and isinstance(again.jackknife, Jackknife)
     assert isinstance(again.comparison, ModelComparison) and isinstance(again.predictive, PredictiveCheck)
     assert all(word in again._repr_html_() for word in ("Misfit", "Jackknife", "Models", "predictive"))
-    with (run.path / TABLES["comparison"]).open() as stream:
+    with (run.path / DIAGNOSIS_TABLES["comparison"]).open() as stream:
         assert {row["model"] for row in csv.DictReader(stream)} == {"k1", "brown"}
     # The control: the diagnosis of another estimate is not shown with this one.
-    assert load_diagnosis(run, dataclasses.replace(cal, theta=cal.theta + 1e-9)) is None
-    (run.path / FILE).write_text("{}")
+    dataclasses.replace(cal, theta=cal.theta + 1e-9).save(run.calibration)
+    assert sc.Run(run.path).diagnosis is None
+    run.diagnosis.write_text("{}")
     with pytest.raises(sc.errors.RunFolderError, match="diagnose"):
-        load_diagnosis(run, cal)
+        _ = sc.Run(run.path).diagnosis
     observations(n_frames=60, seed=4).save(run.observations, force=True)
     with pytest.raises(sc.errors.RunFolderError, match="other observations"):
-        diagnose_run(run.path)
+        sc.Run(run.path).diagnose()
 
 
 def test_two_frames_have_no_jackknife_but_a_diagnosis(obs):

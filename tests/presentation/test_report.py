@@ -11,11 +11,8 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.core.formatting import significant
-from starcal_uq.diagnostics.diagnose import FILE
 from starcal_uq.presentation.report.page import render
 from starcal_uq.presentation.report.tables import attitude_rows, parameter_rows, symbol, weak_directions
-from starcal_uq.runs.run import load_results
-from starcal_uq.runs.steps import diagnose_run
 from tests.helpers.scenes import camera, nominal, observations
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
@@ -76,7 +73,7 @@ def full(tmp_path_factory):
     post.save(run.posterior)
     sc.propagate(post, obs, n_draws=200, seed=1).save(run.attitude)
     sc.propagation.field_map(post, obs, n=9).save(run.field_map)
-    diagnose_run(run.path, n_starts=1)
+    sc.Run(run.path).diagnose(n_starts=1)
     assert sc.report(run.path) == run.report
     return run
 
@@ -94,7 +91,7 @@ def page(run) -> Page:
 
 def words(run, truth=None) -> str:
     """The text of the report that a run would give, without drawing its figures."""
-    return Page(render(load_results(run, truth), {})).text
+    return Page(render(sc.Run(run.path, truth).results, {})).text
 
 
 def test_every_section_is_there_and_every_link_leads_somewhere(full):
@@ -140,7 +137,7 @@ def test_verdict_comes_first_in_words(full):
 
 
 def test_parameters_are_those_of_the_posterior(full):
-    results = load_results(full)
+    results = sc.Run(full.path).results
     rows = parameter_rows(results)
     assert len(rows) == 7
     post = results.posterior
@@ -158,7 +155,7 @@ def test_parameters_are_those_of_the_posterior(full):
 
 
 def test_digits_end_at_the_second_digit_of_sigma(full):
-    for row in parameter_rows(load_results(full)):
+    for row in parameter_rows(sc.Run(full.path).results):
         assert len(row["sigma"].replace(".", "").lstrip("0")) == 2
         assert len(row["estimate"].partition(".")[2]) == len(row["sigma"].partition(".")[2])
 
@@ -167,12 +164,12 @@ def test_field_map_and_distortion_in_words(full):
     text = page(full).text
     assert "Equivalent principal point" in text
     assert "the distortion is" in text
-    field = load_results(full).field_map
+    field = sc.Run(full.path).results.field_map
     assert f"{significant(field.equivalent_principal_point_px[0])} px" in text
 
 
 def test_attitude_table(full):
-    error = load_results(full).attitude
+    error = sc.Run(full.path).results.attitude
     rows = attitude_rows(error)
     assert [row["absorbed"] for row in rows] == ["no", "yes", "no", "in part", "no"]
     assert all(len(row[group]) == 4 for row in rows for group in ("sigma", "p95", "p997"))
@@ -180,7 +177,7 @@ def test_attitude_table(full):
 
 
 def test_weak_direction_names_the_distortion(full):
-    rows = weak_directions(load_results(full).coupling)
+    rows = weak_directions(sc.Run(full.path).results.coupling)
     assert rows[0]["words"].startswith("k1 against")
     assert str(rows[0]["weights"][0][0]).startswith("<i>")
 
@@ -215,13 +212,13 @@ def test_misfit_section_shows_tests_jackknife_models_and_replicates(full):
 
 
 def test_without_diagnosis_or_with_that_of_another_estimate_the_command_is_named(run):
-    text = (run.path / FILE).read_text(encoding="utf-8")
-    (run.path / FILE).write_text(text.replace('"theta": [\n  5', '"theta": [\n  6'), encoding="utf-8")
+    text = run.diagnosis.read_text(encoding="utf-8")
+    run.diagnosis.write_text(text.replace('"theta": [\n  5', '"theta": [\n  6'), encoding="utf-8")
     for _ in range(2):
         found = words(run)
         assert f"starcal-uq diagnose {run.path}" in found
         assert "Jackknife over frames" not in found
-        (run.path / FILE).unlink(missing_ok=True)
+        run.diagnosis.unlink(missing_ok=True)
 
 
 def test_undeclared_directions_are_warned_of_before_any_table(run):
@@ -243,7 +240,7 @@ def test_without_truth_there_is_no_truth(run):
 
 
 def test_a_failed_check_turns_the_verdict_red(full):
-    results = load_results(full)
+    results = sc.Run(full.path).results
     diagnostics = dataclasses.replace(results.posterior.diagnostics, rhat=np.full(6, 1.2))
     results = dataclasses.replace(results, posterior=dataclasses.replace(results.posterior, diagnostics=diagnostics))
     text = render(results, {})
@@ -252,7 +249,7 @@ def test_a_failed_check_turns_the_verdict_red(full):
 
 
 def test_names_from_outside_are_text_and_not_markup(full):
-    results = load_results(full)
+    results = sc.Run(full.path).results
     name = "<script>alert(1)</script> & co"
     nominal_camera = results.calibration.nominal.replace(name=name)
     cal = dataclasses.replace(results.calibration, nominal=nominal_camera)
@@ -274,7 +271,7 @@ def test_a_report_that_fails_leaves_the_old_one(run, monkeypatch):
     before = run.report.read_bytes()
     figures = {path: path.stat().st_mtime_ns for path in run.figures.iterdir()}
     monkeypatch.setattr("starcal_uq.presentation.report.page.draw_figures", lambda _: {"corner": b"new"})
-    monkeypatch.setattr("starcal_uq.runs.steps.render", lambda *_: 1 / 0)
+    monkeypatch.setattr("starcal_uq.presentation.report.page.render", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         sc.report(run.path)
     assert run.report.read_bytes() == before
@@ -299,7 +296,7 @@ def test_every_model_and_a_given_noise(model, tmp_path):
     text = words(run)
     assert f"Distortion model “{model}”" in text
     assert "was given as 0.05" in text
-    assert len(parameter_rows(load_results(run))) == len(cal.theta) + 2
+    assert len(parameter_rows(sc.Run(run.path).results)) == len(cal.theta) + 2
 
 
 def test_real_data(real_data, tmp_path):

@@ -8,7 +8,6 @@ from typing import Any
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.formatting import count, join_words
 from starcal_uq.core.status import Check, Level, Question, worst
-from starcal_uq.diagnostics.verdict.judge import judge
 from starcal_uq.diagnostics.verdict.limits import limits
 from starcal_uq.presentation.figures.coupling import plot_correlations, plot_couplings
 from starcal_uq.presentation.figures.diagnostics import plot_diagnosis, plot_residual_profiles
@@ -46,7 +45,7 @@ def render(results: Results, figures: Mapping[str, bytes]) -> str:
 def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
     """What the template shows."""
     cal, post, obs = results.calibration, results.posterior, results.observations
-    verdict = judge(obs, cal, post, results.truth, results.attitude, results.diagnosis)
+    verdict = results.verdict
     converged = verdict.of(Question.CONVERGED)
     trust = verdict.of(Question.TRUSTWORTHY)
     return {

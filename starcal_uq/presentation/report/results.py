@@ -13,6 +13,7 @@ from starcal_uq.observations.table import Observations
 if TYPE_CHECKING:
     from starcal_uq.budgeting.result import Budget
     from starcal_uq.diagnostics.diagnose import Diagnosis
+    from starcal_uq.diagnostics.verdict.judge import Verdict
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.pipeline.record import ImageRecord
     from starcal_uq.propagation.attitude_error import AttitudeError
@@ -81,6 +82,15 @@ class Results:
     images: ImageRecord | None = None
     budget: Budget | None = None
     missing: tuple[Missing, ...] = ()
+
+    @cached_property
+    def verdict(self) -> Verdict:
+        """Every check of the run, judged once."""
+        from starcal_uq.diagnostics.verdict.judge import judge
+
+        return judge(
+            self.observations, self.calibration, self.posterior, self.truth, self.attitude, diagnosis=self.diagnosis
+        )
 
     @cached_property
     def distortion_curve(self) -> DistortionCurve | None:

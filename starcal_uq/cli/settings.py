@@ -1,0 +1,186 @@
+"""What the steps of a run are told: every option declared once, for all commands that have it."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import astuple, dataclass, fields, is_dataclass
+from functools import wraps
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+
+import typer
+
+import starcal_uq as sc
+from starcal_uq.cli.options import Columns, Seed, TimeUtc, parse_choice
+from starcal_uq.core.types import AnyDict
+
+if TYPE_CHECKING:
+    from starcal_uq.runs.run import Run
+
+
+@dataclass(frozen=True)
+class EstimationSettings:
+    """How a camera is estimated."""
+
+    method: Annotated[
+        str,
+        typer.Option(
+            help="efficient (three stages, then the attitude-marginalised likelihood), three_stage (Ye & Yang 2017), "
+            "or a baseline: least_squares, samaan (Kalman filter), griffith (recursive least squares)."
+        ),
+    ] = "efficient"
+    solver: Annotated[str, typer.Option(help="lm, minpack, or ipopt (keeps the optics within physical bounds).")] = "lm"
+    screen: Annotated[
+        bool, typer.Option("--screen", help="Leave out wrong identifications first; they are listed.")
+    ] = False
+    robust: Annotated[
+        bool, typer.Option("--robust", help="Refine with Student-t tails, which wrong identifications hardly move.")
+    ] = False
+
+    def options(self) -> AnyDict:
+        """Keyword arguments of `Run.calibrate`."""
+        options: AnyDict = {"method": self.method, "solver": self.solver, "screening": self.screen}
+        return options | {"likelihood": "student_t"} if self.robust else options
+
+
+@dataclass(frozen=True)
+class SkySettings:
+    """What is known of the directions, and how the observer moved."""
+
+    column: Columns = None
+    directions: Annotated[
+        str | None,
+        typer.Option(
+            help="What ra_deg and dec_deg are: apparent (as seen by the moving sensor), catalogue (aberration is then "
+            "applied at time_utc), or undeclared.",
+        ),
+    ] = None
+    observer_velocity: Annotated[
+        str | None,
+        typer.Option(
+            "--observer-velocity", metavar="VX,VY,VZ", help="Velocity relative to the Earth's centre, km/s, ICRS axes."
+        ),
+    ] = None
+    site: Annotated[
+        Path | None,
+        typer.Option(
+            "--site",
+            metavar="SITE",
+            help="Where on the ground the camera stood (TOML with a [site] table): refraction and daily aberration are "
+            "applied.",
+        ),
+    ] = None
+    in_space: Annotated[
+        bool, typer.Option("--in-space", help="The camera was above the air; refraction does not matter.")
+    ] = False
+
+    def options(self) -> AnyDict:
+        """Keyword arguments that tables and images share: `observations_from_table`, `observations_from_images`."""
+        from starcal_uq.pipeline.tables import DIRECTIONS
+
+        return {
+            "directions": parse_choice("--directions", self.directions, DIRECTIONS),
+            "site": None if self.site is None else sc.sky.Site.load(self.site),
+            "in_space": self.in_space,
+        }
+
+
+@dataclass(frozen=True)
+class ImageSettings:
+    """What belongs to images alone; None where nothing was said."""
+
+    max_mag: Annotated[
+        float | None, typer.Option(help="Images: magnitude limit of the catalogue, Gaia G; 7 by default.")
+    ] = None
+    epoch: Annotated[
+        float | None, typer.Option(help="Images: Julian year of the star positions; the images' own by default.")
+    ] = None
+    gain: Annotated[float | None, typer.Option(help="Images: electrons per count, where they do not say it.")] = None
+    time: TimeUtc = None
+    engine: Annotated[
+        str | None, typer.Option(help="Images: what finds attitudes: pyramid, or tetra3rs (extra of that name).")
+    ] = None
+
+
+@dataclass(frozen=True)
+class SamplingSettings:
+    """How a posterior is sampled."""
+
+    seed: Seed = 0
+    sigma: Annotated[
+        float | None, typer.Option(help="Centroid noise in px per axis, if it is known; sampled otherwise.")
+    ] = None
+    priors: Annotated[
+        Path | None, typer.Option("--priors", help="TOML file with a [priors] table; wide defaults otherwise.")
+    ] = None
+    ensembles: Annotated[int, typer.Option(min=2, help="Separately seeded ensembles of walkers.")] = 4
+    walkers: Annotated[int, typer.Option(min=14, help="Walkers in each ensemble.")] = 64
+    steps: Annotated[int, typer.Option(min=20, help="Steps kept of each walker.")] = 200
+    likelihood: Annotated[
+        str | None,
+        typer.Option(
+            help="marginal (Gaussian, attitudes marginalised), pairs (interstar angles, Godambe's curvature), "
+            "student_t (heavy tails, for wrong identifications), or pairs_naive (to see what goes wrong); by default "
+            "that of the calibration."
+        ),
+    ] = None
+    evaluation: Annotated[str, typer.Option(help="auto (compressed, checked against exact), compressed, or exact.")] = (
+        "auto"
+    )
+
+    def options(self, run: Run) -> AnyDict:
+        """Keyword arguments of `Run.sample`."""
+        from starcal_uq.runs.priors import read_priors
+
+        options: AnyDict = {
+            "seed": self.seed,
+            "sigma": "sampled" if self.sigma is None else self.sigma,
+            "n_ensembles": self.ensembles,
+            "n_walkers": self.walkers,
+            "n_steps": self.steps,
+            "likelihood": self.likelihood,
+            "evaluation": self.evaluation,
+        }
+        return options if self.priors is None else options | {"priors": read_priors(run, self.priors)}
+
+
+def refuse_others(images: bool, sky: SkySettings, of_images: ImageSettings) -> None:
+    """An option that would be ignored is a mistake of the user's that should show."""
+    if images:
+        given: AnyDict = {"column": sky.column, "observer_velocity": sky.observer_velocity}
+        kind = "tables of stars, not to images"
+    else:
+        given = {field.name: value for field, value in zip(fields(of_images), astuple(of_images), strict=True)}
+        kind = "images, not to a table of stars"
+    for name, value in given.items():
+        if value not in (None, []):
+            raise typer.BadParameter(f"--{name.replace('_', '-')} belongs to {kind}: leave it out.")
+
+
+def unfolded(command: Callable[..., None]) -> Callable[..., None]:
+    """A command whose parameters that are records of settings are options, one for each field."""
+    parameters: list[inspect.Parameter] = []
+    records: dict[str, Any] = {}
+    for parameter in inspect.signature(command, eval_str=True).parameters.values():
+        record = parameter.annotation
+        if not is_dataclass(record):
+            parameters.append(parameter.replace(kind=parameter.KEYWORD_ONLY))
+            continue
+        hints = get_type_hints(record, include_extras=True)
+        records[parameter.name] = record
+        parameters += [
+            inspect.Parameter(f.name, parameter.KEYWORD_ONLY, default=f.default, annotation=hints[f.name])
+            for f in fields(record)
+        ]
+
+    @wraps(command)
+    def run(**given: Any) -> None:
+        settings = {
+            name: record(**{field.name: given.pop(field.name) for field in fields(record)})
+            for name, record in records.items()
+        }
+        command(**given, **settings)
+
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    return run

@@ -1,0 +1,83 @@
+"""From a table of identified stars to observations whose directions are as the camera saw them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from starcal_uq.core.errors import ObservationError
+from starcal_uq.observations.table import load_observations
+from starcal_uq.sky.site import check_sky
+
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.observations.table import Observations
+    from starcal_uq.sky.site import Site
+
+DIRECTIONS = ("undeclared", "catalogue", "apparent")
+
+
+def observations_from_table(
+    path: Path,
+    camera: Camera,
+    *,
+    columns: Mapping[str, str] | None = None,
+    directions: str | None = None,
+    observer_velocity_km_s: Sequence[float] | None = None,
+    site: Site | None = None,
+    in_space: bool = False,
+) -> Observations:
+    """Read a table and make its directions apparent as far as the user has declared how.
+
+    Parameters
+    ----------
+    path : Path
+        CSV, ECSV or Parquet.
+    camera : Camera
+        Its detector bounds the pixels.
+    columns : mapping, optional
+        Names in the file of columns that are called otherwise.
+    directions : {"undeclared", "catalogue", "apparent"}, optional
+        What the directions in the file are; the file's own metadata by default. With ``catalogue``, or with an observer
+        velocity, annual aberration is applied at each row's ``time_utc``.
+    observer_velocity_km_s : (3,) sequence, optional
+        Velocity relative to the Earth's centre, ICRS axes.
+    site : Site, optional
+        Where on the ground the camera stood: refraction and daily aberration are applied too, and stars lower than ten
+        degrees left out.
+    in_space : bool
+        Whether the camera was above the air, so that nothing need be said of refraction.
+
+    Raises
+    ------
+    ObservationError
+        For bad rows, or when aberration is asked for without times.
+    SiteError
+        For a site together with directions that need none.
+    """
+    obs = load_observations(path, camera=camera, columns=columns)
+    if directions is not None:
+        obs = obs.with_meta(directions=directions)
+    # A table that says nothing of its directions is taken to hold a catalogue's.
+    declared = obs.meta.get("directions")
+    check_sky(directions if declared == "undeclared" else declared, site, in_space)
+    if in_space:
+        obs = obs.with_meta(observer="space")
+    if obs.meta.get("directions") == "apparent":
+        if observer_velocity_km_s is not None:
+            raise ObservationError(
+                f"{path}: the directions are declared apparent already, so that an observer velocity would be applied "
+                "twice: leave out --observer-velocity, or declare --directions catalogue."
+            )
+        return obs
+    if obs.meta.get("directions") == "catalogue" or observer_velocity_km_s is not None or site is not None:
+        from starcal_uq.sky.apparent import make_apparent, without_low_stars
+
+        try:
+            return make_apparent(
+                obs if site is None else without_low_stars(obs, site), observer_velocity_km_s, site=site
+            )
+        except ObservationError as error:
+            raise ObservationError(f"{path}: {error}", row=error.row, column=error.column) from error
+    return obs

@@ -1,0 +1,56 @@
+"""The report of a run, and the page of any result that has one."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from starcal_uq.runs.run import Run
+
+if TYPE_CHECKING:
+    from starcal_uq.budgeting.result import Budget
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.comparison.result import CameraComparison
+    from starcal_uq.core.files import PathLike
+    from starcal_uq.planning.plan import Plan
+
+
+def report(
+    what: PathLike | Run | Plan | CameraComparison | Budget, to: PathLike | None = None, *, truth: Camera | None = None
+) -> Path:
+    """Write the report of a run, or the page of another result.
+
+    Parameters
+    ----------
+    what : path, Run, Plan, CameraComparison or Budget
+        Folder of a run that holds a calibration at least, whose ``report.html`` and ``figures`` are written; what is
+        missing beyond that is named in the report together with the command that makes it. Or a result.
+    to : path, optional
+        Folder for the page of a plan or a comparison, file for that of a budget, whose ending names the format
+        (``.html``, ``.xlsx``, ``.tex``, ``.csv``); a run has its own place.
+    truth : Camera, optional
+        The camera of a simulation, shown beside the estimate of a run. Observations made by `starcal_uq.simulate`
+        carry it, and it is then taken from them.
+
+    Returns
+    -------
+    Path
+        The page. It needs no network, no script and no other file.
+
+    Raises
+    ------
+    TypeError
+        If the result has no page, or nothing says where it goes.
+    RunFolderError
+        If there is no calibration, a file cannot be read, or files of different runs are mixed.
+    """
+    if isinstance(what, Run):
+        return what.report()
+    if isinstance(what, str | os.PathLike):
+        return Run(what, truth).report()
+    if to is None:
+        raise TypeError(f"say where the page of a {type(what).__name__} goes: report(what, to).")
+    from starcal_uq.presentation.pages.write import write_page
+
+    return write_page(what, to)

@@ -1,0 +1,104 @@
+"""A run: each result is loaded once, what is stale goes, and data of another calibration are refused."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.cli.app import main
+from starcal_uq.diagnostics.diagnose import Diagnosis
+from tests.helpers.scenes import observations
+
+READERS: tuple[tuple[type, str], ...] = (
+    (sc.Calibration, "load"),
+    (sc.Posterior, "load"),
+    (sc.propagation.AttitudeError, "load"),
+    (sc.propagation.FieldMap, "load"),
+    (sc.budgeting.Budget, "load"),
+    (Diagnosis, "load"),
+)
+# Modules that hold a function, and its name.
+FUNCTIONS = (
+    ("starcal_uq.runs.run", "load_observations"),
+    ("starcal_uq.diagnostics.verdict.judge", "judge"),
+    ("starcal_uq.propagation.coupling", "coupling"),
+)
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """How often each reader of a file, the judge and the couplings were called."""
+    counts: Counter[str] = Counter()
+
+    def counted(label: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*given: Any, **options: Any) -> Any:
+            counts[label] += 1
+            return function(*given, **options)
+
+        return call
+
+    for owner, name in READERS:
+        monkeypatch.setattr(owner, name, counted(owner.__name__, getattr(owner, name)))
+    for module, name in FUNCTIONS:
+        place = import_module(module)
+        monkeypatch.setattr(place, name, counted(name, getattr(place, name)))
+    return counts
+
+
+def test_a_demo_reads_each_file_once_at_most_and_is_judged_once(
+    calls: Counter[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["starcal-uq", "demo", "--frames", "60", "--out", str(tmp_path / "demo")])
+    with pytest.raises(SystemExit):
+        main()
+    assert max(calls.values()) == 1
+    # What a step gave is not read again, but for what a file keeps in part.
+    assert set(calls) == {"AttitudeError", "Diagnosis", "judge", "coupling"}
+    # The control: a new object reads what the report needs, each file once.
+    calls.clear()
+    sc.Run(tmp_path / "demo").report()
+    assert set(calls.values()) == {1}
+    assert {"Calibration", "Posterior", "load_observations", "Budget"} <= set(calls)
+
+
+def test_steps_give_what_they_write_and_remove_what_is_stale(tmp_path: Path) -> None:
+    run = sc.Run(tmp_path / "run")
+    with pytest.raises(sc.errors.RunFolderError, match="starcal-uq calibrate"):
+        _ = run.calibration
+    obs = observations(n_frames=60)
+    cal = run.calibrate(obs, sc.paper.paper_start())
+    assert [part.command.split()[1] for part in run.missing] == ["sample", "propagate", "diagnose"]
+    assert run.best is cal
+    assert run.results.posterior is None
+    posterior = run.sample(n_steps=50, seed=1)
+    run.couple()
+    run.propagate(n_draws=60, seed=1)
+    assert [part.command.split()[1] for part in run.missing] == ["diagnose", "budget"]
+    run.budget()
+    assert [part.command.split()[1] for part in run.missing] == ["diagnose"]
+    again = sc.Run(tmp_path / "run")
+    assert np.array_equal(again.posterior.draws, posterior.draws)
+    assert again.error_budget.to_dict() == run.error_budget.to_dict()
+    assert again.observations.data_hash == run.observations.data_hash
+    assert again.verdict.headline == run.verdict.headline
+    run.calibrate(obs, sc.paper.paper_start(), force=True)
+    assert [part.command.split()[1] for part in run.missing] == ["sample", "propagate", "diagnose"]
+    assert run.best is run.calibration
+    with pytest.raises(sc.errors.RunFolderError, match=r"has no budget\.csv"):
+        _ = run.error_budget
+
+
+@pytest.mark.parametrize("step", ["sample", "diagnose", "report"])
+def test_data_of_another_calibration_are_refused_with_one_sentence(step: str, tmp_path: Path) -> None:
+    sc.Run(tmp_path).calibrate(observations(), sc.paper.paper_start())
+    observations(seed=4).save(tmp_path / "observations.parquet", force=True)
+    with pytest.raises(sc.errors.RunFolderError, match=r"made from other observations .* run `starcal-uq calibrate`"):
+        getattr(sc.Run(tmp_path), step)()
