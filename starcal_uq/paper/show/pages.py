@@ -42,9 +42,9 @@ class Section(NamedTuple):
 def reproduction_figures(found: Reproduction) -> dict[str, bytes]:
     """Every figure as PNG, by name."""
     drawn = _drawn(found, "printed_numbers", "trajectories", "error_fields")
-    drawn["replicates"] = png_bytes(found.replicates.plot.spread())
+    drawn["replicates"] = png_bytes(found.replicates.plot.spread(), DPI)
     if found.study is not None:
-        drawn["interaction"] = png_bytes(found.study.plot.bias())
+        drawn["interaction"] = png_bytes(found.study.plot.bias(), DPI)
     return drawn
 
 
