@@ -315,7 +315,6 @@ def by_contributor(rows: Sequence[Contributor]) -> dict[str, dict[str, Contribut
 
 _SEPARATOR = " | "
 
-
 _READERS: dict[str, Callable[[str], Any]] = {
     "float": float,
     "bool": {"True": True, "False": False}.__getitem__,
@@ -323,9 +322,7 @@ _READERS: dict[str, Callable[[str], Any]] = {
     "tuple[str, ...]": lambda text: tuple(text.split(_SEPARATOR)) if text else (),
 }
 
-
 _DERIVED = ("combination", "margin_arcsec", "verdict")
-
 
 _COLUMNS = tuple(
     dict.fromkeys(

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
 # How far the other starts are from the nominal camera: of its focal length, and of the detector's longer side.
 _START_FOCAL, _START_CENTRE = 0.05, 0.1
-
-
 _SAME_SIGMA, _BETTER = 0.1, 1e-6
 
 

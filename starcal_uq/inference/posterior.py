@@ -33,10 +33,7 @@ DRAW_ORDER = (
     "step in that half, so that split R-hat compares the two halves in time and all ensembles"
 )
 
-
 _QUANTILES = (0.025, 0.5, 0.975)
-
-
 _NUMBERS = ("prior_mean", "prior_sd", "mean", "sd", "q2.5", "q50", "q97.5", "mcse")
 
 
@@ -399,7 +396,6 @@ class Posterior(Shown):
 
 _FORMAT = "starcal_uq posterior 2"
 
-
 _ARRAYS = {
     "draws": ("sample", "parameter"),
     "log_posterior": ("sample",),
@@ -409,7 +405,6 @@ _ARRAYS = {
     # Present only where the likelihood has such a parameter.
     "dof_draws": ("sample",),
 }
-
 
 _RECORD = (
     *("parameter_names", "camera", "priors", "laplace", "diagnostics"),

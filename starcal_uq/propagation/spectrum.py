@@ -35,11 +35,7 @@ if TYPE_CHECKING:
 
 
 MIN_SPECTRUM_FRAMES = 16
-
-
 _MAX_GAPS = 0.2
-
-
 # Times of a uniform series may be rounded, to milliseconds say; more than this share of a step is another series.
 _UNEVEN = 0.05
 
@@ -202,8 +198,6 @@ def _autocorrelation(first: FloatArray, step: float) -> tuple[FloatArray, FloatA
 
 
 _KIND = "starcal_uq error spectrum 1"
-
-
 _AVERAGES = 60
 
 

@@ -15,7 +15,6 @@ from starcal_uq.core.files import PathLike, new_folder
 
 _CALIBRATE = "run `starcal-uq calibrate OBS CAMERA -o RUN` first"
 
-
 # Attribute of RunFolder -> file name, and the command that makes it.
 _FILES: dict[str, tuple[str, str]] = {
     "observations": ("observations.parquet", _CALIBRATE),

@@ -23,12 +23,8 @@ if TYPE_CHECKING:
 
 # Of one false alarm among all tests of a validation.
 FAMILY_LEVEL = 0.01
-
-
 # Below this many replicates, intervals that are half as wide as they should be could go unnoticed.
 ENOUGH_REPLICATES = 100
-
-
 _FORMAT = "starcal_uq validation 1"
 
 
