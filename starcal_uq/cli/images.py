@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
     from starcal_uq.pipeline.refine import ImageCalibration
 
-_CENTROIDED = ("frame", "image", "n_stars", "n_saturated", "n_blended", "background", "noise")
-
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the command line."""

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.observations.table import Observations
 
-_ARRAYS = ("formal_covariance", "jackknife_covariance", "sandwich_covariance", "left_out", "effective_frames")
-
 
 @dataclass(frozen=True, eq=False)
 class Jackknife(Shown):

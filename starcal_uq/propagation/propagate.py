@@ -29,16 +29,15 @@ import numpy as np
 from starcal_uq.attitude.rotations import left_error
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.projection import unproject_jacobian, unproject_theta
-from starcal_uq.core.constants import ARCSEC, AXES, CROSS_BORESIGHT
+from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import DistortionError, ObservationError, SamplingError
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.propagation.attitude_error import CONTRIBUTORS, OBSERVED, AttitudeError
+from starcal_uq.propagation.attitude_error import OBSERVED, AttitudeError
 
 if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import Observations
 
-__all__ = ["AXES", "CONTRIBUTORS", "CROSS_BORESIGHT", "AttitudeError", "propagate"]
 
 _LEVELS = (0.95, 0.997)
 _STARS_AT_ONCE = 1_000_000

@@ -32,7 +32,6 @@ CAMERA_NAMES = {
     "three_stage": "proposed",
     TRUE_CAMERA: "true camera",
 }
-_AXIS_NAMES = ("pitch", "yaw", "roll")
 _ANGLES = "arcsec, pitch / yaw / roll"
 
 
