@@ -135,37 +135,44 @@ VIEWS: Mapping[type, View] = {
         corner=plot_corner,
         prior_posterior=plot_prior_posterior,
     ),
-    Misfit: View(diagnostics.misfit_text, diagnostics.misfit_html, {"p_values": plot_misfit}),
-    Jackknife: View(diagnostics.jackknife_text, diagnostics.jackknife_html, {"ratios": plot_jackknife}),
-    ModelComparison: View(models_sentence, diagnostics.models_html, {"models": plot_comparison}),
-    PredictiveCheck: View(diagnostics.predictive_text, diagnostics.predictive_html),
+    Misfit: _view("Misfit", diagnostics.misfit_text, diagnostics.misfit_table, p_values=plot_misfit),
+    Jackknife: _view("Jackknife", diagnostics.jackknife_text, diagnostics.jackknife_table, ratios=plot_jackknife),
+    ModelComparison: _view("Models", models_sentence, diagnostics.models_table, models=plot_comparison),
+    PredictiveCheck: _view("Posterior predictive check", diagnostics.predictive_text, diagnostics.predictive_table),
     Diagnosis: View(diagnostics.diagnosis_text, diagnostics.diagnosis_html, {"diagnosis": plot_diagnosis}),
-    Validation: View(diagnostics.validation_text, diagnostics.validation_html, {"ranks": plot_validation}),
-    CameraComparison: View(
-        comparison.comparison_text, comparison.comparison_html, {"difference": plot_camera_comparison}
+    Validation: _view("Validation", diagnostics.validation_text, diagnostics.validation_table, ranks=plot_validation),
+    CameraComparison: _view(
+        "Comparison", comparison.comparison_text, comparison.comparison_table, difference=plot_camera_comparison
     ),
     Need: View(planning.need_text),
-    Plan: View(planning.plan_text, planning.plan_html, {"forecast": plot_forecast, "sweeps": plot_plan_sweeps}),
-    FrameChoice: View(planning.choice_text, planning.choice_html, {"choice": plot_frame_choice}),
-    ForecastCheck: View(planning.check_text, planning.check_html, {"check": plot_forecast_check}),
+    Plan: _view("Plan", planning.plan_text, planning.plan_table, forecast=plot_forecast, sweeps=plot_plan_sweeps),
+    FrameChoice: _view(
+        "Frames to take", planning.choice_text, lambda choice: TextTable.of(choice.worth()), choice=plot_frame_choice
+    ),
+    ForecastCheck: _view("Forecast against simulation", planning.check_text, _rows, check=plot_forecast_check),
     Outcome: View(budgeting.outcome_text),
     Budget: View(budgeting.headline, section_html, {"contributors": plot_budget}),
-    Agreement: View(propagation.agreement_text, propagation.agreement_html),
-    AttitudeError: View(
-        propagation.attitude_text,
-        propagation.attitude_html,
-        {"contributors": plot_attitude},
+    Agreement: _view("Sampled over first order", propagation.agreement_text, propagation.agreement_table),
+    AttitudeError: _view(
+        "Attitude error", propagation.attitude_text, propagation.attitude_table, contributors=plot_attitude
     ),
-    Coupling: View(
+    Coupling: _view(
+        "Coupling",
         propagation.coupling_text,
-        propagation.coupling_html,
-        {"correlation": plot_correlation, "correlations": plot_correlations, "couplings": plot_couplings},
+        propagation.coupling_table,
+        correlation=plot_correlation,
+        correlations=plot_correlations,
+        couplings=plot_couplings,
     ),
-    FieldMap: View(propagation.field_text, propagation.field_html, {"maps": plot_field_map}),
-    DistortionCurve: View(propagation.distortion_text, propagation.distortion_html, {"curve": plot_distortion_curve}),
-    ErrorSpectrum: View(
+    FieldMap: _view(
+        "Direction uncertainty over the detector", propagation.field_text, propagation.field_table, maps=plot_field_map
+    ),
+    DistortionCurve: _view("Distortion", propagation.distortion_text, lambda curve: None, curve=plot_distortion_curve),
+    ErrorSpectrum: _view(
+        "Error spectrum",
         propagation.spectrum_text,
-        propagation.spectrum_html,
-        {"spectrum": plot_spectrum, "time_series": plot_error_series},
+        propagation.spectrum_table,
+        spectrum=plot_spectrum,
+        time_series=plot_error_series,
     ),
 }

@@ -7,7 +7,6 @@ import numpy as np
 from starcal_uq.comparison.result import CameraComparison
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import fixed, plural, significant, with_sigma
-from starcal_uq.presentation.html import card
 from starcal_uq.presentation.tables import TextTable
 
 _SMALLEST_P = 1e-12
@@ -75,8 +74,3 @@ def comparison_text(found: CameraComparison) -> str:
 def comparison_table(found: CameraComparison) -> TextTable:
     """One row per quantity: the difference, and what was to be expected."""
     return TextTable.of(found.to_dataframe(), f"{found.labels[1]} minus {found.labels[0]}")
-
-
-def comparison_html(found: CameraComparison) -> str:
-    """Whether chance explains the differences, and each of them."""
-    return card("Comparison", comparison_text(found), comparison_table(found))

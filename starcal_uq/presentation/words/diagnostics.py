@@ -14,9 +14,7 @@ from starcal_uq.diagnostics.models import ModelComparison
 from starcal_uq.diagnostics.predictive import PredictiveCheck
 from starcal_uq.diagnostics.validation.replicates import LOG_LIKELIHOOD
 from starcal_uq.diagnostics.validation.result import ENOUGH_REPLICATES, Validation
-from starcal_uq.diagnostics.verdict.estimate import models_sentence
 from starcal_uq.inference.checks import COMPRESSED_BOUND
-from starcal_uq.presentation.html import card
 from starcal_uq.presentation.tables import TextTable
 
 NBSP = "\N{NO-BREAK SPACE}"
@@ -79,26 +77,6 @@ def diagnosis_text(found: Diagnosis) -> str:
     return "\n".join(part.text for part in parts if part is not None)
 
 
-def misfit_html(found: Misfit) -> str:
-    """The tests for structure in the residuals."""
-    return card("Misfit", misfit_text(found), misfit_table(found))
-
-
-def jackknife_html(found: Jackknife) -> str:
-    """The estimates without each of the frames."""
-    return card("Jackknife", jackknife_text(found), jackknife_table(found))
-
-
-def models_html(found: ModelComparison) -> str:
-    """The distortion models side by side."""
-    return card("Models", models_sentence(found), models_table(found))
-
-
-def predictive_html(found: PredictiveCheck) -> str:
-    """The residuals against replicated ones."""
-    return card("Posterior predictive check", predictive_text(found), predictive_table(found))
-
-
 def diagnosis_html(found: Diagnosis) -> str:
     """Every part, one after the other."""
     parts = (found.misfit, found.jackknife, found.comparison, found.predictive)
@@ -109,11 +87,6 @@ def validation_table(found: Validation) -> TextTable:
     """Coverage and ranks, one row per quantity."""
     columns = ("quantity", "unit", "coverage_95", "coverage_low", "coverage_high", "coverage_p", "rank_p")
     return TextTable.of(found.to_dataframe(), "Validation", columns)
-
-
-def validation_html(found: Validation) -> str:
-    """Whether intervals hold the truth as often as they say."""
-    return card("Validation", validation_text(found), TextTable.of(found.to_dataframe()))
 
 
 def validation_text(found: Validation) -> str:

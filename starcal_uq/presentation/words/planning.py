@@ -9,7 +9,6 @@ from starcal_uq.core.formatting import MINUS, count, fixed, join_words, percent,
 from starcal_uq.planning.check import ForecastCheck
 from starcal_uq.planning.design import FrameChoice
 from starcal_uq.planning.plan import Need, Plan
-from starcal_uq.presentation.html import card
 from starcal_uq.presentation.tables import TextTable
 
 SCOPE_NAMES = {
@@ -149,18 +148,3 @@ def plan_table(plan: Plan) -> TextTable:
 def choice_table(choice: FrameChoice, n: int = 20) -> TextTable:
     """The first frames to take, most valuable first."""
     return TextTable.of(choice.to_dataframe().head(n), f"The first {min(n, len(choice.candidate))} frames to take")
-
-
-def plan_html(plan: Plan) -> str:
-    """What a calibration will give."""
-    return card("Plan", plan_text(plan), plan_table(plan))
-
-
-def choice_html(choice: FrameChoice) -> str:
-    """What the chosen frames are worth."""
-    return card("Frames to take", choice_text(choice), TextTable.of(choice.worth()))
-
-
-def check_html(check: ForecastCheck) -> str:
-    """The forecast beside simulated campaigns."""
-    return card("Forecast against simulation", check_text(check), TextTable.of(check.to_dataframe()))

@@ -8,7 +8,6 @@ import pandas as pd
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import fixed, join_words, percent, pretty_unit, significant
 from starcal_uq.core.types import FloatArray
-from starcal_uq.presentation.html import card
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.propagation.attitude_error import Agreement, AttitudeError, with_cross
 from starcal_uq.propagation.coupling import Coupling
@@ -42,11 +41,6 @@ def agreement_table(agreement: Agreement) -> TextTable:
     return TextTable.of(
         agreement.to_dataframe(), formats={"sampled_over_first_order": lambda v: fixed(v, 5)}, missing="not known"
     )
-
-
-def agreement_html(agreement: Agreement) -> str:
-    """Ratios, and what they mean."""
-    return card("Sampled over first order", agreement_text(agreement), agreement_table(agreement))
 
 
 def one_number_sentence(error: AttitudeError) -> str:
@@ -86,14 +80,6 @@ def attitude_table(error: AttitudeError) -> TextTable:
     return TextTable(heads, tuple(rows), "Attitude error, arcsec, 1 sigma", "lrrrrl")
 
 
-def attitude_html(error: AttitudeError) -> str:
-    """Contributions, on what they rest, and what follows."""
-    rests = f"{error.n_draws} posterior draws through QUEST on {error.n_frames} frames ({error.frames})."
-    return card(
-        "Attitude error", f"{rests} {attitude_text(error)}", TextTable.of(error.to_dataframe(), missing="not known")
-    )
-
-
 def coupling_text(coupling: Coupling) -> str:
     """The directions, from the least to the best determined."""
     return "\n".join(f"{direction.words}." for direction in coupling.weak_directions)
@@ -121,12 +107,6 @@ def correlation_table(coupling: Coupling) -> TextTable:
         for name, row in zip(coupling.extended_names, coupling.extended_correlation, strict=True)
     )
     return TextTable(("", *coupling.extended_names), rows, "Correlations, with the rotation common to all frames")
-
-
-def coupling_html(coupling: Coupling) -> str:
-    """The worst determined directions, and what not knowing the other parameters costs."""
-    words = "; ".join(direction.words for direction in coupling.weak_directions[:2])
-    return card("Coupling", f"{words}.", coupling_table(coupling))
 
 
 def field_text(field: FieldMap) -> str:
@@ -166,11 +146,6 @@ def field_table(field: FieldMap) -> TextTable:
     return TextTable(("", "least", "median", "largest", "worst direction"), rows, "1 sigma per axis, arcsec")
 
 
-def field_html(field: FieldMap) -> str:
-    """Both maps in numbers."""
-    return card("Direction uncertainty over the detector", field_text(field), field_table(field))
-
-
 def corner_sentence(curve: DistortionCurve) -> str:
     """Displacement at the largest radius, with its standard deviation."""
     row = int(np.argmax(np.abs(curve.mean_px[:, -1])))
@@ -187,11 +162,6 @@ def distortion_text(curve: DistortionCurve) -> str:
     """Displacement at the largest radius, and what the bands are."""
     bands = f"Bands of {percent(curve.level)}; the simultaneous one is ±{curve.multiplier:.2f} sd wide."
     return f"{corner_sentence(curve)} {bands}"
-
-
-def distortion_html(curve: DistortionCurve) -> str:
-    """The far end of the curve in numbers."""
-    return card(f"Distortion ({curve.model})", f"{curve.n_draws} draws. {distortion_text(curve)}")
 
 
 def spectrum_text(spectrum: ErrorSpectrum) -> str:
@@ -239,10 +209,3 @@ def spectrum_table(spectrum: ErrorSpectrum) -> TextTable:
         }
     )
     return TextTable.of(table, missing="not known")
-
-
-def spectrum_html(spectrum: ErrorSpectrum) -> str:
-    """The spectrum in words, and axis by axis."""
-    return card(
-        "Error spectrum", f"{spectrum.n_draws} posterior draws. {spectrum_text(spectrum)}", spectrum_table(spectrum)
-    )
