@@ -256,19 +256,15 @@ def _acceptance(post: Posterior) -> Check:
 
 def _derived(post: Posterior) -> Check:
     """Did what follows from the parameters converge, too?"""
-    derived = derived_quantities(post)
-    rhat = max(derived, key=lambda d: d.rhat)
-    fewest = min(derived, key=lambda d: min(d.ess_bulk, d.ess_tail))
-    ess = min(fewest.ess_bulk, fewest.ess_tail)
-    good = rhat.rhat < RHAT_BOUND and ess > ESS_BOUND
+    derived = sorted(derived_quantities(post), key=lambda d: -d.rhat)
+    rhat, ess = max(d.rhat for d in derived), min(min(d.ess_bulk, d.ess_tail) for d in derived)
+    late = [d.name for d in derived if not (d.rhat < RHAT_BOUND and min(d.ess_bulk, d.ess_tail) > ESS_BOUND)]
     sentence = (
-        "Focal length in mm, displacement at the corner and common rotation have converged too."
-        if good
-        else f"{(rhat if rhat.rhat >= RHAT_BOUND else fewest).name.capitalize()} has not converged: raise n_steps."
+        f"{late[0].capitalize()} has not converged: raise n_steps."
+        if late
+        else "Focal length in mm, displacement at the corner and common rotation have converged too."
     )
-    value = f"R-hat {fixed(rhat.rhat, 4)}, {count(int(ess))} draws"
-    bound = f"< {RHAT_BOUND}, > {ESS_BOUND:g}"
-    return _sampling(post, "Derived quantities", good, value, bound, sentence, ESS_BOUND / ess)
+    return _converged(post, "Derived quantities", rhat, ess, sentence)
 
 
 def _digits(post: Posterior) -> Check:
@@ -300,15 +296,9 @@ def _degrees_of_freedom(post: Posterior) -> Check | None:
     if post.dof_draws is None:
         return None
     values = post.dof_draws.reshape(post.n_ensembles, -1)
-    rhat, ess = arviz_compat.rhat(values), arviz_compat.ess_bulk(values)
     low, middle, high = np.quantile(values, (0.025, 0.5, 0.975))
-    good = rhat < RHAT_BOUND and ess > ESS_BOUND
     sentence = f"dof has the median {middle:.3g} and the 95 % interval {low:.3g} to {high:.3g}."
-    if not good:
-        sentence = "The draws of dof have not converged: raise n_steps."
-    value = f"R-hat {fixed(rhat, 4)}, {count(int(ess))} draws"
-    bound = f"< {RHAT_BOUND}, > {ESS_BOUND:g}"
-    return _sampling(post, "Degrees of freedom", good, value, bound, sentence, ESS_BOUND / ess)
+    return _converged(post, "Degrees of freedom", arviz_compat.rhat(values), arviz_compat.ess_bulk(values), sentence)
 
 
 def _bounds(post: Posterior) -> Check:
@@ -424,6 +414,11 @@ def _priors(post: Posterior) -> Check:
 
 def _names(post: Posterior, which: BoolArray) -> list[str]:
     return [post.parameter_names[i] for i, flag in zip(post.sampled, which, strict=True) if flag]
+
+
+def _converged(post: Posterior, name: str, rhat: float, ess: float, sentence: str) -> Check:
+    value, bound = f"R-hat {fixed(rhat, 4)}, {count(int(ess))} draws", f"< {RHAT_BOUND}, > {ESS_BOUND:g}"
+    return _sampling(post, name, rhat < RHAT_BOUND and ess > ESS_BOUND, value, bound, sentence, ESS_BOUND / ess)
 
 
 def _sampling(

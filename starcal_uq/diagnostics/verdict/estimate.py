@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 ESTIMATORS_Z = 4.0
 _IPOPT = f"{CALIBRATE} --solver ipopt or sc.calibrate(obs, camera, solver='ipopt')"
-
 _REMEDIES = {
     Status.MAX_ITERATIONS: "sc.calibrate(obs, camera, max_iterations=1000)",
     Status.OUTSIDE_DETECTOR: _IPOPT,

@@ -85,7 +85,6 @@ def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
         "likelihood_sentence": words.likelihood_sentence(results),
         "sigma_sentence": words.sigma_sentence(results),
         "sampling_sentence": words.sampling_sentence(results),
-        "compressed_sentence": words.compressed_sentence(results),
         **_distortion(results),
         "degrees_of_freedom": count(cal.dof),
         "provenance_rows": words.provenance_rows(results),

@@ -146,19 +146,6 @@ def sampling_sentence(results: Results) -> str:
     )
 
 
-def compressed_sentence(results: Results) -> str:
-    """How the compressed likelihood compares with the exact one."""
-    post = results.posterior
-    if post is None or not np.isfinite(post.diagnostics.compressed_max_difference):
-        return ""
-    d = post.diagnostics
-    return (
-        "Compressed and exact log likelihood differ by at most "
-        f"{significant(d.compressed_max_difference)} nat within three standard deviations (k-hat of the weights "
-        f"between them {fixed(d.compressed_khat, 2)})."
-    )
-
-
 def provenance_rows(results: Results) -> list[tuple[str, str]]:
     """What is needed to repeat the run."""
     rows: list[tuple[str, str]] = [("Data, SHA-256", results.observations.data_hash)]
