@@ -325,14 +325,14 @@ _DIRECTION = {
 }
 
 _KEYS = {
-    "width_px": Key.of(int, "the width of the detector in pixels, a whole number above 0", required=True, gt=0),
-    "height_px": Key.of(int, "the height of the detector in pixels, a whole number above 0", required=True, gt=0),
-    "pixel_um": Key.of(float, "the pitch of the square pixels in micrometres, a number above 0", required=True, gt=0),
-    "focal_mm": Key.of(float, "the focal length in millimetres, a number above 0", required=True, gt=0),
-    "x0_px": Key.of(float, "the principal point along x in pixels, a finite number", required=True),
-    "y0_px": Key.of(float, "the principal point along y in pixels, a finite number", required=True),
-    "distortion": Key.of(str, "the name of the distortion model, one of " + ", ".join(model_names())),
-    "name": Key.of(str, "a name in quotes"),
+    "width_px": Key(int, "the width of the detector in pixels, a whole number above 0", required=True, gt=0),
+    "height_px": Key(int, "the height of the detector in pixels, a whole number above 0", required=True, gt=0),
+    "pixel_um": Key(float, "the pitch of the square pixels in micrometres, a number above 0", required=True, gt=0),
+    "focal_mm": Key(float, "the focal length in millimetres, a number above 0", required=True, gt=0),
+    "x0_px": Key(float, "the principal point along x in pixels, a finite number", required=True),
+    "y0_px": Key(float, "the principal point along y in pixels, a finite number", required=True),
+    "distortion": Key(str, "the name of the distortion model, one of " + ", ".join(model_names())),
+    "name": Key(str, "a name in quotes"),
 }
 
 
@@ -355,7 +355,7 @@ class _CameraSection(Section):
 
 @lru_cache
 def _section(distortion: str) -> Section:
-    own = {c.name: Key.of(float, "a finite number") for c in get_model(distortion).coefficients}
+    own = {c.name: Key(float, "a finite number") for c in get_model(distortion).coefficients}
     return _CameraSection({**_KEYS, **own}, CameraError, distortion)
 
 

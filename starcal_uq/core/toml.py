@@ -88,31 +88,23 @@ def unknown_key(key: str, known: Collection[str]) -> str:
     return f"key {key} is unknown; {hint}"
 
 
-@dataclass(frozen=True)
 class Key:
     """What may stand under a key.
 
-    Attributes
+    Parameters
     ----------
     kind : type
         Type; a whole number may stand for a float, but neither text nor a truth value for a number.
     wanted : str
         Text of what to write, said wherever the key is missing or wrong.
-    bounds : dict
-        Limits as of `pydantic.Field`, such as ``{"gt": 0}``.
     required : bool
         Whether it must be given.
+    **bounds : Any
+        Limits as of `pydantic.Field`, such as ``gt=0``.
     """
 
-    kind: Any
-    wanted: str
-    bounds: Mapping[str, Any]
-    required: bool
-
-    @classmethod
-    def of(cls, kind: Any, wanted: str, *, required: bool = False, **bounds: Any) -> Key:
-        """A key; limits as keywords."""
-        return cls(kind, wanted, bounds, required)
+    def __init__(self, kind: Any, wanted: str, *, required: bool = False, **bounds: Any) -> None:
+        self.kind, self.wanted, self.required, self.bounds = kind, wanted, required, bounds
 
 
 @dataclass(frozen=True)

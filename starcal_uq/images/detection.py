@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -34,10 +34,6 @@ class DetectionOptions:
     min_pixels: int = 1
     psf_sigma_px: float | None = None
     max_stars: int | None = None
-
-    def to_dict(self) -> AnyDict:
-        """The options as plain values."""
-        return asdict(self)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -180,7 +180,7 @@ class _Table:
                 "sigma, which is too small for bright stars; give the gain in electrons per count."
             )
         meta = {
-            "settings": options.to_dict(),
+            "settings": asdict(options),
             "gain_e_per_count": known[0] if len(set(known)) == 1 and len(known) == len(self.gains) else None,
             "gain_from_noise_e_per_count": float(np.median(measured)) if measured else None,
             "flux_unit": "electrons" if known and len(known) == len(self.gains) else "counts",

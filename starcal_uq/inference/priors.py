@@ -86,10 +86,8 @@ class Priors(Shown, ABC):
     @staticmethod
     def from_dict(values: Mapping[str, Any]) -> Priors:
         """Read what `to_dict` wrote, of either kind."""
-
-        if values.get("kind") == KIND:
-            return GaussianPriors.read(values)
-        return PhysicalPriors.read(values)
+        kind = GaussianPriors if values.get("kind") == KIND else PhysicalPriors
+        return kind(**{name: value for name, value in values.items() if name != "kind"})
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -318,11 +316,6 @@ class PhysicalPriors(Priors):
         """Plain values, for files."""
         return {**dataclasses.asdict(self), "principal_point_centre_px": list(self.principal_point_centre_px)}
 
-    @classmethod
-    def read(cls, values: Mapping[str, Any]) -> PhysicalPriors:
-        """Read what `to_dict` wrote."""
-        return cls(**{**values, "principal_point_centre_px": tuple(values["principal_point_centre_px"])})
-
     def _statement(self, name: str) -> str:
         if name in ("x0", "y0"):
             centre = self.principal_point_centre_px["xy".index(name[0])]
@@ -338,9 +331,9 @@ _NUMBER = "a finite number above zero"
 
 PRIORS = Section(
     {
-        "principal_point_px": Key.of(float, _NUMBER, gt=0.0),
-        "principal_point_centre_px": Key.of(list[float], "two numbers in brackets", min_length=2, max_length=2),
-        **{name: Key.of(float, _NUMBER, gt=0.0) for name in _POSITIVE[1:]},
+        "principal_point_px": Key(float, _NUMBER, gt=0.0),
+        "principal_point_centre_px": Key(list[float], "two numbers in brackets", min_length=2, max_length=2),
+        **{name: Key(float, _NUMBER, gt=0.0) for name in _POSITIVE[1:]},
     },
     PriorError,
 )
@@ -424,11 +417,6 @@ class GaussianPriors(Priors):
         """Plain values, for files."""
         arrays = {"theta_mean": self.theta_mean.tolist(), "theta_covariance": self.theta_covariance.tolist()}
         return {"kind": KIND, **vars(self), **arrays, "source": dict(self.source)}
-
-    @classmethod
-    def read(cls, values: Mapping[str, Any]) -> GaussianPriors:
-        """Read what `to_dict` wrote."""
-        return cls(**{name: value for name, value in values.items() if name != "kind"})
 
     def _statement(self, name: str) -> str:
         mean, sd = float(self.mean([name])[0]), float(self.sd([name])[0])

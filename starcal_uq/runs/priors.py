@@ -17,14 +17,14 @@ from starcal_uq.runs.run import Run
 
 _CHAIN = Section(
     {
-        "prior_from": Key.of(str, "the folder of the earlier run, a text in quotes"),
-        "inflation": Key.of(float, "the factor on all standard deviations, a number of at least 1"),
-        "noise": Key.of(str, "default or posterior, a text in quotes"),
-        "shift": Key.of(dict[str, Any], f"a table with {', '.join(SHIFT_KEYS)}"),
+        "prior_from": Key(str, "the folder of the earlier run, a text in quotes"),
+        "inflation": Key(float, "the factor on all standard deviations, a number of at least 1"),
+        "noise": Key(str, "default or posterior, a text in quotes"),
+        "shift": Key(dict[str, Any], f"a table with {', '.join(SHIFT_KEYS)}"),
     },
     PriorError,
 )
-_SHIFT = Section({name: Key.of(float, "a number, zero or more", ge=0.0) for name in SHIFT_KEYS}, PriorError)
+_SHIFT = Section({name: Key(float, "a number, zero or more", ge=0.0) for name in SHIFT_KEYS}, PriorError)
 
 
 def prior_from_run(run: str | Path, **options: Any) -> GaussianPriors:

@@ -22,22 +22,22 @@ _HEADER = """\
 """
 _SECTION = Section(
     {
-        "latitude_deg": Key.of(
+        "latitude_deg": Key(
             float, "the latitude in degrees, north positive, from -90 to 90", required=True, ge=-90.0, le=90.0
         ),
-        "longitude_deg": Key.of(
+        "longitude_deg": Key(
             float, "the longitude in degrees, east positive, from -180 to 360", required=True, ge=-180.0, le=360.0
         ),
-        "height_m": Key.of(float, "the height in metres, from -500 to 9000", ge=-500.0, le=9000.0),
-        "pressure_hpa": Key.of(
+        "height_m": Key(float, "the height in metres, from -500 to 9000", ge=-500.0, le=9000.0),
+        "pressure_hpa": Key(
             float | None, "the pressure at the site in hPa, from 200 to 1100, or leave it out", ge=200.0, le=1100.0
         ),
-        "temperature_c": Key.of(
+        "temperature_c": Key(
             float | None, "the temperature in degrees Celsius, from -90 to 60, or leave it out", ge=-90.0, le=60.0
         ),
-        "relative_humidity": Key.of(float, "the relative humidity, from 0 to 1", ge=0.0, le=1.0),
-        "wavelength_um": Key.of(float, "the effective wavelength in micrometres, from 0.3 to 2.5", ge=0.3, le=2.5),
-        "name": Key.of(str, "a name in quotes"),
+        "relative_humidity": Key(float, "the relative humidity, from 0 to 1", ge=0.0, le=1.0),
+        "wavelength_um": Key(float, "the effective wavelength in micrometres, from 0.3 to 2.5", ge=0.3, le=2.5),
+        "name": Key(str, "a name in quotes"),
     },
     SiteError,
 )

@@ -12,10 +12,10 @@ from starcal_uq.core.toml import Key, Section, read_section, write_section
 
 SECTION = Section(
     {
-        "width": Key.of(int, "the width, a whole number above 0", required=True, gt=0),
-        "height": Key.of(float, "the height, from 0 to 9", ge=0.0, le=9.0),
-        "centre": Key.of(list[float], "two numbers", min_length=2, max_length=2),
-        "name": Key.of(str, "a name in quotes"),
+        "width": Key(int, "the width, a whole number above 0", required=True, gt=0),
+        "height": Key(float, "the height, from 0 to 9", ge=0.0, le=9.0),
+        "centre": Key(list[float], "two numbers", min_length=2, max_length=2),
+        "name": Key(str, "a name in quotes"),
     },
     SiteError,
 )
