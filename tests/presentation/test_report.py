@@ -11,6 +11,7 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.core.formatting import significant
+from starcal_uq.inference.checks import check_draws
 from starcal_uq.presentation.report.page import render
 from starcal_uq.presentation.report.tables import attitude_rows, parameter_rows, symbol, weak_directions
 from tests.helpers.scenes import camera, nominal, observations
@@ -242,7 +243,9 @@ def test_without_truth_there_is_no_truth(run):
 def test_a_failed_check_turns_the_verdict_red(full):
     results = sc.Run(full.path).results
     diagnostics = dataclasses.replace(results.posterior.diagnostics, rhat=np.full(6, 1.2))
-    results = dataclasses.replace(results, posterior=dataclasses.replace(results.posterior, diagnostics=diagnostics))
+    post = dataclasses.replace(results.posterior, diagnostics=diagnostics)
+    post = dataclasses.replace(post, diagnostics=dataclasses.replace(diagnostics, checks=check_draws(post)))
+    results = dataclasses.replace(results, posterior=post)
     text = render(results, {})
     assert "Do not use these numbers: R-hat failed." in Page(text).text
     assert 'class="verdict fail"' in text
