@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
+import starcal_uq as sc
 from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.camera.projection import unproject
 from starcal_uq.comparison.compare import compare, compare_halves
@@ -346,6 +347,9 @@ def few_stars() -> np.ndarray:
 def test_page_tables_and_file(tmp_path: Path) -> None:
     found = halves()
     page = write_comparison(found, tmp_path / "out")
+    assert sc.report(found, tmp_path / "again").read_bytes() == page.read_bytes()
+    with pytest.raises(TypeError, match="say where"):
+        sc.report(found)
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == [
         "comparison.html",
         "comparison.json",
