@@ -40,13 +40,7 @@ def register(views: Callable[[], Mapping[type, View]]) -> None:
 
 
 def view_of(cls: type) -> View:
-    """The view of a class, or of the nearest class that it derives from.
-
-    Raises
-    ------
-    LookupError
-        If nobody has said how it is shown.
-    """
+    """The view of a class, or of the nearest class that it derives from; `LookupError` where there is none."""
     tables = [views() for views in _VIEWS]
     for ancestor in cls.__mro__:
         for table in tables:

@@ -23,13 +23,7 @@ PathLike = str | os.PathLike[str]
 
 
 def ensure_new(path: PathLike, force: bool = False) -> None:
-    """Refuse to write over an existing file unless ``force`` is set.
-
-    Raises
-    ------
-    RunFolderError
-        If `path` exists and `force` is false, or if it exists and is no regular file.
-    """
+    """Refuse to write over an existing file unless ``force`` is set, and over what is no regular file."""
     path = Path(path)
     # os.path, because Path.exists raises in a folder that may not be searched; the write itself reports that.
     if not os.path.exists(path):
@@ -45,13 +39,7 @@ def ensure_new(path: PathLike, force: bool = False) -> None:
 
 
 def check_new_folder(path: PathLike, force: bool = False) -> None:
-    """Refuse a folder that holds anything, unless forced; called before any work is done.
-
-    Raises
-    ------
-    RunFolderError
-        When the folder exists and is not empty, or is a file.
-    """
+    """Refuse a folder that holds anything, unless forced, or a file in its place; called before any work is done."""
     path = Path(path)
     if path.exists() and not path.is_dir():
         raise RunFolderError(f"{path}: is a file, not a folder for results; name another folder.")
@@ -62,13 +50,7 @@ def check_new_folder(path: PathLike, force: bool = False) -> None:
 
 
 def new_folder(path: PathLike) -> Path:
-    """Make a folder, with its parents, if it does not exist.
-
-    Raises
-    ------
-    RunFolderError
-        If a file is in the way or the operating system refuses.
-    """
+    """Make a folder, with its parents, if it does not exist."""
     path = Path(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -79,10 +61,9 @@ def new_folder(path: PathLike) -> Path:
 
 @contextmanager
 def atomic_path(path: PathLike) -> Iterator[Path]:
-    """Yield a temporary path beside `path`, and rename it to `path` if the block succeeds.
+    """Yield a temporary path beside `path`, and rename it to `path` if the block succeeds; if not, `path` is as it was.
 
-    The temporary name keeps the ending, because many writers choose the format by it. If the block raises,
-    the temporary file is removed and `path` is as it was.
+    The temporary name keeps the ending, because many writers choose the format by it.
 
     Raises
     ------
@@ -135,21 +116,9 @@ _UNREADABLE = (
 
 @contextmanager
 def reading(path: PathLike, what: str, remedy: str) -> Iterator[None]:
-    """For a block that makes a result of a file: what goes wrong there, in one sentence.
+    """For a block that makes a result of a file: what goes wrong there becomes one `RunFolderError`.
 
-    Parameters
-    ----------
-    path : path
-        File.
-    what : str
-        What the file should hold, such as "a field map".
-    remedy : str
-        How to get such a file, as an order.
-
-    Raises
-    ------
-    RunFolderError
-        In place of all errors that a missing, damaged or foreign file causes.
+    It says what the file should hold, such as "a field map", and by the remedy, an order, how to get such a file.
     """
     try:
         yield

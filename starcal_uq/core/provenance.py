@@ -23,22 +23,9 @@ def installed_version(distribution: str) -> str | None:
 
 
 def provenance(seed: int | None, settings: Mapping[str, Any], data_hash: str | None) -> dict[str, Any]:
-    """What is needed to repeat a result.
+    """What is needed to repeat a result: time, seed (None where none was drawn), settings, data hash and versions.
 
-    Parameters
-    ----------
-    seed
-        Seed of the random numbers, None where none were drawn.
-    settings
-        The options of the step, as plain values that JSON can hold.
-    data_hash
-        ``Observations.data_hash`` of the data.
-
-    Returns
-    -------
-    dict
-        ``created_utc``, ``seed``, ``settings``, ``data_sha256`` and ``versions`` (of Python and of the
-        packages that decide the numbers; None for one that is not installed).
+    The versions are those of Python and of the packages that decide the numbers; None for one that is not installed.
     """
     versions: dict[str, str | None] = {"python": platform.python_version()}
     # Read from the installed metadata: importing casadi or arviz to ask for its version would cost a second.

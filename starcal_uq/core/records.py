@@ -211,14 +211,7 @@ def read_json(cls: type[Record], path: PathLike, what: str, remedy: str) -> Reco
 def write(record: Any, path: PathLike, kind: str) -> None:
     """Write a record as one ``.npz`` file: arrays to the last bit, all else as JSON beside them; overwritten.
 
-    Parameters
-    ----------
-    record : dataclass
-        The record.
-    path : path
-        File.
-    kind : str
-        What the file says it is; empty for a record of nothing but arrays, whose file needs no word for it.
+    The `kind` says what the file is; it is empty for a record of nothing but arrays, whose file needs no word for it.
     """
     arrays: Arrays = {}
     document = to_plain(record, arrays)

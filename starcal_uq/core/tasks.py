@@ -35,7 +35,7 @@ def run_tasks(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> tuple[list[T], bool]:
-    """Run task 0 .. n_tasks - 1.
+    """Run task 0 .. n_tasks - 1; the results in order, and whether Ctrl-C was pressed before all were complete.
 
     Parameters
     ----------
@@ -51,13 +51,6 @@ def run_tasks(
         Processes; 0 stays in this one, None takes as many as there are processors.
     progress : callable, optional
         Called as ``progress(done, total)``.
-
-    Returns
-    -------
-    list
-        Results in order; all that were complete when Ctrl-C was pressed.
-    bool
-        True if it was.
 
     Raises
     ------
@@ -181,13 +174,9 @@ def _run(numbers: range) -> Numbered[Any]:
 
 @contextmanager
 def interrupt_between_steps() -> Iterator[Callable[[], None]]:
-    """Hold Ctrl-C back until the function that this yields is called.
+    """Hold Ctrl-C back until the function that this yields is called, which raises KeyboardInterrupt if it was pressed.
 
-    Yields
-    ------
-    callable
-        Raises KeyboardInterrupt if Ctrl-C was pressed since the context was entered. In a thread other than the main
-        one, which receives no signals, it does nothing.
+    In a thread other than the main one, which receives no signals, it does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: None

@@ -55,29 +55,13 @@ def julian_days(time_utc: Any, ut1_minus_utc_s: float = 0.0) -> tuple[FloatArray
 
 
 def julian_year(time_utc: Any) -> float:
-    """Mean of some UTC times as a Julian year, for the epoch of a catalogue.
-
-    Parameters
-    ----------
-    time_utc
-        One UTC time or several, ISO 8601.
-
-    Raises
-    ------
-    CatalogueError
-        If a time is missing or unreadable.
-    """
+    """Mean of some UTC times (ISO 8601) as a Julian year, for the epoch of a catalogue."""
     tt, _, inverse = julian_days(time_utc)
     return float(2000.0 + (np.mean(tt.sum(axis=1)[inverse]) - 2451545.0) / 365.25)
 
 
 def utc_text(time: str) -> str:
     """One UTC time as tables hold it, YYYY-MM-DDTHH:MM:SS[.f]; an offset such as "+02:00" is taken out.
-
-    Parameters
-    ----------
-    time
-        ISO 8601 text with a time of day; without an offset it is UTC.
 
     Raises
     ------
@@ -106,13 +90,7 @@ def utc_text(time: str) -> str:
 
 
 def utc_of_scale(time: datetime, scale: str) -> datetime:
-    """UTC of a time without zone in another scale, such as TAI or TT.
-
-    Raises
-    ------
-    ValueError
-        The scale is unknown.
-    """
+    """UTC of a time without zone in another scale, such as TAI or TT; ValueError for an unknown one."""
     import erfa
 
     if scale in _UTC_NAMES:

@@ -22,16 +22,7 @@ if TYPE_CHECKING:
 def read_toml(path: PathLike, name: str, error: type[StarcalError], missing: str = "check the path") -> AnyDict:
     """Content of a TOML file in UTF-8, with or without a byte order mark.
 
-    Parameters
-    ----------
-    path : path
-        File.
-    name : str
-        Subject of the file, such as "camera".
-    error : type
-        Error to raise where the file cannot be read.
-    missing : str
-        Remedy for a file that does not exist.
+    `name` is its subject in messages, such as "camera", and `missing` the remedy for a file that does not exist.
     """
     path = Path(path)
     if os.path.isdir(path):
@@ -68,13 +59,7 @@ def read_section(path: PathLike, name: str, error: type[StarcalError], *, alone:
 
 
 def write_section(path: PathLike, name: str, table: Mapping[str, Any], header: str, force: bool) -> None:
-    """Write a table ``[name]`` without loss of digits, below comments that explain its keys.
-
-    Raises
-    ------
-    RunFolderError
-        If the file exists and `force` is false, or cannot be written.
-    """
+    """Write a table ``[name]`` without loss of digits, below comments that explain its keys."""
     import tomli_w
 
     ensure_new(path, force)
@@ -134,21 +119,7 @@ class Section:
         return create_model("Table", __config__=config, **fields)
 
     def check(self, table: Mapping[str, Any], where: str) -> AnyDict:
-        """Checked values of the keys that are given.
-
-        Parameters
-        ----------
-        table : mapping
-            Keys and values.
-        where : str
-            Name of the table in messages, such as "camera.toml, section [camera]".
-
-        Raises
-        ------
-        StarcalError
-            Of the section's kind: for a key that is unknown or missing, or a value of the wrong type, not finite or
-            out of range.
-        """
+        """Checked values of the keys that are given; `where` names the table in messages."""
         from pydantic import ValidationError
 
         try:

@@ -173,17 +173,9 @@ def _jackknife(obs: Observations, cal: Calibration, normals: FrameNormals) -> Ja
 
 
 def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> MultiStart:
-    """Calibrate from starts scattered around the nominal camera, and count the optima.
+    """Calibrate from n starts scattered around the nominal camera, and count the optima.
 
-    Parameters
-    ----------
-    obs, cal
-        The data and the estimate.
-    n : int
-        Number of starts.
-    seed : int
-        Seed of the starts: focal length within 5 %, principal point within a tenth of the detector (one standard
-        deviation).
+    One standard deviation of the starts is 5 % of the focal length and a tenth of the detector.
     """
     rng = np.random.default_rng((seed, 11))
     nominal = cal.nominal

@@ -338,15 +338,7 @@ def noise_weights(obs: Observations, camera: Camera) -> dict[str, FloatArray]:
 
 
 class NoiseSums:
-    """Sums over stars that the moments need, for several weights.
-
-    Parameters
-    ----------
-    weights : dict
-        Name to values (N,).
-    p : int
-        Number of parameters.
-    """
+    """Sums over stars that the moments need, for several weights (N,) by name, with p parameters."""
 
     def __init__(self, weights: dict[str, FloatArray], p: int) -> None:
         self.weights = weights

@@ -84,16 +84,9 @@ class Shape:
 
 
 def shapes(obs: Observations, camera: Camera, *, max_cells: int = _MAX_CELLS) -> tuple[Shape, ...]:
-    """Every family of shapes that the table allows.
+    """Every family of shapes that the table allows; magnitude, time and temperature are used where they vary.
 
-    Parameters
-    ----------
-    obs : Observations
-        The data; magnitude, time and temperature are used where they vary.
-    camera : Camera
-        The estimate.
-    max_cells : int
-        Largest number of field cells along the longer side.
+    `max_cells` is the largest number of field cells along the longer side.
     """
     found = [*_missing_terms(camera), _axes(camera), _aberration()]
     clock, called = run_clock(obs)

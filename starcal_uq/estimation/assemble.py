@@ -43,24 +43,8 @@ def assemble(
 ) -> Calibration:
     """Everything that a calibration tells about the end of its last stage.
 
-    Parameters
-    ----------
-    obs : Observations
-        The stars.
-    nominal : Camera
-        The start; its distortion model is that of the estimate.
-    method, solver : str
-        For the record.
-    likelihood : MarginalLikelihood
-        Likelihood of the same stars and the same model.
-    stages : list of Stage
-        The last one ends in the estimate; one named ``refinement`` is the maximum of `likelihood`.
-    status : Status
-        How the stages ended.
-    pair_theta, pair_covariance : (p,) and (p, p) arrays
-        Estimate from interstar angles, and its covariance; the covariance of the result without a refinement.
-    settings : dict, optional
-        Further options for the provenance.
+    The last of `stages` ends in the estimate; one named ``refinement`` is the maximum of `likelihood`. Without it, the
+    covariance of the result is `pair_covariance`, that of the estimate from interstar angles.
 
     Raises
     ------

@@ -138,24 +138,11 @@ def pair_likelihood(
     adjusted: bool = True,
     variability: Variability = "auto",
 ) -> PairLikelihood:
-    """Expand the pair objective around its minimum.
+    """Expand the pair objective around its minimum, the pair estimate `theta_hat` (p,) of a calibration, px units.
 
-    Parameters
-    ----------
-    frames : StarFrames
-        Data.
-    model_name : str
-        Distortion model.
-    theta_hat : (p,) array
-        The pair estimate (stage 3 of a calibration), px units.
-    chi2 : float
-        Sum of squared (whitened) pixel residuals at an estimate with its best attitudes.
-    residual_dof : int
-        ``sum_k (2 m_k - 3) - p``.
-    adjusted : bool
-        Give the likelihood Godambe's curvature; otherwise treat pairs as independent, which is wrong.
-    variability : {"auto", "expected", "empirical"}
-        How V is found; ``auto`` takes the scatter of the frames from 50 frames per parameter on.
+    `chi2` is the sum of squared (whitened) pixel residuals at an estimate with its best attitudes, and `residual_dof`
+    its ``sum_k (2 m_k - 3) - p``. Without `adjusted`, pairs are treated as independent, which is wrong. V is found as
+    `variability` says; ``auto`` takes the scatter of the frames from 50 frames per parameter on.
 
     Raises
     ------
@@ -206,17 +193,8 @@ def expected_godambe(objective: PairObjective, theta: FloatArray, sigma: float) 
 
     With ``P_i`` the derivative of a direction with respect to its pixel, the score of a frame changes by
     ``Gamma_i = [(sum_j b_j b_j^T) d b_i + (sum_j b_j d b_j^T) b_i]^T P_i`` per pixel of star i, so that
-    ``V = sigma^2 sum_i Gamma_i Gamma_i^T``. Unlike `PairObjective.godambe` it has no scatter of its own, and it trusts
-    the stated noise.
-
-    Parameters
-    ----------
-    objective : PairObjective
-        Data and model.
-    theta : (p,) array
-        The estimate, px units.
-    sigma : float
-        Noise, px, or the factor on the stated noise.
+    ``V = sigma^2 sum_i Gamma_i Gamma_i^T``, with sigma in px or the factor on the stated noise. Unlike
+    `PairObjective.godambe` it has no scatter of its own, and it trusts the stated noise.
     """
     normal = objective.evaluate(theta)
     h, scale = unit_inverse(normal.matrix)

@@ -124,19 +124,10 @@ class _Recorder(ca.Callback):
 
 
 def ipopt(evaluate: Evaluate, start: FloatArray, constraints: Constraints, *, max_iterations: int = 200) -> Solution:
-    """Minimise a sum of squares under constraints with IPOPT, through CasADi.
+    """Minimise a sum of squares under constraints with IPOPT, through CasADi; the start is moved inside the bounds.
 
     The objective enters as callbacks (value, gradient, Gauss-Newton Hessian), in variables scaled by the curvature at
     the start so that IPOPT sees numbers of order one.
-
-    Parameters
-    ----------
-    evaluate : callable
-        ``theta -> Normal``.
-    start : (p,) array
-        Start values; moved inside the bounds where needed.
-    constraints : Constraints
-        Bounds, and expressions that must stay positive.
     """
     theta = np.clip(np.array(start, dtype=np.float64), constraints.lower, constraints.upper)
     normal = evaluate(theta)

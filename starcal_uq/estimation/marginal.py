@@ -108,21 +108,9 @@ class MarginalLikelihood:
         return Profile(rotations, b, e, a, inverse, log_determinant), step, cost
 
     def profile(self, theta: FloatArray, rotations: FloatArray | None = None) -> tuple[Profile, float]:
-        """Find the best attitudes at theta.
+        """The model at the best attitudes for theta (p,), px units, searched from `rotations` (K, 3, 3) or QUEST's.
 
-        Parameters
-        ----------
-        theta : (p,) array
-            Parameters in px units.
-        rotations : (K, 3, 3) array, optional
-            Attitudes to start from; those of QUEST otherwise.
-
-        Returns
-        -------
-        Profile
-            The model at the best attitudes.
-        float
-            Sum of squared whitened residuals S(theta); infinite when the model is not finite.
+        The second value is the sum of squared whitened residuals S(theta); infinite when the model is not finite.
         """
         theta = np.asarray(theta, dtype=np.float64)
         with np.errstate(all="ignore"):

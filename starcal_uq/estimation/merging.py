@@ -333,16 +333,7 @@ def consistency_between(
 ) -> Consistency:
     """Compare the optima of runs with the merged one.
 
-    Parameters
-    ----------
-    names, parameter_names : sequence of str
-        Names of the runs and of the parameters.
-    runs : sequence of Optimum
-        Each run's own.
-    units : sequence of float
-        Divisors of each run's residuals in the merged sum: 1, or the run's own noise.
-    merged : Optimum
-        The common one.
+    `units` divide each run's residuals in the merged sum: 1, or the run's own noise.
     """
     from scipy.special import fdtrc
 

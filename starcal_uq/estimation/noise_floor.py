@@ -108,17 +108,10 @@ def noise_floor(cal: Calibration, obs: Observations, stated_px: FloatArray | Non
 
 
 def settle_noise(obs: Observations, cal: Calibration) -> Observations:
-    """The observations with a floor in their noise, if their residuals need one.
+    """The observations (with `sigma_px` in every row) with a floor in their noise, if their residuals need one.
 
     Without a floor bright stars have too much weight and hence too small residuals: it is found from a first
     calibration, and again from ones that know it.
-
-    Parameters
-    ----------
-    obs : Observations
-        With `sigma_px` in every row.
-    cal : Calibration
-        Calibration of these observations.
     """
     from starcal_uq.estimation.calibrate import calibrate
 

@@ -105,16 +105,7 @@ def subset(frames: StarFrames, kept: BoolArray) -> StarFrames:
 def robust_start(frames: StarFrames, model_name: str, theta: FloatArray, fit: FitStages) -> RobustStart:
     """Alternate between the paper's stages and leaving out stars that do not fit their frame.
 
-    Parameters
-    ----------
-    frames : StarFrames
-        All stars.
-    model_name : str
-        Distortion model.
-    theta : (p,) array
-        Nominal camera, px units.
-    fit : callable
-        ``(frames, all_parameters) -> stages``: the stages of Ye & Yang 2017, the first one only, or all.
+    ``fit(frames, all_parameters)`` gives the stages of Ye & Yang 2017, the first one only, or all.
 
     Raises
     ------
@@ -198,26 +189,11 @@ class RobustFit:
 def refine(
     frames: StarFrames, model_name: str, theta: FloatArray, rotations: FloatArray, nu: float | None, max_iterations: int
 ) -> RobustFit:
-    """Maximise the Student-t likelihood over theta, sigma and, unless given, nu.
+    """Maximise the Student-t likelihood over theta, sigma and, where it is None, nu.
 
     Camera and shape of the noise are nearly independent (one is odd in the residuals, the other even), so that
     Newton's method on one and the other in turn converges in a few rounds. A free nu has the prior of
     `starcal_uq.estimation.student.log_excess_prior`, without which clean data would send it to infinity.
-
-    Parameters
-    ----------
-    frames : StarFrames
-        Data.
-    model_name : str
-        Distortion model.
-    theta : (p,) array
-        Start, px units.
-    rotations : (K, 3, 3) array
-        Start of the attitudes.
-    nu : float or None
-        Degrees of freedom; estimated if None.
-    max_iterations : int
-        Most rounds.
     """
     began = perf_counter()
     theta = np.array(theta, dtype=np.float64)

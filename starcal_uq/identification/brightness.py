@@ -28,12 +28,9 @@ _LIMIT, _MOST = 13.0, 9.0
 
 
 def instrumental_mag(flux: FloatArray) -> FloatArray | None:
-    """Magnitudes with an unknown zero point; None where all fluxes are equal and so say nothing.
+    """Magnitudes with an unknown zero point; NaN where a flux is not positive.
 
-    Parameters
-    ----------
-    flux : (n,) array
-        In any unit. NaN comes out where it is not positive or not a number.
+    None where all fluxes are equal and so say nothing.
     """
     positive = flux > 0.0
     if len(np.unique(flux[positive])) < 2:
@@ -44,19 +41,11 @@ def instrumental_mag(flux: FloatArray) -> FloatArray | None:
 
 
 def unlike_brightness(difference_mag: FloatArray, misfit: FloatArray) -> BoolArray:
-    """Which stars of a frame are refused: too far from their place for how wrong their brightness is.
+    """Which stars (m,) of a frame are refused: too far from their place for how wrong their brightness is.
 
-    Parameters
-    ----------
-    difference_mag : (m,) array
-        Instrumental minus catalogue magnitude of each matched star; NaN where brightness says nothing, as where the
-        centroid is saturated. The zero point, that is the sensor's gain, does not matter.
-    misfit : (m,) array
-        Squared distance from the predicted place over the variance per axis.
-
-    Returns
-    -------
-    (m,) array of bool
+    `difference_mag` (m,) is instrumental minus catalogue magnitude, NaN where brightness says nothing, as where the
+    centroid is saturated; the zero point, that is the sensor's gain, does not matter. `misfit` (m,) is the squared
+    distance from the predicted place over the variance per axis.
     """
     known = np.isfinite(difference_mag)
     m = int(known.sum())

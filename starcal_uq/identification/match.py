@@ -200,16 +200,11 @@ def log10_false_matches(
     geometry: FieldGeometry,
     tolerance: CameraTolerance,
 ) -> float:
-    """Expected number of wrong attitudes, on the whole sky, at which m of n centroids have a star within the gate.
+    """Log10 of the number of wrong attitudes, on the whole sky, at which m of n centroids have a star within the gate.
 
     A first centroid is any of the `n_sky` stars, a second one any star at its distance within the tolerance of the
     focal length; each of the other m - 2 has a star within the gate with probability ``density pi gate^2``. What the
     free principal point and distortion can take up widens the gate.
-
-    Returns
-    -------
-    float
-        Decimal logarithm.
     """
     length = 0.4 * max(geometry.width_px, geometry.height_px)
     bias = geometry.relative_bias(tolerance)

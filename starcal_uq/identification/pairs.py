@@ -65,16 +65,7 @@ class StarPairs:
         return len(self.star)
 
     def near_angle(self, star: IntArray, angle_rad: FloatArray, tolerance_rad: float) -> tuple[IntArray, IntArray]:
-        """Pattern stars at given angles from given stars.
-
-        Parameters
-        ----------
-        star : (m,) array of int
-            Pattern stars.
-        angle_rad : (m,) array
-            An angle for each.
-        tolerance_rad : float
-            Half the width of the range.
+        """Pattern stars at angles (m,) from pattern stars `star` (m,), each within the tolerance.
 
         Returns
         -------
@@ -113,21 +104,7 @@ class StarPairs:
 def find_star_pairs(
     directions: FloatArray, mag: FloatArray, field_sr: float, max_angle_rad: float, per_field: int = PATTERN_STARS
 ) -> StarPairs:
-    """Choose pattern stars and list their pairs.
-
-    Parameters
-    ----------
-    directions : (N, 3) array
-        Unit vectors of the catalogue.
-    mag : (N,) array
-        Magnitudes.
-    field_sr : float
-        Solid angle of the field of view, sr.
-    max_angle_rad : float
-        Largest angle of a pair.
-    per_field : int
-        Pattern stars that a field should hold.
-    """
+    """Choose pattern stars, `per_field` of them in a field of view, and list their pairs up to the largest angle."""
     from scipy.spatial import cKDTree
 
     order = np.argsort(mag, kind="stable")
@@ -169,13 +146,6 @@ def cached_star_pairs(
 
     The file's name is a hash of the catalogue and of all parameters. A damaged file is replaced; a folder that cannot
     be written to does no harm.
-
-    Parameters
-    ----------
-    directions, mag, field_sr, max_angle_rad, per_field
-        Stars and their limits as `find_star_pairs` takes them.
-    cache_dir : path, optional
-        The folder, made when it is missing; `default_cache_dir()` if not given.
     """
     digest = hashlib.sha256(repr((_VERSION, field_sr, max_angle_rad, per_field)).encode())
     for array in (directions, mag):

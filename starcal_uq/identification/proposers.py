@@ -36,13 +36,7 @@ def prepare_engine(
     cache: bool,
     cache_dir: str | PathLike[str] | None,
 ) -> Proposer:
-    """The catalogue prepared for one of `ENGINES`.
-
-    Raises
-    ------
-    IdentificationError
-        No such engine, or its package is not installed.
-    """
+    """The catalogue prepared for one of `ENGINES`; `IdentificationError` where its package is not installed."""
     from scipy.spatial import cKDTree
 
     if engine == "tetra3rs":
@@ -77,13 +71,7 @@ _FIELD_MARGIN = 0.02
 
 
 class PlateSolver:
-    """A pattern table of tetra3rs for one catalogue and field of view.
-
-    Raises
-    ------
-    IdentificationError
-        The package is not installed, or finds no patterns in the catalogue.
-    """
+    """A pattern table of tetra3rs for one catalogue and field of view."""
 
     def __init__(self, stars: StarCatalogue, geometry: FieldGeometry, tolerance: CameraTolerance) -> None:
         solver = _package()

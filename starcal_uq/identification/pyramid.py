@@ -123,22 +123,8 @@ def hypotheses(
 ) -> Iterator[list[Hypothesis]]:
     """For each triangle, the hypotheses that a fourth star supports, best first.
 
-    Parameters
-    ----------
-    pairs : StarPairs
-        Pattern stars.
-    tree : scipy.spatial.cKDTree
-        Tree of ``pairs.directions``.
-    points : (n, 2) array
-        Ideal pixels, brightest first.
-    sigma_px : (n,) array
-        Noise per axis, px.
-    geometry, tolerance
-        The nominal camera, and how far it may be off.
-    max_centroids : int
-        Triangles are made of so many centroids, the brightest.
-    searched : int
-        So many centroids were searched before: only triangles that this has left are made (`remaining_order`).
+    Triangles are made of the first `max_centroids` of `points` (n, 2), ideal pixels, brightest first; only those that a
+    search of the first `searched` has left (`remaining_order`). `tree` is that of ``pairs.directions``.
     """
     n = min(len(points), max_centroids)
     if n < 4:

@@ -53,24 +53,10 @@ class PreparedImage:
 def prepare_image(
     image: Image, gain: float | None, read_noise_e: float | None, saturation: float | None
 ) -> tuple[PreparedImage, float, float]:
-    """Background and noise of an image.
+    """Background and noise of an image, and their medians (counts).
 
-    Parameters
-    ----------
-    image
-        The image.
-    gain
-        Electrons per count, None where unknown: it is then read off the noise of the background if that will do.
-    read_noise_e
-        Floor of the noise, electrons (needs the gain).
-    saturation
-        Counts at and above which a pixel is saturated, None to take what the image says.
-
-    Returns
-    -------
-    prepared : PreparedImage
-    background, noise : float
-        Medians, counts.
+    Without a `gain` (electrons per count) it is read off the noise of the background if that will do; `read_noise_e`
+    (electrons, a floor of the noise) needs the gain. `saturation` (counts) is what the image says where it is None.
 
     Raises
     ------
@@ -162,13 +148,7 @@ _CLIPPED_VARIANCE = 0.9733
 
 
 def counts_per_electron(data: Any) -> float:
-    """Inverse gain of an image, 0 where its background does not say it.
-
-    Parameters
-    ----------
-    data
-        Counts with background, shape (height, width).
-    """
+    """Inverse gain of an image, from counts with background; 0 where its background does not say it."""
     height, width = (size // _CELL_PX for size in data.shape)
     if height * width < _FEWEST_MESHES:
         return 0.0

@@ -67,13 +67,7 @@ class FrameStars:
 
 
 def find_stars(image: Image, options: DetectionOptions) -> FrameStars:
-    """Find and measure the stars of one image.
-
-    Raises
-    ------
-    ImageError
-        If nothing can be measured: all pixels equal, or too many saturated.
-    """
+    """Find and measure the stars of one image; `ImageError` if nothing can be measured."""
     name = image.name or "image"
     gain = options.gain_e_per_count or image.gain_e_per_count
     frame, background, noise = prepare_image(image, gain, options.read_noise_e, options.saturation)

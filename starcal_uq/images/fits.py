@@ -97,20 +97,7 @@ def cut_stamps(
 
 
 def profile(centre: FloatArray, sigma: FloatArray, n_pixels: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Fractions of the light in pixels 0, 1, ... along one axis, and their derivatives.
-
-    Parameters
-    ----------
-    centre, sigma : array, shape (n,)
-        Position and width, pixels.
-    n_pixels
-        Number of pixels m.
-
-    Returns
-    -------
-    fraction, by_centre, by_log_sigma : array, shape (n, m)
-        Fractions, and their derivatives by the position and by the logarithm of the width.
-    """
+    """Fractions of the light in pixels 0, 1, ... along an axis, and derivatives by centre and by log width; (n, m)."""
     from scipy.special import ndtr
 
     z = (np.arange(n_pixels + 1) - 0.5 - centre[:, None]) / sigma[:, None]
@@ -126,20 +113,9 @@ def _gaussian(px: FloatArray, py: FloatArray) -> FloatArray:
 def fit_stars(
     stamps: Stamps, x: FloatArray, y: FloatArray, sigma_px: float, *, free_sigma: bool = False, pairs: Any = None
 ) -> StarFit:
-    """Fit position and flux of each star, and with `free_sigma` its width too.
+    """Fit position and flux of each star from x, y (n,) in the image, and with `free_sigma` its own width too.
 
-    Parameters
-    ----------
-    stamps
-        The pixels.
-    x, y : array, shape (n,)
-        Start, in the image.
-    sigma_px
-        Width of the star images, or where it starts.
-    free_sigma
-        Whether each star has a width of its own.
-    pairs : array of int, shape (p, 2), optional
-        Stars (i, j) of which j reaches into the stamp of i; it is subtracted there.
+    `pairs` (p, 2) are stars (i, j) of which j reaches into the stamp of i; it is subtracted there.
     """
     n, m = stamps.counts.shape[:2]
     u, v = x - stamps.x0, y - stamps.y0

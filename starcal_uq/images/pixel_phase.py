@@ -36,13 +36,9 @@ class PhaseError:
 
 
 def phase_error(along_px: FloatArray, across_px: FloatArray) -> PhaseError:
-    """Measure the error along an axis from many positions.
+    """Measure the error along an axis from many positions (n,) along it and along the other one.
 
-    Parameters
-    ----------
-    along_px, across_px : array, shape (n,)
-        Positions along the axis and along the other one. Stars that come back to the same place, as in a camera that
-        stares, count as one.
+    Stars that come back to the same place, as in a camera that stares, count as one.
     """
     if len(along_px) < _FEWEST_PLACES:
         return PhaseError(0.0, np.inf)
@@ -61,14 +57,9 @@ def phase_error(along_px: FloatArray, across_px: FloatArray) -> PhaseError:
 def without_phase_error(
     along_px: FloatArray, variance_px2: FloatArray, amplitude_px: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Positions put back where they were, and what their standard deviations are multiplied by.
+    """Positions (n,) put back where they were, and what their standard deviations are multiplied by.
 
-    Parameters
-    ----------
-    along_px, variance_px2 : array, shape (n,)
-        Positions along the axis, with their variances. Noise blurs the phase, so noisy ones are moved less.
-    amplitude_px
-        The amplitude of `phase_error`.
+    Noise blurs the phase, so noisy ones are moved less.
     """
     amplitude = amplitude_px * np.exp(-2.0 * np.pi**2 * variance_px2)
     turn = 2.0 * np.pi

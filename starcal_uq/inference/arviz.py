@@ -48,18 +48,7 @@ def _array_stats() -> Any:
 
 
 def to_arviz(groups: Mapping[str, xr.Dataset]) -> Any:
-    """Wrap datasets with dimensions (chain, draw) into ArviZ's own container.
-
-    Parameters
-    ----------
-    groups : mapping of str to xarray.Dataset
-        ``posterior`` and others of ArviZ's schema.
-
-    Returns
-    -------
-    arviz.InferenceData or xarray.DataTree
-        What the installed ArviZ works on.
-    """
+    """Wrap datasets (chain, draw), by their names in ArviZ's schema, in the container of the installed ArviZ."""
     if is_legacy():
         return _legacy().InferenceData(**groups)
     import xarray as xr
@@ -99,12 +88,7 @@ def hdi(values: FloatArray, prob: float) -> FloatArray:
 
 
 def psis(log_weights: FloatArray) -> tuple[FloatArray, float]:
-    """Pareto-smoothed importance sampling (Vehtari et al. 2024).
-
-    Parameters
-    ----------
-    log_weights : array (n,)
-        Log of target over proposal, up to a constant.
+    """Pareto-smoothed importance sampling (Vehtari et al. 2024) of the log of target over proposal (n,).
 
     Returns
     -------

@@ -83,18 +83,9 @@ def check_compression(
     draws: FloatArray,
     laplace: Laplace,
 ) -> CompressionCheck:
-    """Compare two likelihoods at posterior draws.
+    """Compare two log likelihoods at posterior draws (n, p+1), or (n, p+2) where one parameter is added.
 
-    Parameters
-    ----------
-    compressed, exact : callable
-        Log likelihoods like `Target.log_likelihood`, nat.
-    target : Target
-        Target whose origin is the mode.
-    draws : array (n, p+1)
-        Posterior draws, px units; with a further column where the likelihood has a further parameter.
-    laplace : Laplace
-        Measures the distance from the mode.
+    The origin of `target` is the mode; `laplace` measures the distance from it.
     """
     from starcal_uq.inference.arviz import psis
 
@@ -138,23 +129,7 @@ def measure(
     likelihood_used: str,
     n_evaluations: int,
 ) -> Diagnostics:
-    """Compute the numbers that `check_draws` judges.
-
-    Parameters
-    ----------
-    chains : Chains
-        Chains as sampled.
-    draws : array (n_ensembles, n_draws, p+1)
-        In px units, in chain order.
-    shown : sequence of Parameter
-        Names and scales of the columns.
-    laplace, importance, compression
-        The independent estimates.
-    likelihood, likelihood_used : str
-        Name of the likelihood, and how it was evaluated.
-    n_evaluations : int
-        How often.
-    """
+    """Compute the numbers that `check_draws` judges of draws (n_ensembles, n_draws, p+1), px units, in chain order."""
     from starcal_uq.inference import arviz as arviz_compat
 
     n_sampled = chains.u.shape[-1]
@@ -193,19 +168,7 @@ def measure(
 
 
 def check_draws(post: Posterior, notes: Sequence[str] = ()) -> tuple[Check, ...]:
-    """Hold everything that is known of draws against its bound.
-
-    Parameters
-    ----------
-    post : Posterior
-        Draws with the numbers of `measure`; checks that it has already are not looked at.
-    notes : sequence of str
-        Sentences about the likelihood.
-
-    Returns
-    -------
-    tuple of Check
-    """
+    """Hold everything that is known of draws against its bound; checks that they have already are not looked at."""
     checks = [_rhat(post), _effective_draws(post), _acceptance(post), _derived(post), _digits(post), _bounds(post)]
     several = (_degrees_of_freedom(post), _independent(post), _evaluation(post), _likelihood(post, notes))
     return (*checks, *(check for check in several if check is not None), _priors(post))

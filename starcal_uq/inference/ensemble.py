@@ -99,25 +99,9 @@ def run_ensembles(
 ) -> Chains:
     """Run one ensemble per seed, each from its own draws of the Laplace approximation.
 
-    Parameters
-    ----------
-    density : callable
-        Log density (n,) of points (n, dim), whitened: unit covariance around zero.
-    dim : int
-        Number of coordinates.
-    seeds : sequence of numpy.random.SeedSequence
-        One per ensemble.
-    settings : EnsembleSettings
-        Sizes and moves.
-    progress : callable, optional
-        Called as ``progress(steps_done, steps_total)`` after every step.
-    checkpoint : path, optional
-        File that is rewritten while sampling and read at the start. A resumed run gives the same draws, bit for bit, as
-        one that was not interrupted. It is left in place.
-    fingerprint : str
-        Identifies data and settings; a checkpoint of another one is refused.
-    moves : list of (emcee move, weight), optional
-        Instead of those of ``settings.moves``.
+    `density` takes whitened points (n, dim). The checkpoint is rewritten while sampling and read at the start; a
+    resumed run gives the same draws, bit for bit, as one that was not interrupted. It is left in place, and refused
+    where the `fingerprint` of data and settings is another. `moves` stand in for those of the settings.
 
     Raises
     ------

@@ -79,13 +79,7 @@ class Source:
 
 
 def check_names(likelihood: Any, evaluation: Any, dof: Any, has_observations: bool) -> None:
-    """Refuse settings that mean nothing.
-
-    Raises
-    ------
-    SamplingError
-        With the names that exist.
-    """
+    """Refuse settings that mean nothing, with the names that exist."""
     if not isinstance(likelihood, str):
         if not callable(getattr(likelihood, "log_likelihood", None)):
             raise SamplingError(
@@ -120,13 +114,7 @@ def label_of(likelihood: str | Likelihood) -> str:
 def find_source(
     likelihood: str | Likelihood, obs: Observations | None, cal: Calibration, dof: float | str | None
 ) -> Source:
-    """The likelihood of a name (see `LIKELIHOODS`), or the object that was passed, around a calibration.
-
-    Raises
-    ------
-    SamplingError
-        When calibration and likelihood do not go together.
-    """
+    """The likelihood of a name (see `LIKELIHOODS`), or the object that was passed, around a calibration."""
     if not isinstance(likelihood, str):
         at = (cal.theta, cal.information, cal.sigma, float(cal.dof))
         return Source(label_of(likelihood), *at, exact=likelihood.log_likelihood, fast=None)
@@ -181,13 +169,7 @@ def _settings(cal: Calibration) -> dict[str, Any]:
 
 
 def resolved_dof(cal: Calibration, dof: float | str | None) -> float | Literal["free"]:
-    """The setting for degrees of freedom: as given, else the calibration's, else the default.
-
-    Raises
-    ------
-    SamplingError
-        For anything but "free" or a number in range.
-    """
+    """Degrees of freedom, "free" or a number in range: as given, else the calibration's, else the default."""
     if dof is None and _settings(cal).get("likelihood") == "student_t":
         dof = _settings(cal)["dof"]
     nu = parse_dof(dof, SamplingError)
@@ -260,8 +242,7 @@ class _AdjustedStudent:
     """Student-t log likelihood with the curvature that the stars' scores show.
 
     Stars are a mixture of right and wrong ones and no t distribution, so that the curvature of its likelihood is not
-    the precision of its estimate. As for composite likelihoods, it is evaluated at
-    ``theta_hat + C (theta - theta_hat)``.
+    the precision of its estimate. It is evaluated at ``theta_hat + C (theta - theta_hat)``, as composite ones are.
     """
 
     def __init__(self, fit: Any, nu: float | None) -> None:

@@ -168,16 +168,9 @@ def _component(log_density: FloatArray, columns: Mapping[str, FloatArray]) -> _C
 
 
 def cjs_distance(values: FloatArray, weights: FloatArray) -> float:
-    """Cumulative Jensen-Shannon distance between draws with equal weights and the same draws with others, in [0, 1].
+    """Cumulative Jensen-Shannon distance, 0 to 1, between draws (n,) with equal weights and with others that sum to 1.
 
     The larger one of those of the values and of their negatives, as the divergence is not symmetric in sign.
-
-    Parameters
-    ----------
-    values : array (n,)
-        Draws.
-    weights : array (n,)
-        Weights that sum to one.
     """
     order = np.argsort(values)
     width = np.diff(values[order])

@@ -150,18 +150,9 @@ class Priors(Shown, ABC):
         return np.asarray(-0.5 * z * z - math.log(self.sigma_log_sd) - 0.5 * _LOG_2PI)
 
     def log_density(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
-        """Log prior density per unit of theta and of sigma.
+        """Log prior density (n,) per unit of theta (n, p), px units, and of sigma (n,).
 
-        Parameters
-        ----------
-        theta : array (n, p)
-            Camera parameters x0, y0, f, k... in px units.
-        sigma : array (n,)
-            Noise; -inf is returned where it is not above zero.
-
-        Returns
-        -------
-        array (n,)
+        It is -inf where sigma is not above zero.
         """
         sigma = np.broadcast_to(np.asarray(sigma, dtype=float), np.atleast_2d(theta).shape[:1])
         log_sigma = np.log(np.where(sigma > 0.0, sigma, 1.0))
@@ -214,13 +205,7 @@ class Priors(Shown, ABC):
 
 
 def positive_number(name: str, value: Any) -> float:
-    """A finite number above zero.
-
-    Raises
-    ------
-    PriorError
-        Otherwise.
-    """
+    """A finite number above zero; `PriorError` otherwise."""
     number = float(value)
     if not (math.isfinite(number) and number > 0.0):
         raise PriorError(f"prior {name!r} is {number:g}: it must be a finite number above zero.")
@@ -342,13 +327,7 @@ PRIORS = Section(
 def priors_from_table(
     path: str | Path, table: Mapping[str, Any], camera: Camera, per_star_sigma: bool = False
 ) -> PhysicalPriors:
-    """Priors from the entries of a ``[priors]`` table; `path` is for messages.
-
-    Raises
-    ------
-    PriorError
-        For an unknown key or a value that is not a proper prior.
-    """
+    """Priors from the entries of a ``[priors]`` table; `path` is for messages."""
     values = PRIORS.check(table, f"{path}, section [priors]")
     return PhysicalPriors.around(camera, per_star_sigma).replace(**values)
 

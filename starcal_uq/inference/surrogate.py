@@ -75,22 +75,7 @@ def _monomials(u: FloatArray, exponents: IntArray) -> FloatArray:
 
 
 def fit_polynomial(target: Target, degree: int, rng: np.random.Generator) -> PolynomialLikelihood:
-    """Fit a polynomial to a target's log likelihood around its mode.
-
-    Parameters
-    ----------
-    target : Target
-        Centred and whitened by `starcal_uq.inference.target.laplace_approximation`.
-    degree : int
-        Degree of the polynomial.
-    rng : numpy.random.Generator
-        Draws the points.
-
-    Raises
-    ------
-    SamplingError
-        When the likelihood is not finite around its mode.
-    """
+    """Fit a polynomial to the log likelihood of a target that `laplace_approximation` has centred and whitened."""
     d = target.dim
     exponents = tuple(
         np.array(list(combinations_with_replacement(range(d), k)), dtype=np.int64) for k in range(degree + 1)

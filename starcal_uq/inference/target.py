@@ -138,24 +138,8 @@ def start_target(
 ) -> Target:
     """A target whitened by Fisher information plus prior precision at an estimate.
 
-    Parameters
-    ----------
-    log_likelihood : callable
-        ``(theta (n, p), sigma (n,)) -> (n,)``.
-    priors : Priors
-        Proper priors.
-    theta : array (p,)
-        Estimate, px units.
-    information : array (p, p)
-        Fisher information of the data at `sigma`.
-    sigma : float
-        Noise at the estimate.
-    dof : float
-        Independent residuals; a Gaussian likelihood has curvature ``2 dof`` in log sigma.
-    sigma_given : bool
-        True if the noise is not sampled.
-    extra : Extra, optional
-        A further parameter of the likelihood.
+    `information` (p, p) is that of the data at `sigma`; a Gaussian likelihood of `dof` independent residuals has the
+    curvature ``2 dof`` in log sigma.
 
     Raises
     ------
@@ -187,12 +171,7 @@ def start_target(
 def laplace_approximation(start: Target) -> tuple[Target, Laplace]:
     """Newton's method to the mode, re-whitened with the Hessian at every step.
 
-    Returns
-    -------
-    Target
-        With its origin at the mode and unit curvature there.
-    Laplace
-        The approximation itself.
+    The target that comes back has its origin at the mode and unit curvature there.
 
     Raises
     ------
@@ -281,18 +260,9 @@ class ImportanceCheck:
 
 
 def importance_check(target: Target, n: int, df: float, rng: np.random.Generator) -> ImportanceCheck:
-    """Estimate the moments from multivariate t draws around the mode, with Pareto-smoothed weights.
+    """Estimate the moments from n multivariate t draws around the mode, with Pareto-smoothed weights.
 
-    Parameters
-    ----------
-    target : Target
-        Centred and whitened by `laplace_approximation`.
-    n : int
-        Number of draws.
-    df : float
-        Degrees of freedom of the proposal.
-    rng : numpy.random.Generator
-        Source of random numbers.
+    `target` is one that `laplace_approximation` has centred and whitened; `df` are the proposal's degrees of freedom.
     """
     from starcal_uq.inference.arviz import psis
 

@@ -139,13 +139,7 @@ def prior_from(
 
 
 def check_chain(priors: Priors, camera: Camera, data_sha256: Collection[str] = ()) -> None:
-    """Refuse a chained prior of another camera, or one that the same data have shaped already.
-
-    Raises
-    ------
-    PriorError
-        In these cases.
-    """
+    """Refuse a chained prior of another camera, or one that the same data have shaped already."""
     source: Mapping[str, Any] = getattr(priors, "source", {})
     name = source.get("name", "the prior")
     if priors.distortion != camera.distortion:

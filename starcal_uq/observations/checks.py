@@ -134,16 +134,9 @@ def parse_times(name: str, cells: Sequence[str]) -> tuple[StrArray, list[Problem
 def check_columns(
     columns: Mapping[str, Any], camera: Camera | None = None, unknown_frame: BoolArray | None = None
 ) -> list[Problem]:
-    """Everything that is wrong with the values of a table.
+    """Everything that is wrong with the columns (N,) of a table, where a camera is given also for its detector.
 
-    Parameters
-    ----------
-    columns
-        Name to array of shape (N,), all required columns among them.
-    camera
-        If given, centroids must lie on its detector.
-    unknown_frame
-        Rows whose frame number could not be read, shape (N,).
+    `unknown_frame` (N,) are rows whose frame number could not be read.
     """
     problems: list[Problem] = []
     for name, values in columns.items():
@@ -222,23 +215,9 @@ def _repeats(*keys: Any) -> list[tuple[int, int]]:
 
 
 def raise_problems(source: str, word: str, numbers: IntArray, problems: Sequence[Problem]) -> None:
-    """Report problems, if there are any.
+    """Report problems in a file, if there are any: the first bad row by its "line" or "row" number, and how many more.
 
-    Parameters
-    ----------
-    source
-        The file, as the user named it.
-    word
-        ``"line"`` or ``"row"``.
-    numbers
-        Number of each row in the file, shape (N,).
-    problems
-        Problems found; of several for one cell the first is kept; one for a whole row replaces those of its cells.
-
-    Raises
-    ------
-    ObservationError
-        If there is any problem: the message names the first bad row and counts the others.
+    Of several for one cell the first is kept; one for a whole row replaces those of its cells.
     """
     whole_rows = {p.row for p in problems if p.column is None}
     kept: dict[tuple[int, str | None], Problem] = {}

@@ -52,13 +52,7 @@ def split_frames(obs: Observations, how: str = "odd-even", *, seed: int = 0) -> 
 
 
 def split_labels(how: str) -> tuple[str, str]:
-    """What the two halves are called.
-
-    Raises
-    ------
-    ComparisonError
-        For a split that is not known.
-    """
+    """What the two halves are called."""
     if how not in _LABELS:
         raise ComparisonError(f"split {how!r} is unknown: use one of {', '.join(SPLITS)}.")
     return _LABELS[how]

@@ -146,24 +146,7 @@ def simulate(
 def choose_attitudes(
     sky: Sky, rng: np.random.Generator, *, n_frames: int, min_stars: int, attitudes: FloatArray | None = None
 ) -> tuple[FloatArray, list[tuple[IntArray, FloatArray]]]:
-    """Attitudes that show at least `min_stars` stars: random ones, or the given ones after a check.
-
-    Parameters
-    ----------
-    sky : Sky
-        Catalogue and camera.
-    rng : numpy.random.Generator
-        Source of the attitudes; it is left alone when `attitudes` are given.
-    n_frames, min_stars : int
-        Number of frames, and of stars in each at least.
-    attitudes : (n_frames, 3, 3) array, optional
-        R_cam_icrs.
-
-    Returns
-    -------
-    rotations : (n, 3, 3) array
-    views : list of (indices, pixels)
-        Views that `Sky.views` returns for these rotations.
+    """Attitudes (n, 3, 3), random or given, that show at least `min_stars` stars, and their `Sky.views`.
 
     Raises
     ------

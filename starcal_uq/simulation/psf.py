@@ -17,16 +17,10 @@ def half_width_px(sigma_px: float) -> int:
 
 
 def profiles(centre_px: FloatArray, sigma_px: float, kind: str) -> tuple[IntArray, FloatArray]:
-    """Fractions of the light along one axis, around each of many centres.
+    """Fractions of the light along one axis, around each of many centres (n,); a whole number is the centre of a pixel.
 
-    Parameters
-    ----------
-    centre_px : (n,) array
-        Positions; a whole number is the centre of a pixel.
-    sigma_px : float
-        Standard deviation of the Gaussian, before integration over pixels (which adds 1/12 px^2 to its square).
-    kind : {"gaussian", "sampled"}
-        Integrated over each pixel, or the density at its centre.
+    `sigma_px` is that of the Gaussian before integration over pixels (which adds 1/12 px^2 to its square); the kind
+    ``sampled`` takes the density at each pixel's centre instead.
 
     Returns
     -------

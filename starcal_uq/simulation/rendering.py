@@ -30,17 +30,7 @@ _MAX_VALUES = 2_000_000
 
 
 class Scene:
-    """A catalogue in front of a camera with a sensor, prepared for many frames.
-
-    Parameters
-    ----------
-    stars : StarCatalogue
-        Stars; each puts its light into the frame, down to the faintest.
-    camera : Camera
-        Optics and distortion.
-    sensor : Sensor
-        Detector and PSF.
-    """
+    """A catalogue, down to its faintest star, in front of a camera with a sensor, prepared for many frames."""
 
     def __init__(self, stars: StarCatalogue, camera: Camera, sensor: Sensor) -> None:
         self.stars = stars
@@ -267,22 +257,7 @@ def _table(mean: float) -> tuple[FloatArray, np.ndarray[Any, Any]]:
 
 
 def uniform_shot_noise(mean: float, shape: tuple[int, int], rng: np.random.Generator) -> np.ndarray[Any, Any]:
-    """Independent Poisson numbers.
-
-    Parameters
-    ----------
-    mean : float
-        Mean of the numbers, 0 or more.
-    shape : tuple of int
-        Size of the detector.
-    rng : numpy.random.Generator
-        Source of the randomness.
-
-    Returns
-    -------
-    array of float32
-        Whole numbers; single precision holds them exactly up to 16 million.
-    """
+    """Independent Poisson numbers of one mean; single precision holds whole numbers exactly up to 16 million."""
     if mean == 0.0:
         return np.zeros(shape, dtype=np.float32)
     if mean > _MAX_MEAN:

@@ -26,13 +26,7 @@ from starcal_uq.simulation.sensor import Sensor
 
 
 def check_time(text: str) -> str:
-    """A UTC time in ISO 8601, with microseconds.
-
-    Raises
-    ------
-    SensorError
-        If it cannot be read, or names a time zone other than Z.
-    """
+    """A UTC time in ISO 8601, with microseconds; `SensorError` if it cannot be read or has a time zone other than Z."""
     try:
         time = datetime.fromisoformat(text.removesuffix("Z"))
     except (AttributeError, ValueError):
@@ -178,14 +172,7 @@ _TRUTH_COLUMNS = {
 def write_frame(frame: RenderedFrame, path: str | os.PathLike[str], force: bool = False) -> None:
     """Write a rendered frame and its truth as FITS; the same frame gives the same bytes.
 
-    Parameters
-    ----------
-    frame : RenderedFrame
-        Quantised counts become 16-bit integers (``BZERO`` = 32768), others 64-bit floats.
-    path : str or path
-        The file; it appears complete or not at all.
-    force : bool
-        Whether an existing file may be replaced.
+    Quantised counts become 16-bit integers (``BZERO`` = 32768), others 64-bit floats.
 
     Raises
     ------

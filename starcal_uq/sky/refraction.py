@@ -75,21 +75,9 @@ def refraction_constants(site: Site) -> tuple[float, float]:
 
 
 def refract(directions: FloatArray, zenith: FloatArray, constants: tuple[float, float]) -> FloatArray:
-    """Directions as seen through the air: each is raised towards the zenith.
+    """Directions (n, 3) as seen through the air: each is raised towards the zenith, by `refraction_constants`.
 
-    Parameters
-    ----------
-    directions
-        Unit vectors without refraction, shape (n, 3).
-    zenith
-        Unit vector of the zenith in the same axes, shape (3,) or one row for each direction.
-    constants
-        A and B, rad, from `refraction_constants`.
-
-    Returns
-    -------
-    ndarray, shape (n, 3)
-        Unit vectors. Lower than 3 degrees the refraction of 3 degrees is taken; check `altitude_deg` before.
+    Lower than 3 degrees the refraction of 3 degrees is taken; check `altitude_deg` before.
     """
     a, b = constants
     sine = np.sum(directions * zenith, axis=-1)

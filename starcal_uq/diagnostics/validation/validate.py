@@ -143,13 +143,7 @@ def validate_study(
     progress: Progress | None = None,
     settings: AnyDict | None = None,
 ) -> Validation:
-    """Run the replicates of a study, whose settings may be any, and collect them.
-
-    Raises
-    ------
-    CalibrationError
-        When no replicate gave a result.
-    """
+    """Run the replicates of a study, whose settings may be any, and collect them."""
     outcomes, interrupted = run_replicates(study, stars, n_replicates, workers, progress)
     good = [o for o in outcomes if not o.failure]
     failures = tuple(o.failure for o in outcomes if o.failure)
@@ -234,15 +228,7 @@ _CHUNK = 8
 def run_replicates(
     study: Study, stars: StarCatalogue, n_replicates: int, workers: int | None, progress: Progress | None
 ) -> tuple[list[TrialOutcome], bool]:
-    """Run replicates 0 .. n_replicates - 1; parameters and exceptions as in `run_tasks`.
-
-    Returns
-    -------
-    list of TrialOutcome
-        In order; all that were complete when Ctrl-C was pressed.
-    bool
-        True if it was.
-    """
+    """Run replicates 0 .. n_replicates - 1; as `run_tasks`."""
     return run_tasks(
         partial(run_replicate, study, stars),
         n_replicates,

@@ -59,21 +59,7 @@ def judge(
     attitude: AttitudeError | None = None,
     diagnosis: Diagnosis | None = None,
 ) -> Verdict:
-    """Check a run.
-
-    Parameters
-    ----------
-    obs, cal
-        The data and the estimate made from them.
-    post
-        The posterior, if there is one.
-    truth
-        The camera of a simulation, if it is known.
-    attitude
-        The propagated attitude error, if there is one.
-    diagnosis
-        Diagnosis of the model, if it was made.
-    """
+    """Check a run: everything that is known of it; `truth` is the camera of a simulation."""
     checks: list[Check | None] = [estimate.estimation(cal), estimate.estimators_agree(cal)]
     if diagnosis is not None and diagnosis.starts is not None:
         checks += [estimate.starts(diagnosis.starts)]

@@ -32,17 +32,7 @@ def limits(
     attitude: AttitudeError | None = None,
     diagnosis: Diagnosis | None = None,
 ) -> tuple[str, ...]:
-    """What limits the result, the most important first; one sentence each.
-
-    Parameters
-    ----------
-    obs, cal
-        The data and the estimate.
-    coupling, attitude
-        Results of `starcal_uq.coupling` and `starcal_uq.propagate`, where they exist.
-    diagnosis
-        Tests for misfit and the comparison of models, where they exist.
-    """
+    """What limits the result, the most important first; one sentence each."""
     found = [_systematic(obs, cal)]
     found += [_structure(cal, diagnosis), _model_choice(cal, diagnosis)] if diagnosis is not None else []
     found += [_attitude(attitude)] if attitude is not None else []

@@ -94,12 +94,7 @@ def entry_count(p: int) -> int:
 def frame_entries(normals: PairNormals, moved: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Gram matrices (K, 1 + p, 1 + p) about another point, and the distinct entries of every frame (K, s).
 
-    Parameters
-    ----------
-    normals : PairNormals
-        The frames.
-    moved : (p,) array
-        The point where they were linearised minus the new one, in the units of `normals`.
+    `moved` (p,) is the point where the frames were linearised minus the new one, in the units of `normals`.
     """
     p = len(moved)
     transfer = np.eye(1 + p)

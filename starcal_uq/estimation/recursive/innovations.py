@@ -66,27 +66,11 @@ class PairNormals:
 def frame_normals(
     frames: StarFrames, model_name: str, theta: FloatArray, scale: FloatArray, covariance: PairCovariance = "full"
 ) -> PairNormals:
-    """Linearise the interstar angles of every frame.
+    """Linearise the interstar angles of every frame at theta (p,), px units.
 
     Frames of equal size are treated together; the numbers of a frame do not depend on the others, to the last bit.
-
-    Parameters
-    ----------
-    frames : StarFrames
-        Data.
-    model_name : str
-        Distortion model.
-    theta : (p,) array
-        Point of linearisation, px units.
-    scale : (p,) array
-        Units of the parameters in the result; those of the principal point must be 1 px.
-    covariance : {"full", "diagonal"}
-        Which covariance of the pairs `PairNormals.weighted` assumes.
-
-    Returns
-    -------
-    PairNormals
-        Not finite where the model is not defined at theta, such as at a focal length that is not positive.
+    `scale` (p,) are the units of the parameters in the result; those of the principal point must be 1 px. The numbers
+    are not finite where the model is not defined at theta, such as at a focal length that is not positive.
     """
     try:
         if theta[2] > 0.0:
@@ -157,15 +141,10 @@ def _attitudes(
 
 
 class _Group:
-    """n frames of m stars each.
+    """n frames of m stars each, from a table (n, m, 18 + 3 p).
 
-    Parameters
-    ----------
-    table : (n, m, 18 + 3 p) array
-        Of every star: measured and catalogue direction, directions per pixel (x, then y), pixels per rotation (x, then
-        y), and derivatives of the direction with respect to the parameters.
-    p : int
-        Number of parameters.
+    It holds of every star: measured and catalogue direction, directions per pixel (x, then y), pixels per rotation (x,
+    then y), and derivatives of the direction with respect to the parameters.
     """
 
     def __init__(self, table: FloatArray, p: int) -> None:

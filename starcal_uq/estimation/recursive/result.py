@@ -57,14 +57,8 @@ def joint_estimate(recursion: Recursion, sums: FrameSums | None = None) -> Joint
     optics, E its derivative with respect to them, attitudes eliminated throughout. The sum over frames of the outer
     products of these influences is the sandwich covariance. It is the spread that the method really has, also where the
     distortion is ignored or pairs are taken as independent; the filter's own claim, which presumes its model, is
-    in the sigmas of the stage. With few frames, or with process noise, the model's covariance is given.
-
-    Parameters
-    ----------
-    recursion : Recursion
-        The filter after its last frame.
-    sums : FrameSums, optional
-        Sums taken at the final optics (a second pass); those of the filter otherwise.
+    in the sigmas of the stage. With few frames, or with process noise, the model's covariance is given. `sums` are
+    those of a second pass at the final optics, where there was one.
     """
     sums = recursion.sums if sums is None else sums
     q, p = len(recursion.offset), len(recursion.origin)

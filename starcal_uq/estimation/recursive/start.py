@@ -61,28 +61,10 @@ def prior_of(camera: Camera, options: RecursionOptions, per_star: bool) -> Start
 def begin(
     method: str, camera: Camera, options: RecursionOptions, prior: StartPrior, frames: StarFrames
 ) -> tuple[Recursion, Stage | None]:
-    """The recursion before its first frame.
+    """The recursion before its first frame, and the least-squares start of ``samaan``.
 
-    Parameters
-    ----------
-    method : {"griffith", "samaan"}
-        ``samaan`` starts where least squares on the first of `frames` ends. It takes only the point from there, and
-        filters these frames as the others, so that none counts twice.
-    camera : Camera
-        Start values; the coefficients start from zero.
-    options : RecursionOptions
-        Options.
-    prior : StartPrior
-        Prior that `prior_of` gives.
-    frames : StarFrames
-        First frames.
-
-    Returns
-    -------
-    Recursion
-        With no frame taken.
-    Stage or None
-        The least-squares start of ``samaan``.
+    ``samaan`` starts where least squares on the first of `frames` ends. It takes only the point from there, and filters
+    these frames as the others, so that none counts twice. The coefficients start from zero.
 
     Raises
     ------
@@ -166,13 +148,7 @@ class RecursionOptions:
     iterations: int = 12
 
     def check(self, method: str) -> None:
-        """Refuse what makes no sense.
-
-        Raises
-        ------
-        CalibrationError
-            In one sentence, with the remedy.
-        """
+        """Refuse what makes no sense, by a `CalibrationError` with the remedy."""
         if self.pair_covariance not in PAIR_COVARIANCES:
             raise CalibrationError(
                 f"pair_covariance {self.pair_covariance!r} is unknown: use one of {', '.join(PAIR_COVARIANCES)}."

@@ -39,13 +39,7 @@ class State:
 
 
 def write_state(state: State, path: str | os.PathLike[str]) -> None:
-    """Write a state, all or nothing.
-
-    Raises
-    ------
-    RunFolderError
-        When the file cannot be written.
-    """
+    """Write a state, all or nothing."""
     arrays: Arrays = {}
     header = {"kind": _KIND, "version": _VERSION, **to_plain(state, arrays)}
     with atomic_path(path) as temporary, temporary.open("wb") as stream:
@@ -53,13 +47,7 @@ def write_state(state: State, path: str | os.PathLike[str]) -> None:
 
 
 def read_state(path: str | os.PathLike[str]) -> State:
-    """Inverse of `write_state`.
-
-    Raises
-    ------
-    RunFolderError
-        When the file is missing, truncated, or no such state.
-    """
+    """Inverse of `write_state`; `RunFolderError` for a file that is missing, truncated, or no such state."""
     what = "a saved recursive calibration, or is incomplete"
     with reading(path, what, "give a file written by RecursiveCalibration.save"):
         arrays = read_arrays(path)

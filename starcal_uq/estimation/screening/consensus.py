@@ -47,16 +47,8 @@ class Consensus:
 def consensus(b: FloatArray, r: FloatArray, starts: IntArray, tolerance_rad: FloatArray | float) -> Consensus:
     """Find the largest set of stars in each frame that one attitude explains.
 
-    Parameters
-    ----------
-    b : (3, N) array
-        Measured unit vectors, camera frame; a star with NaN never agrees.
-    r : (3, N) array
-        Catalogue unit vectors.
-    starts : (K + 1,) array
-        Frame k holds the stars ``starts[k]:starts[k + 1]``.
-    tolerance_rad : float or (N,) array
-        Distance within which a star agrees.
+    `b` are measured and `r` catalogue unit vectors (3, N); frame k holds the stars ``starts[k]:starts[k + 1]``. A star
+    with NaN never agrees, the others do within the tolerance (one, or (N,)).
     """
     sizes = np.diff(starts)
     tolerance = np.broadcast_to(np.asarray(tolerance_rad, dtype=np.float64), b.shape[1:])
@@ -189,21 +181,10 @@ def _mode(values: FloatArray) -> float:
 
 
 def pre_screen(camera: Camera, frames: StarFrames) -> tuple[BoolArray, Camera]:
-    """Stars that can be calibrated on, found with a camera that has not been calibrated.
+    """Stars that can be calibrated on, found with a camera that has not been calibrated, and that camera refocused.
 
-    Parameters
-    ----------
-    camera : Camera
-        Nominal camera; its focal length may be tens of per cent off.
-    frames : StarFrames
-        Data.
-
-    Returns
-    -------
-    (N,) bool array
-        Stars that agree on their frame's attitude within what the uncalibrated camera allows.
-    Camera
-        The camera with the focal length of `focal_ratio`.
+    The stars (N,) agree on their frame's attitude within what the uncalibrated camera allows. The nominal focal length
+    may be tens of per cent off; the camera that comes back has that of `focal_ratio`.
     """
     if not np.isfinite(measured_directions(camera, frames)).all():
         camera = camera.replace(coefficients=(0.0,) * len(camera.coefficients))

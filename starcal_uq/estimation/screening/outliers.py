@@ -82,10 +82,7 @@ class StarResiduals:
     def studentised(self, shrinkage: float = 1.0) -> tuple[FloatArray, FloatArray]:
         """t over the noise variance estimated from the other stars (N,), and that estimate's degrees of freedom (N,).
 
-        Parameters
-        ----------
-        shrinkage : float
-            Factor by which screening has shrunk the variance of the stars in use (see `truncated_variance`).
+        Screening has shrunk the variance of the stars in use by `shrinkage` (see `truncated_variance`).
         """
         rest = self.cost - np.where(self.in_use, self.t, 0.0)
         dof = np.maximum(self.dof - 2.0 * self.in_use, 1.0)
@@ -132,18 +129,7 @@ def truncated_variance(p_value: float) -> float:
 
 
 def star_residuals(frames: StarFrames, model_name: str, theta: FloatArray, in_use: BoolArray) -> StarResiduals:
-    """Compare every star with the prediction of the other stars in use.
-
-    Parameters
-    ----------
-    frames : StarFrames
-        All stars.
-    model_name : str
-        Distortion model.
-    theta : (p,) array
-        Estimate from the stars in use.
-    in_use : (N,) bool array
-        Stars that the attitudes and the estimate come from.
+    """Compare every star with the prediction of the other stars in use, at the estimate theta (p,) from those.
 
     Raises
     ------

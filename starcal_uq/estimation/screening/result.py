@@ -217,14 +217,8 @@ def add_dropped_frames(
 ) -> None:
     """Fill in rows of dropped frames: the distance from what most of the frame's stars agree on, and TASTE.
 
-    Parameters
-    ----------
-    table : DataFrame
-        From `rejected_table`; changed in place.
-    vote_rad : (N,) array
-        Angle from the attitude that most stars of the frame agree on.
-    disturbed : (K,) array
-        TASTE of frames dropped for it (without stars that are far off), NaN for others.
+    `vote_rad` (N,) is the angle from that agreement; `disturbed` (K,) is TASTE of frames dropped for it (without stars
+    that are far off), NaN for others. The table is changed in place.
     """
     from scipy.special import chdtri
 
