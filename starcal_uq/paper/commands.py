@@ -39,18 +39,16 @@ class Bar:
 
 
 def run_or_stop(
-    task: Callable[[int], T], n_tasks: int, *, chunk: int, workers: int | None, progress: Progress | None
+    task: Callable[[int], T],
+    n_tasks: int,
+    *,
+    chunk: int,
+    workers: int | None,
+    progress: Progress | None,
+    caller: str = "field_experiment",
 ) -> list[T]:
-    """Every result of tasks of the field experiment (`run_tasks`), or nothing.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        After Ctrl-C.
-    """
-    found, interrupted = run_tasks(
-        task, n_tasks, caller="field_experiment", chunk=chunk, workers=workers, progress=progress
-    )
+    """Every result of the tasks of an experiment (`run_tasks`); Ctrl-C is an interrupt."""
+    found, interrupted = run_tasks(task, n_tasks, caller=caller, chunk=chunk, workers=workers, progress=progress)
     if interrupted:
         raise KeyboardInterrupt
     return found

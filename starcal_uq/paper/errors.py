@@ -13,13 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
 from starcal_uq.attitude.rotations import rotation_vector
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.fields import detector_axes, grid_points
 from starcal_uq.camera.projection import project, unproject
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import DistortionError
@@ -28,9 +29,9 @@ from starcal_uq.core.types import FloatArray
 _GRID = 33
 _FIXED_POINT_STEPS = 40
 Undistortion = Literal["model", "eq14", "eq14_measured", "eq6"]
-UNDISTORTIONS: tuple[Undistortion, ...] = ("model", "eq14", "eq14_measured", "eq6")
+UNDISTORTIONS: tuple[Undistortion, ...] = get_args(Undistortion)
 Optics = Literal["truth", "focal", "estimate"]
-OPTICS: tuple[Optics, ...] = ("truth", "focal", "estimate")
+OPTICS: tuple[Optics, ...] = get_args(Optics)
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class PointErrors:
 
 
 @dataclass(frozen=True)
-class MapError:
+class MapError(PointErrors):
     """Difference of the direction maps of two cameras at places (N, 2) px, the best common rotation removed.
 
     `error_px` (N, 2) is what the true camera would have to displace the point by to give the estimated direction,
@@ -60,7 +61,6 @@ class MapError:
     """
 
     xy_px: FloatArray
-    error_px: FloatArray
     error_arcsec: FloatArray
     weight: FloatArray
     rotation_arcsec: FloatArray
@@ -69,11 +69,6 @@ class MapError:
     def rms_px(self) -> float:
         """Root mean square length, px."""
         return float(np.sqrt(np.sum(self.weight * np.sum(self.error_px**2, axis=1))))
-
-    @property
-    def max_px(self) -> float:
-        """Largest length, px."""
-        return float(np.max(np.hypot(*self.error_px.T)))
 
     @property
     def rms_arcsec(self) -> float:
@@ -89,15 +84,10 @@ class MapError:
 def detector_grid(camera: Camera, n: int = _GRID) -> tuple[FloatArray, FloatArray]:
     """Points (n^2, 2) from edge to edge of the detector, and weights (n^2,) that make a mean over its area.
 
-    Raises
-    ------
-    ValueError
-        For fewer than two points along a side.
+    Raises ValueError for fewer than two points along a side.
     """
     if n < 2:
         raise ValueError(f"a grid needs at least 2 points along each side, not {n}.")
-    x = np.linspace(-0.5, camera.width_px - 0.5, n)
-    y = np.linspace(-0.5, camera.height_px - 0.5, n)
     # Simpson's rule where it applies: the squared distortion grows as the tenth power of the radius.
     side = np.ones(n)
     side[[0, -1]] = 0.5
@@ -105,7 +95,7 @@ def detector_grid(camera: Camera, n: int = _GRID) -> tuple[FloatArray, FloatArra
         side = np.where(np.arange(n) % 2 == 1, 4.0, 2.0) / 3.0
         side[[0, -1]] = 1.0 / 3.0
     weight = np.outer(side, side).ravel()
-    return np.column_stack([grid.ravel() for grid in np.meshgrid(x, y)]), weight / weight.sum()
+    return grid_points(*detector_axes(camera, n)), weight / weight.sum()
 
 
 def map_error(truth: Camera, estimate: Camera, xy_px: FloatArray | None = None, *, n: int = _GRID) -> MapError:
@@ -139,7 +129,7 @@ def map_error(truth: Camera, estimate: Camera, xy_px: FloatArray | None = None, 
 def aligned(estimated: FloatArray, true: FloatArray, weight: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Turn directions (N, 3) by the rotation that brings them closest to others, in weighted least squares.
 
-    Returns the turned directions, and the rotation (3, 3) taken off: ``estimated = R true`` but for what remains.
+    Returns the turned directions, and the rotation (3, 3) taken off.
     """
     rotation = quest(estimated, true, np.array([0, len(true)]), weight, covariance=False).rotations[0]
     return estimated @ rotation, rotation

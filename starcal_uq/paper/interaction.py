@@ -71,17 +71,9 @@ _STATISTICS = (
 class Threshold(NamedTuple):
     """Where along an axis a ratio of a method passes one: |bias| over noise, or the error over the efficient method's.
 
-    Attributes
-    ----------
-    kind : {"bias", "rmse"}
-        Ratio of bias and noise, or of root mean square errors.
-    axis, method, parameter : str
-        Axis, method and parameter.
-    side : str
-        Side of the value on which the ratio exceeds one (``above``, ``below``), or ``always``, ``never``.
-    value, low, high : float
-        Place in the unit of the axis (px at the corner, deg, frames, stars in a frame), interpolated, and its interval
-        from the 95 % interval of the noise; NaN where there is none.
+    The kind is ``bias`` or ``rmse``; the side says where the ratio exceeds one (``above`` or ``below`` the value,
+    ``always``, ``never``). The value is in the unit of the axis (px at the corner, deg, frames, stars in a frame),
+    interpolated, with an interval from the 95 % interval of the noise; NaN where there is none.
     """
 
     kind: str
@@ -377,13 +369,8 @@ def interaction_study(
         Designs at every point; 16 know a spread to 18 %, 50 to 10 %.
     n_frames, min_stars, sigma_px, max_mag
         Data of one calibration where an axis does not say otherwise.
-    seed : int
-        The same seed gives the same result, bit for bit, for any number of processes.
-    workers : int, optional
-        Processes; as many as there are processors by default. With 0, everything happens in this process, where a BLAS
-        with several threads can change the last digits.
-    progress : callable, optional
-        Called as ``progress(done, total)``.
+    seed, workers, progress
+        As in `replicate`; the seed repeats the study bit for bit for any number of processes.
 
     Returns
     -------

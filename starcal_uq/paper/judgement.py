@@ -41,20 +41,11 @@ class Outcome(Enum):
 
 
 class Trial(NamedTuple):
-    """A printed number under one reading.
+    """A printed number under one reading, which the paper's text allows (`faithful`) or not.
 
-    Attributes
-    ----------
-    reading, faithful : str, bool
-        Reading in words, and whether the paper's text allows it.
-    n, mean, spread : int, float, float
-        Number of draws and what they are; of error sizes, the geometric mean and the spread of the logarithm times it.
-    middle, scale : float
-        Mean of the draws, and standard deviation of a new one, rounding included: of the logarithm for error sizes.
-    z : float
-        Distance of the printed number, in units of `scale`.
-    noise_digits : int
-        Number of printed digits that are noise under this reading.
+    `mean` and `spread` are of the n draws; of error sizes, the geometric mean and the spread of the logarithm times it.
+    `z` is the distance of the printed number from `middle` over `scale`, the standard deviation of a new draw with
+    rounding; these are of the logarithm for error sizes. `noise_digits` of the printed digits are noise.
     """
 
     reading: str
@@ -139,13 +130,7 @@ class Judged:
 
 
 def trial(number: Printed, reading: str, faithful: bool, draws: FloatArray | Sequence[float]) -> Trial:
-    """Compare a printed number with draws (n,) of a reading.
-
-    Raises
-    ------
-    ValueError
-        For fewer than two draws that are finite.
-    """
+    """Compare a printed number with draws (n,) of a reading, of which two must be finite (else ValueError)."""
     values = np.asarray(draws, dtype=np.float64)
     values = values[np.isfinite(values)]
     n = len(values)

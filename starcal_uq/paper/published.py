@@ -13,8 +13,6 @@ from decimal import Decimal
 LEAST_SQUARES, SAMAAN, PROPOSED = "least_squares", "samaan", "three_stage"
 # Rows of their Table 2, in order, as methods of `calibrate`.
 PAPER_METHODS = (LEAST_SQUARES, SAMAAN, PROPOSED)
-# Error sizes: never negative, and compared on a logarithmic scale.
-ERROR_SIZES = ("reprojection_px", "max_residual_px", "y0_error_px")
 
 
 @dataclass(frozen=True)
@@ -42,8 +40,8 @@ class Printed:
 
     @property
     def is_error_size(self) -> bool:
-        """Whether it is the size of an error, which cannot be negative."""
-        return self.quantity in ERROR_SIZES
+        """Whether it is the size of an error: never negative, and compared on a logarithmic scale."""
+        return self.quantity in ("reprojection_px", "max_residual_px", "y0_error_px")
 
 
 def _row(method: str, place: str, **values: str) -> tuple[Printed, ...]:
@@ -73,28 +71,17 @@ TABLE_2: tuple[Printed, ...] = (
         reprojection_px="0.0038",
     ),
 )
-SECTION_3_2: tuple[Printed, ...] = (Printed(PROPOSED, "y0_error_px", "0.13", "section 3.2"),)
-SECTION_3_3: tuple[Printed, ...] = (
+PUBLISHED: tuple[Printed, ...] = (
+    *TABLE_2,
+    Printed(PROPOSED, "y0_error_px", "0.13", "section 3.2"),
     *_row(SAMAAN, "section 3.3", k1="3.09e-10", k2="-1.23e-15"),
     *_row(PROPOSED, "section 3.3", k1="1.732e-10", k2="-3.449e-15"),
     Printed(LEAST_SQUARES, "max_residual_px", "0.81", "section 3.3, Fig. 4"),
     Printed(SAMAAN, "max_residual_px", "0.12", "section 3.3, Fig. 5"),
     Printed(PROPOSED, "max_residual_px", "0.015", "section 3.3, Fig. 6; abstract; conclusion"),
 )
-PUBLISHED: tuple[Printed, ...] = (*TABLE_2, *SECTION_3_2, *SECTION_3_3)
 
-# Table 1 and section 3: what was simulated. Sections 3.2 and 3.3: where the estimation starts.
-TRUTH = {
-    "width_px": 1024,
-    "height_px": 1024,
-    "pixel_um": 12.0,
-    "focal_mm": 70.2262,
-    "x0_px": 500.0,
-    "y0_px": 530.0,
-    "k1": 2.0e-10,
-    "k2": -3.5e-15,
-}
-START = {"focal_mm": 72.0, "x0_px": 512.0, "y0_px": 512.0}
+# Section 3: what was simulated.
 N_FRAMES, MIN_STARS, SIGMA_PX, MAX_MAG, N_STARS = 1000, 10, 0.05, 6.0, 5103
 # "Two orders of magnitude" more precise than the other methods: abstract, section 3.3, conclusion.
 CLAIMED_RATIO = 100.0

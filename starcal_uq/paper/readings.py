@@ -20,16 +20,18 @@ from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import unproject_jacobian
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.status import Status
-from starcal_uq.core.tasks import Progress, run_tasks
-from starcal_uq.core.types import AnyDict, FloatArray, IntArray
+from starcal_uq.core.tasks import Progress
+from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.estimation.recursive.start import RecursionOptions
 from starcal_uq.estimation.stages import distortion_stage, joint_stage, optics_stage
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.camera import CONVENTIONS, paper_camera, paper_start
+from starcal_uq.paper.commands import run_or_stop
 from starcal_uq.paper.errors import MAXIMUM, REPROJECTION, error_sizes, undistorted
 from starcal_uq.paper.published import LEAST_SQUARES, MAX_MAG, N_FRAMES, N_STARS, PROPOSED, SAMAAN, Printed
+from starcal_uq.paper.replicates import pinhole
 from starcal_uq.simulation.frames import Campaign
 from starcal_uq.sky.catalogue import load_catalogue
 
@@ -58,11 +60,8 @@ class Readings:
 
     def trials_of(self, number: Printed) -> Iterator[tuple[str, bool, FloatArray]]:
         """Words, faithfulness and draws of every reading that gives this number's quantity, the main one first."""
-        errors: AnyDict = {"": ("", True)}
-        if number.quantity == "reprojection_px":
-            errors = {e.key: (e.words, e.faithful) for e in REPROJECTION}
-        elif number.quantity == "max_residual_px":
-            errors = {e.key: (e.words, e.faithful) for e in MAXIMUM}
+        sizes = {"reprojection_px": REPROJECTION, "max_residual_px": MAXIMUM}.get(number.quantity, ())
+        errors = {one.key: (one.words, one.faithful) for one in sizes} or {"": ("", True)}
         for reading in READINGS:
             for error, (words, allowed) in errors.items():
                 draws = self.of(reading.key, number.method, number.quantity, error)
@@ -79,35 +78,26 @@ def run_readings(
     seed: int = 2017,
     workers: int | None = None,
     progress: Progress | None = None,
-) -> tuple[Readings, bool]:
+) -> Readings:
     """Repeat the experiment over seeds under every reading; parameters as in `replicate`.
 
     `convention` is the main reading of the distortion. Draw i depends on the seed and on i alone, and is none of the
     replicates of the same seed.
-
-    Also returns whether Ctrl-C was pressed; the readings are then of the seeds that were complete.
-
-    Raises
-    ------
-    SamplingError
-        If processes cannot be used.
     """
     stars = load_catalogue(max_mag=MAX_MAG)
     # As many as the paper's, by the embedded catalogue's band.
     sparse = stars.select(np.sort(np.argsort(stars.mag, kind="stable")[:N_STARS]))
     plan = Plan(stars, sparse, convention, Campaign(n_frames), seed)
-    found, interrupted = run_tasks(
-        partial(draw, plan), n_draws, caller="reproduce", chunk=1, workers=workers, progress=progress
-    )
+    task = partial(draw, plan)
+    found = run_or_stop(task, n_draws, caller="reproduce", chunk=1, workers=workers, progress=progress)
     keys = tuple(found[0])
-    return Readings(keys, np.array([[one.get(key, np.nan) for one in found] for key in keys])), interrupted
+    return Readings(keys, np.array([[one.get(key, np.nan) for one in found] for key in keys]))
 
 
 AS_PRINTED, OTHER_EQUATION, DIAGONAL = "as printed", "other equation", "diagonal"
 FEW_FRAMES = 100
 _PROCESS_NOISE_PX = 0.1
-_MAX_ITERATIONS = 200
-_SOLVER = "lm"
+_SOLVER = ("lm", 200)
 _MAX_STEPS = 20
 _TOLERANCE_PX = 1e-7
 # An estimate of a method, None where it failed.
@@ -198,20 +188,15 @@ def draw(plan: Plan, index: int) -> dict[Key, float]:
 def paper_methods(obs: Observations, start: Camera) -> Estimates:
     """The three methods of the paper's Table 2 on one data set."""
     frames = StarFrames.from_observations(obs)
-    optics = optics_stage(frames, start, _SOLVER, _MAX_ITERATIONS)
+    optics = optics_stage(frames, start, *_SOLVER)
     linear = distortion_stage(frames, start, optics.theta)
     objective = PairObjective(frames, start.distortion)
-    joint = joint_stage(objective, start, linear.theta, _SOLVER, _MAX_ITERATIONS)
+    joint = joint_stage(objective, start, linear.theta, *_SOLVER)
     return {
         LEAST_SQUARES: pinhole(start, optics.theta) if optics.status.ok else None,
         SAMAAN: _recursive(obs, start, "samaan"),
         PROPOSED: start.with_theta(joint.theta) if joint.status.ok else None,
     }
-
-
-def pinhole(camera: Camera, theta: FloatArray) -> Camera:
-    """A camera without distortion, of the first three parameters."""
-    return camera.replace(distortion="none", coefficients=()).with_theta(theta[:3])
 
 
 def _recursive(obs: Observations, start: Camera, method: str, options: RecursionOptions | None = None) -> Camera | None:

@@ -22,14 +22,15 @@ from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import read, write
 from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
+from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
+from starcal_uq.estimation.recursive.start import RECURSIVE_METHODS, RecursionOptions
 from starcal_uq.maths.intervals import holm
 from starcal_uq.maths.linear import inverse_diagonal
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.paper.errors import map_error, reprojection_error_px
-from starcal_uq.paper.methods import METHODS, Method
 from starcal_uq.paper.statistics import FAMILY_LEVEL, classical_words, summarise, words
 from starcal_uq.simulation.frames import Campaign
 from starcal_uq.sky.catalogue import load_catalogue
@@ -43,6 +44,8 @@ if TYPE_CHECKING:
 
 # A replicate takes about half a second at a thousand frames.
 _CHUNK = 2
+# Methods that are stages of the efficient one.
+_STAGES = ("least_squares", "three_stage")
 # A slow option of a method, which is there to show what it claims, takes part in one of so many replicates.
 SHARE = 4
 _LEAST = 8
@@ -51,6 +54,63 @@ _FORMAT = "starcal_uq replicates 1"
 # Arrays with one entry for each method and replicate.
 _BY_METHOD = ("estimates", "claimed", "classical", "map_px", "map_arcsec", "reprojection_px")
 _ARRAYS = ("replicate", "crlb", *_BY_METHOD)
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to calibrate: its label in tables and figures, what it does in one line, and arguments of `calibrate`."""
+
+    label: str
+    description: str
+    method: str
+    recursion: RecursionOptions | None = None
+
+    def calibrate(self, obs: Observations, start: Camera) -> Calibration:
+        """Calibrate observations; recursive methods as a stream.
+
+        A stream gives them the same estimate and covariance, and no residuals and attitudes, which take time.
+
+        Raises
+        ------
+        CalibrationError
+            When the method gives no good result.
+        """
+        source = [obs] if self.method in RECURSIVE_METHODS else obs
+        return calibrate(source, start, method=self.method, recursion=self.recursion)
+
+
+METHODS = (
+    Method("least squares", "optics by least squares on interstar angles, distortion ignored", "least_squares"),
+    Method(
+        "samaan",
+        "optics by a Kalman filter on interstar angles with their full covariance, distortion linearly afterwards",
+        "samaan",
+    ),
+    Method(
+        "samaan, diagonal",
+        "the same with the angles of a frame taken as independent, as in the historical filters",
+        "samaan",
+        RecursionOptions(pair_covariance="diagonal"),
+    ),
+    Method(
+        "griffith",
+        "optics by recursive least squares on interstar angles, one frame at a time, distortion ignored",
+        "griffith",
+    ),
+    Method(
+        "griffith, all", "the same for optics and distortion together", "griffith", RecursionOptions(parameters="all")
+    ),
+    Method(
+        "three stages",
+        "optics and distortion together by least squares on interstar angles (Ye & Yang 2017)",
+        "three_stage",
+    ),
+    Method(
+        "efficient",
+        "three stages, then the likelihood of the star positions with the attitudes eliminated",
+        "efficient",
+    ),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -401,9 +461,8 @@ def crlb_sigmas(frames: StarFrames, truth: Camera, sigma_px: float) -> FloatArra
 class Solved(NamedTuple):
     """What a method found: camera, parameters, and standard deviations as claimed and by textbooks, (p,) px units.
 
-    The latter are ``(J^T J)^-1 s^2`` for least squares over pairs, which presumes that pairs are independent, although
-    the m (m - 1) / 2 pairs of m stars hold 2 m - 3 independent numbers; for a filter its own, which presume that its
-    model holds. NaN where there is none, or where it is what the method claims anyway.
+    Least squares over pairs presumes there that pairs are independent, although the m (m - 1) / 2 pairs of m stars hold
+    2 m - 3 independent numbers; a filter that its model holds. NaN where there is none, or none but the claim.
     """
 
     camera: Camera
@@ -427,7 +486,7 @@ def solve_all(
     for method in (*efficient, *others):
         try:
             if whole is not None and method.method in _STAGES:
-                found[method] = _STAGES[method.method](whole, frames)
+                found[method] = _stage(whole, method.method, frames)
                 continue
             cal = method.calibrate(obs, start)
             found[method] = _solved(cal, frames)
@@ -447,21 +506,20 @@ def _solved(cal: Calibration, frames: StarFrames) -> Solved:
     return Solved(cal.camera, cal.theta, cal.sigmas, classical)
 
 
-def _first_stage(whole: Calibration, frames: StarFrames) -> Solved:
-    theta = whole.stages[0].theta[:3]
-    pairs = PairObjective(frames, "none")
-    camera = whole.nominal.replace(distortion="none", coefficients=()).with_theta(theta)
-    return Solved(camera, theta, np.sqrt(np.diag(pairs.godambe(theta))), textbook_sigmas(pairs, theta))
+def _stage(whole: Calibration, method: str, frames: StarFrames) -> Solved:
+    if method == "three_stage":
+        theta, camera = whole.pair_theta, whole.nominal.with_theta(whole.pair_theta)
+    else:
+        theta = whole.stages[0].theta[:3]
+        camera = pinhole(whole.nominal, theta)
+    pairs = PairObjective(frames, camera.distortion)
+    covariance = whole.pair_covariance if method == "three_stage" else pairs.godambe(theta)
+    return Solved(camera, theta, np.sqrt(np.diag(covariance)), textbook_sigmas(pairs, theta))
 
 
-def _third_stage(whole: Calibration, frames: StarFrames) -> Solved:
-    theta = whole.pair_theta
-    pairs = PairObjective(frames, whole.nominal.distortion)
-    sigmas = np.sqrt(np.diag(whole.pair_covariance))
-    return Solved(whole.nominal.with_theta(theta), theta, sigmas, textbook_sigmas(pairs, theta))
-
-
-_STAGES = {"least_squares": _first_stage, "three_stage": _third_stage}
+def pinhole(camera: Camera, theta: FloatArray) -> Camera:
+    """A camera without distortion, of the first three parameters."""
+    return camera.replace(distortion="none", coefficients=()).with_theta(theta[:3])
 
 
 def textbook_sigmas(pairs: PairObjective, theta: FloatArray) -> FloatArray:

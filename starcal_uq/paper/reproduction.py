@@ -12,14 +12,12 @@ from starcal_uq.core.types import AnyDict
 from starcal_uq.paper.camera import paper_camera, paper_start
 from starcal_uq.paper.checks import paper_checks
 from starcal_uq.paper.commands import Bar, write_tables
-from starcal_uq.paper.experiment import run_paper
 from starcal_uq.paper.interaction import interaction_study
 from starcal_uq.paper.published import PAPER_METHODS
 from starcal_uq.paper.readings import run_readings
 from starcal_uq.paper.replicates import replicate
-from starcal_uq.paper.result import Reproduction
+from starcal_uq.paper.result import Reproduction, judge_all, run_paper
 from starcal_uq.paper.show.pages import reproduction_figures, reproduction_page
-from starcal_uq.paper.table_2 import judge_all
 
 # Replicates of every reading, and of the study: enough for z-values to ten per cent, and for the figure.
 N_READING_DRAWS = 12
@@ -93,7 +91,7 @@ def reproduce(
     truth, start = paper_camera(convention), paper_start(convention)
     run = run_paper(convention=convention, n_frames=n_frames, seed=seed)
     bar.finish("run")
-    readings, interrupted = run_readings(
+    readings = run_readings(
         convention=convention,
         n_draws=min(N_READING_DRAWS, n_replicates),
         n_frames=n_frames,
@@ -101,7 +99,6 @@ def reproduce(
         workers=workers,
         progress=bar.part("readings"),
     )
-    _stop_if(interrupted)
     replicates = replicate(
         truth=truth,
         start=start,

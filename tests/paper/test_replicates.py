@@ -18,8 +18,7 @@ from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.maths.intervals import holm, wilson_interval
 from starcal_uq.observations.frames import StarFrames
-from starcal_uq.paper.methods import METHODS, Method
-from starcal_uq.paper.replicates import Replicates, replicate, solve_all
+from starcal_uq.paper.replicates import METHODS, Method, Replicates, replicate, solve_all
 from starcal_uq.paper.statistics import HONEST, TOO_FEW, chi_interval, chi_p_value, summarise
 from tests.helpers.scenes import camera, observations
 

@@ -82,36 +82,20 @@ class FieldStars:
 
 @dataclass(frozen=True, eq=False)
 class AttitudeErrors:
-    """Attitude errors (k, 3) of frames with one camera, and without noise, arcsec; columns pitch, yaw, roll."""
+    """Attitude errors of frames with one camera, arcsec; columns pitch, yaw, roll.
+
+    `total` (k, 3) is against the true attitude, and `rms` (3,) its size; `aligned` its scatter about the mean, which is
+    left when the alignment was calibrated with the same camera. The parts are `noise`, what centroid noise does;
+    `common`, the rotation common to all frames without noise, with its sign; and the `rest`, what the camera does
+    differently from frame to frame; all (3,).
+    """
 
     total: FloatArray
-    camera: FloatArray
-
-    @property
-    def rms(self) -> FloatArray:
-        """Everything, against the true attitude, (3,)."""
-        return _rms(self.total)
-
-    @property
-    def common(self) -> FloatArray:
-        """The rotation common to all frames, with its sign, (3,)."""
-        mean: FloatArray = np.mean(self.camera, axis=0)
-        return mean
-
-    @property
-    def rest(self) -> FloatArray:
-        """What the camera does differently from frame to frame, (3,)."""
-        return _rms(self.camera - self.common)
-
-    @property
-    def noise(self) -> FloatArray:
-        """What centroid noise does, (3,)."""
-        return _rms(self.total - self.camera)
-
-    @property
-    def aligned(self) -> FloatArray:
-        """What is left when the alignment was calibrated with the same camera: the scatter about the mean, (3,)."""
-        return _rms(self.total - np.mean(self.total, axis=0))
+    rms: FloatArray
+    aligned: FloatArray
+    common: FloatArray
+    rest: FloatArray
+    noise: FloatArray
 
     @property
     def sum_of_squares(self) -> FloatArray:
@@ -145,8 +129,16 @@ def attitude_errors(stars: FieldStars, camera: Camera) -> AttitudeErrors:
     weights = np.hypot(stars.sigma_px, LEAST_SIGMA_PX) / camera.focal_px
     b = np.stack([unproject(camera, stars.xy_px), unproject(camera, stars.true_px)])
     found = quest(b, stars.directions, stars.starts, sigma_rad=weights, covariance=False)
-    error = left_error(found.quaternions, stars.quaternions) * ARCSEC
-    return AttitudeErrors(error[0], error[1])
+    total, exact = left_error(found.quaternions, stars.quaternions) * ARCSEC
+    common = np.mean(exact, axis=0)
+    return AttitudeErrors(
+        total=total,
+        rms=_rms(total),
+        aligned=_rms(total - np.mean(total, axis=0)),
+        common=common,
+        rest=_rms(exact - common),
+        noise=_rms(total - exact),
+    )
 
 
 def single_faults(truth: Camera, camera: Camera) -> dict[str, Camera]:
@@ -182,8 +174,12 @@ class FieldReplicates:
 
 
 @dataclass(frozen=True, eq=False)
-class _ReplicateTask:
-    """One repetition: {camera: {part: (3,)}}, without the methods that failed."""
+class Repetition:
+    """Calibration and test again with other noise, by number: {camera: {part: (3,)}}, without methods that failed.
+
+    `campaign_px` (m, 2) is where the stars of the campaign truly are, `scale` its noise over what is stated, `tests`
+    are the stars that each camera identified; those of the paper's methods are calibrated anew from `nominal`.
+    """
 
     campaign: Observations
     campaign_px: FloatArray
@@ -215,39 +211,14 @@ class _ReplicateTask:
 
 
 def replicate_field(
-    campaign: Observations,
-    campaign_px: FloatArray,
-    scale: float,
-    nominal: Camera,
-    tests: Mapping[str, FieldStars],
-    cameras: Mapping[str, Camera],
-    *,
-    n_replicates: int,
-    seed: int,
-    workers: int | None,
-    progress: Progress | None,
+    repetition: Repetition, n_replicates: int, workers: int | None, progress: Progress | None
 ) -> FieldReplicates:
-    """Repeat calibration and test with other noise.
-
-    `campaign_px` (m, 2) is where the stars of the campaign truly are, `scale` its noise over what is stated, `tests`
-    are the stars that each camera identified; those of the paper's methods are calibrated anew from `nominal`.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        After Ctrl-C.
-    """
-    results = run_or_stop(
-        _ReplicateTask(campaign, campaign_px, scale, nominal, tests, cameras, seed),
-        n_replicates,
-        chunk=_CHUNK,
-        workers=workers,
-        progress=progress,
-    )
+    """Every repetition; `FieldReplicates`."""
+    results = run_or_stop(repetition, n_replicates, chunk=_CHUNK, workers=workers, progress=progress)
     empty = np.empty((0, 3))
     return FieldReplicates(
         {
             name: {part: np.array([one[name][part] for one in results if name in one] or empty) for part in PARTS}
-            for name in tests
+            for name in repetition.tests
         }
     )

@@ -13,7 +13,7 @@ from starcal_uq.core.provenance import provenance
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.paper.commands import Bar, write_tables
-from starcal_uq.paper.field.attitudes import attitude_errors, identified_stars, replicate_field
+from starcal_uq.paper.field.attitudes import Repetition, attitude_errors, identified_stars, replicate_field
 from starcal_uq.paper.field.frames import FieldFrames, take_frames
 from starcal_uq.paper.field.identification import WRONG_PX, identify_all, true_pixels
 from starcal_uq.paper.field.published import (
@@ -74,42 +74,24 @@ def field_experiment(
     Parameters
     ----------
     out : path
-        Folder to write: ``field.html`` (self-contained), ``table_3.csv``, ``rates.csv``, ``parts.csv``,
-        ``sources.csv``, ``data_sheets.csv``, ``cameras.csv``, ``frames.csv``, and the figures as PNG in ``figures``.
-        Nothing is written before everything is computed.
-    n_frames : int
-        Frames of the test, at least 20; the paper has 200.
-    n_calibration_frames : int
-        Frames of the calibration, at least 20. The paper does not say how many it used.
+        Folder to write: ``field.html`` (self-contained), the tables of `FieldExperiment.tables` as CSV, and the figures
+        as PNG in ``figures``. Nothing is written before everything is computed.
+    n_frames, n_calibration_frames, n_replicates : int
+        Frames of the test, of which the paper has 200, and of the calibration, of which it does not say; repetitions
+        with other noise, from which the ranges of the errors come. Each at least 20.
     reading : {"window", "full"}
-        How the printed sensor is read (`field_published.READINGS`).
-    seed : int
-        The same seed gives the same numbers, for any number of processes.
-    n_replicates : int
-        Repetitions with other noise, from which the ranges of the errors come; at least 20.
-    workers : int, optional
-        Processes; as many as there are processors by default, 0 for none beside this one.
-    progress : callable, optional
-        Called as ``progress(done, total)``, in units of work.
-    force : bool
-        Write into a folder that holds files already; those of the same names are replaced.
-
-    Returns
-    -------
-    FieldExperiment
+        How the printed sensor is read (`READINGS`).
+    seed, workers, progress, force
+        As in `reproduce`.
 
     Raises
     ------
-    RunFolderError
-        If the folder holds files and `force` is false, or cannot be written.
+    RunFolderError, SamplingError, KeyboardInterrupt
+        As in `reproduce`.
     CalibrationError
         For numbers that are too small or an unknown reading, or when a method gives no result.
     IdentificationError
         When the frames of the calibration cannot be identified.
-    SamplingError
-        If processes cannot be used.
-    KeyboardInterrupt
-        After Ctrl-C; nothing is written then.
     """
     check_new_folder(out, force)
     if reading not in READINGS:
@@ -143,18 +125,16 @@ def field_experiment(
     for focal_mm, result in zip(sheets, results, strict=False):
         chosen = identified_stars(frames, sensor.truth, stars, result)
         data_sheets[focal_mm] = (result, None if chosen is None else attitude_errors(chosen, result.camera))
-    replicates = replicate_field(
-        found.observations,
-        _true_campaign(campaign, found.observations, sensor.truth),
-        tests[TRUE_CAMERA].noise_scale,
-        sensor.nominal(),
-        tests,
-        cameras,
-        n_replicates=n_replicates,
+    repetition = Repetition(
+        campaign=found.observations,
+        campaign_px=_true_campaign(campaign, found.observations, sensor.truth),
+        scale=tests[TRUE_CAMERA].noise_scale,
+        nominal=sensor.nominal(),
+        tests=tests,
+        cameras=cameras,
         seed=seed,
-        workers=workers,
-        progress=bar.part("replicates"),
     )
+    replicates = replicate_field(repetition, n_replicates, workers, bar.part("replicates"))
     settings: dict[str, Any] = {"reading": reading, "n_frames": n_frames, "n_calibration_frames": n_calibration_frames}
     settings |= {"tolerance_px": TOLERANCE_PX, "n_replicates": n_replicates, "nominal_focal_mm": NOMINAL_FOCAL_MM}
     experiment = FieldExperiment(

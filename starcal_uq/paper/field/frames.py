@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -47,13 +47,8 @@ class FieldFrames:
 
     def part(self, first: int, last: int) -> FieldFrames:
         """Frames first .. last - 1, numbered from 0."""
-        table = self.centroids
-        rows = (table.frame >= first) & (table.frame < last)
-        columns: AnyDict = {name: getattr(table, name)[rows] for name in COLUMNS}
-        columns["frame"] = columns["frame"] - first
-        frames: AnyDict = {name: getattr(table, name)[first:last] for name in FRAME_COLUMNS}
-        frames["frame_ids"] = np.arange(last - first)
-        part = Centroids(**columns, **frames, messages=(), meta=table.meta)
+        part = self.centroids.select_frames(np.arange(first, last))
+        part = replace(part, frame=part.frame - first, frame_ids=np.arange(last - first), messages=())
         return FieldFrames(part, self.rotations[first:last], self.share)
 
 
@@ -76,15 +71,7 @@ class _RenderTask:
 def take_frames(
     reading: FieldReading, n_frames: int, seed: int, workers: int | None, progress: Progress | None
 ) -> FieldFrames:
-    """Render random attitudes until `n_frames` of them show more than six stars.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        After Ctrl-C.
-    CalibrationError
-        When next to no attitude shows enough stars.
-    """
+    """Render random attitudes until `n_frames` of them show more than six stars."""
     stars, camera = load_catalogue(max_mag=reading.limit_mag + _FAINTER_MAG), reading.truth
     scene = Scene(stars, camera, reading.sensor)
     attitudes = _Attitudes(reading, np.random.default_rng([seed, 0]))

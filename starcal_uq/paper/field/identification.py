@@ -78,17 +78,13 @@ class _IdentifyTask:
         frame = np.repeat([k for k, _ in solved], [len(match) for _, match in solved]).astype(np.int64)
         row = np.concatenate([field.rows[k][match.centroid] for k, match in solved] or empty)
         star = np.concatenate([match.star for _, match in solved] or empty)
-        bad = self._distance_px(frame, row, star) > WRONG_PX
+        table = self.frames.centroids
+        place = true_pixels(self.truth, self.frames.rotations[frame], self.stars.directions_icrs[star])
+        # Nowhere near is also wrong.
+        bad = ~(np.hypot(table.x_px[row] - place[:, 0], table.y_px[row] - place[:, 1]) <= WRONG_PX)
         wrong = np.bincount(frame[bad], minlength=n) > 0
         correct = (np.bincount(frame, minlength=n) > 0) & ~wrong
         return FieldIdentification(camera, tolerance_px, frame, row, star, correct, wrong)
-
-    def _distance_px(self, frame: IntArray, row: IntArray, star: IntArray) -> FloatArray:
-        table = self.frames.centroids
-        xy = np.column_stack([table.x_px[row], table.y_px[row]])
-        place = true_pixels(self.truth, self.frames.rotations[frame], self.stars.directions_icrs[star])
-        distance: FloatArray = np.nan_to_num(np.hypot(*(xy - place).T), nan=np.inf)
-        return distance
 
 
 def true_pixels(truth: Camera, rotations: FloatArray, directions: FloatArray) -> FloatArray:
@@ -108,13 +104,7 @@ def identify_all(
     workers: int | None,
     progress: Progress | None,
 ) -> list[FieldIdentification]:
-    """Identify the frames once for each job (camera, tolerance in px).
-
-    Raises
-    ------
-    KeyboardInterrupt
-        After Ctrl-C.
-    """
+    """Identify the frames once for each job (camera, tolerance in px)."""
     # One set of pairs serves all cameras, whose fields differ little.
     wide = CameraTolerance(0.03, 0.0, 0.0)
     proposer = prepare_engine("pyramid", stars, field_geometry(truth), wide, False, None)

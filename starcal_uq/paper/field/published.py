@@ -15,20 +15,13 @@ UNCALIBRATED, TRUE_CAMERA = "uncalibrated", "truth"
 # Rows of their Table 3, in order; the truth is ours, as a control.
 FIELD_METHODS = (UNCALIBRATED, LEAST_SQUARES, SAMAAN, PROPOSED)
 FIELD_CAMERAS = (*FIELD_METHODS, TRUE_CAMERA)
-RATE, PITCH, YAW, ROLL = "rate_percent", "pitch_arcsec", "yaw_arcsec", "roll_arcsec"
-AXES = (PITCH, YAW, ROLL)
-
-
-def _rows(rate: str, pitch: str, yaw: str, roll: str, method: str, row: int) -> tuple[Printed, ...]:
-    texts = {RATE: rate, PITCH: pitch, YAW: yaw, ROLL: roll}
-    return tuple(Printed(method, quantity, text, f"Table 3, row {row}") for quantity, text in texts.items())
-
-
-TABLE_3: tuple[Printed, ...] = (
-    *_rows("89", "65", "72", "127.2", UNCALIBRATED, 1),
-    *_rows("93", "45", "49", "69", LEAST_SQUARES, 2),
-    *_rows("95", "17", "21", "32", SAMAAN, 3),
-    *_rows("96", "10", "11", "16.2", PROPOSED, 4),
+RATE = "rate_percent"
+AXES = ("pitch_arcsec", "yaw_arcsec", "roll_arcsec")
+_ROWS = (("89", "65", "72", "127.2"), ("93", "45", "49", "69"), ("95", "17", "21", "32"), ("96", "10", "11", "16.2"))
+TABLE_3: tuple[Printed, ...] = tuple(
+    Printed(method, quantity, text, f"Table 3, row {number}")
+    for number, (method, row) in enumerate(zip(FIELD_METHODS, _ROWS, strict=True), 1)
+    for quantity, text in zip((RATE, *AXES), row, strict=True)
 )
 # Section 3.4: the sensor, its calibration by the proposed method, and the frames.
 FIELD_DEG, PIXEL_UM, FOCAL_MM, X0_PX, Y0_PX, K1, K2 = 10.8, 5.5, 44.38, 1142.06, 1058.62, -3.7e-9, 3.93e-16
@@ -38,24 +31,14 @@ N_CHOSEN, N_TAKEN, MORE_THAN_STARS = 200, 600, 6
 NOMINAL_FOCAL_MM = 44.0
 # Other data sheets, for comparison: the print rounded to 0.1 mm, and the next whole millimetre.
 OTHER_NOMINAL_FOCAL_MM = (44.4, 45.0)
-# Sides of the detector of which the window is a part: a common format of 5.5 um pixels.
-_DETECTOR_PX = 2048
 
 
 @dataclass(frozen=True)
 class FieldReading:
-    """One consistent sensor.
+    """One consistent sensor: its name, what it says, the pixels per side that are read out, and the first of them.
 
-    Attributes
-    ----------
-    name, words : str
-        Name and what it says.
-    side_px, offset_px : int
-        Pixels that are read out, per side, and the first of them on the detector: a pixel coordinate of the paper is
-        ours plus this.
-    limit_mag : float
-        Magnitude (Gaia G) of stars of which half are found. It makes about a third of random attitudes show more than
-        six stars, as many as were chosen of the paper's frames, 200 of 600.
+    A pixel coordinate of the paper is ours plus `offset_px`. Half of the stars of `limit_mag` (Gaia G) are found: about
+    a third of random attitudes then show more than six stars, as many as were chosen of the paper's frames, 200 of 600.
     """
 
     name: str
@@ -101,6 +84,7 @@ class FieldReading:
 # With this the default sensor finds half of the stars of this magnitude.
 _ZERO_POINT_E_S, _ZERO_POINT_MAG = 9.7e4, 4.9
 
+# The window is a part of a common format of 5.5 um pixels.
 READINGS: dict[str, FieldReading] = {
     "window": FieldReading(
         "window",
@@ -110,7 +94,7 @@ READINGS: dict[str, FieldReading] = {
         262,
         4.7,
     ),
-    "full": FieldReading("full", "All of a 2048 × 2048 detector is read out.", _DETECTOR_PX, 0, 4.05),
+    "full": FieldReading("full", "All of a 2048 × 2048 detector is read out.", 2048, 0, 4.05),
 }
 
 

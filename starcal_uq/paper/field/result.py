@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
+import pandas as pd
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.display import Shown
@@ -27,42 +27,19 @@ from starcal_uq.paper.field.frames import FieldFrames
 from starcal_uq.paper.field.identification import FieldIdentification
 from starcal_uq.paper.field.published import AXES, FIELD_METHODS, RATE, FieldReading, printed_field
 
-if TYPE_CHECKING:
-    import pandas as pd
-
 FIELD_REPORT = "field.html"
 AS_IT_STANDS, ALIGNED, BOTH, NEITHER = "against the true attitude", "after alignment", "either way", "no"
 
 
 @dataclass(frozen=True, eq=False)
 class FieldExperiment(Shown):
-    """The paper's field experiment, simulated.
+    """The paper's field experiment, simulated; the report is in the folder `path`.
 
-    Attributes
-    ----------
-    path : Path
-        Folder of the report, the tables and the figures.
-    reading : FieldReading
-        Reading of the printed sensor.
-    tolerance_px : float
-        Tolerance of the identification in the main table.
-    campaign, frames : FieldFrames
-        Frames of the calibration, and of the test.
-    campaign_counts : mapping of str to int
-        Frames of the calibration, those ``identified``, and the ``stars`` of these, of which so many are ``wrong``.
-    calibrations, cameras : mapping
-        Calibration of each method; each camera by its name: ``uncalibrated``, the three methods, ``truth``.
-    sweep : mapping
-        Identifications by camera and tolerance in px.
-    data_sheets : mapping
-        Identification and attitude errors of a camera with another nominal focal length (mm), at the tolerance of the
-        main table; no errors where no frame was identified.
-    stars, errors : mapping
-        Stars identified with each camera in the main table's frames, and the attitude errors.
-    replicates : FieldReplicates
-        Errors over repetitions.
-    provenance : dict
-        Seed, settings, versions, time and hash of the campaign.
+    Cameras go by their names: ``uncalibrated``, the three methods, ``truth``. `sweep` has the identifications by camera
+    and tolerance in px, of which `tolerance_px` is that of the main table; `stars` and `errors` are those of the main
+    table, for cameras that identified a frame. `data_sheets` has identification and, if there is any, attitude errors
+    of a camera with another nominal focal length (mm). `campaign` are the frames of the calibration, `campaign_counts`
+    how many there are, are ``identified``, and the ``stars`` of these, of which so many are ``wrong``.
     """
 
     path: Path
@@ -102,8 +79,6 @@ class FieldExperiment(Shown):
         about the mean over the frames; common (with its sign), rest, noise: the parts; agrees: whether the printed
         number is in the range, and in which one. Errors are root mean squares in arcsec.
         """
-        import pandas as pd
-
         return pd.DataFrame([self._row(method, name) for method in FIELD_METHODS for name in (RATE, *AXES)])
 
     def _row(self, method: str, quantity: str) -> AnyDict:
@@ -130,8 +105,6 @@ class FieldExperiment(Shown):
 
     def rates(self) -> pd.DataFrame:
         """Identification against tolerance: camera, tolerance_px, n_frames, correct, wrong, rate, low, high."""
-        import pandas as pd
-
         return pd.DataFrame(
             [
                 {"camera": camera, "tolerance_px": tolerance, **_counts(found)}
@@ -145,8 +118,6 @@ class FieldExperiment(Shown):
         Columns: camera, axis, rms, sum_of_squares (root of the squares of the three parts), aligned, common, rest,
         noise, and for each of the parts the range over repetitions in ``_low`` and ``_high``.
         """
-        import pandas as pd
-
         rows = []
         for camera, errors in self.errors.items():
             for index, axis in enumerate(AXES):
@@ -164,8 +135,6 @@ class FieldExperiment(Shown):
 
         The faults of an estimated camera make up for each other, so that together they do less than each alone.
         """
-        import pandas as pd
-
         rows = []
         for camera, stars in self.stars.items():
             faults = single_faults(self.reading.truth, self.cameras[camera])
@@ -178,8 +147,6 @@ class FieldExperiment(Shown):
 
     def other_data_sheets(self) -> pd.DataFrame:
         """Other nominal focal lengths: focal_mm, identification as in `rates`, errors after alignment (arcsec)."""
-        import pandas as pd
-
         rows = []
         for focal_mm, (found, errors) in self.data_sheets.items():
             aligned = np.full(3, np.nan) if errors is None else errors.aligned
@@ -189,8 +156,6 @@ class FieldExperiment(Shown):
 
     def camera_table(self) -> pd.DataFrame:
         """The cameras: camera, parameter, value, sigma (claimed; empty where none is), truth; px units."""
-        import pandas as pd
-
         truth = self.reading.truth
         true = dict(zip(truth.parameter_names, truth.theta.tolist(), strict=True))
         rows = []
@@ -204,8 +169,6 @@ class FieldExperiment(Shown):
 
     def frame_table(self) -> pd.DataFrame:
         """Every test frame with every camera: camera, frame, n_stars, correct, wrong, pitch, yaw, roll (arcsec)."""
-        import pandas as pd
-
         tables = []
         for camera in self.cameras:
             found = self.identified(camera)

@@ -1,4 +1,4 @@
-"""Figures of the reproduction of Ye & Yang 2017: their Fig. 3, their Figs. 4 to 6, and their numbers on one axis."""
+"""Figures of the paper's experiments: their Figs. 3 to 6 and printed numbers, the field, replicates, and the study."""
 
 from __future__ import annotations
 
@@ -7,13 +7,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.camera.distortion import parameters
+from starcal_uq.camera.distortion import Parameter, parameters
 from starcal_uq.core.constants import AXES
-from starcal_uq.core.formatting import significant
+from starcal_uq.core.formatting import fixed, significant
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.paper.errors import detector_grid, map_error, reprojection_error_px
 from starcal_uq.paper.field.published import FIELD_METHODS, RATE, printed_field
+from starcal_uq.paper.interaction import AXES as STUDY_AXES
 from starcal_uq.paper.published import PAPER_METHODS, printed
+from starcal_uq.paper.result import QUANTITIES, per_px
 from starcal_uq.paper.show.field import CAMERA_NAMES
 from starcal_uq.paper.show.tables import METHOD_NAMES, NAMES
 from starcal_uq.presentation.figures import style
@@ -28,7 +30,9 @@ if TYPE_CHECKING:
 
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.paper.field.result import FieldExperiment
+    from starcal_uq.paper.interaction import InteractionStudy
     from starcal_uq.paper.judgement import Judged
+    from starcal_uq.paper.replicates import Replicates
     from starcal_uq.paper.result import Reproduction
 
 # Points along each side of the maps of the error.
@@ -38,8 +42,8 @@ _ARROWS = 12
 # z-values within this are drawn to scale.
 _LINEAR_Z = 3.0
 _PALETTE = (style.VERMILLION, style.ORANGE, style.BLUE, style.GREEN, style.PURPLE, style.SKY)
-# Optics in the order of the paper's Fig. 3: unit, px to unit (unless mm), and end of the linear part of the axis.
-_ORDER = {"f": ("mm", 0.0, 1e-3), "x0": ("px", 1.0, 0.1), "y0": ("px", 1.0, 0.1)}
+# Optics in the order of the paper's Fig. 3: unit, and end of the linear part of the axis.
+_ORDER = {"f": ("mm", 1e-3), "x0": ("px", 0.1), "y0": ("px", 0.1)}
 
 
 def plot_trajectories(found: Reproduction) -> Figure:
@@ -50,21 +54,16 @@ def plot_trajectories(found: Reproduction) -> Figure:
     """
     run, truth = found.run, found.run.truth
     calibrations = {run.label(method): run.of(method) for method in PAPER_METHODS}
-    printed_values = {
-        run.label(method): [printed(method, name).value for name in ("f_mm", "x0_px", "y0_px")]
-        for method in PAPER_METHODS
-    }
     filters = [name for name, cal in calibrations.items() if any(s.name == "filter" for s in cal.stages)]
     colours = dict(zip(calibrations, _PALETTE, strict=False))
     names = [p.name for p in parameters("none")]
     figure = style.new_figure(10.0, 8.6)
     panels = figure.subplots(len(_ORDER), 2, sharey="row", sharex="col")
-    for row, (name, (unit, factor, threshold)) in enumerate(_ORDER.items()):
+    for row, (name, (unit, threshold)) in enumerate(_ORDER.items()):
         index = names.index(name)
-        true = float(truth.theta[index])
-        to_unit = truth.pixel_um / 1000.0 if name == "f" else factor
+        true, to_unit = float(truth.theta[index]), per_px(truth, name)
         by_iteration, by_frame = (style.dress(ax, grid=True) for ax in panels[row])
-        for label, cal in calibrations.items():
+        for method, (label, cal) in zip(PAPER_METHODS, calibrations.items(), strict=True):
             colour = colours[label]
             if label in filters:
                 _by_frame(by_frame, cal, index, true, to_unit, colour)
@@ -72,16 +71,10 @@ def plot_trajectories(found: Reproduction) -> Figure:
                 path = (np.concatenate([s.trajectory[:, index] for s in cal.stages]) - true) * to_unit
                 # First stages of several methods coincide: the shorter path is drawn as rings around the longer.
                 short = len(cal.stages) == 1
-                by_iteration.plot(
-                    path,
-                    color=colour,
-                    marker="o",
-                    markersize=7.5 if short else 3.6,
-                    markerfacecolor="none" if short else colour,
-                    linewidth=2.6 if short else 1.3,
-                    alpha=0.75 if short else 1.0,
-                )
-            value = printed_values[label][row] - true * to_unit
+                rings: AnyDict = {"markersize": 7.5, "markerfacecolor": "none", "linewidth": 2.6, "alpha": 0.75}
+                dots: AnyDict = {"markersize": 3.6, "linewidth": 1.3}
+                by_iteration.plot(path, color=colour, marker="o", **(rings if short else dots))
+            value = printed(method, QUANTITIES[name]).value - true * to_unit
             _mark(by_frame if label in filters else by_iteration, 1.0, value, colour, edge=True)
         for ax in (by_iteration, by_frame):
             ax.axhline(0.0, color=style.INK, linewidth=1.0, dashes=(4, 2))
@@ -114,17 +107,10 @@ def _by_frame(ax: Axes, cal: Calibration, index: int, true: float, to_unit: floa
 
 def _mark(ax: Axes, x: float, y: float, colour: str, *, edge: bool = False) -> None:
     """A printed value: at a place, or at the right edge for x = 1."""
-    options: AnyDict = {"marker": "<", "transform": ax.get_yaxis_transform(), "clip_on": False, "zorder": 5}
-    ax.plot(
-        x,
-        y,
-        markersize=7.0,
-        color=colour,
-        markeredgecolor=style.INK,
-        markeredgewidth=0.6,
-        linestyle="none",
-        **(options if edge else {"marker": ">"}),
-    )
+    options: AnyDict = {"marker": ">", "markersize": 7.0, "markeredgecolor": style.INK, "markeredgewidth": 0.6}
+    if edge:
+        options |= {"marker": "<", "transform": ax.get_yaxis_transform(), "clip_on": False, "zorder": 5}
+    ax.plot(x, y, color=colour, linestyle="none", **options)
 
 
 def _printed_key(marker: str, colour: str = style.GREY, text: str = "printed in the paper") -> Line2D:
@@ -215,31 +201,20 @@ def plot_printed_numbers(found: Reproduction) -> Figure:
     ax.axvspan(-_LINEAR_Z, _LINEAR_Z, color=style.GREEN, alpha=0.15, linewidth=0)
     ax.axvline(0.0, color=style.GREY, linewidth=0.8)
     ax.hlines(place, nearest, main, color=style.LIGHT, linewidth=1.6, zorder=1)
-    ax.plot(
-        nearest, place, "o", color="white", markeredgecolor=style.GREY, markersize=5.0, label="closest of all readings"
-    )
+    open_: AnyDict = {"color": "white", "markeredgecolor": style.GREY, "markersize": 5.0}
+    ax.plot(nearest, place, "o", label="closest of all readings", **open_)
     ax.plot(main, place, "o", color=style.BLUE, markersize=5.0, label="as printed (main reading)")
     reach = 1.6 * max(10.0, float(np.abs(main).max()))
     ax.set_xscale("symlog", linthresh=_LINEAR_Z, linscale=1.3)
     ax.set_xlim(-reach, reach)
-    powers = 10.0 ** np.arange(1, np.floor(np.log10(reach)) + 1)
-    ticks = [*(-powers[::-1]), -3.0, 0.0, 3.0, *powers]
-    ax.set_xticks(ticks, [f"{tick:g}".replace("-", "−") for tick in ticks])
-    ax.set_xticks([], minor=True)
+    signed_ticks(ax, reach, (-_LINEAR_Z, 0.0, _LINEAR_Z))
     ax.set_yticks(place, [_axis_name(one) for one in judged])
     ax.tick_params(axis="y", length=0.0)
     ax.set_ylim(-0.7, len(judged) - 0.3)
     ax.grid(True, axis="y", color=style.LIGHT, linewidth=0.5)
     ax.set_axisbelow(True)
     style.label(ax, "", "(printed − our mean) / standard deviation of a new run")
-    figure.legend(
-        *ax.get_legend_handles_labels(),
-        loc="outside upper center",
-        ncols=2,
-        fontsize=style.LABEL_SIZE,
-        frameon=False,
-        labelcolor=style.INK,
-    )
+    style.legend_above(figure, ax.get_legend_handles_labels()[0], fontsize=style.LABEL_SIZE)
     return figure
 
 
@@ -268,14 +243,8 @@ def plot_rates(found: FieldExperiment) -> Figure:
     figure = style.new_figure(8.6, 4.6)
     ax = style.dress(figure.add_subplot(), grid=True)
     ax.axvline(main_px, color=style.GREY, linewidth=1.0, dashes=(4, 3))
-    ax.annotate(
-        "main table",
-        (main_px, 0.0),
-        xytext=(4, 3),
-        textcoords="offset points",
-        fontsize=style.TICK_SIZE,
-        color=style.GREY,
-    )
+    small: AnyDict = {"textcoords": "offset points", "fontsize": style.TICK_SIZE, "color": style.GREY}
+    ax.annotate("main table", (main_px, 0.0), xytext=(4, 3), **small)
     for number, (name, colour) in enumerate(_COLOURS.items()):
         rows = rates[rates["camera"] == name].sort_values("tolerance_px")
         x = rows["tolerance_px"].to_numpy() * _SPREAD ** (number - 2)
@@ -285,15 +254,11 @@ def plot_rates(found: FieldExperiment) -> Figure:
         if name in FIELD_METHODS:
             _mark(ax, 1.0, printed_field(name, RATE).value, colour, edge=True)
     ax.set_xscale("log")
-    ticks = sorted(set(rates["tolerance_px"]))
-    ax.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-    ax.xaxis.minorticks_off()
+    plain_ticks(ax, sorted(set(rates["tolerance_px"])))
     ax.set_ylim(0.0, 102.0)
     style.label(ax, x="tolerance: displacement in the corner that the camera may be wrong by [px]", y="identified [%]")
-    keys = [
-        style.key(CAMERA_NAMES[name], colour, marker="o", markersize=4.0, linewidth=1.4)
-        for name, colour in _COLOURS.items()
-    ]
+    line: AnyDict = {"marker": "o", "markersize": 4.0, "linewidth": 1.4}
+    keys = [style.key(CAMERA_NAMES[name], colour, **line) for name, colour in _COLOURS.items()]
     style.legend_above(figure, [*keys, _printed_key("<")])
     return figure
 
@@ -338,3 +303,237 @@ def _camera_column(ax: Axes, place: int, row: pd.Series) -> None:
         ax.errorbar(place + x, value, error, color=colour, marker=marker, markersize=5.5, linestyle="", elinewidth=1.2)
     for part, (colour, _) in _PARTS.items():
         ax.plot(place + 0.22, abs(float(row[part])), marker="_", markersize=9.0, markeredgewidth=2.4, color=colour)
+
+
+# Errors up to this many bounds are drawn to scale, larger ones on a logarithmic axis.
+_LINEAR = 4.0
+_RIGHT, _WRONG = style.BLUE, style.VERMILLION
+
+
+def plot_replicates(found: Replicates) -> Figure:
+    """Errors and widths of every method, one column of panels for each parameter, in units of the Cramer-Rao bound.
+
+    Above, the mean error (dot) with the spread of the estimates (thick bar) and the claimed standard deviation (thin
+    bar with caps); the grey band is the bound around the truth. The axis is to scale near the truth and logarithmic
+    beyond, where the mean error is also given as a number. Below, the widths alone: spread with its 95 % interval
+    (dot), claim (diamond) and, where there is one, the claim by the formula of the textbooks (cross). Claims that the
+    tests reject are red.
+    """
+    columns = parameters(found.truth.distortion)
+    rows = found.table().to_dict("records")
+    labels = found.labels
+    figure = style.new_figure(2.0 + 2.15 * len(columns), 1.5 + 0.62 * len(labels))
+    panels = figure.subplots(2, len(columns), squeeze=False, sharey=True)
+    for j, parameter in enumerate(columns):
+        some = [row for row in rows if row["parameter"] == parameter.name]
+        places = [len(labels) - 1 - labels.index(row["method"]) for row in some]
+        _errors(panels[0, j], some, places, parameter)
+        _widths(panels[1, j], some, places)
+        for ax in panels[:, j]:
+            ax.set_ylim(-0.6, len(labels) - 0.4)
+            ax.set_yticks(range(len(labels)), labels[::-1])
+            ax.tick_params(axis="y", length=0.0)
+    middle = len(columns) // 2
+    style.label(panels[0, middle], x="error / Cramer-Rao bound (to scale up to ±4, logarithmic beyond)")
+    style.label(panels[1, middle], x="standard deviation / Cramer-Rao bound")
+    _legend(figure, found)
+    return figure
+
+
+def _errors(ax: Axes, rows: list[AnyDict], places: list[int], parameter: Parameter) -> None:
+    style.dress(ax)
+    ax.axvspan(-1.0, 1.0, color=style.LIGHT, linewidth=0)
+    ax.axvline(0.0, color=style.GREY, linewidth=0.7)
+    reach = 0.0
+    for row, place in zip(rows, places, strict=True):
+        bias, spread, claimed = (row[name] / row["crlb"] for name in ("bias", "spread", "claimed"))
+        colour = _WRONG if row["claim_wrong"] else _RIGHT
+        ends = [bias - spread, bias + spread]
+        ax.plot(ends, [place + 0.12] * 2, color=style.SKY, linewidth=4.0, solid_capstyle="butt")
+        ax.errorbar(bias, place - 0.18, xerr=claimed, color=colour, linewidth=1.1, capsize=2.5, fmt="none")
+        ax.plot(bias, place + 0.12, "o", color=style.INK, markersize=3.5)
+        if abs(bias) > _LINEAR:
+            # The logarithmic part has few ticks.
+            side = -1.0 if bias > 0.0 else 1.0
+            ax.annotate(
+                fixed(bias, 0),
+                (bias + side * max(spread, claimed), place),
+                xytext=(side * 5.0, 0.0),
+                textcoords="offset points",
+                ha="right" if side < 0.0 else "left",
+                va="center",
+                fontsize=style.TICK_SIZE - 1.0,
+                color=style.GREY,
+            )
+        reach = max(reach, abs(bias) + max(spread, claimed))
+    _signed_axis(ax, reach)
+    style.label(ax, parameter.latex)
+
+
+def _signed_axis(ax: Axes, reach: float) -> None:
+    if reach <= _LINEAR:
+        ax.set_xlim(-_LINEAR, _LINEAR)
+        plain_ticks(ax, (-3.0, 0.0, 3.0))
+    else:
+        ax.set_xscale("symlog", linthresh=_LINEAR, linscale=1.2)
+        ax.set_xlim(-1.5 * reach, 1.5 * reach)
+        signed_ticks(ax, 1.5 * reach, (0.0,))
+
+
+def signed_ticks(ax: Axes, reach: float, inner: Sequence[float]) -> None:
+    """Powers of ten up to the reach on both sides of some inner ticks."""
+    powers = 10.0 ** np.arange(1, np.floor(np.log10(reach)) + 1)
+    plain_ticks(ax, [*(-powers[::-1]), *inner, *powers])
+
+
+def plain_ticks(ax: Axes, ticks: Sequence[float] | FloatArray) -> None:
+    """Ticks along x that say plain numbers, and no others."""
+    ax.set_xticks(ticks, [f"{tick:g}".replace("-", "−") for tick in ticks])
+    ax.set_xticks([], minor=True)
+
+
+def _widths(ax: Axes, rows: list[AnyDict], places: list[int]) -> None:
+    style.dress(ax)
+    ax.axvline(1.0, color=style.GREY, linewidth=0.9)
+    smallest, largest = 1.0, 1.0
+    for row, place in zip(rows, places, strict=True):
+        spread, claimed, classical = (row[name] / row["crlb"] for name in ("spread", "claimed", "claimed_classical"))
+        colour = _WRONG if row["claim_wrong"] else _RIGHT
+        ends = [1.0 / np.sqrt(row[f"efficiency_{end}"]) for end in ("high", "low")]
+        ax.plot(ends, [place + 0.12] * 2, color=style.SKY, linewidth=4.0, solid_capstyle="butt")
+        ax.plot(spread, place + 0.12, "o", color=style.INK, markersize=3.5)
+        ax.plot(claimed, place - 0.18, "D", color=colour, markersize=4.0)
+        shown = [*ends, claimed]
+        if np.isfinite(classical):
+            ax.plot(classical, place - 0.18, "x", color=_WRONG if row["classical_wrong"] else _RIGHT, markersize=4.5)
+            shown.append(classical)
+        smallest, largest = min(smallest, *shown), max(largest, *shown)
+    ax.set_xscale("log")
+    low, high = 0.8 * smallest, 1.25 * largest
+    ax.set_xlim(low, high)
+    ticks = [tick for tick in (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0, 100.0) if low <= tick <= high]
+    plain_ticks(ax, ticks)
+
+
+def _legend(figure: Figure, found: Replicates) -> None:
+    from matplotlib.patches import Patch
+
+    handles = [
+        style.key("mean error; spread", style.INK, marker="o", linestyle="", markersize=4),
+        style.key("± spread; its 95 % interval", style.SKY, linewidth=4),
+        style.key("claimed", _RIGHT, marker="D", markersize=4),
+        style.key("claimed by the textbook's formula", _RIGHT, marker="x", linestyle="", markersize=5),
+        style.key("claims that the tests reject", _WRONG, linewidth=1.5),
+        Patch(color=style.LIGHT, label="Cramer-Rao bound"),
+    ]
+    frames = found.provenance["settings"].get("n_frames")
+    title = f"{found.n_replicates} replicates" + ("" if frames is None else f" of {frames} frames")
+    style.legend_above(figure, handles, title=title, title_fontsize=style.TITLE_SIZE)
+
+
+# Label and title of each axis of the study.
+_AXES = {
+    "distortion": ("displacement at the corner [px]", "Size of the distortion"),
+    "field": ("full field [deg], as many stars", "Field of view"),
+    "frames": ("frames", "Number of frames"),
+    "stars": ("mean stars in a frame", "Stars in a frame"),
+}
+_METHOD_COLOURS = {
+    "least squares": style.VERMILLION,
+    "samaan": style.ORANGE,
+    "three stages": style.BLUE,
+    "efficient": style.GREEN,
+}
+_MARKERS = {"least squares": "o", "samaan": "s", "three stages": "^", "efficient": "D"}
+# Biases this far below the smallest spread are rounding; they are counted in words rather than drawn.
+_FLOOR = 0.2
+# Spread over noise from which on both are drawn.
+_APART = 1.3
+
+
+def plot_interaction(study: InteractionStudy) -> Figure:
+    """Size of the bias and spread of x0, y0 and f for every method, along the four axes.
+
+    Solid lines are the bias (from data without noise), dashed ones the spread (with noise). Where the bias depends on
+    where the stars are, the spread holds more than the noise, which is then dotted. Where a solid line is above the
+    noise of its colour, the interaction costs more than noise. Biases far below every spread are not drawn: the methods
+    that have them are named in the first panel.
+    """
+    table = study.table
+    optics = [p for p in parameters("none") if p.name in set(table["parameter"])]
+    methods = list(dict.fromkeys(table["method"]))
+    figure = style.new_figure(12.5, 0.9 + 2.55 * len(optics))
+    panels = figure.subplots(len(optics), len(_AXES), squeeze=False, sharex="col", sharey="row")
+    for i, parameter in enumerate(optics):
+        rows = table[table["parameter"] == parameter.name]
+        spread = rows["spread"][rows["spread"] > 0.0]
+        low = _FLOOR * float(spread.min())
+        high = 2.5 * max(float(rows["bias"].abs().max()), float(spread.max()))
+        for j, (axis, (words, title)) in enumerate(_AXES.items()):
+            ax, column = style.dress(panels[i, j], grid=True), STUDY_AXES[axis]
+            some = rows[rows["axis"] == axis].sort_values(column, kind="stable")
+            _panel(ax, some, column, methods, low, j == 0)
+            ax.set_yscale("log")
+            ax.set_ylim(low, high)
+            last = i == len(optics) - 1
+            style.label(ax, title if i == 0 else "", words if last else "", f"{parameter.latex} [px]" if j == 0 else "")
+    for j, axis in enumerate(_AXES):
+        _scale(panels[0, j], table[table["axis"] == axis][STUDY_AXES[axis]].to_numpy())
+    _interaction_legend(figure, methods)
+    return figure
+
+
+def _panel(ax: Axes, rows: pd.DataFrame, column: str, methods: list[str], low: float, named: bool) -> None:
+    unseen = []
+    for method in methods:
+        curve = rows[rows["method"] == method]
+        curve = curve[np.isfinite(curve["spread"])]
+        if curve.empty:
+            continue
+        at, bias = curve[column].to_numpy(), curve["bias"].abs().to_numpy()
+        colour = _METHOD_COLOURS.get(method, style.GREY)
+        ax.plot(at, curve["spread"], "--", color=colour, linewidth=1.1)
+        if np.max(curve["spread"] / curve["noise"]) > _APART:
+            ax.plot(at, curve["noise"], ":", color=colour, linewidth=1.3)
+        if np.max(bias) < low:
+            unseen.append(method)
+            continue
+        marker = _MARKERS.get(method, "o")
+        # A bias of zero has no place on the axis; the line then starts from below it.
+        ax.plot(at, np.maximum(bias, 1e-3 * low), "-", color=colour, linewidth=1.4, marker=marker, markersize=3.5)
+    if unseen and named:
+        words, small = f"bias too small to show: {', '.join(unseen)}", style.TICK_SIZE - 1.0
+        ax.text(0.03, 0.03, words, transform=ax.transAxes, fontsize=small, color=style.GREY)
+
+
+def _scale(ax: Axes, at: FloatArray) -> None:
+    """Logarithmic, with a place for zero where the axis starts there; ticks that say plain numbers."""
+    if len(at) == 0:
+        return
+    positive = np.unique(at[at > 0.0])
+    if at.min() <= 0.0 and len(positive):
+        ax.set_xscale("symlog", linthresh=float(positive[0]), linscale=0.4)
+        ax.set_xlim(-0.1 * float(positive[0]), 1.4 * float(positive[-1]))
+    else:
+        ax.set_xscale("log")
+    ticks = _ticks(positive) if len(positive) else positive
+    plain_ticks(ax, [*([0.0] if at.min() <= 0.0 else []), *ticks])
+
+
+def _ticks(values: FloatArray) -> FloatArray:
+    """Round numbers within the range: decades where it is wide, also 2 and 5 where it is not."""
+    low, high = np.log10(values[0]), np.log10(values[-1])
+    steps = (1.0,) if high - low > 2.2 else (1.0, 3.0) if high - low > 1.5 else (1.0, 2.0, 5.0)
+    decades = 10.0 ** np.arange(np.floor(low) - 1.0, np.ceil(high) + 1.0)
+    candidates: FloatArray = np.sort(np.outer(decades, steps).ravel())
+    chosen: FloatArray = candidates[(candidates > 0.95 * values[0]) & (candidates < 1.05 * values[-1])]
+    return chosen
+
+
+def _interaction_legend(figure: Figure, methods: list[str]) -> None:
+    handles = [
+        style.key(m, _METHOD_COLOURS.get(m, style.GREY), marker=_MARKERS.get(m, "o"), markersize=4) for m in methods
+    ]
+    lines = {"-": "bias", "--": "spread", ":": "noise alone, where it differs from the spread"}
+    handles += [style.key(text, style.INK, linestyle=line) for line, text in lines.items()]
+    style.legend_above(figure, handles)

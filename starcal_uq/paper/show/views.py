@@ -10,7 +10,7 @@ from starcal_uq.paper.field.result import FieldExperiment
 from starcal_uq.paper.interaction import InteractionStudy
 from starcal_uq.paper.replicates import Replicates
 from starcal_uq.paper.result import Reproduction
-from starcal_uq.paper.show import field, figures, study_figures, tables
+from starcal_uq.paper.show import field, figures, tables
 from starcal_uq.presentation.html import card
 from starcal_uq.presentation.tables import TextTable
 
@@ -30,12 +30,12 @@ VIEWS: Mapping[type, View] = {
         error_fields=figures.plot_error_fields,
         printed_numbers=figures.plot_printed_numbers,
     ),
-    Replicates: _view("Replicates", tables.replicates_text, tables.replicates, spread=study_figures.plot_replicates),
+    Replicates: _view("Replicates", tables.replicates_text, tables.replicates, spread=figures.plot_replicates),
     InteractionStudy: _view(
         "Interaction of optics and distortion",
         tables.study_text,
         tables.thresholds,
-        bias=study_figures.plot_interaction,
+        bias=figures.plot_interaction,
     ),
     FieldExperiment: _view(
         "Field experiment of Ye & Yang 2017",
