@@ -89,14 +89,6 @@ class Jackknife(Shown):
         """Factors (p,) by which the formal standard deviations grow if the inflation is accepted; at least 1."""
         return np.maximum(self.ratio, 1.0)
 
-    @property
-    def inflated_covariance(self) -> FloatArray:
-        """Formal covariance (p, p) with its standard deviations times `factors` and its correlations as they are.
-
-        The jackknife's own matrix has rank K - 1 at most and noisy correlations; this one stays positive definite.
-        """
-        return self.formal_covariance * np.outer(self.factors, self.factors)
-
     def to_dataframe(self) -> pd.DataFrame:
         """One row per parameter: formal, jackknife and cluster-robust sigma, their ratios, the factor."""
         import pandas as pd

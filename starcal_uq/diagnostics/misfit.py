@@ -209,9 +209,8 @@ class _Sums:
     def _add(self, part: MarginalLikelihood, state: Any, theta: FloatArray, rows: slice) -> None:
         weight = part.frames.weight
         h = part.derivatives(theta, state)
-        pixels = part.frames.pixel - (state.e if weight is None else state.e / weight)
-        plain = h if weight is None else h / weight
-        view = View(rows, part, state, plain, pixels - theta[:2, None])
+        pixels = part.frames.pixel - part.frames.in_pixels(state.e)
+        view = View(rows, part, state, part.frames.in_pixels(h), pixels - theta[:2, None])
         columns = np.concatenate([family.columns(view) for family in self.families])
         if weight is not None:
             columns = columns * weight

@@ -180,8 +180,7 @@ class _TermColumns:
             theta = np.array([own.get(name, 0.0) for name in names])
             richer = MarginalLikelihood(view.part.frames, model_name)
             columns.append(richer.derivatives(theta, view.state)[3 + index])
-        stacked = np.stack(columns)
-        return stacked if view.part.frames.weight is None else stacked / view.part.frames.weight
+        return view.part.frames.in_pixels(np.stack(columns))
 
 
 def _axes(camera: Camera) -> Shape:
@@ -204,7 +203,7 @@ def _aberration() -> Shape:
         for axis in range(3):
             towards = frames.spread(np.ascontiguousarray(state.rotations[:, :, axis].T))
             found[axis] = np.einsum("ixn,in->xn", state.attitude, np.cross(b, towards, axis=0))
-        return found if frames.weight is None else found / frames.weight
+        return frames.in_pixels(found)
 
     labels = tuple((f"velocity along {axis}", "km/s") for axis in ("ICRS x", "ICRS y", "ICRS z"))
     return Shape("aberration of a constant velocity", "direction", 3, columns, labels, (LIGHT_SPEED_KM_S,) * 3)
@@ -255,7 +254,7 @@ def _phase(axis: int) -> Shape:
 
     def columns(view: View) -> FloatArray:
         # Whole pixels drop out of the waves, so the position on the detector stands for its fraction.
-        centre = view.part.frames.pixel[axis] - _residual(view)[axis]
+        centre = view.part.frames.pixel[axis] - view.part.frames.in_pixels(view.state.e)[axis]
         waves = [f(2.0 * np.pi * h * centre) for h in range(1, _HARMONICS + 1) for f in (np.sin, np.cos)]
         found = np.zeros((len(waves), 2, len(centre)))
         found[:, axis] = waves
@@ -265,11 +264,6 @@ def _phase(axis: int) -> Shape:
     size = 2 * _HARMONICS
     against = f"pixel phase in {name}"
     return Shape(f"error with the pixel phase in {name}", against, size, columns, labels, (1.0,) * size)
-
-
-def _residual(view: View) -> FloatArray:
-    weight = view.part.frames.weight
-    return view.state.e if weight is None else view.state.e / weight
 
 
 def _magnitude(z: FloatArray, camera: Camera) -> Shape:
@@ -302,7 +296,7 @@ def _cells(obs: Observations, camera: Camera, max_cells: int) -> Shape:
     nx, ny = (int(np.ceil(side / cell - 1e-9)) for side in (camera.width_px, camera.height_px))
 
     def columns(view: View) -> FloatArray:
-        x, y = view.part.frames.pixel - _residual(view)
+        x, y = view.part.frames.pixel - view.part.frames.in_pixels(view.state.e)
         column = np.clip(((x + 0.5) / cell).astype(int), 0, nx - 1)
         row = np.clip(((y + 0.5) / cell).astype(int), 0, ny - 1)
         inside = (row * nx + column)[None] == np.arange(nx * ny)[:, None]

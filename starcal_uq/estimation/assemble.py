@@ -69,9 +69,7 @@ def assemble(
         theta = theta - 0.5 * compressed.whitening @ compressed.log_determinant_slope
     state, cost = likelihood.profile(theta, likelihood.rotations_at(theta))
     response = likelihood.attitude_response(state, likelihood.derivatives(theta, state))
-    weight = likelihood.frames.weight
     camera = nominal.with_theta(theta)
-    residuals = state.e if weight is None else state.e / weight
     record: dict[str, Any] = {"method": method, "solver": solver, "distortion": nominal.distortion}
     return Calibration(
         camera=camera,
@@ -82,12 +80,12 @@ def assemble(
         covariance=efficient if refined else pair_covariance,
         sigma=sigma,
         sigma_std=sigma / float(np.sqrt(2.0 * dof)),
-        sigma_name=sigma_parameter(weight is not None).name,
+        sigma_name=sigma_parameter(likelihood.frames.weight is not None).name,
         stages=tuple(stages),
         status=check_camera(camera, status),
         frame_ids=obs.frame_ids,
         quaternions=rotation_to_quaternion(state.rotations),
-        residuals_px=residuals.T,
+        residuals_px=likelihood.frames.in_pixels(state.e).T,
         chi2=cost,
         dof=dof,
         information=normal.matrix / sigma**2,
@@ -105,16 +103,14 @@ def noise_px(likelihood: MarginalLikelihood, theta: FloatArray) -> float:
     state, cost = likelihood.profile(theta)
     if not np.isfinite(cost):
         return float("inf")
-    weight = likelihood.frames.weight
-    return float(np.sqrt(np.mean((state.e if weight is None else state.e / weight) ** 2)))
+    return float(np.sqrt(np.mean(likelihood.frames.in_pixels(state.e) ** 2)))
 
 
 def check_camera(camera: Camera, status: Status) -> Status:
     """`status`, unless the principal point left the detector or the distortion folds over inside the field."""
     if not status.ok:
         return status
-    x0, y0 = camera.theta[:2]
-    if not (-0.5 <= x0 <= camera.width_px - 0.5 and -0.5 <= y0 <= camera.height_px - 0.5):
+    if not camera.contains(camera.theta[:2]):
         return Status.OUTSIDE_DETECTOR
     if fold_radius_px(camera.distortion, camera.theta, camera.corner_radius_px) <= camera.corner_radius_px:
         return Status.FOLDED

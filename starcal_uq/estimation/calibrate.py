@@ -167,9 +167,7 @@ def _robust(
     if not np.isfinite(state.value) or is_singular(information.matrix):
         reason = status if not status.ok else Status.SINGULAR
         raise CalibrationError(f"the calibration failed ({reason.name}): {reason.remedy}.", reason)
-    weight = frames.weight
     result = camera.with_theta(theta)
-    residuals = state.e if weight is None else state.e / weight
     settings: dict[str, object] = {"method": "efficient", "solver": solver, "distortion": model}
     settings |= {"likelihood": "student_t", "dof": "free" if nu is None else nu}
     record = provenance(None, settings, obs.data_hash)
@@ -183,12 +181,12 @@ def _robust(
         covariance=found.covariance,
         sigma=sigma,
         sigma_std=found.sigma_std,
-        sigma_name=sigma_parameter(weight is not None).name,
+        sigma_name=sigma_parameter(frames.weight is not None).name,
         stages=(*start.stages, found.stage),
         status=check_camera(result, status),
         frame_ids=obs.frame_ids,
         quaternions=rotation_to_quaternion(state.rotations),
-        residuals_px=residuals.T,
+        residuals_px=frames.in_pixels(state.e).T,
         chi2=float(np.sum(state.weight * state.e**2)),
         dof=state.dof - len(theta),
         information=information.matrix,

@@ -204,9 +204,7 @@ def _frames(
         )
     likelihood = MarginalLikelihood(observations, calibrations[0].camera.distortion)
     state, _ = likelihood.profile(theta)
-    weight = likelihood.frames.weight
-    residuals = state.e if weight is None else state.e / weight
-    return rotation_to_quaternion(state.rotations), residuals.T
+    return rotation_to_quaternion(state.rotations), likelihood.frames.in_pixels(state.e).T
 
 
 def _provenance(

@@ -9,7 +9,7 @@ from time import perf_counter
 import numpy as np
 
 from starcal_uq.attitude.wahba import quest
-from starcal_uq.camera.projection import backward_kernel, backward_root
+from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import BoolArray, FloatArray
@@ -75,8 +75,7 @@ def star_scores(frames: StarFrames, model_name: str, theta: FloatArray) -> Float
     More than half of a frame's angles to a right star are right where more than half of its stars are, whatever the
     rest is: no attitude is needed, and no single star decides.
     """
-    root = backward_root(model_name, theta, frames.pixel)
-    (b,) = backward_kernel(model_name, False)(frames.n_stars, theta, frames.pixel, root)
+    b = unproject_theta(model_name, theta, frames.pixel.T).T
     scores = np.empty(frames.n_stars)
     for start, stop in zip(frames.starts[:-1], frames.starts[1:], strict=True):
         mine = slice(int(start), int(stop))
@@ -92,14 +91,17 @@ def star_scores(frames: StarFrames, model_name: str, theta: FloatArray) -> Float
 def usable_stars(frames: StarFrames, model_name: str, theta: FloatArray) -> BoolArray:
     """Stars of frames in which at least three agree with the others, so that there is an attitude to speak of."""
     scores = star_scores(frames, model_name, theta)
-    agreeing = (scores <= _DISTRUST * np.median(scores)).astype(np.float64)
-    return np.asarray(frames.spread(frames.sum(agreeing)) >= 3.0)
+    return _in_threes(frames, scores <= _DISTRUST * np.median(scores))
 
 
 def subset(frames: StarFrames, kept: BoolArray) -> StarFrames:
     """Some of the stars, without frames that keep fewer than three."""
-    enough = frames.spread(frames.sum(kept.astype(np.float64))) >= 3.0
-    return frames.select(kept & enough)
+    return frames.select(kept & _in_threes(frames, kept))
+
+
+def _in_threes(frames: StarFrames, kept: BoolArray) -> BoolArray:
+    """Stars (N,), kept or not, of frames that keep three or more."""
+    return np.asarray(frames.spread(frames.sum(kept.astype(np.float64))) >= 3.0)
 
 
 def robust_start(frames: StarFrames, model_name: str, theta: FloatArray, fit: FitStages) -> RobustStart:
@@ -136,13 +138,11 @@ def robust_start(frames: StarFrames, model_name: str, theta: FloatArray, fit: Fi
                 f"the calibration did not end well ({stages[-1].status.name}): {stages[-1].status.remedy}.",
                 stages[-1].status,
             )
-    root = backward_root(model_name, at, frames.pixel)
-    (b,) = backward_kernel(model_name, False)(frames.n_stars, at, frames.pixel, root)
-    enough = frames.spread(frames.sum(trusted.astype(np.float64))) >= 3.0
-    weight = np.where(trusted | ~enough, 1.0, _NEGLIGIBLE_WEIGHT)
+    weight = np.where(trusted | ~_in_threes(frames, trusted), 1.0, _NEGLIGIBLE_WEIGHT)
     if frames.weight is not None:
         weight = weight * frames.weight**2
-    rotations = quest(b.T, frames.r.T, frames.starts, weight, covariance=False, on_degenerate="flag").rotations
+    b = unproject_theta(model_name, at, frames.pixel.T)
+    rotations = quest(b, frames.r.T, frames.starts, weight, covariance=False, on_degenerate="flag").rotations
     return RobustStart(stages, trusted, subset(frames, trusted), rotations)
 
 
@@ -331,10 +331,9 @@ def compress_reweighted(fit: RobustFit) -> CompressedLikelihood:
     """
     frames, theta = fit.likelihood.frames, fit.stage.theta
     kept = fit.state.weight > _NEGLIGIBLE_WEIGHT
-    used = subset(frames, kept)
-    remaining = kept & (frames.spread(frames.sum(kept.astype(np.float64))) >= 3.0)
+    remaining = kept & _in_threes(frames, kept)
     stated = np.ones(frames.n_stars) if frames.weight is None else frames.weight
     weight = (stated * np.sqrt(fit.state.weight))[remaining]
     rotations = fit.state.rotations[frames.sum(remaining.astype(np.float64)) > 0.0]
-    likelihood = MarginalLikelihood(replace(used, weight=weight), fit.likelihood.model_name)
+    likelihood = MarginalLikelihood(replace(frames.select(remaining), weight=weight), fit.likelihood.model_name)
     return compress(likelihood, theta, fit.covariance, rotations)

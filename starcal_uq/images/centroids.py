@@ -147,12 +147,6 @@ class Centroids(FrameRows, Shown):
         return int(np.count_nonzero(self.problem != ""))
 
     @property
-    def covariance_px2(self) -> FloatArray:
-        """Covariance of each centroid, shape (N, 2, 2), square pixels."""
-        rows = [[self.var_x_px2, self.cov_xy_px2], [self.cov_xy_px2, self.var_y_px2]]
-        return np.moveaxis(np.array(rows), 2, 0)
-
-    @property
     def sigma_px(self) -> FloatArray:
         """Centroid noise per axis, shape (N,): the root of the mean of both variances, pixels."""
         sigma: FloatArray = np.sqrt(0.5 * (self.var_x_px2 + self.var_y_px2))
@@ -176,13 +170,6 @@ class Centroids(FrameRows, Shown):
         frames: AnyDict = {name: getattr(self, name)[kept] for name in FRAME_COLUMNS}
         rows: AnyDict = {name: getattr(self, name)[np.isin(self.frame, wanted)] for name in COLUMNS}
         return replace(self, **rows, **frames)
-
-    def brightest(self, n: int | None = None) -> Centroids:
-        """Each frame with its brightest stars first, and at most `n` of them."""
-        order = np.lexsort((-self.flux, self.frame))
-        if n is not None:
-            order = order[np.arange(len(order)) - self.frame_starts[np.searchsorted(self.frame_ids, self.frame)] < n]
-        return replace(self, **{name: getattr(self, name)[order] for name in COLUMNS})
 
     def with_meta(self, **entries: Any) -> Centroids:
         """The same table with entries of `meta` added or changed."""

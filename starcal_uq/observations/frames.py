@@ -84,6 +84,10 @@ class StarFrames:
         """Give every star the value of its frame: (..., K) to (..., N)."""
         return np.repeat(values, self.sizes, axis=-1)
 
+    def in_pixels(self, whitened: FloatArray) -> FloatArray:
+        """Values (..., N) in px that were divided by the stated noise, where there is one."""
+        return whitened if self.weight is None else whitened / self.weight
+
     def part(self, first: int, last: int) -> StarFrames:
         """Frames `first` up to, not including, `last`."""
         stars = slice(int(self.starts[first]), int(self.starts[last]))

@@ -111,7 +111,7 @@ def test_accepting_inflation_is_on_record_and_never_shrinks(obs, cal):
     assert np.all(accepted.sigmas >= cal.sigmas * (1.0 - 1e-12))
     assert accepted.correlation == pytest.approx(cal.correlation)
     assert set(accepted.provenance["settings"]["inflation"]) == set(cal.parameter_names)
-    assert np.all(np.linalg.eigvalsh(found.inflated_covariance / np.outer(cal.sigmas, cal.sigmas)) > 0.0)
+    assert np.all(np.linalg.eigvalsh(accepted.covariance / np.outer(cal.sigmas, cal.sigmas)) > 0.0)
     other = sc.calibrate(obs, nominal(camera("k1")))
     with pytest.raises(sc.errors.CalibrationError, match="same run"):
         accept_inflation(other, found)

@@ -197,7 +197,7 @@ def test_right_uncertainties_pass(good):
     assert good.ok, good.text
     assert (np.abs(good.coverage - 0.95) < 4 * np.sqrt(0.95 * 0.05 / 100)).all()
     assert abs(good.nees_ratio - 1.0) < 4 * np.sqrt(2 / 500)
-    assert abs(good.nees_calibration_ratio - good.nees_ratio) < 0.05
+    assert abs(good.nees_calibration.mean() / good.n_parameters - good.nees_ratio) < 0.05
     assert (good.rank_p_value > 1e-3).all()
     assert np.abs(good.compression_error).max() < 0.05
     assert "are right as far as" in good.text

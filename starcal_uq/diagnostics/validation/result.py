@@ -165,11 +165,6 @@ class Validation(Shown):
         return float(np.sqrt(np.mean(2.0 / p * (p + nu - 2.0) / (nu - 4.0)) / self.n_replicates))
 
     @property
-    def nees_calibration_ratio(self) -> float:
-        """As `nees_ratio`, for estimate and covariance of `calibrate`."""
-        return float(np.mean(self.nees_calibration)) / self.n_parameters
-
-    @property
     def nees_p_value(self) -> float:
         """p-value of a mean NEES of p, from the gamma distribution with the mean and variance that it should have."""
         from scipy.stats import gamma

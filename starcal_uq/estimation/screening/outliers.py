@@ -25,13 +25,13 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.screening.consensus import MIN_STARS
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.marginal import Profile
 
-MIN_STARS = 3
 # Beyond this distance from its prediction (rad) a star is not compared through the lens model, which is only made for
 # the field of view.
 _ELSEWHERE_RAD = 0.05

@@ -12,7 +12,8 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.files import ensure_new, write_csv
 from starcal_uq.core.formatting import join_words, percent
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
-from starcal_uq.estimation.screening.outliers import MIN_STARS, StarResiduals, star_threshold
+from starcal_uq.estimation.screening.consensus import MIN_STARS
+from starcal_uq.estimation.screening.outliers import StarResiduals, star_threshold
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -169,7 +170,6 @@ class Screening(Shown):
 
 def rejected_table(
     obs: Observations,
-    camera: Camera,
     residuals: StarResiduals,
     star_p_value: float,
     frame_p_value: float,

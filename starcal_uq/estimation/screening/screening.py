@@ -20,9 +20,8 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray
 from starcal_uq.estimation.calibrate import calibrate
-from starcal_uq.estimation.screening.consensus import consensus, measured_directions, pre_screen
+from starcal_uq.estimation.screening.consensus import MIN_STARS, consensus, measured_directions, pre_screen
 from starcal_uq.estimation.screening.outliers import (
-    MIN_STARS,
     StarResiduals,
     star_residuals,
     star_threshold,
@@ -133,7 +132,7 @@ def screen(
         # For the error alone.
         calibration = calibrate(kept, camera, **options)
     residuals = star_residuals(frames, calibration.camera.distortion, calibration.theta, use)
-    table = rejected_table(obs, calibration.camera, residuals, rates.star, rates.frame, rates.shrinkage)
+    table = rejected_table(obs, residuals, rates.star, rates.frame, rates.shrinkage)
     add_dropped_frames(table, obs, calibration.camera, tested.vote_rad, tested.disturbed, rates.frame)
     n_rejected = int(np.count_nonzero(~use))
     stable = n_changed == 0
