@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -370,8 +370,6 @@ def consistency_between(
 
 
 def _with_messages(consistency: Consistency) -> Consistency:
-    import dataclasses
-
     messages = []
     if consistency.p_value < ALPHA:
         messages.append(
@@ -386,7 +384,7 @@ def _with_messages(consistency: Consistency) -> Consistency:
             f"The runs differ in noise (p = {consistency.noise_p_value:.2g}; {values}): merge with noise 'own', which "
             "weights each run by its own."
         )
-    return dataclasses.replace(consistency, messages=tuple(messages))
+    return replace(consistency, messages=tuple(messages))
 
 
 def _bartlett(runs: Sequence[Optimum]) -> float:

@@ -66,16 +66,10 @@ class NoiseFloor:
 
 
 def noise_floor(cal: Calibration, obs: Observations, stated_px: FloatArray | None = None) -> NoiseFloor:
-    """The noise that the residuals of a calibration have beyond what the stars state.
+    """The noise that the residuals of a calibration have beyond what its observations state.
 
-    Parameters
-    ----------
-    cal : Calibration
-        Calibration of these observations.
-    obs : Observations
-        With `sigma_px` in every row: the weights of the calibration.
-    stated_px : (N,) array, optional
-        Noise that the stars state, px, where a floor is in `sigma_px` already.
+    `sigma_px` in every row are the weights of the calibration; `stated_px` (N,) is what the stars state, px, where a
+    floor is in `sigma_px` already.
 
     Raises
     ------

@@ -105,31 +105,11 @@ def match_frame(
     radial: bool = True,
     polished: bool = False,
 ) -> Match | None:
-    """Match all centroids of a frame and refine, with a gate that shrinks to the noise.
+    """Match all centroids of a frame, ideal pixels u (n, 2), and refine, with a gate that shrinks to the noise.
 
-    Parameters
-    ----------
-    u : (n, 2) array
-        Ideal pixels.
-    sigma_px : (n,) array
-        Noise per axis.
-    sky : NearbyStars
-        The catalogue.
-    start : CameraState
-        A first state.
-    tolerance : CameraTolerance
-        How far the camera may be from its nominal values.
-    mag : (n,) array, optional
-        Instrumental magnitudes, NaN where not known: doubtful matches of unlike brightness are left out.
-    radial : bool
-        Whether kappa is fitted.
-    polished : bool
-        Whether `start` is good to the noise already, so that the gate starts small.
-
-    Returns
-    -------
-    Match or None
-        None where fewer than four stars are matched.
+    With instrumental magnitudes (n,), NaN where not known, doubtful matches of unlike brightness are left out. `radial`
+    says whether kappa is fitted, and `polished` that `start` is good to the noise already, so that the gate starts
+    small. None where fewer than four stars are matched.
     """
     g = sky.geometry
     focal = g.focal_px * float(np.exp(start.shared[0]))

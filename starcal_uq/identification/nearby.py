@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from math import pi
 from typing import Any
 
@@ -15,17 +16,7 @@ _STARS_PER_CENTROID, _STARS_MORE = 2.0, 20
 
 
 class NearbyStars:
-    """A catalogue, searched to the depth that suits a frame.
-
-    Parameters
-    ----------
-    directions : (N, 3) array
-        Unit vectors.
-    mag : (N,) array
-        Magnitudes.
-    geometry : FieldGeometry
-        The field of view.
-    """
+    """A catalogue, unit vectors (N, 3) and magnitudes (N,), searched to the depth that suits a frame."""
 
     def __init__(self, directions: FloatArray, mag: FloatArray, geometry: FieldGeometry) -> None:
         self.rows: IntArray = np.argsort(mag, kind="stable").astype(np.int64)
@@ -43,8 +34,7 @@ class NearbyStars:
 
     def seen_by(self, geometry: FieldGeometry) -> NearbyStars:
         """The same catalogue for another camera."""
-        other = object.__new__(NearbyStars)
-        other.__dict__.update(self.__dict__)
+        other = copy(self)
         other.geometry = geometry
         return other
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from copy import copy
 from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Protocol
@@ -102,8 +103,7 @@ class FrameTable:
 
     def seen_by(self, camera: Camera) -> FrameTable:
         """The same frames in the ideal pixels of another camera."""
-        other = object.__new__(FrameTable)
-        other.__dict__.update(self.__dict__)
+        other = copy(self)
         other.camera, other.points = camera, other._ideal(camera)
         return other
 
@@ -127,16 +127,14 @@ class Search:
 
     def widened(self, factor: float) -> Search:
         """The same for a lens with more distortion."""
-        other = object.__new__(Search)
-        other.__dict__.update(self.__dict__)
+        other = copy(self)
         other.tolerance = replace(self.tolerance, distortion_px=self.tolerance.distortion_px * factor)
         other.centroids, other.triangles = _CENTROIDS[:1], _MAX_TRIANGLES_WIDE
         return other
 
     def narrowed(self, camera: Camera, covariance: FloatArray) -> Search:
         """The same for a camera known from the frames so far."""
-        other = object.__new__(Search)
-        other.__dict__.update(self.__dict__)
+        other = copy(self)
         sd = 4.0 * np.sqrt(np.diag(covariance))
         t = self.tolerance
         # Not below what a lens model with few terms leaves over.

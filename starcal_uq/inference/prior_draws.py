@@ -2,7 +2,7 @@
 
 A prior is checked in terms that can be judged by eye: fields of view, displacements at the corner, shifts of field
 positions. With observations, it is also checked against them: each drawn camera images the observed stars, and
-attitude- free summaries of such images are compared with those of the real one.
+attitude-free summaries of such images are compared with those of the real one.
 """
 
 from __future__ import annotations

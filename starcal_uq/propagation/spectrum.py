@@ -263,12 +263,6 @@ class ErrorSpectrum(Shown):
         return np.sqrt(self.variance_arcsec2)
 
     @property
-    def integral_arcsec2(self) -> FloatArray:
-        """Integral (3,) of the spectrum over all frequencies; equals `variance_arcsec2` if all is well."""
-        total: FloatArray = self.psd_arcsec2_hz.sum(axis=0) * self.frequency_hz[0]
-        return total
-
-    @property
     def correlation_time_s(self) -> FloatArray:
         """Lag (3,) at which the autocorrelation falls below 1/e, s; NaN where it never does."""
         return np.array([_crossing(self.lag_s, column) for column in self.autocorrelation.T])
@@ -309,12 +303,6 @@ class ErrorSpectrum(Shown):
         total = self.psd_arcsec2_hz.sum(axis=0)
         share: FloatArray = low / np.where(total > 0.0, total, np.nan)
         return share
-
-    def below_arcsec(self, frequency_hz: float) -> FloatArray:
-        """Standard deviation (3,) of the frame-dependent part at frequencies up to `frequency_hz`, arcsec."""
-        low = self.psd_arcsec2_hz[self.frequency_hz <= frequency_hz].sum(axis=0)
-        sigma: FloatArray = np.sqrt(low * self.frequency_hz[0])
-        return sigma
 
     def to_dataframe(self) -> pd.DataFrame:
         """One row per frequency and axis: ``frequency_hz``, ``axis``, ``rest_arcsec2_hz``, ``nea_arcsec2_hz``."""

@@ -22,25 +22,10 @@ _LEAST_STARS = 4
 
 
 def disturbed_stars(obs: Observations, stars: StarCatalogue, camera: Camera, psf_sigma_px: float = 1.0) -> BoolArray:
-    """Stars that a neighbour in the catalogue displaces by more than a fifth of their noise.
+    """Stars (N,) that a neighbour in the catalogue displaces by more than a fifth of their noise.
 
     The light centre of two stars at a distance d is displaced by ``d q / (1 + q)`` from the one, with q the ratio of
-    their fluxes.
-
-    Parameters
-    ----------
-    obs : Observations
-        Identified stars, with magnitudes of the catalogue and their noise.
-    stars : StarCatalogue
-        Catalogue that they were identified in; neighbours fainter than its limit are not known.
-    camera : Camera
-        For the scale.
-    psf_sigma_px : float
-        Width of the star images, px.
-
-    Returns
-    -------
-    mask : (N,) array of bool
+    their fluxes. Neighbours fainter than the catalogue's limit are not known.
     """
     from scipy.spatial import cKDTree
 

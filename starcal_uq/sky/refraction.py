@@ -28,26 +28,10 @@ _NEWTON_STEPS = 4
 
 
 def site_among_stars(site: Site, time_utc: Any, ut1_minus_utc_s: float = 0.0) -> tuple[FloatArray, FloatArray]:
-    """Zenith and velocity of a site, ICRS axes.
+    """Zenith and velocity of a site, ICRS axes, at one UTC time (shape (3,)) or a sequence (n, 3).
 
-    Parameters
-    ----------
-    site
-        The site.
-    time_utc
-        One UTC time or a sequence of n, as for `earth_velocity_km_s`.
-    ut1_minus_utc_s
-        UT1 - UTC, seconds; it turns the site together with its sky.
-
-    Returns
-    -------
-    zenith : ndarray, shape (3,) or (n, 3)
-        Unit vectors along the outward normal of the ellipsoid (WGS 84).
-    velocity_km_s : ndarray, shape (3,) or (n, 3)
-        Velocity relative to the Earth's centre, at most 0.465 km/s: the cause of diurnal aberration, 0.32 arcsec.
-
-    Notes
-    -----
+    The zenith is the outward normal of the ellipsoid (WGS 84); the velocity, relative to the Earth's centre, is at most
+    0.465 km/s: the cause of diurnal aberration, 0.32 arcsec. UT1 - UTC, seconds, turns the site together with its sky.
     Precession and nutation are those of IAU 2006/2000A (`erfa.c2t06a`); polar motion is left out.
     """
     import erfa

@@ -132,7 +132,8 @@ def test_slew_has_a_spectrum(cli, run, tmp_path):
     assert status == 0, err
     assert "correlat" in out or "frequenc" in out
     spectrum = sc.propagation.ErrorSpectrum.load(run / "error_spectrum.npz")
-    assert spectrum.integral_arcsec2 == pytest.approx(spectrum.variance_arcsec2, rel=1e-6)
+    integral_arcsec2 = spectrum.psd_arcsec2_hz.sum(axis=0) * spectrum.frequency_hz[0]
+    assert integral_arcsec2 == pytest.approx(spectrum.variance_arcsec2, rel=1e-6)
     for wrong, word in (("none.csv", "none.csv"), ("run/calibration.json", "calibration.json")):
         status, _, err = cli("propagate", "run", "--attitudes", wrong)
         assert status == 2
