@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Iterable
 from html import escape
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ from starcal_uq.presentation.tables import TextTable
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+    from markupsafe import Markup
 
 
 def card(title: str, text: str, *tables: TextTable) -> str:
@@ -25,17 +27,42 @@ def listed(messages: Iterable[str]) -> str:
     return f"<ul>{items}</ul>" if items else ""
 
 
+def symbol(name: str) -> Markup:
+    """A parameter's name as a mathematical symbol in HTML."""
+    from markupsafe import Markup, escape
+
+    if name == "sigma":
+        return Markup("<i>σ</i>")
+    if name == "sigma_scale":
+        return Markup("<i>s</i><sub>σ</sub>")
+    match = re.fullmatch(r"([a-z])(\d*)", name)
+    if match is None:
+        return Markup("{}").format(escape(name))
+    base = Markup("<i>{}</i>").format(match[1])
+    return base + Markup("<sub>{}</sub>").format(match[2]) if match[2] else base
+
+
+def on_page(table: TextTable, caption: str = "", kind: str = "") -> Markup:
+    """A table of a page, which may scroll: names of parameters as symbols, first column bold."""
+    from markupsafe import Markup
+
+    drawn = table.html(caption, kind, lambda name: f"<b>{symbol(name)}</b>")
+    return Markup(f'<div class="scroll">{drawn}</div>')
+
+
 def template_environment() -> Environment:
     """Jinja's environment for the templates of the package: everything is escaped, and a missing name is an error."""
     import jinja2
 
-    return jinja2.Environment(
+    environment = jinja2.Environment(
         loader=jinja2.PackageLoader("starcal_uq.presentation"),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
+    environment.filters |= {"symbol": symbol, "table": on_page}
+    return environment
 
 
 def embedded_image(png: bytes) -> dict[str, Any]:

@@ -13,10 +13,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from starcal_uq.core.formatting import MINUS, significant
+from starcal_uq.core.formatting import MINUS, pretty_unit, significant
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from starcal_uq.camera.distortion import Parameter
 
 
 @dataclass(frozen=True)
@@ -83,22 +85,28 @@ class TextTable:
             tuple(name.replace("_", " ") for name in names), rows, title, "".join("r" if n else "l" for n in numbers)
         )
 
-    def html(self) -> str:
-        """A ``<table>``; everything is escaped."""
-        classes = ['class="n"' if side == "r" else "" for side in self.align]
+    def html(self, caption: str | None = None, kind: str = "", name: Callable[[str], str] = html.escape) -> str:
+        """A ``<table>`` of a class; everything is escaped, but the first column is left to `name`."""
+        classes = [
+            'class="n"' if side == "r" else 'class="unit"' if head.lower() == "unit" else ""
+            for head, side in zip(self.heads, self.align, strict=True)
+        ]
         styles = ['style="text-align:right"' if side == "r" else 'style="text-align:left"' for side in self.align]
 
         def line(tag: str, cells: Sequence[str], mark: str = "") -> str:
+            shown = [name(cells[0]) if tag == "td" else html.escape(cells[0]), *map(html.escape, cells[1:])]
             parts = (
-                f"<{tag} {' '.join(filter(None, (k, s)))}>{html.escape(cell)}</{tag}>"
-                for cell, k, s in zip(cells, classes, styles, strict=True)
+                f"<{tag} {' '.join(filter(None, (k, s)))}>{cell}</{tag}>"
+                for cell, k, s in zip(shown, classes, styles, strict=True)
             )
             return f"<tr{f' class={mark!r}' if mark else ''}>{''.join(parts)}</tr>"
 
-        caption = f"<caption>{html.escape(self.title)}</caption>" if self.title else ""
+        title = self.title if caption is None else caption
+        above = f"<caption>{html.escape(title)}</caption>" if title else ""
+        opening = f'<table class="{kind}">' if kind else "<table>"
         marks = self.marks or ("",) * len(self.rows)
         body = "".join(line("td", row, mark) for row, mark in zip(self.rows, marks, strict=True))
-        return f"<table>{caption}<thead>{line('th', self.heads)}</thead><tbody>{body}</tbody></table>"
+        return f"{opening}{above}<thead>{line('th', self.heads)}</thead><tbody>{body}</tbody></table>"
 
     def latex(self) -> str:
         """A ``tabular`` with the rules of booktabs; everything is escaped."""
@@ -111,6 +119,12 @@ class TextTable:
             f"\\begin{{tabular}}{{{self.align}}}\n\\toprule\n{line(self.heads)}\n\\midrule\n{body}\n"
             "\\bottomrule\n\\end{tabular}"
         )
+
+
+def with_units(table: TextTable, specs: Sequence[Parameter]) -> TextTable:
+    """The table with a last column: the unit in which each parameter is printed."""
+    rows = tuple((*row, pretty_unit(spec.scaled_unit)) for row, spec in zip(table.rows, specs, strict=True))
+    return TextTable((*table.heads, "unit"), rows, table.title, table.align + "l", table.marks)
 
 
 _TEX = {

@@ -12,8 +12,9 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.core.formatting import significant
 from starcal_uq.inference.checks import check_draws
+from starcal_uq.presentation.html import symbol
 from starcal_uq.presentation.report.page import render
-from starcal_uq.presentation.report.tables import attitude_rows, parameter_rows, symbol, weak_directions
+from starcal_uq.presentation.report.tables import attitude_rows, parameter_rows, weak_directions
 from tests.helpers.scenes import camera, nominal, observations
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}

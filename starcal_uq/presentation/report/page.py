@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.distortion import get_model, parameters
 from starcal_uq.core.formatting import count, join_words
 from starcal_uq.core.status import Check, Level, Question, worst
 from starcal_uq.diagnostics.verdict.limits import limits
@@ -22,7 +22,7 @@ from starcal_uq.presentation.report import tables, words
 from starcal_uq.presentation.report import tables as image_tables
 from starcal_uq.presentation.report import words as field_words
 from starcal_uq.presentation.report.results import Results
-from starcal_uq.presentation.words.propagation import corner_sentence, one_number_sentence
+from starcal_uq.presentation.words.propagation import corner_sentence, coupling_table, one_number_sentence
 
 _MARKS = {Level.PASS: "✓", Level.WARN: "!", Level.FAIL: "✗"}
 
@@ -37,9 +37,7 @@ def render(results: Results, figures: Mapping[str, bytes]) -> str:
     figures
         PNG images by the names of `starcal_uq.presentation.report.page.draw_figures`; a missing one is left out.
     """
-    environment = template_environment()
-    environment.filters["symbol"] = tables.symbol
-    return environment.get_template("report.html.j2").render(context(results, figures)) + "\n"
+    return template_environment().get_template("report.html.j2").render(context(results, figures)) + "\n"
 
 
 def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
@@ -70,12 +68,14 @@ def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
         "attitude_sentence": words.attitude_sentence(results),
         "corner_sentence": "" if results.distortion_curve is None else corner_sentence(results.distortion_curve),
         "equivalent_sentence": field_words.equivalent_sentence(results.field_map),
-        "coupling_rows": [] if results.coupling is None else tables.coupling_rows(results.coupling, results),
+        "coupling_table": None
+        if results.coupling is None
+        else coupling_table(results.coupling, parameters(cal.camera.distortion)),
         "weak_directions": [] if results.coupling is None else tables.weak_directions(results.coupling),
         "diagnostics_rows": [] if post is None else tables.diagnostics_rows(post),
         "agreement": next((check.value for check in verdict.checks if check.name == "Independent posterior"), ""),
         "methods_rows": tables.methods_rows(results),
-        "derived_rows": [] if post is None else model_tables.derived_rows(post),
+        "derived_table": None if post is None else model_tables.derived_table(post),
         **model_tables.diagnosis_context(results.diagnosis, cal),
         **image_tables.image_context(results.images, cal),
         **budget_tables.budget_context(results.budget),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
 from typing import TYPE_CHECKING, Any
 
@@ -12,11 +11,10 @@ from starcal_uq.camera.distortion import Parameter, parameters, sigma_parameter
 from starcal_uq.core.constants import INTERACTION
 from starcal_uq.core.formatting import count, decimals_for, fixed, percent, plural, pretty_unit, significant, with_sigma
 from starcal_uq.diagnostics.verdict.estimate import truth_z
+from starcal_uq.presentation.html import symbol
 from starcal_uq.propagation.attitude_error import CONTRIBUTORS
 
 if TYPE_CHECKING:
-    from markupsafe import Markup
-
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.pipeline.record import ImageRecord
@@ -27,21 +25,6 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 # Two-sided 95 % quantile of the normal distribution.
 Z_95 = 1.959964
-
-
-def symbol(name: str) -> Markup:
-    """A parameter's name as a mathematical symbol in HTML."""
-    from markupsafe import Markup, escape
-
-    if name == "sigma":
-        return Markup("<i>σ</i>")
-    if name == "sigma_scale":
-        return Markup("<i>s</i><sub>σ</sub>")
-    match = re.fullmatch(r"([a-z])(\d*)", name)
-    if match is None:
-        return Markup("{}").format(escape(name))
-    base = Markup("<i>{}</i>").format(match[1])
-    return base + Markup("<sub>{}</sub>").format(match[2]) if match[2] else base
 
 
 def all_parameters(results: Results) -> tuple[Parameter, ...]:
@@ -148,33 +131,6 @@ def _small(arcsec: float) -> str:
     if np.isnan(arcsec):
         return "—"
     return "< 0.001".replace(" ", "\N{NO-BREAK SPACE}") if 0.0 < arcsec < 0.0005 else significant(arcsec)
-
-
-def coupling_rows(coupling: Coupling, results: Results) -> list[Row]:
-    """Marginal and conditional sigma, inflation, Cramer-Rao bound and contraction of every parameter."""
-    rows = []
-    for i, parameter in enumerate(parameters(results.calibration.camera.distortion)):
-        scale = parameter.scale
-        contraction = None if coupling.contraction is None else float(coupling.contraction[i])
-        rows.append(
-            {
-                "symbol": symbol(parameter.name),
-                "unit": pretty_unit(parameter.scaled_unit),
-                "marginal": significant(float(coupling.sigma_marginal[i]) / scale),
-                "conditional": significant(float(coupling.sigma_conditional[i]) / scale),
-                "ratio": significant(float(coupling.sigma_marginal[i] / coupling.sigma_conditional[i])),
-                "inflation": significant(float(coupling.variance_inflation[i])),
-                "bound": significant(float(coupling.crlb_sigma[i]) / scale),
-                "contraction": "" if contraction is None else _contraction_text(contraction),
-            }
-        )
-    return rows
-
-
-def _contraction_text(contraction: float) -> str:
-    """As the factor by which the data shrank the prior's sigma: 1 - 1e-6 would print as 1."""
-    remaining = max(1.0 - contraction, 1e-30)
-    return f"{significant(1.0 / np.sqrt(remaining))} ×"
 
 
 def weak_directions(coupling: Coupling) -> list[Row]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 
 import numpy as np
 
-from starcal_uq.core.formatting import count, fixed, join_words, percent, plural, significant
+from starcal_uq.camera.distortion import Parameter
+from starcal_uq.core.formatting import count, decimals_for, fixed, join_words, percent, plural, significant
 from starcal_uq.diagnostics.diagnose import Diagnosis
 from starcal_uq.diagnostics.jackknife import Jackknife
 from starcal_uq.diagnostics.misfit import Misfit
@@ -14,8 +16,9 @@ from starcal_uq.diagnostics.models import ModelComparison
 from starcal_uq.diagnostics.predictive import PredictiveCheck
 from starcal_uq.diagnostics.validation.replicates import LOG_LIKELIHOOD
 from starcal_uq.diagnostics.validation.result import ENOUGH_REPLICATES, Validation
+from starcal_uq.diagnostics.verdict.estimate import MISFIT_P
 from starcal_uq.inference.checks import COMPRESSED_BOUND
-from starcal_uq.presentation.tables import TextTable
+from starcal_uq.presentation.tables import TextTable, with_units
 
 NBSP = "\N{NO-BREAK SPACE}"
 # Errors this far from one posterior standard deviation are said to be too narrow or too wide; a mean error this far
@@ -32,9 +35,25 @@ def misfit_text(found: Misfit) -> str:
 
 
 def misfit_table(found: Misfit) -> TextTable:
-    """One row per test."""
-    columns = ("test", "against", "statistic", "p_value", "p_holm", "size_px", "amplitudes")
-    return TextTable.of(found.to_dataframe(), "Misfit", columns)
+    """One row per test; what found something is marked."""
+    rows = tuple(
+        (
+            test.name[0].upper() + test.name[1:],
+            test.against,
+            f"F({count(test.dof)}, {count(test.dof_residual)}) = {fixed(test.statistic, 2)}"
+            if test.dof
+            else f"z = {fixed(test.statistic, 2)}",
+            significant(test.p_value),
+            significant(test.p_holm),
+            "" if np.isnan(test.size_px) else significant(test.size_px),
+            "" if np.isnan(test.visible) else percent(test.visible),
+            "; ".join(map(str, test.amplitudes)),
+        )
+        for test in found.tests
+    )
+    heads = ("looks for", "against", "statistic", "p", "p, corrected", "size [px]", "visible", "amplitudes")
+    marks = tuple("warning" if test.p_holm < MISFIT_P else "" for test in found.tests)
+    return TextTable(heads, rows, "Misfit", "llrrrrrl", marks)
 
 
 def jackknife_text(found: Jackknife) -> str:
@@ -44,18 +63,48 @@ def jackknife_text(found: Jackknife) -> str:
     return f"Jackknife sigmas over {frames} are {fixed(low, 2)} to {fixed(high, 2)} times the formal ones."
 
 
-def jackknife_table(found: Jackknife) -> TextTable:
-    """One row per parameter."""
-    columns = ("parameter", "formal_sigma", "jackknife_sigma", "ratio", "sandwich_ratio")
-    return TextTable.of(
-        found.to_dataframe(), "Jackknife over frames", (*columns, "expected_low", "expected_high", "p_value")
+def jackknife_table(found: Jackknife, specs: Sequence[Parameter] = ()) -> TextTable:
+    """One row per parameter; sigmas in the units of `specs`, or in px units."""
+    low, high = found.expected()
+    scales = np.array([spec.scale for spec in specs]) if specs else np.ones(len(low))
+    columns = (
+        [significant(v) for v in np.sqrt(np.diag(found.formal_covariance)) / scales],
+        [significant(v) for v in np.sqrt(np.diag(found.jackknife_covariance)) / scales],
+        [fixed(v, 2) for v in found.ratio],
+        [f"{fixed(a, 2)} to {fixed(b, 2)}" for a, b in zip(low, high, strict=True)],
+        [fixed(v, 2) for v in found.sandwich_ratio],
+        [significant(v) for v in found.p_values],
+        [fixed(v, 2) for v in found.factors],
     )
+    heads = ("formal σ", "jackknife σ", "ratio", "by chance (95 %)", "cluster-robust ratio", "p", "factor if accepted")
+    rows = tuple(zip(found.parameter_names, *columns, strict=True))
+    table = TextTable(("", *heads), rows, "Jackknife over frames")
+    return with_units(table, specs) if specs else table
 
 
-def models_table(found: ModelComparison) -> TextTable:
-    """One row per model, the best first."""
-    columns = ("model", "n_parameters", "elpd", "difference", "difference_se", "max_khat", "rejected")
-    return TextTable.of(found.to_dataframe(), "Distortion models", columns)
+def models_table(found: ModelComparison, sigma_unit: str = "") -> TextTable:
+    """One row per model, the best first; common and rest are the attitudes' move across the boresight / in roll."""
+
+    def moved(part: tuple[float, float, float]) -> str:
+        return f"{significant(float(np.hypot(*part[:2])))} / {significant(abs(part[2]))}"
+
+    rows = []
+    for score in found.scores:
+        mine, best = score.model == found.fitted, score.difference == 0.0
+        replaced = f" ({score.n_replaced} in closed form)" if score.n_replaced else ""
+        rows.append(
+            (
+                f"{score.model}, fitted" if mine else score.model,
+                str(score.n_parameters),
+                significant(score.sigma, 4) + sigma_unit,
+                "best" if best else f"{fixed(score.difference, 1)} ± {fixed(score.difference_se, 1)}",
+                "rejected" if score.rejected else "not rejected",
+                *(("–", "–") if mine else (moved(score.common_arcsec), moved(score.rest_arcsec))),
+                fixed(score.max_khat, 2) + replaced,
+            )
+        )
+    heads = ("model", "parameters", "noise", "difference [nat]", "outcome", "common [arcsec]", "rest [arcsec]", "k-hat")
+    return TextTable(heads, tuple(rows), "Distortion models", "lrrrlrrr")
 
 
 def predictive_text(found: PredictiveCheck) -> str:
@@ -66,9 +115,13 @@ def predictive_text(found: PredictiveCheck) -> str:
 
 
 def predictive_table(found: PredictiveCheck) -> TextTable:
-    """One row per statistic."""
-    columns = ("name", "observed", "replicated_low", "replicated_high", "p_value")
-    return TextTable.of(found.to_dataframe(), "Predictive checks", columns)
+    """One row per statistic: the data, and the range of 95 % of the replicates."""
+    rows = []
+    for s in found.statistics:
+        decimals = decimals_for(s.replicated_high - s.replicated_low)
+        low, high = fixed(s.replicated_low, decimals), fixed(s.replicated_high, decimals)
+        rows.append((s.name, fixed(s.observed, decimals), f"{low} to {high}", significant(s.p_value)))
+    return TextTable(("statistic", "data", "replicates (95 %)", "p"), tuple(rows), "Predictive checks")
 
 
 def diagnosis_text(found: Diagnosis) -> str:

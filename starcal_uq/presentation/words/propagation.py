@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pandas as pd
 
+from starcal_uq.camera.distortion import Parameter
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import fixed, join_words, percent, pretty_unit, significant
 from starcal_uq.core.types import FloatArray
@@ -85,19 +88,26 @@ def coupling_text(coupling: Coupling) -> str:
     return "\n".join(f"{direction.words}." for direction in coupling.weak_directions)
 
 
-def coupling_table(coupling: Coupling) -> TextTable:
-    """Standard deviations with the others unknown and known, and what not knowing them costs."""
+def coupling_table(coupling: Coupling, specs: Sequence[Parameter] = ()) -> TextTable:
+    """What not knowing the others costs every parameter; sigmas in the units of `specs`, or in px units."""
+    scales = np.array([spec.scale for spec in specs]) if specs else np.ones(len(coupling.parameter_names))
     columns = {
-        "sigma": coupling.sigma_marginal,
-        "others known": coupling.sigma_conditional,
+        "σ": coupling.sigma_marginal / scales,
+        "σ, others known": coupling.sigma_conditional / scales,
+        "ratio": coupling.sigma_marginal / coupling.sigma_conditional,
         "variance inflation": coupling.variance_inflation,
+        "Cramér–Rao bound": coupling.crlb_sigma / scales,
     }
-    rows = tuple(
-        (name, *(significant(float(column[i]), 3) for column in columns.values()), pretty_unit(unit))
-        for i, (name, unit) in enumerate(zip(coupling.parameter_names, coupling.units, strict=True))
+    texts = {head: [significant(float(v)) for v in column] for head, column in columns.items()}
+    if coupling.contraction is not None:
+        # The factor by which the data shrank the prior's sigma: a contraction of 1 - 1e-6 would print as 1.
+        shrunk = np.sqrt(np.maximum(1.0 - coupling.contraction, 1e-30))
+        texts["prior σ / σ"] = [f"{significant(float(1.0 / v))} ×" for v in shrunk]
+    texts["unit"] = [pretty_unit(unit) for unit in ([s.scaled_unit for s in specs] or coupling.units)]
+    rows = tuple(zip(coupling.parameter_names, *texts.values(), strict=True))
+    return TextTable(
+        ("", *texts), rows, "Coupling: what not knowing the others costs", "l" + "r" * (len(texts) - 1) + "l"
     )
-    title = "Coupling: what not knowing the others costs"
-    return TextTable(("parameter", *columns, "unit"), rows, title, "l" + "r" * len(columns) + "l")
 
 
 def correlation_table(coupling: Coupling) -> TextTable:
