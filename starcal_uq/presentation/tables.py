@@ -124,7 +124,7 @@ class TextTable:
 def with_units(table: TextTable, specs: Sequence[Parameter]) -> TextTable:
     """The table with a last column: the unit in which each parameter is printed."""
     rows = tuple((*row, pretty_unit(spec.scaled_unit)) for row, spec in zip(table.rows, specs, strict=True))
-    return TextTable((*table.heads, "unit"), rows, table.title, table.align + "l", table.marks)
+    return TextTable((*table.heads, "Unit"), rows, table.title, table.align + "l", table.marks)
 
 
 _TEX = {

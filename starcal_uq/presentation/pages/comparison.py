@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from starcal_uq.core.formatting import fixed, percent, pretty_unit, significant,
 from starcal_uq.presentation.figures.comparison import plot_camera_comparison
 from starcal_uq.presentation.figures.style import png_bytes
 from starcal_uq.presentation.html import embedded_image, template_environment
+from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.comparison import headline, p_words, rotation_words
 
 _LEVELS = {"agree": "pass", "parameters differ": "warning", "maps differ": "fail", "not tested": "warning"}
@@ -60,103 +60,81 @@ def render_comparison(comparison: CameraComparison, image: bytes) -> str:
         "headline": headline(comparison),
         "rotation": rotation_words(comparison),
         "false_alarms": percent(comparison.level, 1),
-        "map_rows": _map_rows(comparison),
-        "test_rows": _test_rows(comparison),
-        "parameter_rows": _parameter_rows(comparison),
-        "sources": [
-            _source(label, comparison.provenance.get(key, {}))
-            for label, key in zip(comparison.labels, "ab", strict=True)
-        ],
+        "map_table": _map_table(comparison),
+        "test_table": _test_table(comparison),
+        "parameter_table": _parameter_table(comparison),
+        "source_table": _source_table(comparison),
         "image": embedded_image(image),
     }
     return environment.get_template("comparison.html.j2").render(context) + "\n"
 
 
-def _map_rows(comparison: CameraComparison) -> list[dict[str, str]]:
-    return [
-        {
-            "name": "Root mean square over the detector",
-            "arcsec": significant(comparison.rms_arcsec),
-            "px": significant(comparison.rms_px),
-            "expected": significant(comparison.expected_rms_arcsec) if comparison.tested else "not known",
-        },
-        {
-            "name": "Largest",
-            "arcsec": significant(comparison.largest_arcsec),
-            "px": significant(comparison.largest_px),
-            "expected": "",
-        },
-    ]
-
-
-def _test_rows(comparison: CameraComparison) -> list[dict[str, str]]:
-    if not comparison.tested:
-        return []
-    worst = (
-        f"{significant(comparison.worst_ratio)} times its 1 sigma at x = {comparison.worst_x_px:.0f} px, y = "
-        f"{comparison.worst_y_px:.0f} px"
+def _map_table(found: CameraComparison) -> TextTable:
+    expected = significant(found.expected_rms_arcsec) if found.tested else "not known"
+    rows = (
+        ("Root mean square over the detector", significant(found.rms_arcsec), significant(found.rms_px), expected),
+        ("Largest", significant(found.largest_arcsec), significant(found.largest_px), ""),
     )
-    error = f" (Monte Carlo, ±\N{NO-BREAK SPACE}{significant(comparison.p_worst_error, 1)})"
-    rows = [
-        {
-            "name": "Map",
-            "asks": "Do the directions differ by more than they should, on average over the detector?",
-            "statistic": f"{significant(comparison.rms_arcsec)} arcsec, "
-            f"{significant(comparison.expected_rms_arcsec)} expected",
-            "p": p_words(comparison.p_map),
-        },
-        {
-            "name": "Parameters",
-            "asks": "Can the two be the same camera, every direction weighed by its own uncertainty?",
-            "statistic": f"χ² = {significant(comparison.statistic, 3)} for {comparison.n_directions}",
-            "p": p_words(comparison.p_parameters),
-        },
-        {
-            "name": "Worst place",
-            "asks": "Is the place that stands out most worse than the worst of so many by chance?",
-            "statistic": worst,
-            "p": p_words(comparison.p_worst) + error,
-        },
-    ]
-    return rows if np.isfinite(comparison.p_parameters) else rows[:1]
+    return TextTable(("Length of the difference", "arcsec", "px", "Expected [arcsec]"), rows)
 
 
-def _parameter_rows(comparison: CameraComparison) -> list[dict[str, str]]:
-    specs = {p.name: p for model in comparison.models for p in parameters(model)}
+def _test_table(found: CameraComparison) -> TextTable | None:
+    if not found.tested:
+        return None
+    error = f" (Monte Carlo, ±\N{NO-BREAK SPACE}{significant(found.p_worst_error, 1)})"
+    rows = (
+        (
+            "Map",
+            "Do the directions differ by more than they should, on average over the detector?",
+            f"{significant(found.rms_arcsec)} arcsec, {significant(found.expected_rms_arcsec)} expected",
+            p_words(found.p_map),
+        ),
+        (
+            "Parameters",
+            "Can the two be the same camera, every direction weighed by its own uncertainty?",
+            f"χ² = {significant(found.statistic, 3)} for {found.n_directions}",
+            p_words(found.p_parameters),
+        ),
+        (
+            "Worst place",
+            "Is the place that stands out most worse than the worst of so many by chance?",
+            f"{significant(found.worst_ratio)} times its 1 sigma at x = {found.worst_x_px:.0f} px, "
+            f"y = {found.worst_y_px:.0f} px",
+            p_words(found.p_worst) + error,
+        ),
+    )
+    shown = rows if np.isfinite(found.p_parameters) else rows[:1]
+    return TextTable(("Test", "Asks", "Found", "p-value"), shown, align="llll")
+
+
+def _parameter_table(found: CameraComparison) -> TextTable:
+    specs = {p.name: p for model in found.models for p in parameters(model)}
+    estimates = (found.theta_a, found.theta_b, found.sd_a, found.sd_b, found.sd_difference)
     rows = []
-    for i, name in enumerate(comparison.parameter_names):
+    for i, name in enumerate(found.parameter_names):
         spec = specs[name]
-        a, b, sd_a, sd_b, sd = (
-            float(values[i]) / spec.scale
-            for values in (
-                comparison.theta_a,
-                comparison.theta_b,
-                comparison.sd_a,
-                comparison.sd_b,
-                comparison.sd_difference,
-            )
-        )
+        a, b, sd_a, sd_b, sd = (float(values[i]) / spec.scale for values in estimates)
         known = np.isfinite(sd) and sd > 0.0
         rows.append(
-            {
-                "name": name,
-                "a": f"{with_sigma(a, sd_a)} ± {significant(sd_a)}",
-                "b": f"{with_sigma(b, sd_b)} ± {significant(sd_b)}",
-                "difference": f"{with_sigma(b - a, sd)} ± {significant(sd)}" if known else significant(b - a),
-                "z": fixed((b - a) / sd, 1) if known else "",
-                "unit": pretty_unit(spec.scaled_unit),
-            }
+            (
+                name,
+                f"{with_sigma(a, sd_a)} ± {significant(sd_a)}",
+                f"{with_sigma(b, sd_b)} ± {significant(sd_b)}",
+                f"{with_sigma(b - a, sd)} ± {significant(sd)}" if known else significant(b - a),
+                fixed((b - a) / sd, 1) if known else "",
+                pretty_unit(spec.scaled_unit),
+            )
         )
-    return rows
+    return TextTable(("", *found.labels, "Difference", "In sigma", "Unit"), tuple(rows), align="lrrrrl")
 
 
-def _source(label: str, provenance: dict[str, Any]) -> dict[str, str]:
-    """Where a result comes from."""
-    settings = provenance.get("settings", {})
-    words = [f"{name} {settings[name]}" for name in ("method", "likelihood") if name in settings]
-    return {
-        "label": label,
-        "created": str(provenance.get("created_utc", "")).replace("T", " ").replace("Z", " UTC"),
-        "settings": ", ".join(words),
-        "data": str(provenance.get("data_sha256") or ""),
-    }
+def _source_table(found: CameraComparison) -> TextTable:
+    """Where both results come from."""
+    rows = []
+    for label, key in zip(found.labels, "ab", strict=True):
+        provenance = found.provenance.get(key, {})
+        settings = provenance.get("settings", {})
+        how = ", ".join(f"{name} {settings[name]}" for name in ("method", "likelihood") if name in settings)
+        created = str(provenance.get("created_utc", "")).replace("T", " ").replace("Z", " UTC")
+        rows.append((label, created, how, str(provenance.get("data_sha256") or "")))
+    return TextTable(("Calibration", "Made", "How", "Data (SHA-256)"), tuple(rows), align="llll")

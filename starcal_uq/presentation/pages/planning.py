@@ -24,6 +24,7 @@ from starcal_uq.presentation.figures.planning import (
 )
 from starcal_uq.presentation.figures.style import png_bytes
 from starcal_uq.presentation.html import embedded_image, template_environment
+from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.planning import (
     SCOPE_NAMES,
     check_text,
@@ -145,23 +146,39 @@ def render_plan(
     context = _context(plan, images)
     context |= {"choice": None if choice is None else choice_text(choice)}
     context |= {"check": None if check is None else check_text(check)}
-    context |= {"frame_rows": [] if choice is None else _frame_rows(choice)}
+    context |= {"frame_table": None if choice is None else _frame_table(choice)}
     return template_environment().get_template(_TEMPLATE).render(context) + "\n"
 
 
-def _frame_rows(choice: FrameChoice) -> list[dict[str, str]]:
+def _frame_table(choice: FrameChoice) -> TextTable:
     """The chosen frames, most valuable first."""
-    return [
-        {
-            "order": str(row["order"]),
-            "ra": fixed(row["ra_deg"], 2),
-            "dec": fixed(row["dec_deg"], 2),
-            "roll": fixed(row["roll_deg"], 1),
-            "stars": str(row["n_stars"]),
-            "score": significant(row["score"], 3),
-        }
+    rows = tuple(
+        (
+            str(row["order"]),
+            *(fixed(row[name], 2) for name in ("ra_deg", "dec_deg")),
+            fixed(row["roll_deg"], 1),
+            str(row["n_stars"]),
+            significant(row["score"], 3),
+        )
         for row in choice.to_dataframe().head(_FRAMES_SHOWN).to_dict("records")
-    ]
+    )
+    heads = ("Order", "RA [deg]", "Dec [deg]", "Position angle of +Y [deg]", "Stars", "Criterion after it")
+    return TextTable(heads, rows, align="rrrrrr")
+
+
+def _needs_table(plan: Plan) -> TextTable:
+    """Frames needed, by part of the error; the part that was asked for is marked."""
+    rows = tuple(
+        (
+            SCOPE_NAMES[need.scope],
+            need_words(need, need.frames),
+            need_words(need, need.frames_surely),
+            significant(need.floor_arcsec, 3) if need.floor_arcsec > 0.0 else "0",
+        )
+        for need in plan.needs
+    )
+    heads = ("Part of the error", "On average", "In 95 % of campaigns", "Floor [arcsec]")
+    return TextTable(heads, rows, marks=tuple("chosen" if need.scope == plan.scope else "" for need in plan.needs))
 
 
 def _context(plan: Plan, images: Mapping[str, bytes]) -> dict[str, Any]:
@@ -178,16 +195,7 @@ def _context(plan: Plan, images: Mapping[str, bytes]) -> dict[str, Any]:
         "level": level(plan.confidence),
         "scope": SCOPE_NAMES[plan.scope],
         "target": None if plan.target_arcsec is None else f"{plan.target_arcsec:g} arcsec",
-        "needs": [
-            {
-                "scope": SCOPE_NAMES[need.scope],
-                "chosen": need.scope == plan.scope,
-                "frames": need_words(need, need.frames),
-                "surely": need_words(need, need.frames_surely),
-                "floor": significant(need.floor_arcsec, 3) if need.floor_arcsec > 0.0 else "0",
-            }
-            for need in plan.needs
-        ],
+        "needs": _needs_table(plan),
         "groups": [(name, len(pairs)) for name, pairs in groups],
         "heads": [(head, column in edges) for column, head in shown],
         "rows": [

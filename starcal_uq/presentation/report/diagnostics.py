@@ -34,7 +34,7 @@ def diagnosis_context(diagnosis: Diagnosis | None, cal: Calibration) -> dict[str
         "misfit_sentence": _misfit_sentence(diagnosis),
         "jackknife_table": None if jackknife is None else jackknife_table(jackknife, parameters(cal.camera.distortion)),
         "jackknife_sentence": "" if jackknife is None else jackknife_text(jackknife),
-        "models_table": None if models is None else models_table(models, unit),
+        "models_table": None if models is None else models_table(models, unit, "this report"),
         "models_sentence": "" if models is None else models_sentence(models),
         "predictive_table": predictive_table(diagnosis.predictive),
     }

@@ -51,7 +51,7 @@ def misfit_table(found: Misfit) -> TextTable:
         )
         for test in found.tests
     )
-    heads = ("looks for", "against", "statistic", "p", "p, corrected", "size [px]", "visible", "amplitudes")
+    heads = ("Looks for", "Against", "Statistic", "p", "p, corrected", "Size [px]", "Visible", "Amplitudes")
     marks = tuple("warning" if test.p_holm < MISFIT_P else "" for test in found.tests)
     return TextTable(heads, rows, "Misfit", "llrrrrrl", marks)
 
@@ -76,13 +76,13 @@ def jackknife_table(found: Jackknife, specs: Sequence[Parameter] = ()) -> TextTa
         [significant(v) for v in found.p_values],
         [fixed(v, 2) for v in found.factors],
     )
-    heads = ("formal σ", "jackknife σ", "ratio", "by chance (95 %)", "cluster-robust ratio", "p", "factor if accepted")
+    heads = ("Formal σ", "Jackknife σ", "Ratio", "By chance (95 %)", "Cluster-robust ratio", "p", "Factor if accepted")
     rows = tuple(zip(found.parameter_names, *columns, strict=True))
     table = TextTable(("", *heads), rows, "Jackknife over frames")
     return with_units(table, specs) if specs else table
 
 
-def models_table(found: ModelComparison, sigma_unit: str = "") -> TextTable:
+def models_table(found: ModelComparison, sigma_unit: str = "", fitted: str = "fitted") -> TextTable:
     """One row per model, the best first; common and rest are the attitudes' move across the boresight / in roll."""
 
     def moved(part: tuple[float, float, float]) -> str:
@@ -94,7 +94,7 @@ def models_table(found: ModelComparison, sigma_unit: str = "") -> TextTable:
         replaced = f" ({score.n_replaced} in closed form)" if score.n_replaced else ""
         rows.append(
             (
-                f"{score.model}, fitted" if mine else score.model,
+                f"{score.model} ({fitted})" if mine else score.model,
                 str(score.n_parameters),
                 significant(score.sigma, 4) + sigma_unit,
                 "best" if best else f"{fixed(score.difference, 1)} ± {fixed(score.difference_se, 1)}",
@@ -103,7 +103,7 @@ def models_table(found: ModelComparison, sigma_unit: str = "") -> TextTable:
                 fixed(score.max_khat, 2) + replaced,
             )
         )
-    heads = ("model", "parameters", "noise", "difference [nat]", "outcome", "common [arcsec]", "rest [arcsec]", "k-hat")
+    heads = ("Model", "Parameters", "Noise", "Difference [nat]", "Outcome", "Common [arcsec]", "Rest [arcsec]", "k-hat")
     return TextTable(heads, tuple(rows), "Distortion models", "lrrrlrrr")
 
 
@@ -121,7 +121,7 @@ def predictive_table(found: PredictiveCheck) -> TextTable:
         decimals = decimals_for(s.replicated_high - s.replicated_low)
         low, high = fixed(s.replicated_low, decimals), fixed(s.replicated_high, decimals)
         rows.append((s.name, fixed(s.observed, decimals), f"{low} to {high}", significant(s.p_value)))
-    return TextTable(("statistic", "data", "replicates (95 %)", "p"), tuple(rows), "Predictive checks")
+    return TextTable(("Statistic", "Data", "Replicates (95 %)", "p"), tuple(rows), "Predictive checks")
 
 
 def diagnosis_text(found: Diagnosis) -> str:
