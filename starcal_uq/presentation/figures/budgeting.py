@@ -125,27 +125,17 @@ def _write(ax: Axes, x: float, y: float, text: str, colour: str, *, italic: bool
 
 
 def _handles(budget: Budget) -> list[object]:
-    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     handles: list[object] = [
         Patch(facecolor=style.SKY, label="from the posterior"),
         Patch(facecolor=style.ORANGE, label="from the budget file"),
         Patch(facecolor=style.GREY, hatch="///", edgecolor="white", label="absorbed by alignment"),
-        Line2D([], [], marker="o", linestyle="", color=style.INK, markersize=7, label="total by the rule"),
-        Line2D(
-            [],
-            [],
-            marker="D",
-            linestyle="",
-            color="white",
-            markeredgecolor=style.INK,
-            markersize=4.2,
-            label="total by sampling",
-        ),
+        style.key("total by the rule", style.INK, marker="o", linestyle="", markersize=7),
+        style.key("total by sampling", "white", marker="D", linestyle="", markeredgecolor=style.INK, markersize=4.2),
     ]
     if budget.comparable:
-        handles.append(Line2D([], [], color=style.GREEN, linewidth=2.4, label="limit"))
+        handles.append(style.key("limit", style.GREEN, linewidth=2.4))
     if any(outcome.verdict == "violated" for outcome in budget.comparable):
-        handles.append(Line2D([], [], color=style.VERMILLION, linewidth=2.4, label="limit, violated"))
+        handles.append(style.key("limit, violated", style.VERMILLION, linewidth=2.4))
     return handles

@@ -126,21 +126,9 @@ def _plot_profile(ax: Axes, profile: Profile1D) -> None:
     shift = 0.006 * np.ptp(profile.centres)
     looks = ((style.BLUE, "o", -shift), (style.ORANGE, "s", shift))
     for name, means, (colour, marker, aside) in zip(profile.names, profile.means, looks, strict=True):
-        ax.errorbar(
-            profile.centres + aside,
-            means,
-            profile.errors,
-            color=colour,
-            marker=marker,
-            markersize=4.0,
-            linestyle="none",
-            elinewidth=1.1,
-            label=name,
-        )
-    ax.axhline(0.0, color=style.INK, linewidth=0.9)
-    top = 1.4 * max(np.abs(ax.get_ylim()))
-    ax.set_ylim(-top, top)
-    style.legend(ax, loc="upper left", ncols=2, columnspacing=1.0, handletextpad=0.2)
+        at = profile.centres + aside
+        ax.errorbar(at, means, profile.errors, color=colour, marker=marker, label=name, **style.BARS)
+    style.about_zero(ax)
     style.label(ax, profile.title, profile.label, "mean residual [px]")
 
 

@@ -61,26 +61,17 @@ def plot_convergence(cal: Calibration, truth: Camera | None = None) -> Figure:
 
 
 def _key(figure: Figure, cal: Calibration, what: str) -> None:
-    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     stages = ", ".join(f"{i} {stage.name}" for i, stage in enumerate(cal.stages, 1))
-    handles: list[Line2D | Patch] = [
-        Line2D([], [], color=style.BLUE, marker="o", markersize=3.2, linewidth=1.2, label="estimate"),
-        Line2D([], [], color=style.VERMILLION, dashes=(4, 2), linewidth=1.0, label=what),
+    handles: list[object] = [
+        style.key("estimate", style.BLUE, marker="o", markersize=3.2, linewidth=1.2),
+        style.key(what, style.VERMILLION, dashes=(4, 2), linewidth=1.0),
         Patch(facecolor=style.GREEN, alpha=0.2, label="within 1 sigma"),
-        Line2D([], [], linestyle="none", label=f"Stages: {stages}"),
+        style.key(f"Stages: {stages}", style.INK, linestyle="none"),
     ]
-    figure.legend(
-        handles=handles,
-        loc="outside upper left",
-        ncols=4,
-        fontsize=style.LABEL_SIZE,
-        frameon=False,
-        labelcolor=style.INK,
-        columnspacing=1.6,
-        handlelength=1.8,
-    )
+    options = {"loc": "outside upper left", "fontsize": style.LABEL_SIZE, "columnspacing": 1.6, "handlelength": 1.8}
+    style.legend_above(figure, handles, **options)
 
 
 def _comparable(truth: Camera | None, cal: Calibration) -> bool:
@@ -239,21 +230,9 @@ def plot_residual_radius(cal: Calibration, obs: Observations, ax: Axes | None = 
     looks = ((style.BLUE, "o", "radial", -1), (style.ORANGE, "s", "tangential", 1))
     for part, (colour, marker, name, side) in zip(parts, looks, strict=True):
         mean = np.bincount(index, part, n_bins) / counts
-        ax.errorbar(
-            centre + side * 0.004 * radius.max(),
-            mean,
-            spread,
-            color=colour,
-            marker=marker,
-            markersize=4.5,
-            linestyle="none",
-            elinewidth=1.2,
-            label=name,
-        )
-    ax.axhline(0.0, color=style.INK, linewidth=0.9)
-    top = 1.35 * max(np.abs(ax.get_ylim()))
-    ax.set_ylim(-top, top)
-    style.legend(ax, loc="upper left", ncols=2, columnspacing=1.0, handletextpad=0.3)
+        at = centre + side * 0.004 * radius.max()
+        ax.errorbar(at, mean, spread, color=colour, marker=marker, label=name, **style.BARS)
+    style.about_zero(ax)
     style.label(ax, "Against radius", "distance from principal point [px]", "mean residual [px]")
     return ax
 

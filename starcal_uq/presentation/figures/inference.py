@@ -14,6 +14,7 @@ from starcal_uq.presentation.figures.scales import AxisScale, axis_scale
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.lines import Line2D
 
     from starcal_uq.camera.camera import Camera
     from starcal_uq.estimation.calibration import Calibration
@@ -147,7 +148,6 @@ def _ticks(
 
 
 def _corner_key(figure: Figure, gaussian: bool, truth: bool, n_draws: int) -> None:
-    from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     handles: list[Patch | Line2D] = [
@@ -155,13 +155,9 @@ def _corner_key(figure: Figure, gaussian: bool, truth: bool, n_draws: int) -> No
         Patch(facecolor="#cfe3f1", edgecolor=style.BLUE, label="86 % of the draws (2 sigma)"),
     ]
     if gaussian:
-        handles.append(Line2D([], [], color=style.INK, dashes=(4, 2), linewidth=1.0, label="Gaussian approximation"))
+        handles.append(style.key("Gaussian approximation", style.INK, dashes=(4, 2), linewidth=1.0))
     if truth:
-        handles.append(
-            Line2D(
-                [], [], color=style.VERMILLION, marker="+", markersize=9, linewidth=1.3, label="truth of the simulation"
-            )
-        )
+        handles.append(style.key("truth of the simulation", style.VERMILLION, marker="+", markersize=9, linewidth=1.3))
     figure.legend(
         handles=handles,
         loc="upper right",
@@ -231,22 +227,13 @@ def _prior_grid(priors: Priors, name: str, column: FloatArray, scale: AxisScale)
 
 
 def _prior_key(figure: Figure, truth: bool) -> None:
-    from matplotlib.lines import Line2D
-
     handles = [
-        Line2D([], [], color=style.GREEN, dashes=(4, 1.5), linewidth=1.5, label="prior (below: its slope only)"),
-        Line2D([], [], color=style.BLUE, linewidth=1.5, label="posterior"),
+        style.key("prior (below: its slope only)", style.GREEN, dashes=(4, 1.5), linewidth=1.5),
+        style.key("posterior", style.BLUE, linewidth=1.5),
     ]
     if truth:
-        handles.append(Line2D([], [], color=style.VERMILLION, linewidth=1.3, label="truth of the simulation"))
-    figure.legend(
-        handles=handles,
-        loc="outside upper left",
-        ncols=3,
-        fontsize=style.LABEL_SIZE,
-        frameon=False,
-        labelcolor=style.INK,
-    )
+        handles.append(style.key("truth of the simulation", style.VERMILLION, linewidth=1.3))
+    style.legend_above(figure, handles, loc="outside upper left", ncols=3, fontsize=style.LABEL_SIZE)
 
 
 def _unit(text: str) -> str:

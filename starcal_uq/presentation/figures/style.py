@@ -22,6 +22,8 @@ INK, GREY, LIGHT = "#1b2733", "#66727f", "#dfe4e9"
 
 TITLE_SIZE, LABEL_SIZE, TICK_SIZE = 10.5, 9.5, 8.5
 DPI = 200
+# Means with their standard errors.
+BARS: dict[str, Any] = {"markersize": 4.0, "linestyle": "none", "elinewidth": 1.1}
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
@@ -79,6 +81,14 @@ def legend(ax: Axes, **keywords: Any) -> None:
     ax.legend(**{**options, **keywords})
 
 
+def about_zero(ax: Axes) -> None:
+    """Means about a line at zero, with room above them for a legend of two entries."""
+    ax.axhline(0.0, color=INK, linewidth=0.9)
+    top = 1.4 * max(map(abs, ax.get_ylim()))
+    ax.set_ylim(-top, top)
+    legend(ax, loc="upper left", ncols=2, columnspacing=1.0, handletextpad=0.2)
+
+
 def key(text: str, colour: str, **keywords: Any) -> Line2D:
     """An entry of a legend that stands for no artist."""
     from matplotlib.lines import Line2D
@@ -89,7 +99,7 @@ def key(text: str, colour: str, **keywords: Any) -> Line2D:
 def legend_above(figure: Figure, handles: Any, **keywords: Any) -> None:
     """One legend for all panels, in a line above them."""
     options: dict[str, Any] = {"ncols": len(handles), "fontsize": TICK_SIZE, "frameon": False, "labelcolor": INK}
-    figure.legend(handles=handles, loc="outside upper center", **{**options, **keywords})
+    figure.legend(handles=handles, **{"loc": "outside upper center", **options, **keywords})
 
 
 def colour_bar(ax: Axes, image: Any, text: str) -> Any:

@@ -24,15 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Missing:
-    """A part that the report lacks.
-
-    Attributes
-    ----------
-    what : str
-        The part, in words.
-    command : str
-        The command that makes it.
-    """
+    """A part that the report lacks, in words, and the command that makes it."""
 
     what: str
     command: str
@@ -42,32 +34,8 @@ class Missing:
 class Results:
     """Everything that a report is made from; None for what the run does not hold.
 
-    Attributes
-    ----------
-    name : str
-        Name of the run.
-    observations : Observations
-        The data.
-    calibration : Calibration
-        The estimate.
-    posterior : Posterior or None
-        The draws.
-    coupling : Coupling or None
-        The couplings, of the posterior if there is one, else of the estimate.
-    attitude : AttitudeError or None
-        The attitude error.
-    field_map : FieldMap or None
-        The direction uncertainty over the field.
-    diagnosis : Diagnosis or None
-        What questions the model: tests for misfit, jackknife, comparison of models.
-    truth : Camera or None
-        The camera of a simulation.
-    images : ImageRecord or None
-        What became of the images, where the run started from images.
-    budget : Budget or None
-        The attitude error budget.
-    missing : tuple of Missing
-        What the run does not hold.
+    The couplings are those of the posterior if there is one, else of the estimate; `truth` is the camera of a
+    simulation.
     """
 
     name: str
