@@ -72,7 +72,7 @@ def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
         if results.coupling is None
         else coupling_table(results.coupling, parameters(cal.camera.distortion)),
         "weak_directions": [] if results.coupling is None else tables.weak_directions(results.coupling),
-        "diagnostics_rows": [] if post is None else tables.diagnostics_rows(post),
+        "diagnostics_table": None if post is None else tables.diagnostics_table(post),
         "agreement": next((check.value for check in verdict.checks if check.name == "Independent posterior"), ""),
         "methods_rows": tables.methods_rows(results),
         "derived_table": None if post is None else model_tables.derived_table(post),
@@ -80,7 +80,7 @@ def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
         **image_tables.image_context(results.images, cal),
         **budget_tables.budget_context(results.budget),
         "stage_rows": tables.stage_rows(results),
-        "pair_rows": tables.pair_rows(results),
+        "pair_table": tables.pair_table(cal),
         "prior_rows": words.prior_rows(results),
         "likelihood_sentence": words.likelihood_sentence(results),
         "sigma_sentence": words.sigma_sentence(results),

@@ -12,6 +12,7 @@ from starcal_uq.core.constants import INTERACTION
 from starcal_uq.core.formatting import count, decimals_for, fixed, percent, plural, pretty_unit, significant, with_sigma
 from starcal_uq.diagnostics.verdict.estimate import truth_z
 from starcal_uq.presentation.html import symbol
+from starcal_uq.presentation.tables import TextTable, with_units
 from starcal_uq.propagation.attitude_error import CONTRIBUTORS
 
 if TYPE_CHECKING:
@@ -146,27 +147,27 @@ def weak_directions(coupling: Coupling) -> list[Row]:
     return rows
 
 
-def diagnostics_rows(post: Posterior) -> list[Row]:
+def diagnostics_table(post: Posterior) -> TextTable:
     """Convergence of every sampled parameter."""
     d = post.diagnostics
     rows = []
     for i in post.sampled:
         parameter = post.parameters[i]
+        mcse = float(d.mcse[i]) / parameter.scale
         rows.append(
-            {
-                "symbol": symbol(parameter.name),
-                "rhat": fixed(float(d.rhat[i]), 4),
-                "bulk": count(int(d.ess_bulk[i])),
-                "tail": count(int(d.ess_tail[i])),
-                "mcse": _with_unit(significant(float(d.mcse[i]) / parameter.scale), parameter),
-                "mcse_share": percent(float(d.mcse[i] / post.sd[i])),
-                "mean": mean_to_mcse(
-                    float(post.draws[:, i].mean()) / parameter.scale, float(d.mcse[i]) / parameter.scale
-                ),
-                "tau": fixed(float(d.autocorrelation[i]), 1),
-            }
+            (
+                parameter.name,
+                fixed(float(d.rhat[i]), 4),
+                count(int(d.ess_bulk[i])),
+                count(int(d.ess_tail[i])),
+                mean_to_mcse(float(post.draws[:, i].mean()) / parameter.scale, mcse),
+                _with_unit(significant(mcse), parameter),
+                percent(float(d.mcse[i] / post.sd[i])),
+                fixed(float(d.autocorrelation[i]), 1),
+            )
         )
-    return rows
+    heads = ("", "R-hat", "ESS, bulk", "ESS, tail", "Mean, to the digits of its MCSE", "MCSE of the mean", "MCSE / σ")
+    return TextTable((*heads, "Autocorrelation [steps]"), tuple(rows))
 
 
 def mean_to_mcse(mean: float, mcse: float) -> str:
@@ -225,22 +226,21 @@ def stage_rows(results: Results) -> list[Row]:
     return rows
 
 
-def pair_rows(results: Results) -> list[Row]:
+def pair_table(cal: Calibration) -> TextTable:
     """The paper's estimator beside the efficient one: its sigma and the price in precision."""
-    cal = results.calibration
-    pair_sigma = np.sqrt(np.diag(cal.pair_covariance))
-    return [
-        {
-            "symbol": symbol(p.name),
-            "unit": pretty_unit(p.scaled_unit),
-            "pair": f"{with_sigma(float(cal.pair_theta[i]) / p.scale, float(pair_sigma[i]) / p.scale)} ± "
-            f"{significant(float(pair_sigma[i]) / p.scale)}",
-            "efficient": f"{with_sigma(float(cal.theta[i]) / p.scale, float(cal.sigmas[i]) / p.scale)} ± "
-            f"{significant(float(cal.sigmas[i]) / p.scale)}",
-            "ratio": fixed(float(pair_sigma[i] / cal.sigmas[i]) ** 2, 2),
-        }
-        for i, p in enumerate(parameters(cal.camera.distortion))
-    ]
+    specs = parameters(cal.camera.distortion)
+    pair_sigmas = np.sqrt(np.diag(cal.pair_covariance))
+    rows = tuple(
+        (
+            p.name,
+            _with_error(float(cal.pair_theta[i]) / p.scale, float(pair_sigmas[i]) / p.scale),
+            _with_error(float(cal.theta[i]) / p.scale, float(cal.sigmas[i]) / p.scale),
+            fixed(float(pair_sigmas[i] / cal.sigmas[i]) ** 2, 2),
+        )
+        for i, p in enumerate(specs)
+    )
+    heads = ("", "Interstar angles (stage 3)", "Marginal likelihood (stage 4)", "Ratio of variances")
+    return with_units(TextTable(heads, rows), specs)
 
 
 # More images than this are counted, and only those left out are listed.
