@@ -144,8 +144,6 @@ def undistorted(camera: Camera, xy_px: FloatArray, how: Undistortion = "model") 
 
     Raises
     ------
-    ValueError
-        For another `how`.
     DistortionError
         When the camera's own distortion folds over within these points.
     """

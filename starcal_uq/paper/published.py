@@ -44,38 +44,25 @@ class Printed:
         return self.quantity in ("reprojection_px", "max_residual_px", "y0_error_px")
 
 
-def _row(method: str, place: str, **values: str) -> tuple[Printed, ...]:
-    return tuple(Printed(method, quantity, text, place) for quantity, text in values.items())
-
-
-TABLE_2: tuple[Printed, ...] = (
-    *_row(LEAST_SQUARES, "Table 2, row 1", f_mm="70.2122", x0_px="500.09", y0_px="527.70", reprojection_px="0.0567"),
-    *_row(
-        SAMAAN,
-        "Table 2, row 2",
-        f_mm="70.2293",
-        x0_px="500.18",
-        y0_px="531.23",
-        k1="2.76e-10",
-        k2="-1.88e-15",
-        reprojection_px="0.0379",
-    ),
-    *_row(
-        PROPOSED,
-        "Table 2, row 3",
-        f_mm="70.2259",
-        x0_px="500.03",
-        y0_px="530.09",
-        k1="2.14e-10",
-        k2="-3.56e-15",
-        reprojection_px="0.0038",
-    ),
+_QUANTITIES = ("f_mm", "x0_px", "y0_px", "k1", "k2", "reprojection_px")
+_ROWS = (
+    ("70.2122", "500.09", "527.70", "", "", "0.0567"),
+    ("70.2293", "500.18", "531.23", "2.76e-10", "-1.88e-15", "0.0379"),
+    ("70.2259", "500.03", "530.09", "2.14e-10", "-3.56e-15", "0.0038"),
+)
+TABLE_2: tuple[Printed, ...] = tuple(
+    Printed(method, quantity, text, f"Table 2, row {number}")
+    for number, (method, row) in enumerate(zip(PAPER_METHODS, _ROWS, strict=True), 1)
+    for quantity, text in zip(_QUANTITIES, row, strict=True)
+    if text
 )
 PUBLISHED: tuple[Printed, ...] = (
     *TABLE_2,
     Printed(PROPOSED, "y0_error_px", "0.13", "section 3.2"),
-    *_row(SAMAAN, "section 3.3", k1="3.09e-10", k2="-1.23e-15"),
-    *_row(PROPOSED, "section 3.3", k1="1.732e-10", k2="-3.449e-15"),
+    Printed(SAMAAN, "k1", "3.09e-10", "section 3.3"),
+    Printed(SAMAAN, "k2", "-1.23e-15", "section 3.3"),
+    Printed(PROPOSED, "k1", "1.732e-10", "section 3.3"),
+    Printed(PROPOSED, "k2", "-3.449e-15", "section 3.3"),
     Printed(LEAST_SQUARES, "max_residual_px", "0.81", "section 3.3, Fig. 4"),
     Printed(SAMAAN, "max_residual_px", "0.12", "section 3.3, Fig. 5"),
     Printed(PROPOSED, "max_residual_px", "0.015", "section 3.3, Fig. 6; abstract; conclusion"),

@@ -69,11 +69,6 @@ class Method:
         """Calibrate observations; recursive methods as a stream.
 
         A stream gives them the same estimate and covariance, and no residuals and attitudes, which take time.
-
-        Raises
-        ------
-        CalibrationError
-            When the method gives no good result.
         """
         source = [obs] if self.method in RECURSIVE_METHODS else obs
         return calibrate(source, start, method=self.method, recursion=self.recursion)
@@ -387,13 +382,7 @@ def check_settings(
     campaign: Campaign,
     workers: int | None,
 ) -> None:
-    """Refuse settings of a study over seeds that cannot work; `others` are conditions and what to say without them.
-
-    Raises
-    ------
-    SamplingError
-        In one sentence.
-    """
+    """Refuse settings of a study over seeds that cannot work; `others` are conditions and what to say without them."""
     models = [camera.distortion for camera in cameras]
     for good, text in (
         *others,

@@ -103,13 +103,7 @@ class PaperRun:
 
 
 def run_paper(*, convention: str = "eq14", n_frames: int = N_FRAMES, seed: int = 2017) -> PaperRun:
-    """Run the paper's experiment once, with its noise and its least number of stars.
-
-    Raises
-    ------
-    CalibrationError
-        When a method gives no good result.
-    """
+    """Run the paper's experiment once, with its noise and its least number of stars."""
     truth, start = paper_camera(convention), paper_start(convention)
     obs = Campaign(n_frames, MIN_STARS, SIGMA_PX, MAX_MAG).simulate(load_catalogue(max_mag=MAX_MAG), truth, seed)
     rng = np.random.default_rng((seed, _NOISE_STREAM))
@@ -193,13 +187,7 @@ def row_tests(replicates: Replicates) -> tuple[RowTest, ...]:
 
 
 def judge_all(readings: Readings, replicates: Replicates) -> tuple[Judged, ...]:
-    """Every printed number under every reading.
-
-    Raises
-    ------
-    CalibrationError
-        When a method gave too few results to compare with.
-    """
+    """Every printed number under every reading; a CalibrationError where a method gave too few results."""
     judged = []
     for number in PUBLISHED:
         trials = []

@@ -9,6 +9,8 @@ Holm's procedure together, so that chance is called a finding in one of a hundre
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from starcal_uq.core.formatting import fixed, percent, significant
@@ -50,9 +52,7 @@ def summarise(error: FloatArray, claimed: FloatArray, classical: FloatArray, crl
             "spread": spread,
             "spread_se": spread / np.sqrt(2.0 * max(n - 1, 1)),
             "crlb": crlb,
-            "efficiency": (crlb / spread) ** 2,
-            "efficiency_low": (crlb / spread * low) ** 2,
-            "efficiency_high": (crlb / spread * high) ** 2,
+            **_with_ends("efficiency", *((crlb / spread * factor) ** 2 for factor in (1.0, low, high))),
             "rmse": rmse,
             "rmse_over_crlb": rmse / crlb,
             "bias_p": float(2.0 * t.sf(abs(bias / bias_se), n - 1)),
@@ -64,17 +64,17 @@ def summarise(error: FloatArray, claimed: FloatArray, classical: FloatArray, crl
             wilson = wilson_interval(held, n) if known else (np.nan, np.nan)
             values |= {
                 f"claimed{suffix}": size,
-                f"claimed{suffix}_over_spread": size / spread,
-                f"claimed{suffix}_over_spread_low": size / spread * low,
-                f"claimed{suffix}_over_spread_high": size / spread * high,
+                **_with_ends(f"claimed{suffix}_over_spread", *(size / spread * factor for factor in (1.0, low, high))),
                 f"claimed{suffix}_over_rmse": size / rmse,
-                f"coverage95{suffix}": held / n if known else np.nan,
-                f"coverage95{suffix}_low": wilson[0],
-                f"coverage95{suffix}_high": wilson[1],
+                **_with_ends(f"coverage95{suffix}", held / n if known else np.nan, *wilson),
                 f"claimed{suffix}_p": chi_p_value(spread / size, n) if known else np.nan,
                 f"coverage95{suffix}_p": float(binomtest(held, n, _INTERVAL).pvalue) if known else np.nan,
             }
     return values
+
+
+def _with_ends(name: str, value: Any, low: Any, high: Any) -> AnyDict:
+    return {name: value, f"{name}_low": low, f"{name}_high": high}
 
 
 def chi_interval(n: int) -> tuple[float, float]:

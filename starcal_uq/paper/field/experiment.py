@@ -141,7 +141,6 @@ def field_experiment(
         path=Path(out),
         reading=sensor,
         tolerance_px=TOLERANCE_PX,
-        campaign=campaign,
         frames=frames,
         calibrations=calibrations,
         cameras=cameras,

@@ -38,14 +38,13 @@ class FieldExperiment(Shown):
     Cameras go by their names: ``uncalibrated``, the three methods, ``truth``. `sweep` has the identifications by camera
     and tolerance in px, of which `tolerance_px` is that of the main table; `stars` and `errors` are those of the main
     table, for cameras that identified a frame. `data_sheets` has identification and, if there is any, attitude errors
-    of a camera with another nominal focal length (mm). `campaign` are the frames of the calibration, `campaign_counts`
-    how many there are, are ``identified``, and the ``stars`` of these, of which so many are ``wrong``.
+    of a camera with another nominal focal length (mm). `campaign_counts` says how many frames of the calibration
+    there are, are ``identified``, and the ``stars`` of these, of which so many are ``wrong``.
     """
 
     path: Path
     reading: FieldReading
     tolerance_px: float
-    campaign: FieldFrames
     frames: FieldFrames
     calibrations: Mapping[str, Calibration]
     cameras: Mapping[str, Camera]

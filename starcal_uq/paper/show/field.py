@@ -51,16 +51,10 @@ def table_3(found: FieldExperiment) -> TextTable:
     rows, marks = [], []
     for row in found.table_3().to_dict("records"):
         rate = row["quantity"] == RATE
-        rows.append(
-            (
-                CAMERA_NAMES[row["method"]],
-                "identified [%]" if rate else f"{row['quantity'].removesuffix('_arcsec')} [arcsec]",
-                row["printed"],
-                _ranged(*(row[name] for name in ("ours", "low", "high"))),
-                _ranged(*(row[name] for name in ("aligned", "aligned_low", "aligned_high"))),
-                row["agrees"],
-            )
-        )
+        what = "identified [%]" if rate else f"{row['quantity'].removesuffix('_arcsec')} [arcsec]"
+        ours = _ranged(row["ours"], row["low"], row["high"])
+        after = _ranged(row["aligned"], row["aligned_low"], row["aligned_high"])
+        rows.append((CAMERA_NAMES[row["method"]], what, row["printed"], ours, after, row["agrees"]))
         marks.append("" if row["agrees"] == NEITHER else "pass")
     return TextTable(
         ("Camera", "", "Printed", "Ours (95 % range)", "After alignment", "Agrees"),

@@ -113,21 +113,11 @@ def printed_numbers(judged: Sequence[Judged]) -> TextTable:
     rows = []
     for one in judged:
         number, main, best = one.printed, one.main, one.best
-        other = ("", "") if best is main else (_spread(best.mean, best.spread, number.quantity), signed(best.z))
-        rows.append(
-            (
-                f"{number.place}: {METHOD_NAMES[number.method]}",
-                _named(number.quantity),
-                _minus(number.text),
-                str(one.noise_digits),
-                _spread(main.mean, main.spread, number.quantity),
-                signed(main.z),
-                *other,
-                "" if best is main else reading_words(best),
-                "" if np.isnan(one.by_chance) else percent(one.by_chance),
-                one.outcome.value,
-            )
-        )
+        what = (f"{number.place}: {METHOD_NAMES[number.method]}", _named(number.quantity), _minus(number.text))
+        ours, other = ((_spread(t.mean, t.spread, number.quantity), signed(t.z)) for t in (main, best))
+        better = ("", "", "") if best is main else (*other, reading_words(best))
+        chance = "" if np.isnan(one.by_chance) else percent(one.by_chance)
+        rows.append((*what, str(one.noise_digits), *ours, *better, chance, one.outcome.value))
     return TextTable(
         ("Place", "Number", "Printed", "Noise digits", "Ours", "z", "Best", "z", "Reading", "Fits anything", "Outcome"),
         tuple(rows),
@@ -264,25 +254,15 @@ def replicates(found: Replicates) -> TextTable:
     rows = []
     for row in found.table().to_dict("records"):
         p = by_name[row["parameter"]]
-        bias, bias_se = row["bias"] / p.scale, row["bias_se"] / p.scale
+        bias, bias_se, spread, bound = (row[name] / p.scale for name in ("bias", "bias_se", "spread", "crlb"))
         claimed, low, high = (fixed(row[f"claimed_over_spread{end}"], 2) for end in ("", "_low", "_high"))
         textbook = row["claimed_classical_over_spread"]
-        rows.append(
-            (
-                row["method"],
-                f"{NAMES[p.name]} [{pretty_unit(p.scaled_unit)}]",
-                count(row["n"]),
-                f"{with_sigma(bias, bias_se)} ± {significant(bias_se)}",
-                significant(row["spread"] / p.scale),
-                significant(row["crlb"] / p.scale),
-                significant(row["rmse_over_crlb"]),
-                "–" if row["biased"] else fixed(row["efficiency"], 2),
-                f"{claimed} ({low} to {high})",
-                fixed(textbook, 2) if np.isfinite(textbook) else "–",
-                percent(row["coverage95"], 3),
-                row["verdict"],
-            )
-        )
+        what = (row["method"], f"{NAMES[p.name]} [{pretty_unit(p.scaled_unit)}]", count(row["n"]))
+        sizes = (significant(size) for size in (spread, bound, row["rmse_over_crlb"]))
+        efficiency = "–" if row["biased"] else fixed(row["efficiency"], 2)
+        claims = (f"{claimed} ({low} to {high})", fixed(textbook, 2) if np.isfinite(textbook) else "–")
+        mean = f"{with_sigma(bias, bias_se)} ± {significant(bias_se)}"
+        rows.append((*what, mean, *sizes, efficiency, *claims, percent(row["coverage95"], 3), row["verdict"]))
     return TextTable(
         (
             *("Method", "", "n", "Bias", "Spread", "Bound", "RMSE / bound", "Efficiency"),
