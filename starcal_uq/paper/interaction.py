@@ -88,16 +88,9 @@ class Threshold(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class InteractionStudy(Shown):
-    """Bias and spread of the optics along four axes.
+    """Bias and spread of the optics along four axes; `interrupted` if the user stopped it before the last data set.
 
-    Attributes
-    ----------
-    table : DataFrame
-        One row per point, method and parameter; its columns below.
-    interrupted : bool
-        Stopped by the user before the last data set.
-    provenance : dict
-        Seed, settings, versions and time; empty when the table was read from a file.
+    The table has a row per point, method and parameter. The provenance is empty when it was read from a file.
 
     Columns
     -------

@@ -77,13 +77,7 @@ CLAIMED_Y0_ERROR_PX = (2.0, 3.0)
 
 
 def printed(method: str, quantity: str, place: str = "") -> Printed:
-    """The printed number of a method and quantity; the first whose place starts as given.
-
-    Raises
-    ------
-    KeyError
-        Where the paper prints none.
-    """
+    """The printed number of a method and quantity; the first whose place starts as given. A KeyError where none is."""
     for number in PUBLISHED:
         if (number.method, number.quantity) == (method, quantity) and number.place.startswith(place):
             return number

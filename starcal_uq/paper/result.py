@@ -207,26 +207,11 @@ def judge_all(readings: Readings, replicates: Replicates) -> tuple[Judged, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Reproduction(Shown):
-    """The paper's experiment beside ours.
+    """The paper's experiment beside ours; report, tables and figures are in the folder `path`.
 
-    Attributes
-    ----------
-    path : Path
-        Folder of the report, the tables and the figures.
-    run : PaperRun
-        One run: Table 2, Figs. 3 to 6.
-    replicates : Replicates
-        Every method over seeds.
-    readings : Readings
-        The paper's methods over seeds under every reading of the experiment.
-    judged : tuple of Judged
-        Every printed number and what became of it.
-    checks : tuple of PaperCheck
-        The paper against its own numbers.
-    study : InteractionStudy or None
-        Optics against distortion; None where it was left out.
-    provenance : dict
-        Seed, settings, versions, time and hash of the run's data.
+    `run` is one run (Table 2, Figs. 3 to 6), `replicates` every method over seeds, `readings` the paper's methods over
+    seeds under every reading of the experiment; `judged` has every printed number and what became of it, `checks` the
+    paper against its own numbers, and `study` optics against distortion, None where it was left out.
     """
 
     path: Path

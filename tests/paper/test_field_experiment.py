@@ -15,7 +15,7 @@ from starcal_uq.camera.projection import fold_radius_px, project, unproject
 from starcal_uq.core.errors import CalibrationError, RunFolderError
 from starcal_uq.paper.field.attitudes import FieldStars, attitude_errors, single_faults
 from starcal_uq.paper.field.experiment import field_experiment
-from starcal_uq.paper.field.identification import true_pixels
+from starcal_uq.paper.field.frames import true_pixels
 from starcal_uq.paper.field.published import (
     AXES,
     FIELD_CAMERAS,

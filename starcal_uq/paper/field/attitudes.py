@@ -25,8 +25,7 @@ from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.identification.search import LEAST_SIGMA_PX
 from starcal_uq.paper.commands import run_or_stop
-from starcal_uq.paper.field.frames import FieldFrames
-from starcal_uq.paper.field.identification import FieldIdentification, true_pixels
+from starcal_uq.paper.field.frames import FieldFrames, FieldIdentification, true_pixels
 from starcal_uq.paper.published import PAPER_METHODS
 
 if TYPE_CHECKING:

@@ -14,8 +14,7 @@ from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.paper.commands import Bar, write_tables
 from starcal_uq.paper.field.attitudes import Repetition, attitude_errors, identified_stars, replicate_field
-from starcal_uq.paper.field.frames import FieldFrames, take_frames
-from starcal_uq.paper.field.identification import WRONG_PX, identify_all, true_pixels
+from starcal_uq.paper.field.frames import WRONG_PX, FieldFrames, identify_all, take_frames, true_pixels
 from starcal_uq.paper.field.published import (
     FIELD_CAMERAS,
     NOMINAL_FOCAL_MM,

@@ -62,10 +62,7 @@ class FieldReading:
         )
 
     def nominal(self, focal_mm: float = NOMINAL_FOCAL_MM) -> Camera:
-        """The sensor as a data sheet has it: principal point at the centre, no distortion.
-
-        The model has coefficients, which are zero, so that a calibration can estimate them.
-        """
+        """The sensor as a data sheet has it: principal point at the centre, coefficients of zero to start from."""
         centre = 0.5 * (self.side_px - 1)
         return self.truth.replace(
             focal_mm=focal_mm, x0_px=centre, y0_px=centre, coefficients=(0.0, 0.0), name="data sheet"
@@ -73,11 +70,7 @@ class FieldReading:
 
     @property
     def sensor(self) -> Sensor:
-        """Detector and PSF: the default star tracker, as sensitive as `limit_mag` says.
-
-        Behind the filter of the detection, a star at the limit stands out by five standard deviations of the
-        background, which is the threshold: half of such stars are found.
-        """
+        """Detector and PSF of the default star tracker, of which a star at the limit just passes the threshold."""
         return Sensor(zero_point_e_s=_ZERO_POINT_E_S * 10.0 ** (0.4 * (self.limit_mag - _ZERO_POINT_MAG)))
 
 

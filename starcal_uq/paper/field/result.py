@@ -23,8 +23,7 @@ from starcal_uq.paper.field.attitudes import (
     attitude_errors,
     single_faults,
 )
-from starcal_uq.paper.field.frames import FieldFrames
-from starcal_uq.paper.field.identification import FieldIdentification
+from starcal_uq.paper.field.frames import FieldFrames, FieldIdentification
 from starcal_uq.paper.field.published import AXES, FIELD_METHODS, RATE, FieldReading, printed_field
 
 FIELD_REPORT = "field.html"

@@ -22,7 +22,7 @@ from starcal_uq.paper.field.result import NEITHER
 from starcal_uq.presentation.tables import TextTable
 
 if TYPE_CHECKING:
-    from starcal_uq.paper.field.identification import FieldIdentification
+    from starcal_uq.paper.field.frames import FieldIdentification
     from starcal_uq.paper.field.result import FieldExperiment
 
 CAMERA_NAMES = {

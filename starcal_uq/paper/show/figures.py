@@ -178,9 +178,8 @@ def _error_panel(ax: Axes, xy: FloatArray, error: FloatArray, norm: LogNorm) -> 
         length = np.sqrt(np.hypot(*along[2:]) * longest)
         along[2:] = [part / np.maximum(length, 1e-300) for part in along[2:]]
         scale = 1.0 / (0.95 * (x[some[1]] - x[some[0]]))
-        ax.quiver(
-            *along, angles="xy", scale_units="xy", scale=scale, color="white", width=0.005, headwidth=3.6, pivot="mid"
-        )
+        units: AnyDict = {"angles": "xy", "scale_units": "xy", "pivot": "mid"}
+        ax.quiver(*along, scale=scale, color="white", width=0.005, headwidth=3.6, **units)
     ax.set_xlim(x[0], x[-1])
     ax.set_ylim(y[-1], y[0])
     ax.set_aspect("equal")
@@ -355,16 +354,9 @@ def _errors(ax: Axes, rows: list[AnyDict], places: list[int], parameter: Paramet
         if abs(bias) > _LINEAR:
             # The logarithmic part has few ticks.
             side = -1.0 if bias > 0.0 else 1.0
-            ax.annotate(
-                fixed(bias, 0),
-                (bias + side * max(spread, claimed), place),
-                xytext=(side * 5.0, 0.0),
-                textcoords="offset points",
-                ha="right" if side < 0.0 else "left",
-                va="center",
-                fontsize=style.TICK_SIZE - 1.0,
-                color=style.GREY,
-            )
+            small: AnyDict = {"textcoords": "offset points", "fontsize": style.TICK_SIZE - 1.0, "color": style.GREY}
+            end, anchor = (bias + side * max(spread, claimed), place), "right" if side < 0.0 else "left"
+            ax.annotate(fixed(bias, 0), end, xytext=(side * 5.0, 0.0), ha=anchor, va="center", **small)
         reach = max(reach, abs(bias) + max(spread, claimed))
     _signed_axis(ax, reach)
     style.label(ax, parameter.latex)

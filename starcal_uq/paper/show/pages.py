@@ -63,12 +63,8 @@ def reproduction_page(found: Reproduction, figures: Mapping[str, bytes]) -> str:
     n, settings = obs.n_frames, found.provenance["settings"]
     tried = [len(one.trials) for one in found.judged]
     warning = (
-        ""
-        if n == N_FRAMES
-        else (
-            f"This reproduction has {plural(n, 'frame')} where the paper has {count(N_FRAMES)}: our draws spread "
-            f"{fixed(float(np.sqrt(N_FRAMES / n)), 1)} times as far, and z-values are that much smaller."
-        )
+        f"This reproduction has {plural(n, 'frame')} where the paper has {count(N_FRAMES)}: our draws spread "
+        f"{fixed(float(np.sqrt(N_FRAMES / n)), 1)} times as far, and z-values are that much smaller."
     )
     sections = [
         Section("Table 2, every method", (tables.table_2(found), tables.row_tests(found), tables.methods(found))),
@@ -113,9 +109,9 @@ def reproduction_page(found: Reproduction, figures: Mapping[str, bytes]) -> str:
         shown = (tables.thresholds(found.study),)
         sections.append(Section("Optics against distortion", shown, words, "interaction", caption))
     about = f"{_ABOUT} Distortion by {settings['convention'].replace('eq', 'eq. ')}."
-    return _page(
-        "Ye & Yang 2017, reproduced", about, tables.headline(found), sections, found.provenance, figures, warning
-    )
+    title, headline = "Ye & Yang 2017, reproduced", tables.headline(found)
+    warning = "" if n == N_FRAMES else warning
+    return _page(title, about, headline, sections, found.provenance, figures, warning)
 
 
 def field_page(found: FieldExperiment, figures: Mapping[str, bytes]) -> str:

@@ -133,19 +133,12 @@ def table_2(found: Reproduction) -> TextTable:
     for row in found.table_2().to_dict("records"):
         scale, _ = _unit(row["quantity"])
         ours, spread = row["ours"] / scale, row["spread"] / scale
-        rows.append(
-            (
-                row["method"],
-                _named(row["quantity"]),
-                f"{row['truth'] / scale:g}".replace("-", MINUS),
-                with_sigma(ours, spread) if np.isfinite(spread) else significant(ours),
-                _spread(row["mean"], row["spread"], row["quantity"]),
-                _known(row["sigma_claimed"] / scale),
-                _known(row["sigma_crlb"] / scale),
-                _minus(row["printed"]),
-                signed(row["z_printed"]) if row["printed"] else "",
-            )
-        )
+        one_run = with_sigma(ours, spread) if np.isfinite(spread) else significant(ours)
+        what = (row["method"], _named(row["quantity"]), f"{row['truth'] / scale:g}".replace("-", MINUS))
+        sigmas = (_known(row[name] / scale) for name in ("sigma_claimed", "sigma_crlb"))
+        z = signed(row["z_printed"]) if row["printed"] else ""
+        over_seeds = _spread(row["mean"], row["spread"], row["quantity"])
+        rows.append((*what, one_run, over_seeds, *sigmas, _minus(row["printed"]), z))
     return TextTable(
         ("Method", "", "Truth", "This run", "Over seeds", "Claimed σ", "Cramér–Rao bound", "Printed", "z"),
         tuple(rows),
