@@ -100,6 +100,10 @@ def _rows(result: Any) -> TextTable:
     return TextTable.of(result.to_dataframe())
 
 
+def _draws(result: Any) -> Iterable[str]:
+    return [f"{result.n_draws} posterior draws."]
+
+
 def _messages(result: Any) -> Iterable[str]:
     messages: Iterable[str] = result.messages
     return messages
@@ -154,7 +158,11 @@ VIEWS: Mapping[type, View] = {
     Budget: View(budgeting.headline, section_html, {"contributors": plot_budget}),
     Agreement: _view("Sampled over first order", propagation.agreement_text, propagation.agreement_table),
     AttitudeError: _view(
-        "Attitude error", propagation.attitude_text, propagation.attitude_table, contributors=plot_attitude
+        "Attitude error",
+        propagation.attitude_text,
+        propagation.attitude_table,
+        lambda error: [f"{error.n_draws} posterior draws through QUEST on {error.n_frames} frames ({error.frames})."],
+        contributors=plot_attitude,
     ),
     Coupling: _view(
         "Coupling",
@@ -167,11 +175,14 @@ VIEWS: Mapping[type, View] = {
     FieldMap: _view(
         "Direction uncertainty over the detector", propagation.field_text, propagation.field_table, maps=plot_field_map
     ),
-    DistortionCurve: _view("Distortion", propagation.distortion_text, lambda curve: None, curve=plot_distortion_curve),
+    DistortionCurve: _view(
+        "Distortion", propagation.distortion_text, lambda curve: None, _draws, curve=plot_distortion_curve
+    ),
     ErrorSpectrum: _view(
         "Error spectrum",
         propagation.spectrum_text,
         propagation.spectrum_table,
+        _draws,
         spectrum=plot_spectrum,
         time_series=plot_error_series,
     ),

@@ -69,14 +69,17 @@ def remembering(function):
 @pytest.fixture(scope="module")
 def remembered():
     """Studies of one camera and seed that differ in the likelihood only share their simulations and calibrations."""
-    return {"simulate": remembering(sc.simulate), "calibrate": remembering(sc.calibrate)}
+    return {
+        "starcal_uq.simulation.frames.simulate": remembering(sc.simulate),
+        "starcal_uq.diagnostics.validation.replicates.calibrate": remembering(sc.calibrate),
+    }
 
 
 @contextlib.contextmanager
 def data_made_once(remembered):
     with pytest.MonkeyPatch.context() as patch:
-        for name, function in remembered.items():
-            patch.setattr(f"starcal_uq.diagnostics.validation.replicates.{name}", function)
+        for place, function in remembered.items():
+            patch.setattr(place, function)
         yield
 
 

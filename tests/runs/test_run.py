@@ -54,7 +54,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
 
 
 def test_a_demo_reads_each_file_once_at_most_and_is_judged_once(
-    calls: Counter[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    calls: Counter[str], unpainted: None, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(sys, "argv", ["starcal-uq", "demo", "--frames", "60", "--out", str(tmp_path / "demo")])
     with pytest.raises(SystemExit):
