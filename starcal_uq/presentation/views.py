@@ -160,7 +160,7 @@ VIEWS: Mapping[type, View] = {
     AttitudeError: _view(
         "Attitude error",
         propagation.attitude_text,
-        propagation.attitude_table,
+        lambda error: TextTable.of(error.to_dataframe(), missing="not known"),
         lambda error: [f"{error.n_draws} posterior draws through QUEST on {error.n_frames} frames ({error.frames})."],
         contributors=plot_attitude,
     ),
