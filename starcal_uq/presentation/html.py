@@ -43,10 +43,11 @@ def symbol(name: str) -> Markup:
 
 
 def on_page(table: TextTable, caption: str = "", kind: str = "") -> Markup:
-    """A table of a page, which may scroll: names of parameters as symbols, first column bold."""
+    """A table of a page, which may scroll: first column bold; under an empty head, names of parameters as symbols."""
     from markupsafe import Markup
 
-    drawn = table.html(caption, kind, lambda name: f"<b>{symbol(name)}</b>")
+    shown = escape if table.heads[0] else symbol
+    drawn = table.html(caption, kind, lambda name: f"<b>{shown(name)}</b>")
     return Markup(f'<div class="scroll">{drawn}</div>')
 
 
