@@ -57,7 +57,7 @@ bench: .venv/.installed ## timings and effective draws, beside the straightforwa
 	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python benchmarks/run.py
 
 clean: ## remove everything that the other targets made
-	rm -rf .venv .venv-alt docs/_build docs/notebooks docs/reference/_commands.txt starcal-demo dist
+	rm -rf .venv .venv-alt docs/_build docs/notebooks docs/reference/_commands.txt docs/reference/api starcal-demo dist
 	rm -rf .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
