@@ -112,6 +112,9 @@ def from_plain(cls: type[Record], data: Any, arrays: Arrays | None = None) -> Re
 
 def _value(hint: Any, data: Any, arrays: Arrays, name: str) -> Any:
     origin, args = get_origin(hint), get_args(hint)
+    if hasattr(origin, "__value__"):
+        # NumPy 2.5 declares NDArray by a type statement where Python has one.
+        return _value(origin.__value__[args], data, arrays, name)
     if hint is Any:
         return data
     if hint in _SCALARS:
