@@ -1,0 +1,136 @@
+"""A star sensor of a second make: NumPy alone, no code of the package, for tests that attack from outside.
+
+Distortion is Brown's (ideal to distorted). Every departure from the package's assumptions is a switch: directions that
+err with their star, noise that varies with radius, magnitude or frame, frames that see one patch of sky.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+Noise = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Campaign:
+    """Columns of an observations table, and what is true.
+
+    `columns` has frame, x_px, y_px, ra_deg, dec_deg, star_id and mag; `theta` is x0, y0, f, k1, k2 in px units;
+    `attitudes` (K, 3, 3) turn ICRS into the camera; `size_px` is the side of the square detector.
+    """
+
+    columns: dict[str, np.ndarray]
+    theta: np.ndarray
+    attitudes: np.ndarray
+    size_px: int
+
+    def camera_toml(self, focal_error: float = 0.01) -> dict[str, float | str | int]:
+        """A data sheet: centred, the focal length wrong by a fraction, no distortion; 10 um pixels."""
+        centre = 0.5 * (self.size_px - 1)
+        focal_mm = self.theta[2] * 0.01 * (1.0 + focal_error)
+        sheet: dict[str, float | str | int] = {"width_px": self.size_px, "height_px": self.size_px, "pixel_um": 10.0}
+        return sheet | {"focal_mm": focal_mm, "x0_px": centre, "y0_px": centre, "distortion": "brown"}
+
+
+def campaign(
+    rng: np.random.Generator,
+    *,
+    n_frames: int,
+    stars_per_frame: int = 15,
+    field_deg: float = 15.0,
+    size_px: int = 1024,
+    corner_px: tuple[float, float] = (3.0, -1.0),
+    sigma_px: float | Noise = 0.05,
+    patch_stars: int | None = None,
+    star_sigma_px: float = 0.0,
+    frame_focal: float = 0.0,
+) -> Campaign:
+    """Observe.
+
+    `field_deg` is the width of the field; `corner_px` are the displacements by k1 and k2 at the corner; `sigma_px` is a
+    number or a function of (radius over the half diagonal, magnitude, frame number). With `patch_stars` all frames see
+    the same stars, that many over a patch that random rolls and pointings of up to a fifth of the field stay within;
+    otherwise every frame has stars of its own. `star_sigma_px` is the error per axis of each star's own direction, the
+    same whenever it is seen; `frame_focal` the relative spread of the focal length from frame to frame.
+    """
+    focal = 0.5 * size_px / np.tan(np.radians(0.5 * field_deg))
+    x0, y0 = 0.5 * size_px - 12.0, 0.5 * size_px + 18.0
+    corner = 0.5 * size_px * np.sqrt(2.0)
+    k1, k2 = corner_px[0] / corner**3, corner_px[1] / corner**5
+    patch = None if patch_stars is None else cap(rng, np.array([0.3, -0.5, 0.8]), 0.85 * field_deg, patch_stars)
+    magnitudes = None if patch_stars is None else rng.uniform(2.0, 6.0, patch_stars)
+    offsets = None if patch_stars is None else star_sigma_px / focal * rng.standard_normal((patch_stars, 2))
+    rows: dict[str, list[np.ndarray]] = {name: [] for name in ("frame", "x", "y", "r", "id", "mag")}
+    attitudes = []
+    for frame in range(n_frames):
+        if patch is None:
+            attitude = frame_at(rng, random_unit(rng))
+            stars = cap(rng, attitude[2], 0.75 * field_deg, 6 * stars_per_frame)
+            mag, number = rng.uniform(2.0, 6.0, len(stars)), np.arange(len(stars)) + 1000 * frame
+            own = star_sigma_px / focal * rng.standard_normal((len(stars), 2))
+        else:
+            attitude = frame_at(rng, cap(rng, np.array([0.3, -0.5, 0.8]), 0.2 * field_deg, 1)[0])
+            stars, mag, number, own = patch, magnitudes, np.arange(len(patch)), offsets
+        f = focal * (1.0 + frame_focal * rng.standard_normal())
+        # What shines is where the star is; what the table states is off by the star's own error.
+        b = stars @ attitude.T
+        x, y = f * b[:, 0] / b[:, 2] + x0, f * b[:, 1] / b[:, 2] + y0
+        r2 = (x - x0) ** 2 + (y - y0) ** 2
+        stretch = 1.0 + k1 * r2 + k2 * r2**2
+        x, y = x0 + (x - x0) * stretch, y0 + (y - y0) * stretch
+        seen = np.flatnonzero((b[:, 2] > 0.3) & (x > 0) & (x < size_px - 1) & (y > 0) & (y < size_px - 1))
+        seen = seen[rng.permutation(len(seen))[:stars_per_frame]]
+        radius = np.sqrt(r2[seen]) / corner
+        sigma = sigma_px(radius, mag[seen], np.full(len(seen), frame)) if callable(sigma_px) else sigma_px
+        noise = sigma * rng.standard_normal((2, len(seen)))
+        attitudes.append(attitude)
+        xy = np.array([x[seen], y[seen]]) + noise
+        values = (np.full(len(seen), frame), *xy, moved(stars[seen], own[seen]), number[seen], mag[seen])
+        for name, column in zip(rows, values, strict=True):
+            rows[name].append(column)
+    r = np.concatenate(rows["r"])
+    columns = {
+        "frame": np.concatenate(rows["frame"]),
+        "x_px": np.concatenate(rows["x"]),
+        "y_px": np.concatenate(rows["y"]),
+        "ra_deg": np.degrees(np.arctan2(r[:, 1], r[:, 0])) % 360.0,
+        "dec_deg": np.degrees(np.arcsin(r[:, 2])),
+        "star_id": np.array([f"S{i}" for i in np.concatenate(rows["id"])]),
+        "mag": np.concatenate(rows["mag"]),
+    }
+    return Campaign(columns, np.array([x0, y0, focal, k1, k2]), np.array(attitudes), size_px)
+
+
+def random_unit(rng: np.random.Generator) -> np.ndarray:
+    """A direction, uniform on the sphere."""
+    v = rng.standard_normal(3)
+    return v / np.linalg.norm(v)
+
+
+def frame_at(rng: np.random.Generator, boresight: np.ndarray) -> np.ndarray:
+    """Rotation (3, 3) from the sky to a camera that looks at `boresight`, at a random roll."""
+    z = boresight / np.linalg.norm(boresight)
+    x = np.cross(z, random_unit(rng))
+    x /= np.linalg.norm(x)
+    return np.array([x, np.cross(z, x), z])
+
+
+def cap(rng: np.random.Generator, centre: np.ndarray, radius_deg: float, n: int) -> np.ndarray:
+    """Directions (n, 3), uniform over a spherical cap."""
+    axes = frame_at(rng, centre)
+    z = rng.uniform(np.cos(np.radians(radius_deg)), 1.0, n)
+    phi = rng.uniform(0.0, 2.0 * np.pi, n)
+    s = np.sqrt(1.0 - z**2)
+    return np.column_stack([s * np.cos(phi), s * np.sin(phi), z]) @ axes
+
+
+def moved(stars: np.ndarray, offsets_rad: np.ndarray) -> np.ndarray:
+    """Unit vectors (n, 3) displaced by offsets (n, 2) along right ascension and declination."""
+    east = np.cross([0.0, 0.0, 1.0], stars)
+    east /= np.linalg.norm(east, axis=1)[:, None]
+    north = np.cross(stars, east)
+    v = stars + offsets_rad[:, :1] * east + offsets_rad[:, 1:] * north
+    return v / np.linalg.norm(v, axis=1)[:, None]
