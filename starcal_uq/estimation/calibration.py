@@ -18,6 +18,7 @@ from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.estimation.compressed import CompressedLikelihood
 from starcal_uq.estimation.stages import Stage
+from starcal_uq.maths.intervals import student_quantile
 from starcal_uq.maths.linear import correlation_of
 
 if TYPE_CHECKING:
@@ -132,6 +133,11 @@ class Calibration(Shown):
     def correlation(self) -> FloatArray:
         """Correlation matrix, (p, p)."""
         return correlation_of(self.covariance)[0]
+
+    def interval(self, probability: float = 0.95) -> FloatArray:
+        """Interval of each parameter without sampling, (p, 2), px units: Student's with `dof` degrees of freedom."""
+        half = student_quantile(probability, self.dof) * self.sigmas
+        return np.stack([self.theta - half, self.theta + half], axis=1)
 
     @property
     def n_stars(self) -> int:

@@ -1,4 +1,4 @@
-"""Intervals for fractions, and Holm's correction for many tests.
+"""Intervals for fractions and estimates, and Holm's correction for many tests.
 
 The closed forms stand here because `scipy.stats.binomtest(...).proportion_ci` finds the exact interval by a search that
 ends at 5e-13, and SciPy has no correction of Holm's.
@@ -14,6 +14,13 @@ from starcal_uq.core.types import FloatArray
 
 # Standard deviations of a normal 95 % interval.
 HALF_WIDTH_95 = 1.959963984540054
+
+
+def student_quantile(probability: float, dof: float) -> float:
+    """Half-width of an interval for a mean whose standard deviation was estimated, in those standard deviations."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(max(dof, 1.0), 0.5 * (1.0 + probability)))
 
 
 def binomial_interval(successes: int, n: int, probability: float = 0.95) -> tuple[float, float]:

@@ -1,0 +1,247 @@
+"""Are the stated uncertainties right, regime by regime? The tables of the documentation are made by this command.
+
+    python benchmarks/regimes.py [--only NAME ...] [--runs N] [--seed 1] [--processes N] [--write] [--list]
+
+Every run simulates a campaign with `tests/helpers/outside.py` (NumPy alone, none of the package's code), takes it
+through the public chain (`calibrate`, intervals of the estimate, `diagnose`, the verdict), and compares with the truth.
+``--write`` puts the rows that were run into the tables of `docs/explanation`; the other rows stay as they are.
+``--only`` takes parts of names.
+
+A regime is a function from a random generator to an `Outcome`, listed with `Regime` in REGIMES: most are a `campaign`
+with some switches, and `chain`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT)]
+
+import starcal_uq as sc  # noqa: E402
+from starcal_uq.core.status import Level  # noqa: E402
+from starcal_uq.core.tasks import processors, run_tasks  # noqa: E402
+from starcal_uq.diagnostics.verdict.judge import judge  # noqa: E402
+from tests.helpers.outside import Campaign, campaign  # noqa: E402
+
+# A fact of the data and no test: few frames and empty corners are warned of in every run of such a regime.
+FACTS = ("Coverage of the field",)
+VERDICTS = {Level.PASS: "passed", Level.WARN: "warning", Level.FAIL: "do not use"}
+STATISTICS_HEAD = (
+    "Regime",
+    "Runs",
+    "Coverage of 95 %",
+    "Squared error / stated",
+    "Passed",
+    "Warning",
+    "Do not use",
+    "Most frequent alarms",
+)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one run gave.
+
+    Attributes
+    ----------
+    inside : tuple of bool
+        For each parameter whether its 95 % interval holds the truth; empty where there is no estimate.
+    squared : float
+        Squared error (normalised by the stated covariance, over its expectation): 1 on average if that is right.
+    verdict : str
+        One of VERDICTS; "refused" where the chain raised an error, empty where nothing was judged.
+    alarms : tuple of str
+        Checks that did not pass, those of FACTS left out.
+    figures : dict
+        Further numbers by column name; the table shows their medians.
+    """
+
+    inside: tuple[bool, ...] = ()
+    squared: float = float("nan")
+    verdict: str = ""
+    alarms: tuple[str, ...] = ()
+    figures: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Regime:
+    """A row: its name, what is done in one run, how many runs stand in the table, and the page with the table."""
+
+    name: str
+    run: Callable[[np.random.Generator], Outcome]
+    runs: int
+    page: str = "statistics"
+
+
+def chain(
+    c: Campaign, *, diagnose: bool = True, calibrate: Mapping[str, Any] | None = None, **diagnosis: Any
+) -> Outcome:
+    """Calibrate a campaign, with `calibrate`'s options, diagnose it, and hold both against the truth."""
+    obs = sc.Observations(**c.columns, meta={"directions": "apparent"})
+    camera = sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
+    try:
+        cal = sc.calibrate(obs, camera, **(calibrate or {}))
+    except sc.StarcalError:
+        return Outcome(verdict="refused")
+    found = sc.diagnose(obs, cal, **diagnosis) if diagnose else None
+    return against_truth(c, cal, *(verdict_of(obs, cal, found) if diagnose else ("", ())))
+
+
+def against_truth(c: Campaign, cal: sc.Calibration, verdict: str = "", alarms: tuple[str, ...] = ()) -> Outcome:
+    """Intervals and squared error of an estimate."""
+    low, high = cal.interval(0.95).T
+    error = (cal.theta - c.theta) / cal.sigmas
+    squared = float(error @ np.linalg.solve(cal.correlation, error)) / len(error)
+    # With d degrees of freedom the form is p times an F variable, whose mean is d / (d - 2).
+    expected = cal.dof / (cal.dof - 2.0) if cal.dof > 2 else float("nan")
+    inside = (low <= c.theta) & (c.theta <= high)
+    return Outcome(tuple(bool(v) for v in inside), squared / expected, verdict, alarms)
+
+
+def verdict_of(
+    obs: sc.Observations, cal: sc.Calibration, found: sc.diagnostics.Diagnosis | None
+) -> tuple[str, tuple[str, ...]]:
+    """The verdict on a run that has not been sampled, and the checks that did not pass; facts left out."""
+    checks = [c for c in judge(obs, cal, diagnosis=found).checks if c.name not in FACTS and c.level is not Level.PASS]
+    level = max((c.level for c in checks), key=lambda v: v.rank, default=Level.PASS)
+    return VERDICTS[level], tuple(c.name for c in checks)
+
+
+def plain(rng: np.random.Generator, options: Mapping[str, Any], **chain_options: Any) -> Outcome:
+    """A campaign with these options, through the chain."""
+    return chain(campaign(rng, **options), **chain_options)
+
+
+def clean(name: str, runs: int, **options: Any) -> Regime:
+    """A regime in which the model holds."""
+    return Regime(name, partial(plain, options=options), runs)
+
+
+REGIMES: list[Regime] = [
+    clean("clean: 3 frames", 400, n_frames=3),
+    clean("clean: 5 frames", 400, n_frames=5),
+    clean("clean: 10 frames", 400, n_frames=10),
+    clean("clean: 20 frames", 400, n_frames=20),
+    clean("clean: 100 frames", 200, n_frames=100),
+    clean("clean: 1000 frames", 40, n_frames=1000),
+    clean("clean: 3 stars in each of 60 frames", 200, n_frames=60, stars_per_frame=3),
+    clean("clean: 5 stars in each of 20 frames", 200, n_frames=20, stars_per_frame=5),
+    clean("clean: field of 4°, 50 frames", 200, n_frames=50, field_deg=4.0),
+    clean("clean: field of 55°, 50 frames", 200, n_frames=50, field_deg=55.0),
+]
+
+
+def one_run(index: int, name: str, seed: int) -> Outcome:
+    """Run `index` of a regime; the same for any number of processes, and whatever else is run."""
+    regime = next(r for r in REGIMES if r.name == name)
+    return regime.run(np.random.default_rng([seed, index, *name.encode()]))
+
+
+def cells(regime: Regime, found: Sequence[Outcome]) -> dict[str, str]:
+    """The row of a regime."""
+    n = len(found)
+    row = dict.fromkeys(STATISTICS_HEAD, "–") if regime.page == "statistics" else {}
+    row |= {"Regime": regime.name, "Runs": str(n)}
+    if inside := [o.inside for o in found if o.inside]:
+        shares = 100.0 * np.mean(inside, axis=0)
+        row["Coverage of 95 %"] = f"{shares.min():.1f} – {shares.max():.1f} %"
+        squared = np.array([o.squared for o in found if o.inside])
+        # A squared error over p parameters scatters widely where degrees of freedom are few: the mean, with its error.
+        row["Squared error / stated"] = f"{squared.mean():.2f} ± {squared.std(ddof=1) / np.sqrt(len(squared)):.2f}"
+    if verdicts := [o.verdict for o in found if o.verdict]:
+        for words, column in (("passed", "Passed"), ("warning", "Warning"), ("do not use", "Do not use")):
+            row[column] = _share(sum(v == words for v in verdicts), len(verdicts))
+        counted = Counter(name for o in found for name in o.alarms).most_common(3)
+        refused = sum(v == "refused" for v in verdicts)
+        named = [("refused", refused)] if refused else []
+        row["Most frequent alarms"] = ", ".join(f"{name} {_share(k, n)}" for name, k in named + counted) or "–"
+    for name in dict.fromkeys(name for o in found for name in o.figures):
+        row[name] = f"{np.median([o.figures[name] for o in found if name in o.figures]):.3g}"
+    return row
+
+
+def _share(count: int, n: int) -> str:
+    return f"{100.0 * count / n:.1f} %"
+
+
+def markdown(rows: Sequence[Mapping[str, str]]) -> str:
+    """Rows as a table; columns in the order in which they occur."""
+    head = list(dict.fromkeys(name for row in rows for name in row))
+    lines = [head, ["---"] * len(head), *([row.get(name, "–") for name in head] for row in rows)]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def page(name: str) -> tuple[Path, str]:
+    """The page of a table, and the word between its markers."""
+    return ROOT / "docs" / "explanation" / f"{name}.md", "regimes" if name == "statistics" else f"{name} regimes"
+
+
+def stored(name: str) -> list[dict[str, str]]:
+    """Rows of the table that a page has."""
+    path, word = page(name)
+    between = path.read_text(encoding="utf-8").partition(f"<!-- {word} -->")[2].partition(f"<!-- /{word} -->")[0]
+    lines = [[c.strip() for c in line.strip("|").split("|")] for line in between.splitlines() if line.startswith("|")]
+    return [dict(zip(lines[0], line, strict=True)) for line in lines[2:]]
+
+
+def write(name: str, rows: Sequence[Mapping[str, str]], seed: int) -> None:
+    """Put rows into the table of a page, in the order of REGIMES; rows that were not run stay."""
+    path, word = page(name)
+    merged = {row["Regime"]: row for row in [*stored(name), *rows]}
+    ordered = [merged[r.name] for r in REGIMES if r.name in merged]
+    text = path.read_text(encoding="utf-8")
+    before, found, rest = text.partition(f"<!-- {word} -->")
+    if not found or f"<!-- /{word} -->" not in rest:
+        raise SystemExit(f"{path} has no markers <!-- {word} --> and <!-- /{word} -->")
+    after = rest.partition(f"<!-- /{word} -->")[2]
+    made = f"Made by `python benchmarks/regimes.py --seed {seed} --write`; do not edit."
+    path.write_text(f"{before}{found}\n\n{made}\n\n{markdown(ordered)}\n\n<!-- /{word} -->{after}", encoding="utf-8")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(prog="python benchmarks/regimes.py", description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--only", nargs="+", default=[""], metavar="NAME", help="regimes whose name has one of these")
+    parser.add_argument("--runs", type=int, help="runs of each regime (default: as many as the documentation's)")
+    parser.add_argument("--seed", type=int, default=1, help="seed (default 1)")
+    parser.add_argument("--processes", type=int, default=processors(), help="processes; 0 stays in this one")
+    parser.add_argument("--write", action="store_true", help="write the rows into the documentation")
+    parser.add_argument("--list", action="store_true", help="list the regimes and stop")
+    options = parser.parse_args(arguments)
+    chosen = [r for r in REGIMES if any(part in r.name for part in options.only)]
+    if options.list or not chosen:
+        sys.stdout.write("".join(f"{r.page}: {r.name} ({r.runs} runs)\n" for r in REGIMES))
+        return 0 if options.list else 2
+    tables: dict[str, list[dict[str, str]]] = {}
+    for regime in chosen:
+        task = partial(one_run, name=regime.name, seed=options.seed)
+        report = partial(_report, regime.name)
+        runs = options.runs or regime.runs
+        found, stopped = run_tasks(task, runs, caller="regimes.py", chunk=4, workers=options.processes, progress=report)
+        sys.stderr.write("\n")
+        if stopped:
+            return 1
+        tables.setdefault(regime.page, []).append(cells(regime, found))
+        if options.write:
+            write(regime.page, tables[regime.page], options.seed)
+    for rows in tables.values():
+        sys.stdout.write(markdown(rows) + "\n")
+    return 0
+
+
+def _report(name: str, done: int, total: int) -> None:
+    sys.stderr.write(f"\r{name}: {done} of {total}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
