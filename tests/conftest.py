@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import os
 import tempfile
 
@@ -17,7 +16,6 @@ os.environ["XDG_CACHE_HOME"] = os.path.join(tempfile.gettempdir(), "starcal_uq-t
 import warnings
 from importlib.metadata import version
 from pathlib import Path
-from typing import IO
 
 import hypothesis
 import pytest
@@ -40,12 +38,6 @@ def pytest_configure(config: pytest.Config) -> None:
             import arviz  # noqa: F401
 
 
-# One white pixel.
-BLANK_PNG = base64.b64decode(
-    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAAAAAA6fptVAAAACklEQVR42mP4DwABAQEAG7buVgAAAABJRU5ErkJggg=="
-)
-
-
 @pytest.fixture
 def unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
     """Figures are made but not painted: a file of one white pixel takes the place of each.
@@ -53,15 +45,11 @@ def unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
     Painting is most of the time that a report takes, and all of it is Matplotlib's. Every figure is painted in
     `tests/presentation`, whole pages in the tests of the report and in one run of the command line.
     """
-    from matplotlib.figure import Figure
+    import numpy as np
 
-    def blank(_figure: Figure, file: IO[bytes] | str | Path, **_options: object) -> None:
-        if isinstance(file, str | Path):
-            Path(file).write_bytes(BLANK_PNG)
-        else:
-            file.write(BLANK_PNG)
+    from starcal_uq.presentation.figures import style
 
-    monkeypatch.setattr(Figure, "savefig", blank)
+    monkeypatch.setattr(style, "painted", lambda _figure, _dpi: np.full((1, 1, 3), 255, dtype=np.uint8))
 
 
 @pytest.fixture(scope="session")

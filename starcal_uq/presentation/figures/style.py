@@ -10,10 +10,13 @@ import io
 import sys
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D
+    from numpy.typing import NDArray
 
 # Okabe & Ito (2008), "Color Universal Design".
 BLUE, SKY, GREEN = "#0072B2", "#56B4E9", "#009E73"
@@ -22,6 +25,8 @@ INK, GREY, LIGHT = "#1b2733", "#66727f", "#dfe4e9"
 
 TITLE_SIZE, LABEL_SIZE, TICK_SIZE = 10.5, 9.5, 8.5
 DPI = 200
+# Half the time of zlib's default for pictures of the same size, because flat grounds are most of them.
+_COMPRESSION = 3
 # Means with their standard errors.
 BARS: dict[str, Any] = {"markersize": 4.0, "linestyle": "none", "elinewidth": 1.1}
 
@@ -127,9 +132,28 @@ def figure_of(ax: Axes) -> Figure:
 
 def png_bytes(figure: Figure, dpi: int = DPI) -> bytes:
     """The figure as PNG, without a time stamp: the same figure gives the same bytes."""
+    from PIL import Image
+
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
+    picture = Image.fromarray(painted(figure, dpi))
+    picture.save(buffer, format="png", dpi=(dpi, dpi), compress_level=_COMPRESSION)
     return buffer.getvalue()
+
+
+def painted(figure: Figure, dpi: int) -> NDArray[np.uint8]:
+    """The figure's pixels (height, width, 3), drawn once, where `Figure.savefig` draws twice."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas, resolution = figure.canvas, figure.dpi
+    try:
+        figure.dpi = dpi
+        agg: Any = FigureCanvasAgg(figure)
+        agg.draw()
+        # Opaque, as all figures here are.
+        return np.ascontiguousarray(np.asarray(agg.buffer_rgba())[..., :3])
+    finally:
+        figure.dpi = resolution
+        figure.set_canvas(canvas)
 
 
 def _in_notebook() -> bool:
