@@ -52,24 +52,42 @@ class Outcome(Shown):
 
         NaN if it is not known. The larger of both is at least the rule, which is enough where that violates the limit.
         """
-        found, asked = self.total, self.requirement
-        if asked.judged_by == "both" and found.unresolved and found.rule_arcsec > asked.limit_arcsec:
-            return found.rule_arcsec
-        chosen = {"rule": found.rule_arcsec, "sampling": found.sampled_arcsec}
-        return chosen.get(asked.judged_by, found.larger_arcsec)
+        return self._judged(self.total.rule_arcsec, self.total.sampled_arcsec)
+
+    @property
+    def least_arcsec(self) -> float:
+        """The same bound if worst cases of different contributors do not meet: only above the limit is it violated."""
+        least = self._judged(self.total.rule_least_arcsec, self.total.sampled_least_arcsec)
+        return self.bound_arcsec if math.isnan(least) else least
+
+    def _judged(self, rule: float, sampled: float) -> float:
+        asked = self.requirement
+        if asked.judged_by == "both" and math.isnan(sampled) and rule > asked.limit_arcsec:
+            return rule
+        both = math.nan if math.isnan(sampled) else max(rule, sampled)
+        return {"rule": rule, "sampling": sampled}.get(asked.judged_by, both)
 
     @property
     def margin_arcsec(self) -> float:
-        """Limit minus bound; negative if violated."""
+        """Limit minus bound; negative if violated, or open between the least and the bound."""
         return self.requirement.limit_arcsec - self.bound_arcsec
 
     @property
     def verdict(self) -> str:
-        """``violated``; ``open`` while contributors are missing or samples do not resolve the confidence; ``met``."""
-        if self.margin_arcsec < 0.0:
+        """``violated``, ``met``, or ``open``.
+
+        Open while contributors are missing or samples do not resolve the confidence, and where the limit lies between
+        what is reached for certain and a bound that is only an upper one.
+        """
+        if self.least_arcsec > self.requirement.limit_arcsec:
             return "violated"
         # No row at all is assessed, or the samples end too early: the margin is not a number.
-        return "open" if self.total.at_least or math.isnan(self.margin_arcsec) else "met"
+        return "met" if self.margin_arcsec >= 0.0 and not self.total.at_least else "open"
+
+    @property
+    def between(self) -> bool:
+        """True if it is open because the bound above the limit is only an upper one."""
+        return self.verdict == "open" and self.margin_arcsec < 0.0
 
     @property
     def unresolved(self) -> bool:
@@ -114,7 +132,7 @@ class Budget(Shown):
 
     @property
     def open_requirements(self) -> tuple[Outcome, ...]:
-        """Requirements that are neither violated nor met: contributors are missing, or samples resolve too little."""
+        """Requirements that are neither violated nor met: see `Outcome.verdict`."""
         return tuple(outcome for outcome in self.outcomes if outcome.verdict == "open")
 
     @property
@@ -182,15 +200,17 @@ class Budget(Shown):
         return pd.DataFrame(rows).assign(not_assessed=["; ".join(entry.not_assessed) for entry in self.totals])
 
     def requirements_dataframe(self) -> pd.DataFrame:
-        """One row per requirement: its fields, ``rule_arcsec``, ``sampled_arcsec``, ``margin_arcsec``, ``verdict``."""
+        """One row per requirement: its fields, the bounds, ``least_arcsec``, ``margin_arcsec`` and ``verdict``."""
         import pandas as pd
 
         names = [f.name for f in fields(Requirement)]
-        columns = [*names, "rule_arcsec", "sampled_arcsec", "bound_arcsec", "margin_arcsec", "verdict", "at_least"]
+        columns = [*names, "rule_arcsec", "sampled_arcsec", "least_arcsec", "bound_arcsec"]
+        columns += ["margin_arcsec", "verdict", "at_least"]
         rows = [
             (
                 *(getattr(outcome.requirement, name) for name in names),
-                *(outcome.total.rule_arcsec, outcome.total.sampled_arcsec, outcome.bound_arcsec),
+                *(outcome.total.rule_arcsec, outcome.total.sampled_arcsec),
+                *(outcome.least_arcsec, outcome.bound_arcsec),
                 *(outcome.margin_arcsec, outcome.verdict, outcome.total.at_least),
             )
             for outcome in self.outcomes
@@ -342,4 +362,7 @@ def _text(value: Any) -> str:
 
 
 def _made(kind: Any, record: Mapping[str, str]) -> Any:
-    return kind(**{f.name: _READERS[str(f.type)](record[f.name]) for f in fields(kind)})
+    # Files of earlier versions lack columns, for which the defaults stand.
+    return kind(
+        **{f.name: _READERS[str(f.type)](record[f.name]) for f in fields(kind) if record.get(f.name) is not None}
+    )

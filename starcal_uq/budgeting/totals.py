@@ -7,11 +7,14 @@ of a two-axis Gaussian error for the angle across the boresight.
 What counts as random depends on what the confidence is about:
 
 - *mixed*: a sensor and a moment taken at random. All rows spread.
-- *ensemble*: a sensor taken at random, at its worst moment. Rows that are random in time enter with their half-width at
-  the confidence, added linearly.
-- *temporal*: the worst sensor, at a moment taken at random. Rows that are random over the ensemble enter so.
+- *ensemble*: a sensor taken at random, at its worst moment. Rows that are random in time alone enter with their worst.
+- *temporal*: the worst sensor, at a moment taken at random. Rows that are random over the ensemble alone enter so.
 
-A row that is random over both enters the last two by its half-width, which is more than is needed, never less.
+A row that is random over both differs from sensor to sensor and from moment to moment: it spreads in all three, with
+its sigma as that of the worst sensor, or of the worst moment. Worst cases are half-widths at the confidence, and add
+linearly, as the standard has it. That all of them meet in one sensor is an upper bound. Beside it stands what one
+sensor (or moment) in 1 / (1 - confidence) reaches, with the worst cases in squares, or sampled: only that can violate a
+limit.
 """
 
 from __future__ import annotations
@@ -33,6 +36,8 @@ N_SAMPLES = 200_000
 _SPREAD = 2.0
 # Samples beyond a quantile with fewer say little about it: its standard error is unknown, or the samples end before it.
 _RESOLVED = 20.0
+# Cases on either side of a quantile that stand for it where they point in different directions.
+_NEIGHBOURS = 4
 _DOMINANT = 0.5
 # Bounds that differ by less agree.
 _AGREE = 0.02
@@ -67,6 +72,9 @@ class Total:
         fewer than 20 samples lie beyond it.
     sampled_se_arcsec : float
         Standard error of the sampled bound.
+    rule_least_arcsec, sampled_least_arcsec : float
+        Bounds if worst cases of different rows do not meet: only a limit below is violated. Those above where at most
+        one row is taken at its worst.
     not_assessed : tuple of str
         Contributors that are missing: with any, the bounds are "at least".
     dominant : str
@@ -88,6 +96,8 @@ class Total:
     rule_arcsec: float
     sampled_arcsec: float
     sampled_se_arcsec: float
+    rule_least_arcsec: float = math.nan
+    sampled_least_arcsec: float = math.nan
     not_assessed: tuple[str, ...] = field(default=())
     dominant: str = ""
     dominant_share: float = math.nan
@@ -157,18 +167,23 @@ def total(
     counted = [row for row in chosen if row.assessed and row.applies]
     if not counted:
         nan = math.nan
-        return Total(scope, axis, interpretation, confidence, nan, nan, nan, nan, nan, nan, nan, missing)
-    random = [row for row in counted if interpretation in ("mixed", row.interpretation)]
+        return Total(scope, axis, interpretation, confidence, *(nan,) * 7, not_assessed=missing)
+    random = [row for row in counted if row.interpretation in _random(interpretation)]
     worst = [row for row in counted if row not in random]
     mean = np.array([sum(row.mean_arcsec for row in counted if row.axis == name) for name in axes[1]])
     sigma = np.array([grouped_sigma([row for row in random if row.axis == name]) for name in axes[1]])
     radius = _radius(confidence, sigma)
-    gaussian = _worst(worst, axes[1], confidence, by_shape=False)
+    gaussian, squares = _worst(worst, axes[1], confidence, by_shape=False)
     length, rms = float(np.linalg.norm(mean)), float(np.sqrt(np.mean(sigma**2)))
     rule = length + radius + gaussian
-    sampled, error = _sampled(
-        samples, scope, interpretation, mean, axes[1], confidence, _worst(worst, axes[1], confidence, by_shape=True)
+    by_shape, _ = _worst(worst, axes[1], confidence, by_shape=True)
+    columns = [AXES.index(name) for name in axes[1]]
+    chance, rest = (
+        sum((samples.sums[scope, kind][:, columns] for kind in kinds), start=np.zeros((1, len(columns))))
+        for kinds in (_random(interpretation), _worst_kinds(interpretation))
     )
+    sampled, error = _quantile(_meeting(mean, by_shape, chance) + chance, confidence)
+    least = min(_one_of_many(mean + rest, chance, confidence), sampled) if by_shape > 0.0 else sampled
     dominant, share = _dominant(counted, axes[1], confidence)
     result = Total(
         scope=scope,
@@ -182,12 +197,14 @@ def total(
         rule_arcsec=rule,
         sampled_arcsec=sampled,
         sampled_se_arcsec=error,
+        rule_least_arcsec=length + radius + squares,
+        sampled_least_arcsec=least,
         not_assessed=missing,
         dominant=dominant.name if share > _DOMINANT else "",
         dominant_share=share,
     )
     if result.unresolved:
-        n = len(samples.sums[scope, interpretation if interpretation != "mixed" else INTERPRETATIONS[0]])
+        n = len(chance)
         text = f"{n} samples do not resolve a confidence of {confidence_text(confidence)}: there is no sampled bound."
         return replace(result, explanation=text)
     return replace(result, explanation=explain(result, counted, random, dominant))
@@ -249,6 +266,8 @@ def _above(
         )
         if abs(total.mean_arcsec) > total.sigma_arcsec:
             return reasons
+    if total.worst_arcsec > _MEAN_COUNTS * total.sigma_arcsec > 0.0:
+        reasons.append("a worst case points one way, where fewer sigmas hold the same share than on both sides")
     # Small bounded rows explain nothing.
     bounded = [row for row in random if row.distribution in _BOUNDED]
     bounded = [row for row in bounded if row.sigma_arcsec >= _WORTH_NAMING * max(r.sigma_arcsec for r in bounded)]
@@ -298,12 +317,31 @@ def _radius(confidence: float, sigma: FloatArray) -> float:
     return two_axis_radius(confidence, float(sigma[0]), float(sigma[1]))
 
 
-def _worst(rows: Sequence[Contributor], axes: Sequence[str], confidence: float, *, by_shape: bool) -> float:
-    """Sum of half-widths: of the distributions themselves, or with the rule's Gaussian factor for unbounded ones."""
+def _random(interpretation: str) -> tuple[str, ...]:
+    """Kinds of rows that spread in this interpretation."""
+    return INTERPRETATIONS if interpretation == "mixed" else (interpretation, "mixed")
+
+
+def _worst_kinds(interpretation: str) -> tuple[str, ...]:
+    return tuple(kind for kind in INTERPRETATIONS if kind not in _random(interpretation))
+
+
+def _worst(
+    rows: Sequence[Contributor], axes: Sequence[str], confidence: float, *, by_shape: bool
+) -> tuple[float, float]:
+    """Half-widths of the contributors, added linearly, and in squares: groups err together in both.
+
+    Half-widths are those of the distributions themselves, or take the rule's Gaussian factor where they are unbounded.
+    """
     by_name: dict[str, list[Contributor]] = {}
     for row in rows:
         by_name.setdefault(row.name, []).append(row)
-    return sum((_reach(members, axes, confidence, by_shape=by_shape) for members in by_name.values()), start=0.0)
+    apart: dict[tuple[str, str], float] = {}
+    for name, members in by_name.items():
+        group = members[0].correlation_group
+        key = ("group", group) if group else ("row", name)
+        apart[key] = apart.get(key, 0.0) + _reach(members, axes, confidence, by_shape=by_shape)
+    return sum(apart.values(), start=0.0), math.hypot(*apart.values())
 
 
 def _reach(rows: Sequence[Contributor], axes: Sequence[str], confidence: float, *, by_shape: bool) -> float:
@@ -325,30 +363,44 @@ def _reach(rows: Sequence[Contributor], axes: Sequence[str], confidence: float, 
     return spread + float(np.linalg.norm(bounded))
 
 
-def _sampled(
-    samples: Samples,
-    scope: str,
-    interpretation: str,
-    mean: FloatArray,
-    axes: Sequence[str],
-    confidence: float,
-    worst: float,
-) -> tuple[float, float]:
-    """Quantile of the sampled error beyond the worst case of the rest, and its standard error; NaN if unresolved."""
-    kinds = INTERPRETATIONS if interpretation == "mixed" else (interpretation,)
-    columns = [AXES.index(name) for name in axes]
-    errors = mean + np.sum([samples.sums[scope, kind][:, columns] for kind in kinds], axis=0)
-    size = np.sort(np.linalg.norm(errors, axis=1))
+def _meeting(mean: FloatArray, worst: float, chance: FloatArray) -> FloatArray:
+    """The mean with a worst case of this length beside it, in the direction that reaches furthest."""
+    if worst == 0.0:
+        return mean
+    if len(mean) == 1:
+        towards = np.array([[1.0], [-1.0]])
+    else:
+        angle = np.linspace(0.0, 2.0 * np.pi, 360, endpoint=False)
+        towards = np.column_stack((np.cos(angle), np.sin(angle)))
+    reached = mean + worst * towards
+    size = np.linalg.norm(reached, axis=1)
+    spread = np.atleast_2d(np.cov(chance, rowvar=False)) if len(chance) > 1 else np.zeros((len(mean), len(mean)))
+    along = np.sqrt(np.einsum("ni,ij,nj->n", reached, spread, reached)) / np.maximum(size, 1e-300)
+    furthest: FloatArray = reached[int(np.argmax(size + 2.0 * along))]
+    return furthest
+
+
+def _one_of_many(rest: FloatArray, chance: FloatArray, confidence: float) -> float:
+    """What chance reaches at the confidence where the rest is as large as it is in one case of 1 / (1 - confidence)."""
+    size = np.linalg.norm(rest, axis=1)
+    at = math.ceil(confidence * len(size)) - 1
+    near = range(max(at - _NEIGHBOURS, 0), min(at + _NEIGHBOURS + 1, len(size))) if rest.shape[1] > 1 else (at,)
+    order = np.argpartition(size, list(near))
+    return float(np.mean([_quantile(rest[order[place]] + chance, confidence)[0] for place in near]))
+
+
+def _quantile(errors: FloatArray, confidence: float) -> tuple[float, float]:
+    """Quantile of the size of errors (n, axes), and its standard error; NaN if unresolved."""
+    size = np.abs(errors[:, 0]) if errors.shape[1] == 1 else np.hypot(errors[:, 0], errors[:, 1])
     n = len(size)
-    if size[0] == size[-1]:
-        return float(size[0]) + worst, 0.0
+    if size.min() == size.max():
+        return float(size[0]), 0.0
     if n * min(confidence, 1.0 - confidence) < _RESOLVED * (1.0 - 1e-9):
         return math.nan, math.nan
     step = _SPREAD * math.sqrt(n * confidence * (1.0 - confidence))
-    low, here, high = (
-        float(size[min(max(math.ceil(confidence * n + shift) - 1, 0), n - 1)]) for shift in (-step, 0.0, step)
-    )
-    return here + worst, (high - low) / (2.0 * _SPREAD)
+    places = [min(max(math.ceil(confidence * n + shift) - 1, 0), n - 1) for shift in (-step, 0.0, step)]
+    low, here, high = np.partition(size, places)[places].tolist()
+    return here, (high - low) / (2.0 * _SPREAD)
 
 
 def _dominant(rows: Sequence[Contributor], axes: Sequence[str], confidence: float) -> tuple[Contributor, float]:

@@ -409,7 +409,7 @@ def test_excel_has_numbers_units_and_marks(stated: Path, tmp_path: Path) -> None
     names = [cell.value for cell in sheet["A"]]
     assert "'=my own" in names and not any(cell.data_type == "f" for cells in sheet.iter_rows() for cell in cells)
     requirements = book["Requirements"]
-    assert requirements["K2"].value == "violated" and requirements["A2"].fill.fgColor.rgb.endswith("FDE6DB")
+    assert requirements["L2"].value == "violated" and requirements["A2"].fill.fgColor.rgb.endswith("FDE6DB")
     assert all(dimension.width > 5 for dimension in sheet.column_dimensions.values())
     write_budget(made(), tmp_path / "plain.xlsx")
     assert "Requirements" not in load_workbook(tmp_path / "plain.xlsx").sheetnames

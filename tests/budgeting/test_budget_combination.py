@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from starcal_uq.budgeting.file import Requirement
+from starcal_uq.budgeting.result import Outcome
 from starcal_uq.budgeting.rows import DISTRIBUTIONS, GAUSSIAN_997, Contributor, confidence_text
 from starcal_uq.budgeting.shapes import (
     deviates,
@@ -18,6 +20,7 @@ from starcal_uq.budgeting.shapes import (
     two_axis_radius,
 )
 from starcal_uq.budgeting.totals import Total, draw, grouped_sigma, total
+from starcal_uq.presentation.words.budgeting import outcome_text
 
 
 def row(name: str, sigma: float, axis: str = "pitch", **changes: object) -> Contributor:
@@ -187,10 +190,108 @@ def test_interpretations_differ_by_what_counts_as_random() -> None:
     bounded = [row("shift", 1.0, distribution="uniform"), rows[1]]
     found = combined(bounded, interpretation="temporal")
     assert found.worst_arcsec == pytest.approx(math.sqrt(3.0))
-    # A row that is random over both is taken at its worst by either.
+    # A row that is random over both spreads in both.
     both_kinds = combined([row("rest", 1.0, interpretation="mixed")], interpretation="ensemble")
-    assert both_kinds.rule_arcsec == pytest.approx(factor) and both_kinds.sigma_arcsec == 0.0
-    assert math.isnan(both_kinds.factor)
+    assert both_kinds.rule_arcsec == pytest.approx(factor) and both_kinds.sigma_arcsec == 1.0
+    # Where nothing is random there is no factor.
+    assert math.isnan(combined(rows[:1], interpretation="temporal").factor)
+
+
+def of_one_sensor(rows: list[Contributor], confidence: float, rng: np.random.Generator) -> tuple[float, float]:
+    """NumPy alone, on one axis: quantiles over moments for the worst sensor, and for one in 1 / (1 - P)."""
+    shapes = {
+        "gaussian": lambda n: rng.standard_normal(n),
+        "uniform": lambda n: rng.uniform(-math.sqrt(3.0), math.sqrt(3.0), n),
+        "arcsine": lambda n: math.sqrt(2.0) * np.sin(rng.uniform(0.0, 2.0 * math.pi, n)),
+        "constant": lambda n: np.zeros(n),
+    }
+    ends = {"gaussian": stats.norm.ppf(0.5 + 0.5 * confidence), "uniform": math.sqrt(3.0), "arcsine": math.sqrt(2.0)}
+    constants = [entry for entry in rows if entry.interpretation == "ensemble"]
+    mean = sum(entry.mean_arcsec for entry in rows)
+    moments = np.zeros(400_000)
+    for entry in rows:
+        if entry.interpretation != "ensemble":
+            moments += entry.sigma_arcsec * shapes[entry.distribution](len(moments))
+    worst = sum(ends.get(entry.distribution, 0.0) * entry.sigma_arcsec for entry in constants)
+    at_worst = max(np.quantile(np.abs(mean + side * worst + moments), confidence) for side in (1, -1))
+    sensors = mean + sum(
+        (entry.sigma_arcsec * shapes[entry.distribution](20_000) for entry in constants), start=np.zeros(20_000)
+    )
+    # The quantile over moments grows with the size of the sensor's constant: its own quantile over sensors follows.
+    grid = np.quantile(np.abs(sensors), confidence)
+    side = math.copysign(1.0, mean) if mean else 1.0
+    return float(at_worst), float(np.quantile(np.abs(side * grid + moments), confidence))
+
+
+def test_three_rows_that_are_random_over_both_do_not_add_linearly() -> None:
+    rows = [row(name, 6.6, interpretation="mixed") for name in ("catalogue", "pixels", "colour")]
+    found = combined(rows, confidence=0.9973, interpretation="temporal")
+    sampled, _ = of_one_sensor(rows, 0.9973, np.random.default_rng(1))
+    assert found.rule_arcsec == pytest.approx(34.3, abs=0.1) and found.worst_arcsec == 0.0
+    assert found.sampled_arcsec == pytest.approx(sampled, rel=0.02) == pytest.approx(34.2, rel=0.02)
+    asked = Requirement("R", "pitch", 45.0, 0.9973, "before alignment", "temporal")
+    assert Outcome(asked, found).verdict == "met"
+    # Control: the rule of before, n sigma of each added linearly, called 45 arcsec violated.
+    assert 3.0 * 6.6 * one_axis_factor(0.9973) == pytest.approx(59.4, abs=0.1)
+
+
+def test_worst_cases_that_must_not_meet_leave_a_limit_open() -> None:
+    rows = [row(name, 6.6) for name in ("ground", "launch", "lens")]
+    found = combined(rows, confidence=0.9973, interpretation="temporal")
+    assert found.rule_arcsec == pytest.approx(59.4, abs=0.1) == pytest.approx(found.sampled_arcsec, abs=0.1)
+    assert found.rule_least_arcsec == pytest.approx(34.3, abs=0.1)
+    assert found.sampled_least_arcsec == pytest.approx(34.3, rel=0.02)
+    for limit, verdict in ((33.0, "violated"), (45.0, "open"), (60.0, "met")):
+        outcome = Outcome(Requirement("R", "pitch", limit, 0.9973, "before alignment", "temporal"), found)
+        assert outcome.verdict == verdict and outcome.between == (verdict == "open")
+        assert f"is {verdict}" in outcome_text(outcome)
+    assert "34.3 if they do not" in outcome_text(
+        Outcome(Requirement("R", "pitch", 45.0, 0.9973, "before alignment", "temporal", "rule"), found)
+    )
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_temporal_totals_of_random_rows_against_monte_carlo(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    kinds = [("ensemble", "gaussian"), ("ensemble", "uniform"), ("mixed", "uniform"), ("mixed", "gaussian")]
+    kinds += [("temporal", "gaussian"), ("temporal", "arcsine"), ("ensemble", "constant")]
+    chosen = [kinds[i] for i in rng.permutation(len(kinds))[: rng.integers(3, 6)]] + [("temporal", "gaussian")]
+    rows = [
+        row(
+            str(number),
+            0.0 if shape == "constant" else rng.uniform(1.0, 8.0),
+            interpretation=kind,
+            distribution=shape,
+            mean_arcsec=rng.uniform(-5.0, 5.0) if shape == "constant" else 0.0,
+        )
+        for number, (kind, shape) in enumerate(chosen)
+    ]
+    found = combined(rows, interpretation="temporal", confidence=0.95)
+    worst, least = of_one_sensor(rows, 0.95, rng)
+    assert found.sampled_arcsec == pytest.approx(worst, rel=0.01)
+    assert found.sampled_least_arcsec == pytest.approx(min(least, worst), rel=0.02)
+    assert found.sampled_least_arcsec <= found.sampled_arcsec and found.rule_least_arcsec <= found.rule_arcsec
+    # Control: the rule of before, which added what is random over both linearly.
+    mixed = [entry.sigma_arcsec for entry in rows if entry.interpretation == "mixed"]
+    if mixed:
+        random = math.hypot(*(entry.sigma_arcsec for entry in rows if entry.interpretation == "temporal"))
+        old = found.rule_arcsec + one_axis_factor(0.95) * (sum(mixed) + random - found.sigma_arcsec)
+        assert old > worst * 1.05
+
+
+def test_least_and_worst_across_the_boresight_against_monte_carlo() -> None:
+    rng = np.random.default_rng(8)
+    rows = [
+        *both("ground", 3.0),
+        row("launch", 6.0),
+        row("launch", 1.0, "yaw"),
+        *both("noise", 2.0, interpretation="temporal"),
+    ]
+    found = combined(rows, "cross-boresight", 0.95, interpretation="temporal")
+    sensors = rng.standard_normal((400, 2)) * np.hypot(3.0, [6.0, 1.0])
+    quantiles = [np.quantile(np.hypot(*(own[:, None] + 2.0 * rng.standard_normal((2, 4000)))), 0.95) for own in sensors]
+    assert found.sampled_least_arcsec == pytest.approx(np.quantile(quantiles, 0.95), rel=0.12)
+    assert found.sampled_least_arcsec < found.sampled_arcsec
 
 
 def test_alignment_takes_away_and_brings_in() -> None:

@@ -114,20 +114,22 @@ def _totals(sheet: Worksheet, budget: Budget) -> None:
     header = [
         *("Scope", "Axis", "Random over", "Confidence", "Mean [arcsec]", "Sigma [arcsec]", "Factor n [sigma]"),
         *("Worst case added [arcsec]", "Bound by the rule [arcsec]", "Bound by sampling [arcsec]"),
+        *("Rule, worst cases in squares [arcsec]", "Sampling, worst cases sampled [arcsec]"),
         *("Standard error of sampling [arcsec]", "Reads", "Dominant", "Not assessed", "Rule against sampling"),
     ]
     rows = [
         [
             *(entry.scope, AXIS_LABELS[entry.axis], entry.interpretation, entry.confidence),
             *(_numbers(entry)[:2]),
-            *(entry.factor, entry.worst_arcsec, *_numbers(entry)[2:], entry.sampled_se_arcsec),
+            *(entry.factor, entry.worst_arcsec, *_numbers(entry)[2:]),
+            *(entry.rule_least_arcsec, entry.sampled_least_arcsec, entry.sampled_se_arcsec),
             *("at least" if entry.at_least else "total", entry.dominant, "; ".join(entry.not_assessed)),
             entry.explanation,
         ]
         for entry in budget.totals
     ]
     colours = [_AMBER if entry.at_least else "" for entry in budget.totals]
-    _table(sheet, header, rows, [17, 17, 13, 12, 13, 13, 11, 14, 14, 14, 16, 10, 30, 55, 60], colours)
+    _table(sheet, header, rows, [17, 17, 13, 12, 13, 13, 11, 14, 14, 14, 14, 14, 16, 10, 30, 55, 60], colours)
 
 
 def _numbers(entry: Total) -> list[Any]:
@@ -139,7 +141,14 @@ def _numbers(entry: Total) -> list[Any]:
 def _requirements(sheet: Worksheet, budget: Budget) -> None:
     header = [
         *("Requirement", "Axis", "Scope", "Random over", "Confidence", "Limit [arcsec]", "Bound by the rule [arcsec]"),
-        *("Bound by sampling [arcsec]", "Judged by", "Margin [arcsec]", "Outcome", "In words"),
+        *(
+            "Bound by sampling [arcsec]",
+            "Judged by",
+            "Bound, worst cases apart [arcsec]",
+            "Margin [arcsec]",
+            "Outcome",
+            "In words",
+        ),
     ]
     rows = []
     for outcome in budget.outcomes:
@@ -147,12 +156,13 @@ def _requirements(sheet: Worksheet, budget: Budget) -> None:
         rows.append(
             [
                 *(asked.name, AXIS_LABELS[asked.axis], asked.scope, asked.interpretation, asked.confidence),
-                *(asked.limit_arcsec, *_numbers(outcome.total)[2:], asked.judged_by, outcome.margin_arcsec),
+                *(asked.limit_arcsec, *_numbers(outcome.total)[2:], asked.judged_by, outcome.least_arcsec),
+                outcome.margin_arcsec,
                 *(outcome.verdict, outcome_text(outcome)),
             ]
         )
     colours = [{"violated": _RED, "open": _AMBER, "met": _GREEN}[outcome.verdict] for outcome in budget.outcomes]
-    _table(sheet, header, rows, [34, 17, 17, 13, 12, 12, 14, 14, 12, 12, 12, 70], colours)
+    _table(sheet, header, rows, [34, 17, 17, 13, 12, 12, 14, 14, 12, 14, 12, 12, 70], colours)
 
 
 def _table(

@@ -58,9 +58,15 @@ def headline(budget: Budget) -> str:
     if met:
         parts.append(f"{plural(len(met), 'requirement')} met.")
     unresolved = [outcome for outcome in budget.open_requirements if outcome.unresolved]
-    missing = len(budget.open_requirements) - len(unresolved)
+    between = [outcome for outcome in budget.open_requirements if outcome.between]
+    missing = len(budget.open_requirements) - len(unresolved) - len(between)
     if missing:
         parts.append(f"{plural(missing, 'requirement')} open: contributors are missing.")
+    if between:
+        parts.append(
+            f"{plural(len(between), 'requirement')} open: the limit is exceeded only if worst cases meet in one sensor "
+            "or moment."
+        )
     if unresolved:
         parts.append(f"{plural(len(unresolved), 'requirement')} open: the samples do not resolve so high a confidence.")
     if budget.not_assessed:
@@ -189,6 +195,7 @@ def _requirement_row(outcome: Outcome) -> Row:
         "limit": significant(asked.limit_arcsec, 3),
         "rule": bound(outcome.total.rule_arcsec, outcome.total.at_least),
         "sampled": _sampled(outcome.total),
+        "least": bound(outcome.least_arcsec, outcome.total.at_least),
         "margin": "–" if math.isnan(outcome.margin_arcsec) else significant(outcome.margin_arcsec, 3),
         "judged_by": {"both": "the larger"}.get(asked.judged_by, asked.judged_by),
         "verdict": outcome.verdict,
@@ -234,6 +241,12 @@ def outcome_text(outcome: Outcome) -> str:
     if outcome.verdict == "violated":
         cause = f"; {total.dominant!r} dominates" if total.dominant else ""
         return f"{asked.name!r} ({what}) is violated: {least}{numbers}{cause}."
+    if outcome.between:
+        what_meets = "in one sensor" if asked.interpretation == "temporal" else "at one moment"
+        return (
+            f"{asked.name!r} ({what}) is open: {numbers} if the worst cases of all contributors meet {what_meets}, "
+            f"{least}{significant(outcome.least_arcsec, 3)} if they do not."
+        )
     if outcome.verdict == "open":
         count = len(total.not_assessed)
         missing = f"{count} contributors are" if count > 1 else "1 contributor is"
