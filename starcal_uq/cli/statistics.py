@@ -84,13 +84,20 @@ def diagnose_command(
     json: Json = False,
 ) -> None:
     """Question the model: misfit, jackknife, other distortion models, predictive checks, other starts."""
-    from starcal_uq.presentation.words.diagnostics import jackknife_table, misfit_table, models_table, predictive_table
+    from starcal_uq.presentation.words.diagnostics import (
+        jackknife_table,
+        misfit_table,
+        models_table,
+        predictive_table,
+        star_table,
+    )
 
     with progress_bar("diagnosis") as progress:
         found = sc.Run(run).diagnose(n_starts=starts, seed=seed, progress=progress)
     parts = {
         "Misfit": found.misfit,
         "Jackknife over frames": found.jackknife,
+        "Errors of the stars": found.stars,
         "Distortion models": found.comparison,
         "Predictive checks": found.predictive,
     }
@@ -101,11 +108,15 @@ def diagnose_command(
     print_table(misfit_table(found.misfit))
     if found.jackknife is not None:
         print_table(jackknife_table(found.jackknife))
+    if found.stars is not None:
+        print_table(star_table(found.stars))
     if found.comparison is not None:
         print_table(models_table(found.comparison))
     print_table(predictive_table(found.predictive))
     if found.comparison is not None:
         print(found.comparison.text)
+    if found.stars is not None:
+        print(found.stars.text)
 
 
 def merge_command(

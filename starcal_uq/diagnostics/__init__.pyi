@@ -7,4 +7,6 @@ from .misfit import misfit_tests as misfit_tests
 from .models import ModelComparison as ModelComparison
 from .models import compare_models as compare_models
 from .predictive import predictive_check as predictive_check
+from .stars import StarTest as StarTest
+from .stars import star_test as star_test
 from .validation.result import Validation as Validation

@@ -1,7 +1,8 @@
 """Everything that questions the model of a run, in one result that is stored with it.
 
-The tests for misfit, the jackknife, the comparison of distortion models, the posterior predictive check and fits from
-other starts take seconds; the report reads what is stored, and leaves out what was made from another calibration.
+The tests for misfit and for errors of the stars, the jackknife, the comparison of distortion models, the posterior
+predictive check and fits from other starts take seconds; the report reads what is stored, and leaves out what was made
+from another calibration.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from starcal_uq.diagnostics.jackknife import Jackknife, jackknife_frames
 from starcal_uq.diagnostics.misfit import Misfit, misfit_tests
 from starcal_uq.diagnostics.models import MODELS, ModelComparison, compare_models
 from starcal_uq.diagnostics.predictive import PredictiveCheck, predictive_check
+from starcal_uq.diagnostics.stars import StarTest, star_test
 from starcal_uq.estimation.calibrate import METHODS, calibrate
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.normals import FrameNormals
@@ -81,6 +83,8 @@ class Diagnosis(Shown):
         The estimate that all this is about.
     provenance : dict
         Seed, settings, versions, time and data hash.
+    stars : StarTest or None
+        Errors that stars bring along; None in a diagnosis of an earlier version.
     """
 
     misfit: Misfit
@@ -90,6 +94,7 @@ class Diagnosis(Shown):
     starts: MultiStart | None
     theta: tuple[float, ...]
     provenance: AnyDict
+    stars: StarTest | None = None
 
     def is_of(self, cal: Calibration) -> bool:
         """True if this calibration is the one that was diagnosed."""
@@ -161,6 +166,7 @@ def diagnose(
         starts=starts,
         theta=tuple(cal.theta.tolist()),
         provenance=provenance(seed, settings, obs.data_hash),
+        stars=star_test(obs, cal),
     )
 
 

@@ -1,6 +1,6 @@
-"""What each frame says about the parameters: its normal equations with its attitude eliminated.
+"""What each frame, or each star, says about the parameters: normal equations with the attitudes eliminated.
 
-Everything that leaves one frame out, or adds one, follows from these small matrices to first order, without another
+Everything that leaves one of them out, or adds one, follows from these small matrices to first order, without another
 fit.
 """
 
@@ -14,6 +14,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.star_errors import StarSums, add_by_star
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
@@ -106,3 +107,84 @@ class FrameNormals:
         steps = np.full(self.slopes.shape, np.nan)
         steps[determined] = np.linalg.solve(rest[determined], slope[determined][..., None])[..., 0]
         return steps, rest
+
+
+@dataclass(frozen=True)
+class StarNormals:
+    """What each of S stars says about the parameters through all of its images, in scaled parameters z.
+
+    Attributes
+    ----------
+    scale : (p,) array
+        Unit of each parameter, as in `FrameNormals`.
+    matrix : (p, p) array
+        Gauss-Newton matrix of all stars.
+    squares : float
+        Sum of squared whitened residuals after the fit.
+    scores : (S, p) array
+        Share of the slope at the estimate; they sum to nothing.
+    matrices, slopes : (S, p, p) and (S, p) arrays
+        What the normal equations lose without a star, the attitudes of its frames fitted anew.
+    response : (S, 2, p) array
+        Change of the slope by one px of offset of the star along each of its axes.
+    dof : int
+        Degrees of freedom after the fit.
+    """
+
+    scale: FloatArray
+    matrix: FloatArray
+    squares: float
+    scores: FloatArray
+    matrices: FloatArray
+    slopes: FloatArray
+    response: FloatArray
+    dof: int
+
+    @classmethod
+    def at(cls, obs: Observations, cal: Calibration, numbers: IntArray) -> StarNormals:
+        """Sums over the stars that `numbers` (N,) tells apart, at the estimate of a calibration."""
+        likelihood = MarginalLikelihood(obs, cal.camera.distortion)
+        frames, p = likelihood.frames, len(cal.theta)
+        sums = StarSums(numbers, frames.r, float(cal.theta[2]))
+        start = quaternion_to_rotation(cal.quaternions)
+        matrix, slope, squares = np.zeros((p, p)), np.zeros(p), 0.0
+        s = sums.n_stars
+        scores, slopes, matrices, response = (np.zeros((s, *shape)) for shape in ((p,), (p,), (p, p), (2, p)))
+        for first, last in frames.parts(_STARS_AT_ONCE):
+            part = MarginalLikelihood(frames.part(first, last), likelihood.model_name)
+            rows = slice(int(frames.starts[first]), int(frames.starts[last]))
+            state, _ = part.profile(cal.theta, start[first:last])
+            h = part.project_out(state, part.derivatives(cal.theta, state))
+            h = h * cal.sigmas[:, None, None]
+            stars = numbers[rows]
+            # I - a (A^T A)^-1 a^T of every image, inverted: what its own pull on the attitude has hidden.
+            a = state.attitude
+            pulled = np.einsum("axn,abn,byn->xyn", a, part.frames.spread(state.inverse), a, optimize=True)
+            free = np.linalg.inv(np.eye(2) - np.moveaxis(pulled, 2, 0))
+            raised = np.einsum("nxy,pyn->pxn", free, h, optimize=True)
+            matrix += np.einsum("axn,bxn->ab", h, h, optimize=True)
+            slope += np.einsum("axn,xn->a", h, state.e)
+            squares += float(np.sum(state.e**2))
+            add_by_star(scores, np.sum(h * state.e, axis=1), stars)
+            add_by_star(slopes, np.sum(raised * state.e, axis=1), stars)
+            add_by_star(matrices, np.einsum("axn,bxn->abn", raised, h), stars)
+            add_by_star(response, np.einsum("ixn,pxn->ipn", sums.columns(part, state, rows), h), stars)
+        unit = 1.0 / np.sqrt(np.diag(matrix))
+        return cls(
+            scale=cal.sigmas * unit,
+            matrix=matrix * np.outer(unit, unit),
+            squares=squares - float(slope @ np.linalg.solve(matrix, slope)),
+            scores=scores * unit,
+            matrices=matrices * np.outer(unit, unit),
+            slopes=slopes * unit,
+            response=response * unit,
+            dof=likelihood.dof - p,
+        )
+
+    def left_out(self) -> FloatArray:
+        """Changes z (S, p) of the estimate without each star, not finite where the parameters hang on it."""
+        rest = self.matrix - self.matrices
+        determined = np.linalg.cond(rest) < 1e14
+        steps = np.full(self.slopes.shape, np.nan)
+        steps[determined] = np.linalg.solve(rest[determined], -self.slopes[determined][..., None])[..., 0]
+        return steps

@@ -15,8 +15,9 @@ from starcal_uq.diagnostics.jackknife import Jackknife
 from starcal_uq.diagnostics.misfit import Misfit
 from starcal_uq.diagnostics.models import ModelComparison
 from starcal_uq.diagnostics.predictive import PredictiveCheck
+from starcal_uq.diagnostics.stars import StarTest
 from starcal_uq.diagnostics.validation.result import Validation
-from starcal_uq.diagnostics.verdict.estimate import models_sentence
+from starcal_uq.diagnostics.verdict.estimate import models_sentence, star_sentence
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.merging import Consistency
 from starcal_uq.estimation.screening.result import Screening
@@ -141,6 +142,7 @@ VIEWS: Mapping[type, View] = {
     ),
     Misfit: _view("Misfit", diagnostics.misfit_text, diagnostics.misfit_table, p_values=plot_misfit),
     Jackknife: _view("Jackknife", diagnostics.jackknife_text, diagnostics.jackknife_table, ratios=plot_jackknife),
+    StarTest: _view("Errors of the stars", star_sentence, diagnostics.star_table),
     ModelComparison: _view("Models", models_sentence, diagnostics.models_table, models=plot_comparison),
     PredictiveCheck: _view("Posterior predictive check", diagnostics.predictive_text, diagnostics.predictive_table),
     Diagnosis: View(diagnostics.diagnosis_text, diagnostics.diagnosis_html, {"diagnosis": plot_diagnosis}),

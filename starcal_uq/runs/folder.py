@@ -30,6 +30,7 @@ class _File:
 DIAGNOSIS_TABLES = {
     "misfit": "misfit.csv",
     "jackknife": "jackknife.csv",
+    "stars": "stars.csv",
     "comparison": "comparison.csv",
     "predictive": "predictive.csv",
 }

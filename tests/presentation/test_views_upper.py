@@ -17,6 +17,7 @@ from starcal_uq.diagnostics.jackknife import Jackknife
 from starcal_uq.diagnostics.misfit import Misfit
 from starcal_uq.diagnostics.models import ModelComparison
 from starcal_uq.diagnostics.predictive import PredictiveCheck
+from starcal_uq.diagnostics.stars import StarTest
 from starcal_uq.diagnostics.validation.result import Validation
 from starcal_uq.planning.check import ForecastCheck
 from starcal_uq.planning.design import FrameChoice
@@ -42,6 +43,7 @@ FIGURES = {
     ErrorSpectrum: ["spectrum", "time_series"],
     Misfit: ["p_values"],
     Jackknife: ["ratios"],
+    StarTest: [],
     ModelComparison: ["models"],
     PredictiveCheck: [],
     Diagnosis: ["diagnosis"],
@@ -105,7 +107,8 @@ def results() -> dict[type, Any]:
         *(error, error.agreement, sc.coupling(cal), sc.propagation.field_map(post, obs, 9)),
         *(sc.propagation.distortion_curve(post, obs, n=11, n_draws=50), validation(), plan, plan.needs[0]),
         sc.propagation.error_spectrum(post, slewing, n_draws=5),
-        *(diagnosis, diagnosis.misfit, diagnosis.jackknife, diagnosis.comparison, diagnosis.predictive),
+        *(diagnosis, diagnosis.misfit, diagnosis.jackknife, diagnosis.stars),
+        *(diagnosis.comparison, diagnosis.predictive),
         sc.comparison.compare_halves(obs, nominal(camera())),
         sc.planning.choose_frames(camera(), stars, n_frames=5, candidates=100, n_geometries=100),
         sc.planning.check_forecast(camera(), stars, n_frames=(5, 10), n_campaigns=2, n_geometries=100, workers=0),

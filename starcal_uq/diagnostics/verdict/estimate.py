@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from starcal_uq.diagnostics.misfit import Misfit
     from starcal_uq.diagnostics.models import ModelComparison
     from starcal_uq.diagnostics.predictive import PredictiveCheck
+    from starcal_uq.diagnostics.stars import StarTest
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.inference.posterior import Posterior
 
@@ -96,6 +97,7 @@ def model_checks(diagnosis: Diagnosis) -> list[Check]:
     """Every check that a diagnosis allows."""
     checks = [misfit(diagnosis.misfit)]
     checks += [] if diagnosis.jackknife is None else [jackknife(diagnosis.jackknife)]
+    checks += [] if diagnosis.stars is None else [stars(diagnosis.stars)]
     checks += [] if diagnosis.comparison is None else [comparison(diagnosis.comparison)]
     return [*checks, predictive(diagnosis.predictive)]
 
@@ -144,6 +146,49 @@ def jackknife(found: Jackknife) -> Check:
     remedy = "sc.diagnostics.accept_inflation(cal, sc.diagnostics.jackknife_frames(obs, cal))" if np.any(bad) else ""
     level = pass_or_warn(not np.any(bad))
     return Check("Jackknife over frames", Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
+
+
+STAR_P, STAR_WIDENING = 0.01, 1.5
+
+
+def stars(found: StarTest) -> Check:
+    """Do stars bring errors of their own along?"""
+    name, bound = "Errors of the stars", f"p ≥ {STAR_P:g}"
+    if not found.applicable:
+        value = "too few stars recur"
+        return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, star_sentence(found))
+    widest = int(np.argmax(found.widening))
+    ratio = float(found.widening[widest])
+    value = f"p = {significant(found.p_value)}, sigma × {fixed(ratio, 2)} ({found.parameter_names[widest]})"
+    if found.p_value >= STAR_P:
+        return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, star_sentence(found))
+    level = Level.FAIL if ratio > STAR_WIDENING else Level.WARN
+    return Check(name, Question.TRUSTWORTHY, level, value, bound, star_sentence(found))
+
+
+def star_sentence(found: StarTest) -> str:
+    """Size of the stars' own errors, and what they do to sigma."""
+
+    def sized(px: float) -> str:
+        return f"{significant(px)} px ({significant(px * found.arcsec_per_px)} arcsec)"
+
+    if not found.applicable:
+        return (
+            "Too few stars are seen in several frames to test whether a star errs alike in all of them; where none is, "
+            "such errors act as noise."
+        )
+    if found.p_value >= STAR_P:
+        return (
+            "Residuals of one star in different frames are as independent as noise; a direction error of "
+            f"{sized(found.visible_px)} would have been seen nine times in ten."
+        )
+    widest = int(np.argmax(found.widening))
+    error = significant(found.tau_px_std)
+    return (
+        f"Each star brings a direction error of {sized(found.tau_px)} ± {error} px per axis along into every frame: "
+        f"more frames of the same stars do not average it out, and sigma of {found.parameter_names[widest]} is "
+        f"{fixed(float(found.widening[widest]), 2)} times what is stated."
+    )
 
 
 def comparison(models: ModelComparison) -> Check:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.formatting import count, decimals_for, fixed, percent, plural, significant
-from starcal_uq.diagnostics.verdict.estimate import MISFIT_P, models_sentence
+from starcal_uq.diagnostics.verdict.estimate import MISFIT_P, models_sentence, star_sentence
 from starcal_uq.inference.derived import derived_quantities
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.diagnostics import (
@@ -15,6 +15,7 @@ from starcal_uq.presentation.words.diagnostics import (
     misfit_table,
     models_table,
     predictive_table,
+    star_table,
 )
 
 if TYPE_CHECKING:
@@ -27,13 +28,15 @@ def diagnosis_context(diagnosis: Diagnosis | None, cal: Calibration) -> dict[str
     """What the misfit section shows; empty where there is no diagnosis."""
     if diagnosis is None:
         return {}
-    jackknife, models = diagnosis.jackknife, diagnosis.comparison
+    jackknife, models, stars = diagnosis.jackknife, diagnosis.comparison, diagnosis.stars
     unit = " px" if cal.sigma_name == "sigma" else ""
     return {
         "misfit_table": misfit_table(diagnosis.misfit),
         "misfit_sentence": _misfit_sentence(diagnosis),
         "jackknife_table": None if jackknife is None else jackknife_table(jackknife, parameters(cal.camera.distortion)),
         "jackknife_sentence": "" if jackknife is None else jackknife_text(jackknife),
+        "star_table": None if stars is None else star_table(stars, parameters(cal.camera.distortion)),
+        "star_sentence": "" if stars is None else star_sentence(stars),
         "models_table": None if models is None else models_table(models, unit, "this report"),
         "models_sentence": "" if models is None else models_sentence(models),
         "predictive_table": predictive_table(diagnosis.predictive),

@@ -14,6 +14,7 @@ from starcal_uq.diagnostics.jackknife import Jackknife
 from starcal_uq.diagnostics.misfit import Misfit
 from starcal_uq.diagnostics.models import ModelComparison
 from starcal_uq.diagnostics.predictive import PredictiveCheck
+from starcal_uq.diagnostics.stars import StarTest
 from starcal_uq.diagnostics.validation.replicates import LOG_LIKELIHOOD
 from starcal_uq.diagnostics.validation.result import ENOUGH_REPLICATES, Validation
 from starcal_uq.diagnostics.verdict.estimate import MISFIT_P
@@ -82,6 +83,23 @@ def jackknife_table(found: Jackknife, specs: Sequence[Parameter] = ()) -> TextTa
     return with_units(table, specs) if specs else table
 
 
+def star_table(found: StarTest, specs: Sequence[Parameter] = ()) -> TextTable:
+    """One row per parameter: sigmas with the star as the unit of what is independent."""
+    scales = np.array([spec.scale for spec in specs]) if specs else np.ones(len(found.parameter_names))
+    covariances = (
+        found.formal_covariance,
+        found.model_covariance,
+        found.sandwich_covariance,
+        found.jackknife_covariance,
+    )
+    columns = [[significant(v) for v in np.sqrt(np.diag(c)) / scales] for c in covariances]
+    heads = ("Formal σ", "With star errors", "Ratio", "Cluster-robust σ", "Jackknife σ")
+    ratio = [fixed(v, 2) for v in found.widening]
+    rows = tuple(zip(found.parameter_names, *columns[:2], ratio, *columns[2:], strict=True))
+    table = TextTable(("", *heads), rows, "Errors of the stars")
+    return with_units(table, specs) if specs else table
+
+
 def models_table(found: ModelComparison, sigma_unit: str = "", fitted: str = "fitted") -> TextTable:
     """One row per model, the best first; common and rest are the attitudes' move across the boresight / in roll."""
 
@@ -126,13 +144,13 @@ def predictive_table(found: PredictiveCheck) -> TextTable:
 
 def diagnosis_text(found: Diagnosis) -> str:
     """Every part in its own words."""
-    parts = (found.misfit, found.jackknife, found.comparison, found.predictive)
+    parts = (found.misfit, found.jackknife, found.stars, found.comparison, found.predictive)
     return "\n".join(part.text for part in parts if part is not None)
 
 
 def diagnosis_html(found: Diagnosis) -> str:
     """Every part, one after the other."""
-    parts = (found.misfit, found.jackknife, found.comparison, found.predictive)
+    parts = (found.misfit, found.jackknife, found.stars, found.comparison, found.predictive)
     return "".join(part._repr_html_() or "" for part in parts if part is not None)
 
 

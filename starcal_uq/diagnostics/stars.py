@@ -1,0 +1,260 @@
+"""Does a star bring an error along? A test of the variance that images of one star share, and what it does to sigma.
+
+Catalogue errors, blends and colours move a star's images together, however the camera is turned. Residuals e, brought
+to the star's own axes on the sky (Q, a turn for every image), are then alike within a star:
+
+    R = e^T (Q Q^T - I) e / e^T e,
+
+over the images of stars that recur, attitudes and parameters projected out. It is the score test of a variance
+component that is common to a star; pairs of images alone count, so that noise that differs from star to star does not
+raise it. Moments of R under independent noise are exact; its tail is that of the gamma distribution with the first
+three.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import quaternion_to_rotation
+from starcal_uq.core.constants import ARCSEC
+from starcal_uq.core.display import Shown
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.normals import StarNormals
+from starcal_uq.estimation.star_errors import StarSums, star_numbers
+from starcal_uq.observations.frames import StarFrames
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.observations.table import Observations
+
+_STARS_AT_ONCE = 20_000
+_LEAST_DOF = 10
+_ABSORBED = 1e-10
+# More stars than this, and what the parameters absorb of them is too little to be worth a dense matrix.
+_DENSE = 1500
+# Normal quantiles: of a test of 5 %, and of a power of 90 %.
+_SEEN = 1.645 + 1.282
+
+
+@dataclass(frozen=True, eq=False)
+class StarTest(Shown):
+    """Errors that stars bring along: their size, the test for them, and uncertainties clustered on the star.
+
+    Attributes
+    ----------
+    parameter_names : tuple of str
+        The p parameters.
+    n_stars, n_recurring : int
+        Distinct stars, and those seen in more than one frame that the test could use.
+    n_images : int
+        Images of the latter.
+    p_value : float
+        Probability of as much likeness within stars by chance; NaN where too few stars recur.
+    tau_px, tau_px_std : float
+        Direction error of a star per axis and its standard error, px at the boresight.
+    visible_px : float
+        Error that a test of 5 % would have seen nine times in ten, px.
+    arcsec_per_px : float
+        Scale at the boresight.
+    formal_covariance : (p, p) array
+        Covariance if all images err independently.
+    model_covariance : (p, p) array
+        Covariance of the same estimate if stars bring errors of `tau_px`.
+    sandwich_covariance : (p, p) array
+        Cluster-robust covariance, clustered on the star.
+    jackknife_covariance : (p, p) array
+        ``(S - 1) / S`` times the scatter of the estimates that leave one of S stars out; NaN where one is needed.
+    """
+
+    parameter_names: tuple[str, ...]
+    n_stars: int
+    n_recurring: int
+    n_images: int
+    p_value: float
+    tau_px: float
+    tau_px_std: float
+    visible_px: float
+    arcsec_per_px: float
+    formal_covariance: FloatArray
+    model_covariance: FloatArray
+    sandwich_covariance: FloatArray
+    jackknife_covariance: FloatArray
+
+    @property
+    def applicable(self) -> bool:
+        """False where too few stars recur for a test."""
+        return bool(np.isfinite(self.p_value))
+
+    @property
+    def widening(self) -> FloatArray:
+        """Standard deviations with the stars' errors over the formal ones, (p,)."""
+        return np.sqrt(np.diag(self.model_covariance) / np.diag(self.formal_covariance))
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """One row per parameter: formal sigma, with star errors, cluster-robust, jackknife over stars."""
+        import pandas as pd
+
+        names = {
+            "formal_sigma": self.formal_covariance,
+            "star_sigma": self.model_covariance,
+            "sandwich_sigma": self.sandwich_covariance,
+            "jackknife_sigma": self.jackknife_covariance,
+        }
+        columns = {name: np.sqrt(np.diag(covariance)) for name, covariance in names.items()}
+        return pd.DataFrame({"parameter": list(self.parameter_names), **columns, "widening": self.widening})
+
+
+def star_test(obs: Observations, cal: Calibration) -> StarTest:
+    """Test whether stars bring errors of their own along, and how much that widens the uncertainties.
+
+    Parameters
+    ----------
+    obs, cal
+        The data and the estimate made from them. Stars are told apart by `star_id` where all have one, else by
+        direction.
+    """
+    focal = float(cal.theta[2])
+    numbers = star_numbers(obs, focal)
+    normals = StarNormals.at(obs, cal, numbers)
+    found = _likeness(obs, cal, numbers)
+    inverse = np.linalg.inv(normals.matrix)
+    unit = np.outer(normals.scale, normals.scale)
+    s = len(normals.scores)
+    pull = normals.response.reshape(-1, len(unit)) @ inverse
+    pulled = pull.T @ pull * found.tau2
+    # The images' own noise is what is left when the stars' errors are taken off.
+    noise = max(normals.squares / normals.dof, 0.0)
+    own = max(noise - found.tau2 * float(np.mean(1.0 if obs.sigma_px is None else obs.sigma_px**-2.0)), 0.1 * noise)
+    steps = normals.left_out()
+    spread = steps - steps.mean(axis=0)
+    scores = normals.scores @ inverse
+    return StarTest(
+        parameter_names=cal.parameter_names,
+        n_stars=s,
+        n_recurring=found.n_stars,
+        n_images=found.n_images,
+        p_value=found.p_value,
+        tau_px=float(np.sqrt(found.tau2)),
+        tau_px_std=found.tau_std,
+        visible_px=found.visible,
+        arcsec_per_px=ARCSEC / focal,
+        formal_covariance=inverse * noise * unit,
+        model_covariance=(inverse * own + pulled) * unit if found.tau2 > 0.0 else inverse * noise * unit,
+        sandwich_covariance=scores.T @ scores * s / (s - 1.0) * unit,
+        jackknife_covariance=spread.T @ spread * (s - 1.0) / s * unit,
+    )
+
+
+@dataclass(frozen=True)
+class _Likeness:
+    n_stars: int
+    n_images: int
+    p_value: float = float("nan")
+    tau2: float = 0.0
+    tau_std: float = float("nan")
+    visible: float = float("nan")
+
+
+def _recurring(obs: Observations, numbers: IntArray) -> BoolArray:
+    """Images (N,) of stars that recur, in frames with two such images or more."""
+    frame = np.searchsorted(obs.frame_ids, obs.frame)
+    used = np.ones(len(numbers), dtype=bool)
+    while True:
+        often = np.bincount(numbers[used], minlength=int(numbers.max()) + 1) >= 2
+        kept = used & often[numbers]
+        kept &= (np.bincount(frame[kept], minlength=len(obs.frame_ids)) >= 2)[frame]
+        if np.array_equal(kept, used):
+            return kept
+        used = kept
+
+
+def _likeness(obs: Observations, cal: Calibration, numbers: IntArray) -> _Likeness:
+    """The test, on images of recurring stars alone: others say nothing about likeness within a star."""
+    used = _recurring(obs, numbers)
+    if not used.any():
+        return _Likeness(0, 0)
+    everything = StarFrames.from_observations(obs)
+    present = everything.sum(used.astype(np.float64)) > 0
+    frames = everything.select(used)
+    rotations = quaternion_to_rotation(cal.quaternions)[present]
+    stars = np.unique(numbers[used], return_inverse=True)[1]
+    sums = StarSums(stars, frames.r, float(cal.theta[2]), rigid=True)
+    p = len(cal.theta)
+    gram = np.zeros((p + 1, p + 1))
+    for first, last in frames.parts(_STARS_AT_ONCE):
+        part = MarginalLikelihood(frames.part(first, last), cal.camera.distortion)
+        state, _ = part.profile(cal.theta, rotations[first:last])
+        h = part.derivatives(cal.theta, state) * cal.sigmas[:, None, None]
+        columns = part.project_out(state, np.concatenate([h, state.e[None]]))
+        flat = columns.reshape(p + 1, -1)
+        gram += flat @ flat.T
+        sums.add(part, state, columns, slice(int(frames.starts[first]), int(frames.starts[last])))
+    values, vectors = np.linalg.eigh(gram[:p, :p])
+    kept = values > _ABSORBED * values.max()
+    root = vectors[:, kept] / np.sqrt(values[kept])
+    explained = root.T @ gram[:p, p]
+    absorbed = sums.cross[:, :p] @ root
+    total = float(gram[p, p] - explained @ explained)
+    pull = sums.cross[:, p] - absorbed @ explained
+    dof = 2 * frames.n_stars - 3 * frames.n_frames - int(kept.sum())
+    nothing = _Likeness(sums.n_stars, frames.n_stars)
+    if dof < _LEAST_DOF:
+        return nothing
+    g1, g2, g3, g4 = _traces(sums.matrix, absorbed)
+    # Of A = M - (g1 / dof) I on the residuals, M having the traces g: sums of powers of its eigenvalues.
+    m = g1 / dof
+    a2, a3 = g2 - m * g1, g3 - 3.0 * m * g2 + 3.0 * m**2 * g1 - m**3 * dof
+    if a2 <= _ABSORBED * g2:
+        return nothing
+    variance = 2.0 * a2 / (dof * (dof + 2.0))
+    skewness = 8.0 * a3 / (dof * (dof + 2.0) * (dof + 4.0)) / variance**1.5
+    statistic = (float(pull @ pull) / total - m) / np.sqrt(variance)
+    # Moments of e^T M e and e^T e where a star's error adds tau^2 to the noise s^2.
+    tau2 = (float(pull @ pull) - m * total) / a2
+    noise = max((total - max(tau2, 0.0) * g1) / dof, 0.1 * total / dof)
+
+    def spread(share: float) -> float:
+        middle, last = g3 - 2.0 * m * g2 + m**2 * g1, g4 - 2.0 * m * g3 + m**2 * g2
+        return float(np.sqrt(2.0 * (noise**2 * a2 + 2.0 * noise * share * middle + share**2 * last)) / a2)
+
+    sd = spread(max(tau2, 0.0))
+    unit = 1.0 if frames.weight is None else float(1.0 / np.sqrt(np.mean(frames.weight**2)))
+    low, high = np.sqrt(max(tau2 - sd, 0.0)), np.sqrt(max(tau2, 0.0) + sd)
+    return _Likeness(
+        n_stars=sums.n_stars,
+        n_images=frames.n_stars,
+        p_value=_gamma_tail(statistic, skewness),
+        tau2=max(tau2, 0.0) * unit**2,
+        tau_std=float(0.5 * (high - low)) * unit,
+        visible=float(np.sqrt(_SEEN * spread(0.0))) * unit,
+    )
+
+
+def _traces(matrix: Any, absorbed: FloatArray) -> tuple[float, float, float, float]:
+    """Traces of the first four powers of ``matrix - absorbed absorbed^T``."""
+    if matrix.shape[0] <= _DENSE:
+        g = matrix.toarray() - absorbed @ absorbed.T
+        square = g @ g
+        return float(np.trace(g)), float(np.trace(square)), float(np.sum(square * g)), float(np.sum(square**2))
+    square = matrix @ matrix
+    third = float(square.multiply(matrix).sum())
+    return float(matrix.trace()), float(square.trace()), third, float(square.multiply(square).sum())
+
+
+def _gamma_tail(z: float, skewness: float) -> float:
+    """P(Z > z) of a gamma variable of mean 0, variance 1 and this skewness (Pearson's type III)."""
+    from scipy.special import erfc, gammainc, gammaincc
+
+    if abs(skewness) < 1e-4:
+        return float(0.5 * erfc(z / np.sqrt(2.0)))
+    shape = 4.0 / skewness**2
+    x = shape + z * np.sqrt(shape) * np.sign(skewness)
+    if x <= 0.0:
+        return 1.0 if skewness > 0.0 else 0.0
+    return float(gammaincc(shape, x) if skewness > 0.0 else gammainc(shape, x))
