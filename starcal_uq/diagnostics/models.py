@@ -24,7 +24,7 @@ from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.normals import FrameNormals
-from starcal_uq.inference.arviz import psis
+from starcal_uq.maths.draws import psis_rows
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -238,14 +238,12 @@ def _leave_out(normals: FrameNormals, n_draws: int, rng: np.random.Generator) ->
     )
     log_density = -0.5 * squares / sigma[:, None] ** 2 - np.outer(np.log(sigma), normals.dof)
     log_density += -0.5 * normals.log_determinant - 0.5 * normals.dof * np.log(2.0 * np.pi)
-    pointwise, khats = np.empty(len(closed)), np.empty(len(closed))
-    for k, column in enumerate(log_density.T):
-        weights, khats[k] = psis(-column)
-        pointwise[k] = _log_mean_exp(weights + column) + np.log(n_draws)
+    by_frame = np.ascontiguousarray(log_density.T)
+    weights, khats = psis_rows(-by_frame)
+    pointwise = _log_mean_exp(weights + by_frame) + np.log(n_draws)
     bad = ~(khats <= KHAT_BOUND)
     pointwise[bad] = closed[bad]
-    in_sample = np.array([_log_mean_exp(column) for column in log_density.T])
-    return _LeftOut(pointwise, closed, in_sample, float(np.max(khats)), int(np.count_nonzero(bad)))
+    return _LeftOut(pointwise, closed, _log_mean_exp(by_frame), float(np.max(khats)), int(np.count_nonzero(bad)))
 
 
 def closed_form(normals: FrameNormals) -> FloatArray:
@@ -283,6 +281,6 @@ def closed_form(normals: FrameNormals) -> FloatArray:
     return density
 
 
-def _log_mean_exp(values: FloatArray) -> float:
-    top = float(np.max(values))
-    return top + float(np.log(np.mean(np.exp(values - top))))
+def _log_mean_exp(rows: FloatArray) -> FloatArray:
+    top = np.max(rows, axis=1)
+    return np.asarray(top + np.log(np.mean(np.exp(rows - top[:, None]), axis=1)))
