@@ -127,7 +127,10 @@ def _notes(rows: tuple[Contributor, ...]) -> tuple[str, ...]:
         )
     part = tuple(dict.fromkeys(row.name for row in rows if row.absorbed_by_alignment == "in part" and row.assessed))
     if part:
-        notes.append(f"Absorbed by alignment in part, and counted in full after it: {join_words(part)}.")
+        notes.append(
+            f"Absorbed by alignment in part: {join_words(part)}. It counts in full in bounds after alignment, and not "
+            "at all where these would violate a requirement."
+        )
     return tuple(notes)
 
 

@@ -19,7 +19,6 @@ from starcal_uq.budgeting.rows import (
     INTERACTING,
     INTERPRETATIONS,
     SCOPES,
-    TIME_CLASSES,
     Contributor,
     Expected,
 )
@@ -41,17 +40,40 @@ _REQUIREMENT_AXES = {key: names for key, names in _AXIS_NAMES.items() if key != 
 # A full turn; no error is larger.
 _FULL_TURN_ARCSEC = 1_296_000.0
 # What the starter's names bring along, and nobody can guess for others.
-_OWN_KEYS = ("ecss_class", "time_class", "interpretation", "absorbed_by_alignment")
+_OWN_KEYS = ("ecss_class", "interpretation", "absorbed_by_alignment")
 # Names as similar as this are one name mistyped.
 _SAME_NAME = 0.9
 JUDGED_BY = ("both", "rule", "sampling")
 
-_CONTRIBUTOR_KEYS = (
-    *("name", "ecss_class", "axis", "mean_arcsec", "sigma_arcsec", "half_width_arcsec", "distribution", "time_class"),
-    *("interpretation", "absorbed_by_alignment", "correlation_group", "conditions", "provenance", "applies"),
-)
-
-_REQUIREMENT_KEYS = ("name", "axis", "limit_arcsec", "confidence", "scope", "interpretation", "judged_by")
+# What may stand in the tables: keys, with the words or the type that they take.
+Keys = Mapping[str, type | tuple[str, ...]]
+BUDGET_KEYS: Keys = {"title": str, "confidence": float}
+CONTRIBUTOR_KEYS: Keys = {
+    "name": str,
+    "ecss_class": ECSS_CLASSES,
+    "axis": tuple(_AXIS_NAMES),
+    "mean_arcsec": float,
+    "sigma_arcsec": float,
+    "half_width_arcsec": float,
+    "distribution": DISTRIBUTIONS,
+    "interpretation": INTERPRETATIONS,
+    "absorbed_by_alignment": ABSORBED,
+    "correlation_group": str,
+    "conditions": str,
+    "provenance": str,
+    "applies": bool,
+}
+REQUIREMENT_KEYS: Keys = {
+    "name": str,
+    "axis": tuple(_REQUIREMENT_AXES),
+    "limit_arcsec": float,
+    "confidence": float,
+    "scope": SCOPES,
+    "interpretation": INTERPRETATIONS,
+    "judged_by": JUDGED_BY,
+}
+# Keys of earlier versions, and why to delete them.
+_GONE = {"time_class": "interpretation alone decides how a row is combined"}
 
 
 @dataclass(frozen=True)
@@ -113,11 +135,13 @@ class BudgetFile:
 class _Table:
     """One table of the file, whose keys are taken with their type checked."""
 
-    def __init__(self, data: Any, where: str, known: Sequence[str]) -> None:
+    def __init__(self, data: Any, where: str, known: Keys) -> None:
         if not isinstance(data, Mapping):
             raise BudgetError(f"{where}: is no table; write [[contributor]] or [[requirement]] above its keys.")
-        self.data, self.where = data, where
+        self.data, self.where, self.known = data, where, known
         for key in data:
+            if key in _GONE:
+                raise BudgetError(f"{where}: key {key} is no longer read, because {_GONE[key]}; delete the line.")
             if key not in known:
                 raise BudgetError(f"{where}: {unknown_key(key, known)}.".replace("?.", "?"))
 
@@ -132,8 +156,9 @@ class _Table:
             raise BudgetError(f"{self.where}: key {key} is {value!r}; write text in quotes.")
         return value.strip()
 
-    def choice(self, key: str, allowed: Sequence[str], default: str | None = None) -> str:
-        value = self.text(key, default)
+    def choice(self, key: str, default: str | None = None) -> str:
+        value, allowed = self.text(key, default), self.known[key]
+        assert isinstance(allowed, tuple)
         found = {entry.lower(): entry for entry in allowed}.get(value.lower())
         if found is None:
             raise BudgetError(f"{self.where}: key {key} is {value!r}; write one of {', '.join(map(repr, allowed))}.")
@@ -188,14 +213,14 @@ def load_budget_file(path: str | os.PathLike[str]) -> BudgetFile:
             raise BudgetError(
                 f"{path}: {key} is not known; write [budget], [[contributor]] and [[requirement]] tables only."
             )
-    head = _Table(content.get("budget", {}), f"{path}, [budget]", ("title", "confidence"))
+    head = _Table(content.get("budget", {}), f"{path}, [budget]", BUDGET_KEYS)
     confidence = head.confidence("confidence") if "confidence" in head else None
     rows: list[Contributor] = []
     for number, table in enumerate(_tables(content, "contributor", path), start=1):
-        rows += _contributor(_Table(table, f"{path}, [[contributor]] {number}", _CONTRIBUTOR_KEYS))
+        rows += _contributor(_Table(table, f"{path}, [[contributor]] {number}", CONTRIBUTOR_KEYS))
     _no_doubles([(row.name, row.axis) for row in rows], f"{path}: contributor")
     requirements = tuple(
-        _requirement(_Table(table, f"{path}, [[requirement]] {number}", _REQUIREMENT_KEYS), confidence)
+        _requirement(_Table(table, f"{path}, [[requirement]] {number}", REQUIREMENT_KEYS), confidence)
         for number, table in enumerate(_tables(content, "requirement", path), start=1)
     )
     _no_doubles([(requirement.name,) for requirement in requirements], f"{path}: requirement")
@@ -231,8 +256,8 @@ def _contributor(table: _Table) -> list[Contributor]:
     if starter is None:
         _check_own(table, name, close)
     known = starter or _own(name)
-    axes = _AXIS_NAMES[table.choice("axis", tuple(_AXIS_NAMES)).lower()]
-    distribution = table.choice("distribution", DISTRIBUTIONS, known.distribution)
+    axes = _AXIS_NAMES[table.choice("axis").lower()]
+    distribution = table.choice("distribution", known.distribution)
     applies = table.flag("applies", True)
     mean, sigma = (0.0, 0.0) if not applies else _moments(table, distribution)
     provenance = table.text("provenance", "")
@@ -243,14 +268,13 @@ def _contributor(table: _Table) -> list[Contributor]:
     return [
         Contributor(
             name=name,
-            ecss_class=table.choice("ecss_class", ECSS_CLASSES, known.ecss_class),
+            ecss_class=table.choice("ecss_class", known.ecss_class),
             axis=axis,
             mean_arcsec=mean,
             sigma_arcsec=sigma,
             distribution=distribution,
-            time_class=table.choice("time_class", TIME_CLASSES, known.time_class),
-            interpretation=table.choice("interpretation", INTERPRETATIONS, known.interpretation),
-            absorbed_by_alignment=table.choice("absorbed_by_alignment", ABSORBED, known.absorbed_by_alignment),
+            interpretation=table.choice("interpretation", known.interpretation),
+            absorbed_by_alignment=table.choice("absorbed_by_alignment", known.absorbed_by_alignment),
             correlation_group=table.text("correlation_group", ""),
             conditions=table.text("conditions", ""),
             provenance=provenance,
@@ -288,7 +312,7 @@ def _check_own(table: _Table, name: str, close: str) -> None:
 
 
 def _own(name: str) -> Expected:
-    return Expected(name, "other", "constant", "ensemble", "no", "gaussian", "")
+    return Expected(name, "other", "ensemble", "no", "gaussian", "")
 
 
 def _moments(table: _Table, distribution: str) -> tuple[float, float]:
@@ -315,7 +339,7 @@ def _moments(table: _Table, distribution: str) -> tuple[float, float]:
 def _requirement(table: _Table, confidence: float | None) -> Requirement:
     name = table.text("name")
     table.where += f" ({name!r})"
-    axis = table.choice("axis", tuple(_REQUIREMENT_AXES)).lower()
+    axis = table.choice("axis").lower()
     limit = table.number("limit_arcsec")
     if not limit > 0.0:
         raise BudgetError(f"{table.where}: key limit_arcsec is {limit!r}; write a positive number of arcsec.")
@@ -324,9 +348,9 @@ def _requirement(table: _Table, confidence: float | None) -> Requirement:
         axis=axis if axis == CROSS_BORESIGHT else _REQUIREMENT_AXES[axis][0],
         limit_arcsec=limit,
         confidence=table.confidence("confidence", 0.997 if confidence is None else confidence),
-        scope=table.choice("scope", SCOPES, SCOPES[1]),
-        interpretation=table.choice("interpretation", INTERPRETATIONS, "mixed"),
-        judged_by=table.choice("judged_by", JUDGED_BY, "both"),
+        scope=table.choice("scope", SCOPES[1]),
+        interpretation=table.choice("interpretation", "mixed"),
+        judged_by=table.choice("judged_by", "both"),
     )
 
 
@@ -338,7 +362,7 @@ _HEADER = f"""\
 # Remove the "# " in front of the lines of a contributor that you have assessed, and put your number in. What stays
 # commented out reads "not assessed" in the budget, never zero, and the totals read "at least".
 # What does not exist for your sensor: applies = false, with the reason as provenance.
-# A contributor of your own has a name that is not listed here, and states ecss_class, time_class, interpretation and
+# A contributor of your own has a name that is not listed here, and states ecss_class, interpretation and
 # absorbed_by_alignment too. On an axis that it leaves out it is not assessed, unless applies = false is stated there.
 #
 # Keys of a contributor (values that are left out are those shown here for it):
@@ -348,7 +372,6 @@ _HEADER = f"""\
 #   distribution           {", ".join(DISTRIBUTIONS)}
 #   ecss_class             {", ".join(ECSS_CLASSES[:5])},
 #                          {", ".join(ECSS_CLASSES[5:])}
-#   time_class             {", ".join(TIME_CLASSES)}
 #   interpretation         what it is random over: {", ".join(INTERPRETATIONS)}
 #   absorbed_by_alignment  by an alignment calibration with the same camera parameters:
 #                          {", ".join(ABSORBED)} (exists only after it)
@@ -403,7 +426,6 @@ def _entry(entry: Expected, axes: Sequence[str]) -> str:
             f"{size} = ",
             f'distribution = "{entry.distribution}"',
             f'ecss_class = "{entry.ecss_class}"',
-            f'time_class = "{entry.time_class}"',
             f'interpretation = "{entry.interpretation}"',
             f'absorbed_by_alignment = "{entry.absorbed_by_alignment}"',
             'conditions = ""',

@@ -187,7 +187,6 @@ def posterior_rows(
                     mean_arcsec=0.0,
                     sigma_arcsec=float(inflated[index]),
                     distribution=entry.distribution,
-                    time_class=entry.time_class,
                     interpretation=entry.interpretation,
                     absorbed_by_alignment=entry.absorbed_by_alignment,
                     tail_997=GAUSSIAN_997 + float(share) * excess,

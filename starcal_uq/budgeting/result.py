@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import math
 import os
@@ -12,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.budgeting.file import Requirement
-from starcal_uq.budgeting.rows import AXIS_LABELS, SCOPES, Contributor
-from starcal_uq.budgeting.totals import Samples, Total, total
+from starcal_uq.budgeting.rows import AXIS_LABELS, ECSS_CLASSES, SCOPES, Contributor
+from starcal_uq.budgeting.totals import Samples, Total, grouped_sigma, total
 from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import BudgetError
@@ -56,7 +57,10 @@ class Outcome(Shown):
 
     @property
     def least_arcsec(self) -> float:
-        """The same bound if worst cases of different contributors do not meet: only above the limit is it violated."""
+        """The same bound at the least: worst cases do not meet, and what is absorbed in part is gone.
+
+        Only where it is above the limit is the requirement violated.
+        """
         least = self._judged(self.total.rule_least_arcsec, self.total.sampled_least_arcsec)
         return self.bound_arcsec if math.isnan(least) else least
 
@@ -199,6 +203,20 @@ class Budget(Shown):
         ]
         return pd.DataFrame(rows).assign(not_assessed=["; ".join(entry.not_assessed) for entry in self.totals])
 
+    def classes_dataframe(self, scope: str = "after alignment") -> pd.DataFrame:
+        """Standard deviations by class of the standard: ``ecss_class``, ``axis``, ``sigma_arcsec``, ``at_least``."""
+        import pandas as pd
+
+        counted = [row for row in self.rows if row.counts(scope)]
+        classes = [name for name in ECSS_CLASSES if any(row.ecss_class == name for row in counted)]
+        records = []
+        for name, axis in itertools.product(classes, AXES):
+            rows = [row for row in counted if (row.ecss_class, row.axis) == (name, axis)]
+            known = [row for row in rows if row.assessed and row.applies]
+            sigma = grouped_sigma(known) if any(row.assessed for row in rows) else math.nan
+            records.append((name, axis, sigma, any(not row.assessed for row in rows)))
+        return pd.DataFrame(records, columns=["ecss_class", "axis", "sigma_arcsec", "at_least"])
+
     def requirements_dataframe(self) -> pd.DataFrame:
         """One row per requirement: its fields, the bounds, ``least_arcsec``, ``margin_arcsec`` and ``verdict``."""
         import pandas as pd
@@ -228,6 +246,7 @@ class Budget(Shown):
             "title": self.title,
             "confidence": self.confidence,
             "contributors": plain(self.to_dataframe()),
+            "classes": plain(self.classes_dataframe()),
             "totals": plain(self.totals_dataframe()),
             "requirements": plain(self.requirements_dataframe()),
             "violations": [outcome.requirement.name for outcome in self.violations],

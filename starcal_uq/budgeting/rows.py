@@ -21,10 +21,11 @@ AXIS_LABELS = {
 }
 
 DISTRIBUTIONS = ("gaussian", "uniform", "arcsine", "rayleigh", "constant")
-TIME_CLASSES = ("constant", "long-term", "orbital", "field", "frame to frame")
 INTERPRETATIONS = ("ensemble", "temporal", "mixed")
 ABSORBED = ("yes", "no", "in part", "caused by it")
 SCOPES = ("before alignment", "after alignment")
+# After an alignment that absorbs all of what it absorbs in part.
+AFTER_AT_LEAST = "after alignment, at the least"
 SOURCES = ("posterior", "file", "not assessed")
 ECSS_CLASSES = (
     "bias",
@@ -62,13 +63,11 @@ class Contributor:
         Mean and standard deviation, arcsec; NaN where not assessed.
     distribution : str
         One of `DISTRIBUTIONS`: shape around the mean. ``constant`` has no spread.
-    time_class : str
-        How fast it changes, one of `TIME_CLASSES`; ``field`` as stars move over the field of view.
     interpretation : str
         Kind of randomness: ``ensemble`` (of calibrations and units: constant in time), ``temporal`` or ``mixed``.
     absorbed_by_alignment : str
         Does an alignment calibration with the same camera parameters take it up? ``caused by it`` marks what exists
-        only after it. ``in part`` counts in full.
+        only after it. ``in part`` counts in full for upper bounds, and not at all for the least ones.
     correlation_group : str
         Rows of one group and axis err together, their sigmas add; empty if it errs alone.
     tail_997 : float
@@ -90,7 +89,6 @@ class Contributor:
     mean_arcsec: float = _NAN
     sigma_arcsec: float = _NAN
     distribution: str = "gaussian"
-    time_class: str = "constant"
     interpretation: str = "ensemble"
     absorbed_by_alignment: str = "no"
     correlation_group: str = ""
@@ -124,11 +122,11 @@ class Contributor:
         return group or "in squares"
 
     def counts(self, scope: str) -> bool:
-        """True if it exists in this scope, one of `SCOPES`."""
-        if self.absorbed_by_alignment == "yes":
+        """True if it exists in this scope, one of `SCOPES` or `AFTER_AT_LEAST`."""
+        if self.absorbed_by_alignment == "yes" or (scope == AFTER_AT_LEAST and self.absorbed_by_alignment == "in part"):
             return scope == SCOPES[0]
         if self.absorbed_by_alignment == "caused by it":
-            return scope == SCOPES[1]
+            return scope != SCOPES[0]
         return True
 
 
@@ -138,7 +136,7 @@ class Expected:
 
     Attributes
     ----------
-    name, ecss_class, time_class, interpretation, absorbed_by_alignment, distribution : str
+    name, ecss_class, interpretation, absorbed_by_alignment, distribution : str
         Entries of a `Contributor`; a file may state otherwise.
     what : str
         Description and usual source of the number, for people.
@@ -146,7 +144,6 @@ class Expected:
 
     name: str
     ecss_class: str
-    time_class: str
     interpretation: str
     absorbed_by_alignment: str
     distribution: str
@@ -155,74 +152,74 @@ class Expected:
 
 FROM_POSTERIOR = (
     Expected(
-        *(COMMON, "bias", "constant", "ensemble", "yes", "gaussian"),
+        *(COMMON, "bias", "ensemble", "yes", "gaussian"),
         "error of the camera parameters that turns all attitudes alike",
     ),
     Expected(
-        *(REST, "FOV spatial", "field", "mixed", "no", "gaussian"),
+        *(REST, "FOV spatial", "mixed", "no", "gaussian"),
         "error of the camera parameters that depends on where the stars are",
     ),
     Expected(
-        *(NEA, "temporal noise (NEA)", "frame to frame", "temporal", "no", "gaussian"),
+        *(NEA, "temporal noise (NEA)", "temporal", "no", "gaussian"),
         "noise of the centroids",
     ),
 )
 INTERACTING = Expected(
-    *(INTERACTION, "temporal noise (NEA)", "frame to frame", "mixed", "no", "gaussian"),
+    *(INTERACTION, "temporal noise (NEA)", "mixed", "no", "gaussian"),
     "what is left when noise and calibration error act together",
 )
 FROM_FILE = (
     Expected(
-        *("on-ground alignment measurement", "bias", "constant", "ensemble", "yes", "gaussian"),
+        *("on-ground alignment measurement", "bias", "ensemble", "yes", "gaussian"),
         "alignment of the sensor's frame with its mounting reference (cube, feet), as measured before launch",
     ),
     Expected(
-        *("launch and settling shift", "bias", "constant", "ensemble", "yes", "uniform"),
+        *("launch and settling shift", "bias", "ensemble", "yes", "uniform"),
         "change of that alignment from its measurement to the start of the mission: launch loads, gravity, moisture",
     ),
     Expected(
-        *("alignment calibration in flight", "bias", "long-term", "ensemble", "caused by it", "gaussian"),
+        *("alignment calibration in flight", "bias", "ensemble", "caused by it", "gaussian"),
         "error of the in-flight estimate that replaces the rows it absorbs",
     ),
     Expected(
-        *("thermo-elastic distortion", "thermo-elastic", "orbital", "temporal", "no", "arcsine"),
+        *("thermo-elastic distortion", "thermo-elastic", "temporal", "no", "arcsine"),
         "motion of boresight against mounting reference with temperature and its gradients over orbit and season",
     ),
     Expected(
-        *("drift of focal length and distortion", "FOV spatial", "long-term", "ensemble", "no", "gaussian"),
+        *("drift of focal length and distortion", "FOV spatial", "ensemble", "no", "gaussian"),
         "change of the camera since the calibration: temperature, vacuum, ageing",
     ),
     Expected(
-        *("chromatic and asymmetric star images", "FOV spatial", "field", "mixed", "no", "gaussian"),
+        *("chromatic and asymmetric star images", "FOV spatial", "mixed", "no", "gaussian"),
         "shift of centroids with star colour, field position and focus that no distortion model holds",
     ),
     Expected(
-        *("star catalogue", "FOV spatial", "field", "mixed", "no", "gaussian"),
+        *("star catalogue", "FOV spatial", "mixed", "no", "gaussian"),
         "errors of catalogue positions: proper motion since epoch, parallax, double stars",
     ),
     Expected(
-        *("pixel spatial error", "pixel spatial", "field", "mixed", "no", "gaussian"),
+        *("pixel spatial error", "pixel spatial", "mixed", "no", "gaussian"),
         "centroid interpolation, photo-response and dark-signal non-uniformity, as far as the calibration frames did "
         "not hold it as noise",
     ),
     Expected(
-        *("aberration residual", "aberration", "orbital", "temporal", "no", "arcsine"),
+        *("aberration residual", "aberration", "temporal", "no", "arcsine"),
         "what the on-board correction of aberration leaves: velocity error, or the whole effect if it is not corrected",
     ),
     Expected(
-        *("measurement date error", "measurement date", "frame to frame", "temporal", "no", "uniform"),
+        *("measurement date error", "measurement date", "temporal", "no", "uniform"),
         "error of the time tag times the angular rate",
     ),
     Expected(
-        *("motion during exposure", "temporal noise (NEA)", "frame to frame", "temporal", "no", "gaussian"),
+        *("motion during exposure", "temporal noise (NEA)", "temporal", "no", "gaussian"),
         "smear, jitter and rolling shutter at the mission's rates, beyond those of the calibration frames",
     ),
     Expected(
-        *("end-of-life noise", "temporal noise (NEA)", "long-term", "temporal", "no", "gaussian"),
+        *("end-of-life noise", "temporal noise (NEA)", "temporal", "no", "gaussian"),
         "growth of the noise with radiation dose, dark current, loss of transmission",
     ),
     Expected(
-        *("straylight, particles and false stars", "robustness", "frame to frame", "temporal", "no", "gaussian"),
+        *("straylight, particles and false stars", "robustness", "temporal", "no", "gaussian"),
         "added error at the exclusion angles and particle fluxes that the mission has to endure",
     ),
 )
@@ -244,7 +241,6 @@ def not_assessed(expected: Expected, axis: str) -> Contributor:
         ecss_class=expected.ecss_class,
         axis=axis,
         distribution=expected.distribution,
-        time_class=expected.time_class,
         interpretation=expected.interpretation,
         absorbed_by_alignment=expected.absorbed_by_alignment,
         conditions=expected.what,

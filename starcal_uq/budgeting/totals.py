@@ -25,7 +25,14 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from starcal_uq.budgeting.rows import GAUSSIAN_997, INTERPRETATIONS, SCOPES, Contributor, confidence_text
+from starcal_uq.budgeting.rows import (
+    AFTER_AT_LEAST,
+    GAUSSIAN_997,
+    INTERPRETATIONS,
+    SCOPES,
+    Contributor,
+    confidence_text,
+)
 from starcal_uq.budgeting.shapes import deviates, half_width, mixture_spread, one_axis_factor, two_axis_radius
 from starcal_uq.core.constants import AXES, CROSS_BORESIGHT, TOTAL_AXES
 from starcal_uq.core.formatting import join_words, percent, significant
@@ -73,8 +80,8 @@ class Total:
     sampled_se_arcsec : float
         Standard error of the sampled bound.
     rule_least_arcsec, sampled_least_arcsec : float
-        Bounds if worst cases of different rows do not meet: only a limit below is violated. Those above where at most
-        one row is taken at its worst.
+        Bounds if worst cases of different rows do not meet, and alignment absorbs all of what it absorbs in part: only
+        a limit below is violated. Those above where there is neither.
     not_assessed : tuple of str
         Contributors that are missing: with any, the bounds are "at least".
     dominant : str
@@ -132,7 +139,8 @@ def draw(rows: Sequence[Contributor], n_samples: int = N_SAMPLES, seed: int = 0)
     Rows of one correlation group share their probabilities on each axis. A sigma that changes from frame to frame is
     the same for all axes of a contributor.
     """
-    sums = {(scope, kind): np.zeros((n_samples, 3)) for scope in SCOPES for kind in INTERPRETATIONS}
+    scopes = (*SCOPES, AFTER_AT_LEAST) if any(row.absorbed_by_alignment == "in part" for row in rows) else SCOPES
+    sums = {(scope, kind): np.zeros((n_samples, 3)) for scope in scopes for kind in INTERPRETATIONS}
     shared: dict[tuple[str, str], FloatArray] = {}
     scales: dict[str, FloatArray] = {}
     for index, row in enumerate(rows):
@@ -145,7 +153,7 @@ def draw(rows: Sequence[Contributor], n_samples: int = N_SAMPLES, seed: int = 0)
             scales[row.name] = np.random.default_rng((seed, 2, index)).standard_normal(n_samples)
         log_scale = scales.get(row.name, uniform)
         errors = row.sigma_arcsec * deviates(row.distribution, uniform, log_scale, row.tail_997)
-        for scope in SCOPES:
+        for scope in scopes:
             if row.counts(scope):
                 sums[scope, row.interpretation][:, AXES.index(row.axis)] += errors
     return Samples(sums)
@@ -168,46 +176,91 @@ def total(
     if not counted:
         nan = math.nan
         return Total(scope, axis, interpretation, confidence, *(nan,) * 7, not_assessed=missing)
-    random = [row for row in counted if row.interpretation in _random(interpretation)]
-    worst = [row for row in counted if row not in random]
-    mean = np.array([sum(row.mean_arcsec for row in counted if row.axis == name) for name in axes[1]])
-    sigma = np.array([grouped_sigma([row for row in random if row.axis == name]) for name in axes[1]])
-    radius = _radius(confidence, sigma)
-    gaussian, squares = _worst(worst, axes[1], confidence, by_shape=False)
-    length, rms = float(np.linalg.norm(mean)), float(np.sqrt(np.mean(sigma**2)))
-    rule = length + radius + gaussian
-    by_shape, _ = _worst(worst, axes[1], confidence, by_shape=True)
-    columns = [AXES.index(name) for name in axes[1]]
-    chance, rest = (
-        sum((samples.sums[scope, kind][:, columns] for kind in kinds), start=np.zeros((1, len(columns))))
-        for kinds in (_random(interpretation), _worst_kinds(interpretation))
-    )
-    sampled, error = _quantile(_meeting(mean, by_shape, chance) + chance, confidence)
-    least = min(_one_of_many(mean + rest, chance, confidence), sampled) if by_shape > 0.0 else sampled
+    here = _bounds(counted, samples, scope, axes[1], interpretation, confidence)
+    certain, at_least = counted, here
+    if scope == SCOPES[1]:
+        certain = [row for row in counted if row.counts(AFTER_AT_LEAST)]
+    if len(certain) < len(counted):
+        at_least = _bounds(certain, samples, AFTER_AT_LEAST, axes[1], interpretation, confidence)
     dominant, share = _dominant(counted, axes[1], confidence)
     result = Total(
         scope=scope,
         axis=axis,
         interpretation=interpretation,
         confidence=confidence,
-        mean_arcsec=length if len(mean) > 1 else float(mean[0]),
-        sigma_arcsec=rms,
-        factor=radius / rms if rms > 0.0 else math.nan,
-        worst_arcsec=gaussian,
-        rule_arcsec=rule,
-        sampled_arcsec=sampled,
-        sampled_se_arcsec=error,
-        rule_least_arcsec=length + radius + squares,
-        sampled_least_arcsec=least,
+        mean_arcsec=here.mean,
+        sigma_arcsec=here.sigma,
+        factor=here.radius / here.sigma if here.sigma > 0.0 else math.nan,
+        worst_arcsec=here.worst,
+        rule_arcsec=here.rule,
+        sampled_arcsec=here.sampled,
+        sampled_se_arcsec=here.error,
+        rule_least_arcsec=min(at_least.rule_least, here.rule),
+        sampled_least_arcsec=min(at_least.sampled_least, here.sampled),
         not_assessed=missing,
         dominant=dominant.name if share > _DOMINANT else "",
         dominant_share=share,
     )
     if result.unresolved:
-        n = len(chance)
+        n = len(next(iter(samples.sums.values())))
         text = f"{n} samples do not resolve a confidence of {confidence_text(confidence)}: there is no sampled bound."
         return replace(result, explanation=text)
-    return replace(result, explanation=explain(result, counted, random, dominant))
+    return replace(result, explanation=explain(result, counted, _spread(counted, interpretation), dominant))
+
+
+@dataclass(frozen=True)
+class _Bounds:
+    """What some rows reach in one scope; arcsec."""
+
+    mean: float
+    sigma: float
+    radius: float
+    worst: float
+    rule: float
+    rule_least: float
+    sampled: float
+    error: float
+    sampled_least: float
+
+
+def _bounds(
+    rows: Sequence[Contributor],
+    samples: Samples,
+    scope: str,
+    axes: Sequence[str],
+    interpretation: str,
+    confidence: float,
+) -> _Bounds:
+    random = _spread(rows, interpretation)
+    worst = [row for row in rows if row not in random]
+    mean = np.array([sum(row.mean_arcsec for row in rows if row.axis == name) for name in axes])
+    sigma = np.array([grouped_sigma([row for row in random if row.axis == name]) for name in axes])
+    radius = _radius(confidence, sigma)
+    together, apart = _worst(worst, axes, confidence, by_shape=False)
+    by_shape, _ = _worst(worst, axes, confidence, by_shape=True)
+    columns = [AXES.index(name) for name in axes]
+    chance, rest = (
+        sum((samples.sums[scope, kind][:, columns] for kind in kinds), start=np.zeros((1, len(columns))))
+        for kinds in (_random(interpretation), _worst_kinds(interpretation))
+    )
+    sampled, error = _quantile(_meeting(mean, by_shape, chance) + chance, confidence)
+    least = min(_one_of_many(mean + rest, chance, confidence), sampled) if by_shape > 0.0 else sampled
+    length = float(np.linalg.norm(mean))
+    return _Bounds(
+        mean=length if len(mean) > 1 else float(mean[0]),
+        sigma=float(np.sqrt(np.mean(sigma**2))),
+        radius=radius,
+        worst=together,
+        rule=length + radius + together,
+        rule_least=length + radius + apart,
+        sampled=sampled,
+        error=error,
+        sampled_least=least,
+    )
+
+
+def _spread(rows: Sequence[Contributor], interpretation: str) -> list[Contributor]:
+    return [row for row in rows if row.interpretation in _random(interpretation)]
 
 
 def explain(total: Total, counted: Sequence[Contributor], random: Sequence[Contributor], dominant: Contributor) -> str:

@@ -16,7 +16,13 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.budgeting.budget import budget
-from starcal_uq.budgeting.file import load_budget_file
+from starcal_uq.budgeting.file import (
+    _AXIS_NAMES,
+    BUDGET_KEYS,
+    CONTRIBUTOR_KEYS,
+    REQUIREMENT_KEYS,
+    load_budget_file,
+)
 from starcal_uq.budgeting.posterior import inflation
 from starcal_uq.budgeting.result import Budget
 from starcal_uq.budgeting.rows import COMMON, FROM_FILE, GAUSSIAN_997, NEA, REST
@@ -59,7 +65,6 @@ axis = "X"
 mean_arcsec = 0.25
 sigma_arcsec = 0.1
 ecss_class = "other"
-time_class = "constant"
 interpretation = "ensemble"
 absorbed_by_alignment = "no"
 provenance = "note"
@@ -232,6 +237,88 @@ def test_frames_that_disagree_multiply_both_calibration_rows() -> None:
     assert not rows[NEA, "pitch"].inflated
     chance = SimpleNamespace(ratio=np.array([1.0, 1.5]), p_values=np.array([0.5, 0.1]))
     assert not any(row.inflated for row in made(misfit=diagnosis(jackknife=chance)).rows)
+
+
+# --- every key of the file has an effect ---
+
+
+PROBE = {
+    "name": "probe",
+    "ecss_class": "other",
+    "axis": "roll",
+    "mean_arcsec": 1.0,
+    "sigma_arcsec": 1.0,
+    "distribution": "uniform",
+    "interpretation": "mixed",
+    "absorbed_by_alignment": "no",
+    "correlation_group": "",
+    "conditions": "in air",
+    "provenance": "note 1",
+    "applies": True,
+}
+ASKED = {"name": "R-1", "axis": "roll", "limit_arcsec": 30.0, "confidence": 0.997}
+TABLES = {
+    "[budget]": (BUDGET_KEYS, {"title": "one", "confidence": 0.997}),
+    "[[contributor]]": (CONTRIBUTOR_KEYS, PROBE),
+    "[[requirement]]": (REQUIREMENT_KEYS, ASKED),
+}
+
+
+def lines(table: dict[str, Any]) -> str:
+    return "".join(f"{key} = {json.dumps(value)}\n" for key, value in table.items())
+
+
+def result(folder: Path, head: str, table: dict[str, Any]) -> str:
+    """Everything that a budget states but its provenance, as text; beside others whose tails and groups matter."""
+    tables = {name: table if name == head else dict(base) for name, (_, base) in TABLES.items()}
+    other = {**PROBE, "name": "other", "sigma_arcsec": 2.0, "interpretation": "ensemble"}
+    others = [{**other, "axis": "X"}, {**other, "axis": "Z", "correlation_group": "text of its own"}]
+    text = "".join(f"{name}\n{lines(entry)}" for name, entry in tables.items())
+    text += "".join(f"[[contributor]]\n{lines(entry)}" for entry in others)
+    (folder / "key.toml").write_text(text, encoding="utf-8")
+    found = made(folder / "key.toml", n_samples=10_000)
+    shown = found.to_dict()
+    del shown["provenance"]
+    # What is stated is not yet an effect: only what follows from it, and words for people.
+    words = ("name", "conditions", "provenance")
+    shown["contributors"] = [{key: row[key] for key in words} for row in shown["contributors"]]
+    bounds = ("name", "bound_arcsec", "least_arcsec", "margin_arcsec", "verdict")
+    shown["requirements"] = [{key: row[key] for key in bounds} for row in shown["requirements"]]
+    return json.dumps(shown)
+
+
+def values(kind: Any, now: Any) -> list[Any]:
+    if isinstance(kind, tuple):
+        return list({str(aliases): word for word in kind for aliases in [_AXIS_NAMES.get(word, word)]}.values())
+    if kind is float:
+        return [0.9 * (now or 10.0), now]
+    return ["text of its own", now] if kind is str else [False, True]
+
+
+@pytest.mark.parametrize(("head", "key"), [(head, key) for head, (keys, _) in TABLES.items() for key in keys])
+def test_every_value_of_every_key_changes_the_result(tmp_path: Path, head: str, key: str) -> None:
+    keys, base = TABLES[head]
+    found: dict[str, list[str]] = {}
+    # About the boresight noise has a heavy tail, and sampling says more; across it a uniform row, and the rule does.
+    for axis in ("roll", "pitch") if key == "judged_by" else ("roll",):
+        for value in values(keys[key], base.get(key)):
+            table = {**base, **({"axis": axis} if "axis" in base else {}), key: value}
+            if key == "half_width_arcsec":
+                del table["sigma_arcsec"]
+                table["half_width_arcsec"] = value or 8.0
+            if value == "constant":
+                del table["sigma_arcsec"]
+            found.setdefault(str(value), []).append(result(tmp_path, head, table))
+    assert len({str(states) for states in found.values()}) == len(found) > 1, key
+
+
+def test_a_key_without_effect_would_be_found(tmp_path: Path) -> None:
+    # Control: the time class of earlier versions was shown and changed nothing; it is refused with a sentence.
+    path = tmp_path / "old.toml"
+    path.write_text(f'[[contributor]]\n{lines(PROBE)}time_class = "field"\n', encoding="utf-8")
+    with pytest.raises(BudgetError, match="key time_class is no longer read, because interpretation alone decides"):
+        made(path)
+    assert result(tmp_path, "[[contributor]]", PROBE) == result(tmp_path, "[[contributor]]", dict(PROBE))
 
 
 # --- requirements ----------------------------------------------------------------------------------------------------

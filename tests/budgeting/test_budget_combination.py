@@ -245,9 +245,20 @@ def test_worst_cases_that_must_not_meet_leave_a_limit_open() -> None:
         outcome = Outcome(Requirement("R", "pitch", limit, 0.9973, "before alignment", "temporal"), found)
         assert outcome.verdict == verdict and outcome.between == (verdict == "open")
         assert f"is {verdict}" in outcome_text(outcome)
-    assert "34.3 if they do not" in outcome_text(
-        Outcome(Requirement("R", "pitch", 45.0, 0.9973, "before alignment", "temporal", "rule"), found)
-    )
+    open_one = Outcome(Requirement("R", "pitch", 45.0, 0.9973, "before alignment", "temporal", "rule"), found)
+    assert "is open: at the least 34.3 and at most 59.4 arcsec against a limit of 45.0." in outcome_text(open_one)
+
+
+def test_what_is_absorbed_in_part_leaves_a_limit_open() -> None:
+    rows = [row("ground", 6.0, absorbed_by_alignment="in part"), row("noise", 1.0)]
+    found = combined(rows, scope="after alignment")
+    assert found.rule_arcsec == pytest.approx(math.sqrt(37.0) * one_axis_factor(0.997))
+    assert found.rule_least_arcsec == pytest.approx(one_axis_factor(0.997))
+    for limit, verdict in ((2.0, "violated"), (10.0, "open"), (20.0, "met")):
+        assert Outcome(Requirement("R", "pitch", limit, 0.997), found).verdict == verdict
+    # Control: before alignment it is there in full.
+    before = Outcome(Requirement("R", "pitch", 10.0, 0.997, "before alignment"), combined(rows))
+    assert before.verdict == "violated"
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -21,7 +21,6 @@ provenance = "catalogue note"
 """
 OWN = """
 ecss_class = "other"
-time_class = "field"
 interpretation = "mixed"
 absorbed_by_alignment = "no"
 """
@@ -43,7 +42,7 @@ def test_a_contributor_takes_what_is_expected_of_it(tmp_path: Path) -> None:
     found = load_budget_file(written(tmp_path, ROW))
     assert [row.axis for row in found.contributors] == list(AXES)
     first = found.contributors[0]
-    assert (first.ecss_class, first.time_class, first.interpretation) == ("FOV spatial", "field", "mixed")
+    assert (first.ecss_class, first.interpretation) == ("FOV spatial", "mixed")
     assert first.sigma_arcsec == 0.2 and first.mean_arcsec == 0.0 and first.source == "file"
 
 
@@ -87,7 +86,7 @@ def test_names_of_the_starter_may_be_in_any_case(tmp_path: Path, name: str) -> N
 @pytest.mark.parametrize("name", ["polishing residual", "star sensor cable", "launch lock"])
 def test_a_name_of_ones_own_is_taken_with_what_it_states(tmp_path: Path, name: str) -> None:
     row = load_budget_file(written(tmp_path, ROW.replace("star catalogue", name) + OWN)).contributors[0]
-    assert (row.name, row.time_class, row.distribution) == (name, "field", "gaussian")
+    assert (row.name, row.interpretation, row.distribution) == (name, "mixed", "gaussian")
 
 
 def test_requirements_take_the_confidence_of_the_file(tmp_path: Path) -> None:
@@ -142,7 +141,7 @@ BAD = {
     ),
     "mistyped, everything stated": (ROW.replace("star catalogue", "star catalogues") + OWN, "did you mean"),
     "posterior's, in capitals": (ROW.replace("star catalogue", "Centroid Noise (NEA)"), "filled by the posterior"),
-    "own without class": (ROW.replace("star catalogue", "polish"), "must state ecss_class, time_class, interpretation"),
+    "own without class": (ROW.replace("star catalogue", "polish"), "must state ecss_class, interpretation"),
     "too large": (ROW.replace("0.2", "1e308"), "more than 1296000 arcsec, a full turn"),
     "too large for a float": (ROW.replace("0.2", "1" + 400 * "0"), "more than 1296000 arcsec, a full turn"),
     "too large to be read": (ROW.replace("0.2", "1" + 5000 * "0"), "too many digits"),
@@ -240,10 +239,10 @@ def test_the_documented_example_loads(root: Path, tmp_path: Path) -> None:
 
 
 def test_the_documented_keys_are_all_there_are(root: Path) -> None:
-    from starcal_uq.budgeting.file import _CONTRIBUTOR_KEYS, _REQUIREMENT_KEYS
+    from starcal_uq.budgeting.file import CONTRIBUTOR_KEYS, REQUIREMENT_KEYS
 
     page = (root / "docs" / "how-to" / "budget.md").read_text(encoding="utf-8")
-    for heading, keys in (("Keys of a contributor", _CONTRIBUTOR_KEYS), ("Keys of a requirement", _REQUIREMENT_KEYS)):
+    for heading, keys in (("Keys of a contributor", CONTRIBUTOR_KEYS), ("Keys of a requirement", REQUIREMENT_KEYS)):
         table = page.split(f"## {heading}", 1)[1].split("##", 1)[0]
         listed = [line.split("`")[1] for line in table.splitlines() if line.startswith("| `")]
         assert sorted(listed) == sorted(keys)

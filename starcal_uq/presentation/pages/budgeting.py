@@ -91,7 +91,7 @@ def write_xlsx(budget: Budget, path: str | os.PathLike[str]) -> None:
 def _contributors(sheet: Worksheet, budget: Budget) -> None:
     header = [
         *("Contributor", "ECSS class", "Axis", "Mean [arcsec]", "Sigma [arcsec]", "Sigma before inflation [arcsec]"),
-        *("Distribution", "99.7 % half-width [sigma]", "In time", "Random over", "Correlation group", "Combination"),
+        *("Distribution", "99.7 % half-width [sigma]", "Random over", "Correlation group", "Combination"),
         *("Absorbed by alignment", "Conditions", "Provenance", "Source"),
     ]
     rows, colours = [], []
@@ -102,19 +102,19 @@ def _contributors(sheet: Worksheet, budget: Budget) -> None:
             [
                 *(row.name, row.ecss_class, AXIS_LABELS[row.axis], mean, sigma, row.raw_sigma_arcsec),
                 *(row.distribution if row.applies else "does not apply", row.tail_997 if gaussian else None),
-                *(row.time_class, row.interpretation, row.correlation_group, row.combination),
+                *(row.interpretation, row.correlation_group, row.combination),
                 *(row.absorbed_by_alignment, row.conditions, row.provenance, row.source),
             ]
         )
         colours.append("" if row.assessed and not row.inflated else _AMBER)
-    _table(sheet, header, rows, [34, 20, 11, 13, 13, 17, 15, 16, 15, 13, 16, 24, 15, 50, 40, 13], colours)
+    _table(sheet, header, rows, [34, 20, 11, 13, 13, 17, 15, 16, 13, 16, 24, 15, 50, 40, 13], colours)
 
 
 def _totals(sheet: Worksheet, budget: Budget) -> None:
     header = [
         *("Scope", "Axis", "Random over", "Confidence", "Mean [arcsec]", "Sigma [arcsec]", "Factor n [sigma]"),
         *("Worst case added [arcsec]", "Bound by the rule [arcsec]", "Bound by sampling [arcsec]"),
-        *("Rule, worst cases in squares [arcsec]", "Sampling, worst cases sampled [arcsec]"),
+        *("Rule at the least [arcsec]", "Sampling at the least [arcsec]"),
         *("Standard error of sampling [arcsec]", "Reads", "Dominant", "Not assessed", "Rule against sampling"),
     ]
     rows = [
@@ -144,7 +144,7 @@ def _requirements(sheet: Worksheet, budget: Budget) -> None:
         *(
             "Bound by sampling [arcsec]",
             "Judged by",
-            "Bound, worst cases apart [arcsec]",
+            "Bound at the least [arcsec]",
             "Margin [arcsec]",
             "Outcome",
             "In words",

@@ -34,6 +34,7 @@ def tables(budget: Budget) -> dict[str, Any]:
         "confidence": confidence_text(budget.confidence),
         "rows": contributor_rows(budget),
         "has_means": any(row.assessed and row.mean_arcsec != 0.0 for row in budget.rows),
+        "classes": class_rows(budget),
         "totals": total_rows(budget),
         "interpretations": [{"name": name, "meaning": text} for name, text in _MEANING.items()],
         "requirements": [_requirement_row(outcome) for outcome in budget.outcomes],
@@ -63,10 +64,7 @@ def headline(budget: Budget) -> str:
     if missing:
         parts.append(f"{plural(missing, 'requirement')} open: contributors are missing.")
     if between:
-        parts.append(
-            f"{plural(len(between), 'requirement')} open: the limit is exceeded only if worst cases meet in one sensor "
-            "or moment."
-        )
+        parts.append(f"{plural(len(between), 'requirement')} open: only an upper bound exceeds the limit.")
     if unresolved:
         parts.append(f"{plural(len(unresolved), 'requirement')} open: the samples do not resolve so high a confidence.")
     if budget.not_assessed:
@@ -103,7 +101,6 @@ def _contributor_row(name: str, axes: dict[str, Contributor]) -> Row:
             dict.fromkeys(row.distribution if row.applies else "does not apply" for row in stated)
         ),
         "tail": _tails(stated),
-        "time_class": listed([row.time_class for row in every]),
         "interpretation": listed([row.interpretation for row in every]),
         "absorbed": listed([row.absorbed_by_alignment for row in every]),
         "combination": listed([row.combination for row in every]),
@@ -139,6 +136,14 @@ def _tails(rows: list[Contributor]) -> str:
         return ""
     ends = " to ".join(dict.fromkeys(significant(tail, 3) for tail in (min(tails), max(tails))))
     return f"sigma varies by frame: 99.7 % within {ends} σ"
+
+
+def class_rows(budget: Budget) -> list[Row]:
+    """One row per class of the standard: sigma on its axes after alignment."""
+    found: dict[str, list[str]] = {}
+    for name, _, sigma, at_least in budget.classes_dataframe().itertuples(index=False):
+        found.setdefault(name, []).append(bound(sigma, at_least))
+    return [{"name": name, "sigma": cells} for name, cells in found.items()]
 
 
 def bound(value: float, at_least: bool, digits: int = 3) -> str:
@@ -242,11 +247,9 @@ def outcome_text(outcome: Outcome) -> str:
         cause = f"; {total.dominant!r} dominates" if total.dominant else ""
         return f"{asked.name!r} ({what}) is violated: {least}{numbers}{cause}."
     if outcome.between:
-        what_meets = "in one sensor" if asked.interpretation == "temporal" else "at one moment"
-        return (
-            f"{asked.name!r} ({what}) is open: {numbers} if the worst cases of all contributors meet {what_meets}, "
-            f"{least}{significant(outcome.least_arcsec, 3)} if they do not."
-        )
+        so_far = " so far" if total.at_least else ""
+        lower = significant(outcome.least_arcsec, 3)
+        return f"{asked.name!r} ({what}) is open: at the least {lower} and at most {numbers}{so_far}."
     if outcome.verdict == "open":
         count = len(total.not_assessed)
         missing = f"{count} contributors are" if count > 1 else "1 contributor is"
