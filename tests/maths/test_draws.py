@@ -46,9 +46,10 @@ def test_chains_of_tiny_numbers_as_of_large_ones() -> None:
     assert float(arviz().mcse(1e-18 * draws, method="mean")) < 0.2 * small.mcse_mean
 
 
-@pytest.mark.parametrize("n", [20, 60, 1000])
+@pytest.mark.parametrize("n", [60, 400])
 @pytest.mark.parametrize("k", [-0.5, 0.4, 2.0, 20.0])
 def test_weights_as_in_arviz(n: int, k: float) -> None:
+    # Numbers whose tail has one length in 0.23, which rounds it up, and in 1.x, which rounds it down.
     log_weights = k * np.random.default_rng(5).exponential(size=(40, n))
     log_weights[::4, 1] = -np.inf
     smoothed, khat = psis_rows(log_weights)
