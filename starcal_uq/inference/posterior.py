@@ -116,10 +116,10 @@ class Diagnostics:
     agreement_sd : float
         Largest relative difference between their standard deviations.
     compressed_max_difference : float
-        Largest difference between compressed and exact log likelihood over posterior draws within three standard
-        deviations of the mode, relative to the mode, nat; NaN where it was not checked.
+        Largest difference between compressed and exact log likelihood found within three standard deviations of the
+        mode, relative to the mode, nat; NaN where it was not checked.
     compressed_khat : float
-        Pareto shape of the weights exact over compressed at all checked draws; 0 where all differences are below 0.1
+        Pareto shape of the weights exact over compressed at the checked draws; 0 where all differences are below 0.1
         nat, and no tail can matter.
     likelihood_used : str
         How it was evaluated: ``compressed``, ``exact``, or the name of the likelihood that was passed.

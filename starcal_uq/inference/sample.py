@@ -107,9 +107,9 @@ def sample(
         ``log_likelihood(theta (n, p), sigma (n,)) -> (n,)`` is used as it is.
     evaluation : {"auto", "compressed", "exact"}
         ``auto`` samples the compressed form (for ``student_t``, a polynomial fitted to a few hundred exact values),
-        compares it with the exact one at 300 draws and samples the exact one if they differ by more than 0.5 nat within
-        three standard deviations, or if the importance weights between them are not all within 0.1 nat and have k-hat
-        above 0.7.
+        compares it with the exact one three standard deviations from the mode, and at 300 draws where they differ by
+        more than 0.005 nat there. It samples the exact one if they differ by more than 0.5 nat within three standard
+        deviations, or if the importance weights between them are not all within 0.1 nat and have k-hat above 0.7.
     dof : float or "free", optional
         Degrees of freedom of ``student_t``: by default those of a calibration with that likelihood, otherwise 4; "free"
         samples them, with the gamma prior of Juarez & Steel (2010) on what exceeds 2.

@@ -282,6 +282,14 @@ def test_compression_check_measures_the_difference() -> None:
     bad = check_compression(off_by(0.2), exact, target, draws, laplace)
     assert not bad.good
     assert 0.5 < bad.max_difference < 1.9
+    # What an expansion leaves out grows with the third power, in a direction that nobody knows.
+    whiten = np.linalg.inv(laplace.transform[:5, :5] / SD[:, None])
+    for direction in np.linalg.qr(np.random.default_rng(2).standard_normal((5, 5)))[0]:
+
+        def cubic(t: Any, s: Any, to: Any = direction @ whiten) -> Any:
+            return exact(t, s) + 2.0 * ((t - cal.theta) / SD @ to / 3.0) ** 3
+
+        assert not check_compression(cubic, exact, target, draws, laplace).good
 
 
 def test_too_short_a_run_fails_its_checks() -> None:
