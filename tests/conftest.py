@@ -14,6 +14,7 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 os.environ["XDG_CACHE_HOME"] = os.path.join(tempfile.gettempdir(), "starcal_uq-test-cache")
 
 import warnings
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 
@@ -39,17 +40,12 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 @pytest.fixture
-def unpainted(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures are made but not painted: a file of one white pixel takes the place of each.
+def unpainted() -> Iterator[None]:
+    """`without_painting` for one test."""
+    from tests.helpers.painting import without_painting
 
-    Painting is most of the time that a report takes, and all of it is Matplotlib's. Every figure is painted in
-    `tests/presentation`, whole pages in the tests of the report and in one run of the command line.
-    """
-    import numpy as np
-
-    from starcal_uq.presentation.figures import style
-
-    monkeypatch.setattr(style, "painted", lambda _figure, _dpi: np.full((1, 1, 3), 255, dtype=np.uint8))
+    with without_painting():
+        yield
 
 
 @pytest.fixture(scope="session")

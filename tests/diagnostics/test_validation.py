@@ -5,10 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-import os
 import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -140,7 +137,7 @@ def test_binomial_interval():
     # Clopper & Pearson's own example: 3 of 10 at 95 %.
     assert binomial_interval(3, 10) == pytest.approx((0.0667, 0.6525), abs=1e-4)
     assert binomial_interval(0, 10)[0] == 0.0
-    assert binomial_interval(10, 10)[1] == 1.0
+    assert binomial_interval(6, 6)[1] == 1.0
 
 
 # --- one replicate ---
@@ -309,28 +306,26 @@ def _same(a, b):
 
 def test_workers_do_not_change_a_bit_and_progress_is_told(stars):
     settings, calls = study(seed=11), []
-    alone = validate_study(settings, stars, 10, workers=0)
-    both = validate_study(settings, stars, 10, workers=2, progress=lambda done, total: calls.append((done, total)))
+    alone = validate_study(settings, stars, 6, workers=0)
+    both = validate_study(settings, stars, 6, workers=2, progress=lambda done, total: calls.append((done, total)))
     _same(alone, both)
-    _same(alone, validate_study(settings, stars, 10, workers=1))
-    assert calls[-1] == (10, 10)
+    assert calls[-1] == (6, 6)
     assert [done for done, _ in calls] == sorted(done for done, _ in calls)
     # A longer run begins with the shorter one.
     np.testing.assert_array_equal(validate_study(settings, stars, 4, workers=0).ranks, alone.ranks[:4])
     assert not np.array_equal(validate_study(study(seed=12), stars, 4, workers=0).ranks, alone.ranks[:4])
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-def test_interrupt_keeps_what_is_done(stars, workers):
+def test_interrupt_keeps_what_is_done(stars):
     settings = study(seed=11)
 
     def press(done, total):
-        if done >= 8:
+        if done >= 3:
             signal.raise_signal(signal.SIGINT)
 
-    found = validate_study(settings, stars, 200, workers=workers, progress=press)
+    found = validate_study(settings, stars, 200, workers=0, progress=press)
     assert found.interrupted
-    assert 8 <= found.n_replicates < 200
+    assert 3 <= found.n_replicates < 200
     assert f"interrupted after {found.n_replicates} of 200" in found.text
     np.testing.assert_array_equal(found.ranks[0], validate_study(settings, stars, 1, workers=0).ranks[0])
 
@@ -347,22 +342,6 @@ def test_interrupt_before_the_first_result_is_an_interrupt(stars, monkeypatch):
 def test_a_local_function_cannot_go_to_workers(stars):
     with pytest.raises(SamplingError, match="top level, or use workers=0"):
         validate_study(study(likelihood=lambda obs, cal: cal.compressed), stars, 20, workers=2)
-
-
-def test_a_script_without_a_guard_ends_with_the_remedy(tmp_path, root):
-    """The processes import the script, which starts processes; without care both wait for each other forever."""
-    script = tmp_path / "script.py"
-    script.write_text(
-        "import starcal_uq as sc\n"
-        "from starcal_uq.diagnostics.validation.validate import validate\n"
-        "validate(sc.paper.paper_camera(), n_replicates=20, n_frames=8, workers=2)\n"
-    )
-    environment = {**os.environ, "PYTHONPATH": str(root)}
-    done = subprocess.run(
-        [sys.executable, script], capture_output=True, text=True, timeout=120, check=False, env=environment
-    )
-    assert done.returncode == 1
-    assert 'call validate below `if __name__ == "__main__":`' in done.stderr
 
 
 # --- surface ---

@@ -16,7 +16,6 @@ from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.merging import consistency_of, merge
 from starcal_uq.inference.update import shift_test
 from starcal_uq.simulation.frames import simulate
-from starcal_uq.sky.catalogue import load_catalogue
 from tests.helpers import scenes
 
 NOMINAL = scenes.nominal(scenes.camera())
@@ -27,8 +26,7 @@ def calibrated(seed: int, n_frames: int = 12, shift_f_px: float = 0.0) -> Calibr
     camera = scenes.camera()
     theta = camera.theta.copy()
     theta[2] += shift_f_px
-    stars = load_catalogue(max_mag=6.0, epoch=2026.9)
-    obs = simulate(stars, camera.with_theta(theta), n_frames=n_frames, min_stars=8, seed=seed)
+    obs = simulate(scenes.catalogue(), camera.with_theta(theta), n_frames=n_frames, min_stars=8, seed=seed)
     return calibrate(obs, NOMINAL)
 
 

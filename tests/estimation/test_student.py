@@ -244,6 +244,7 @@ def test_sampling_with_given_degrees_of_freedom(spoilt: tuple[Any, Any]) -> None
     assert np.max(np.abs(both[0].mean - both[1].mean) / cal.sigmas) < 0.1
 
 
+@pytest.mark.usefixtures("few_importance_draws")
 def test_sampling_degrees_of_freedom(spoilt: tuple[Any, Any], tmp_path: Path) -> None:
     obs, cal = spoilt
     post = sample(obs, cal, **QUICK, likelihood="student_t", dof="free")
@@ -264,6 +265,7 @@ def test_sampling_degrees_of_freedom(spoilt: tuple[Any, Any], tmp_path: Path) ->
     assert np.isnan(given.diagnostics.rhat[-1])
 
 
+@pytest.mark.usefixtures("few_importance_draws")
 def test_student_t_from_a_gaussian_calibration() -> None:
     obs = observations(n_frames=30)
     cal = calibrate(obs, nominal(camera()))

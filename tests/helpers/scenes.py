@@ -10,7 +10,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.observations.table import Observations
 from starcal_uq.paper.camera import paper_camera
 from starcal_uq.simulation.frames import simulate
-from starcal_uq.sky.catalogue import load_catalogue
+from starcal_uq.sky.catalogue import StarCatalogue, load_catalogue
 
 COEFFICIENTS: dict[str, tuple[float, ...]] = {
     "none": (),
@@ -34,13 +34,19 @@ def nominal(truth: Camera) -> Camera:
     return truth.replace(focal_mm=truth.focal_mm * 1.025, x0_px=x, y0_px=y, coefficients=zeros)
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=8)
+def catalogue(max_mag: float = 6.0, epoch: float = 2026.9) -> StarCatalogue:
+    """Stars of the embedded catalogue, whose file takes longer to read than a campaign to simulate."""
+    return load_catalogue(max_mag=max_mag, epoch=epoch)
+
+
+@lru_cache(maxsize=64)
 def observations(
     model: str = "brown", n_frames: int = 60, seed: int = 3, sigma_px: float = 0.05, max_mag: float = 6.0
 ) -> Observations:
     """Simulated observations; cached, since many tests look at the same ones."""
     return simulate(
-        load_catalogue(max_mag=max_mag, epoch=2026.9),
+        catalogue(max_mag),
         camera(model),
         n_frames=n_frames,
         min_stars=8,

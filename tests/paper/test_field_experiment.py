@@ -32,6 +32,7 @@ from starcal_uq.paper.field.published import (
     printed_sensor,
 )
 from starcal_uq.paper.field.result import ALIGNED, AS_IT_STANDS, BOTH, NEITHER
+from tests.helpers.painting import without_painting
 
 ARCSEC = np.degrees(1.0) * 3600.0
 
@@ -164,13 +165,13 @@ def test_ctrl_c_leaves_nothing(tmp_path) -> None:
 
 
 # A small experiment for the tests, smaller than users are let: its parts are those of a large one.
-SMALL = {"n_frames": 10, "n_calibration_frames": 12, "n_replicates": 20}
+SMALL = {"n_frames": 5, "n_calibration_frames": 10, "n_replicates": 8}
 
 
 @pytest.fixture(scope="module")
 def small_sizes():
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("starcal_uq.paper.field.experiment._LEAST", 10)
+        patch.setattr("starcal_uq.paper.field.experiment._LEAST", 5)
         patch.setattr("starcal_uq.paper.field.experiment.TOLERANCES_PX", (0.1, 0.5, 2.0))
         yield
 
@@ -178,12 +179,13 @@ def small_sizes():
 @pytest.fixture(scope="module")
 def small(tmp_path_factory, small_sizes):
     seen: list[int] = []
-    found = field_experiment(
-        tmp_path_factory.mktemp("field") / "out",
-        workers=0,
-        progress=lambda done, total: seen.append(100 * done // total),
-        **SMALL,
-    )
+    with without_painting():
+        found = field_experiment(
+            tmp_path_factory.mktemp("field") / "out",
+            workers=0,
+            progress=lambda done, total: seen.append(100 * done // total),
+            **SMALL,
+        )
     return found, seen
 
 

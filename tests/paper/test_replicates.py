@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -31,8 +28,8 @@ ARRAYS = ("replicate", "estimates", "claimed", "classical", "crlb", "map_px", "m
 
 @pytest.fixture(scope="module")
 def found():
-    """Fifty data sets of fifteen frames, by every method."""
-    return replicate(n_replicates=50, n_frames=15, seed=5, workers=0)
+    """A dozen data sets of twenty frames, by every method."""
+    return replicate(n_replicates=12, n_frames=20, seed=5, workers=0)
 
 
 def artificial(error, claimed, truth=None, classical=None):
@@ -277,13 +274,12 @@ def test_workers_do_not_change_a_bit_and_progress_is_told():
     assert (other.estimates != shorter.estimates).all()
 
 
-@pytest.mark.parametrize("workers", [0, 2])
-def test_interrupt_keeps_what_is_done(workers):
+def test_interrupt_keeps_what_is_done():
     def press(done, total):
         if done >= 4:
             signal.raise_signal(signal.SIGINT)
 
-    found = replicate(n_replicates=500, workers=workers, progress=press, **SMALL)
+    found = replicate(n_replicates=500, workers=0, progress=press, **SMALL)
     assert found.interrupted
     assert 4 <= found.n_replicates < 500
     assert f"interrupted after {found.n_replicates} of 500" in found.text
@@ -298,19 +294,6 @@ def test_interrupt_before_the_first_result_is_an_interrupt(monkeypatch):
     monkeypatch.setattr("starcal_uq.paper.replicates.run_replicate", stop)
     with pytest.raises(KeyboardInterrupt):
         replicate(n_replicates=3, workers=0, **SMALL)
-
-
-def test_a_script_without_a_guard_ends_with_the_remedy(tmp_path, root):
-    script = tmp_path / "script.py"
-    script.write_text(
-        "from starcal_uq.paper.replicates import replicate\nreplicate(n_replicates=9, n_frames=8, workers=2)\n"
-    )
-    environment = {**os.environ, "PYTHONPATH": str(root)}
-    done = subprocess.run(
-        [sys.executable, script], capture_output=True, text=True, timeout=120, check=False, env=environment
-    )
-    assert done.returncode == 1
-    assert 'call replicate below `if __name__ == "__main__":`' in done.stderr
 
 
 # --- surface ---
@@ -352,7 +335,7 @@ def test_table(found):
     wanted = "truth bias bias_se spread spread_se crlb efficiency claimed claimed_classical claimed_over_spread "
     wanted += "claimed_over_spread_low claimed_over_spread_high coverage95 coverage95_low coverage95_high verdict"
     assert set(wanted.split()) <= set(table.columns)
-    assert (table["n"] == 50).all()
+    assert (table["n"] == 12).all()
     assert (table["claimed_over_spread_low"] < table["claimed_over_spread"]).all()
     assert (table["coverage95_low"] <= table["coverage95"]).all()
     known = table["claimed_classical"].notna()

@@ -1,0 +1,61 @@
+"""Tasks over processes: the same results for any number of them, Ctrl-C, and what cannot be sent to them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from starcal_uq.core.errors import SamplingError
+from starcal_uq.core.tasks import run_tasks
+from tests.helpers.tasks import numbered
+
+EXPECTED = [(index**2, "1") for index in range(30)]
+
+
+@pytest.mark.parametrize("workers", [0, 1, 2])
+def test_results_come_in_order_whoever_computes_them(workers: int) -> None:
+    calls: list[tuple[int, int]] = []
+    found = run_tasks(
+        numbered, 30, caller="f", chunk=4, workers=workers, progress=lambda *numbers: calls.append(numbers)
+    )
+    assert found == (EXPECTED, False)
+    assert calls[-1] == (30, 30)
+    assert [done for done, _ in calls] == sorted(done for done, _ in calls)
+
+
+@pytest.mark.parametrize("workers", [0, 2])
+def test_interrupt_keeps_what_is_done(workers: int) -> None:
+    def press(done: int, total: int) -> None:
+        if done >= 8:
+            signal.raise_signal(signal.SIGINT)
+
+    found, interrupted = run_tasks(numbered, 2000, caller="f", chunk=2, workers=workers, progress=press)
+    assert interrupted
+    assert 8 <= len(found) < 2000
+    assert found[:8] == EXPECTED[:8]
+
+
+def test_a_script_without_a_guard_ends_with_the_remedy(tmp_path: Path, root: Path) -> None:
+    """The processes import the script, which starts processes; without care both wait for each other forever."""
+    script = tmp_path / "script.py"
+    script.write_text(
+        "from starcal_uq.core.tasks import run_tasks\n"
+        "from tests.helpers.tasks import numbered\n"
+        "run_tasks(numbered, 20, caller='validate', chunk=2, workers=2)\n"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(root)}
+    done = subprocess.run(
+        [sys.executable, script], capture_output=True, text=True, timeout=120, check=False, env=environment
+    )
+    assert done.returncode == 1
+    assert 'call validate below `if __name__ == "__main__":`' in done.stderr
+
+
+def test_a_local_function_cannot_go_to_workers() -> None:
+    with pytest.raises(SamplingError, match="top level, or use workers=0"):
+        run_tasks(lambda index: index, 20, caller="f", chunk=2, workers=2)
