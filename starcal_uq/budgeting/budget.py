@@ -12,9 +12,9 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from starcal_uq.budgeting.file import BudgetFile, checked_confidence, load_budget_file
-from starcal_uq.budgeting.posterior import inflation, posterior_rows
+from starcal_uq.budgeting.posterior import misfit_notes, posterior_rows
 from starcal_uq.budgeting.result import Budget, by_contributor, judge
-from starcal_uq.budgeting.rows import AXIS_LABELS, FROM_FILE, Contributor, not_assessed
+from starcal_uq.budgeting.rows import AXIS_LABELS, FROM_FILE, UNTESTED, Contributor, Expected, not_assessed
 from starcal_uq.budgeting.totals import N_SAMPLES, totals
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.errors import BudgetError
@@ -56,7 +56,7 @@ def budget(
     confidence : float, optional
         Probability of the totals; that of the file, or 0.997. Requirements have their own.
     misfit : Diagnosis, optional
-        The tests of the model (`starcal_uq.diagnostics.diagnose.diagnose`), which decide about inflation.
+        The tests of the model (`starcal_uq.diagnose`), for an attitude error that does not hold what they found.
     n_samples, seed : int
         Number and seed of the sampled totals.
 
@@ -78,8 +78,12 @@ def budget(
     chosen = checked_confidence(_CONFIDENCE if chosen is None else chosen, "the confidence of the budget")
     if n_samples < 10_000:
         raise BudgetError(f"n_samples is {n_samples}, too few for the tails of an error; use at least 10000.")
-    added = inflation(attitude, misfit, post, obs)
-    rows = (*posterior_rows(attitude, post, obs, added), *_from_file(stated))
+    if misfit is not None and attitude.misfit is None:
+        from starcal_uq.diagnostics.inflation import with_misfit
+
+        attitude = with_misfit(attitude, misfit, post, obs)
+    untested = () if attitude.misfit is not None else (UNTESTED,)
+    rows = (*posterior_rows(attitude, post), *_from_file(stated, (*untested, *FROM_FILE)))
     found, samples = totals(rows, chosen, n_samples=n_samples, seed=seed)
     settings = {"confidence": chosen, "n_samples": n_samples, "file": stated.path}
     return Budget(
@@ -88,15 +92,15 @@ def budget(
         outcomes=judge(stated.requirements, rows, samples),
         confidence=chosen,
         title=stated.title or "Attitude error budget",
-        notes=(*added.notes, *_notes(rows)),
+        notes=(*misfit_notes(attitude), *_notes(rows)),
         provenance=provenance(seed, settings, post.provenance.get("data_sha256")),
     )
 
 
-def _from_file(stated: BudgetFile) -> tuple[Contributor, ...]:
+def _from_file(stated: BudgetFile, expected: tuple[Expected, ...]) -> tuple[Contributor, ...]:
     """Expected contributors as the file states them or not assessed, then the user's own; each on three axes."""
     given = {(row.name, row.axis): row for row in stated.contributors}
-    rows = [given.pop((entry.name, axis), not_assessed(entry, axis)) for entry in FROM_FILE for axis in AXES]
+    rows = [given.pop((entry.name, axis), not_assessed(entry, axis)) for entry in expected for axis in AXES]
     for name in dict.fromkeys(name for name, _ in given):
         first = next(row for row in given.values() if row.name == name)
         rows += [given.get((name, axis), _silent(first, axis)) for axis in AXES]

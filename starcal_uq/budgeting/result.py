@@ -305,6 +305,10 @@ class Budget(Shown):
                 records = list(csv.DictReader(file))
             by_kind: dict[str, list[dict[str, str]]] = {}
             for record in records:
+                before = record.pop("raw_sigma_arcsec", "nan")
+                if before not in ("", "nan"):
+                    # What a version before called inflated.
+                    record |= {"if_model_holds_arcsec": before, "with_misfit_found_arcsec": record["sigma_arcsec"]}
                 by_kind.setdefault(record["record"], []).append(record)
             settings = {record["name"]: json.loads(record["value"]) for record in by_kind["setting"]}
             return Budget(

@@ -7,7 +7,6 @@ so that it is read as "not assessed" and never as zero.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from decimal import Decimal
 
@@ -77,8 +76,9 @@ class Contributor:
         Under what conditions it holds, and where the number is from.
     source : str
         ``posterior``, ``file`` or ``not assessed``.
-    raw_sigma_arcsec : float
-        Sigma before inflation for what tests of the model found; NaN if it was not inflated.
+    if_model_holds_arcsec, with_misfit_found_arcsec : float
+        Sigma by the posterior alone, and with what the tests of the model found, which is then `sigma_arcsec`; NaN
+        where there is no such figure, as in rows of a file or where the model was not tested.
     applies : bool
         False where the file states that there is no such error: it then counts as zero, with that as its reason.
     """
@@ -96,7 +96,8 @@ class Contributor:
     conditions: str = ""
     provenance: str = ""
     source: str = "not assessed"
-    raw_sigma_arcsec: float = _NAN
+    if_model_holds_arcsec: float = _NAN
+    with_misfit_found_arcsec: float = _NAN
     applies: bool = True
 
     @property
@@ -107,7 +108,7 @@ class Contributor:
     @property
     def inflated(self) -> bool:
         """True if sigma is larger than the posterior's own."""
-        return not math.isnan(self.raw_sigma_arcsec)
+        return self.with_misfit_found_arcsec > self.if_model_holds_arcsec
 
     @property
     def combination(self) -> str:
@@ -167,6 +168,11 @@ FROM_POSTERIOR = (
 INTERACTING = Expected(
     *(INTERACTION, "temporal noise (NEA)", "mixed", "no", "gaussian"),
     "what is left when noise and calibration error act together",
+)
+# Present as long as nobody has tested the model: then its error is in the calibration rows.
+UNTESTED = Expected(
+    *("misfit of the camera model", "FOV spatial", "mixed", "no", "gaussian"),
+    "what the model of camera and noise cannot follow, as long as it was not tested",
 )
 FROM_FILE = (
     Expected(

@@ -117,12 +117,13 @@ def _after_calibration(
     """Sample, couple, propagate, question the model, budget, report; status 1 when a check or a requirement failed."""
     posterior = sample_run(run, sampling, force=True)
     run.couple()
-    error, _, _ = run.propagate(n_draws=draws, seed=sampling.seed)
+    run.propagate(n_draws=draws, seed=sampling.seed)
     if show:
         show_posterior(posterior)
-        show_attitude(error)
     with progress_bar("diagnosis") as progress:
         run.diagnose(seed=sampling.seed, progress=progress)
+    if show:
+        show_attitude(run.attitude)
     made = run.budget(file=budget, seed=sampling.seed)
     if show:
         show_budget(made)

@@ -223,7 +223,7 @@ def propagate_command(
 
     error, _, spectrum = sc.Run(run).propagate(n_draws=draws, seed=seed, sky=sky, tell=tell)
     if json:
-        document = {"frames": error.frames, "attitude_error": records(error.to_dataframe())}
+        document = {"frames": error.frames, "attitude_error": records(error.to_written())}
         print_json(document if spectrum is None else document | {"spectrum": spectrum.text})
         return
     show_attitude(error)

@@ -1,4 +1,5 @@
 from .diagnose import Diagnosis as Diagnosis
+from .inflation import with_misfit as with_misfit
 from .jackknife import Jackknife as Jackknife
 from .jackknife import accept_inflation as accept_inflation
 from .jackknife import jackknife_frames as jackknife_frames

@@ -162,7 +162,7 @@ VIEWS: Mapping[type, View] = {
     AttitudeError: _view(
         "Attitude error",
         propagation.attitude_text,
-        lambda error: TextTable.of(error.to_dataframe(), missing="not known"),
+        propagation.attitude_table,
         lambda error: [f"{error.n_draws} posterior draws through QUEST on {error.n_frames} frames ({error.frames})."],
         contributors=plot_attitude,
     ),

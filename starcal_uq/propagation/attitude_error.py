@@ -1,8 +1,14 @@
-"""The attitude error of single frames by contributor: the result of `starcal_uq.propagation.propagate.propagate`."""
+"""The attitude error of single frames by contributor: the result of `starcal_uq.propagation.propagate.propagate`.
+
+Every error has two figures, under the same two names wherever it is shown: *if the model holds*, by the posterior
+alone, and *with the misfit found*, with what the tests of the model add. The second is the headline, and it is not
+assessed, never equal to the first, until the model has been tested. Both are computed here and nowhere else.
+"""
 
 from __future__ import annotations
 
 import csv
+import json
 import os
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -12,10 +18,15 @@ import numpy as np
 from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.files import reading, write_csv
+from starcal_uq.core.formatting import significant
+from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.types import FloatArray
+from starcal_uq.maths.circular import mixture_radius
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from starcal_uq.observations.table import Observations
 
 CONTRIBUTORS = (
     "centroid noise (NEA)",
@@ -30,6 +41,12 @@ _ABSORBED = ("no", "yes", "no", "in part", "no")
 _REQUIRED = CONTRIBUTORS[:4]
 # A ratio of sigmas below a microarcsecond means nothing.
 _SMALLEST_ARCSEC = 1e-6
+
+IF_MODEL_HOLDS, WITH_MISFIT_FOUND = "if the model holds", "with the misfit found"
+NOT_ASSESSED = "not assessed"
+# Confidences of the half-widths, and the two-sided quantiles of a Gaussian error.
+_CONFIDENCES = (0.95, 0.997)
+_GAUSSIAN = (1.959963984540054, 2.9677379253417833)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +87,35 @@ class Agreement(Shown):
 
 
 @dataclass(frozen=True, eq=False)
+class MisfitFound:
+    """What the tests of the model add to the calibration's part of the attitude error.
+
+    Attributes
+    ----------
+    factor : float
+        Factor on the standard deviations of common rotation and rest, from the jackknife over frames; 1 if they agree.
+    common_arcsec, rest_arcsec : (3,) array
+        Errors added in squares to the common rotation and to the rest, arcsec.
+    common_reasons, rest_reasons : tuple of str
+        Reasons for each of the two; empty if nothing was found.
+    notes : tuple of str
+        Further sentences for the reader.
+    """
+
+    factor: float
+    common_arcsec: FloatArray
+    rest_arcsec: FloatArray
+    common_reasons: tuple[str, ...] = ()
+    rest_reasons: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Reasons for either, each once."""
+        return tuple(dict.fromkeys((*self.common_reasons, *self.rest_reasons)))
+
+
+@dataclass(frozen=True, eq=False)
 class AttitudeError(Shown):
     """Attitude error of single frames by contributor, arcsec.
 
@@ -101,6 +147,14 @@ class AttitudeError(Shown):
         first order there is nothing. NaN when read from a file of a version that did not sample it.
     frames : str
         Which frames these are, such as ``observed frames``.
+    misfit : MisfitFound or None
+        What the tests of the model add; None as long as it was not tested.
+    seen : Observations or None
+        The frames themselves; None when read from a file.
+
+    Notes
+    -----
+    All fields but `misfit` hold if the model does.
     """
 
     nea_arcsec: FloatArray
@@ -118,6 +172,8 @@ class AttitudeError(Shown):
     nea_per_frame_arcsec: FloatArray | None = None
     interaction_arcsec: FloatArray = field(default_factory=lambda: np.full(3, np.nan))
     frames: str = OBSERVED
+    misfit: MisfitFound | None = None
+    seen: Observations | None = None
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -138,22 +194,66 @@ class AttitudeError(Shown):
         ratio = np.where(real, sampled / np.where(first > 0.0, first, np.nan), np.nan)
         return Agreement(CONTRIBUTORS[:3], ratio)
 
-    def to_dataframe(self) -> pd.DataFrame:
-        """One row per contributor and axis.
+    @property
+    def if_model_holds_arcsec(self) -> FloatArray:
+        """Standard deviations (5, 4) by the posterior alone.
 
-        Columns are ``contributor``, ``axis``, ``sigma_arcsec``, ``p95_arcsec``, ``p997_arcsec``,
-        ``first_order_arcsec`` (sigma by first-order propagation) and ``absorbed_by_alignment`` (yes, no, in part).
-        The cross-boresight rows hold the root mean square of the sigmas of pitch and yaw.
+        Rows are `CONTRIBUTORS`, columns the three axes and the root mean square of the two across the boresight.
         """
-        import pandas as pd
-
-        sampled = (
+        rows = (
             self.nea_arcsec,
             self.common_arcsec,
             self.rest_arcsec,
             self.calibration_total_arcsec,
             self.interaction_arcsec,
         )
+        return np.stack([with_cross(np.asarray(row, dtype=np.float64)) for row in rows])
+
+    @property
+    def with_misfit_found_arcsec(self) -> FloatArray:
+        """Standard deviations (5, 4) with what the tests of the model found; NaN as long as it was not tested."""
+        found, held = self.misfit, self.if_model_holds_arcsec
+        if found is None:
+            return np.full_like(held, np.nan)
+        common = np.hypot(found.factor * self.common_arcsec, found.common_arcsec)
+        rest = np.hypot(found.factor * self.rest_arcsec, found.rest_arcsec)
+        calibration = [with_cross(values) for values in (common, rest, np.hypot(common, rest))]
+        return np.stack([held[0], *calibration, held[4]])
+
+    @property
+    def headline_arcsec(self) -> FloatArray:
+        """Standard deviations (5, 4) with the misfit found; those if the model holds where that is not assessed."""
+        return self.if_model_holds_arcsec if self.misfit is None else self.with_misfit_found_arcsec
+
+    @property
+    def half_widths_with_misfit_found_arcsec(self) -> FloatArray:
+        """Half-widths (2, 5, 4) that hold 95 % and 99.7 % of the errors with the misfit found; NaN if not assessed.
+
+        What the misfit adds is taken as Gaussian: the excess of the tails over Gaussian ones shrinks with its share.
+        """
+        held, found = self.if_model_holds_arcsec, self.with_misfit_found_arcsec
+        factor = 1.0 if self.misfit is None else self.misfit.factor
+        scale = np.where([[False], [True], [True], [True], [False]], factor, 1.0)
+        share = np.where(found > 0.0, scale * held / np.where(found > 0.0, found, 1.0), 1.0) ** 2
+        widths = np.stack((self.p95_arcsec, self.p997_arcsec))
+        tails = widths / np.where(held > 0.0, held, np.nan)
+        gaussian = np.stack([_gaussian_tails(held, *pair) for pair in zip(_CONFIDENCES, _GAUSSIAN, strict=True)])
+        excess = np.nan_to_num(tails - gaussian)
+        wanted = np.stack([_gaussian_tails(found, *pair) for pair in zip(_CONFIDENCES, _GAUSSIAN, strict=True)])
+        made: FloatArray = (wanted + share * excess) * found
+        return made
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """One row per contributor and axis.
+
+        Columns are ``contributor``, ``axis``, the standard deviations ``if_model_holds_arcsec`` and
+        ``with_misfit_found_arcsec`` (NaN: not assessed), the half-widths ``p95_if_model_holds_arcsec``,
+        ``p95_with_misfit_found_arcsec`` and the same for ``p997``, ``first_order_arcsec`` (sigma by first-order
+        propagation) and ``absorbed_by_alignment`` (yes, no, in part). The cross-boresight rows hold the root mean
+        square of the sigmas of pitch and yaw.
+        """
+        import pandas as pd
+
         analytic = (
             self.analytic_nea_arcsec,
             self.analytic_common_arcsec,
@@ -161,22 +261,35 @@ class AttitudeError(Shown):
             np.hypot(self.analytic_common_arcsec, self.analytic_rest_arcsec),
             0.0 * self.interaction_arcsec,
         )
+        p95, p997 = self.half_widths_with_misfit_found_arcsec
         return pd.DataFrame(
             {
                 "contributor": np.repeat(CONTRIBUTORS, len(TOTAL_AXES)).astype(object),
                 "axis": np.array(TOTAL_AXES * len(CONTRIBUTORS), dtype=object),
-                "sigma_arcsec": np.concatenate([with_cross(values) for values in sampled]),
-                "p95_arcsec": self.p95_arcsec.ravel(),
-                "p997_arcsec": self.p997_arcsec.ravel(),
+                "if_model_holds_arcsec": self.if_model_holds_arcsec.ravel(),
+                "with_misfit_found_arcsec": self.with_misfit_found_arcsec.ravel(),
+                "p95_if_model_holds_arcsec": self.p95_arcsec.ravel(),
+                "p95_with_misfit_found_arcsec": p95.ravel(),
+                "p997_if_model_holds_arcsec": self.p997_arcsec.ravel(),
+                "p997_with_misfit_found_arcsec": p997.ravel(),
                 "first_order_arcsec": np.concatenate([with_cross(values) for values in analytic]),
                 "absorbed_by_alignment": np.repeat(_ABSORBED, len(TOTAL_AXES)).astype(object),
             }
         )
 
+    def to_written(self) -> pd.DataFrame:
+        """The table as files and JSON have it: ``not assessed`` in words where the model was not tested."""
+        table = self.to_dataframe()
+        if self.misfit is None:
+            table = table.assign(**{name: NOT_ASSESSED for name in table.columns if "with_misfit_found" in name})
+        return table
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the table as CSV, atomically and to the last digit; overwritten. Single draws are not kept."""
-        table = self.to_dataframe().assign(n_draws=self.n_draws, n_frames=self.n_frames, frames=self.frames)
-        write_csv(table, path)
+        misfit = "" if self.misfit is None else json.dumps(to_plain(self.misfit))
+        table = self.to_written().assign(n_draws=self.n_draws, n_frames=self.n_frames, frames=self.frames)
+        # Once is enough: it is the same for all rows.
+        write_csv(table.assign(misfit=[misfit] + [""] * (len(table) - 1)), path)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> AttitudeError:
@@ -189,13 +302,17 @@ class AttitudeError(Shown):
         RunFolderError
             If the file is missing or is not such a table.
         """
-        names = ("sigma", "p95", "p997", "first_order")
+        names: tuple[str, ...] = ("if_model_holds", "p95_if_model_holds", "p997_if_model_holds", "first_order")
+        # What earlier versions called them.
+        old = {"if_model_holds": "sigma", "p95_if_model_holds": "p95", "p997_if_model_holds": "p997"}
         with reading(path, "a table of attitude errors", "run `starcal-uq propagate RUN` to write it"):
             with open(path, newline="", encoding="utf-8") as file:
                 rows = {(row["contributor"], row["axis"]): row for row in csv.DictReader(file)}
             known = CONTRIBUTORS if (INTERACTION, AXES[0]) in rows else _REQUIRED
             chosen = [[rows[contributor, axis] for axis in TOTAL_AXES] for contributor in known]
             table = np.full((len(names), len(CONTRIBUTORS), len(TOTAL_AXES)), np.nan)
+            if "if_model_holds_arcsec" not in chosen[0][0]:
+                names = tuple(old.get(name, name) for name in names)
             table[:, : len(known)] = [
                 [[float(row[f"{name}_arcsec"] or "nan") for row in line] for line in chosen] for name in names
             ]
@@ -204,6 +321,7 @@ class AttitudeError(Shown):
             first = chosen[0][0]
             counts = {name: int(first[name]) for name in ("n_draws", "n_frames")}
             frames = first.get("frames") or OBSERVED
+            misfit = from_plain(MisfitFound, json.loads(first["misfit"])) if first.get("misfit") else None
         sigma, p95, p997, analytic = table
         return cls(
             *(sigma[0, :3], sigma[1, :3], sigma[2, :3], p95, p997),
@@ -212,7 +330,22 @@ class AttitudeError(Shown):
             n_frames=counts["n_frames"],
             interaction_arcsec=sigma[4, :3],
             frames=frames,
+            misfit=misfit,
         )
+
+
+def two_figures(with_misfit_found: float, if_model_holds: float) -> str:
+    """One error by its two names, arcsec, for a sentence."""
+    first = f"{significant(float(if_model_holds))}{{}} {IF_MODEL_HOLDS}"
+    if np.isnan(with_misfit_found):
+        return f"{first.format(' arcsec')} ({WITH_MISFIT_FOUND}: {NOT_ASSESSED})"
+    return f"{significant(float(with_misfit_found))} arcsec {WITH_MISFIT_FOUND} ({first.format('')})"
+
+
+def _gaussian_tails(sigmas: FloatArray, confidence: float, one_axis: float) -> FloatArray:
+    """Half-widths over sigmas (5, 4) that Gaussian errors would have: of one axis, and of the angle across."""
+    across = [mixture_radius(np.diag(row[:2] ** 2), confidence) / row[3] if row[3] > 0.0 else np.nan for row in sigmas]
+    return np.column_stack((np.full((len(sigmas), 3), one_axis), across))
 
 
 def with_cross(sigma: FloatArray) -> FloatArray:

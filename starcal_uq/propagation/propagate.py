@@ -116,6 +116,7 @@ def propagate(post: Posterior, obs: Observations, *, n_draws: int = 300, seed: i
         nea_per_frame_arcsec=np.sqrt(_diagonal(nea)) * ARCSEC,
         interaction_arcsec=_rms(interaction.reshape(-1, 3) ** 2) * ARCSEC,
         frames=str(obs.meta.get("frames", OBSERVED)),
+        seen=obs,
     )
 
 

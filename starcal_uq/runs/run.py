@@ -7,7 +7,7 @@ is removed when a step is done again, so that a folder never mixes two runs.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -437,7 +437,11 @@ class Run:
                 f"the budget rested on the numbers of before and was removed: run `starcal-uq budget {self.path}`."
             )
         # What rests on the attitude error of before goes with it.
-        self._remove(("spectrum", "budget"))
+        self._remove(("spectrum", "budget", "mission"))
+        if sky is not None:
+            # A diagnosis of later is carried to the same frames.
+            frames.save(self.folder.mission)
+        error = self._with_misfit(error)
         error.save(self.folder.attitude)
         fields.save(self.folder.field_map)
         if spectrum is not None:
@@ -453,7 +457,8 @@ class Run:
     def diagnose(self, **options: Any) -> Diagnosis:
         """Question the model; writes ``diagnosis.json``, with the tables as CSV beside it.
 
-        Options are those of `starcal_uq.diagnose`.
+        The attitude error is written again with what was found, and a budget that rested on it is removed. Options are
+        those of `starcal_uq.diagnose`.
         """
         from starcal_uq.diagnostics.diagnose import diagnose
 
@@ -465,15 +470,30 @@ class Run:
                 write_csv(part.to_dataframe(), self.path / file_name)
         diagnosis.save(self.folder.diagnosis)
         self._forget("diagnosis")
+        if posterior is not None and self.has("attitude"):
+            self._with_misfit(self.attitude).save(self.folder.attitude)
+            self._remove(("budget",))
+            self._forget("attitude")
         return diagnosis
+
+    def _with_misfit(self, error: AttitudeError) -> AttitudeError:
+        """The attitude error with what the diagnosis of this run found, if there is one."""
+        diagnosis = self.diagnosis
+        if diagnosis is None:
+            return error
+        from starcal_uq.diagnostics.inflation import with_misfit
+
+        if error.seen is None:
+            mission = load_observations(self.folder.mission) if self.has("mission") else self.observations
+            error = replace(error, seen=mission)
+        return with_misfit(error, diagnosis, self.posterior, self.observations)
 
     def budget(
         self, *, file: BudgetFile | PathLike | None = None, confidence: float | None = None, seed: int = 0
     ) -> Budget:
         """Make the attitude error budget and write it.
 
-        The attitude errors are those of ``attitude.csv``, and the tests of the model those of ``diagnosis.json`` if the
-        run was diagnosed.
+        The attitude errors are those of ``attitude.csv``, with the misfit found if the run was diagnosed.
 
         Parameters
         ----------
@@ -498,7 +518,6 @@ class Run:
             attitude,
             file=stated,
             confidence=confidence,
-            misfit=self.diagnosis,
             seed=seed,
         )
         made.save(self.folder.budget)

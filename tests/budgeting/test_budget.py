@@ -23,12 +23,12 @@ from starcal_uq.budgeting.file import (
     REQUIREMENT_KEYS,
     load_budget_file,
 )
-from starcal_uq.budgeting.posterior import inflation
 from starcal_uq.budgeting.result import Budget
-from starcal_uq.budgeting.rows import COMMON, FROM_FILE, GAUSSIAN_997, NEA, REST
+from starcal_uq.budgeting.rows import COMMON, FROM_FILE, GAUSSIAN_997, NEA, REST, UNTESTED
 from starcal_uq.budgeting.shapes import one_axis_factor
 from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
 from starcal_uq.core.errors import BudgetError, RunFolderError
+from starcal_uq.diagnostics.inflation import with_misfit
 from starcal_uq.diagnostics.misfit import Misfit, MisfitTest
 from starcal_uq.presentation.pages.budgeting import budget_context, write_budget
 from starcal_uq.presentation.tables import tex
@@ -138,7 +138,10 @@ def test_the_posterior_fills_its_rows_and_no_others() -> None:
     assert rows[COMMON, "pitch"].absorbed_by_alignment == "yes"
     assert rows[COMMON, "pitch"].tail_997 == GAUSSIAN_997 < rows[NEA, "pitch"].tail_997 == pytest.approx(3.2)
     assert rows[INTERACTION, "roll"].sigma_arcsec == 1e-3
-    assert set(found.not_assessed) == {entry.name for entry in FROM_FILE}
+    # Nobody has tested the model: what it misses is a contributor that is not assessed, never zero.
+    assert set(found.not_assessed) == {entry.name for entry in (UNTESTED, *FROM_FILE)}
+    assert math.isnan(rows[REST, "roll"].with_misfit_found_arcsec) and rows[REST, "roll"].if_model_holds_arcsec == 0.05
+    assert UNTESTED.name not in made(misfit=diagnosis()).not_assessed
     for row in found.rows:
         assert row.assessed is (row.source == "posterior")
         assert row.assessed or (math.isnan(row.sigma_arcsec) and math.isnan(row.mean_arcsec))
@@ -204,7 +207,7 @@ def test_a_pattern_over_the_field_inflates_the_rest_with_its_whole_size() -> Non
     assert rows[REST, "roll"].sigma_arcsec == pytest.approx(np.hypot(0.05, 0.02 / 400.0 * arcsec))
     # The added part has no tail of its own; with next to all of the variance it leaves next to nothing of the tail.
     assert GAUSSIAN_997 < rows[REST, "pitch"].tail_997 < GAUSSIAN_997 + 0.01
-    assert rows[REST, "pitch"].raw_sigma_arcsec == 0.006 and rows[REST, "pitch"].inflated
+    assert rows[REST, "pitch"].if_model_holds_arcsec == 0.006 and rows[REST, "pitch"].inflated
     assert "0.020 px" in rows[REST, "pitch"].conditions and "2 rejected tests" in rows[REST, "pitch"].conditions
     assert not rows[COMMON, "pitch"].inflated and not rows[NEA, "pitch"].inflated
     assert any(REST in note and "inflated" in note for note in found.notes)
@@ -222,10 +225,10 @@ def comparison(rejected: bool) -> Any:
 
 
 def test_models_that_predict_as_well_count_where_they_differ_by_more_than_sigma() -> None:
-    found = inflation(attitude(), diagnosis(comparison=comparison(False)), POST, OBS)  # type: ignore[arg-type]
+    found = with_misfit(attitude(), diagnosis(comparison=comparison(False)), POST, OBS).misfit  # type: ignore[arg-type]
     assert found.common_arcsec.tolist() == [9.0, 0.0, 0.0] and found.rest_arcsec.tolist() == [0.0, 0.02, 0.0]
     assert "brown3" in found.common_reasons[0] and "none" not in found.common_reasons[0]
-    worse = inflation(attitude(), diagnosis(comparison=comparison(True)), POST, OBS)  # type: ignore[arg-type]
+    worse = with_misfit(attitude(), diagnosis(comparison=comparison(True)), POST, OBS).misfit  # type: ignore[arg-type]
     assert worse.common_arcsec.tolist() == [9.0, 0.1, 0.0] and worse.rest_arcsec.tolist() == [0.001, 0.02, 0.0]
 
 
@@ -352,7 +355,7 @@ def complete(limit: float, judged_by: str = "both") -> str:
 def test_met_only_if_everything_is_assessed(tmp_path: Path) -> None:
     path = tmp_path / "complete.toml"
     path.write_text(complete(30.0), encoding="utf-8")
-    found = made(path)
+    found = made(path, misfit=diagnosis())
     assert found.outcomes[0].verdict == "met" and not found.not_assessed and not found.violations
     assert "is met" in found.outcomes[0].text
     assert not any(entry.at_least for entry in found.totals)
@@ -363,7 +366,7 @@ def test_what_judges_decides_where_rule_and_sampling_disagree(tmp_path: Path, ju
     # 6.6 arcsec of noise whose sigma varies: 19.6 by the rule, 21.1 by sampling.
     path = tmp_path / "complete.toml"
     path.write_text(complete(20.2, judged_by), encoding="utf-8")
-    assert made(path, n_samples=200_000).outcomes[0].verdict == verdict
+    assert made(path, misfit=diagnosis(), n_samples=200_000).outcomes[0].verdict == verdict
 
 
 @pytest.fixture(scope="module")
@@ -371,7 +374,7 @@ def resolved(tmp_path_factory: pytest.TempPathFactory) -> Budget:
     """A budget at a confidence that the samples just resolve."""
     path = tmp_path_factory.mktemp("resolved") / "complete.toml"
     path.write_text(complete(60.0).replace("0.997", "0.999"), encoding="utf-8")
-    return made(path, n_samples=20_000)
+    return made(path, misfit=diagnosis(), n_samples=20_000)
 
 
 @pytest.mark.usefixtures("unpainted")
@@ -390,7 +393,7 @@ def test_a_confidence_beyond_the_samples_is_not_judged_by_them(
 ) -> None:
     path = tmp_path / "complete.toml"
     path.write_text(complete(limit, judged_by).replace("0.997", "0.9999999"), encoding="utf-8")
-    found = made(path, n_samples=20_000)
+    found = made(path, misfit=diagnosis(), n_samples=20_000)
     outcome = found.outcomes[0]
     assert outcome.verdict == verdict
     assert math.isnan(outcome.total.sampled_arcsec) and math.isnan(outcome.total.sampled_se_arcsec)
@@ -558,7 +561,7 @@ def test_the_report_gets_one_name(stated: Path) -> None:
 
 
 def test_the_figure_names_what_is_not_assessed_and_colours_the_limits(stated: Path) -> None:
-    found = made(stated)
+    found = made(stated, misfit=diagnosis())
     figure = found.plot.contributors()
     left, right = figure.axes
     labels = [text.get_text() for text in left.get_yticklabels()]

@@ -17,6 +17,7 @@ from starcal_uq.diagnostics.verdict.judge import judge
 from starcal_uq.diagnostics.verdict.limits import limits
 from starcal_uq.inference.checks import check_draws
 from starcal_uq.presentation.report.tables import mean_to_mcse
+from starcal_uq.propagation.attitude_error import AttitudeError, MisfitFound
 from tests.helpers.scenes import camera, observations, with_sigmas
 
 
@@ -310,13 +311,18 @@ def test_stated_noise_is_a_factor():
 
 
 def test_limits_name_the_largest_term_and_the_coupling(run):
-    error = SimpleNamespace(nea_arcsec=(0.5, 0.5, 7.0), common_arcsec=(5.4, 5.5, 0.1), rest_arcsec=(0.02, 0.02, 0.2))
+    sizes = [np.array([0.5, 0.5, 7.0]), np.array([5.4, 5.5, 0.1]), np.array([0.02, 0.02, 0.2])]
+    nothing = np.full((5, 4), np.nan)
+    error = AttitudeError(*sizes, nothing, nothing, *sizes, n_draws=300, n_frames=100)
     sentences = limits(run.obs, run.cal, sc.coupling(run.post), error)
-    assert "common rotation (5.5 arcsec" in sentences[0]
-    assert "0.020 arcsec remains" in sentences[0]
+    assert "common rotation, one constant, exceeds centroid noise: 5.5 arcsec if the model holds" in sentences[0]
+    assert "what remains is 0.020 arcsec if the model holds (with the misfit found: not assessed)" in sentences[0]
+    found = MisfitFound(1.0, np.zeros(3), np.array([0.5, 0.5, 7.0]))
+    tested = limits(run.obs, run.cal, attitude=dataclasses.replace(error, misfit=found))[0]
+    assert "what remains is 0.50 arcsec with the misfit found (0.020 if the model holds)" in tested
     assert "k1 trades against k2" in sentences[1] or "f trades against" in sentences[1]
-    error.common_arcsec = (0.1, 0.1, 0.1)
-    assert "centroid noise of a single frame dominates" in limits(run.obs, run.cal, attitude=error)[0]
+    small = dataclasses.replace(error, common_arcsec=np.full(3, 0.1))
+    assert "centroid noise of a single frame dominates" in limits(run.obs, run.cal, attitude=small)[0]
 
 
 def test_propagation_that_departs_from_first_order_warns(run):

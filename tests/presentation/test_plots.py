@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import subprocess
 import sys
@@ -29,6 +30,7 @@ from starcal_uq.presentation.figures.inference import CONTOUR_MASSES, mass_level
 from starcal_uq.presentation.figures.propagation import plot_attitude, plot_field_map
 from starcal_uq.presentation.figures.scales import axis_scale
 from starcal_uq.presentation.figures.style import figure_of, png_bytes
+from starcal_uq.propagation.attitude_error import AttitudeError, MisfitFound
 from tests.helpers.scenes import camera, nominal, observations
 
 PNG = b"\x89PNG\r\n\x1a\n"
@@ -50,12 +52,9 @@ def errors():
     """Attitude errors and a map, the sizes of the paper's set-up."""
     x, y = np.linspace(-0.5, 1023.5, 9), np.linspace(-0.5, 767.5, 7)
     radius = np.hypot(x[None, :] - 500.0, y[:, None] - 400.0) / 700.0
-    attitude = SimpleNamespace(
-        axes=("pitch", "yaw", "roll"),
-        nea_arcsec=np.array([0.5, 0.5, 7.0]),
-        common_arcsec=np.array([5.4, 5.5, 0.1]),
-        rest_arcsec=np.array([0.02, 0.02, 0.2]),
-    )
+    sizes = [np.array([0.5, 0.5, 7.0]), np.array([5.4, 5.5, 0.1]), np.array([0.02, 0.02, 0.2])]
+    nothing = np.full((5, 4), np.nan)
+    attitude = AttitudeError(*sizes, nothing, nothing, *sizes, n_draws=300, n_frames=100)
     absolute, compensated = 5.0 + 0.01 * radius, 0.002 + 0.1 * radius**4
     shape = np.array([[1.2, 0.3], [0.3, 0.8]])
     field = SimpleNamespace(
@@ -210,8 +209,19 @@ def test_attitude_bars(errors):
     assert heights == pytest.approx(wanted)
     assert ax.get_yscale() == "log"
     drawn(ax)
-    attitude.rest_arcsec = np.zeros(3)
-    drawn(plot_attitude(attitude))
+    drawn(plot_attitude(dataclasses.replace(attitude, rest_arcsec=np.zeros(3))))
+    assert "with the misfit found: not assessed" in ax.get_xlabel()
+
+
+def test_attitude_bars_are_with_the_misfit_found_and_lines_if_the_model_holds(errors):
+    attitude, _ = errors
+    found = MisfitFound(2.0, np.array([3.0, 0.0, 0.0]), np.array([0.5, 0.1, 0.0]))
+    ax = plot_attitude(dataclasses.replace(attitude, misfit=found))
+    bars = np.array([bar.get_height() for bar in ax.patches])
+    assert bars[3] == pytest.approx(np.hypot(2.0 * 5.4, 3.0)) and bars[6] == pytest.approx(np.hypot(0.04, 0.5))
+    lines = [line.get_ydata()[0] for line in ax.lines]
+    assert lines == pytest.approx([0.5, 0.5, 7.0, 5.4, 5.5, 0.1, 0.02, 0.02, 0.2])
+    drawn(ax)
 
 
 def test_field_map_has_a_colour_bar_for_each_panel(errors):

@@ -15,6 +15,7 @@ from starcal_uq.inference.checks import check_draws
 from starcal_uq.presentation.html import symbol
 from starcal_uq.presentation.report.page import render
 from starcal_uq.presentation.report.tables import attitude_rows, parameter_rows, weak_directions
+from starcal_uq.propagation.attitude_error import AttitudeError, MisfitFound
 from tests.helpers.scenes import camera, nominal, observations
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
@@ -174,8 +175,9 @@ def test_attitude_table(full):
     error = sc.Run(full.path).results.attitude
     rows = attitude_rows(error)
     assert [row["absorbed"] for row in rows] == ["no", "yes", "no", "in part", "no"]
-    assert all(len(row[group]) == 4 for row in rows for group in ("sigma", "p95", "p997"))
-    assert float(rows[1]["sigma"][0]) == pytest.approx(error.common_arcsec[0], rel=0.05)
+    held = [row["figures"][1] for row in rows]
+    assert all(len(row[group]) == 4 for row in held for group in ("sigma", "p95", "p997"))
+    assert float(held[1]["sigma"][0]) == pytest.approx(error.common_arcsec[0], rel=0.05)
 
 
 def test_weak_direction_names_the_distortion(full):
@@ -315,3 +317,104 @@ def test_real_data(real_data, tmp_path):
     text = words(run)
     assert "567 stars in 8 frames" in text
     assert "Neither time nor observer velocity was declared" in text
+
+
+def both_figures(error) -> dict[str, list[str]]:
+    """What every place must say of the rest of the calibration, pitch, yaw and roll, by its two names."""
+    return {
+        "with the misfit found": [significant(float(v)) for v in error.with_misfit_found_arcsec[2, :3]],
+        "if the model holds": [significant(float(v)) for v in error.if_model_holds_arcsec[2, :3]],
+    }
+
+
+def stated_everywhere(run, capsys) -> dict[str, dict[str, list[str]]]:
+    """The same from every place of a run that states it, by place."""
+    import csv
+    import json
+    import re
+
+    from starcal_uq.cli.console import out, print_json, records, show_attitude
+    from starcal_uq.presentation.words.budgeting import contributors_table
+
+    opened = sc.Run(run.path)
+    names = {"with the misfit found": "with_misfit_found_arcsec", "if the model holds": "if_model_holds_arcsec"}
+
+    def of_rows(rows, contributor: str) -> dict[str, list[str]]:
+        mine = {row["axis"]: row for row in rows if contributor in (row.get("contributor"), row.get("name"))}
+        return {
+            name: [significant(float(mine[axis][column])) for axis in ("pitch", "yaw", "roll")]
+            for name, column in names.items()
+        }
+
+    def of_text(text: str) -> dict[str, list[str]]:
+        after = text[text.lower().index("calibration, rest") :]
+        return {name: re.findall(r"[0-9.]+(?:×10\S+)?", after[after.index(name) + len(name) :])[:3] for name in names}
+
+    rest, found = "calibration, rest", {}
+    with open(run.attitude, encoding="utf-8") as file:
+        found["attitude.csv"] = of_rows(list(csv.DictReader(file)), rest)
+    with open(run.budget, encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["record"] == "contributor"]
+        found["budget.csv"] = of_rows(rows, rest)
+        counted = [significant(float(row["sigma_arcsec"])) for row in rows if row["name"] == rest]
+        assert counted == found["budget.csv"]["with the misfit found"]
+    print_json({"attitude_error": records(opened.attitude.to_written())})
+    found["JSON"] = of_rows(json.loads(capsys.readouterr().out)["attitude_error"], rest)
+    found["JSON of the budget"] = of_rows(opened.error_budget.to_dict()["contributors"], rest)
+    out.width = 150
+    show_attitude(opened.attitude)
+    found["terminal"] = of_text(capsys.readouterr().out)
+    html = Page(render(opened.results, {})).text
+    found["report, attitude"] = of_text(html[html.index("Contribution pitch") :])
+    budget = html[html.index("Contributors Standard") :].lower()
+    found["report, budget"] = of_text(budget)
+    found["notebook"] = of_text(Page(opened.attitude._repr_html_()).text)
+    found["notebook, budget"] = of_text(Page(opened.error_budget._repr_html_()).text.lower())
+    cells = contributors_table(opened.error_budget).rows
+    place = next(i for i, row in enumerate(cells) if row[0] == rest)
+    found["terminal, budget"] = {row[0].strip(): list(row[2:5]) for row in cells[place + 1 : place + 3]}
+    bars = [text.get_text().removesuffix("″") for text in opened.attitude.plot.contributors().texts]
+    figure = {
+        "with the misfit found": bars[6:9],
+        "if the model holds": both_figures(opened.attitude)["if the model holds"],
+    }
+    found["figure"] = figure
+    # The card and the sentences say it across the boresight.
+    across = opened.attitude.with_misfit_found_arcsec[2, 3], opened.attitude.if_model_holds_arcsec[2, 3]
+    words = (
+        f"{significant(float(across[0]))} arcsec with the misfit found ({significant(float(across[1]))} if the model"
+    )
+    assert html.count(words) == 2 and words in opened.attitude.text
+    return found
+
+
+@pytest.mark.usefixtures("unpainted")
+def test_every_place_shows_the_same_two_figures_under_the_same_two_names(run, capsys):
+    found = MisfitFound(1.3, np.array([0.7, 0.3, 0.02]), np.array([0.52, 0.41, 7.3]), ("test",), ("test",))
+    error = dataclasses.replace(AttitudeError.load(run.attitude), misfit=found)
+    error.save(run.attitude)
+    sc.Run(run.path).budget()
+    wanted = both_figures(error)
+    assert wanted["with the misfit found"] != wanted["if the model holds"]
+    places = stated_everywhere(run, capsys)
+    assert len(places) == 11
+    assert {place: figures for place, figures in places.items() if figures != wanted} == {}
+    # Control: one source that has its own idea is noticed.
+    other = dataclasses.replace(error, misfit=dataclasses.replace(found, rest_arcsec=2.0 * found.rest_arcsec))
+    other.save(run.attitude)
+    differing = {place for place, figures in stated_everywhere(run, capsys).items() if figures != wanted}
+    assert "attitude.csv" in differing and "budget.csv" not in differing
+    # Never equal to the first by silence.
+    dataclasses.replace(error, misfit=None).save(run.attitude)
+    sc.Run(run.path).budget()
+    opened = sc.Run(run.path)
+    for text in (
+        run.attitude.read_text(encoding="utf-8"),
+        opened.attitude._repr_html_(),
+        opened.error_budget._repr_html_(),
+        render(opened.results, {}),
+    ):
+        assert "not assessed" in text
+    assert np.isnan(opened.attitude.with_misfit_found_arcsec).all()
+    assert all(np.isnan(row.with_misfit_found_arcsec) for row in opened.error_budget.rows)
+    assert "misfit of the camera model" in opened.error_budget.not_assessed

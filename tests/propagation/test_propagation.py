@@ -269,9 +269,12 @@ def test_table_has_one_row_per_contributor_and_axis() -> None:
     assert list(table.columns) == [
         "contributor",
         "axis",
-        "sigma_arcsec",
-        "p95_arcsec",
-        "p997_arcsec",
+        "if_model_holds_arcsec",
+        "with_misfit_found_arcsec",
+        "p95_if_model_holds_arcsec",
+        "p95_with_misfit_found_arcsec",
+        "p997_if_model_holds_arcsec",
+        "p997_with_misfit_found_arcsec",
         "first_order_arcsec",
         "absorbed_by_alignment",
     ]
@@ -279,12 +282,12 @@ def test_table_has_one_row_per_contributor_and_axis() -> None:
     assert list(table["contributor"].unique()) == list(CONTRIBUTORS)
     absorbed = table.groupby("contributor", sort=False)["absorbed_by_alignment"].first()
     assert list(absorbed) == ["no", "yes", "no", "in part", "no"]
-    rows = table.set_index(["contributor", "axis"])["sigma_arcsec"]
+    rows = table.set_index(["contributor", "axis"])["if_model_holds_arcsec"]
     assert rows["calibration, common rotation", "yaw"] == found.common_arcsec[1]
     across = np.sqrt(np.mean(found.nea_arcsec[:2] ** 2))
     assert rows["centroid noise (NEA)", "cross-boresight"] == pytest.approx(across)
-    assert (table["p95_arcsec"] > table["sigma_arcsec"]).all()
-    assert (table["p997_arcsec"] > table["p95_arcsec"]).all()
+    assert (table["p95_if_model_holds_arcsec"] > table["if_model_holds_arcsec"]).all()
+    assert (table["p997_if_model_holds_arcsec"] > table["p95_if_model_holds_arcsec"]).all()
     html = found._repr_html_()
     assert "300 posterior draws" in html
     assert "cross-boresight" in html
@@ -322,13 +325,13 @@ def test_file_of_an_earlier_version_is_read_and_the_interaction_not_known(tmp_pa
     assert np.isnan(loaded.p95_arcsec[4]).all()
     assert "not known" in loaded._repr_html_()
     row = attitude_rows(loaded)[-1]
-    assert row["sigma"] == ["—"] * 4
+    assert row["figures"][1]["sigma"] == ["—"] * 4
     assert row["note"].startswith("not sampled by the version")
-    assert attitude_rows(found)[-1]["sigma"][2] == "<\N{NO-BREAK SPACE}0.001"
+    assert attitude_rows(found)[-1]["figures"][1]["sigma"][2] == "<\N{NO-BREAK SPACE}0.001"
     loaded.save(path)
     assert np.isnan(AttitudeError.load(path).interaction_arcsec).all()
     # Control: a missing number elsewhere is not excused.
-    table.loc[0, "sigma_arcsec"] = np.nan
+    table.loc[0, "if_model_holds_arcsec"] = np.nan
     table.to_csv(path, index=False)
     with pytest.raises(RunFolderError, match="is not a table"):
         AttitudeError.load(path)
@@ -336,7 +339,9 @@ def test_file_of_an_earlier_version_is_read_and_the_interaction_not_known(tmp_pa
 
 def test_one_number_is_taken_apart() -> None:
     found = error()
-    assert "smaller by a factor of" in found.text
+    assert "what remains in flight is" in found.text
+    # A figure that nobody has assessed is not one.
+    assert found.text.count("with the misfit found: not assessed") == 2 and "starcal-uq diagnose" in found.text
     swapped = dataclasses.replace(found, common_arcsec=found.rest_arcsec, rest_arcsec=found.common_arcsec)
     assert "no alignment absorbs it" in swapped.text
     none = dataclasses.replace(found, rest_arcsec=np.zeros(3))

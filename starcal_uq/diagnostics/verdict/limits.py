@@ -11,6 +11,7 @@ from starcal_uq.core.formatting import significant
 from starcal_uq.diagnostics.residuals import bin_residuals
 from starcal_uq.diagnostics.verdict.estimate import MISFIT_P
 from starcal_uq.diagnostics.verdict.observed import PATTERN_P, air
+from starcal_uq.propagation.attitude_error import two_figures
 
 if TYPE_CHECKING:
     from starcal_uq.diagnostics.diagnose import Diagnosis
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 _STRONG = 0.7
 # A shift within two standard deviations is what noise in the further parameters gives.
 _MODEL_SIGMAS = 2.0
-_CROSS = slice(0, 2)
 
 
 def limits(
@@ -90,18 +90,18 @@ def _model_choice(cal: Calibration, diagnosis: Diagnosis) -> str:
 def _attitude(error: AttitudeError) -> str:
     """Compare the terms across the boresight, where missions state their requirement."""
     names = ("centroid noise of a single frame", "the calibration's common rotation", "the calibration's rest")
-    values = [
-        float(np.sqrt(np.mean(np.asarray(v)[_CROSS] ** 2)))
-        for v in (error.nea_arcsec, error.common_arcsec, error.rest_arcsec)
-    ]
-    noise, common, rest = (f"{significant(v)} arcsec" for v in values)
+    values = error.headline_arcsec[:3, 3]
+    pairs = zip(error.with_misfit_found_arcsec[:3, 3], error.if_model_holds_arcsec[:3, 3], strict=True)
+    noise, common, rest = (two_figures(*pair) for pair in pairs)
     largest = names[int(np.argmax(values))]
     if values[1] == max(values):
         return (
-            f"Attitude across the boresight: {largest} ({common}, one constant) exceeds centroid noise ({noise}, per "
-            f"frame). Alignment calibration with these parameters absorbs it; {rest} remains."
+            f"Attitude across the boresight: {largest}, one constant, exceeds centroid noise: {common} against "
+            f"{noise} per frame. Alignment calibration with these parameters absorbs it; what remains is {rest}."
         )
-    return f"Attitude across the boresight: {largest} dominates (noise {noise}, common rotation {common}, rest {rest})."
+    return (
+        f"Attitude across the boresight: {largest} dominates. Noise: {noise}; common rotation: {common}; rest: {rest}."
+    )
 
 
 def _coupled(coupling: Coupling) -> str:

@@ -11,6 +11,7 @@ from starcal_uq.core.formatting import percent, significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.figures import style
 from starcal_uq.presentation.figures.scales import round_levels, ticks_at_levels
+from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -23,23 +24,32 @@ if TYPE_CHECKING:
 
 
 def plot_attitude(error: AttitudeError, ax: Axes | None = None) -> Axes:
-    """Bars of the three contributions to the attitude error per axis, 1 sigma, arcsec, on a log axis."""
+    """Bars of the three contributions to the attitude error per axis, 1 sigma, arcsec, on a log axis.
+
+    Bars and their numbers are with the misfit found, lines across them if the model holds; open bars are not assessed.
+    """
     if ax is None:
         ax = style.new_axes(7.2, 3.4)
     style.dress(ax, grid=True)
     series = (
-        ("centroid noise (NEA)", error.nea_arcsec, style.SKY, ""),
-        ("calibration, common", error.common_arcsec, style.ORANGE, "//"),
-        ("calibration, rest", error.rest_arcsec, style.GREEN, ".."),
+        ("centroid noise (NEA)", style.SKY, ""),
+        ("calibration, common", style.ORANGE, "//"),
+        ("calibration, rest", style.GREEN, ".."),
     )
-    values = np.array([np.asarray(v, dtype=np.float64) for _, v, _, _ in series])
-    positive = values[values > 0]
+    held, values = (np.asarray(v)[:3, :3] for v in (error.if_model_holds_arcsec, error.headline_arcsec))
+    tested = error.misfit is not None
+    positive = np.concatenate([values[values > 0], held[held > 0]])
     floor = 10.0 ** np.floor(np.log10(positive.min() * 0.7)) if positive.size else 1e-3
     place = np.arange(len(error.axes))
-    for i, (name, _, colour, hatch) in enumerate(series):
+    for i, (name, colour, hatch) in enumerate(series):
         at = place + (i - 1) * 0.27
-        ax.bar(at, np.maximum(values[i], floor), width=0.25, color=colour, hatch=hatch, edgecolor="white", label=name)
-        for x, value in zip(at, values[i], strict=True):
+        look: dict[str, Any] = {"color": colour, "edgecolor": "white"}
+        if not tested:
+            look = {"color": "none", "edgecolor": colour}
+        ax.bar(at, np.maximum(values[i], floor), width=0.25, hatch=hatch, label=name, **look)
+        for x, value, first in zip(at, values[i], held[i], strict=True):
+            if tested:
+                ax.plot([x - 0.125, x + 0.125], [max(first, floor)] * 2, color=style.INK, linewidth=1.6)
             ax.annotate(
                 f"{significant(float(value))}″",
                 (x, max(value, floor)),
@@ -55,7 +65,11 @@ def plot_attitude(error: AttitudeError, ax: Axes | None = None) -> Axes:
     ax.tick_params(axis="x", length=0)
     ax.grid(False, axis="x")
     style.legend(ax, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, ncols=3, columnspacing=1.4)
-    style.label(ax, "", _interaction_words(error), "1 sigma [arcsec]")
+    which = f"bars: {WITH_MISFIT_FOUND}; lines: {IF_MODEL_HOLDS}"
+    if not tested:
+        which = f"{IF_MODEL_HOLDS}; {WITH_MISFIT_FOUND}: {NOT_ASSESSED}"
+    words = "\n".join(filter(None, (which, _interaction_words(error))))
+    style.label(ax, "", words, "1 sigma [arcsec]")
     return ax
 
 

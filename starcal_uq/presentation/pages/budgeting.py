@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.budgeting.result import Budget
-from starcal_uq.budgeting.rows import AXIS_LABELS, confidence_text
+from starcal_uq.budgeting.rows import AXIS_LABELS, Contributor, confidence_text
 from starcal_uq.budgeting.totals import Total
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.files import atomic_path, atomic_write_text
@@ -17,7 +17,8 @@ from starcal_uq.presentation.figures.budgeting import plot_budget
 from starcal_uq.presentation.figures.style import png_bytes
 from starcal_uq.presentation.html import embedded_image, template_environment
 from starcal_uq.presentation.tables import tex
-from starcal_uq.presentation.words.budgeting import NOT_ASSESSED, NOT_RESOLVED, headline, outcome_text, tables
+from starcal_uq.presentation.words.budgeting import NOT_RESOLVED, headline, outcome_text, tables
+from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND
 
 if TYPE_CHECKING:
     from openpyxl.worksheet.worksheet import Worksheet
@@ -90,7 +91,8 @@ def write_xlsx(budget: Budget, path: str | os.PathLike[str]) -> None:
 
 def _contributors(sheet: Worksheet, budget: Budget) -> None:
     header = [
-        *("Contributor", "ECSS class", "Axis", "Mean [arcsec]", "Sigma [arcsec]", "Sigma before inflation [arcsec]"),
+        *("Contributor", "ECSS class", "Axis", "Mean [arcsec]", "Sigma [arcsec]"),
+        *(f"{name[0].upper()}{name[1:]} [arcsec]" for name in (WITH_MISFIT_FOUND, IF_MODEL_HOLDS)),
         *("Distribution", "99.7 % half-width [sigma]", "Random over", "Correlation group", "Combination"),
         *("Absorbed by alignment", "Conditions", "Provenance", "Source"),
     ]
@@ -100,14 +102,20 @@ def _contributors(sheet: Worksheet, budget: Budget) -> None:
         gaussian = row.assessed and row.applies and row.distribution == "gaussian"
         rows.append(
             [
-                *(row.name, row.ecss_class, AXIS_LABELS[row.axis], mean, sigma, row.raw_sigma_arcsec),
+                *(row.name, row.ecss_class, AXIS_LABELS[row.axis], mean, sigma),
+                *(_with_misfit(row), row.if_model_holds_arcsec),
                 *(row.distribution if row.applies else "does not apply", row.tail_997 if gaussian else None),
                 *(row.interpretation, row.correlation_group, row.combination),
                 *(row.absorbed_by_alignment, row.conditions, row.provenance, row.source),
             ]
         )
         colours.append("" if row.assessed and not row.inflated else _AMBER)
-    _table(sheet, header, rows, [34, 20, 11, 13, 13, 17, 15, 16, 13, 16, 24, 15, 50, 40, 13], colours)
+    _table(sheet, header, rows, [34, 20, 11, 13, 13, 17, 17, 15, 16, 13, 16, 24, 15, 50, 40, 13], colours)
+
+
+def _with_misfit(row: Contributor) -> float | str:
+    untested = row.source == "posterior" and math.isnan(row.with_misfit_found_arcsec)
+    return NOT_ASSESSED if untested else row.with_misfit_found_arcsec
 
 
 def _totals(sheet: Worksheet, budget: Budget) -> None:

@@ -22,7 +22,12 @@ from starcal_uq.presentation.report import tables, words
 from starcal_uq.presentation.report import tables as image_tables
 from starcal_uq.presentation.report import words as field_words
 from starcal_uq.presentation.report.results import Results
-from starcal_uq.presentation.words.propagation import corner_sentence, coupling_table, one_number_sentence
+from starcal_uq.presentation.words.propagation import (
+    corner_sentence,
+    coupling_table,
+    misfit_sentence,
+    one_number_sentence,
+)
 
 _MARKS = {Level.PASS: "✓", Level.WARN: "!", Level.FAIL: "✗"}
 
@@ -65,6 +70,7 @@ def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
         "parameter_rows": tables.parameter_rows(results),
         "attitude_rows": [] if results.attitude is None else tables.attitude_rows(results.attitude),
         "one_number_sentence": "" if results.attitude is None else one_number_sentence(results.attitude),
+        "misfit_attitude_sentence": "" if results.attitude is None else misfit_sentence(results.attitude),
         "attitude_sentence": words.attitude_sentence(results),
         "corner_sentence": "" if results.distortion_curve is None else corner_sentence(results.distortion_curve),
         "equivalent_sentence": field_words.equivalent_sentence(results.field_map),

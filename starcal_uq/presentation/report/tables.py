@@ -13,7 +13,7 @@ from starcal_uq.core.formatting import count, decimals_for, fixed, percent, plur
 from starcal_uq.diagnostics.verdict.estimate import truth_z
 from starcal_uq.presentation.html import symbol
 from starcal_uq.presentation.tables import TextTable, with_units
-from starcal_uq.propagation.attitude_error import CONTRIBUTORS
+from starcal_uq.propagation.attitude_error import CONTRIBUTORS, IF_MODEL_HOLDS, WITH_MISFIT_FOUND
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
@@ -109,21 +109,34 @@ _ATTITUDE_NOTES = (
 
 
 def attitude_rows(error: AttitudeError) -> list[Row]:
-    """Contributions to the attitude error: 1 sigma, 95 % and 99.7 % for each axis and across the boresight, arcsec."""
+    """Contributions to the attitude error by both their figures: 1 sigma, 95 % and 99.7 % for each axis, arcsec."""
     table = error.to_dataframe()
     rows = []
     for (contributor, group), note in zip(table.groupby("contributor", sort=False), _ATTITUDE_NOTES, strict=True):
-        shown = _small if contributor == INTERACTION else significant
-        columns = {
-            column: [shown(float(v)) for v in group[f"{column}_arcsec"]]
-            for column in ("sigma", "p95", "p997", "first_order")
-        }
         text = str(contributor)
-        if group["sigma_arcsec"].isna().any():
+        shown = _small if text == INTERACTION else significant
+        figures = []
+        for name, column in ((WITH_MISFIT_FOUND, "with_misfit_found"), (IF_MODEL_HOLDS, "if_model_holds")):
+            untested = column == "with_misfit_found" and error.misfit is None
+            values = {
+                head: [] if untested else [shown(float(v)) for v in group[f"{start}{column}_arcsec"]]
+                for head, start in (("sigma", ""), ("p95", "p95_"), ("p997", "p997_"))
+            }
+            figures.append({"name": name, "untested": untested, **values})
+        if group["if_model_holds_arcsec"].isna().any():
             note = "not sampled by the version that wrote this run"
         absorbed = str(group["absorbed_by_alignment"].iloc[0])
         name = text[0].upper() + text[1:]
-        rows.append({"name": name, "note": note, "absorbed": absorbed, "total": text == CONTRIBUTORS[3], **columns})
+        rows.append(
+            {
+                "name": name,
+                "note": note,
+                "absorbed": absorbed,
+                "total": text == CONTRIBUTORS[3],
+                "figures": figures,
+                "first_order": [shown(float(v)) for v in group["first_order_arcsec"]],
+            }
+        )
     return rows
 
 

@@ -12,9 +12,9 @@ from starcal_uq.budgeting.totals import Total
 from starcal_uq.core.constants import AXES, TOTAL_AXES
 from starcal_uq.core.formatting import decimals_for, fixed, join_words, plural, significant
 from starcal_uq.presentation.tables import TextTable
+from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND
 
 Row = dict[str, Any]
-NOT_ASSESSED = "not assessed"
 NOT_RESOLVED = "not resolved"
 # Above what rounding makes of 2.968.
 _GAUSSIAN_TAIL = 2.98
@@ -95,6 +95,8 @@ def _contributor_row(name: str, axes: dict[str, Contributor]) -> Row:
         "name": name,
         "ecss_class": listed([row.ecss_class for row in every]),
         "sigma": [_sigma(axes.get(axis)) for axis in AXES],
+        "figures": _figures(axes),
+        "figures_text": "; ".join(f"{name}: {', '.join(values)} arcsec" for name, values in _figures(axes)),
         "mean": _means(axes),
         "missing": [axis in axes and not axes[axis].assessed for axis in AXES],
         "distribution": " / ".join(
@@ -118,7 +120,20 @@ def _sigma(row: Contributor | None) -> str:
         return "–"
     if not row.assessed:
         return NOT_ASSESSED
-    return significant(row.sigma_arcsec, 3) if row.applies else "n/a"
+    # With the digits of the attitude table, where it is the same number.
+    return significant(row.sigma_arcsec, 2 if row.source == "posterior" else 3) if row.applies else "n/a"
+
+
+def _figures(axes: dict[str, Contributor]) -> list[tuple[str, list[str]]]:
+    """What the posterior fills, by the two names that every attitude error has; empty for other rows."""
+    rows = list(axes.values())
+    if any(row.source != "posterior" for row in rows):
+        return []
+    pairs = (
+        (WITH_MISFIT_FOUND, [row.with_misfit_found_arcsec for row in rows]),
+        (IF_MODEL_HOLDS, [row.if_model_holds_arcsec for row in rows]),
+    )
+    return [(name, [NOT_ASSESSED if math.isnan(v) else significant(v) for v in values]) for name, values in pairs]
 
 
 def _means(axes: dict[str, Contributor]) -> str:
@@ -258,18 +273,16 @@ def outcome_text(outcome: Outcome) -> str:
 
 
 def contributors_table(budget: Budget) -> TextTable:
-    """One row per contributor, 1 sigma on its axes."""
-    rows = tuple(
+    """One row per contributor, 1 sigma on its axes; what the posterior fills by both its figures."""
+    rows: list[tuple[str, ...]] = []
+    for row in contributor_rows(budget):
         # What is not assessed is said once where it holds for all axes.
-        (
-            *(row["name"], row["ecss_class"]),
-            *(row["sigma"] if row["assessed"] else (NOT_ASSESSED, "", "")),
-            *(row["interpretation"], row["absorbed"]),
-        )
-        for row in contributor_rows(budget)
-    )
+        sigma = row["sigma"] if row["assessed"] else (NOT_ASSESSED, "", "")
+        shown = ("", "", "") if row["figures"] else sigma
+        rows.append((row["name"], row["ecss_class"], *shown, row["interpretation"], row["absorbed"]))
+        rows += [(f"  {name}", "", *values, "", "") for name, values in row["figures"]]
     heads = ("contributor", "class", "X", "Y", "Z", "random over", "absorbed")
-    return TextTable(heads, rows, f"{budget.title}: contributors, 1 sigma, arcsec", "lllllll")
+    return TextTable(heads, tuple(rows), f"{budget.title}: contributors, 1 sigma, arcsec", "lllllll")
 
 
 def totals_table(budget: Budget) -> TextTable:

@@ -8,11 +8,18 @@ import numpy as np
 import pandas as pd
 
 from starcal_uq.camera.distortion import Parameter
-from starcal_uq.core.constants import AXES
+from starcal_uq.core.constants import AXES, TOTAL_AXES
 from starcal_uq.core.formatting import fixed, join_words, percent, pretty_unit, significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.tables import TextTable
-from starcal_uq.propagation.attitude_error import Agreement, AttitudeError, with_cross
+from starcal_uq.propagation.attitude_error import (
+    IF_MODEL_HOLDS,
+    NOT_ASSESSED,
+    WITH_MISFIT_FOUND,
+    Agreement,
+    AttitudeError,
+    two_figures,
+)
 from starcal_uq.propagation.coupling import Coupling
 from starcal_uq.propagation.distortion import DistortionCurve
 from starcal_uq.propagation.field import FieldMap
@@ -47,40 +54,59 @@ def agreement_table(agreement: Agreement) -> TextTable:
 
 
 def one_number_sentence(error: AttitudeError) -> str:
-    """What a single number for the calibration would hide."""
-    common, rest = with_cross(error.common_arcsec)[3], with_cross(error.rest_arcsec)[3]
+    """What a single number for the calibration would hide, by both figures of every error."""
+    common, rest, both = (
+        (error.with_misfit_found_arcsec[row, 3], error.if_model_holds_arcsec[row, 3]) for row in (1, 2, 3)
+    )
+    words = "Across the boresight, 1 sigma per axis, the calibration"
     # Below this it is rounding: frames that all show the same stars have no part that changes.
-    if not rest > _ROUNDING_ARCSEC:
-        return f"Across the boresight the calibration is a common rotation of {significant(float(common))} arcsec."
-    words = f"{significant(float(np.hypot(common, rest)))} arcsec per axis across the boresight"
-    ratio = float(common / rest)
-    if ratio < 1.0:
+    if not max(np.nan_to_num(rest)) > _ROUNDING_ARCSEC:
+        return f"{words} is a common rotation of {two_figures(*common)}."
+    headline = error.headline_arcsec[:, 3]
+    if headline[1] < headline[2]:
         return (
-            f"The calibration contributes {words}, of which most depends on where the stars are "
-            f"({significant(float(rest))} arcsec) and no alignment absorbs it."
+            f"{words} contributes {two_figures(*both)}; most of it depends on where the stars are, "
+            f"{two_figures(*rest)}, and no alignment absorbs it."
         )
     return (
-        f"Whoever reports one number for the calibration, {words}, reports a constant that alignment calibration "
-        f"absorbs: what remains in flight is {significant(float(rest))} arcsec, smaller by a factor of "
-        f"{significant(ratio)}."
+        f"{words} contributes {two_figures(*both)}. Most of it is a constant that alignment calibration with the same "
+        f"parameters absorbs; what remains in flight is {two_figures(*rest)}."
     )
 
 
+def misfit_sentence(error: AttitudeError) -> str:
+    """What the tests of the model added, or the command that makes them."""
+    if error.misfit is None:
+        return (
+            f"What the errors are {WITH_MISFIT_FOUND} is {NOT_ASSESSED}: the model was not tested "
+            "(`starcal-uq diagnose RUN`)."
+        )
+    reasons = error.misfit.reasons
+    if not reasons:
+        return f"The tests of the model found nothing: an error {WITH_MISFIT_FOUND} is that {IF_MODEL_HOLDS}."
+    return f"Found: {'; '.join(reasons)}."
+
+
 def attitude_text(error: AttitudeError) -> str:
-    """Whether first order holds, and what a single number would hide."""
-    return f"{agreement_text(error.agreement)} {one_number_sentence(error)}"
+    """Whether first order holds, what a single number would hide, and what the misfit adds."""
+    return f"{agreement_text(error.agreement)} {one_number_sentence(error)} {misfit_sentence(error)}"
 
 
 def attitude_table(error: AttitudeError) -> TextTable:
-    """Contributors by axis, 1 sigma; the half-width across the boresight that holds 95 %."""
-    rows = []
-    for contributor, group in error.to_dataframe().groupby("contributor", sort=False):
-        cells = group.set_index("axis")
-        across = cells.drop(index=list(AXES))["p95_arcsec"].iloc[0]
-        sigmas = (significant(float(cells.at[axis, "sigma_arcsec"])) for axis in AXES)
-        rows.append((str(contributor), *sigmas, significant(float(across)), cells["absorbed_by_alignment"].iloc[0]))
-    heads = ("contributor", *AXES, "two-axis 95 %", "absorbed by alignment")
-    return TextTable(heads, tuple(rows), "Attitude error, arcsec, 1 sigma", "lrrrrl")
+    """Contributors by axis, by both figures: 1 sigma, and the half-width across the boresight that holds 95 %."""
+    held, found = error.if_model_holds_arcsec, error.with_misfit_found_arcsec
+    widths = (error.half_widths_with_misfit_found_arcsec[0], error.p95_arcsec)
+    absorbed = error.to_dataframe().groupby("contributor", sort=False)["absorbed_by_alignment"].first()
+    rows: list[tuple[str, ...]] = []
+    for place, (contributor, words) in enumerate(absorbed.items()):
+        rows.append((str(contributor), *[""] * 5, str(words)))
+        for name, sigma, width in zip((WITH_MISFIT_FOUND, IF_MODEL_HOLDS), (found, held), widths, strict=True):
+            # The interaction is not known of runs of old; what the misfit makes of an error is another question.
+            missing = NOT_ASSESSED if name == WITH_MISFIT_FOUND and error.misfit is None else "not known"
+            values = [*sigma[place], width[place, 3]]
+            rows.append((f"  {name}", *(missing if np.isnan(v) else significant(float(v)) for v in values), ""))
+    heads = ("contributor", *TOTAL_AXES, "two-axis 95 %", "absorbed by alignment")
+    return TextTable(heads, tuple(rows), "Attitude error, arcsec, 1 sigma", "lrrrrrl")
 
 
 def coupling_text(coupling: Coupling) -> str:
@@ -123,8 +149,8 @@ def field_text(field: FieldMap) -> str:
     """The middle of both maps, and the common rotation as an error of the principal point."""
     absolute, rest = (float(np.median(m)) for m in (field.sigma_absolute_arcsec, field.sigma_compensated_arcsec))
     text = (
-        f"Half of the detector knows its directions to {significant(absolute)} arcsec (1 sigma per axis), or to "
-        f"{significant(rest)} arcsec once the best rotation is removed."
+        f"If the model holds, half of the detector knows its directions to {significant(absolute)} arcsec (1 sigma per "
+        f"axis), or to {significant(rest)} arcsec once the best rotation is removed."
     )
     shift = equivalent_shift(field)
     return (
@@ -181,9 +207,10 @@ def spectrum_text(spectrum: ErrorSpectrum) -> str:
     if not np.all(rest > _ROUNDING_ARCSEC):
         return "The calibration has no frame-dependent part along this profile: its frames all show the same stars."
     words = (
-        f"Along {spectrum.frames}, the frame-dependent part of the calibration error is {_listed(rest)} arcsec "
-        f"({', '.join(AXES)}), beside {_listed(spectrum.nea_arcsec)} arcsec of centroid noise in each frame. It keeps "
-        f"its value for about {_listed(tau)} s; {', '.join(percent(float(v)) for v in share)} of its variance lie "
+        f"If the model holds, along {spectrum.frames} the frame-dependent part of the calibration error is "
+        f"{_listed(rest)} arcsec ({', '.join(AXES)}), beside {_listed(spectrum.nea_arcsec)} arcsec of centroid noise "
+        f"in each frame. It keeps its value for about {_listed(tau)} s; "
+        f"{', '.join(percent(float(v)) for v in share)} of its variance lie "
         f"below a tenth of the highest frequency ({significant(0.1 * nyquist)} Hz). {_averaging(spectrum)}"
     )
     if spectrum.gap_share > 0.0:
