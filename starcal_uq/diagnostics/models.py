@@ -17,12 +17,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.attitude.rotations import left_error, rotation_to_quaternion
-from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.estimation.calibrate import refit
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.maths.draws import psis_rows
 
@@ -163,17 +162,17 @@ def compare_models(
     fits, failed = {}, {}
     for name in names:
         try:
-            fits[name] = FrameNormals.at(obs, found := _fit(obs, cal, name)), found
+            fits[name] = _normals(obs, cal, name)
         except StarcalError as error:
             failed[name] = str(error)
     if not fits:
         raise StarcalError(f"no distortion model could be calibrated: {next(iter(failed.values()))}")
     rng = np.random.default_rng(seed)
-    found_scores = {name: _leave_out(normals, n_draws, rng) for name, (normals, _) in fits.items()}
+    found_scores = {name: _leave_out(normals, n_draws, rng) for name, normals in fits.items()}
     best = max(found_scores, key=lambda name: float(np.sum(found_scores[name].pointwise)))
     reference = found_scores[best].pointwise
     scores = []
-    for name, (normals, fit) in fits.items():
+    for name, normals in fits.items():
         loo = found_scores[name]
         difference = loo.pointwise - reference
         spread = float(np.sqrt(len(difference)) * np.std(difference, ddof=1))
@@ -182,8 +181,8 @@ def compare_models(
         scores.append(
             ModelScore(
                 model=name,
-                n_parameters=len(fit.theta),
-                sigma=fit.sigma,
+                n_parameters=len(normals.theta),
+                sigma=cal.sigma if name == cal.camera.distortion else float(np.sqrt(normals.variance)),
                 elpd=float(np.sum(loo.pointwise)),
                 difference=total,
                 difference_se=spread,
@@ -200,11 +199,12 @@ def compare_models(
     return ModelComparison(tuple(scores), cal.camera.distortion, failed)
 
 
-def _fit(obs: Observations, cal: Calibration, name: str) -> Calibration:
+def _normals(obs: Observations, cal: Calibration, name: str) -> FrameNormals:
+    """Normal equations at the optimum of a model."""
     if name == cal.camera.distortion:
-        return cal
-    start = cal.nominal.replace(distortion=name, coefficients=(0.0,) * len(get_model(name).coefficients))
-    return calibrate(obs, start)
+        return FrameNormals.at(obs, cal)
+    found = refit(obs, cal, name)
+    return FrameNormals.around(obs, name, found.theta, found.rotations)
 
 
 def _moved(cal: Calibration, normals: FrameNormals) -> tuple[tuple[float, float, float], tuple[float, float, float]]:

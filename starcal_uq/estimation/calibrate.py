@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import rotation_to_quaternion
+from starcal_uq.attitude.rotations import quaternion_to_rotation, rotation_to_quaternion
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import sigma_parameter
+from starcal_uq.camera.distortion import get_model, sigma_parameter
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.status import Status
+from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, assemble, check_camera, noise_px
 from starcal_uq.estimation.baselines import check_count, least_squares, recursive
 from starcal_uq.estimation.calibration import Calibration
@@ -31,6 +33,7 @@ LIKELIHOODS = ("marginal", "student_t")
 SOLVERS = ("lm", "minpack", "ipopt")
 # Stage 1 that moves the principal point by more than this fraction of the width has met strong distortion.
 _FAR = 0.05
+_ITERATIONS = 200
 
 
 def calibrate(
@@ -39,7 +42,7 @@ def calibrate(
     *,
     method: str = "efficient",
     solver: str = "lm",
-    max_iterations: int = 200,
+    max_iterations: int = _ITERATIONS,
     throw: bool = True,
     likelihood: str = "marginal",
     dof: float | str | None = None,
@@ -134,10 +137,83 @@ def _gaussian(
     obs: Observations, camera: Camera, likelihood: MarginalLikelihood, method: str, solver: str, max_iterations: int
 ) -> Calibration:
     pairs = PairObjective(likelihood.frames, camera.distortion)
-    stages = _pair_stages(pairs, camera, solver, max_iterations)
-    pair_theta = stages[-1].theta
+    stages, status = _stages(pairs, camera, likelihood, method, solver, max_iterations)
+    pair_theta = stages[-2 if stages[-1].name == "refinement" else -1].theta
     pair_covariance = pairs.godambe(pair_theta)
-    status = stages[-1].status
+    return assemble(obs, camera, method, solver, likelihood, stages, status, pair_theta, pair_covariance)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """An estimate and nothing else.
+
+    Attributes
+    ----------
+    theta : (p,) array
+        End of the last stage, px units.
+    chi2 : float
+        Sum of squared residuals there, px^2 or in units of the stated noise.
+    rotations : (K, 3, 3) array
+        Best attitudes.
+    """
+
+    theta: FloatArray
+    chi2: float
+    rotations: FloatArray
+
+
+def fit(obs: Observations, camera: Camera, *, method: str = "efficient") -> Fit:
+    """Go through the stages of `calibrate` without covariances, compression and whatever else a result holds.
+
+    Raises
+    ------
+    CalibrationError
+        As for `calibrate`, whose ``efficient`` and ``three_stage`` are the methods.
+    """
+    likelihood = MarginalLikelihood(obs, camera.distortion)
+    check_count(likelihood, camera)
+    pairs = PairObjective(likelihood.frames, camera.distortion)
+    stages, status = _stages(pairs, camera, likelihood, method, "lm", _ITERATIONS)
+    return _fitted(likelihood, camera, stages[-1].theta, status)
+
+
+def refit(obs: Observations, cal: Calibration, model: str) -> Fit:
+    """Another distortion model on the same stars, from the optics and attitudes of a calibration.
+
+    Raises
+    ------
+    CalibrationError
+        When neither they nor the nominal camera lead to an estimate.
+    """
+    likelihood = MarginalLikelihood(obs, model)
+    start = cal.nominal.replace(distortion=model, coefficients=(0.0,) * len(get_model(model).coefficients))
+    check_count(likelihood, start)
+    known = dict(zip(cal.parameter_names, cal.theta, strict=True))
+    if get_model(model).direction != get_model(cal.camera.distortion).direction:
+        known = dict(list(known.items())[:3])
+    likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
+    theta = np.array([known.get(name, 0.0) for name in start.parameter_names])
+    stage = refinement_stage(likelihood, theta, _ITERATIONS)
+    try:
+        return _fitted(likelihood, start, stage.theta, stage.status)
+    except CalibrationError:
+        return fit(obs, start)
+
+
+def _fitted(likelihood: MarginalLikelihood, camera: Camera, theta: FloatArray, status: Status) -> Fit:
+    raise_unless_good(check_camera(camera.with_theta(theta), status))
+    state, cost = likelihood.profile(theta, likelihood.rotations)
+    if float(np.sqrt(np.mean(likelihood.frames.in_pixels(state.e) ** 2))) > IMPLAUSIBLE_NOISE * camera.width_px:
+        raise_unless_good(Status.INCONSISTENT)
+    return Fit(theta, cost, state.rotations)
+
+
+def _stages(
+    pairs: PairObjective, camera: Camera, likelihood: MarginalLikelihood, method: str, solver: str, max_iterations: int
+) -> tuple[list[Stage], Status]:
+    """All stages of a Gaussian fit, and how they ended."""
+    stages = _pair_stages(pairs, camera, solver, max_iterations)
+    pair_theta, status = stages[-1].theta, stages[-1].status
     if status.ok:
         likelihood.use_rotations(likelihood.start_rotations(pair_theta))
         if noise_px(likelihood, pair_theta) > IMPLAUSIBLE_NOISE * camera.width_px:
@@ -146,7 +222,7 @@ def _gaussian(
         elif method == "efficient":
             stages.append(refinement_stage(likelihood, pair_theta, max_iterations))
             status = stages[-1].status
-    return assemble(obs, camera, method, solver, likelihood, stages, status, pair_theta, pair_covariance)
+    return stages, status
 
 
 def _robust(

@@ -132,6 +132,11 @@ class MarginalLikelihood:
         """Best attitudes (K, 3, 3) at theta."""
         return self.profile(theta)[0].rotations
 
+    @property
+    def rotations(self) -> FloatArray | None:
+        """Where attitude searches start, (K, 3, 3), if that was said."""
+        return self._rotations
+
     def use_rotations(self, rotations: FloatArray) -> None:
         """Start later attitude searches here, which saves QUEST when theta moves little."""
         self._rotations = rotations

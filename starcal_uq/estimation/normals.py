@@ -71,13 +71,17 @@ class FrameNormals:
     @classmethod
     def at(cls, obs: Observations, cal: Calibration) -> FrameNormals:
         """Normal equations at the estimate of a calibration."""
-        likelihood = MarginalLikelihood(obs, cal.camera.distortion)
-        start = quaternion_to_rotation(cal.quaternions)
+        return cls.around(obs, cal.camera.distortion, cal.theta, quaternion_to_rotation(cal.quaternions))
+
+    @classmethod
+    def around(cls, obs: Observations, model: str, theta: FloatArray, start: FloatArray) -> FrameNormals:
+        """Normal equations of a distortion model at theta (p,), attitudes searched from `start` (K, 3, 3)."""
+        likelihood = MarginalLikelihood(obs, model)
         matrices, slopes, squares, volumes, rotations = [], [], [], [], []
         for first, last in likelihood.frames.parts(_STARS_AT_ONCE):
             part = MarginalLikelihood(likelihood.frames.part(first, last), likelihood.model_name)
-            state, _ = part.profile(cal.theta, start[first:last])
-            h = part.project_out(state, part.derivatives(cal.theta, state))
+            state, _ = part.profile(theta, start[first:last])
+            h = part.project_out(state, part.derivatives(theta, state))
             matrices.append(np.moveaxis(part.frames.sum(np.einsum("axn,bxn->abn", h, h)), 2, 0))
             slopes.append(part.frames.sum(np.sum(h * state.e, axis=1)).T)
             squares.append(part.frames.sum(np.sum(state.e**2, axis=0)))
@@ -86,7 +90,7 @@ class FrameNormals:
         matrix = np.concatenate(matrices)
         scale = 1.0 / np.sqrt(np.einsum("kaa->a", matrix))
         return cls(
-            theta=cal.theta,
+            theta=theta,
             scale=scale,
             matrices=matrix * np.outer(scale, scale),
             slopes=np.concatenate(slopes) * scale,
