@@ -23,7 +23,7 @@ from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibrate import refit
 from starcal_uq.estimation.normals import FrameNormals
-from starcal_uq.maths.draws import psis_rows
+from starcal_uq.inference.arviz import psis
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -239,7 +239,7 @@ def _leave_out(normals: FrameNormals, n_draws: int, rng: np.random.Generator) ->
     log_density = -0.5 * squares / sigma[:, None] ** 2 - np.outer(np.log(sigma), normals.dof)
     log_density += -0.5 * normals.log_determinant - 0.5 * normals.dof * np.log(2.0 * np.pi)
     by_frame = np.ascontiguousarray(log_density.T)
-    weights, khats = psis_rows(-by_frame)
+    weights, khats = psis(-by_frame)
     pointwise = _log_mean_exp(weights + by_frame) + np.log(n_draws)
     bad = ~(khats <= KHAT_BOUND)
     pointwise[bad] = closed[bad]

@@ -1,4 +1,9 @@
-"""The only importer of ArviZ: the container of draws of 0.23 (`InferenceData`) or of 1.x (`DataTree`)."""
+"""The only importer of ArviZ: one set of functions over ArviZ 0.23 (`InferenceData`) and 1.x (`DataTree`).
+
+What differs between them and is settled here: the container of draws; a default `prob` of the tail ESS that went away;
+and Pareto smoothing, which takes log weights in 0.23 and *negated* log weights in 1.x, without complaint when given the
+wrong ones.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +14,17 @@ from collections.abc import Mapping
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from starcal_uq.core.types import FloatArray
+
 if TYPE_CHECKING:
     import xarray as xr
+
+# Tail ESS is the smaller of the ESS of these two quantiles (Vehtari et al. 2021), stated because the default differs.
+_TAIL = (0.05, 0.95)
+# Log weights closer than this are equal for every purpose, and a Pareto tail cannot be fitted to them.
+_EQUAL_WEIGHTS = 1e-9
 
 
 @lru_cache(maxsize=1)
@@ -19,16 +33,75 @@ def is_legacy() -> bool:
     return int(importlib.metadata.version("arviz").split(".")[0]) < 1
 
 
+@lru_cache(maxsize=1)
+def _legacy() -> Any:
+    with warnings.catch_warnings():
+        # 0.23 announces 1.x once a day; nothing that a user of this package could act on.
+        warnings.filterwarnings("ignore", message=r"\s*ArviZ is undergoing a major refactor", category=FutureWarning)
+        return importlib.import_module("arviz")
+
+
+@lru_cache(maxsize=1)
+def _array_stats() -> Any:
+    # The array interface of 1.x needs neither matplotlib nor a container.
+    return importlib.import_module("arviz_stats.base").array_stats
+
+
 def to_arviz(groups: Mapping[str, xr.Dataset]) -> Any:
     """Wrap datasets (chain, draw), by their names in ArviZ's schema, in the container of the installed ArviZ."""
     if is_legacy():
-        with warnings.catch_warnings():
-            # 0.23 announces 1.x once a day; nothing that a user of this package could act on.
-            warnings.filterwarnings(
-                "ignore", message=r"\s*ArviZ is undergoing a major refactor", category=FutureWarning
-            )
-            legacy: Any = importlib.import_module("arviz")
-        return legacy.InferenceData(**groups)
+        return _legacy().InferenceData(**groups)
     import xarray as xr
 
     return xr.DataTree.from_dict(dict(groups))
+
+
+def rhat(values: FloatArray) -> float:
+    """Rank-normalised split R-hat of draws (chain, draw)."""
+    return float(_legacy().rhat(values) if is_legacy() else _array_stats().rhat(values))
+
+
+def ess_bulk(values: FloatArray) -> float:
+    """Bulk effective sample size of draws (chain, draw)."""
+    stats = _legacy() if is_legacy() else _array_stats()
+    return float(stats.ess(values, method="bulk"))
+
+
+def ess_tail(values: FloatArray) -> float:
+    """Tail effective sample size (5 % and 95 % quantiles) of draws (chain, draw)."""
+    stats = _legacy() if is_legacy() else _array_stats()
+    return float(stats.ess(values, method="tail", prob=_TAIL))
+
+
+def mcse_mean(values: FloatArray) -> float:
+    """Monte Carlo standard error of the mean of draws (chain, draw)."""
+    stats = _legacy() if is_legacy() else _array_stats()
+    return float(stats.mcse(values, method="mean"))
+
+
+def psis(log_weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pareto-smoothed importance sampling (Vehtari et al. 2024) of rows of the log of target over proposal (..., n).
+
+    Returns
+    -------
+    log_weights : array (..., n)
+        Smoothed, normalised so that the weights of a row sum to one.
+    khat : array (...)
+        Shape of the fitted Pareto tail; below 0.7 the weights can be trusted. 0 where the largest weights are all
+        equal, which leaves no tail to fit.
+    """
+    values = np.array(log_weights, dtype=float)
+    n = values.shape[-1]
+    n_tail = max(5, int(np.ceil(min(n / 5, 3 * np.sqrt(n)))))
+    largest = np.sort(values, axis=-1)[..., -n_tail - 1 :]
+    flat = largest[..., -1] - largest[..., 0] < _EQUAL_WEIGHTS
+    khat = np.zeros(values.shape[:-1])
+    top = largest[..., -1:]
+    smoothed = values - top - np.log(np.sum(np.exp(values - top), axis=-1, keepdims=True))
+    if not np.all(flat):
+        # Trial shapes of the tail fit that are out of the question get the weight exp(-large), by way of 1 / inf.
+        with np.errstate(over="ignore"):
+            smoothed[~flat], khat[~flat] = (
+                _legacy().psislw(values[~flat]) if is_legacy() else _array_stats().psislw(-values[~flat])
+            )
+    return smoothed, khat

@@ -23,7 +23,6 @@ from starcal_uq.inference.ensemble import Chains, autocorrelation
 from starcal_uq.inference.named import LIKELIHOODS
 from starcal_uq.inference.posterior import Diagnostics, Laplace, Posterior
 from starcal_uq.inference.target import ImportanceCheck, LogLikelihood, Target
-from starcal_uq.maths.draws import chain_statistics, psis
 
 # Vehtari et al. 2021 for R-hat and ESS, Vehtari et al. 2024 for k-hat.
 RHAT_BOUND = 1.01
@@ -103,6 +102,8 @@ def check_compression(
     laplace : Laplace
         Measure of the distance from the mode.
     """
+    from starcal_uq.inference.arviz import psis
+
     mode = target.natural(np.zeros((1, target.dim)))
 
     def differences(points: FloatArray) -> FloatArray:
@@ -122,7 +123,7 @@ def check_compression(
     near = np.sum(z * z, axis=0) <= _REACH_SD**2
     size = np.abs(difference)
     max_difference = float(np.max(size[near])) if np.any(near) else float(np.max(size))
-    khat = 0.0 if float(np.max(size)) <= _HARMLESS else psis(difference)[1]
+    khat = 0.0 if float(np.max(size)) <= _HARMLESS else float(psis(difference)[1])
     return CompressionCheck(max_difference, khat)
 
 
@@ -159,11 +160,13 @@ def measure(
     n_evaluations: int,
 ) -> Diagnostics:
     """Compute the numbers that `check_draws` judges of draws (n_ensembles, n_draws, p+1), px units, in chain order."""
+    from starcal_uq.inference import arviz as arviz_compat
+
     n_sampled = chains.u.shape[-1]
     n_steps, n_walkers = chains.u.shape[1:3]
     scale = np.array([parameter.scale for parameter in shown])
     scaled = draws[..., :n_sampled] / scale[:n_sampled]
-    found = [chain_statistics(scaled[..., i]) for i in range(n_sampled)]
+    columns = [np.ascontiguousarray(scaled[..., i]) for i in range(n_sampled)]
 
     def padded(values: Sequence[float] | FloatArray) -> FloatArray:
         return np.concatenate([values, np.full(len(shown) - n_sampled, np.nan)])
@@ -172,10 +175,10 @@ def measure(
     mean, sd = flat.mean(axis=0), flat.std(axis=0, ddof=1)
     psis_mean, psis_sd = padded(importance.mean[:n_sampled]), padded(importance.sd[:n_sampled])
     return Diagnostics(
-        rhat=padded([f.rhat for f in found]),
-        ess_bulk=padded([f.ess_bulk for f in found]),
-        ess_tail=padded([f.ess_tail for f in found]),
-        mcse=padded([f.mcse_mean for f in found]) * scale,
+        rhat=padded([arviz_compat.rhat(c) for c in columns]),
+        ess_bulk=padded([arviz_compat.ess_bulk(c) for c in columns]),
+        ess_tail=padded([arviz_compat.ess_tail(c) for c in columns]),
+        mcse=padded([arviz_compat.mcse_mean(c) for c in columns]) * scale,
         acceptance=chains.accepted / (n_steps * n_walkers),
         autocorrelation=padded(autocorrelation(step_order(scaled, n_steps, n_walkers))),
         n_evaluations=n_evaluations,
@@ -281,13 +284,14 @@ def _digits(post: Posterior) -> Check:
 
 def _degrees_of_freedom(post: Posterior) -> Check | None:
     """Did the degrees of freedom of a Student-t likelihood converge, where they were free?"""
+    from starcal_uq.inference import arviz as arviz_compat
+
     if post.dof_draws is None:
         return None
     values = post.dof_draws.reshape(post.n_ensembles, -1)
-    found = chain_statistics(values)
     low, middle, high = np.quantile(values, (0.025, 0.5, 0.975))
     sentence = f"dof has the median {middle:.3g} and the 95 % interval {low:.3g} to {high:.3g}."
-    return _converged(post, "Degrees of freedom", found.rhat, found.ess_bulk, sentence)
+    return _converged(post, "Degrees of freedom", arviz_compat.rhat(values), arviz_compat.ess_bulk(values), sentence)
 
 
 def _bounds(post: Posterior) -> Check:
