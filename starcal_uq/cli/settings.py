@@ -38,9 +38,17 @@ class EstimationSettings:
         bool, typer.Option("--robust", help="Refine with Student-t tails, which wrong identifications hardly move.")
     ] = False
 
+    noise: Annotated[
+        str,
+        typer.Option(
+            help="common (one noise for all stars), or model (fitted against radius, magnitude and frame, as far as "
+            "the residuals ask for it)."
+        ),
+    ] = "common"
+
     def options(self) -> AnyDict:
         """Keyword arguments of `Run.calibrate`."""
-        options: AnyDict = {"method": self.method, "solver": self.solver, "screening": self.screen}
+        options: AnyDict = {"method": self.method, "solver": self.solver, "screening": self.screen, "noise": self.noise}
         return options | {"likelihood": "student_t"} if self.robust else options
 
 

@@ -27,6 +27,7 @@ from starcal_uq.diagnostics.predictive import PredictiveCheck, predictive_check
 from starcal_uq.diagnostics.stars import StarTest, star_test
 from starcal_uq.estimation.calibrate import METHODS, calibrate, fit
 from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import FrameNormals
 
 if TYPE_CHECKING:
@@ -146,6 +147,7 @@ def diagnose(
         Called with the number of steps done and their total.
     """
     step = progress or (lambda done, total: None)
+    obs = weighed(obs, cal)
     misfit = misfit_tests(obs, cal)
     step(1, 5)
     normals = FrameNormals.at(obs, cal)

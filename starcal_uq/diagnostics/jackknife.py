@@ -15,6 +15,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.types import FloatArray
+from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import FrameNormals
 
 if TYPE_CHECKING:
@@ -127,7 +128,7 @@ def jackknife_frames(obs: Observations, cal: Calibration, normals: FrameNormals 
     """
     if obs.n_frames < 3:
         raise CalibrationError(f"a jackknife over {plural(obs.n_frames, 'frame')} says nothing: use three or more.")
-    found = FrameNormals.at(obs, cal) if normals is None else normals
+    found = FrameNormals.at(weighed(obs, cal), cal) if normals is None else normals
     z, _ = found.left_out()
     if not np.isfinite(z).all():
         frame = obs.frame_ids[int(np.argmin(np.isfinite(z).all(axis=1)))]

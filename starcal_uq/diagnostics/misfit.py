@@ -12,7 +12,7 @@ unequal noise compare the residuals' weighted and unweighted sums of squares wit
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +23,7 @@ from starcal_uq.core.formatting import significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.shapes import Shape, View, run_clock, shapes
 from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.noise_model import NoiseModel, fit_noise, sigma_ratios, weighed
 from starcal_uq.maths.intervals import holm
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.observations.frames import StarFrames
@@ -38,6 +39,9 @@ if TYPE_CHECKING:
 _ABSORBED = 1e-8
 _STARS_AT_ONCE = 10_000
 _LEAST_DOF = 10
+# Frames with less than one degree of freedom have no noise of their own to compare.
+_LEAST_FRAMES, _LEAST_FRAME_DOF = 3, 1.0
+_NOISE_ROUNDS = 3
 ALPHA = 0.05
 
 
@@ -97,6 +101,30 @@ class MisfitTest:
     visible: float
     amplitudes: tuple[Amplitude, ...] = ()
 
+    @property
+    def is_of_noise(self) -> bool:
+        """Whether it looks for unequal noise; otherwise for a pattern."""
+        return self.dof == 0
+
+
+@dataclass(frozen=True, eq=False)
+class UnevenNoise:
+    """How the noise varies that one noise for all stars was fitted to.
+
+    Attributes
+    ----------
+    model : NoiseModel
+        Fitted variance.
+    parameter_names : tuple of str
+        Camera parameters.
+    ratios : (p,) array
+        Real over stated standard deviation of each.
+    """
+
+    model: NoiseModel
+    parameter_names: tuple[str, ...]
+    ratios: FloatArray
+
 
 @dataclass(frozen=True)
 class Misfit(Shown):
@@ -110,12 +138,16 @@ class Misfit(Shown):
         Noise that the tests are relative to, in units of the calibration's.
     n_stars, n_frames : int
         Size of the data.
+    uneven : UnevenNoise or None
+        How the noise varies, and what that does to the stated sigmas; None where no test found that it does, or where
+        the calibration knows it already.
     """
 
     tests: tuple[MisfitTest, ...]
     sigma: float
     n_stars: int
     n_frames: int
+    uneven: UnevenNoise | None = None
 
     @property
     def p_value(self) -> float:
@@ -150,18 +182,27 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = 8) -> 
     Misfit
         With a false-alarm rate that is the nominal one for each test, and at most that for all of them together.
     """
+    obs = weighed(obs, cal)
     families = shapes(obs, cal.camera, max_cells=max_cells)
     sums = _Sums.over(obs, cal, families)
     tests = [test for test in (sums.family(index) for index in range(len(families))) if test is not None]
     if (test := sums.frame_by_frame()) is not None:
         tests.append(test)
-    tests += [
-        MisfitTest(f"noise that changes with {name}", name, z, 0, sums.dof, p, 1.0, float("nan"), float("nan"))
+    of_noise = [
+        (f"noise that changes with {name}", name, z, p)
         for name, z, p in sums.noise.tests(sums.parameters, sums.projection, sums.rss, sums.dof)
     ]
+    if (frames := sums.noise_by_frame()) is not None:
+        of_noise.append(("noise that differs from frame to frame", "frame", *frames))
+    nothing = float("nan")
+    tests += [MisfitTest(name, against, z, 0, sums.dof, p, 1.0, nothing, nothing) for name, against, z, p in of_noise]
     corrected = holm([test.p_value for test in tests])
     tests = [replace(test, p_holm=float(p)) for test, p in zip(tests, corrected, strict=True)]
-    return Misfit(tuple(tests), float(np.sqrt(sums.rss / sums.dof)), obs.n_stars, obs.n_frames)
+    uneven = None
+    if any(test.is_of_noise and test.p_holm < ALPHA for test in tests) and cal.noise_model is None:
+        model, _ = fit_noise(obs, cal.camera, rounds=_NOISE_ROUNDS)
+        uneven = UnevenNoise(model, cal.parameter_names, sigma_ratios(obs, cal.camera, model, cal.sigma))
+    return Misfit(tuple(tests), float(np.sqrt(sums.rss / sums.dof)), obs.n_stars, obs.n_frames, uneven)
 
 
 @dataclass
@@ -180,6 +221,8 @@ class _Sums:
     block_slope: FloatArray
     block_square: float = 0.0
     block_rank: int = 0
+    # Sums of squares of the frames, degrees of freedom that attitudes leave them, and their normal matrices.
+    frames: list[tuple[FloatArray, FloatArray, FloatArray]] = field(default_factory=list)
 
     @classmethod
     def over(cls, obs: Observations, cal: Calibration, families: tuple[Shape, ...]) -> _Sums:
@@ -222,6 +265,8 @@ class _Sums:
         h, e = projected[: self.p], projected[self.p]
         self._add_blocks(part, state, view, h, e)
         self.noise.add(part.frames, state, h, e, rows)
+        matrices = np.moveaxis(part.frames.sum(np.einsum("axn,bxn->abn", h, h)), 2, 0)
+        self.frames.append((part.frames.sum(np.sum(e**2, axis=0)), np.asarray(2.0 * part.frames.sizes - 3.0), matrices))
 
     def _add_blocks(self, part: MarginalLikelihood, state: Any, view: View, h: FloatArray, e: FloatArray) -> None:
         """Scale and quadrupole of every frame by itself: three columns per frame, which no other frame sees."""
@@ -305,6 +350,26 @@ class _Sums:
         if rank <= 0 or self.dof - rank < _LEAST_DOF:
             return None
         return self._f_test("scale and shape that change from frame to frame", "frame", self.rss - full, rank)
+
+    def noise_by_frame(self) -> tuple[float, float] | None:
+        """Normal z and p-value of Bartlett's test that all frames have one noise; None for too few frames.
+
+        With d_k degrees of freedom of the frames' sums of squares S_k, nu in all, the statistic is T = nu log(S / nu) -
+        sum d_k log(S_k / d_k). Shares of S are independent of S, so that mean and variance of T follow exactly from
+        those of logarithms of chi-squares; T is then taken as gamma-distributed.
+        """
+        from scipy.special import digamma, gammaincc, ndtri, polygamma
+
+        squares, dof, matrices = (np.concatenate(column) for column in zip(*self.frames, strict=True))
+        dof = dof - np.einsum("kab,ba->k", matrices, self.projection)
+        nu = float(dof.sum())
+        if len(dof) < _LEAST_FRAMES or nu < _LEAST_DOF or dof.min() < _LEAST_FRAME_DOF or squares.min() <= 0.0:
+            return None
+        found = nu * np.log(squares.sum() / nu) - np.sum(dof * np.log(squares / dof))
+        mean = nu * (digamma(nu / 2) - np.log(nu / 2)) - np.sum(dof * (digamma(dof / 2) - np.log(dof / 2)))
+        variance = np.sum(dof**2 * polygamma(1, dof / 2)) - nu**2 * float(polygamma(1, nu / 2))
+        p = float(gammaincc(mean**2 / variance, found * mean / variance))
+        return float(-ndtri(np.clip(p, 1e-300, 1.0 - 1e-16))), p
 
     def _f_test(self, name: str, against: str, explained: float, rank: int) -> MisfitTest:
         from scipy.special import fdtrc

@@ -22,6 +22,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibrate import refit
+from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.inference.arviz import psis
 
@@ -158,6 +159,7 @@ def compare_models(
     StarcalError
         When no model can be calibrated.
     """
+    obs = weighed(obs, cal)
     names = tuple(dict.fromkeys((cal.camera.distortion, *models)))
     fits, failed = {}, {}
     for name in names:

@@ -15,6 +15,7 @@ from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.display import Shown
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.maths.linear import scaled_cholesky
 
 if TYPE_CHECKING:
@@ -99,7 +100,7 @@ def predictive_check(
         Seed of the draws and the replicates.
     """
     rng = np.random.default_rng(seed)
-    likelihood = MarginalLikelihood(obs, cal.camera.distortion)
+    likelihood = MarginalLikelihood(weighed(obs, cal), cal.camera.distortion)
     frames = likelihood.frames
     # The statistics settle long before: of very many stars, the first frames do.
     last = min(frames.n_frames, max(1, int(np.searchsorted(frames.starts, _MAX_STARS, side="right")) - 1))
@@ -118,6 +119,9 @@ def predictive_check(
     p = np.mean(fake >= data, axis=0)
     rows = zip(_NAMES, data.mean(axis=0), low, middle, high, p, strict=True)
     statistics = tuple(PredictiveStatistic(name, *(float(v) for v in values)) for name, *values in rows)
+    if cal.noise_model is not None and cal.noise_model.frame_dof is not None:
+        # Every frame's sum of squares went into the factor of its own noise.
+        statistics = tuple(s for s in statistics if not s.name.startswith("worst frame"))
     return PredictiveCheck(statistics, len(sigma), last)
 
 

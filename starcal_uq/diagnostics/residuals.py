@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.core.types import FloatArray
+from starcal_uq.estimation.noise_model import weighed
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
@@ -106,6 +107,7 @@ def residual_scale(cal: Calibration, obs: Observations) -> FloatArray:
     sqrt(d / 2N) on average.
     """
     shrink = np.sqrt(max(cal.dof, 1) / (2.0 * obs.n_stars))
+    obs = weighed(obs, cal)
     stated = np.ones(obs.n_stars) if obs.sigma_px is None else np.asarray(obs.sigma_px)
     return np.asarray(cal.sigma * shrink * stated, dtype=np.float64)
 

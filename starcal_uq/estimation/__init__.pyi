@@ -1,5 +1,6 @@
 from .merging import consistency_of as consistency_of
 from .merging import merge as merge
+from .noise_model import NoiseModel as NoiseModel
 from .recursive.start import RecursionOptions as RecursionOptions
 from .recursive.stream import FilterStep as FilterStep
 from .recursive.stream import RecursiveCalibration as RecursiveCalibration

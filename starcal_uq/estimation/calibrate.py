@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, assemble, check_ca
 from starcal_uq.estimation.baselines import check_count, least_squares, recursive
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.noise_model import NOISES, fit_noise
 from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.estimation.recursive.start import RECURSIVE_METHODS, RecursionOptions
 from starcal_uq.estimation.recursive.stream import raise_unless_good
@@ -47,6 +48,7 @@ def calibrate(
     likelihood: str = "marginal",
     dof: float | str | None = None,
     recursion: RecursionOptions | None = None,
+    noise: str = "common",
 ) -> Calibration:
     """Estimate optics and distortion from identified stars.
 
@@ -86,6 +88,11 @@ def calibrate(
         Juarez & Steel (2010) on what exceeds 2.
     recursion : RecursionOptions, optional
         Options of ``samaan`` and ``griffith``.
+    noise : {"common", "model"}
+        One noise for all stars (or one factor on what they state), or a variance that is fitted as a function of
+        radius, magnitude and frame, as far as the residuals ask for it: `Calibration.noise_model`. Everything that
+        takes the result then weighs the stars by it, and `sigma` is a factor on it. It needs the ``efficient`` method
+        and the ``marginal`` likelihood.
 
     Returns
     -------
@@ -110,6 +117,13 @@ def calibrate(
         raise CalibrationError(
             f"method {method!r} has no Student-t likelihood: use method='efficient', or likelihood='marginal'."
         )
+    if noise not in NOISES:
+        raise CalibrationError(f"noise {noise!r} is unknown: use one of {', '.join(NOISES)}.")
+    if noise == "model" and (method != "efficient" or likelihood != "marginal"):
+        raise CalibrationError(
+            "noise='model' weighs the stars in the Gaussian likelihood of their pixels: use method='efficient' and "
+            "likelihood='marginal', or noise='common'."
+        )
     if recursion is not None and method not in RECURSIVE_METHODS:
         raise CalibrationError(f"method {method!r} is not recursive: leave recursion out, or use samaan or griffith.")
     if method in RECURSIVE_METHODS:
@@ -121,10 +135,14 @@ def calibrate(
     elif method == "least_squares":
         calibration = least_squares(obs, camera, solver, max_iterations)
     else:
+        # Weights of another calibration's noise model are what this table states.
+        obs = replace(obs, stated_px=None) if obs.stated_px is not None and noise == "common" else obs
         frames = StarFrames.from_observations(obs)
         gaussian = MarginalLikelihood(frames, camera.distortion)
         check_count(gaussian, camera)
-        if likelihood == "student_t":
+        if noise == "model":
+            calibration = _with_noise_model(obs.unweighted, camera, method, solver, max_iterations)
+        elif likelihood == "student_t":
             calibration = _robust(obs, camera, frames, solver, max_iterations, nu)
         else:
             calibration = _gaussian(obs, camera, gaussian, method, solver, max_iterations)
@@ -223,6 +241,25 @@ def _stages(
             stages.append(refinement_stage(likelihood, pair_theta, max_iterations))
             status = stages[-1].status
     return stages, status
+
+
+def _with_noise_model(obs: Observations, camera: Camera, method: str, solver: str, max_iterations: int) -> Calibration:
+    """Calibrate, fit how the noise varies, and refine with the weights that follow; even noise changes nothing."""
+    calibration = _gaussian(obs, camera, MarginalLikelihood(obs, camera.distortion), method, solver, max_iterations)
+    if calibration.status.ok:
+        model, theta = fit_noise(obs, calibration.camera, max_iterations=max_iterations)
+        if model.varies:
+            obs = obs.weighted(model.sigma_px(obs))
+            likelihood = MarginalLikelihood(obs, camera.distortion)
+            likelihood.use_rotations(likelihood.start_rotations(theta))
+            # Interstar angles had one noise, and their sandwich needs none: only the refinement knows the weights.
+            stages = [*calibration.stages[:-1], refinement_stage(likelihood, theta, max_iterations)]
+            pair = calibration.pair_theta, calibration.pair_covariance
+            calibration = assemble(obs, camera, method, solver, likelihood, stages, stages[-1].status, *pair)
+        settings = {**calibration.provenance["settings"], "noise": "model"}
+        record = {**calibration.provenance, "settings": settings, "noise_model": model.record()}
+        calibration = replace(calibration, provenance=record)
+    return calibration
 
 
 def _robust(

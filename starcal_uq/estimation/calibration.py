@@ -24,6 +24,7 @@ from starcal_uq.maths.linear import correlation_of
 if TYPE_CHECKING:
     import pandas as pd
 
+    from starcal_uq.estimation.noise_model import NoiseModel
 
 # Fields whose arrays grow with the data or the iterations: they stand in an archive beside the document.
 _APART = ("frame_ids", "quaternions", "residuals_px", "trajectory", "cost", "sigmas")
@@ -138,6 +139,13 @@ class Calibration(Shown):
         """Interval of each parameter without sampling, (p, 2), px units: Student's with `dof` degrees of freedom."""
         half = student_quantile(probability, self.dof) * self.sigmas
         return np.stack([self.theta - half, self.theta + half], axis=1)
+
+    @property
+    def noise_model(self) -> NoiseModel | None:
+        """How the noise varies, of a calibration with ``noise="model"``; None otherwise."""
+        from starcal_uq.estimation.noise_model import noise_model_of
+
+        return noise_model_of(self)
 
     @property
     def n_stars(self) -> int:

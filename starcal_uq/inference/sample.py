@@ -18,6 +18,7 @@ from starcal_uq.core.provenance import data_hashes, provenance
 from starcal_uq.core.records import to_plain
 from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.inference.checks import CompressionCheck, chain_order, check_compression, check_draws, measure
 from starcal_uq.inference.ensemble import PROPOSAL_DF, Chains, EnsembleSettings, Moves, run_ensembles
 from starcal_uq.inference.named import (
@@ -129,6 +130,7 @@ def sample(
         For settings that cannot work, a calibration that is not sound, or a checkpoint of another run.
     """
     settings = _settings(n_ensembles, n_walkers, n_steps, n_burn, moves, sigma, cal)
+    obs = None if obs is None else weighed(obs, cal)
     check_names(likelihood, evaluation, dof, obs is not None)
     label = label_of(likelihood)
     dof = resolved_dof(cal, dof) if likelihood == "student_t" else None
@@ -152,7 +154,10 @@ def sample(
     }
     data_hash = cal.provenance.get("data_sha256") if obs is None else obs.data_hash
     source = find_source(likelihood, obs, cal, dof)
-    run = _Run(cal, source, priors, settings, n_ensembles, seed, sigma, progress, provenance(seed, chosen, data_hash))
+    record = provenance(seed, chosen, data_hash)
+    if cal.noise_model is not None:
+        record["noise_model"] = cal.noise_model.record(frames=False)
+    run = _Run(cal, source, priors, settings, n_ensembles, seed, sigma, progress, record)
     if isinstance(likelihood, str):
         outcome, compression = _with_fallback(run, evaluation, checkpoint)
     else:

@@ -57,6 +57,9 @@ class Observations(FrameRows, Shown):
     meta : dict
         Plain values about the table: ``directions`` ("apparent", "catalogue" or "undeclared"),
         ``observer_velocity_km_s`` (three numbers or None), ``source``, ``ignored_columns``, ``seed`` and more.
+    stated_px : array, shape (N,), or None
+        Noise that the stars state, px, NaN where they state none, of a table whose `sigma_px` comes from a fitted noise
+        model (see `weighted`); None for all other tables.
 
     Raises
     ------
@@ -75,6 +78,7 @@ class Observations(FrameRows, Shown):
     time_utc: StrArray | None = None
     temperature_c: FloatArray | None = None
     meta: AnyDict = field(default_factory=dict)
+    stated_px: FloatArray | None = None
 
     def __post_init__(self) -> None:
         columns = {name: _array(name, values) for name, values in self.columns.items()}
@@ -89,6 +93,8 @@ class Observations(FrameRows, Shown):
         if np.any(frame[1:] < frame[:-1]):
             order = np.argsort(frame, kind="stable")
             columns = {name: values[order] for name, values in columns.items()}
+            if self.stated_px is not None:
+                object.__setattr__(self, "stated_px", locked(self.stated_px[order]))
         for name, values in columns.items():
             # A column without a single value is as good as absent, and files do not tell the two apart.
             absent = COLUMNS[name].gaps and n > 0 and _all_missing(values)
@@ -128,9 +134,12 @@ class Observations(FrameRows, Shown):
 
     @cached_property
     def data_hash(self) -> str:
-        """SHA-256 (hex) of the columns that are present; the same for the same table from any file format."""
+        """SHA-256 (hex) of the columns that are present; the same for the same table from any file format.
+
+        A noise model changes nothing in it: the data are what was measured and stated.
+        """
         digest = hashlib.sha256()
-        for name, values in self.columns.items():
+        for name, values in self.unweighted.columns.items():
             digest.update(f"{name}:{len(values)};".encode())
             if values.dtype.kind == "U":
                 # The length before each text: without it ("ab", "c") and ("a", "bc") would agree.
@@ -144,7 +153,21 @@ class Observations(FrameRows, Shown):
     def select(self, mask: ArrayLike) -> Observations:
         """The rows where `mask` (bool, shape (N,)) is true."""
         chosen = self._mask(mask, "observations")
-        return replace(self, **{name: values[chosen] for name, values in self.columns.items()})
+        columns = {name: values[chosen] for name, values in self.columns.items()}
+        return replace(self, **columns, stated_px=None if self.stated_px is None else self.stated_px[chosen])
+
+    def weighted(self, sigma_px: FloatArray) -> Observations:
+        """The same data with another noise per axis, (N,) px, in `sigma_px`: that of a fitted noise model."""
+        stated = self.unweighted.sigma_px
+        kept = np.full(len(self), np.nan) if stated is None else stated
+        return replace(self, sigma_px=sigma_px, stated_px=locked(np.array(kept)))
+
+    @property
+    def unweighted(self) -> Observations:
+        """The table as it was stated, without the noise of a fitted model."""
+        if self.stated_px is None:
+            return self
+        return replace(self, sigma_px=None if np.isnan(self.stated_px).all() else self.stated_px, stated_px=None)
 
     def select_frames(self, ids: ArrayLike) -> Observations:
         """The rows of the frames with these numbers.

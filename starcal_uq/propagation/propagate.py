@@ -32,6 +32,7 @@ from starcal_uq.camera.projection import unproject_jacobian, unproject_theta
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import DistortionError, ObservationError, SamplingError
 from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.propagation.attitude_error import OBSERVED, AttitudeError
 
 if TYPE_CHECKING:
@@ -153,6 +154,7 @@ class FrameGeometry:
     @classmethod
     def of(cls, post: Posterior, obs: Observations) -> FrameGeometry:
         """Linearise QUEST on these frames."""
+        obs = weighed(obs, post)
         noise_px, weights = _noise(post, obs)
         model, xy, starts = post.camera.distortion, obs.xy, obs.frame_starts
         b, per_theta = unproject_jacobian(model, post.mean, xy)

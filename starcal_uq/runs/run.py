@@ -25,6 +25,7 @@ from starcal_uq.core.files import (
 )
 from starcal_uq.core.tasks import Progress
 from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.noise_model import noise_model_of, weighed
 from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.presentation.report.results import Missing, Results
 from starcal_uq.runs.folder import DERIVED, DIAGNOSIS_TABLES, RESULTS, RunFolder
@@ -85,7 +86,11 @@ class MissionSky:
 
         stars = load_catalogue(max_mag=self.max_mag, epoch=self.epoch)
         camera = posterior.camera.with_theta(posterior.mean)
-        like = obs if posterior.sigma_name == sigma_parameter(True).name else None
+        like = obs.unweighted if posterior.sigma_name == sigma_parameter(True).name else None
+        model = noise_model_of(posterior)
+        if model is not None and not model.multiplies:
+            # The model itself says what each star's noise is, when the frames are propagated to.
+            like = None
         if self.profile is None:
             return mission_frames(
                 stars, camera, n_frames=self.n_frames, min_stars=self.min_stars or 5, seed=seed, noise_like=like
@@ -145,7 +150,9 @@ class Run:
 
     @cached_property
     def observations(self) -> Observations:
-        """The data that the calibration was made from.
+        """The data that the calibration was made from, with the noise that its noise model gives each star.
+
+        The file holds them as they were given.
 
         Raises
         ------
@@ -159,7 +166,7 @@ class Run:
                 f"{self.path}: the calibration was made from other observations than {self.folder.observations.name} "
                 "holds; run `starcal-uq calibrate` again."
             )
-        return table
+        return weighed(table, calibration)
 
     @cached_property
     def posterior(self) -> Posterior:
@@ -342,7 +349,8 @@ class Run:
         self._remove(RESULTS)
         self.folder.create()
         if obs is not None:
-            obs.save(self.folder.observations, force=True)
+            obs = weighed(obs, calibration)
+            obs.unweighted.save(self.folder.observations, force=True)
             self.observations = obs
         calibration.nominal.save(self.folder.camera, force=True)
         calibration.save(self.folder.calibration)

@@ -155,6 +155,10 @@ def _seen(sky: Sky, rotations: FloatArray) -> tuple[IntArray, IntArray, FloatArr
 
 def _with_noise(frames: Observations, like: Observations) -> Observations:
     """The frames with stated noise like that of other observations."""
+    if like.stated_px is not None and like.unweighted.sigma_px is None:
+        # A fitted noise model gives these frames their noise when an attitude error is propagated to them.
+        return frames
+    like = like.unweighted
     if like.sigma_px is None:
         raise ObservationError(
             "noise_like has no column sigma_px, so that there is no stated noise to carry over: leave it out.",

@@ -157,7 +157,7 @@ class TestDiagnosis:
         weak = self.check(run, self.reject(found, "decentring", 0.01), "Unexplained structure")
         strong = self.check(run, self.reject(found, "decentring", 1e-6), "Unexplained structure")
         phase = self.check(run, self.reject(found, "error with the pixel phase in x", 1e-9), "Unexplained structure")
-        noise = self.check(run, self.reject(found, "noise that changes with mag", 1e-9), "Unexplained structure")
+        noise = self.check(run, self.reject(found, "noise that changes with mag", 1e-9), "Evenness of the noise")
         assert [c.level for c in (weak, strong, phase, noise)] == [Level.WARN, Level.FAIL, Level.WARN, Level.WARN]
         assert "moves the parameters" in strong.sentence and "like more noise" in phase.sentence
         assert "decentring" in strong.sentence

@@ -63,6 +63,14 @@ GONE: dict[str, set[str]] = {
 }
 
 
+def without_new(again: Any, before: Any) -> Any:
+    """Plain values without the entries that came later, which are empty for an old file."""
+    if isinstance(again, dict) and isinstance(before, dict):
+        assert all(value is None for name, value in again.items() if name not in before)
+        return {name: without_new(value, before[name]) for name, value in again.items() if name in before}
+    return again
+
+
 @pytest.mark.parametrize("name", SAVED)
 def test_a_result_is_read_and_written_again_as_it_was(tmp_path: Path, name: str) -> None:
     SAVED[name].load(PREVIOUS / name).save(tmp_path / name)
@@ -71,6 +79,10 @@ def test_a_result_is_read_and_written_again_as_it_was(tmp_path: Path, name: str)
         kept = [column for column in before if column in again]
         assert set(before) - set(kept) == GONE[name]
         assert again[kept][: len(before)].equals(before[kept])
+        return
+    if name == "diagnosis.json":
+        before = json.loads(content(PREVIOUS / name))
+        assert without_new(json.loads(content(tmp_path / name)), before) == before
         return
     assert content(tmp_path / name) == content(PREVIOUS / name)
     arrays = PREVIOUS / name.replace(".json", ".npz")

@@ -95,7 +95,7 @@ _LIKE_NOISE = ("pixel phase in x", "pixel phase in y")
 
 def model_checks(diagnosis: Diagnosis) -> list[Check]:
     """Every check that a diagnosis allows."""
-    checks = [misfit(diagnosis.misfit)]
+    checks = [misfit(diagnosis.misfit), even_noise(diagnosis.misfit)]
     checks += [] if diagnosis.jackknife is None else [jackknife(diagnosis.jackknife)]
     checks += [] if diagnosis.stars is None else [stars(diagnosis.stars)]
     checks += [] if diagnosis.comparison is None else [comparison(diagnosis.comparison)]
@@ -105,12 +105,13 @@ def model_checks(diagnosis: Diagnosis) -> list[Check]:
 def misfit(found: Misfit) -> Check:
     """Is there structure in the residuals?"""
     name, bound = "Unexplained structure", f"p ≥ {MISFIT_P:g}"
-    value = f"p = {significant(found.p_value)}, corrected for {plural(len(found.tests), 'test')}"
-    rejected = found.found(MISFIT_P)
+    patterns = [test.p_holm for test in found.tests if not test.is_of_noise]
+    value = f"p = {significant(min(patterns, default=1.0))}, corrected for {plural(len(found.tests), 'test')}"
+    rejected = [test for test in found.found(MISFIT_P) if not test.is_of_noise]
     if not rejected:
         sentence = "The residuals show no structure beyond noise, in any of the ways that were looked for."
         return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, sentence)
-    bending = [t for t in rejected if t.dof > 0 and t.against not in _LIKE_NOISE and t.p_holm < MISFIT_FAIL_P]
+    bending = [t for t in rejected if t.against not in _LIKE_NOISE and t.p_holm < MISFIT_FAIL_P]
     words = []
     for test in rejected[:3]:
         size = "" if np.isnan(test.size_px) else f", {significant(test.size_px)} px"
@@ -119,12 +120,39 @@ def misfit(found: Misfit) -> Check:
     sentence = f"The residuals hold more than noise: {join_words(words)}{more}. "
     if bending:
         sentence += "The model is wrong in a way that moves the parameters; no interval of this report holds that."
-    elif all(t.dof == 0 or t.against in _LIKE_NOISE for t in rejected):
+    elif all(t.against in _LIKE_NOISE for t in rejected):
         sentence += "This acts like more noise, unevenly spread, and hardly moves the parameters."
     else:
         sentence += "No interval of this report holds that."
     level = Level.FAIL if bending else Level.WARN
     return Check(name, Question.TRUSTWORTHY, level, value, bound, sentence)
+
+
+def even_noise(found: Misfit) -> Check:
+    """Is the noise what the weights of the stars say?"""
+    tests = [test for test in found.tests if test.is_of_noise]
+    rejected = [test for test in found.found(MISFIT_P) if test.is_of_noise]
+    name, bound = "Evenness of the noise", f"p ≥ {MISFIT_P:g}"
+    value = f"p = {significant(min((test.p_holm for test in tests), default=1.0))}"
+    if not rejected:
+        sentence = "The noise does not change with radius, magnitude, time or frame beyond what the weights know of it."
+        return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, sentence)
+    changes = f"The residuals hold {join_words([test.name for test in rejected])}"
+    if found.uneven is None:
+        sentence = f"{changes}, which the weights of the stars do not know: the stated sigmas may be wrong."
+        return Check(name, Question.TRUSTWORTHY, Level.WARN, value, bound, sentence)
+    uneven = found.uneven
+    if not uneven.model.varies:
+        sentence = f"{changes}, too little of it to change a stated sigma."
+        return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, sentence)
+    worst = int(np.argmax(np.abs(np.log(uneven.ratios))))
+    sentence = (
+        f"{changes}: {uneven.model}. The stated sigmas rest on one noise for all stars and are wrong: that of "
+        f"{uneven.parameter_names[worst]} should be {fixed(float(uneven.ratios[worst]), 2)} times as large, and with "
+        "fitted weights the estimate itself would be more precise."
+    )
+    remedy = f"{CALIBRATE} --noise model or sc.calibrate(obs, camera, noise='model')"
+    return Check(name, Question.TRUSTWORTHY, Level.WARN, value, bound, sentence, remedy)
 
 
 def jackknife(found: Jackknife) -> Check:

@@ -114,18 +114,23 @@ def noise(cal: Calibration) -> Check:
     """Is the estimated noise that of star centroids?"""
     scaled = cal.sigma_name == "sigma_scale"
     low, high = PLAUSIBLE_SCALE if scaled else PLAUSIBLE_NOISE_PX
+    fitted = cal.noise_model if scaled and cal.noise_model is not None and cal.noise_model.varies else None
     good = low <= cal.sigma <= high
+    if fitted is not None and not fitted.multiplies:
+        good = PLAUSIBLE_NOISE_PX[0] <= cal.sigma * fitted.level_px <= PLAUSIBLE_NOISE_PX[1]
     unit = "" if scaled else " px"
     value = f"{significant(cal.sigma, 3)}{unit}"
     if good:
         sentence = "The stated noise of the stars is confirmed." if scaled else "Usual for star centroids."
+        if fitted is not None:
+            sentence = f"The noise was fitted: {fitted}."
     elif cal.sigma > high:
         sentence = (
             "Far more scatter than centroids have: identifications, camera file or distortion model may be wrong."
         )
     else:
         sentence = "Less scatter than centroids have: the stated noise is too large, or the data are not measurements."
-    name = "Factor on the stated noise" if scaled else "Centroid noise per axis"
+    name = f"Factor on the {'stated' if fitted is None else 'fitted'} noise" if scaled else "Centroid noise per axis"
     bound = f"{low:g} to {high:g}{unit}"
     return Check(name, Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence)
 

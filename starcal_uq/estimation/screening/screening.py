@@ -11,7 +11,7 @@ number E of false rejections, a star is rejected at p < E / (2N) and a frame at 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -69,6 +69,7 @@ def screen(
     control: str = "table",
     max_rounds: int = 10,
     throw: bool = True,
+    noise: str = "common",
     **options: Any,
 ) -> Screening:
     """Find wrong identifications and calibrate on the rest.
@@ -91,6 +92,9 @@ def screen(
         Limit on the rounds of calibrating and testing.
     throw : bool
         Whether to raise an error where the calibration does not converge.
+    noise : {"common", "model"}
+        As for `calibrate`. With ``model``, stars are screened a second time, with the noise that the model fitted to
+        those kept at first gives each of them.
     **options
         Passed on to `calibrate`, such as ``solver``.
 
@@ -106,6 +110,9 @@ def screen(
     ValueError
         For a significance, control or number of rounds that makes no sense.
     """
+    if noise != "common":
+        settings = {"significance": significance, "control": control, "max_rounds": max_rounds, "throw": throw}
+        return _with_noise_model(obs.unweighted, camera, settings, options | {"noise": noise})
     frames = StarFrames.from_observations(obs)
     rates = _rates(frames, significance, control, max_rounds)
     use, start = pre_screen(camera, frames)
@@ -161,6 +168,18 @@ def screen(
         stable=stable,
         warnings=warnings_about(obs, calibration.camera, use, table, stable),
     )
+
+
+def _with_noise_model(obs: Observations, camera: Camera, settings: AnyDict, options: AnyDict) -> Screening:
+    """Screen with one noise, fit how it varies, screen with that; what is kept gets a model of its own."""
+    plain = {name: value for name, value in options.items() if name != "noise"}
+    first = screen(obs, camera, **settings, **plain)
+    model = calibrate(first.observations, camera, throw=settings["throw"], **options).noise_model
+    if model is not None and model.varies:
+        first = screen(obs.weighted(model.sigma_px(obs)), camera, **settings, **plain)
+    kept = first.observations.unweighted
+    calibration = calibrate(kept, camera, throw=settings["throw"], **options)
+    return replace(first, observations=kept, calibration=calibration)
 
 
 def _round(

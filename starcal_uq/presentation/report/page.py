@@ -87,6 +87,8 @@ def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
         **budget_tables.budget_context(results.budget),
         "stage_rows": tables.stage_rows(results),
         "pair_table": tables.pair_table(cal),
+        "noise_table": tables.noise_table(cal),
+        "noise_model": cal.noise_model,
         "prior_rows": words.prior_rows(results),
         "likelihood_sentence": words.likelihood_sentence(results),
         "sigma_sentence": words.sigma_sentence(results),

@@ -256,6 +256,20 @@ def pair_table(cal: Calibration) -> TextTable:
     return with_units(TextTable(heads, rows), specs)
 
 
+def noise_table(cal: Calibration) -> TextTable | None:
+    """The fitted noise model, term by term; None where there is none."""
+    model = cal.noise_model
+    if model is None or not model.varies:
+        return None
+    rows = [
+        (term.replace("^2", "²"), f"{with_sigma(float(value), float(error))} ± {significant(float(error))}")
+        for term, value, error in zip(model.terms, model.coefficients, model.errors, strict=True)
+    ]
+    if model.frame_dof is not None:
+        rows.append(("frames", f"inverse chi-square, {significant(model.frame_dof)} degrees of freedom"))
+    return TextTable(("Term", "Coefficient of the log variance"), tuple(rows))
+
+
 # More images than this are counted, and only those left out are listed.
 _LISTED = 40
 

@@ -64,6 +64,8 @@ def _air_words(results: Results) -> str:
 
 def _noise_words(results: Results) -> str:
     cal, post = results.calibration, results.posterior
+    if cal.noise_model is not None and cal.noise_model.varies:
+        return f"fitted: {cal.noise_model}; the data ask for {significant(cal.sigma, 3)} times that"
     if cal.sigma_name == "sigma_scale":
         floor = results.observations.meta.get("noise_floor_px")
         more = (
@@ -83,6 +85,8 @@ def sigma_sentence(results: Results) -> str:
     kind = "px per axis, the same for all stars"
     if results.calibration.sigma_name == "sigma_scale":
         kind = "a common factor on the noise that each star states"
+        if results.calibration.noise_model is not None:
+            kind = "a common factor on the noise that was fitted to each star"
     if post is None:
         return f"The noise σ ({kind}) is estimated from the residuals and their degrees of freedom."
     if post.sigma_sampled:

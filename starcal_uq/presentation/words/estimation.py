@@ -22,11 +22,17 @@ def focal_length(cal: Calibration) -> str:
     return f"{fixed(cal.camera.focal_mm, decimals)} +- {fixed(sigma, decimals)} mm"
 
 
+def noise_kind(cal: Calibration) -> str:
+    """Which noise of each star a common factor multiplies."""
+    return "stated" if cal.noise_model is None else "fitted"
+
+
 def calibration_text(cal: Calibration) -> str:
-    """What was calibrated, how it ended, and the focal length."""
+    """What was calibrated, how it ended, the focal length, and how the noise varies where that was fitted."""
+    noise = "" if cal.noise_model is None else f" Fitted noise: {cal.noise_model}."
     return (
         f"{plural(cal.n_stars, 'star')} in {plural(cal.n_frames, 'frame')}, {cal.method} ({cal.solver}): "
-        f"{cal.status.name.lower().replace('_', ' ')}; focal length {focal_length(cal)}."
+        f"{cal.status.name.lower().replace('_', ' ')}; focal length {focal_length(cal)}.{noise}"
     )
 
 
@@ -43,7 +49,7 @@ def calibration_table(cal: Calibration, truth: Camera | None = None) -> TextTabl
             cells += [fixed(true / spec.scale, decimals), fixed((value - true) / sigma, 2)]
         rows.append((spec.name, *cells, pretty_unit(spec.scaled_unit)))
     decimals = decimals_for(cal.sigma_std)
-    unit = "px per axis" if cal.sigma_name == "sigma" else "times the stated noise"
+    unit = "px per axis" if cal.sigma_name == "sigma" else f"times the {noise_kind(cal)} noise"
     noise = (fixed(cal.sigma, decimals), fixed(cal.sigma_std, decimals))
     rows.append((cal.sigma_name, "", *noise, *("" for _ in known), unit))
     heads = ("parameter", "start", "estimate", "sigma", *known, "unit")

@@ -1,0 +1,437 @@
+"""Centroid noise that varies: its variance as a smooth function of radius and magnitude, times a factor per frame.
+
+The squared residuals of a fit tell the variances. With H the hat matrix of attitudes and parameters (weights as
+fitted), the two residuals of star i have the expected square ``v_i (2 - h_i)``, h_i the trace of its block of H.
+Setting ``sum_i z_i (d_i / v_i - (2 - h_i)) = 0`` for every column z of a log-linear model is restricted maximum
+likelihood (Smyth 2002, J. Comput. Graph. Stat. 11, 836): a gamma regression of d_i / (2 - h_i). The factors of frames
+follow a scaled inverse chi-square distribution whose degrees of freedom are estimated (Smyth 2004, Stat. Appl. Genet.
+Mol. Biol. 3, 3): each frame's own variance is shrunk towards that of the others. Weights and estimate are repeated
+until they settle.
+
+A term stays only if it raises twice the log likelihood by more than the logarithm of the number of stars (Schwarz's
+criterion), so that even noise is left as it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from starcal_uq.core.formatting import fixed, join_words, significant
+from starcal_uq.core.records import from_plain, to_plain
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.stages import refinement_stage
+from starcal_uq.maths.linear import scaled_inverse
+from starcal_uq.observations.frames import StarFrames
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.observations.table import Observations
+
+NOISES = ("common", "model")
+_QUANTITIES = ("radius", "magnitude")
+_HIGHEST_POWER = 2
+_ROUNDS, _CHOOSING_ROUNDS, _SETTLED = 10, 2, 1e-3
+_NEWTON_STEPS, _LONGEST_STEP, _STEP_SETTLED = 50, 2.0, 1e-8
+# Logarithms of the degrees of freedom of the frames' distribution: from wild to hardly different.
+_FRAME_LOG_DOF, _FRAME_LOG_DOF_START = (0.0, 9.0), 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class NoiseModel:
+    """Variance per axis of a star: ``level_px^2 exp(terms)``, times the factor of its frame, times its stated variance.
+
+    Attributes
+    ----------
+    terms : tuple of str
+        Powers of ``radius`` (distance from the principal point over the half diagonal) and of ``magnitude`` (less the
+        reference) in the log variance, such as ``radius`` and ``radius^2``.
+    coefficients, errors : (q,) array
+        Coefficients of the terms, and their standard errors.
+    level_px : float
+        Noise at radius zero and the reference magnitude, px per axis; a factor where the stars state their noise.
+    multiplies : bool
+        Whether the model multiplies a noise that the stars state.
+    centre_px : (2,) array
+        Principal point, px.
+    corner_px : float
+        Half diagonal, px.
+    radius_range, mag_range : (2,) array
+        Where stars were seen; beyond, the noise is that of the end.
+    mag_reference : float
+        Mean magnitude, which stands for a magnitude that is not known.
+    frame_dof : float or None
+        Degrees of freedom of the inverse chi-square distribution of the frames' variances; None where frames are alike.
+    frame_ids, frame_factors : (K,) array
+        Frames, and the factor of each on the variance; empty where frames are alike, and in a posterior.
+    frame_mean : float
+        Mean of the factors, which stands for frames that were not observed.
+    """
+
+    terms: tuple[str, ...]
+    coefficients: FloatArray
+    errors: FloatArray
+    level_px: float
+    multiplies: bool
+    centre_px: FloatArray
+    corner_px: float
+    radius_range: FloatArray
+    mag_range: FloatArray
+    mag_reference: float
+    frame_dof: float | None
+    frame_ids: IntArray
+    frame_factors: FloatArray
+    frame_mean: float
+
+    @property
+    def varies(self) -> bool:
+        """Whether the data ask for more than one noise."""
+        return bool(self.terms) or self.frame_dof is not None
+
+    def __str__(self) -> str:
+        if not self.varies:
+            return "the same for all stars"
+        unit = " times what the stars state" if self.multiplies else " px per axis"
+        middle, edge = (self._noise(r) for r in (0.0, self.radius_range[1]))
+        parts = []
+        if "radius" in self.terms:
+            parts.append(f"{significant(middle)}{unit} in the centre of the field and {significant(edge)} at its edge")
+        if "magnitude" in self.terms:
+            low, high = (float(mag) for mag in self.mag_range)
+            bright, faint = (self._noise(0.0, mag) for mag in (low, high))
+            parts.append(
+                f"{significant(faint / bright)} times as much at magnitude {fixed(high, 1)} as at {fixed(low, 1)}"
+                if parts
+                else f"{significant(bright)}{unit} at magnitude {fixed(low, 1)} and {significant(faint)} at "
+                f"{fixed(high, 1)}"
+            )
+        if self.frame_dof is not None:
+            parts.append("a factor of its own in every frame" + self._frame_words())
+        return join_words(parts)
+
+    def _frame_words(self) -> str:
+        if not len(self.frame_factors):
+            return ""
+        low, high = np.sqrt(np.quantile(self.frame_factors, (0.05, 0.95)) / self.frame_mean)
+        return f" ({significant(low)} to {significant(high)} in 90 % of them)"
+
+    def _noise(self, radius: float, mag: float | None = None) -> float:
+        x = np.array([self.centre_px[0] + radius * self.corner_px])
+        return float(self.at(x, self.centre_px[1:], None if mag is None else np.array([mag]))[0])
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """One row per term: coefficient of the log variance and its standard error."""
+        import pandas as pd
+
+        columns = {"term": list(self.terms), "coefficient": self.coefficients, "error": self.errors}
+        return pd.DataFrame(columns)
+
+    def at(self, x_px: FloatArray, y_px: FloatArray, mag: FloatArray | None = None) -> FloatArray:
+        """Noise of stars at pixels (n,) with magnitudes (n,), px per axis or a factor; frames apart, their mean."""
+        radius = np.hypot(x_px - self.centre_px[0], y_px - self.centre_px[1]) / self.corner_px
+        centred = np.zeros_like(radius)
+        if mag is not None:
+            centred = np.nan_to_num(np.clip(mag, *self.mag_range) - self.mag_reference)
+        columns = _columns(self.terms, np.clip(radius, *self.radius_range), centred)
+        sigma: FloatArray = self.level_px * np.sqrt(self.frame_mean) * np.exp(0.5 * (columns @ self.coefficients))
+        return sigma
+
+    def sigma_px(self, obs: Observations) -> FloatArray:
+        """Noise of every star, (N,) px per axis; frames of a mission get the mean variance of those observed."""
+        stated = obs.unweighted.sigma_px
+        sigma = self.at(obs.x_px, obs.y_px, obs.mag)
+        if len(self.frame_ids) and "frames" not in obs.meta:
+            place = np.clip(np.searchsorted(self.frame_ids, obs.frame), 0, len(self.frame_ids) - 1)
+            own = np.where(self.frame_ids[place] == obs.frame, self.frame_factors[place], self.frame_mean)
+            sigma = sigma * np.sqrt(own / self.frame_mean)
+        return sigma if stated is None or not self.multiplies else np.asarray(sigma * stated)
+
+    def record(self, frames: bool = True) -> AnyDict:
+        """The model as plain values, for a provenance, with or without the factors of frames."""
+        kept = self if frames else replace(self, frame_ids=self.frame_ids[:0], frame_factors=self.frame_factors[:0])
+        plain: AnyDict = to_plain(kept)
+        return plain
+
+
+def noise_model_of(result: Any) -> NoiseModel | None:
+    """The noise model of a calibration or posterior; None where there is one noise for all."""
+    record: AnyDict | None = result.provenance.get("noise_model")
+    return None if record is None else from_plain(NoiseModel, record)
+
+
+def weighed(obs: Observations, result: Any) -> Observations:
+    """Observations as a calibration or posterior weighs them: with the noise of its model, if it has one that varies.
+
+    The data and their hash stay what they are. Without a model, weights of another result's are what the table states.
+    """
+    model = noise_model_of(result)
+    if model is None or not model.varies:
+        return obs if obs.stated_px is None else replace(obs, stated_px=None)
+    if model.multiplies and obs.unweighted.sigma_px is None:
+        return obs
+    if obs.stated_px is not None and model.frame_dof is not None and not len(model.frame_ids):
+        # A posterior keeps no factors of frames; the calibration that weighed these does.
+        return obs
+    return obs.weighted(model.sigma_px(obs))
+
+
+def _columns(terms: tuple[str, ...], radius: FloatArray, mag: FloatArray) -> FloatArray:
+    """Columns (n, q) of the log variance."""
+    values = dict(zip(_QUANTITIES, (radius, mag), strict=True))
+    found = [values[name] ** int(power or 1) for name, _, power in (term.partition("^") for term in terms)]
+    return np.stack(found, axis=-1) if found else np.zeros((len(radius), 0))
+
+
+def star_squares(likelihood: MarginalLikelihood, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Squared whitened residuals (N,) of the stars, two axes, and their expectation 2 - h (N,) where weights are right.
+
+    Parameters
+    ----------
+    likelihood : MarginalLikelihood
+        Data with their weights.
+    theta : (p,) array
+        Estimate, px units.
+    """
+    state, _ = likelihood.profile(theta)
+    h = likelihood.project_out(state, likelihood.derivatives(theta, state))
+    flat = h.reshape(len(h), -1)
+    inverse = scaled_inverse(flat @ flat.T)
+    by_camera = np.einsum("pxn,pxn->n", h, np.tensordot(inverse, h, axes=1))
+    spread = likelihood.frames.spread(state.inverse)
+    by_attitude = np.einsum("axn,abn,bxn->n", state.attitude, spread, state.attitude, optimize=True)
+    return np.sum(state.e**2, axis=0), np.maximum(2.0 - by_camera - by_attitude, 1e-6)
+
+
+def fit_noise(
+    obs: Observations, camera: Camera, *, rounds: int = _ROUNDS, max_iterations: int = 200
+) -> tuple[NoiseModel, FloatArray]:
+    """Fit the noise model around an estimate, weights and estimate in turn until they settle.
+
+    Parameters
+    ----------
+    obs : Observations
+        Identified stars; a noise that they state is multiplied.
+    camera : Camera
+        Estimate.
+    rounds : int
+        Largest number of fits; with 1 the estimate stays where it is.
+    max_iterations : int
+        Limit of each refinement.
+
+    Returns
+    -------
+    (NoiseModel, (p,) array)
+        The model, and the estimate with its weights.
+    """
+    obs, theta = obs.unweighted, camera.theta
+    plain = StarFrames.from_observations(obs)
+    stated = np.ones(obs.n_stars) if obs.sigma_px is None else np.asarray(obs.sigma_px)
+    variance, before = np.ones(obs.n_stars), np.ones(obs.n_stars)
+    fit = _Fit((), np.zeros(1), np.zeros(1), None, np.ones(obs.n_frames))
+    for turn in range(rounds):
+        likelihood = MarginalLikelihood(replace(plain, weight=1.0 / (stated * np.sqrt(variance))), camera.distortion)
+        if turn > 0:
+            likelihood.use_rotations(likelihood.start_rotations(theta))
+            stage = refinement_stage(likelihood, theta, max_iterations)
+            if not stage.status.ok:
+                break
+            theta = stage.theta
+        squares, share = star_squares(likelihood, theta)
+        stars = _Stars.of(obs, camera.with_theta(theta), squares * variance, share)
+        # The first residuals come from wrong weights: terms are chosen again.
+        fit = _chosen(stars) if turn < _CHOOSING_ROUNDS else _fitted(stars, fit.terms, fit.frame_dof is not None)
+        variance = fit.variance(stars)
+        if not fit.varies or np.max(np.abs(variance / before - 1.0)) < _SETTLED:
+            break
+        before = variance
+    return _model(obs, camera.with_theta(theta), stars, fit), theta
+
+
+def sigma_ratios(obs: Observations, camera: Camera, model: NoiseModel, sigma: float) -> FloatArray:
+    """Real over stated standard deviations (p,) of an estimate with one noise, if the noise is that of a model.
+
+    Parameters
+    ----------
+    obs : Observations
+        Identified stars, with the weights of the estimate.
+    camera : Camera
+        Estimate.
+    model : NoiseModel
+        Noise of the stars.
+    sigma : float
+        Noise of the estimate, px or a factor on what the stars state.
+    """
+    likelihood = MarginalLikelihood(obs, camera.distortion)
+    state, _ = likelihood.profile(camera.theta)
+    h = likelihood.project_out(state, likelihood.derivatives(camera.theta, state))
+    whitened = model.sigma_px(obs) * (1.0 if likelihood.frames.weight is None else likelihood.frames.weight)
+    flat, noisy = h.reshape(len(h), -1), (h * whitened).reshape(len(h), -1)
+    inverse = scaled_inverse(flat @ flat.T)
+    real = inverse @ (noisy @ noisy.T) @ inverse
+    return np.asarray(np.sqrt(np.diag(real) / np.diag(inverse)) / sigma)
+
+
+class _Stars(NamedTuple):
+    """What the regression needs of the stars: squared residuals and their degrees of freedom, and the quantities."""
+
+    squares: FloatArray
+    share: FloatArray
+    radius: FloatArray
+    mag: FloatArray
+    frame: IntArray
+    n_frames: int
+
+    @classmethod
+    def of(cls, obs: Observations, camera: Camera, squares: FloatArray, share: FloatArray) -> _Stars:
+        x0, y0 = camera.theta[:2]
+        radius = np.hypot(obs.x_px - x0, obs.y_px - y0) / _corner_px(camera)
+        mag = np.zeros(obs.n_stars) if obs.mag is None else np.nan_to_num(obs.mag - np.nanmean(obs.mag))
+        return cls(squares, share, radius, mag, np.searchsorted(obs.frame_ids, obs.frame), obs.n_frames)
+
+    def per_frame(self, values: FloatArray) -> FloatArray:
+        """Sums over the stars of each frame."""
+        return np.asarray(np.bincount(self.frame, values, self.n_frames), dtype=np.float64)
+
+    def highest(self, name: str) -> int:
+        """Highest power of a quantity that the stars can tell."""
+        distinct = len(np.unique(self.radius if name == "radius" else self.mag))
+        return min(_HIGHEST_POWER, distinct - 1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """Terms with their coefficients (the first is that of the level), and the frames' distribution and factors."""
+
+    terms: tuple[str, ...]
+    beta: FloatArray
+    errors: FloatArray
+    frame_dof: float | None
+    factors: FloatArray
+    log_likelihood: float = -np.inf
+
+    @property
+    def varies(self) -> bool:
+        return bool(self.terms) or self.frame_dof is not None
+
+    def score(self, n_stars: int) -> float:
+        """Schwarz's criterion, the larger the better."""
+        n_terms = len(self.terms) + (self.frame_dof is not None)
+        return float(2.0 * self.log_likelihood - n_terms * np.log(n_stars))
+
+    def variance(self, stars: _Stars) -> FloatArray:
+        """Variance of every star."""
+        smooth: FloatArray = np.exp(_design(stars, self.terms) @ self.beta)
+        return smooth * self.factors[stars.frame]
+
+
+def _design(stars: _Stars, terms: tuple[str, ...]) -> FloatArray:
+    return np.column_stack([np.ones(len(stars.radius)), _columns(terms, stars.radius, stars.mag)])
+
+
+def _chosen(stars: _Stars) -> _Fit:
+    """The fit with the best criterion that is reached from even noise by one quantity at a time."""
+    powers, frames = dict.fromkeys(_QUANTITIES, 0), False
+    best, n_stars = _fitted(stars, (), False), len(stars.radius)
+    while True:
+        trials = [(_fitted(stars, _terms(more), apart), more, apart) for more, apart in _near(stars, powers, frames)]
+        found = max(trials, key=lambda trial: trial[0].score(n_stars))
+        if found[0].score(n_stars) <= best.score(n_stars):
+            return best
+        best, powers, frames = found
+
+
+def _near(stars: _Stars, powers: dict[str, int], frames: bool) -> Iterator[tuple[dict[str, int], bool]]:
+    """Choices of terms that differ in one quantity."""
+    for name, power in powers.items():
+        for other in range(stars.highest(name) + 1):
+            if other != power:
+                yield {**powers, name: other}, frames
+    yield powers, not frames and stars.n_frames > 2
+
+
+def _terms(powers: dict[str, int]) -> tuple[str, ...]:
+    return tuple(f"{name}^{i}" if i > 1 else name for name, power in powers.items() for i in range(1, power + 1))
+
+
+def _fitted(stars: _Stars, terms: tuple[str, ...], with_frames: bool) -> _Fit:
+    """Restricted maximum likelihood of the coefficients, and of the frames' distribution where frames differ."""
+    design = _design(stars, terms)
+    information = 0.5 * (design.T * stars.share) @ design
+    beta = _scored(design, stars.squares, stars.share, information)
+    errors = np.sqrt(np.diag(np.linalg.inv(information)))
+    if not with_frames:
+        eta = design @ beta
+        log_likelihood = -0.5 * float(np.sum(stars.squares * np.exp(-eta) + stars.share * (eta + np.log(2.0))))
+        return _Fit(terms, beta, errors, None, np.ones(stars.n_frames), log_likelihood)
+    from scipy.optimize import minimize
+
+    dof = stars.per_frame(stars.share)
+    bounds = [*[(None, None)] * len(beta), _FRAME_LOG_DOF]
+    start = np.append(beta, _FRAME_LOG_DOF_START)
+    found = minimize(_frames_cost, start, (stars, design, dof), jac=True, method="L-BFGS-B", bounds=bounds)
+    beta, nu = found.x[:-1], float(np.exp(found.x[-1]))
+    sums = stars.per_frame(stars.squares * np.exp(-design @ beta))
+    return _Fit(terms, beta, errors, nu, (nu + sums) / (nu + dof), -float(found.fun))
+
+
+def _scored(design: FloatArray, squares: FloatArray, share: FloatArray, information: FloatArray) -> FloatArray:
+    """Fisher's scoring from one noise for all."""
+    beta = np.zeros(design.shape[1])
+    beta[0] = np.log(np.sum(squares) / np.sum(share))
+    for _ in range(_NEWTON_STEPS):
+        step = np.linalg.solve(information, 0.5 * design.T @ (squares * np.exp(-design @ beta) - share))
+        longest = float(np.max(np.abs(design @ step)))
+        beta = beta + step * min(1.0, _LONGEST_STEP / max(longest, 1e-300))
+        if longest < _STEP_SETTLED:
+            break
+    return beta
+
+
+def _frames_cost(x: FloatArray, stars: _Stars, design: FloatArray, dof: FloatArray) -> tuple[float, FloatArray]:
+    """Minus the log likelihood of coefficients and log degrees of freedom of the frames, and its gradient.
+
+    Whitened sums of squares of frames are chi-squares times nu over a chi-square of nu degrees of freedom.
+    """
+    from scipy.special import digamma, gammaln
+
+    eta, nu = design @ x[:-1], float(np.exp(x[-1]))
+    whitened = stars.squares * np.exp(-eta)
+    sums = stars.per_frame(whitened)
+    value = gammaln(0.5 * (dof + nu)) - gammaln(0.5 * nu) - 0.5 * dof * np.log(nu)
+    value -= 0.5 * (dof + nu) * np.log1p(sums / nu)
+    precision = (nu + dof) / (nu + sums)
+    by_beta = 0.5 * design.T @ (precision[stars.frame] * whitened - stars.share)
+    by_nu = digamma(0.5 * (dof + nu)) - digamma(0.5 * nu) - dof / nu - np.log1p(sums / nu) + precision * sums / nu
+    slope = np.append(by_beta, 0.5 * nu * np.sum(by_nu))
+    return -float(np.sum(value) - 0.5 * stars.share @ eta), -slope
+
+
+def _corner_px(camera: Camera) -> float:
+    return 0.5 * float(np.hypot(camera.width_px, camera.height_px))
+
+
+def _model(obs: Observations, camera: Camera, stars: _Stars, fit: _Fit) -> NoiseModel:
+    known = np.zeros(1) if obs.mag is None else obs.mag[np.isfinite(obs.mag)]
+    apart = fit.frame_dof is not None
+    return NoiseModel(
+        terms=fit.terms,
+        coefficients=fit.beta[1:],
+        errors=fit.errors[1:],
+        level_px=float(np.exp(0.5 * fit.beta[0])),
+        multiplies=obs.sigma_px is not None,
+        centre_px=np.array(camera.theta[:2]),
+        corner_px=_corner_px(camera),
+        radius_range=np.array([stars.radius.min(), stars.radius.max()]),
+        mag_range=np.array([known.min(), known.max()]),
+        mag_reference=float(np.mean(known)),
+        frame_dof=fit.frame_dof,
+        frame_ids=np.array(obs.frame_ids) if apart else np.zeros(0, dtype=np.int64),
+        frame_factors=fit.factors if apart else np.zeros(0),
+        frame_mean=float(np.mean(fit.factors)),
+    )
