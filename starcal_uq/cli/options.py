@@ -49,6 +49,13 @@ TimeUtc = Annotated[
     ),
 ]
 Engine = Annotated[str, typer.Option(help="What finds attitudes: pyramid, or tetra3rs (extra of that name).")]
+Duplicates = Annotated[
+    str,
+    typer.Option(
+        help="Frames that hold the same measurement as an earlier one: refuse, drop (leave them out), or keep (they "
+        "are exposures of their own)."
+    ),
+]
 Draws = Annotated[int, typer.Option(min=50, help="Posterior draws that go through QUEST.")]
 
 

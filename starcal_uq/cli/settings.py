@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 import starcal_uq as sc
-from starcal_uq.cli.options import Columns, Seed, TimeUtc, parse_choice
+from starcal_uq.cli.options import Columns, Duplicates, Seed, TimeUtc, parse_choice
 from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
@@ -45,10 +45,17 @@ class EstimationSettings:
             "the residuals ask for it)."
         ),
     ] = "common"
+    duplicates: Duplicates = "refuse"
 
     def options(self) -> AnyDict:
         """Keyword arguments of `Run.calibrate`."""
-        options: AnyDict = {"method": self.method, "solver": self.solver, "screening": self.screen, "noise": self.noise}
+        options: AnyDict = {
+            "method": self.method,
+            "solver": self.solver,
+            "screening": self.screen,
+            "noise": self.noise,
+            "duplicates": self.duplicates,
+        }
         return options | {"likelihood": "student_t"} if self.robust else options
 
 

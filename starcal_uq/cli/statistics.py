@@ -10,7 +10,7 @@ import typer
 import starcal_uq as sc
 from starcal_uq.cli.console import out as console
 from starcal_uq.cli.console import print_json, print_table, progress_bar, records, show_calibration
-from starcal_uq.cli.options import CameraFile, Force, Json, NewRun, RunPath, Seed
+from starcal_uq.cli.options import CameraFile, Duplicates, Force, Json, NewRun, RunPath, Seed
 from starcal_uq.core.files import atomic_write_bytes, check_new_folder, new_folder, write_csv
 
 
@@ -123,17 +123,24 @@ def merge_command(
     runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders of the same camera.")],
     out: NewRun,
     noise: Annotated[
-        str, typer.Option(help="common (one noise for all runs) or own (each run keeps its estimated noise).")
-    ] = "common",
+        str,
+        typer.Option(
+            help="common (one noise for all runs), own (each run keeps its estimated noise), or auto (own where the "
+            "runs' noises differ)."
+        ),
+    ] = "auto",
     allow_inconsistent: Annotated[
         bool, typer.Option("--allow-inconsistent", help="Merge even where the runs disagree on the camera.")
     ] = False,
+    duplicates: Duplicates = "refuse",
     force: Force = False,
 ) -> None:
     """Combine the likelihoods of several runs into one, without going back to the stars; tests that they agree."""
     from starcal_uq.presentation.words.estimation import consistency_table
 
-    merged = sc.runs.merge_runs(runs, out, noise=noise, allow_inconsistent=allow_inconsistent, force=force)
+    merged = sc.runs.merge_runs(
+        runs, out, noise=noise, allow_inconsistent=allow_inconsistent, duplicates=duplicates, force=force
+    )
     agreement = sc.estimation.consistency_of(merged)
     if agreement is not None:
         print_table(consistency_table(agreement))

@@ -48,6 +48,7 @@ from starcal_uq.observations.splits import split_frames, split_labels
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.fingerprints import Fingerprints
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import Observations
 
@@ -62,6 +63,7 @@ def compare(
     labels: tuple[str, str] = ("A", "B"),
     same_data: bool | None = None,
     observations: tuple[Observations, Observations] | None = None,
+    fingerprints: tuple[Fingerprints | None, Fingerprints | None] | None = None,
     n: int = 25,
     level: float = 0.01,
     n_draws: int = 4000,
@@ -76,9 +78,12 @@ def compare(
     labels : (str, str)
         Names of the two in words and figures.
     same_data : bool, optional
-        Whether both rest on the same frames. Without it, the hashes of their data say so, and `observations`.
+        Whether both rest on the same frames. Without it, the hashes of their data say so, `observations` and
+        `fingerprints`.
     observations : pair of Observations, optional
         The frames of each; shared ones are then found even where the tables differ.
+    fingerprints : pair of Fingerprints or None, optional
+        Those of the frames, by which images that were measured anew are found as well; a calibration brings its own.
     n : int
         Grid points along each side of the detector.
     level : float
@@ -96,7 +101,8 @@ def compare(
         When the distortion of a camera folds over within the detector.
     """
     _check(a, b, labels, level)
-    rule = difference_rule(a, b, labels, same_data, observations)
+    marks = fingerprints or (getattr(a, "fingerprints", None), getattr(b, "fingerprints", None))
+    rule = difference_rule(a, b, labels, same_data, observations, marks)
     first, second = one_noise(estimate_of(a), estimate_of(b), rule)
     x, y = detector_axes(first.camera, n)
     xy, weight = grid_points(x, y), area_weights(n)
@@ -183,8 +189,10 @@ def compare_halves(
     CalibrationError
         When a half does not determine the camera.
     """
-    first, second = (calibrate(part, camera, method=method) for part in split_frames(obs, how, seed=seed))
-    options = {"labels": split_labels(how), "same_data": False, **options}
+    first, second = (
+        calibrate(part, camera, method=method, duplicates="keep") for part in split_frames(obs, how, seed=seed)
+    )
+    options = {"labels": split_labels(how), **options}
     return compare(first, second, seed=seed, **options)
 
 

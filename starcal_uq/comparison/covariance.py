@@ -12,12 +12,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from starcal_uq.camera.distortion import get_model
+from starcal_uq.core.formatting import plural
 from starcal_uq.core.provenance import data_hashes
+from starcal_uq.estimation.fingerprints import shared
 from starcal_uq.inference.priors import GaussianPriors
 from starcal_uq.observations.splits import shared_frames
 
 if TYPE_CHECKING:
+    from starcal_uq.estimation.fingerprints import Fingerprints
     from starcal_uq.observations.table import Observations
 
 INDEPENDENT, SAME, A_IN_B, B_IN_A, OVERLAP = "independent", "same", "A within B", "B within A", "overlapping"
@@ -48,6 +53,7 @@ def difference_rule(
     labels: tuple[str, str],
     same_data: bool | None,
     observations: tuple[Observations, Observations] | None,
+    fingerprints: tuple[Fingerprints | None, Fingerprints | None] = (None, None),
 ) -> Rule:
     """The rule for two calibrations or posteriors.
 
@@ -61,12 +67,22 @@ def difference_rule(
         True or False overrules what hashes and frames say.
     observations : pair of Observations or None
         The frames that each rests on, in which shared ones are then looked for.
+    fingerprints : pair of Fingerprints or None
+        Those of the frames of each, by which images that were measured anew are found as well.
     """
-    data = _relation(a, b, same_data, observations)
+    data, seen = _relation(a, b, same_data, observations, fingerprints)
     if data == INDEPENDENT:
+        if seen is None:
+            return Rule(
+                data,
+                (1.0, 1.0),
+                "The data are taken for independent, so the two covariances add: their hashes differ, but whether they "
+                "share frames cannot be checked without fingerprints or observations: calibrate again to have it so.",
+            )
         return Rule(data, (1.0, 1.0), "The data are independent, so the two covariances add.")
     if data == OVERLAP:
-        why = "both rest in part on the same data, and how their errors correlate is not known"
+        count = f" ({plural(seen, 'frame')})" if seen else ""
+        why = f"both rest in part on the same data{count}, and how their errors correlate is not known"
         return Rule(data, None, f"There is no p-value: {why}; compare runs that share all frames, or none.")
     signs = _hausman(a, b, data)
     if signs is None:
@@ -90,24 +106,38 @@ def difference_rule(
     )
 
 
-def _relation(a: Any, b: Any, same_data: bool | None, observations: tuple[Observations, Observations] | None) -> str:
+def _relation(
+    a: Any,
+    b: Any,
+    same_data: bool | None,
+    observations: tuple[Observations, Observations] | None,
+    fingerprints: tuple[Fingerprints | None, Fingerprints | None],
+) -> tuple[str, int | None]:
+    """What the data have in common, and how many frames they were seen to share; None where that was not asked."""
     if same_data is not None:
-        return SAME if same_data else INDEPENDENT
+        return (SAME if same_data else INDEPENDENT), 0
     first, second = data_hashes(a.provenance), data_hashes(b.provenance)
     if _prior_hashes(a) & second or _prior_hashes(b) & first:
-        return OVERLAP
+        return OVERLAP, None
     if first and first == second:
-        return SAME
+        return SAME, None
     if first & second:
-        return OVERLAP
-    if observations is None:
-        return INDEPENDENT
-    common, sizes = shared_frames(*observations), [obs.n_frames for obs in observations]
-    if common == 0:
-        return INDEPENDENT
+        return OVERLAP, None
+    a_marks, b_marks = fingerprints
+    common: int | None = None
+    if observations is not None:
+        common, sizes = shared_frames(*observations), [obs.n_frames for obs in observations]
+    if a_marks is not None and b_marks is not None and not common:
+        # The same pixels are the same data; the same image measured anew has another error, though nearly the same.
+        pairs, sizes = shared(a_marks, b_marks), [len(a_marks.sizes), len(b_marks.sizes)]
+        common = len(np.unique(pairs[:, 0]))
+        if common and not a_marks.equal(b_marks, pairs):
+            return OVERLAP, common
+    if not common:
+        return INDEPENDENT, common
     if common == sizes[0]:
-        return SAME if common == sizes[1] else A_IN_B
-    return B_IN_A if common == sizes[1] else OVERLAP
+        return (SAME if common == sizes[1] else A_IN_B), common
+    return (B_IN_A if common == sizes[1] else OVERLAP), common
 
 
 def _prior_hashes(result: Any) -> set[str]:

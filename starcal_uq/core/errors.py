@@ -81,6 +81,14 @@ class CalibrationError(StarcalError):
         self.status = status
 
 
+class RepeatedFramesError(CalibrationError):
+    """Frames hold the same measurement; `pairs` has their numbers, the frame that stays and the one that repeats it."""
+
+    def __init__(self, message: str, pairs: Sequence[Sequence[int]] = ()) -> None:
+        super().__init__(message)
+        self.pairs = tuple((int(first), int(later)) for first, later in pairs)
+
+
 class PriorError(StarcalError):
     """A prior is improper or misspelt."""
 

@@ -16,6 +16,7 @@ from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.compressed import compress
+from starcal_uq.estimation.fingerprints import Fingerprints
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.solvers import is_singular
 from starcal_uq.estimation.stages import Stage
@@ -70,6 +71,7 @@ def assemble(
     state, cost = likelihood.profile(theta, likelihood.rotations_at(theta))
     response = likelihood.attitude_response(state, likelihood.derivatives(theta, state))
     camera = nominal.with_theta(theta)
+    residuals = likelihood.frames.in_pixels(state.e).T
     record: dict[str, Any] = {"method": method, "solver": solver, "distortion": nominal.distortion}
     return Calibration(
         camera=camera,
@@ -85,7 +87,7 @@ def assemble(
         status=check_camera(camera, status),
         frame_ids=obs.frame_ids,
         quaternions=rotation_to_quaternion(state.rotations),
-        residuals_px=likelihood.frames.in_pixels(state.e).T,
+        residuals_px=residuals,
         chi2=cost,
         dof=dof,
         information=normal.matrix / sigma**2,
@@ -95,6 +97,7 @@ def assemble(
         pair_covariance=pair_covariance,
         compressed=compressed,
         provenance=provenance(None, record | (settings or {}), obs.data_hash),
+        fingerprints=Fingerprints.of(obs, residuals, nominal.centre_px),
     )
 
 

@@ -17,6 +17,7 @@ from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, assemble, check_camera, noise_px
 from starcal_uq.estimation.baselines import check_count, least_squares, recursive
 from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.fingerprints import Fingerprints, check_duplicates, repeating_frames
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import NOISES, fit_noise
 from starcal_uq.estimation.pairs import PairObjective
@@ -49,6 +50,7 @@ def calibrate(
     dof: float | str | None = None,
     recursion: RecursionOptions | None = None,
     noise: str = "common",
+    duplicates: str = "refuse",
 ) -> Calibration:
     """Estimate optics and distortion from identified stars.
 
@@ -93,6 +95,11 @@ def calibrate(
         radius, magnitude and frame, as far as the residuals ask for it: `Calibration.noise_model`. Everything that
         takes the result then weighs the stars by it, and `sigma` is a factor on it. It needs the ``efficient`` method
         and the ``marginal`` likelihood.
+    duplicates : {"refuse", "drop", "keep"}
+        What to do with frames that hold the same measurement as an earlier one, whatever their numbers, order and
+        stars (`starcal_uq.estimation.repeated_frames`): they would count twice. ``drop`` leaves them out
+        (``obs.select_frames(calibration.frame_ids)`` is then what was calibrated), ``keep`` does not ask. Streams are
+        not asked.
 
     Returns
     -------
@@ -103,7 +110,10 @@ def calibrate(
     ------
     CalibrationError
         When there are too few stars, or, with `throw`, when the status is not CONVERGED.
+    RepeatedFramesError
+        When frames hold the same measurement, and `duplicates` is ``refuse``.
     """
+    check_duplicates(duplicates)
     if method not in METHODS:
         raise CalibrationError(f"method {method!r} is unknown: use one of {', '.join(METHODS)}.")
     if solver not in SOLVERS:
@@ -148,7 +158,23 @@ def calibrate(
             calibration = _gaussian(obs, camera, gaussian, method, solver, max_iterations)
     if throw:
         raise_unless_good(calibration.status)
-    return calibration
+    repeating = repeating_frames(calibration, duplicates)
+    if not len(repeating) or not isinstance(obs, Observations):
+        return calibration
+    rest = calibrate(
+        obs.select_frames(np.setdiff1d(obs.frame_ids, repeating)),
+        camera,
+        method=method,
+        solver=solver,
+        max_iterations=max_iterations,
+        throw=throw,
+        likelihood=likelihood,
+        dof=dof,
+        recursion=recursion,
+        noise=noise,
+        duplicates="keep",
+    )
+    return replace(rest, provenance={**rest.provenance, "dropped_frames": repeating.tolist()})
 
 
 def _gaussian(
@@ -284,6 +310,7 @@ def _robust(
     settings: dict[str, object] = {"method": "efficient", "solver": solver, "distortion": model}
     settings |= {"likelihood": "student_t", "dof": "free" if nu is None else nu}
     record = provenance(None, settings, obs.data_hash)
+    residuals = frames.in_pixels(state.e).T
     record["student_t"] = {"dof": found.nu, "dof_std": found.nu_std, "stars_out_of_field": int(np.sum(~state.seen))}
     return Calibration(
         camera=result,
@@ -299,7 +326,7 @@ def _robust(
         status=check_camera(result, status),
         frame_ids=obs.frame_ids,
         quaternions=rotation_to_quaternion(state.rotations),
-        residuals_px=frames.in_pixels(state.e).T,
+        residuals_px=residuals,
         chi2=float(np.sum(state.weight * state.e**2)),
         dof=state.dof - len(theta),
         information=information.matrix,
@@ -309,6 +336,7 @@ def _robust(
         pair_covariance=PairObjective(start.frames, model).godambe(pair_theta),
         compressed=compress_reweighted(found),
         provenance=record,
+        fingerprints=Fingerprints.of(obs, residuals, camera.centre_px),
     )
 
 

@@ -17,6 +17,7 @@ from starcal_uq.core.records import Arrays, from_plain, read_arrays, to_plain, w
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.estimation.compressed import CompressedLikelihood
+from starcal_uq.estimation.fingerprints import Fingerprints
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.maths.intervals import student_quantile
 from starcal_uq.maths.linear import correlation_of
@@ -27,12 +28,12 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.noise_model import NoiseModel
 
 # Fields whose arrays grow with the data or the iterations: they stand in an archive beside the document.
-_APART = ("frame_ids", "quaternions", "residuals_px", "trajectory", "cost", "sigmas")
+_APART = ("frame_ids", "quaternions", "residuals_px", "trajectory", "cost", "sigmas", "sizes", "xy_px", "error_px")
 # Fields of the document, in the order in which it is read.
 _DOCUMENT = (
     *("status", "parameter_names", "method", "solver", "sigma", "sigma_std", "sigma_name", "chi2", "dof", "provenance"),
     *("theta", "covariance", "information", "rotation_per_theta", "attitude_noise", "pair_theta", "pair_covariance"),
-    *("camera", "nominal", "stages", "compressed"),
+    *("camera", "nominal", "stages", "compressed", "fingerprints"),
 )
 # What the document says of a stage; its last estimate is there for readers.
 _STAGE = ("name", "status", "iterations", "evaluations", "seconds", "theta")
@@ -94,6 +95,9 @@ class Calibration(Shown):
         The whole data set's likelihood around the estimate.
     provenance : dict
         Versions, settings, time and the hash of the data.
+    fingerprints : Fingerprints or None
+        What identifies the frames, so that a measurement is not counted twice; None for a stream, and for a calibration
+        by a version before this one.
     """
 
     camera: Camera
@@ -119,6 +123,7 @@ class Calibration(Shown):
     pair_covariance: FloatArray
     compressed: CompressedLikelihood
     provenance: AnyDict
+    fingerprints: Fingerprints | None = None
 
     @property
     def parameter_names(self) -> tuple[str, ...]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -18,13 +19,14 @@ import numpy as np
 from starcal_uq.attitude.rotations import rotation_to_quaternion
 from starcal_uq.camera.distortion import sigma_parameter
 from starcal_uq.core.display import Shown
-from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
 from starcal_uq.core.provenance import data_hashes, provenance
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.compressed import Optimum, combined, optimum, scaled, total
+from starcal_uq.estimation.fingerprints import Fingerprints, check_duplicates, fingerprints_of, shared
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.maths.linear import correlation_of
@@ -33,7 +35,7 @@ from starcal_uq.observations.table import Observations
 if TYPE_CHECKING:
     import pandas as pd
 
-NOISES = ("common", "own")
+NOISES = ("auto", "common", "own")
 # Up to this many sigmas of a run, its quadratic expansion was never wrong by more than 0.15 nat, even with five frames.
 # Runs of one camera stay within five.
 MAX_DISTANCE = 8.0
@@ -44,26 +46,31 @@ def merge(
     observations: Observations | None = None,
     *,
     names: Sequence[str] | None = None,
-    noise: str = "common",
+    noise: str = "auto",
     allow_inconsistent: bool = False,
+    duplicates: str = "refuse",
 ) -> Calibration:
     """Combine calibrations of the same camera on different frames.
 
     Parameters
     ----------
     calibrations : sequence of Calibration
-        At least two, with the same detector and distortion model, whose frames have nothing in common. The start values
-        (`nominal`) of the first become those of the result, and with them the centre of the default priors.
+        At least two, with the same detector and distortion model. The start values (`nominal`) of the first become
+        those of the result, and with them the centre of the default priors.
     observations : Observations, optional
         All stars, from `join_observations`. With them, residuals and attitudes are those at the merged
         estimate; without, they are the runs' own.
     names : sequence of str, optional
         Names of the runs in messages; ``run 1``... otherwise.
-    noise : {"common", "own"}
+    noise : {"auto", "common", "own"}
         ``common``: one noise for all runs, estimated anew. ``own``: each run keeps its own estimate as stated noise,
         and the result has a common factor on it (`sigma_scale`), which also allows runs with and without stated noises.
+        ``auto``: ``own`` where the runs' noises differ (Bartlett's test at 0.1 %) or are of different kinds.
     allow_inconsistent : bool
         Merge runs that do not show the same camera; the result says so.
+    duplicates : {"refuse", "keep"}
+        What to do with frames that hold the same measurement in two runs: they would count twice. `merge_runs` can
+        also drop them.
 
     Returns
     -------
@@ -76,16 +83,25 @@ def merge(
     CalibrationError
         For runs that cannot be merged: other camera, other kind of noise, shared data, unsound estimates, a shift of
         more than `MAX_DISTANCE` sigmas, or, unless allowed, significantly different cameras.
+    RepeatedFramesError
+        For runs with the same measurements, unless they are kept.
     """
     began = perf_counter()
     names = [f"run {i}" for i in range(1, len(calibrations) + 1)] if names is None else list(names)
-    _check_mergeable(calibrations, names, noise)
+    check_mergeable(calibrations, names, noise, duplicates)
+    marks = _fingerprints(calibrations, observations)
+    unchecked = [name for name, mark in zip(names, marks, strict=True) if mark is None]
+    if duplicates == "refuse":
+        refuse_shared(calibrations, marks, names)
     runs = [optimum(cal.compressed) for cal in calibrations]
+    noise = merging_noise(calibrations, noise)
     units = [run.sigma if noise == "own" else 1.0 for run in runs]
     parts = [scaled(cal.compressed, unit) for cal, unit in zip(calibrations, units, strict=True)]
     best = optimum(total(parts))
     sigma_name = sigma_parameter(True).name if noise == "own" else calibrations[0].sigma_name
-    found = consistency_between(names, calibrations[0].parameter_names, runs, units, best)
+    found = consistency_between(names, calibrations[0].parameter_names, runs, best, noise, unchecked)
+    if len({cal.sigma_name for cal in calibrations}) > 1:
+        found = replace(found, noise_p_value=float("nan"))
     _check_consistent(found, allow_inconsistent)
     theta = best.theta - 0.5 * best.compressed.whitening @ best.compressed.log_determinant_slope
     stage = Stage("merging", best.trajectory, best.cost, Status.CONVERGED, len(best.cost), perf_counter() - began)
@@ -120,7 +136,50 @@ def merge(
         pair_covariance=pair_covariance,
         compressed=best.compressed,
         provenance=_provenance(calibrations, observations, names, noise, found, shifts, runs),
+        fingerprints=Fingerprints.joined([mark for mark in marks if mark is not None]) if not unchecked else None,
     )
+
+
+def merging_noise(calibrations: Sequence[Calibration], noise: str) -> str:
+    """``common`` or ``own``: as given, or as the runs' noises need it where that is ``auto``."""
+    if noise != "auto":
+        return noise
+    one_kind = len({cal.sigma_name for cal in calibrations}) == 1
+    # Where noises differ unnoticed, the common one costs weight, not coverage: the covariance from the mean square of
+    # all residuals is right where runs have their share of the information by their share of the stars.
+    equal = one_kind and _bartlett([optimum(cal.compressed) for cal in calibrations]) >= ALPHA
+    return "common" if equal else "own"
+
+
+def _fingerprints(calibrations: Sequence[Calibration], observations: Observations | None) -> list[Fingerprints | None]:
+    """Those of each run; of runs that lack them, from the rows of all runs, which stand one after the other."""
+    if observations is None or len(observations) != sum(len(cal.residuals_px) for cal in calibrations):
+        return [cal.fingerprints for cal in calibrations]
+    ends = np.cumsum([0, *(len(cal.residuals_px) for cal in calibrations)])
+    place = np.arange(len(observations))
+    return [
+        cal.fingerprints or fingerprints_of(cal, observations.select((place >= first) & (place < last)))
+        for cal, first, last in zip(calibrations, ends[:-1], ends[1:], strict=True)
+    ]
+
+
+def refuse_shared(
+    calibrations: Sequence[Calibration], marks: Sequence[Fingerprints | None], names: Sequence[str]
+) -> None:
+    """Raise for the first two runs that hold the same measurements."""
+    for (i, first), (j, later) in combinations(enumerate(marks), 2):
+        pairs = np.empty((0, 2)) if first is None or later is None else shared(first, later)
+        if len(pairs):
+            ids = np.column_stack([calibrations[i].frame_ids[pairs[:, 0]], calibrations[j].frame_ids[pairs[:, 1]]])
+            n = len(np.unique(pairs[:, 1]))
+            one = f"frame {ids[0, 1]} holds the same measurement as frame {ids[0, 0]} of {names[i]}"
+            more = f", and {n - 1} more of its {calibrations[j].n_frames} frames repeat others" if n > 1 else ""
+            raise RepeatedFramesError(
+                f"{names[j]}: {one}{more}, which would count twice: leave the shared frames out "
+                "(duplicates='drop', --duplicates drop, where the runs hold their observations), or, if you know them "
+                "to be exposures of their own, keep them (duplicates='keep').",
+                pairs=ids.tolist(),
+            )
 
 
 def renumbered(frame_ids: Sequence[IntArray]) -> tuple[IntArray, list[int]]:
@@ -135,7 +194,11 @@ def renumbered(frame_ids: Sequence[IntArray]) -> tuple[IntArray, list[int]]:
     return np.concatenate([ids + shift for ids, shift in zip(frame_ids, shifts, strict=True)]), shifts
 
 
-def _check_mergeable(calibrations: Sequence[Calibration], names: Sequence[str], noise: str) -> None:
+def check_mergeable(
+    calibrations: Sequence[Calibration], names: Sequence[str], noise: str, duplicates: str = "refuse"
+) -> None:
+    """Refuse runs that cannot be merged, whatever their estimates."""
+    check_duplicates(duplicates)
     if noise not in NOISES:
         raise CalibrationError(f"noise {noise!r} is unknown: use one of {', '.join(NOISES)}.")
     if len(calibrations) < 2:
@@ -167,7 +230,7 @@ def _check_mergeable(calibrations: Sequence[Calibration], names: Sequence[str], 
                 f"{name}: was calibrated with the likelihood {likelihood!r}, which does not add up in compressed "
                 "form: calibrate it with the marginal likelihood, or calibrate all observations together."
             )
-        for value in data_hashes(cal.provenance):
+        for value in data_hashes(cal.provenance) if duplicates == "refuse" else ():
             if value in seen:
                 raise CalibrationError(
                     f"{name}: holds the same observations as {seen[value]}, which would count twice: leave one out."
@@ -257,8 +320,8 @@ class Consistency(Shown):
         The p camera parameters.
     statistic : float
         F.
-    dof : tuple of int
-        Degrees of freedom of the statistic: (R - 1) p, and those of the pooled noise.
+    dof : (int, float)
+        Degrees of freedom of the statistic: (R - 1) p, and those that the runs' noise estimates leave it.
     p_value : float
         Probability of a larger F if all runs show the same camera.
     distance_sigma : array (R,)
@@ -270,7 +333,7 @@ class Consistency(Shown):
     sigma : array (R,)
         Noise of each run.
     noise_p_value : float
-        Probability of noises that differ as much, if they are the same; NaN where each run keeps its own.
+        Probability of noises that differ as much, if they are the same; NaN where they are of different kinds.
     messages : tuple of str
         Sentences on what deserves attention.
     """
@@ -278,7 +341,7 @@ class Consistency(Shown):
     names: tuple[str, ...]
     parameter_names: tuple[str, ...]
     statistic: float
-    dof: tuple[int, int]
+    dof: tuple[int, float]
     p_value: float
     distance_sigma: FloatArray
     run_p_value: FloatArray
@@ -289,7 +352,7 @@ class Consistency(Shown):
 
     @property
     def ok(self) -> bool:
-        """True if neither the cameras nor the noises differ significantly."""
+        """True if nothing deserves attention: neither cameras nor noises differ, and all frames could be compared."""
         return not self.messages
 
     @property
@@ -326,63 +389,103 @@ def consistency_between(
     names: Sequence[str],
     parameter_names: Sequence[str],
     runs: Sequence[Optimum],
-    units: Sequence[float],
     merged: Optimum,
+    noise: str,
+    unchecked: Sequence[str] = (),
 ) -> Consistency:
-    """Compare the optima of runs with the merged one.
+    """Compare the optima of runs with each other and with the merged one.
 
-    `units` divide each run's residuals in the merged sum: 1, or the run's own noise.
+    Every run is weighed by its own noise, however they are merged: what differs by noise is then no sign of another
+    camera. `noise` is how they are merged, and `unchecked` names runs that may share frames with others.
     """
-    from scipy.special import fdtrc
-
     p = len(merged.theta)
-    own = float(sum(run.sum_of_squares / unit**2 for run, unit in zip(runs, units, strict=True)))
-    dof = ((len(runs) - 1) * p, sum(run.dof for run in runs))
-    pooled = own / dof[1]
-    statistic = max(merged.sum_of_squares - own, 0.0) / dof[0] / pooled
+    weighed = optimum(total([scaled(run.compressed, run.sigma) for run in runs]))
+    square = max(weighed.sum_of_squares - sum(run.dof for run in runs), 0.0)
+    scale = correlation_of(weighed.covariance)[1]
+    information = np.array([run.information for run in runs]) * np.outer(scale, scale)
+    together = np.linalg.inv(information.sum(axis=0))
+    dof = np.array([run.dof for run in runs], dtype=np.float64)
+    statistic, second, p_value = welch_james(square, information, dof)
     distance, run_p, z = [], [], []
-    reduced, scale = correlation_of(merged.covariance)
-    for run, unit in zip(runs, units, strict=True):
-        shift = (run.theta - merged.theta) / scale
-        # The run's covariance at the pooled noise; that of its difference from a mean it is part of is the difference.
-        covariance = run.covariance * (pooled * unit**2 / run.sigma**2) / np.outer(scale, scale)
-        information = run.information * np.outer(scale, scale)
-        difference = covariance - reduced * (pooled / merged.sigma**2)
-        distance.append(float(np.sqrt(shift @ information @ shift)))
-        square = float(shift @ np.linalg.solve(difference, shift))
-        run_p.append(float(fdtrc(p, dof[1], max(square, 0.0) / p)))
+    for i, run in enumerate(runs):
+        away = (run.theta - merged.theta) / scale
+        distance.append(float(np.sqrt(away @ information[i] @ away)))
+        shift = (run.theta - weighed.theta) / scale
+        # The covariance of a difference from a mean it is part of is the difference.
+        difference = np.linalg.inv(information[i]) - together
+        others = np.delete(np.arange(len(runs)), i)
+        share = np.array([np.trace(together @ information[j]) for j in others])
+        rest = 1.0 / float(np.sum((share / share.sum()) ** 2 / dof[others]))
+        alone = np.array([information[i], information[others].sum(axis=0)])
+        distant = float(shift @ np.linalg.solve(difference, shift))
+        run_p.append(welch_james(max(distant, 0.0), alone, np.array([dof[i], rest]))[2])
         z.append(shift / np.sqrt(np.diag(difference)))
-    noise_p = float("nan") if any(unit != 1.0 for unit in units) else _bartlett(runs)
     found = Consistency(
         names=tuple(names),
         parameter_names=tuple(parameter_names),
-        statistic=float(statistic),
-        dof=dof,
-        p_value=float(fdtrc(*dof, statistic)),
+        statistic=statistic,
+        dof=((len(runs) - 1) * p, second),
+        p_value=p_value,
         distance_sigma=np.array(distance),
         run_p_value=np.array(run_p),
         z=np.array(z),
         sigma=np.array([run.sigma for run in runs]),
-        noise_p_value=noise_p,
+        noise_p_value=_bartlett(runs),
         messages=(),
     )
-    return _with_messages(found)
+    return _with_messages(found, noise, unchecked)
 
 
-def _with_messages(consistency: Consistency) -> Consistency:
+def welch_james(square: float, information: FloatArray, dof: FloatArray) -> tuple[float, float, float]:
+    """F, its second degrees of freedom, and p of R estimates weighed by their own estimated noises.
+
+    The statistic ``sum (theta_i - mean)^T I_i (theta_i - mean)`` is a chi-square with q = (R - 1) p degrees of freedom
+    where the noises are known. Of noises with nu_i degrees of freedom its mean is q + 2 A and its variance
+    2 q + 12 A + 2 B to first order in 1 / nu, with A = sum tr((1 - G_i)^2) / nu_i, B = sum tr(1 - G_i)^2 / nu_i and
+    G_i the share of run i in the whole information. c F with q and q (q + 2) / (2 A + B) degrees of freedom has the
+    same mean and variance; for one parameter this is the test of Welch (1951), and for p > 1 it is to unknown scalars
+    what James (1954) and Johansen (1980) are to unknown matrices.
+
+    Parameters
+    ----------
+    square : float
+        The statistic.
+    information : (R, p, p) array
+        Information of each estimate at its own noise.
+    dof : (R,) array
+        Degrees of freedom of each noise.
+    """
+    from scipy.special import fdtrc
+
+    n, p = information.shape[:2]
+    q = (n - 1) * p
+    lost = np.eye(p) - np.linalg.solve(information.sum(axis=0), information)
+    a = float(np.sum(np.einsum("rij,rji->r", lost, lost) / dof))
+    b = float(np.sum(np.einsum("rii->r", lost) ** 2 / dof))
+    second = q * (q + 2.0) / (2.0 * a + b)
+    f = square / (q + 2.0 * a - 2.0 * q / second)
+    return float(f), float(second), float(fdtrc(q, second, f))
+
+
+def _with_messages(consistency: Consistency, noise: str, unchecked: Sequence[str]) -> Consistency:
     messages = []
     if consistency.p_value < ALPHA:
         messages.append(
             f"The runs do not show the same camera (p = {consistency.p_value:.2g}): {consistency.odd_one_out}; the "
             f"merged sigmas are too small by a factor of about {np.sqrt(consistency.statistic):.2g}."
         )
-    if consistency.noise_p_value < ALPHA:
+    if noise == "common" and consistency.noise_p_value < ALPHA:
         values = ", ".join(
             f"{name} {sigma:.3g}" for name, sigma in zip(consistency.names, consistency.sigma, strict=True)
         )
         messages.append(
             f"The runs differ in noise (p = {consistency.noise_p_value:.2g}; {values}): merge with noise 'own', which "
             "weights each run by its own."
+        )
+    if unchecked:
+        messages.append(
+            f"Whether frames are shared cannot be checked for {', '.join(unchecked)}, whose calibration holds no "
+            "fingerprints of its frames: calibrate again to have it checked."
         )
     return replace(consistency, messages=tuple(messages))
 

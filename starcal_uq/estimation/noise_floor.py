@@ -115,7 +115,7 @@ def settle_noise(obs: Observations, cal: Calibration) -> Observations:
         if not found.needed:
             break
         before = found.floor_px
-        found = noise_floor(calibrate(raised, cal.nominal), raised, obs.sigma_px)
+        found = noise_floor(calibrate(raised, cal.nominal, duplicates="keep"), raised, obs.sigma_px)
         raised = with_noise_floor(obs, found)
         if abs(found.floor_px - before) < _SETTLED * before:
             break

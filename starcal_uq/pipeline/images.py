@@ -174,6 +174,8 @@ def observations_from_images(
         stars,
         prepare=prepare,
         to_catalogue=to_catalogue if motion else None,
+        # The calibration of the run will ask which frames repeat others.
+        method={"duplicates": "keep"},
         identification={"engine": engine},
     )
     return settle_noise(found.observations, found.calibration), centroids, found

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.core.display import Shown
-from starcal_uq.core.errors import CalibrationError, IdentificationError
+from starcal_uq.core.errors import CalibrationError, IdentificationError, RepeatedFramesError
 from starcal_uq.core.formatting import plural
 from starcal_uq.identification.engine import identify
 from starcal_uq.pipeline.displacement import ToCatalogue, as_measured, mirrored, undisplaced
@@ -102,7 +102,11 @@ def identify_and_calibrate(
             raise IdentificationError(f"no frame is identified: {found.text}")
         obs = found.observations if prepare is None else prepare(found.observations)
         try:
-            known = calibrate(obs, found.nominal if number == 0 else rounds[0][0].nominal, **(method or {}))
+            # Which frames repeat others is asked once, at the end.
+            asked = {**(method or {}), **({"duplicates": "keep"} if number == 0 else {})}
+            known = calibrate(obs, found.nominal if number == 0 else rounds[0][0].nominal, **asked)
+        except RepeatedFramesError:
+            raise
         except CalibrationError as error:
             stars_words, frames_words = plural(obs.n_stars, "star"), plural(found.n_identified, "frame")
             raise CalibrationError(

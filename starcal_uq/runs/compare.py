@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from starcal_uq.comparison.compare import compare, compare_halves
 from starcal_uq.core.errors import ComparisonError, RunFolderError
+from starcal_uq.estimation.fingerprints import fingerprints_of
 from starcal_uq.runs.run import Run
 
 if TYPE_CHECKING:
@@ -50,9 +51,12 @@ def compare_runs(
         labels = (first.name, second.name) if first.name != second.name else (str(run_a), str(run_b))
     table_a, table_b = _table(first), _table(second)
     observations = None if table_a is None or table_b is None else (table_a, table_b)
+    fingerprints = fingerprints_of(calibrations[0], table_a), fingerprints_of(calibrations[1], table_b)
     sampled = first.has("posterior") and second.has("posterior")
     pair: tuple[Any, Any] = (first.posterior, second.posterior) if sampled else calibrations
-    return compare(*pair, labels=labels, same_data=same_data, observations=observations, **options)
+    return compare(
+        *pair, labels=labels, same_data=same_data, observations=observations, fingerprints=fingerprints, **options
+    )
 
 
 def compare_split(run: PathLike, how: str = "odd-even", *, seed: int = 0, **options: Any) -> CameraComparison:

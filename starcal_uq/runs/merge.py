@@ -10,9 +10,11 @@ import numpy as np
 from starcal_uq.core.errors import CalibrationError, RunFolderError
 from starcal_uq.core.files import PathLike, check_new_folder
 from starcal_uq.core.types import AnyDict, FloatArray, StrArray
+from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.compressed import optimum
-from starcal_uq.estimation.merging import merge, renumbered
+from starcal_uq.estimation.fingerprints import fingerprints_of, shared
+from starcal_uq.estimation.merging import check_mergeable, merge, merging_noise, refuse_shared, renumbered
 from starcal_uq.observations.columns import COLUMNS
 from starcal_uq.observations.table import Observations
 from starcal_uq.runs.run import Run
@@ -22,8 +24,9 @@ def merge_runs(
     paths: Sequence[PathLike],
     out: PathLike | None = None,
     *,
-    noise: str = "common",
+    noise: str = "auto",
     allow_inconsistent: bool = False,
+    duplicates: str = "refuse",
     force: bool = False,
 ) -> Calibration:
     """Merge run folders and write the result as a run folder.
@@ -40,6 +43,9 @@ def merge_runs(
         Folder to write; nothing is written without it.
     noise, allow_inconsistent
         As in `merging.merge`.
+    duplicates : {"refuse", "drop", "keep"}
+        What to do with frames that hold the same measurement in two runs. ``drop`` leaves them out of the later run,
+        which is calibrated again without them and must hold its observations for that.
     force : bool
         Replace the results in `out` if it is not empty.
 
@@ -54,6 +60,8 @@ def merge_runs(
         If a folder lacks its calibration, or `out` is one of the runs, or not empty.
     CalibrationError
         If the runs cannot be merged.
+    RepeatedFramesError
+        If they hold the same measurements, and those are refused.
     """
     runs = [Run(path) for path in paths]
     target = None if out is None else Run(out)
@@ -62,19 +70,34 @@ def merge_runs(
     calibrations = [run.calibration for run in runs]
     names = _names(runs)
     tables = [_own_observations(run) for run in runs]
+    if duplicates == "drop":
+        _drop_shared(calibrations, tables, names)
+        duplicates = "refuse"
+    check_mergeable(calibrations, names, noise, duplicates)
     present = [table for table in tables if table is not None]
     joined = None
     if len(present) == len(tables) and len(present) > 1:
+        if duplicates == "refuse":
+            # Said before the joined table finds stars that agree to the last bit: by frames, with the way out.
+            marks = [fingerprints_of(cal, table) for cal, table in zip(calibrations, present, strict=True)]
+            refuse_shared(calibrations, marks, names)
+        noise = merging_noise(calibrations, noise)
         stated = [optimum(cal.compressed).sigma for cal in calibrations] if noise == "own" else None
-        joined = join_observations(present, names, stated)
-    merged = merge(calibrations, joined, names=names, noise=noise, allow_inconsistent=allow_inconsistent)
+        joined = join_observations(present, names, stated, keep_shared=duplicates == "keep")
+    merged = merge(
+        calibrations, joined, names=names, noise=noise, allow_inconsistent=allow_inconsistent, duplicates=duplicates
+    )
     if target is not None:
         target.write(merged, joined)
     return merged
 
 
 def join_observations(
-    tables: Sequence[Observations], names: Sequence[str], noise: Sequence[float] | None = None
+    tables: Sequence[Observations],
+    names: Sequence[str],
+    noise: Sequence[float] | None = None,
+    *,
+    keep_shared: bool = False,
 ) -> Observations:
     """All rows in one table, frames renumbered run by run.
 
@@ -89,6 +112,8 @@ def join_observations(
         What the runs are called.
     noise : sequence of float, optional
         Noise of each run, px or a factor on what its stars state, to be written as their stated noise.
+    keep_shared : bool
+        Whether stars that two runs hold are let pass.
 
     Raises
     ------
@@ -116,7 +141,8 @@ def join_observations(
             [_gaps(name, len(t)) if v is None else v for t, v in zip(tables, values, strict=True)]
         )
     columns["frame"] = np.concatenate([table.frame + shift for table, shift in zip(tables, shifts, strict=True)])
-    _check_disjoint(columns, tables, names)
+    if not keep_shared:
+        _check_disjoint(columns, tables, names)
     parts = [
         {"name": name, "frame_shift": shift, "n_frames": table.n_frames, "data_sha256": table.data_hash}
         for name, shift, table in zip(names, shifts, tables, strict=True)
@@ -152,6 +178,28 @@ def _check_disjoint(columns: AnyDict, tables: Sequence[Observations], names: Seq
             f"{names[second]}: {int(np.sum(shared))} of its stars are measurements that another run holds too (first "
             f"{names[first]}), which would count twice: leave one of the runs out, or calibrate them apart."
         )
+
+
+def _drop_shared(calibrations: list[Calibration], tables: list[Observations | None], names: Sequence[str]) -> None:
+    """Leave the frames that an earlier run holds out of each later run, and calibrate it again."""
+    for i, (name, table) in enumerate(zip(names, tables, strict=True)):
+        marks = [fingerprints_of(cal, obs) for cal, obs in zip(calibrations[: i + 1], tables, strict=False)]
+        own = marks.pop()
+        places = [shared(mark, own)[:, 1] for mark in marks if mark is not None and own is not None]
+        repeating = np.unique(np.concatenate(places)) if places else np.empty(0, dtype=np.int64)
+        if not len(repeating):
+            continue
+        cal = calibrations[i]
+        if len(repeating) == cal.n_frames:
+            raise CalibrationError(f"{name}: all of its frames are measurements that earlier runs hold: leave it out.")
+        if table is None:
+            raise CalibrationError(
+                f"{name}: {len(repeating)} of its frames are measurements that an earlier run holds, and it has no "
+                "observations to be calibrated again without them: leave one of the runs out."
+            )
+        rest = table.select_frames(np.delete(table.frame_ids, repeating))
+        tables[i] = rest
+        calibrations[i] = calibrate(rest, cal.nominal, method=cal.method, duplicates="keep")
 
 
 def _own_observations(run: Run) -> Observations | None:

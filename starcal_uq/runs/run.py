@@ -337,6 +337,8 @@ class Run:
             from starcal_uq.estimation.calibrate import calibrate
 
             calibration = calibrate(obs, camera, **options)
+            if calibration.n_frames < obs.n_frames:
+                obs = obs.select_frames(calibration.frame_ids)
         check_new_folder(self.path, force)
         self.write(calibration, obs)
         if screened is not None:

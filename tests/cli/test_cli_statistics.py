@@ -62,6 +62,20 @@ def test_merge_combines_two_halves(cli, inputs, tmp_path):
     assert "error: " in err
 
 
+def test_a_table_that_holds_its_frames_twice_is_refused(cli, inputs, tmp_path):
+    table = pd.read_csv(inputs / "obs.csv")
+    again = table.assign(frame=table["frame"] + 5000, x_px=table["x_px"] + 0.001).drop(index=[3, 50])
+    pd.concat([table, again]).to_csv(inputs / "twice.csv", index=False)
+    status, _, err = cli("calibrate", inputs / "twice.csv", inputs / "camera.toml", "-o", "run")
+    assert status == 2
+    assert "holds the same measurement as frame 0" in " ".join(err.split())
+    assert not (tmp_path / "run").exists()
+    call = ("calibrate", inputs / "twice.csv", inputs / "camera.toml", "-o", "run", "--duplicates")
+    assert cli(*call, "drop")[0] == 0
+    assert sc.Run(tmp_path / "run").observations.n_frames == table["frame"].nunique()
+    assert cli(*call, "perhaps", "--force")[0] == 2
+
+
 def test_screen_lists_what_it_left_out(cli, inputs, tmp_path):
     table = pd.read_csv(inputs / "obs.csv")
     table.loc[5, ["ra_deg", "dec_deg"]] = [(table.loc[5, "ra_deg"] + 40.0) % 360.0, -table.loc[5, "dec_deg"]]

@@ -100,12 +100,13 @@ def test_saves_itself_without_loss(tmp_path):
         ours, theirs = getattr(cal, field.name), getattr(again, field.name)
         if isinstance(ours, np.ndarray):
             assert np.array_equal(ours, theirs), field.name
-        elif field.name not in ("stages", "compressed"):
+        elif field.name not in ("stages", "compressed", "fingerprints"):
             assert ours == theirs, field.name
     for ours, theirs in zip(cal.stages, again.stages, strict=True):
         assert np.array_equal(ours.trajectory, theirs.trajectory)
         assert ours.status is theirs.status
     assert np.array_equal(cal.compressed.gram, again.compressed.gram)
+    assert np.array_equal(cal.fingerprints.xy_px, again.fingerprints.xy_px)
     assert list(cal.to_dataframe()["parameter"]) == ["x0", "y0", "f", "k1", "k2", "sigma"]
     assert "focal length" in cal._repr_html_()
     with pytest.raises(RunFolderError, match=r"missing\.json"):

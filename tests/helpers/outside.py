@@ -47,6 +47,8 @@ def campaign(
     patch_stars: int | None = None,
     star_sigma_px: float = 0.0,
     frame_focal: float = 0.0,
+    pointings: int | None = None,
+    drift_px: float = 0.0,
 ) -> Campaign:
     """Observe.
 
@@ -54,7 +56,9 @@ def campaign(
     number or a function of (radius over the half diagonal, magnitude, frame number). With `patch_stars` all frames see
     the same stars, that many over a patch that random rolls and pointings of up to a fifth of the field stay within;
     otherwise every frame has stars of its own. `star_sigma_px` is the error per axis of each star's own direction, the
-    same whenever it is seen; `frame_focal` the relative spread of the focal length from frame to frame.
+    same whenever it is seen; `frame_focal` the relative spread of the focal length from frame to frame. With
+    `pointings` the camera stares: frames take turns at so many attitudes, each with the same stars whenever it comes
+    round, and `drift_px` further along the rows from one turn to the next.
     """
     focal = 0.5 * size_px / np.tan(np.radians(0.5 * field_deg))
     x0, y0 = 0.5 * size_px - 12.0, 0.5 * size_px + 18.0
@@ -64,9 +68,17 @@ def campaign(
     magnitudes = None if patch_stars is None else rng.uniform(2.0, 6.0, patch_stars)
     offsets = None if patch_stars is None else star_sigma_px / focal * rng.standard_normal((patch_stars, 2))
     rows: dict[str, list[np.ndarray]] = {name: [] for name in ("frame", "x", "y", "r", "id", "mag")}
-    attitudes = []
+    attitudes: list[np.ndarray] = []
+    views: list[tuple[np.ndarray, ...]] = []
     for frame in range(n_frames):
-        if patch is None:
+        if pointings is not None and frame >= pointings:
+            attitude, stars, mag, number, own = views[frame % pointings]
+            angle = drift_px / focal * (frame // pointings)
+            turn = np.array(
+                [[np.cos(angle), 0.0, np.sin(angle)], [0.0, 1.0, 0.0], [-np.sin(angle), 0.0, np.cos(angle)]]
+            )
+            attitude = turn @ attitude
+        elif patch is None:
             attitude = frame_at(rng, random_unit(rng))
             stars = cap(rng, attitude[2], 0.75 * field_deg, 6 * stars_per_frame)
             mag, number = rng.uniform(2.0, 6.0, len(stars)), np.arange(len(stars)) + 1000 * frame
@@ -74,6 +86,8 @@ def campaign(
         else:
             attitude = frame_at(rng, cap(rng, np.array([0.3, -0.5, 0.8]), 0.2 * field_deg, 1)[0])
             stars, mag, number, own = patch, magnitudes, np.arange(len(patch)), offsets
+        if pointings is not None and frame < pointings:
+            views.append((attitude, stars, mag, number, own))
         f = focal * (1.0 + frame_focal * rng.standard_normal())
         # What shines is where the star is; what the table states is off by the star's own error.
         b = stars @ attitude.T
@@ -82,7 +96,8 @@ def campaign(
         stretch = 1.0 + k1 * r2 + k2 * r2**2
         x, y = x0 + (x - x0) * stretch, y0 + (y - y0) * stretch
         seen = np.flatnonzero((b[:, 2] > 0.3) & (x > 0) & (x < size_px - 1) & (y > 0) & (y < size_px - 1))
-        seen = seen[rng.permutation(len(seen))[:stars_per_frame]]
+        chosen = np.arange(len(seen)) if pointings is not None else rng.permutation(len(seen))
+        seen = seen[chosen[:stars_per_frame]]
         radius = np.sqrt(r2[seen]) / corner
         sigma = sigma_px(radius, mag[seen], np.full(len(seen), frame)) if callable(sigma_px) else sigma_px
         noise = sigma * rng.standard_normal((2, len(seen)))
@@ -102,6 +117,27 @@ def campaign(
         "mag": np.concatenate(rows["mag"]),
     }
     return Campaign(columns, np.array([x0, y0, focal, k1, k2]), np.array(attitudes), size_px)
+
+
+def measured_again(
+    rng: np.random.Generator,
+    columns: dict[str, np.ndarray],
+    error_px: float,
+    *,
+    origin_px: float = 0.0,
+    lost: float = 0.07,
+) -> dict[str, np.ndarray]:
+    """The same images by another program: its own errors and origin, some stars lost, other numbers and order.
+
+    Frame numbers run backwards from 1000 on; names and magnitudes are not known.
+    """
+    frame = columns["frame"]
+    kept = rng.random(len(frame)) > lost
+    order = rng.permutation(np.flatnonzero(kept))
+    again = {name: columns[name][order] for name in ("frame", "x_px", "y_px", "ra_deg", "dec_deg")}
+    for name in ("x_px", "y_px"):
+        again[name] = again[name] + origin_px + error_px * rng.standard_normal(len(order))
+    return again | {"frame": 1000 + frame.max() - again["frame"]}
 
 
 def random_unit(rng: np.random.Generator) -> np.ndarray:

@@ -20,6 +20,7 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray
 from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.estimation.fingerprints import check_duplicates, repeating_frames
 from starcal_uq.estimation.screening.consensus import MIN_STARS, consensus, measured_directions, pre_screen
 from starcal_uq.estimation.screening.outliers import (
     StarResiduals,
@@ -70,6 +71,7 @@ def screen(
     max_rounds: int = 10,
     throw: bool = True,
     noise: str = "common",
+    duplicates: str = "refuse",
     **options: Any,
 ) -> Screening:
     """Find wrong identifications and calibrate on the rest.
@@ -95,6 +97,8 @@ def screen(
     noise : {"common", "model"}
         As for `calibrate`. With ``model``, stars are screened a second time, with the noise that the model fitted to
         those kept at first gives each of them.
+    duplicates : {"refuse", "drop", "keep"}
+        As for `calibrate`; asked once, of the rows that are kept.
     **options
         Passed on to `calibrate`, such as ``solver``.
 
@@ -110,8 +114,11 @@ def screen(
     ValueError
         For a significance, control or number of rounds that makes no sense.
     """
+    check_duplicates(duplicates)
+    options["duplicates"] = "keep"
     if noise != "common":
         settings = {"significance": significance, "control": control, "max_rounds": max_rounds, "throw": throw}
+        settings["duplicates"] = duplicates
         return _with_noise_model(obs.unweighted, camera, settings, options | {"noise": noise})
     frames = StarFrames.from_observations(obs)
     rates = _rates(frames, significance, control, max_rounds)
@@ -138,6 +145,10 @@ def screen(
     if throw and not calibration.status.ok:
         # For the error alone.
         calibration = calibrate(kept, camera, **options)
+    repeating = repeating_frames(calibration, duplicates)
+    if len(repeating):
+        again = {"significance": significance, "control": control, "max_rounds": max_rounds, "throw": throw, **options}
+        return screen(obs.select_frames(np.setdiff1d(obs.frame_ids, repeating)), camera, **again)
     residuals = star_residuals(frames, calibration.camera.distortion, calibration.theta, use)
     table = rejected_table(obs, residuals, rates.star, rates.frame, rates.shrinkage)
     add_dropped_frames(table, obs, calibration.camera, tested.vote_rad, tested.disturbed, rates.frame)
@@ -172,7 +183,7 @@ def screen(
 
 def _with_noise_model(obs: Observations, camera: Camera, settings: AnyDict, options: AnyDict) -> Screening:
     """Screen with one noise, fit how it varies, screen with that; what is kept gets a model of its own."""
-    plain = {name: value for name, value in options.items() if name != "noise"}
+    plain = {name: value for name, value in options.items() if name not in ("noise", "duplicates")}
     first = screen(obs, camera, **settings, **plain)
     model = calibrate(first.observations, camera, throw=settings["throw"], **options).noise_model
     if model is not None and model.varies:

@@ -97,7 +97,7 @@ def consistency_text(consistency: Consistency) -> str:
     """Whether the runs show the same camera."""
     verdict = "show the same camera" if consistency.p_value >= ALPHA else "do not show the same camera"
     return (
-        f"The runs {verdict} (F = {consistency.statistic:.3g} with {consistency.dof[0]} and {consistency.dof[1]} "
+        f"The runs {verdict} (F = {consistency.statistic:.3g} with {consistency.dof[0]} and {consistency.dof[1]:.0f} "
         f"degrees of freedom, p = {consistency.p_value:.2g})."
     )
 

@@ -1,0 +1,370 @@
+"""Fingerprints of frames, and which frames hold the same measurement twice.
+
+Two exposures of one sky have noise of their own: their positions differ by sqrt(2) sigma, even if the camera stood
+still. An image that is measured again, by other software or with stars more or fewer, keeps its noise. So a frame
+leaves its few most central stars, as positions with the size of their errors, and two frames are one measurement where
+the positions differ by much less than the errors would have them.
+
+With u = (e_k - e_l) / sqrt(2) and v = (e_k + e_l) / sqrt(2) independent for independent errors e of equal size, the
+share |u|^2 / (|u|^2 + |v|^2) = r / 2 has a beta distribution with half the degrees of freedom on either side, whatever
+the noise is. r is 1 on average for two exposures, and eta^2 / 2 for positions that were measured again to within eta
+sigma.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.observations.table import Observations
+
+DUPLICATES = ("refuse", "drop", "keep")
+# Stars of a frame that are kept, and of those the ones by whose triangles frames are looked up.
+_MARKS, _CORNERS = 12, 5
+# Positions of one image by two programs may be off by another origin, px; stars are paired over twice that.
+_SHIFT = 1.5
+# Largest r of one measurement: positions within 0.3 sigma, errors correlated by more than 0.95.
+_SAME = 0.05
+# Below it, no error that a star or a pixel repeats from exposure to exposure is so much larger than the noise.
+_COPY = 0.002
+# Probability that a table without repeated frames is said to have any.
+_FALSE_ALARM = 1e-6
+# From so many other frames of one pointing on, they tell how much error exposures share; so many are asked.
+_STARE, _ASKED = 5, 8
+_MOST_CANDIDATES, _PART = 2_000_000, 20_000
+# Terms of a smooth misfit up to the fifth degree, with so many stars for each, from at most so many stars.
+_DEGREE, _STARS_PER_TERM, _MOST_STARS = 5, 20, 50_000
+
+
+@dataclass(frozen=True, eq=False)
+class Fingerprints:
+    """What identifies the frames of a calibration: at most 12 stars each, 12 bytes a star.
+
+    Attributes
+    ----------
+    sizes : (K,) array of int
+        Stars in each frame; the min(12, size) nearest to the detector's centre are kept, frame by frame.
+    xy_px : (M, 2) array of float32
+        Their positions, px.
+    error_px : (M,) array of float32
+        Length of their residuals, px, without the part that varies smoothly over the detector, and brought to the
+        noise by the degrees of freedom that the attitude takes.
+    """
+
+    sizes: IntArray
+    xy_px: NDArray[np.float32]
+    error_px: NDArray[np.float32]
+
+    @classmethod
+    def of(cls, obs: Observations, residuals_px: FloatArray, centre_px: tuple[float, float]) -> Fingerprints:
+        """Take those of a table with its residuals (N, 2)."""
+        sizes = obs.stars_per_frame
+        distance = np.hypot(*(obs.xy - centre_px).T)
+        order = np.lexsort((distance, obs.frame))
+        rank = np.arange(len(order)) - np.repeat(obs.frame_starts[:-1], sizes)
+        rows = order[rank < _MARKS]
+        error = np.linalg.norm(_unsmooth(obs.xy, residuals_px, rows), axis=1)
+        free = np.sqrt(1.0 - 1.5 / np.maximum(sizes, 2))
+        error /= np.repeat(free, np.minimum(sizes, _MARKS))
+        return cls(sizes.astype(np.int64), obs.xy[rows].astype(np.float32), error.astype(np.float32))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Fingerprints]) -> Fingerprints:
+        """Those of several runs, one after the other."""
+        return cls(
+            np.concatenate([part.sizes for part in parts]),
+            np.concatenate([part.xy_px for part in parts]),
+            np.concatenate([part.error_px for part in parts]),
+        )
+
+    def equal(self, other: Fingerprints, pairs: IntArray) -> bool:
+        """Whether all pairs (n, 2) of frames, those of `self` and of `other`, have their stars at the same pixels."""
+        places = (np.split(one.xy_px, np.cumsum(one.counts)[:-1]) for one in (self, other))
+        mine, theirs = places
+        return all(np.array_equal(mine[i], theirs[j]) for i, j in pairs)
+
+    @property
+    def counts(self) -> IntArray:
+        """Stars kept of each frame, (K,)."""
+        return np.minimum(self.sizes, _MARKS)
+
+
+def _unsmooth(xy: FloatArray, residuals: FloatArray, rows: IntArray) -> FloatArray:
+    """Residuals of some rows without a polynomial over the detector: what a model cannot follow is no noise."""
+    step = max(1, len(xy) // _MOST_STARS)
+    place = xy - xy.mean(axis=0)
+    place /= np.abs(place).max() or 1.0
+    degree = max(d for d in range(_DEGREE + 1) if d == 0 or (d + 1) * (d + 2) // 2 * _STARS_PER_TERM <= len(xy))
+
+    def terms(at: FloatArray) -> FloatArray:
+        x, y = (np.vander(values, degree + 1, increasing=True) for values in at.T)
+        return np.column_stack([x[:, i] * y[:, j] for i in range(degree + 1) for j in range(degree + 1 - i)])
+
+    length = np.linalg.norm(residuals, axis=1)
+    # A few wrong stars would bend the polynomial for all others.
+    used = np.flatnonzero(length <= 5.0 * np.median(length))[::step]
+    x = terms(place[used])
+    solution = np.linalg.lstsq(x.T @ x, x.T @ residuals[used], rcond=None)[0]
+    return np.asarray(residuals[rows] - terms(place[rows]) @ solution)
+
+
+def fingerprints_of(calibration: Calibration, obs: Observations | None = None) -> Fingerprints | None:
+    """Those of a calibration; where a version before this one made it, from its observations, if there are any."""
+    if calibration.fingerprints is not None or obs is None or len(obs) != len(calibration.residuals_px):
+        return calibration.fingerprints
+    return Fingerprints.of(obs, calibration.residuals_px, calibration.camera.centre_px)
+
+
+def repeated_frames(a: Calibration, b: Calibration | None = None) -> IntArray:
+    """Frames that hold the same measurement, whatever their numbers, order and stars.
+
+    Parameters
+    ----------
+    a : Calibration
+        A calibration with fingerprints.
+    b : Calibration, optional
+        Another, whose frames are compared with those of `a`; otherwise those of `a` are compared with each other.
+
+    Returns
+    -------
+    (n, 2) array of int
+        Frame numbers: of the first and the repeating frame, or of the frame of `a` and that of `b`.
+
+    Raises
+    ------
+    RepeatedFramesError
+        If a calibration has no fingerprints: it was made from a stream or by a version without them.
+    """
+    given = [a] if b is None else [a, b]
+    marks = [calibration.fingerprints for calibration in given]
+    present = [one for one in marks if one is not None]
+    if len(present) < len(given):
+        raise RepeatedFramesError(
+            "a calibration without fingerprints of its frames cannot be checked: calibrate again."
+        )
+    if b is None:
+        return np.asarray(a.frame_ids[repeats(present[0])])
+    pairs = shared(*present)
+    return np.column_stack([a.frame_ids[pairs[:, 0]], b.frame_ids[pairs[:, 1]]])
+
+
+def shared(a: Fingerprints, b: Fingerprints) -> IntArray:
+    """Places (n, 2) of frames of `a` that `b` repeats, and of those in `b`."""
+    n = len(a.sizes)
+    group = np.repeat([0, 1], [n, len(b.sizes)])
+    pairs: IntArray = repeats(Fingerprints.joined([a, b]), group) - np.array([0, n], dtype=np.int64)
+    return pairs
+
+
+def repeats(marks: Fingerprints, group: IntArray | None = None) -> IntArray:
+    """Places (n, 2), ascending in each row, of frames that are one measurement; with `group`, of different groups.
+
+    A pair counts where r is at most 0.05 and its probability for independent exposures, times the frames of the same
+    pointing and the number of all frames, is below 1e-6; or, where pairs are less certain one by one, where more of
+    them than chance gives (1e-6) have a probability below 1 %. Frames of one pointing from five others on tell how
+    much of their error exposures share (the stars' own, or the pixels'), and a repeated one then shares more.
+    """
+    nothing = np.empty((0, 2), dtype=np.int64)
+    if np.count_nonzero(marks.sizes >= 3) < 2:
+        return nothing
+    search = _Search(marks)
+    pairs = search.candidates(group)
+    if not len(pairs):
+        return nothing
+    r, shift = search.compared(pairs, None)[0::2]
+    pairs, shift = pairs[r < 3.0 * _SAME], shift[r < 3.0 * _SAME]
+    if not len(pairs):
+        return nothing
+    # Another origin of the pixels shifts all of them alike; a camera that moves does not.
+    common = np.median(shift, axis=0)
+    steady = len(pairs) >= 3 and np.all(np.median(np.abs(shift - common), axis=0) < 0.1 * _SHIFT)
+    r, p = search.compared(pairs, np.zeros(2))[:2]
+    if steady:
+        r, p = (
+            np.minimum(at_none, value)
+            for at_none, value in zip((r, p), search.compared(pairs, common)[:2], strict=True)
+        )
+    kept = r < 2.0 * _SAME
+    pairs, r, p = pairs[kept], r[kept], p[kept]
+    return pairs[search.judged(pairs, r, p)] if len(pairs) else nothing
+
+
+class _Search:
+    """Frames looked up by the triangles of their most central stars."""
+
+    def __init__(self, marks: Fingerprints) -> None:
+        self.counts = marks.counts
+        self.starts = np.cumsum(self.counts) - self.counts
+        self.xy = np.asarray(marks.xy_px, dtype=np.float64)
+        self.square = np.asarray(marks.error_px, dtype=np.float64) ** 2
+        # Median length of two normal errors, so that wrong stars do not count.
+        self.sigma = float(np.median(marks.error_px)) / 1.1774 + 1e-4
+        frames, triangles = [], []
+        for chosen in combinations(range(_CORNERS), 3):
+            frame = np.flatnonzero(self.counts > chosen[-1])
+            corner = self.xy[self.starts[frame, None] + np.array(chosen)]
+            corner = np.take_along_axis(corner, np.argsort(corner[..., :1], axis=1), axis=1)
+            sides = (corner[:, 1:] - corner[:, :1]).reshape(-1, 4)
+            frames.append(frame)
+            triangles.append(np.hstack([corner[:, 0], sides]))
+        self.frame, self.triangle = np.concatenate(frames), np.concatenate(triangles)
+        # One triangle of each frame (that of its three most central stars) tells how many others look the same way.
+        has, self.first = frames[0], np.full(len(self.counts), -1)
+        self.first[has] = np.arange(len(has))
+        points = triangles[0] / _SHIFT
+        self.partners = np.zeros(len(self.counts))
+        self.partners[has] = _tree(points).query_ball_point(points, 1.0, p=np.inf, return_length=True) - 1
+
+    def candidates(self, group: IntArray | None) -> IntArray:
+        """Pairs of frames with a triangle in common."""
+        tree = _tree(self.triangle / np.array([_SHIFT, _SHIFT, *[self.sigma] * 4]))
+        reach = 1.0
+        # A stare of very many frames has too many neighbours: the nearer ones are then looked at.
+        if self.partners.sum() > _MOST_CANDIDATES:
+            while tree.count_neighbors(tree, reach, p=np.inf) > 2 * _MOST_CANDIDATES + len(self.frame):
+                reach *= 0.8
+        pairs = np.sort(self.frame[tree.query_pairs(reach, p=np.inf, output_type="ndarray")], axis=1)
+        pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+        if group is not None:
+            pairs = pairs[group[pairs[:, 0]] != group[pairs[:, 1]]]
+        return np.unique(pairs, axis=0)
+
+    def compared(
+        self, pairs: IntArray, offset: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Of pairs (P, 2): r, its probability for independent errors, the shift (P, 2), half the degrees of freedom.
+
+        Positions may differ by the `offset`; each pair by one of its own where that is None.
+        """
+        parts = [self._compared(pairs[i : i + _PART], offset) for i in range(0, len(pairs), _PART)]
+        r, p, shift, half = (np.concatenate(values) for values in zip(*parts, strict=True))
+        return r, p, shift, half
+
+    def _compared(
+        self, pairs: IntArray, offset: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        from scipy.special import betainc, comb
+
+        (a, in_a), (b, in_b) = self._rows(pairs[:, 0]), self._rows(pairs[:, 1])
+        gap = self.xy[b][:, None, :, :] - self.xy[a][:, :, None, :]
+        distance = np.where(in_a[:, :, None] & in_b[:, None, :], np.sum(gap**2, axis=3), np.inf)
+        at = np.argmin(distance, axis=2)
+        mutual = np.take_along_axis(np.argmin(distance, axis=1), at, axis=1) == np.arange(_MARKS)
+        used = mutual & (np.min(distance, axis=2) < (2.0 * _SHIFT) ** 2)
+        count = np.count_nonzero(used, axis=1)
+        d = np.take_along_axis(gap, at[:, :, None, None], axis=2)[:, :, 0]
+        shift = _median(d, used)
+        off = np.sum((d - (shift[:, None] if offset is None else offset)) ** 2, axis=2)
+        # One star in five may be measured quite differently by another program.
+        left = count // 5
+        rank = np.argsort(np.argsort(np.where(used, off, np.inf), axis=1), axis=1)
+        used &= rank < (count - left)[:, None]
+        n = np.maximum(count - left, 1)
+        square = self.square[a] + np.take_along_axis(self.square[b], at, axis=1)
+        # The error of a wrong star is the same in every exposure.
+        square = np.minimum(square, 9.0 * _median(square[..., None], used)) * used
+        total = np.maximum(square.sum(axis=1), np.finfo(np.float64).tiny)
+        r = np.sum(off * used, axis=1) / total
+        if offset is None:
+            r *= n / np.maximum(n - 1, 1)
+        # Stars of unequal noise are worth fewer: those of equal noise have a relative variance of 1/2.
+        worth = np.minimum(1.0, 1.5 * total**2 / np.maximum(np.sum(square**2, axis=1), np.finfo(np.float64).tiny) / n)
+        half = 0.5 * np.maximum((2.0 * n - 3.0) * worth, 1.0)
+        p = betainc(half, half, np.minimum(0.5 * r, 1.0)) * comb(count, left)
+        enough = (n >= 3) & (2 * count >= np.minimum(*self.counts[pairs].T))
+        return np.where(enough, r, np.inf), np.where(enough, np.minimum(p, 1.0), 1.0), shift, half
+
+    def _rows(self, frames: IntArray) -> tuple[IntArray, BoolArray]:
+        """Rows (P, 12) of the stars of frames, and where there is one."""
+        place = np.arange(_MARKS)
+        there = place < self.counts[frames][:, None]
+        return np.where(there, self.starts[frames][:, None] + place, 0), there
+
+    def judged(self, pairs: IntArray, r: FloatArray, p: FloatArray) -> BoolArray:
+        """Which pairs (P, 2) with these r and probabilities are one measurement."""
+        from scipy.special import bdtrc, betainc
+
+        n_frames, partners = len(self.counts), self.partners
+        # Where a camera stares, what its exposures have in common is not what two measurements of one have.
+        crowded = np.flatnonzero((partners[pairs] >= _STARE).all(axis=1) & (r > _COPY))
+        if len(crowded):
+            asking, inverse = np.unique(pairs[crowded, 0], return_inverse=True)
+            share, half = (values[inverse] for values in self._common(asking))
+            r[crowded] /= share
+            p[crowded] = np.maximum(p[crowded], betainc(half, half, np.minimum(0.5 * r[crowded], 1.0)))
+        p = np.minimum(1.0, p * np.maximum(1.0, partners[pairs].max(axis=1)))
+        same: BoolArray = (r < _SAME) & (p * n_frames < _FALSE_ALARM)
+        possible = max(int(np.count_nonzero(partners)) // 2, 1)
+        unlikely = pairs[(r < _SAME) & (p < 0.01)]
+        # Every frame counts once, or exposures that happen to be near many would.
+        apart = min(np.unique(unlikely[:, 0]).size, np.unique(unlikely[:, 1]).size, possible)
+        if apart > 1 and bdtrc(apart - 1, possible, 0.01) < _FALSE_ALARM:
+            same |= (r < _SAME) & (p < 0.05)
+        # A table that repeats some frames may well repeat others less exactly, and one frame left out harms little.
+        return same | (same.any() & (r < 2.0 * _SAME) & (p < 1e-3))
+
+    def _common(self, frames: IntArray) -> tuple[FloatArray, FloatArray]:
+        """What r is for other exposures of the pointing of frames, at most 1, and half its degrees of freedom."""
+        points = self.triangle / _SHIFT
+        _, near = _tree(points).query(points[self.first[frames]], k=4 * _ASKED, p=np.inf, distance_upper_bound=1.0)
+        others = np.append(self.frame, -1)[near]
+        row, column = np.nonzero((others >= 0) & (others != frames[:, None]))
+        r, half = np.full(others.shape, np.nan), np.full(others.shape, np.nan)
+        values = self.compared(np.column_stack([frames[row], others[row, column]]), None)
+        r[row, column], half[row, column] = np.where(np.isfinite(values[0]), values[0], np.nan), values[3]
+        enough = np.count_nonzero(np.isfinite(r), axis=1) >= _STARE
+        r[~enough], half[~enough] = 1.0, 1.5
+        # Trimmed of its largest differences, r is about 2/3 for independent exposures.
+        return np.clip(1.5 * np.nanmedian(r, axis=1), 1e-12, 1.0), np.nanmedian(half, axis=1)
+
+
+def _tree(points: FloatArray) -> cKDTree:
+    from scipy.spatial import cKDTree
+
+    return cKDTree(points)
+
+
+def _median(values: FloatArray, used: BoolArray) -> FloatArray:
+    """Median (P, c) over the used ones of values (P, n, c); zero where none is."""
+    ordered = np.sort(np.where(used[..., None], values, np.inf), axis=1)
+    count = np.count_nonzero(used, axis=1)
+    low, high = (np.maximum(count - 1, 0) // 2), count // 2
+    pick = [np.take_along_axis(ordered, at[:, None, None], axis=1)[:, 0] for at in (low, np.maximum(high, low))]
+    middle = 0.5 * (pick[0] + pick[1])
+    return np.where(count[:, None] > 0, middle, 0.0)
+
+
+def check_duplicates(duplicates: str) -> None:
+    """Refuse a word that says nothing about repeated frames."""
+    if duplicates not in DUPLICATES:
+        raise CalibrationError(f"duplicates {duplicates!r} is unknown: use one of {', '.join(DUPLICATES)}.")
+
+
+def repeating_frames(calibration: Calibration, duplicates: str) -> IntArray:
+    """Numbers of the frames to leave out: none where they are kept, and an error where they are refused."""
+    if duplicates == "keep" or calibration.fingerprints is None:
+        return np.empty(0, dtype=np.int64)
+    pairs = repeated_frames(calibration)
+    later = np.unique(pairs[:, 1])
+    if len(later) and duplicates == "refuse":
+        more = len(later) - 1
+        others = f", and {more} more repeat others" if more > 1 else ", and one more repeats another" if more else ""
+        raise RepeatedFramesError(
+            f"frame {pairs[0, 1]} holds the same measurement as frame {pairs[0, 0]}{others}: their stars differ by "
+            "far less than their noise, and would count twice; leave the later ones out (duplicates='drop', "
+            "--duplicates drop), or, if you know them to be exposures of their own, keep them (duplicates='keep').",
+            pairs=pairs.tolist(),
+        )
+    return later
