@@ -17,7 +17,8 @@ from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, assemble, check_camera, noise_px
 from starcal_uq.estimation.baselines import check_count, least_squares, recursive
 from starcal_uq.estimation.calibration import Calibration
-from starcal_uq.estimation.fingerprints import Fingerprints, check_duplicates, repeating_frames
+from starcal_uq.estimation.duplicates import check_duplicates, repeating_frames
+from starcal_uq.estimation.fingerprints import Fingerprints
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import NOISES, fit_noise
 from starcal_uq.estimation.pairs import PairObjective

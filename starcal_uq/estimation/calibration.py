@@ -212,7 +212,7 @@ class Calibration(Shown):
         plain["stages"] = [{name: kept[name] for name in _STAGE} for kept in plain["stages"]]
         with atomic_path(path.with_suffix(".npz")) as temporary, temporary.open("wb") as stream:
             np.savez_compressed(stream, allow_pickle=False, **arrays)
-        write_json({name: plain[name] for name in _DOCUMENT}, path)
+        write_json({name: plain[name] for name in _DOCUMENT if plain[name] is not None}, path)
 
     @classmethod
     def load(cls, path: str | Path) -> Calibration:

@@ -26,7 +26,8 @@ from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.compressed import Optimum, combined, optimum, scaled, total
-from starcal_uq.estimation.fingerprints import Fingerprints, check_duplicates, fingerprints_of, shared
+from starcal_uq.estimation.duplicates import check_duplicates, fingerprints_of
+from starcal_uq.estimation.fingerprints import Fingerprints, shared
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.maths.linear import correlation_of

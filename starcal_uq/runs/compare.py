@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from starcal_uq.comparison.compare import compare, compare_halves
 from starcal_uq.core.errors import ComparisonError, RunFolderError
-from starcal_uq.estimation.fingerprints import fingerprints_of
+from starcal_uq.estimation.duplicates import fingerprints_of
 from starcal_uq.runs.run import Run
 
 if TYPE_CHECKING:

@@ -13,7 +13,8 @@ from starcal_uq.core.types import AnyDict, FloatArray, StrArray
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.compressed import optimum
-from starcal_uq.estimation.fingerprints import fingerprints_of, shared
+from starcal_uq.estimation.duplicates import fingerprints_of
+from starcal_uq.estimation.fingerprints import shared
 from starcal_uq.estimation.merging import check_mergeable, merge, merging_noise, refuse_shared, renumbered
 from starcal_uq.observations.columns import COLUMNS
 from starcal_uq.observations.table import Observations

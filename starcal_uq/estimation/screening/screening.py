@@ -20,7 +20,7 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray
 from starcal_uq.estimation.calibrate import calibrate
-from starcal_uq.estimation.fingerprints import check_duplicates, repeating_frames
+from starcal_uq.estimation.duplicates import check_duplicates, repeating_frames
 from starcal_uq.estimation.screening.consensus import MIN_STARS, consensus, measured_directions, pre_screen
 from starcal_uq.estimation.screening.outliers import (
     StarResiduals,

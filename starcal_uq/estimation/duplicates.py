@@ -1,0 +1,81 @@
+"""What becomes of frames that hold the same measurement twice: refused, left out or kept."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
+from starcal_uq.core.types import IntArray
+from starcal_uq.estimation.fingerprints import Fingerprints, repeats, shared
+
+if TYPE_CHECKING:
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.observations.table import Observations
+
+DUPLICATES = ("refuse", "drop", "keep")
+
+
+def fingerprints_of(calibration: Calibration, obs: Observations | None = None) -> Fingerprints | None:
+    """Those of a calibration; where a version before this one made it, from its observations, if there are any."""
+    if calibration.fingerprints is not None or obs is None or len(obs) != len(calibration.residuals_px):
+        return calibration.fingerprints
+    return Fingerprints.of(obs, calibration.residuals_px, calibration.camera.centre_px)
+
+
+def repeated_frames(a: Calibration, b: Calibration | None = None) -> IntArray:
+    """Frames that hold the same measurement, whatever their numbers, order and stars.
+
+    Parameters
+    ----------
+    a : Calibration
+        A calibration with fingerprints.
+    b : Calibration, optional
+        Another, whose frames are compared with those of `a`; otherwise those of `a` are compared with each other.
+
+    Returns
+    -------
+    (n, 2) array of int
+        Frame numbers: of the first and the repeating frame, or of the frame of `a` and that of `b`.
+
+    Raises
+    ------
+    RepeatedFramesError
+        If a calibration has no fingerprints: it was made from a stream or by a version without them.
+    """
+    given = [a] if b is None else [a, b]
+    marks = [calibration.fingerprints for calibration in given]
+    present = [one for one in marks if one is not None]
+    if len(present) < len(given):
+        raise RepeatedFramesError(
+            "a calibration without fingerprints of its frames cannot be checked: calibrate again."
+        )
+    if b is None:
+        return np.asarray(a.frame_ids[repeats(present[0])])
+    pairs = shared(*present)
+    return np.column_stack([a.frame_ids[pairs[:, 0]], b.frame_ids[pairs[:, 1]]])
+
+
+def check_duplicates(duplicates: str) -> None:
+    """Refuse a word that says nothing about repeated frames."""
+    if duplicates not in DUPLICATES:
+        raise CalibrationError(f"duplicates {duplicates!r} is unknown: use one of {', '.join(DUPLICATES)}.")
+
+
+def repeating_frames(calibration: Calibration, duplicates: str) -> IntArray:
+    """Numbers of the frames to leave out: none where they are kept, and an error where they are refused."""
+    if duplicates == "keep" or calibration.fingerprints is None:
+        return np.empty(0, dtype=np.int64)
+    pairs = repeated_frames(calibration)
+    later = np.unique(pairs[:, 1])
+    if len(later) and duplicates == "refuse":
+        more = len(later) - 1
+        others = f", and {more} more repeat others" if more > 1 else ", and one more repeats another" if more else ""
+        raise RepeatedFramesError(
+            f"frame {pairs[0, 1]} holds the same measurement as frame {pairs[0, 0]}{others}: their stars differ by "
+            "far less than their noise, and would count twice; leave the later ones out (duplicates='drop', "
+            "--duplicates drop), or, if you know them to be exposures of their own, keep them (duplicates='keep').",
+            pairs=pairs.tolist(),
+        )
+    return later
