@@ -218,7 +218,7 @@ def _optimum(obs: Observations, cal: Calibration, start: Camera) -> tuple[FloatA
     likelihood = cal.provenance.get("settings", {}).get("likelihood", "marginal")
     if likelihood != "marginal" or method not in ("efficient", "three_stage"):
         options: AnyDict = {} if likelihood == "marginal" else {"likelihood": likelihood}
-        other = calibrate(obs, start, method=method, **options)
+        other = calibrate(obs, start, method=method, duplicates="keep", **options)
         return other.theta, other.chi2
     found = fit(obs, start, method=method)
     # The last, small step of a calibration, which is the same for all that end in its optimum.

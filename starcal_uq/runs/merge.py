@@ -200,7 +200,8 @@ def _drop_shared(calibrations: list[Calibration], tables: list[Observations | No
             )
         rest = table.select_frames(np.delete(table.frame_ids, repeating))
         tables[i] = rest
-        calibrations[i] = calibrate(rest, cal.nominal, method=cal.method, duplicates="keep")
+        noise = cal.provenance["settings"].get("noise", "common")
+        calibrations[i] = calibrate(rest, cal.nominal, method=cal.method, noise=noise, duplicates="keep")
 
 
 def _own_observations(run: Run) -> Observations | None:

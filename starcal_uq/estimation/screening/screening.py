@@ -98,7 +98,7 @@ def screen(
         As for `calibrate`. With ``model``, stars are screened a second time, with the noise that the model fitted to
         those kept at first gives each of them.
     duplicates : {"refuse", "drop", "keep"}
-        As for `calibrate`; asked once, of the rows that are kept.
+        As for `calibrate`; asked once, of the rows that are kept. With ``drop``, the result is of the other frames.
     **options
         Passed on to `calibrate`, such as ``solver``.
 
