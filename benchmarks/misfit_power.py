@@ -17,7 +17,7 @@ from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import project, unproject
 from starcal_uq.core.types import FloatArray
-from starcal_uq.diagnostics.misfit import ALPHA, misfit_tests
+from starcal_uq.diagnostics.misfit import misfit_tests
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.observations.table import Observations
 from starcal_uq.paper.camera import paper_camera, paper_start
@@ -29,6 +29,8 @@ from starcal_uq.sky.positions import ra_dec_deg, unit_vectors
 EARTH_KM_S = 29.8
 # Refraction at sea level: 58.2 arcsec times the tangent of the zenith distance.
 _REFRACTION_RAD = 58.2 / 206_264.806
+# Level of the table.
+ALPHA = 0.05
 _MAX_MAG, _EPOCH, _SIGMA_PX = 6.0, 2026.9, 0.05
 # Towards Puppis, where stars are many: right ascension and declination.
 _FIELD_DEG = (120.0, -40.0)

@@ -38,12 +38,6 @@ _STYLES = {Level.PASS: "green", Level.WARN: "yellow", Level.FAIL: "red"}
 out = Console(width=_WIDTH, markup=False)
 err = Console(stderr=True, markup=False)
 
-UNDECLARED = (
-    "Neither time nor observer velocity was declared: annual aberration stretches a 10 degree field by up to "
-    "3.6 arcsec, which can move f by many sigma. Declare --directions apparent, or --directions catalogue with a "
-    "time_utc column."
-)
-
 
 def print_json(value: Any) -> None:
     """Plain JSON on standard output, nothing else."""
@@ -151,10 +145,16 @@ def warn_air(obs: Observations, cal: Calibration) -> None:
         err.print(f"warning: {conditional_words(cal)} {REMEDY}", style="yellow", highlight=False, soft_wrap=True)
 
 
-def warn_undeclared(obs: Observations) -> None:
-    """Say what follows when nothing is known of the observer's motion, and what was left out."""
+def warn_undeclared(obs: Observations, camera: Camera) -> None:
+    """Say what follows for this camera when nothing is known of the observer's motion, and what was left out."""
+    from starcal_uq.diagnostics.verdict.observed import aberration_size
+
     if not obs.directions_declared:
-        err.print(f"warning: {UNDECLARED}", style="yellow", highlight=False, soft_wrap=True)
+        words = (
+            f"warning: Neither time nor observer velocity was declared: annual aberration {aberration_size(camera)}. "
+            "Declare --directions apparent, or --directions catalogue with a time_utc column."
+        )
+        err.print(words, style="yellow", highlight=False, soft_wrap=True)
     floor = obs.meta.get("noise_floor_px")
     if floor:
         words = (

@@ -160,7 +160,7 @@ def load_images(
     left_out = obs.meta.get("disturbed_stars", 0)
     if left_out:
         err.print(f"{left_out} stars left out, because the light of a neighbour displaces them.", highlight=False)
-    warn_undeclared(obs)
+    warn_undeclared(obs, camera)
     # Of mirrored images x is counted from the right edge, and so is this camera's.
     return obs, found.rounds[0][0].nominal if found.identification.parity == "mirrored" else camera, centroids, found
 

@@ -70,7 +70,7 @@ def load_table(path: Path, camera_path: Path, sky: SkySettings) -> tuple[Observa
         observer_velocity_km_s=parse_velocity(sky.observer_velocity),
         **known,
     )
-    warn_undeclared(obs)
+    warn_undeclared(obs, camera)
     return obs, camera
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.formatting import join_words, plural, significant
 from starcal_uq.core.types import FloatArray
+from starcal_uq.diagnostics.verdict.estimate import JACKKNIFE_P, JACKKNIFE_RATIO, MISFIT_P
 from starcal_uq.propagation.attitude_error import CONTRIBUTORS, MisfitFound
 
 if TYPE_CHECKING:
@@ -18,8 +19,6 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
     from starcal_uq.propagation.attitude_error import AttitudeError
 
-# The same limits as the verdict of the report.
-_MISFIT_P, _JACKKNIFE_P, _JACKKNIFE_RATIO = 0.05, 0.01, 1.1
 _PIXEL_PHASE = ("pixel phase in x", "pixel phase in y")
 
 
@@ -49,7 +48,7 @@ def with_misfit(error: AttitudeError, diagnosis: Diagnosis, post: Posterior, obs
     pattern, pattern_reasons = _pattern(diagnosis, post, obs)
     common_shift, rest_shift, common_models, rest_models = _models(error, diagnosis)
     factor, frames = _frames(diagnosis)
-    phase = [t for t in diagnosis.misfit.found(_MISFIT_P) if t.against in _PIXEL_PHASE]
+    phase = [t for t in diagnosis.misfit.found(MISFIT_P) if t.against in _PIXEL_PHASE]
     notes: tuple[str, ...] = ()
     if phase:
         sizes = join_words([f"{significant(t.size_px)} px with the {t.against}" for t in phase])
@@ -72,7 +71,7 @@ def _pattern(diagnosis: Diagnosis, post: Posterior, obs: Observations) -> tuple[
     """The largest pattern over the field that a misfit test found, arcsec per axis."""
     found = [
         test
-        for test in diagnosis.misfit.found(_MISFIT_P)
+        for test in diagnosis.misfit.found(MISFIT_P)
         if test.dof > 0 and test.against not in _PIXEL_PHASE and test.size_px > 0.0
     ]
     if not found:
@@ -123,7 +122,7 @@ def _frames(diagnosis: Diagnosis) -> tuple[float, tuple[str, ...]]:
     found = diagnosis.jackknife
     if found is None:
         return 1.0, ()
-    flagged = (found.p_values * len(found.p_values) < _JACKKNIFE_P) & (found.ratio > _JACKKNIFE_RATIO)
+    flagged = (found.p_values * len(found.p_values) < JACKKNIFE_P) & (found.ratio > JACKKNIFE_RATIO)
     if not flagged.any():
         return 1.0, ()
     factor = float(found.ratio[flagged].max())

@@ -1,7 +1,9 @@
 """Leave-one-frame-out jackknife: uncertainties from how the frames disagree, whatever the cause.
 
 Formal uncertainties hold if noise is Gaussian and independent from star to star. Whatever makes stars of one frame err
-together, and differently from frame to frame, shows in the scatter of estimates that leave one frame out.
+together, and differently from frame to frame, shows in the scatter of estimates that leave one frame out, and in that
+of the frames' slopes. The second is tested: with the leverage corrected (CR2 of Bell & McCaffrey 2002) it is unbiased
+for any number of frames.
 """
 
 from __future__ import annotations
@@ -24,6 +26,9 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.observations.table import Observations
 
+# Degrees of freedom of a noise that is taken as known.
+_MANY = 10_000_000
+
 
 @dataclass(frozen=True, eq=False)
 class Jackknife(Shown):
@@ -38,14 +43,16 @@ class Jackknife(Shown):
     jackknife_covariance : (p, p) array
         ``(K - 1) / K`` times the scatter of the estimates that leave one of K frames out.
     sandwich_covariance : (p, p) array
-        ``H^-1 (sum_k g_k g_k^T) H^-1`` over frames, times K / (K - 1): the cluster-robust one.
+        ``H^-1 (sum_k g_k g_k^T) H^-1`` over frames: the cluster-robust one, with the leverage of each frame corrected.
     left_out : (K, p) array
         Estimates without each frame, px units.
     effective_frames : (p,) array
-        Frames of equal weight that would determine each parameter as unevenly as these K do (Satterthwaite): fewer
-        than K where some frames say more than others.
+        Frames of equal weight that would determine each parameter as unevenly as these K do: one more than
+        Satterthwaite's degrees of freedom of `sandwich_covariance`.
     n_frames : int
         K.
+    residual_dof : int
+        Degrees of freedom of the noise in `formal_covariance`; 0 in files of before, which took it as known.
     """
 
     parameter_names: tuple[str, ...]
@@ -55,35 +62,54 @@ class Jackknife(Shown):
     left_out: FloatArray
     effective_frames: FloatArray
     n_frames: int
+    residual_dof: int = 0
 
     @property
     def ratio(self) -> FloatArray:
-        """Jackknife standard deviation over the formal one, (p,)."""
-        return np.sqrt(np.diag(self.jackknife_covariance) / np.diag(self.formal_covariance))
-
-    @property
-    def sandwich_ratio(self) -> FloatArray:
         """Cluster-robust standard deviation over the formal one, (p,)."""
         return np.sqrt(np.diag(self.sandwich_covariance) / np.diag(self.formal_covariance))
 
+    @property
+    def jackknife_ratio(self) -> FloatArray:
+        """Jackknife standard deviation over the formal one, (p,); too large on average where frames are few."""
+        return np.sqrt(np.diag(self.jackknife_covariance) / np.diag(self.formal_covariance))
+
     def expected(self, probability: float = 0.95) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper end (p,) of the ratios that chance alone gives: of root chi-square over its freedom."""
-        from scipy.special import chdtri
+        """Lower and upper end (p,) of the ratios that chance alone gives."""
+        from scipy.special import betaincinv
 
         tail = 0.5 * (1.0 - probability)
-        low, high = (np.sqrt(chdtri(self._dof, q) / self._dof) for q in (1.0 - tail, tail))
+        low, high = (np.sqrt(betaincinv(*self._shape, q) / self._share) for q in (tail, 1.0 - tail))
         return low, high
 
     @property
-    def _dof(self) -> FloatArray:
+    def dof(self) -> FloatArray:
+        """Degrees of freedom (p,) of the cluster-robust variances."""
         return np.maximum(self.effective_frames - 1.0, 1.0)
 
     @property
-    def p_values(self) -> FloatArray:
-        """Probability (p,) of a ratio at least this large if the formal errors hold (chi-square)."""
-        from scipy.special import chdtrc
+    def _share(self) -> FloatArray:
+        # A ratio squared is to its degrees of freedom as the frames' scatter is to all squares, of which it is a part.
+        return self.dof / (self.residual_dof or _MANY)
 
-        return np.asarray(chdtrc(self._dof, self._dof * self.ratio**2), dtype=np.float64)
+    @property
+    def _shape(self) -> tuple[FloatArray, FloatArray]:
+        rest = np.maximum((self.residual_dof or _MANY) - self.dof, 1.0)
+        return 0.5 * self.dof, 0.5 * rest
+
+    @property
+    def p_values(self) -> FloatArray:
+        """Probability (p,) of a ratio at least this large if the formal errors hold."""
+        from scipy.special import betaincc
+
+        return np.asarray(betaincc(*self._shape, np.minimum(self._share * self.ratio**2, 1.0)), dtype=np.float64)
+
+    def detectable(self, alpha: float, power: float = 0.9) -> FloatArray:
+        """Ratios (p,) of true uncertainties that a test at this level finds with this probability."""
+        from scipy.special import betaincinv
+
+        found, missed = (betaincinv(*self._shape, q) for q in (1.0 - alpha, 1.0 - power))
+        return np.asarray(np.sqrt(found / missed), dtype=np.float64)
 
     @property
     def factors(self) -> FloatArray:
@@ -102,7 +128,7 @@ class Jackknife(Shown):
                 "jackknife_sigma": np.sqrt(np.diag(self.jackknife_covariance)),
                 "sandwich_sigma": np.sqrt(np.diag(self.sandwich_covariance)),
                 "ratio": self.ratio,
-                "sandwich_ratio": self.sandwich_ratio,
+                "jackknife_ratio": self.jackknife_ratio,
                 "expected_low": low,
                 "expected_high": high,
                 "p_value": self.p_values,
@@ -137,19 +163,17 @@ def jackknife_frames(obs: Observations, cal: Calibration, normals: FrameNormals 
         )
     k = obs.n_frames
     unit = np.outer(found.scale, found.scale)
-    inverse = np.linalg.inv(found.matrix)
     spread = z - z.mean(axis=0)
-    slopes = found.slopes - found.slopes.mean(axis=0)
-    # Variance of each frame's pull on each parameter, per unit of noise.
-    pull = np.einsum("ja,kab,bj->kj", inverse, found.matrices, inverse)
+    clustered, dof = found.clustered()
     return Jackknife(
         parameter_names=cal.parameter_names,
-        formal_covariance=inverse * found.variance * unit,
+        formal_covariance=np.linalg.inv(found.matrix) * found.variance * unit,
         jackknife_covariance=spread.T @ spread * (k - 1.0) / k * unit,
-        sandwich_covariance=inverse @ (slopes.T @ slopes) @ inverse * k / (k - 1.0) * unit,
+        sandwich_covariance=clustered * unit,
         left_out=found.theta + z * found.scale,
-        effective_frames=pull.sum(axis=0) ** 2 / np.sum(pull**2, axis=0),
+        effective_frames=dof + 1.0,
         n_frames=k,
+        residual_dof=int(np.sum(found.dof)) - len(found.theta),
     )
 
 
@@ -169,4 +193,6 @@ def accept_inflation(cal: Calibration, jackknife: Jackknife) -> Calibration:
     factors = dict(zip(jackknife.parameter_names, jackknife.factors.tolist(), strict=True))
     settings = {**cal.provenance.get("settings", {}), "inflation": factors}
     covariance = cal.covariance * np.outer(jackknife.factors, jackknife.factors)
-    return replace(cal, covariance=covariance, provenance={**cal.provenance, "settings": settings})
+    # A sigma that frames were asked for has only their degrees of freedom.
+    dof = {name: d for name, d in zip(factors, jackknife.dof.tolist(), strict=True) if factors[name] > 1.0}
+    return replace(cal, covariance=covariance, provenance={**cal.provenance, "settings": settings, "interval_dof": dof})

@@ -42,7 +42,9 @@ _LEAST_DOF = 10
 # Frames with less than one degree of freedom have no noise of their own to compare.
 _LEAST_FRAMES, _LEAST_FRAME_DOF = 3, 1.0
 _NOISE_ROUNDS = 3
-ALPHA = 0.05
+# Level of all tests together: what is left of the verdict's 5 % for the other checks is 3 %.
+ALPHA = 0.02
+POWER = 0.9
 
 
 @dataclass(frozen=True)
@@ -88,6 +90,14 @@ class MisfitTest:
         Share of the squared shapes that attitudes and parameters do not absorb; NaN for unequal noise.
     amplitudes : tuple of Amplitude
         Amplitudes, where they mean something by themselves.
+    moved_sigma : float
+        Largest change of a parameter if the shapes were fitted too, in its standard deviations; NaN where nothing is
+        fitted.
+    moved_name : str
+        That parameter.
+    detectable_px : float
+        Root mean square per axis of a pattern that the test finds nine times in ten, at level ALPHA of all tests
+        together, px; NaN for unequal noise.
     """
 
     name: str
@@ -100,6 +110,9 @@ class MisfitTest:
     size_px: float
     visible: float
     amplitudes: tuple[Amplitude, ...] = ()
+    moved_sigma: float = float("nan")
+    moved_name: str = ""
+    detectable_px: float = float("nan")
 
     @property
     def is_of_noise(self) -> bool:
@@ -197,12 +210,33 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = 8) -> 
     nothing = float("nan")
     tests += [MisfitTest(name, against, z, 0, sums.dof, p, 1.0, nothing, nothing) for name, against, z, p in of_noise]
     corrected = holm([test.p_value for test in tests])
-    tests = [replace(test, p_holm=float(p)) for test, p in zip(tests, corrected, strict=True)]
+    unit = np.sqrt(sums.rss / sums.dof / (2.0 * obs.n_stars)) * sums.noise_px
+    tests = [
+        replace(test, p_holm=float(p), detectable_px=float(unit * _detectable(test, ALPHA / len(tests))))
+        for test, p in zip(tests, corrected, strict=True)
+    ]
     uneven = None
     if any(test.is_of_noise and test.p_holm < ALPHA for test in tests) and cal.noise_model is None:
         model, _ = fit_noise(obs, cal.camera, rounds=_NOISE_ROUNDS)
         uneven = UnevenNoise(model, cal.parameter_names, sigma_ratios(obs, cal.camera, model, cal.sigma))
     return Misfit(tuple(tests), float(np.sqrt(sums.rss / sums.dof)), obs.n_stars, obs.n_frames, uneven)
+
+
+def _detectable(test: MisfitTest, level: float) -> float:
+    """Root of the noncentrality at which an F test of this level has its power; NaN for a test for unequal noise."""
+    from scipy.special import fdtri, ncfdtr
+
+    if test.dof == 0:
+        return float("nan")
+    limit = fdtri(test.dof, test.dof_residual, 1.0 - level)
+    low, high = 0.0, 1.0
+    while ncfdtr(test.dof, test.dof_residual, high, limit) > 1.0 - POWER:
+        low, high = high, 2.0 * high
+    for _ in range(20):
+        middle = 0.5 * (low + high)
+        weak = ncfdtr(test.dof, test.dof_residual, middle, limit) > 1.0 - POWER
+        low, high = (middle, high) if weak else (low, middle)
+    return float(np.sqrt(high))
 
 
 @dataclass
@@ -223,6 +257,7 @@ class _Sums:
     block_rank: int = 0
     # Sums of squares of the frames, degrees of freedom that attitudes leave them, and their normal matrices.
     frames: list[tuple[FloatArray, FloatArray, FloatArray]] = field(default_factory=list)
+    names: tuple[str, ...] = ()
 
     @classmethod
     def over(cls, obs: Observations, cal: Calibration, families: tuple[Shape, ...]) -> _Sums:
@@ -240,6 +275,7 @@ class _Sums:
             raw=np.zeros(size),
             block_matrix=np.zeros((p, p)),
             block_slope=np.zeros(p),
+            names=cal.parameter_names,
         )
         rotations = quaternion_to_rotation(cal.quaternions)
         starts = likelihood.frames.starts
@@ -325,6 +361,10 @@ class _Sums:
         explained = float(np.sum(scores**2 / values[kept]))
         test = self._f_test(family.name, family.against, explained, rank)
         visible = float(np.trace(left) / max(np.count_nonzero(present), 1))
+        # What fitting the shapes takes from the parameters, in units of their standard deviations.
+        fitted = vectors[:, kept] @ (scores / values[kept]) / norm
+        moved = np.abs(self.projection @ cross.T @ fitted) / np.sqrt(np.diag(self.projection) * self.rss / self.dof)
+        worst = int(np.argmax(moved))
         amplitudes: tuple[Amplitude, ...] = ()
         if family.labels and rank == family.size:
             inverse = (vectors / values) @ vectors.T
@@ -335,7 +375,8 @@ class _Sums:
                 Amplitude(name, u, float(value), float(sigma))
                 for (name, u), value, sigma in zip(family.labels, best, error, strict=True)
             )
-        return replace(test, visible=visible, amplitudes=amplitudes)
+        largest, name = float(moved[worst]), self.names[worst]
+        return replace(test, visible=visible, amplitudes=amplitudes, moved_sigma=largest, moved_name=name)
 
     def frame_by_frame(self) -> MisfitTest | None:
         """Does scale or shape change from frame to frame?"""

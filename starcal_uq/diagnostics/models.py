@@ -25,6 +25,7 @@ from starcal_uq.estimation.calibrate import refit
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.inference.arviz import psis
+from starcal_uq.maths.intervals import student_quantile
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -34,9 +35,9 @@ if TYPE_CHECKING:
 
 MODELS = ("none", "k1", "brown", "brown3", "brown_tangential")
 KHAT_BOUND = 0.7
-# A model is rejected when another one predicts better by this many standard errors, and by more than chance between
-# equal models (Sivula et al. 2020: below four, a difference of elpd says nothing).
-REJECT_SE, REJECT_ELPD = 2.0, 4.0
+# A model is rejected when another one predicts better beyond the Student quantile for so many frames, and by more than
+# chance between equal models (Sivula et al. 2020: below four, a difference of elpd says nothing).
+REJECT_P, REJECT_ELPD = 0.005, 4.0
 _DRAWS = 1000
 
 
@@ -173,6 +174,7 @@ def compare_models(
     found_scores = {name: _leave_out(normals, n_draws, rng) for name, normals in fits.items()}
     best = max(found_scores, key=lambda name: float(np.sum(found_scores[name].pointwise)))
     reference = found_scores[best].pointwise
+    beyond_doubt = student_quantile(1.0 - 2.0 * REJECT_P, len(reference) - 1)
     scores = []
     for name, normals in fits.items():
         loo = found_scores[name]
@@ -194,7 +196,7 @@ def compare_models(
                 n_replaced=loo.n_replaced,
                 common_arcsec=common,
                 rest_arcsec=rest,
-                rejected=bool(-total > max(REJECT_SE * spread, REJECT_ELPD)),
+                rejected=bool(-total > max(beyond_doubt * spread, REJECT_ELPD)),
             )
         )
     scores.sort(key=lambda score: -score.elpd)

@@ -17,6 +17,7 @@ from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, assemble, check_camera, noise_px
 from starcal_uq.estimation.baselines import check_count, least_squares, recursive
 from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.composite import pair_covariance
 from starcal_uq.estimation.duplicates import check_duplicates, repeating_frames
 from starcal_uq.estimation.fingerprints import Fingerprints
 from starcal_uq.estimation.marginal import MarginalLikelihood
@@ -65,8 +66,9 @@ def calibrate(
         Start values; its `distortion` names the model. The coefficients start from zero, as in the paper.
     method : {"efficient", "three_stage", "least_squares", "samaan", "griffith"}
         ``three_stage`` is Ye & Yang 2017: interstar angles without distortion, linear distortion, interstar angles with
-        both; its covariance is the sandwich of composite likelihood. ``efficient`` goes on to the
-        attitude-marginalised likelihood, whose covariance is the Cramer-Rao bound. The others are what the paper
+        both; its covariance is the sandwich of composite likelihood, from the scatter of frames if there are 50 for
+        each parameter, else from Gaussian noise. ``efficient`` goes on to the attitude-marginalised likelihood, whose
+        covariance is the Cramer-Rao bound. The others are what the paper
         compares itself with: ``least_squares`` fits the optics to interstar angles as if there were no distortion, and
         its result's model is ``none``; ``samaan`` filters the optics frame by frame from the least-squares solution of
         the first frames, and fits the distortion linearly afterwards; ``griffith`` is recursive least squares from the
@@ -184,8 +186,13 @@ def _gaussian(
     pairs = PairObjective(likelihood.frames, camera.distortion)
     stages, status = _stages(pairs, camera, likelihood, method, solver, max_iterations)
     pair_theta = stages[-2 if stages[-1].name == "refinement" else -1].theta
-    pair_covariance = pairs.godambe(pair_theta)
-    return assemble(obs, camera, method, solver, likelihood, stages, status, pair_theta, pair_covariance)
+    covariance = _pair_covariance(pairs, likelihood, pair_theta)
+    return assemble(obs, camera, method, solver, likelihood, stages, status, pair_theta, covariance)
+
+
+def _pair_covariance(pairs: PairObjective, likelihood: MarginalLikelihood, pair_theta: FloatArray) -> FloatArray:
+    chi2 = likelihood.profile(pair_theta, likelihood.rotations)[1]
+    return pair_covariance(pairs, pair_theta, chi2, likelihood.dof - len(pair_theta))
 
 
 @dataclass(frozen=True)
@@ -334,7 +341,9 @@ def _robust(
         rotation_per_theta=information.rotation_per_theta,
         attitude_noise=information.attitude_noise,
         pair_theta=pair_theta,
-        pair_covariance=PairObjective(start.frames, model).godambe(pair_theta),
+        pair_covariance=_pair_covariance(
+            PairObjective(start.frames, model), MarginalLikelihood(start.frames, model), pair_theta
+        ),
         compressed=compress_reweighted(found),
         provenance=record,
         fingerprints=Fingerprints.of(obs, residuals, camera.centre_px),

@@ -90,7 +90,8 @@ class Calibration(Shown):
     pair_theta : (p,) array
         Estimate from interstar angles: that of stage 3, the paper's, or of the method itself where it has no other.
     pair_covariance : (p, p) array
-        Sandwich (Godambe) covariance of `pair_theta`, px units.
+        Sandwich (Godambe) covariance of `pair_theta`, px units; with fewer than 50 frames per parameter that which
+        Gaussian noise gives.
     compressed : CompressedLikelihood
         The whole data set's likelihood around the estimate.
     provenance : dict
@@ -141,9 +142,20 @@ class Calibration(Shown):
         return correlation_of(self.covariance)[0]
 
     def interval(self, probability: float = 0.95) -> FloatArray:
-        """Interval of each parameter without sampling, (p, 2), px units: Student's with `dof` degrees of freedom."""
-        half = student_quantile(probability, self.dof) * self.sigmas
+        """Interval of each parameter without sampling, (p, 2), px units: Student's with `dof` degrees of freedom.
+
+        A sigma from the scatter of frames has its own degrees of freedom, which provenance states.
+        """
+        own = self.provenance.get("interval_dof", {})
+        half = self.sigmas * [student_quantile(probability, own.get(n, self.dof)) for n in self.parameter_names]
         return np.stack([self.theta - half, self.theta + half], axis=1)
+
+    def sigma_interval(self, probability: float = 0.95) -> FloatArray:
+        """Interval of the noise without sampling, (2,), in the unit of `sigma`: of chi-square with `dof`."""
+        from scipy.special import chdtri
+
+        tail = 0.5 * (1.0 - probability)
+        return self.sigma * np.sqrt([self.dof / float(chdtri(self.dof, q)) for q in (tail, 1.0 - tail)])
 
     @property
     def noise_model(self) -> NoiseModel | None:
@@ -168,13 +180,15 @@ class Calibration(Shown):
         return len(self.residuals_px) > 0
 
     def to_dataframe(self) -> pd.DataFrame:
-        """One row per parameter: start, estimate, sigma and unit; the noise is the last row."""
+        """One row per parameter: start, estimate, sigma, 95 % interval and unit; the noise is the last row."""
         import pandas as pd
 
         rows = [
-            {"parameter": p.name, "start": start, "estimate": value, "sigma": sigma, "unit": p.unit}
-            for p, start, value, sigma in zip(
-                parameters(self.camera.distortion), self.nominal.theta, self.theta, self.sigmas, strict=True
+            {"parameter": p.name, "start": start, "estimate": value, "sigma": sigma, "low": low, "high": high}
+            | {"unit": p.unit}
+            for p, start, value, sigma, (low, high) in zip(
+                *(parameters(self.camera.distortion), self.nominal.theta, self.theta, self.sigmas, self.interval()),
+                strict=True,
             )
         ]
         unit = "px" if self.sigma_name == "sigma" else "1"
@@ -184,6 +198,8 @@ class Calibration(Shown):
                 "start": np.nan,
                 "estimate": self.sigma,
                 "sigma": self.sigma_std,
+                "low": float(self.sigma_interval()[0]),
+                "high": float(self.sigma_interval()[1]),
                 "unit": unit,
             }
         )

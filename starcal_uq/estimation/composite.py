@@ -162,7 +162,7 @@ def pair_likelihood(
     sigma = float(np.sqrt(chi2 / residual_dof))
     naive = scaled_inverse(normal.matrix) * tau**2
     if variability == "auto":
-        variability = "expected" if frames.n_frames < _FRAMES_PER_PARAMETER * p else "empirical"
+        variability = "empirical" if enough_frames(objective) else "expected"
     godambe = (
         expected_godambe(objective, theta_hat, sigma) if variability == "expected" else objective.godambe(theta_hat)
     )
@@ -186,6 +186,24 @@ def pair_likelihood(
         variability=variability,
         objective=objective,
     )
+
+
+def enough_frames(objective: PairObjective) -> bool:
+    """True if the scatter of the frames' scores says enough of its own variability: 50 frames per parameter."""
+    return objective.frames.n_frames >= _FRAMES_PER_PARAMETER * objective.n_parameters
+
+
+def pair_covariance(objective: PairObjective, theta: FloatArray, chi2: float, residual_dof: int) -> FloatArray:
+    """Covariance (p, p) of the pair estimate: empirical where there are `enough_frames`, else that of Gaussian noise.
+
+    With fewer frames than parameters the empirical one is not defined, and with few its intervals are too short. `chi2`
+    and `residual_dof` are those of `pair_likelihood`. Not finite where the pairs do not determine every parameter.
+    """
+    if enough_frames(objective):
+        return objective.godambe(theta)
+    if not np.isfinite(chi2) or is_singular(objective.evaluate(theta).matrix):
+        return np.full((len(theta), len(theta)), np.nan)
+    return expected_godambe(objective, theta, float(np.sqrt(chi2 / max(residual_dof, 1))))
 
 
 def expected_godambe(objective: PairObjective, theta: FloatArray, sigma: float) -> FloatArray:

@@ -100,6 +100,34 @@ class FrameNormals:
             dof=2 * likelihood.frames.sizes - 3,
         )
 
+    def clustered(self) -> tuple[FloatArray, FloatArray]:
+        """Covariance (p, p) of z from the scatter of the frames, and the degrees of freedom (p,) of its diagonal.
+
+        Bell & McCaffrey (2002): residuals of frame k are multiplied by (I - h_k H^-1 h_k^T)^(-1/2), which frees the
+        covariance of what the fit takes up wherever noise is independent, and Satterthwaite's degrees of freedom are
+        those of a chi-square of the same variance. Both need only H_k, H and the slopes. Not finite where a frame
+        alone determines a parameter.
+        """
+        root = np.linalg.inv(np.linalg.cholesky(self.matrix))
+        shares = root @ self.matrices @ root.T
+        values, vectors = np.linalg.eigh(shares)
+        free = 1.0 - values
+        with np.errstate(divide="ignore", invalid="ignore"):
+            stretch = np.where(free > 1e-10, free, np.nan) ** -0.5
+        adjust = np.einsum("kab,kb,kcb->kac", vectors, stretch, vectors)
+        step = np.linalg.solve(self.matrix, self.slopes.sum(axis=0))
+        left = (self.slopes - self.matrices @ step) @ root.T
+        # Columns of `root` are the whitened parameters; their pull on frame k, adjusted, before and after its share.
+        pull = np.einsum("kab,bj->kja", adjust, root)
+        own = np.einsum("kab,kjb->kja", shares, pull)
+        scatter = np.einsum("kja,ka->kj", pull, left)
+        # Covariance of the scatter between frames: a diagonal less `own own^T`, for each parameter.
+        diagonal = np.sum(pull * own, axis=2)
+        inner = np.einsum("kja,kjb->jab", own, own)
+        square = np.sum(diagonal**2 - 2.0 * diagonal * np.sum(own**2, axis=2), axis=0) + np.sum(inner**2, axis=(1, 2))
+        trace = np.sum(diagonal - np.sum(own**2, axis=2), axis=0)
+        return scatter.T @ scatter, trace**2 / square
+
     def left_out(self) -> tuple[FloatArray, FloatArray]:
         """Estimates z (K, p) without each frame, and the matrices (K, p, p) of the remaining ones.
 

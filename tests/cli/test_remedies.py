@@ -93,7 +93,7 @@ EXAMPLES = {
         estimate.estimation(dataclasses.replace(s.cal, status=status)) for status in Status if not status.ok
     ],
     "diagnostics.verdict.estimate.jackknife": lambda s: [
-        estimate.jackknife(dataclasses.replace(s.jackknife, jackknife_covariance=9.0 * s.jackknife.formal_covariance))
+        estimate.jackknife(dataclasses.replace(s.jackknife, sandwich_covariance=9.0 * s.jackknife.formal_covariance))
     ],
     "diagnostics.verdict.observed.directions": lambda s: [
         observed.directions(dataclasses.replace(s.obs, meta=meta), s.cal)

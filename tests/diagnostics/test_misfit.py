@@ -12,7 +12,7 @@ from scipy import stats
 import starcal_uq as sc
 from benchmarks.misfit_power import SCENARIOS, main, power
 from starcal_uq.core.records import from_plain, to_plain
-from starcal_uq.diagnostics.misfit import Misfit, misfit_tests
+from starcal_uq.diagnostics.misfit import ALPHA, Misfit, misfit_tests
 from starcal_uq.diagnostics.shapes import View, shapes
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.maths.intervals import holm
@@ -120,6 +120,26 @@ def test_score_tests_estimate_the_term_that_is_missing(model, term, value):
     assert amplitude.value == pytest.approx(rich.theta[index] * scale, abs=0.3 * amplitude.sigma)
     assert abs(amplitude.value) > 5.0 * amplitude.sigma
     assert found.found()[0].p_holm < 1e-4
+    test = next(t for t in found.tests if amplitude in t.amplitudes)
+    if term == "k3":
+        # The move that it announces is the one that fitting the term makes.
+        move = np.abs(rich.theta[:5] - poor.theta) / poor.sigmas
+        assert test.moved_sigma == pytest.approx(move.max(), rel=0.1)
+        assert test.moved_name == poor.parameter_names[int(move.argmax())] and test.moved_sigma > 3.0
+
+
+def test_a_pattern_of_the_detectable_size_is_found_nine_times_in_ten():
+    """Sums of squares of noise and a pattern of the announced size, drawn without the package; the control is half."""
+    found = refit(observations(n_frames=30))
+    test, rng = named(found, "decentring"), np.random.default_rng(8)
+    limit = stats.f.isf(ALPHA / len(found.tests), test.dof, test.dof_residual)
+    for strength, low, high in ((1.0, 0.88, 0.92), (0.5, 0.0, 0.4)):
+        # Twice the number of stars times the mean square is the pattern's sum of squares, here in units of the noise.
+        root = np.sqrt(2 * found.n_stars) * strength * test.detectable_px / found.sigma
+        squares = (root + rng.standard_normal(20_000)) ** 2 + rng.chisquare(test.dof - 1, 20_000)
+        f = squares / test.dof / (rng.chisquare(test.dof_residual, 20_000) / test.dof_residual)
+        assert low < np.mean(f > limit) < high
+    assert 0.0 < test.detectable_px < 0.05
 
 
 def test_aberration_is_measured_as_a_velocity():

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy import stats
 
 import starcal_uq as sc
 from starcal_uq.camera.distortion import model_names
@@ -238,3 +239,15 @@ def test_the_spread_over_seeds_is_the_sigma_that_is_reported():
     assert (np.mean(np.abs(errors / naive) < 1.96, axis=0) < 0.91).all()
     # Cramer-Rao bound of the true noise, by an independent path: the information at the truth scaled to 0.05 px.
     assert np.allclose(np.mean(sigmas, axis=0), [0.14, 0.14, 0.026, 0.36e-10, 0.068e-15], rtol=0.06)
+
+
+def test_intervals_without_sampling_are_students_and_stand_in_the_table():
+    obs = observations(n_frames=60).select_frames(range(3))
+    cal = sc.calibrate(obs, sc.paper.paper_start())
+    half = stats.t.ppf(0.975, cal.dof) * cal.sigmas
+    assert cal.interval() == pytest.approx(np.stack([cal.theta - half, cal.theta + half], axis=1))
+    assert half[0] > 1.01 * 1.96 * cal.sigmas[0], "the normal interval, the control, is shorter"
+    low, high = cal.sigma_interval()
+    assert stats.chi2.cdf(cal.dof * cal.sigma**2 / np.array([high, low]) ** 2, cal.dof) == pytest.approx([0.025, 0.975])
+    table = cal.to_dataframe()
+    assert table["low"].to_numpy()[:5] == pytest.approx(cal.interval()[:, 0]) and table["high"].iloc[-1] == high

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import model_names
 from starcal_uq.camera.projection import backward_kernel, backward_root, backward_second_kernel, project, second_index
 from starcal_uq.core.errors import SamplingError
@@ -23,8 +24,10 @@ from starcal_uq.inference.sample import sample
 from starcal_uq.inference.target import laplace_approximation, start_target
 from starcal_uq.maths.linear import symmetric_inverse
 from starcal_uq.observations.frames import StarFrames
+from starcal_uq.observations.table import Observations
 from starcal_uq.simulation.frames import simulate
 from starcal_uq.sky.catalogue import load_catalogue
+from tests.helpers.outside import campaign
 from tests.helpers.scenes import camera, nominal, observations, with_sigmas
 
 QUICK: dict[str, Any] = {"n_ensembles": 2, "n_walkers": 32, "n_steps": 60, "n_burn": 10, "seed": 3}
@@ -156,6 +159,34 @@ def test_both_variabilities_agree_where_there_are_many_frames() -> None:
     assert np.all((ratio > 0.75) & (ratio < 1.33))
     assert build(observations(n_frames=60))[0].variability == "expected"
     assert build(observations(n_frames=1000))[0].variability == "empirical"
+
+
+def test_fewer_frames_than_parameters_have_the_covariance_of_gaussian_noise() -> None:
+    """The scatter of four frames knows nothing of a fifth direction: that is the control."""
+    obs = observations(n_frames=60).select_frames(range(4))
+    cal = calibrate(obs, nominal(camera()), method="three_stage")
+    objective = PairObjective(StarFrames.from_observations(obs), "brown")
+    expected = expected_godambe(objective, cal.pair_theta, cal.sigma)
+    assert relative(cal.pair_covariance, expected) < 1e-9 and cal.covariance is cal.pair_covariance
+    unit = np.outer(cal.sigmas, cal.sigmas)
+    assert np.linalg.eigvalsh(cal.covariance / unit)[0] > 1e-4
+    assert np.linalg.eigvalsh(objective.godambe(cal.pair_theta) / unit)[0] < 1e-12
+
+
+@pytest.mark.slow
+def test_intervals_of_the_pair_estimate_cover_with_four_frames() -> None:
+    """Against a simulator of another make; the sandwich over frames of before is the control."""
+    inside, before = [], []
+    for seed in range(100):
+        c = campaign(np.random.default_rng(seed), n_frames=4)
+        obs = Observations(**c.columns, meta={"directions": "apparent"})
+        cal = calibrate(obs, Camera(**c.camera_toml(), coefficients=(0.0, 0.0)), method="three_stage")
+        low, high = cal.interval().T
+        inside.append((low <= c.theta) & (c.theta <= high))
+        spread = PairObjective(StarFrames.from_observations(obs), "brown").godambe(cal.theta)
+        before.append(np.abs(cal.theta - c.theta) <= 1.96 * np.sqrt(np.diag(spread)))
+    assert 0.92 < np.mean(inside) < 0.98
+    assert np.mean(before) < 0.9
 
 
 def test_noise_of_a_pair_is_predicted() -> None:

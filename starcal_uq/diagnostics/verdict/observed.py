@@ -14,6 +14,7 @@ from starcal_uq.sky.refraction import refraction_constants, shrinking
 from starcal_uq.sky.site import Site
 
 if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.observations.table import Observations
 
@@ -57,14 +58,17 @@ def directions(obs: Observations, cal: Calibration) -> Check:
 
 def aberration_words(cal: Calibration) -> str:
     """What annual aberration can do to this camera if it is not in the directions."""
-    camera = cal.camera
+    ratio = significant(ABERRATION_RAD * cal.camera.focal_px / float(cal.sigmas[2]))
+    return f"Annual aberration {aberration_size(cal.camera)}, {ratio} times its sigma."
+
+
+def aberration_size(camera: Camera) -> str:
+    """What annual aberration can do to a camera of this field, as the end of a sentence."""
     diagonal_rad = 2.0 * np.arctan(np.hypot(camera.width_px, camera.height_px) / 2.0 / camera.focal_px)
     angle = fixed(ABERRATION_RAD * diagonal_rad * ARCSEC, 1)
-    shift_px = ABERRATION_RAD * camera.focal_px
-    ratio = significant(shift_px / float(cal.sigmas[2]))
     return (
-        f"Annual aberration changes angles by up to {angle} arcsec from corner to corner of this field and can move f "
-        f"by up to {significant(shift_px)} px, {ratio} times its sigma."
+        f"changes angles by up to {angle} arcsec from corner to corner of this field and can move f by up to "
+        f"{significant(ABERRATION_RAD * camera.focal_px)} px"
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from starcal_uq.camera.distortion import parameters, sigma_parameter
 from starcal_uq.core.formatting import fixed, significant
 from starcal_uq.core.types import FloatArray
+from starcal_uq.diagnostics.misfit import ALPHA
 from starcal_uq.diagnostics.residuals import Profile1D, residual_profiles
 from starcal_uq.maths.ranks import counts_below, uniformity_band
 from starcal_uq.presentation.figures import style
@@ -25,11 +26,10 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.observations.table import Observations
 
-_ALPHA = 0.05
 _SMALLEST_P = 1e-12
 
 
-def plot_misfit(misfit: Misfit, ax: Axes | None = None, *, alpha: float = _ALPHA) -> Axes:
+def plot_misfit(misfit: Misfit, ax: Axes | None = None, *, alpha: float = ALPHA) -> Axes:
     """Corrected p-value of every test on a logarithmic axis; beyond the line is more than noise."""
     if ax is None:
         ax = style.new_axes(7.2, 0.27 * len(misfit.tests) + 1.0)
@@ -49,20 +49,20 @@ def plot_misfit(misfit: Misfit, ax: Axes | None = None, *, alpha: float = _ALPHA
 
 
 def plot_jackknife(jackknife: Jackknife, ax: Axes | None = None) -> Axes:
-    """Jackknife over formal sigma of every parameter, with the range that chance gives."""
+    """Cluster-robust and jackknife over formal sigma of every parameter, with the range that chance gives."""
     if ax is None:
         ax = style.new_axes(4.2, 3.2)
     style.dress(ax, grid=True)
     rows = np.arange(len(jackknife.ratio))
     low, high = jackknife.expected()
     ax.bar(rows, high - low, bottom=low, width=0.62, color=style.LIGHT, label="chance (95 %)")
-    ax.scatter(rows - 0.08, jackknife.ratio, color=style.BLUE, s=32, zorder=3, label="jackknife")
+    ax.scatter(rows - 0.08, jackknife.ratio, color=style.BLUE, s=32, zorder=3, label="cluster-robust")
     ax.scatter(
-        rows + 0.08, jackknife.sandwich_ratio, color=style.ORANGE, marker="s", s=26, zorder=3, label="cluster-robust"
+        rows + 0.08, jackknife.jackknife_ratio, color=style.ORANGE, marker="s", s=26, zorder=3, label="jackknife"
     )
     ax.axhline(1.0, color=style.INK, linewidth=0.9)
     ax.set_xticks(rows, jackknife.parameter_names)
-    top = max(float(np.max([high, jackknife.ratio, jackknife.sandwich_ratio])), 1.2)
+    top = max(float(np.max([high, jackknife.ratio, jackknife.jackknife_ratio])), 1.2)
     ax.set_ylim(min(0.5, float(low.min()) - 0.05), 1.0 + 1.8 * (top - 1.0))
     style.legend(ax, loc="upper left", ncols=2, columnspacing=0.7, handletextpad=0.2, handlelength=1.0)
     style.label(ax, "Frames against formal errors", "", "ratio to formal sigma")

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.formatting import count, decimals_for, fixed, percent, plural, significant
-from starcal_uq.diagnostics.verdict.estimate import MISFIT_P, models_sentence, star_sentence
+from starcal_uq.diagnostics.verdict.estimate import MISFIT_P, models_sentence, sensitivity, star_sentence
 from starcal_uq.inference.derived import derived_quantities
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.diagnostics import (
@@ -32,7 +32,7 @@ def diagnosis_context(diagnosis: Diagnosis | None, cal: Calibration) -> dict[str
     unit = " px" if cal.sigma_name == "sigma" else ""
     return {
         "misfit_table": misfit_table(diagnosis.misfit),
-        "misfit_sentence": _misfit_sentence(diagnosis),
+        "misfit_sentence": f"{_misfit_sentence(diagnosis)} {sensitivity(diagnosis)}".strip(),
         "jackknife_table": None if jackknife is None else jackknife_table(jackknife, parameters(cal.camera.distortion)),
         "jackknife_sentence": "" if jackknife is None else jackknife_text(jackknife),
         "star_table": None if stars is None else star_table(stars, parameters(cal.camera.distortion)),

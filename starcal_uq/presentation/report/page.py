@@ -89,6 +89,7 @@ def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
         "pair_table": tables.pair_table(cal),
         "noise_table": tables.noise_table(cal),
         "noise_model": cal.noise_model,
+        "assumption_rows": words.assumption_rows(verdict),
         "prior_rows": words.prior_rows(results),
         "likelihood_sentence": words.likelihood_sentence(results),
         "sigma_sentence": words.sigma_sentence(results),

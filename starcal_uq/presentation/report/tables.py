@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 Row = dict[str, Any]
 # Two-sided 95 % quantile of the normal distribution.
-Z_95 = 1.959964
 
 
 def all_parameters(results: Results) -> tuple[Parameter, ...]:
@@ -38,7 +37,7 @@ def parameter_rows(results: Results) -> list[Row]:
     """One row per parameter, and one for the focal length in millimetres."""
     cal, post, truth = results.calibration, results.posterior, results.truth
     mean, sd = np.append(cal.theta, cal.sigma), np.append(cal.sigmas, cal.sigma_std)
-    low, high = mean - Z_95 * sd, mean + Z_95 * sd
+    low, high = np.vstack([cal.interval(), cal.sigma_interval()]).T
     prior: list[tuple[float, float] | None] = [None] * len(mean)
     if post is not None:
         mean, sd = post.draws.mean(axis=0), post.sd

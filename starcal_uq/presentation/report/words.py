@@ -14,6 +14,7 @@ from starcal_uq.diagnostics.verdict.observed import air, conditional_words, corr
 from starcal_uq.presentation.words.propagation import equivalent_shift
 
 if TYPE_CHECKING:
+    from starcal_uq.diagnostics.verdict.judge import Verdict
     from starcal_uq.observations.table import Observations
     from starcal_uq.presentation.report.results import Results
     from starcal_uq.propagation.field import FieldMap
@@ -125,6 +126,30 @@ def attitude_sentence(results: Results) -> str:
         f"{plural(error.n_draws, 'posterior draw')} through QUEST on {plural(error.n_frames, 'frame')} "
         f"({error.frames}); first-order propagation gives the same σ within {percent(propagation_difference(error))}."
     )
+
+
+# What the uncertainties assume, and the checks that look for the opposite.
+_ASSUMPTIONS = (
+    ("Centroid errors are Gaussian, with the noise that is stated.", ("Outliers", "Posterior predictive check")),
+    ("The noise is the same over field, magnitude and time, or stated star by star.", ("Evenness of the noise",)),
+    (
+        "Stars of one frame share no error but the attitude (motion, refraction, temperature).",
+        ("Jackknife over frames", "Unexplained structure"),
+    ),
+    ("A star brings no error along (catalogue position and motion, blend, colour).", ("Errors of the stars",)),
+    ("Directions are those that the camera saw: aberration, and refraction in air.", ("Catalogue directions",)),
+    (
+        "The lens follows the distortion model, the same in all frames.",
+        ("Pattern in the residuals", "Unexplained structure", "Distortion model"),
+    ),
+    ("Every star is the one that it is said to be.", ("Outliers", "Two estimators")),
+)
+
+
+def assumption_rows(verdict: Verdict) -> list[dict[str, Any]]:
+    """What is assumed, with the outcome of the checks that were made for it."""
+    made = {check.name: check for check in verdict.checks}
+    return [{"assumed": words, "checks": [made[n] for n in names if n in made]} for words, names in _ASSUMPTIONS]
 
 
 def prior_rows(results: Results) -> list[dict[str, str]]:

@@ -17,7 +17,7 @@ from starcal_uq.diagnostics.predictive import PredictiveCheck
 from starcal_uq.diagnostics.stars import StarTest
 from starcal_uq.diagnostics.validation.replicates import LOG_LIKELIHOOD
 from starcal_uq.diagnostics.validation.result import ENOUGH_REPLICATES, Validation
-from starcal_uq.diagnostics.verdict.estimate import MISFIT_P
+from starcal_uq.diagnostics.verdict.estimate import MISFIT_P, sensitivity
 from starcal_uq.inference.checks import COMPRESSED_BOUND
 from starcal_uq.presentation.tables import TextTable, with_units
 
@@ -61,7 +61,7 @@ def jackknife_text(found: Jackknife) -> str:
     """By how much frames scatter more than the formal errors say."""
     low, high = float(found.ratio.min()), float(found.ratio.max())
     frames = plural(found.n_frames, "frame")
-    return f"Jackknife sigmas over {frames} are {fixed(low, 2)} to {fixed(high, 2)} times the formal ones."
+    return f"Sigmas from the scatter of {frames} are {fixed(low, 2)} to {fixed(high, 2)} times the formal ones."
 
 
 def jackknife_table(found: Jackknife, specs: Sequence[Parameter] = ()) -> TextTable:
@@ -70,14 +70,14 @@ def jackknife_table(found: Jackknife, specs: Sequence[Parameter] = ()) -> TextTa
     scales = np.array([spec.scale for spec in specs]) if specs else np.ones(len(low))
     columns = (
         [significant(v) for v in np.sqrt(np.diag(found.formal_covariance)) / scales],
-        [significant(v) for v in np.sqrt(np.diag(found.jackknife_covariance)) / scales],
+        [significant(v) for v in np.sqrt(np.diag(found.sandwich_covariance)) / scales],
         [fixed(v, 2) for v in found.ratio],
         [f"{fixed(a, 2)} to {fixed(b, 2)}" for a, b in zip(low, high, strict=True)],
-        [fixed(v, 2) for v in found.sandwich_ratio],
+        [fixed(v, 2) for v in found.jackknife_ratio],
         [significant(v) for v in found.p_values],
         [fixed(v, 2) for v in found.factors],
     )
-    heads = ("Formal σ", "Jackknife σ", "Ratio", "By chance (95 %)", "Cluster-robust ratio", "p", "Factor if accepted")
+    heads = ("Formal σ", "Over frames σ", "Ratio", "By chance (95 %)", "Jackknife ratio", "p", "Factor if accepted")
     rows = tuple(zip(found.parameter_names, *columns, strict=True))
     table = TextTable(("", *heads), rows, "Jackknife over frames")
     return with_units(table, specs) if specs else table
@@ -145,7 +145,7 @@ def predictive_table(found: PredictiveCheck) -> TextTable:
 def diagnosis_text(found: Diagnosis) -> str:
     """Every part in its own words."""
     parts = (found.misfit, found.jackknife, found.stars, found.comparison, found.predictive)
-    return "\n".join(part.text for part in parts if part is not None)
+    return "\n".join([*(part.text for part in parts if part is not None), sensitivity(found)]).strip()
 
 
 def diagnosis_html(found: Diagnosis) -> str:
