@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import importlib
 import os
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
-from types import ModuleType
 from typing import Any, Literal
 
 import numpy as np
@@ -66,34 +62,6 @@ class Chains:
     accepted: IntArray
 
 
-@lru_cache(maxsize=1)
-def _emcee() -> Any:
-    """The package emcee, without the most of a second that `scipy.stats` takes to load.
-
-    One of its moves, which is not used here, imports a function from there. Whoever uses that move, or imports
-    `scipy.stats` at the same moment, gets the real thing.
-    """
-    name = "scipy.stats"
-
-    def real(attribute: str) -> Any:
-        if attribute.startswith("__"):
-            # Importing looks at these, too.
-            raise AttributeError(attribute)
-        if sys.modules.get(name) is late:
-            del sys.modules[name]
-        return getattr(importlib.import_module(name), attribute)
-
-    late = ModuleType(name)
-    vars(late).update(__getattr__=real, gaussian_kde=lambda *given, **options: real("gaussian_kde")(*given, **options))
-    sys.modules.setdefault(name, late)
-    try:
-        import emcee
-    finally:
-        if sys.modules.get(name) is late:
-            del sys.modules[name]
-    return emcee
-
-
 def student_t_proposal(df: float) -> Callable[[FloatArray, Any], tuple[FloatArray, FloatArray]]:
     """An independence proposal for `emcee.moves.MHMove`: a standard multivariate t, whatever the present point."""
 
@@ -108,7 +76,8 @@ def student_t_proposal(df: float) -> Callable[[FloatArray, Any], tuple[FloatArra
 
 def make_moves(moves: Moves) -> list[tuple[Any, float]]:
     """The weighted emcee moves of a name."""
-    emcee = _emcee()
+    import emcee
+
     if moves == "stretch":
         return [(emcee.moves.StretchMove(), 1.0)]
     return [
@@ -139,7 +108,8 @@ def run_ensembles(
     SamplingError
         If a start is not finite or the checkpoint belongs to another run.
     """
-    emcee = _emcee()
+    import emcee
+
     weighted = make_moves(settings.moves) if moves is None else moves
     store = _Store(len(seeds), settings, dim, checkpoint, fingerprint)
     per_ensemble = settings.n_burn + settings.n_steps
@@ -165,11 +135,14 @@ def run_ensembles(
 
 def autocorrelation(values: FloatArray) -> FloatArray:
     """Integrated autocorrelation times (d,) in steps of draws (ensemble, step, walker, d), averaged over ensembles."""
-    integrated_time = _emcee().autocorr.integrated_time
+    from emcee.autocorr import integrated_time
+
     return np.asarray(np.mean([integrated_time(chain, tol=0, quiet=True) for chain in values], axis=0))
 
 
 def _start(density: Density, dim: int, seed: np.random.SeedSequence, n_walkers: int) -> Any:
+    import emcee
+
     random = np.random.RandomState(seed.generate_state(8))
     u = random.standard_normal((n_walkers, dim))
     # emcee accepts walkers of zero density and never moves them.
@@ -179,7 +152,7 @@ def _start(density: Density, dim: int, seed: np.random.SeedSequence, n_walkers: 
             f"{bad} of {n_walkers} start points drawn around the calibrated camera have no posterior density: check "
             "that the calibration converged, or use more stars."
         )
-    return _emcee().State(u, random_state=random.get_state())
+    return emcee.State(u, random_state=random.get_state())
 
 
 def _chunks(done: int, settings: EnsembleSettings, size: int) -> Iterator[tuple[int, int]]:
@@ -250,6 +223,8 @@ class _Store:
     def _read(self, path: str | os.PathLike[str]) -> None:
         import zipfile
 
+        import emcee
+
         try:
             with np.load(path, allow_pickle=False) as saved:
                 content = {name: saved[name] for name in saved.files}
@@ -265,4 +240,4 @@ class _Store:
         self.ensemble, self.step = (int(v) for v in content["place"])
         position, has_gauss = (int(v) for v in content["rest"])
         random_state = ("MT19937", content["key"], position, has_gauss, float(content["gauss"]))
-        self.state = _emcee().State(content["coords"], log_prob=content["log_prob"], random_state=random_state)
+        self.state = emcee.State(content["coords"], log_prob=content["log_prob"], random_state=random_state)
