@@ -12,9 +12,18 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from starcal_uq.budgeting.file import BudgetFile, checked_confidence, load_budget_file
-from starcal_uq.budgeting.posterior import misfit_notes, posterior_rows
+from starcal_uq.budgeting.posterior import alignment_rows, misfit_notes, posterior_rows
 from starcal_uq.budgeting.result import Budget, by_contributor, judge
-from starcal_uq.budgeting.rows import AXIS_LABELS, FROM_FILE, UNTESTED, Contributor, Expected, not_assessed
+from starcal_uq.budgeting.rows import (
+    AXIS_LABELS,
+    COMMON,
+    FROM_FILE,
+    REST,
+    UNTESTED,
+    Contributor,
+    Expected,
+    not_assessed,
+)
 from starcal_uq.budgeting.totals import N_SAMPLES, totals
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.errors import BudgetError
@@ -83,23 +92,43 @@ def budget(
 
         attitude = with_misfit(attitude, misfit, post, obs)
     untested = () if attitude.misfit is not None else (UNTESTED,)
-    rows = (*posterior_rows(attitude, post), *_from_file(stated, (*untested, *FROM_FILE)))
+    known = (_seen(row, attitude) for row in posterior_rows(attitude, post))
+    rows = (*known, *_from_file(stated, (*untested, *FROM_FILE), alignment_rows(attitude)))
     found, samples = totals(rows, chosen, n_samples=n_samples, seed=seed)
-    settings = {"confidence": chosen, "n_samples": n_samples, "file": stated.path}
+    settings = {"confidence": chosen, "n_samples": n_samples, "file": stated.path, "alignment": attitude.alignment}
     return Budget(
         rows=rows,
         totals=found,
         outcomes=judge(stated.requirements, rows, samples),
         confidence=chosen,
         title=stated.title or "Attitude error budget",
-        notes=(*misfit_notes(attitude), *_notes(rows)),
+        notes=(
+            f"After alignment: an alignment calibration on {attitude.alignment}.",
+            *misfit_notes(attitude),
+            *_notes(rows),
+        ),
         provenance=provenance(seed, settings, post.provenance.get("data_sha256")),
     )
 
 
-def _from_file(stated: BudgetFile, expected: tuple[Expected, ...]) -> tuple[Contributor, ...]:
-    """Expected contributors as the file states them or not assessed, then the user's own; each on three axes."""
-    given = {(row.name, row.axis): row for row in stated.contributors}
+def _seen(row: Contributor, attitude: AttitudeError) -> Contributor:
+    """A row of the posterior with what depends on the frames of alignment and mission."""
+    if row.name == COMMON:
+        return replace(row, conditions=f"{row.conditions}; alignment on {attitude.alignment}")
+    if row.name == REST and attitude.stays[AXES.index(row.axis)]:
+        # Frames that all see the same field: a bias that no moment changes.
+        return replace(row, interpretation="ensemble")
+    return row
+
+
+def _from_file(
+    stated: BudgetFile, expected: tuple[Expected, ...], known: tuple[Contributor, ...]
+) -> tuple[Contributor, ...]:
+    """Expected contributors as the file states them, as known without it, or not assessed; then the user's own.
+
+    Each is there on three axes.
+    """
+    given = {(row.name, row.axis): row for row in (*known, *stated.contributors)}
     rows = [given.pop((entry.name, axis), not_assessed(entry, axis)) for entry in expected for axis in AXES]
     for name in dict.fromkeys(name for name, _ in given):
         first = next(row for row in given.values() if row.name == name)

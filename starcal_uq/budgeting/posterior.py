@@ -3,11 +3,23 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.budgeting.rows import COMMON, FROM_POSTERIOR, GAUSSIAN_997, INTERACTING, NEA, REST, Contributor
+from starcal_uq.budgeting.rows import (
+    ALIGNMENT,
+    COMMON,
+    FROM_FILE,
+    FROM_POSTERIOR,
+    GAUSSIAN_997,
+    INTERACTING,
+    NEA,
+    REST,
+    Contributor,
+    not_assessed,
+)
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import plural
 from starcal_uq.propagation.attitude_error import CONTRIBUTORS, IF_MODEL_HOLDS, WITH_MISFIT_FOUND
@@ -78,6 +90,23 @@ def misfit_notes(attitude: AttitudeError) -> tuple[str, ...]:
         "The tests of the model found nothing that inflates the calibration rows; what they cannot see is not in them.",
     )
     return (*notes, *found.notes)
+
+
+def alignment_rows(attitude: AttitudeError) -> tuple[Contributor, ...]:
+    """The error of the alignment from the noise of its frames, where it was propagated; a file may state another."""
+    expected = next(entry for entry in FROM_FILE if entry.name == ALIGNMENT)
+    rows = (
+        replace(
+            not_assessed(expected, axis),
+            mean_arcsec=0.0,
+            sigma_arcsec=float(sigma),
+            conditions=f"noise of {attitude.alignment}, reference attitude without error",
+            provenance="propagated with the posterior",
+            source="posterior",
+        )
+        for axis, sigma in zip(AXES, attitude.alignment_arcsec, strict=True)
+    )
+    return tuple(row for row in rows if math.isfinite(row.sigma_arcsec))
 
 
 def _tails(attitude: AttitudeError) -> dict[tuple[str, str], float]:

@@ -41,6 +41,7 @@ ECSS_CLASSES = (
 NEA = "centroid noise (NEA)"
 COMMON = "calibration, common rotation"
 REST = "calibration, rest"
+ALIGNMENT = "alignment calibration in flight"
 _NAN = float("nan")
 # Two-sided 99.7 % quantile of a Gaussian error, standard deviations.
 GAUSSIAN_997 = 2.9677379253417833
@@ -184,8 +185,9 @@ FROM_FILE = (
         "change of that alignment from its measurement to the start of the mission: launch loads, gravity, moisture",
     ),
     Expected(
-        *("alignment calibration in flight", "bias", "ensemble", "caused by it", "gaussian"),
-        "error of the in-flight estimate that replaces the rows it absorbs",
+        *(ALIGNMENT, "bias", "ensemble", "caused by it", "gaussian"),
+        "error of the in-flight estimate that replaces the rows it absorbs, if it is more than noise of the frames on "
+        "which `propagate` aligns",
     ),
     Expected(
         *("thermo-elastic distortion", "thermo-elastic", "temporal", "no", "arcsine"),

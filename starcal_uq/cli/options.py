@@ -56,6 +56,16 @@ Duplicates = Annotated[
         "are exposures of their own)."
     ),
 ]
+Alignment = Annotated[
+    str,
+    typer.Option(
+        metavar="random|observed|FILE",
+        help="Frames on which alignment is calibrated in flight: random sky, those of the calibration, or a table.",
+    ),
+]
+AlignmentFrames = Annotated[
+    int | None, typer.Option(min=1, metavar="N", help="Number of alignment frames of random sky; 100 by default.")
+]
 Draws = Annotated[int, typer.Option(min=50, help="Posterior draws that go through QUEST.")]
 
 

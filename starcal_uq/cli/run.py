@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -21,7 +21,7 @@ from starcal_uq.cli.console import (
 )
 from starcal_uq.cli.images import load_images
 from starcal_uq.cli.mission import fail_if_violated, show_budget
-from starcal_uq.cli.options import CameraFile, Draws, Force, NewRun, Seed
+from starcal_uq.cli.options import Alignment, AlignmentFrames, CameraFile, Draws, Force, NewRun, Seed
 from starcal_uq.cli.settings import (
     EstimationSettings,
     ImageSettings,
@@ -79,6 +79,8 @@ def run_command(
     images: ImageSettings,
     sampling: SamplingSettings,
     draws: Draws = 300,
+    alignment: Alignment = "random",
+    alignment_frames: AlignmentFrames = None,
     budget: Annotated[
         Path | None,
         typer.Option(metavar="TOML", help="Contributors that the data cannot know, and requirements: see `budget`."),
@@ -108,16 +110,23 @@ def run_command(
         show_screening(run.screening)
     show_calibration(calibration, run.truth)
     warn_air(obs, calibration)
-    _after_calibration(run, sampling, draws, budget, show=True)
+    aligning = {"alignment": alignment, "alignment_frames": alignment_frames}
+    _after_calibration(run, sampling, draws, budget, show=True, **aligning)
 
 
 def _after_calibration(
-    run: Run, sampling: SamplingSettings, draws: int = 300, budget: Path | None = None, *, show: bool = False
+    run: Run,
+    sampling: SamplingSettings,
+    draws: int = 300,
+    budget: Path | None = None,
+    *,
+    show: bool = False,
+    **aligning: Any,
 ) -> None:
     """Sample, couple, propagate, question the model, budget, report; status 1 when a check or a requirement failed."""
     posterior = sample_run(run, sampling, force=True)
     run.couple()
-    run.propagate(n_draws=draws, seed=sampling.seed)
+    run.propagate(n_draws=draws, seed=sampling.seed, **aligning)
     if show:
         show_posterior(posterior)
     with progress_bar("diagnosis") as progress:

@@ -26,6 +26,8 @@ from starcal_uq.cli.console import (
 from starcal_uq.cli.console import out as console
 from starcal_uq.cli.options import (
     FAINTEST,
+    Alignment,
+    AlignmentFrames,
     CameraFile,
     Draws,
     Force,
@@ -196,6 +198,8 @@ def propagate_command(
         str | None, typer.Option(help="Profile: first or last, where its columns are numbered (q0 to q3).")
     ] = None,
     sense: Annotated[str, typer.Option(help="Profile: icrs_to_camera (b = R r) or camera_to_icrs.")] = "icrs_to_camera",
+    alignment: Alignment = "random",
+    alignment_frames: AlignmentFrames = None,
     draws: Draws = 300,
     seed: Seed = 0,
     json: Json = False,
@@ -221,9 +225,15 @@ def propagate_command(
     def tell(message: str) -> None:
         err.print(f"note: {message}", style="yellow", highlight=False, soft_wrap=True)
 
-    error, _, spectrum = sc.Run(run).propagate(n_draws=draws, seed=seed, sky=sky, tell=tell)
+    error, _, spectrum = sc.Run(run).propagate(
+        n_draws=draws, seed=seed, sky=sky, alignment=alignment, alignment_frames=alignment_frames, tell=tell
+    )
     if json:
-        document = {"frames": error.frames, "attitude_error": records(error.to_written())}
+        document = {
+            "frames": error.frames,
+            "alignment": error.alignment,
+            "attitude_error": records(error.to_written()),
+        }
         print_json(document if spectrum is None else document | {"spectrum": spectrum.text})
         return
     show_attitude(error)

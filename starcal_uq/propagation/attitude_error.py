@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import os
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.files import reading, write_csv
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.records import from_plain, to_plain
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.maths.circular import mixture_radius
 
 if TYPE_CHECKING:
@@ -36,6 +37,10 @@ CONTRIBUTORS = (
     INTERACTION,
 )
 OBSERVED = "observed frames"
+# What alignment was taken to be where nothing is said about it.
+SAME_FRAMES = "the frames themselves"
+# Columns of a row of a covariance, one for each axis.
+_COVARIANCES = tuple(f"covariance_{axis}_arcsec2" for axis in AXES)
 _ABSORBED = ("no", "yes", "no", "in part", "no")
 # Runs of earlier versions hold the first four only.
 _REQUIRED = CONTRIBUTORS[:4]
@@ -147,6 +152,20 @@ class AttitudeError(Shown):
         first order there is nothing. NaN when read from a file of a version that did not sample it.
     frames : str
         Which frames these are, such as ``observed frames``.
+    total_arcsec, analytic_total_arcsec : (3,) array or None
+        Standard deviation of common rotation and rest together, which may be correlated, sampled and by first order;
+        None in files of a version where they were not.
+    rest_constant_arcsec : (3,) array
+        Standard deviation of the part of the rest that all of the mission's frames share: a bias after alignment.
+    covariance_arcsec2 : (5, 3, 3) array
+        Covariances of pitch, yaw and roll, arcsec^2, mean over frames; rows are `CONTRIBUTORS`. Their diagonals are the
+        squares of the standard deviations.
+    alignment : str
+        Frames on which alignment is calibrated, which decide what is common.
+    alignment_covariance_arcsec2 : (3, 3) array
+        Covariance of the alignment itself from the noise of its frames, arcsec^2; NaN in files of a version without.
+    aligned : Observations or None
+        Frames of the alignment; None when read from a file.
     misfit : MisfitFound or None
         What the tests of the model add; None as long as it was not tested.
     seen : Observations or None
@@ -174,6 +193,24 @@ class AttitudeError(Shown):
     frames: str = OBSERVED
     misfit: MisfitFound | None = None
     seen: Observations | None = None
+    total_arcsec: FloatArray | None = None
+    analytic_total_arcsec: FloatArray | None = None
+    rest_constant_arcsec: FloatArray = field(default_factory=lambda: np.zeros(3))
+    covariance_arcsec2: FloatArray = field(default_factory=lambda: np.full((len(CONTRIBUTORS), 3, 3), np.nan))
+    alignment: str = SAME_FRAMES
+    alignment_covariance_arcsec2: FloatArray = field(default_factory=lambda: np.full((3, 3), np.nan))
+    aligned: Observations | None = None
+
+    @property
+    def alignment_arcsec(self) -> FloatArray:
+        """Standard deviation (3,) of the alignment itself, which stands in place of the common rotation afterwards."""
+        sigma: FloatArray = np.sqrt(np.diag(self.alignment_covariance_arcsec2))
+        return sigma
+
+    @property
+    def stays(self) -> BoolArray:
+        """True (3,) where most of the rest is one constant of the mission, as for frames that stare at one field."""
+        return np.asarray(self.rest_constant_arcsec**2 > 0.5 * self.rest_arcsec**2)
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -182,8 +219,8 @@ class AttitudeError(Shown):
 
     @property
     def calibration_total_arcsec(self) -> FloatArray:
-        """Common rotation and rest together (3,), which are uncorrelated by construction."""
-        return np.hypot(self.common_arcsec, self.rest_arcsec)
+        """Common rotation and rest together (3,)."""
+        return np.hypot(self.common_arcsec, self.rest_arcsec) if self.total_arcsec is None else self.total_arcsec
 
     @property
     def agreement(self) -> Agreement:
@@ -217,7 +254,8 @@ class AttitudeError(Shown):
             return np.full_like(held, np.nan)
         common = np.hypot(found.factor * self.common_arcsec, found.common_arcsec)
         rest = np.hypot(found.factor * self.rest_arcsec, found.rest_arcsec)
-        calibration = [with_cross(values) for values in (common, rest, np.hypot(common, rest))]
+        both = np.hypot(found.factor * self.calibration_total_arcsec, np.hypot(found.common_arcsec, found.rest_arcsec))
+        calibration = [with_cross(values) for values in (common, rest, both)]
         return np.stack([held[0], *calibration, held[4]])
 
     @property
@@ -258,7 +296,9 @@ class AttitudeError(Shown):
             self.analytic_nea_arcsec,
             self.analytic_common_arcsec,
             self.analytic_rest_arcsec,
-            np.hypot(self.analytic_common_arcsec, self.analytic_rest_arcsec),
+            np.hypot(self.analytic_common_arcsec, self.analytic_rest_arcsec)
+            if self.analytic_total_arcsec is None
+            else self.analytic_total_arcsec,
             0.0 * self.interaction_arcsec,
         )
         p95, p997 = self.half_widths_with_misfit_found_arcsec
@@ -288,6 +328,14 @@ class AttitudeError(Shown):
         """Write the table as CSV, atomically and to the last digit; overwritten. Single draws are not kept."""
         misfit = "" if self.misfit is None else json.dumps(to_plain(self.misfit))
         table = self.to_written().assign(n_draws=self.n_draws, n_frames=self.n_frames, frames=self.frames)
+        every = {"rest_constant_arcsec": self.rest_constant_arcsec, "alignment_sigma_arcsec": self.alignment_arcsec}
+        columns = {name: np.tile(with_cross(values), len(CONTRIBUTORS)) for name, values in every.items()}
+        # A line holds its row of the matrix; the angle across the boresight has none.
+        for prefix, matrices in (("", self.covariance_arcsec2), ("alignment_", self.alignment_covariance_arcsec2)):
+            filled = np.full((len(CONTRIBUTORS), len(TOTAL_AXES), 3), np.nan)
+            filled[:, :3] = matrices
+            columns |= {prefix + name: filled[..., i].ravel() for i, name in enumerate(_COVARIANCES)}
+        table = table.assign(alignment=self.alignment, **columns)
         # Once is enough: it is the same for all rows.
         write_csv(table.assign(misfit=[misfit] + [""] * (len(table) - 1)), path)
 
@@ -322,6 +370,24 @@ class AttitudeError(Shown):
             counts = {name: int(first[name]) for name in ("n_draws", "n_frames")}
             frames = first.get("frames") or OBSERVED
             misfit = from_plain(MisfitFound, json.loads(first["misfit"])) if first.get("misfit") else None
+            later: dict[str, Any] = {}
+            if first.get("alignment"):
+
+                def matrix(contributor: str, prefix: str = "") -> list[list[float]]:
+                    names = [prefix + name for name in _COVARIANCES]
+                    return [[float(rows[contributor, axis][name] or "nan") for name in names] for axis in AXES]
+
+                unknown = [[math.nan] * len(AXES)] * len(AXES)
+                later = {
+                    "alignment": first["alignment"],
+                    "total_arcsec": table[0, 3, :3],
+                    "analytic_total_arcsec": table[3, 3, :3],
+                    "rest_constant_arcsec": np.array([float(row["rest_constant_arcsec"]) for row in chosen[0][:3]]),
+                    "covariance_arcsec2": np.array(
+                        [matrix(name) for name in known] + [unknown] * (table.shape[1] - len(known))
+                    ),
+                    "alignment_covariance_arcsec2": np.array(matrix(known[0], "alignment_")),
+                }
         sigma, p95, p997, analytic = table
         return cls(
             *(sigma[0, :3], sigma[1, :3], sigma[2, :3], p95, p997),
@@ -331,6 +397,7 @@ class AttitudeError(Shown):
             interaction_arcsec=sigma[4, :3],
             frames=frames,
             misfit=misfit,
+            **later,
         )
 
 

@@ -3,13 +3,12 @@
 Every draw of the camera turns the measured pixels into directions, and QUEST turns these into one attitude per frame.
 Its difference from the attitude at the posterior mean is a left rotation vector phi (pitch, yaw, roll), split into
 
-- the *common rotation*, its mean over frames: one constant for the mission, which alignment calibration with the same
-  parameters absorbs, and
-- the *rest*, which depends on where the stars are and is absorbed by nothing.
+- the *common rotation*: what an alignment calibration with the same parameters finds on its own frames, and removes,
+- the *rest*: what remains on the frames of the mission, and is absorbed by nothing.
 
-The mean square of phi is the sum of theirs. Centroid noise (the noise-equivalent angle, NEA) stands beside them: it is
-new in every frame. What noise and a wrong camera do together, phi(camera, noise) - phi(camera, 0) - phi(0, noise), is
-their *interaction*, of second order.
+Alignment and mission see different frames: a mission that stares at one field keeps the error of that field. Centroid
+noise (the noise-equivalent angle, NEA) stands beside them: it is new in every frame. What noise and a wrong camera do
+together, phi(camera, noise) - phi(camera, 0) - phi(0, noise), is their *interaction*, of second order.
 
 A few hundred draws give a standard deviation to 4 % only. But phi is linear in the parameters to high accuracy, and its
 first-order response K is known, so it serves as a control variate: to the variance of the sampled phi is added
@@ -33,6 +32,8 @@ from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import DistortionError, ObservationError, SamplingError
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.noise_model import weighed
+from starcal_uq.propagation.alignment import alignment_frames as _alignment_frames
+from starcal_uq.propagation.alignment import alignment_weights
 from starcal_uq.propagation.attitude_error import OBSERVED, AttitudeError
 
 if TYPE_CHECKING:
@@ -49,7 +50,15 @@ _NOISY_DRAWS = 40
 _STEP_PX = 0.5
 
 
-def propagate(post: Posterior, obs: Observations, *, n_draws: int = 300, seed: int = 0) -> AttitudeError:
+def propagate(
+    post: Posterior,
+    obs: Observations,
+    *,
+    n_draws: int = 300,
+    seed: int = 0,
+    alignment: Observations | str | None = None,
+    alignment_frames: int | None = None,
+) -> AttitudeError:
     """Attitude error of single frames: centroid noise, calibration as common rotation and rest, and their interaction.
 
     QUEST weights stars equally, or by their stated noise where the posterior scales it.
@@ -64,7 +73,12 @@ def propagate(post: Posterior, obs: Observations, *, n_draws: int = 300, seed: i
     n_draws : int
         Draws that go through QUEST; all if there are fewer.
     seed : int
-        Chooses them, and the noise.
+        Chooses them, the noise, and a random sky.
+    alignment : Observations or str, optional
+        Frames on which alignment is calibrated in flight: ``random`` (by default) for a random sky with as many stars a
+        frame as `obs`, ``observed`` for `obs` itself, or a table.
+    alignment_frames : int, optional
+        Number of frames of the random sky; 100 by default.
 
     Raises
     ------
@@ -73,7 +87,7 @@ def propagate(post: Posterior, obs: Observations, *, n_draws: int = 300, seed: i
     DistortionError
         When a draw folds the distortion within the observed pixels.
     ObservationError
-        When the posterior scales stated noises that the observations lack.
+        When the posterior scales stated noises that the observations lack, or the alignment is none of these.
     DegenerateFrameError
         When a frame does not determine an attitude.
     """
@@ -82,27 +96,47 @@ def propagate(post: Posterior, obs: Observations, *, n_draws: int = 300, seed: i
     if count < 2:
         raise SamplingError("propagation needs at least two posterior draws: raise n_draws.")
     frames = FrameGeometry.of(post, obs)
+    aligning, told = _alignment_frames(post, obs, alignment, alignment_frames, seed)
+    aligned = frames if aligning is obs else FrameGeometry.of(post, aligning)
+    weights, alignment_covariance = alignment_weights(aligned.noise_covariance)
     common = np.empty((count, 3))
-    total, squares = np.zeros((obs.n_frames, 3)), np.zeros((obs.n_frames, 3))
+    for part, phi in aligned.rotations(draws):
+        common[part] = np.einsum("nij,dnj->di", weights, phi)
+    rest, whole = _Moments(obs.n_frames), _Moments(obs.n_frames)
+    constant = np.empty((count, 3))
     for part, phi in frames.rotations(draws):
-        common[part] = phi.mean(axis=1)
-        rest = phi - common[part, None]
-        total += rest.sum(axis=0)
-        squares += np.sum(rest * rest, axis=0)
+        whole.add(phi)
+        rest.add(phi - common[part, None])
+        constant[part] = phi.mean(axis=1) - common[part]
 
     nea = frames.noise_covariance
-    together, apart = frames.response.mean(axis=0), frames.response - frames.response.mean(axis=0)
+    together = np.einsum("nij,njp->ip", weights, aligned.response)
+    apart = frames.response - together
+    staying = apart.mean(axis=0)
     chance = post.covariance - np.cov(draws, rowvar=False)
     common_variance = np.maximum(common.var(axis=0, ddof=1) + spread(together, chance), 0.0)
-    rest_variance = (squares - total * total / count) / (count - 1) + spread(apart, chance)
-    rest_variance = np.maximum(rest_variance, 0.0)
+    constant_variance = np.maximum(constant.var(axis=0, ddof=1) + spread(staying, chance), 0.0)
+    rest_variance = np.maximum(rest.variance + spread(apart, chance), 0.0)
+    whole_variance = np.maximum(whole.variance + spread(frames.response, chance), 0.0).mean(axis=0)
     noise_excess, interaction = _with_noise(frames, draws[:_NOISY_DRAWS], seed)
     half_widths = [_noise_half_widths(nea, seed)]
     sigmas = (np.sqrt(common_variance), _rms(rest_variance))
     half_widths += [*_calibration_half_widths(post, together, apart, sigmas, seed), _half_widths(interaction)]
     p95, p997 = np.swapaxes(half_widths, 0, 1) * ARCSEC
+    noise_sigma = np.sqrt(np.maximum(_diagonal(nea).mean(axis=0) + noise_excess, 0.0))
+    met = interaction.reshape(-1, 3)
+    covariances = [
+        _with_sigmas(nea.mean(axis=0), noise_sigma),
+        _with_sigmas(together @ post.covariance @ together.T, sigmas[0]),
+        _with_sigmas((apart @ post.covariance @ np.swapaxes(apart, 1, 2)).mean(axis=0), sigmas[1]),
+        _with_sigmas(
+            (frames.response @ post.covariance @ np.swapaxes(frames.response, 1, 2)).mean(axis=0),
+            np.sqrt(whole_variance),
+        ),
+        met.T @ met / len(met),
+    ]
     return AttitudeError(
-        nea_arcsec=np.sqrt(np.maximum(_diagonal(nea).mean(axis=0) + noise_excess, 0.0)) * ARCSEC,
+        nea_arcsec=noise_sigma * ARCSEC,
         common_arcsec=sigmas[0] * ARCSEC,
         rest_arcsec=sigmas[1] * ARCSEC,
         p95_arcsec=p95,
@@ -118,7 +152,32 @@ def propagate(post: Posterior, obs: Observations, *, n_draws: int = 300, seed: i
         interaction_arcsec=_rms(interaction.reshape(-1, 3) ** 2) * ARCSEC,
         frames=str(obs.meta.get("frames", OBSERVED)),
         seen=obs,
+        total_arcsec=np.sqrt(whole_variance) * ARCSEC,
+        analytic_total_arcsec=_rms(spread(frames.response, post.covariance)) * ARCSEC,
+        rest_constant_arcsec=np.sqrt(constant_variance) * ARCSEC,
+        covariance_arcsec2=np.stack(covariances) * ARCSEC**2,
+        alignment=told,
+        alignment_covariance_arcsec2=alignment_covariance * ARCSEC**2,
+        aligned=aligning,
     )
+
+
+class _Moments:
+    """Variance (K, 3) over draws that come in parts (d, K, 3)."""
+
+    def __init__(self, n_frames: int) -> None:
+        self._count = 0
+        self._total, self._squares = np.zeros((n_frames, 3)), np.zeros((n_frames, 3))
+
+    def add(self, values: FloatArray) -> None:
+        self._count += len(values)
+        self._total += values.sum(axis=0)
+        self._squares += np.sum(values * values, axis=0)
+
+    @property
+    def variance(self) -> FloatArray:
+        found: FloatArray = (self._squares - self._total**2 / self._count) / (self._count - 1)
+        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -260,6 +319,14 @@ def _calibration_half_widths(
     draw, frame = rng.integers(len(shift), size=_SAMPLES), rng.integers(len(apart), size=_SAMPLES)
     rest = _scaled(np.einsum("np,nip->ni", shift[draw], apart[frame]), sigmas[1])
     return [_half_widths(errors) for errors in (common, rest, rest + common[draw])]
+
+
+def _with_sigmas(covariance: FloatArray, sigma: FloatArray) -> FloatArray:
+    """A first-order covariance (3, 3) with the correlations it has, and these standard deviations."""
+    own = np.sqrt(np.diag(covariance))
+    scale = np.divide(sigma, own, out=np.zeros(3), where=own > 0.0)
+    scaled: FloatArray = covariance * np.outer(scale, scale)
+    return scaled
 
 
 def _scaled(errors: FloatArray, sigma: FloatArray) -> FloatArray:

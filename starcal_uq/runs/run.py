@@ -404,6 +404,8 @@ class Run:
         n_draws: int = 300,
         seed: int = 0,
         sky: MissionSky | None = None,
+        alignment: str | PathLike = "random",
+        alignment_frames: int | None = None,
         tell: Callable[[str], None] | None = None,
     ) -> tuple[AttitudeError, FieldMap, ErrorSpectrum | None]:
         """Carry the posterior through QUEST on the observed frames or a mission's, and over the field; write all of it.
@@ -416,6 +418,10 @@ class Run:
             As for `starcal_uq.propagate`.
         sky : MissionSky, optional
             Frames in place of the observed ones.
+        alignment : str or path
+            Frames on which alignment is calibrated: ``random`` sky, those ``observed`` for this run, or a table.
+        alignment_frames : int, optional
+            Number of frames of the random sky; 100 by default.
         tell : callable, optional
             Function that gets what a user should know, one sentence each.
         """
@@ -429,7 +435,14 @@ class Run:
         from starcal_uq.propagation.propagate import propagate
 
         frames = self.observations if sky is None else sky.frames(posterior, self.observations, seed)
-        error = propagate(posterior, frames, n_draws=n_draws, seed=seed)
+        aligning: Observations | str = str(alignment)
+        if aligning == "observed":
+            aligning = self.observations.with_meta(frames="observed frames")
+        elif aligning != "random":
+            aligning = load_observations(alignment).with_meta(frames=str(alignment))
+        error = propagate(
+            posterior, frames, n_draws=n_draws, seed=seed, alignment=aligning, alignment_frames=alignment_frames
+        )
         fields = field_map(posterior, self.observations)
         spectrum = None
         told = [str(message) for message in frames.meta.get("messages", ())]

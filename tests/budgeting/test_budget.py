@@ -24,7 +24,7 @@ from starcal_uq.budgeting.file import (
     load_budget_file,
 )
 from starcal_uq.budgeting.result import Budget
-from starcal_uq.budgeting.rows import COMMON, FROM_FILE, GAUSSIAN_997, NEA, REST, UNTESTED
+from starcal_uq.budgeting.rows import ALIGNMENT, COMMON, FROM_FILE, GAUSSIAN_997, NEA, REST, UNTESTED
 from starcal_uq.budgeting.shapes import one_axis_factor
 from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
 from starcal_uq.core.errors import BudgetError, RunFolderError
@@ -612,8 +612,13 @@ def test_the_budget_of_a_run_is_written_to_its_folder(full: Any, stated: Path) -
     assert repr(back.totals) == repr(found.totals) and len(found.violations) == 1
     error = AttitudeError.load(full.attitude)
     assert found.total("roll").sigma_arcsec == pytest.approx(
-        np.hypot(error.nea_arcsec[2], error.rest_arcsec[2]), rel=1e-3
+        np.linalg.norm([error.nea_arcsec[2], error.rest_arcsec[2], error.alignment_arcsec[2]]), rel=1e-3
     )
+    # The noise of the alignment fills its row, which says on which frames.
+    filled = [row for row in found.rows if row.name == ALIGNMENT]
+    assert [row.sigma_arcsec for row in filled] == list(error.alignment_arcsec)
+    assert all("100 frames of random sky" in row.conditions and row.source == "posterior" for row in filled)
+    assert found.provenance["settings"]["alignment"] == "100 frames of random sky"
     # Sampled from the rows, with their varying sigmas, it is what was propagated from the posterior.
     assert found.total("roll").sampled_arcsec == pytest.approx(error.p997_arcsec[0][2], rel=0.03)
     # Negative control: the rule's Gaussian quantile is not.

@@ -97,7 +97,8 @@ def _attitude(error: AttitudeError) -> str:
     if values[1] == max(values):
         return (
             f"Attitude across the boresight: {largest}, one constant, exceeds centroid noise: {common} against "
-            f"{noise} per frame. Alignment calibration with these parameters absorbs it; what remains is {rest}."
+            f"{noise} per frame. Alignment calibration with these parameters, on {error.alignment}, absorbs it; what "
+            f"remains is {rest}."
         )
     return (
         f"Attitude across the boresight: {largest} dominates. Noise: {noise}; common rotation: {common}; rest: {rest}."

@@ -23,6 +23,7 @@ from starcal_uq.presentation.report import tables as image_tables
 from starcal_uq.presentation.report import words as field_words
 from starcal_uq.presentation.report.results import Results
 from starcal_uq.presentation.words.propagation import (
+    alignment_sentence,
     corner_sentence,
     coupling_table,
     misfit_sentence,
@@ -69,6 +70,7 @@ def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
         "names": [p.name for p in tables.all_parameters(results)],
         "parameter_rows": tables.parameter_rows(results),
         "attitude_rows": [] if results.attitude is None else tables.attitude_rows(results.attitude),
+        "alignment_sentence": "" if results.attitude is None else alignment_sentence(results.attitude),
         "one_number_sentence": "" if results.attitude is None else one_number_sentence(results.attitude),
         "misfit_attitude_sentence": "" if results.attitude is None else misfit_sentence(results.attitude),
         "attitude_sentence": words.attitude_sentence(results),

@@ -87,9 +87,23 @@ def misfit_sentence(error: AttitudeError) -> str:
     return f"Found: {'; '.join(reasons)}."
 
 
+def alignment_sentence(error: AttitudeError) -> str:
+    """What "absorbed by alignment" refers to, and what the alignment itself adds."""
+    head = f"Alignment is on {error.alignment}"
+    if not np.isfinite(error.alignment_arcsec).all():
+        return f"{head}, the noise of which was not propagated by the version that wrote this."
+    sizes = join_words([significant(float(v)) for v in error.alignment_arcsec])
+    text = f"{head}, whose noise leaves {sizes} arcsec ({', '.join(AXES)}) for good."
+    if error.stays.any():
+        axes = join_words([axis for axis, stays in zip(AXES, error.stays, strict=True) if stays])
+        text += f" The mission's frames see one field: the rest in {axes} is a bias that stays, too."
+    return text
+
+
 def attitude_text(error: AttitudeError) -> str:
-    """Whether first order holds, what a single number would hide, and what the misfit adds."""
-    return f"{agreement_text(error.agreement)} {one_number_sentence(error)} {misfit_sentence(error)}"
+    """Whether first order holds, what a single number would hide, what alignment is, and what the misfit adds."""
+    parts = (agreement_text(error.agreement), one_number_sentence(error), alignment_sentence(error))
+    return " ".join((*parts, misfit_sentence(error)))
 
 
 def attitude_table(error: AttitudeError) -> TextTable:

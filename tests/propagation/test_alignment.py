@@ -1,0 +1,215 @@
+"""What alignment removes: against a star sensor of a second make that aligns on some frames and flies on others."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.core.errors import ObservationError
+from starcal_uq.observations.table import Observations
+from starcal_uq.propagation.attitude_error import AttitudeError
+from starcal_uq.propagation.propagate import propagate
+
+ARCSEC = 648_000.0 / np.pi
+THETA = np.array([500.0, 530.0, 5800.0, 2.0e-10, -3.5e-15])
+# Standard deviations and one strong correlation: the principal point is loose, the focal length coarse.
+SIGMA = np.array([0.3, 0.3, 0.6, 1.0e-10, 2.0e-16])
+NOISE_PX = 0.05
+
+
+class Draws:
+    """A posterior of the second make: Gaussian draws of the camera and its noise."""
+
+    def __init__(self, n: int = 4000) -> None:
+        rng = np.random.default_rng(7)
+        self.theta_draws = THETA + SIGMA * rng.standard_normal((n, 5))
+        self.sigma_draws = np.full(n, NOISE_PX)
+        self.draws = np.column_stack((self.theta_draws, self.sigma_draws))
+        self.mean, self.covariance = self.theta_draws.mean(axis=0), np.cov(self.theta_draws, rowvar=False)
+        self.sigma_name = "sigma"
+        self.provenance: dict[str, str] = {}
+        self.camera = sc.Camera(
+            width_px=1024, height_px=1024, pixel_um=12.0, focal_mm=69.6, x0_px=500.0, y0_px=530.0,
+            distortion="brown", coefficients=(2.0e-10, -3.5e-15),
+        )  # fmt: skip
+
+    def thin(self, n: int, seed: int) -> np.ndarray:
+        return self.draws[np.random.default_rng(seed).permutation(len(self.draws))[:n]]
+
+
+POST = Draws()
+
+
+def table(pixels: list[np.ndarray]) -> Observations:
+    """Frames of such pixels, wherever the camera looks."""
+    xy = np.concatenate(pixels)
+    b = directions(POST.mean, xy)
+    return Observations(
+        frame=np.repeat(np.arange(len(pixels)), [len(p) for p in pixels]),
+        x_px=xy[:, 0],
+        y_px=xy[:, 1],
+        ra_deg=np.degrees(np.arctan2(b[:, 1], b[:, 0])) % 360.0,
+        dec_deg=np.degrees(np.arcsin(b[:, 2])),
+    )
+
+
+def directions(theta: np.ndarray, xy: np.ndarray) -> np.ndarray:
+    """Brown's model turned round by fixed-point iteration."""
+    x0, y0, f, k1, k2 = theta
+    seen = xy - [x0, y0]
+    ideal = seen
+    for _ in range(30):
+        r2 = np.sum(ideal**2, axis=1, keepdims=True)
+        ideal = seen / (1.0 + k1 * r2 + k2 * r2**2)
+    b = np.column_stack((ideal, np.full(len(xy), f)))
+    return b / np.linalg.norm(b, axis=1, keepdims=True)
+
+
+def turn(theta: np.ndarray, xy: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Left rotation vector (3,) arcsec of the best attitude, by singular values, from that of the true directions."""
+    u, _, vt = np.linalg.svd(directions(theta, xy).T @ true)
+    r = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return 0.5 * ARCSEC * np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])
+
+
+def skies(rng: np.random.Generator, n_frames: int, stars: int = 12) -> list[np.ndarray]:
+    return [rng.uniform(0.0, 1023.0, (stars, 2)) for _ in range(n_frames)]
+
+
+def slew(rng: np.random.Generator, n_frames: int) -> list[np.ndarray]:
+    """Stars that move along x, 100 px a frame."""
+    stars = np.column_stack((rng.uniform(0.0, 1023.0 + 100.0 * n_frames, 24), rng.uniform(0.0, 1023.0, 24)))
+    frames = []
+    for k in range(n_frames):
+        xy = stars - [100.0 * k, 0.0]
+        frames.append(xy[(xy[:, 0] > 0.0) & (xy[:, 0] < 1023.0)])
+    return frames
+
+
+def flown(
+    align: list[np.ndarray], mission: list[np.ndarray], thetas: np.ndarray, n_noise: int, *, old: bool = False
+) -> dict[str, np.ndarray]:
+    """Root mean squares (3,) arcsec: what alignment removes, what it leaves of the camera, and its own noise.
+
+    Attitudes of the alignment are weighted by the inverse of their covariance from noise.
+    """
+    rng = np.random.default_rng(3)
+    true = [[directions(POST.mean, p) for p in frames] for frames in (align, mission)]
+    weights = np.array([np.sum(np.eye(3) - b[:, :, None] * b[:, None, :], axis=0) for b in true[0]])
+    weights = np.linalg.inv(weights.sum(axis=0)) @ weights
+
+    def aligned(turns: np.ndarray) -> np.ndarray:
+        return np.einsum("nij,nj->i", weights, turns)
+
+    common, rest = [], []
+    for theta in thetas:
+        phi = np.array([turn(theta, p, b) for p, b in zip(mission, true[1], strict=True)])
+        found = aligned(np.array([turn(theta, p, b) for p, b in zip(align, true[0], strict=True)]))
+        common.append(phi.mean(axis=0) if old else found)
+        rest.append(np.sqrt(np.mean((phi - common[-1]) ** 2, axis=0)))
+    noise = [
+        aligned(
+            np.array(
+                [
+                    turn(POST.mean, p + NOISE_PX * rng.standard_normal(p.shape), b)
+                    for p, b in zip(align, true[0], strict=True)
+                ]
+            )
+        )
+        for _ in range(n_noise)
+    ]
+    values = {"common": common, "rest": rest, "noise": noise or [np.zeros(3)]}
+    return {name: np.sqrt(np.mean(np.square(found), axis=0)) for name, found in values.items()}
+
+
+def sigma_points() -> np.ndarray:
+    """Ten cameras that have the mean and the covariance of the posterior."""
+    steps = np.sqrt(5.0) * np.linalg.cholesky(POST.covariance).T
+    return POST.mean + np.concatenate((steps, -steps))
+
+
+@lru_cache
+def scenes() -> dict[str, tuple[list[np.ndarray], list[np.ndarray]]]:
+    """Frames of alignment, and of the mission."""
+    rng = np.random.default_rng(5)
+    align = skies(rng, 12)
+    return {
+        "stare": (align, [skies(rng, 1)[0]] * 6),
+        "slew": (align, slew(rng, 10)),
+        "random": (align, skies(rng, 10)),
+    }
+
+
+@pytest.mark.parametrize("mission", ["stare", "slew", "random"])
+def test_what_alignment_leaves_is_that_of_sensors_that_align_and_fly(mission: str) -> None:
+    align, flight = scenes()[mission]
+    found: AttitudeError = propagate(POST, table(flight), n_draws=20, alignment=table(align))  # type: ignore[arg-type]
+    seen = flown(align, flight, sigma_points(), 60)
+    np.testing.assert_allclose(found.common_arcsec, seen["common"], rtol=0.01)
+    np.testing.assert_allclose(found.rest_arcsec, seen["rest"], rtol=0.01)
+    # Standard deviations of 60 alignments are good to 9 %.
+    np.testing.assert_allclose(found.alignment_arcsec, seen["noise"], rtol=0.3)
+    assert found.stays.all() == (mission == "stare")
+    # Control: the split of before takes the mean over the mission's own frames for common.
+    old = flown(flight, flight, sigma_points(), 0, old=True)["rest"]
+    assert (np.abs(old / found.rest_arcsec - 1.0) > 0.02).any()
+    if mission == "stare":
+        assert old.max() < 1e-9 < 1e-3 < found.rest_arcsec.min()
+
+
+@pytest.mark.slow
+def test_sensors_that_align_and_stare_are_as_predicted() -> None:
+    """A thousand sensors align on the same sky with noise of their own, then stare at one field."""
+    align, flight = scenes()["stare"]
+    found = propagate(POST, table(flight), n_draws=300, alignment=table(align))  # type: ignore[arg-type]
+    thetas = POST.theta_draws[:1000]
+    seen = flown(align, flight[:1], thetas, 1000)
+    np.testing.assert_allclose(found.rest_arcsec, seen["rest"], rtol=0.07)
+    after = np.hypot(found.rest_arcsec, found.alignment_arcsec)
+    np.testing.assert_allclose(after, np.hypot(seen["rest"], seen["noise"]), rtol=0.07)
+    own = propagate(POST, table(flight), n_draws=300, alignment="observed")  # type: ignore[arg-type]
+    assert own.rest_arcsec.max() < 1e-6
+
+
+def test_a_random_sky_is_the_default_and_is_said() -> None:
+    align, stare = scenes()["stare"]
+    frames = table(stare)
+    found = propagate(POST, frames, n_draws=20)  # type: ignore[arg-type]
+    assert found.alignment == "100 frames of random sky"
+    assert "Alignment is on 100 frames of random sky, whose noise leaves" in found.text
+    assert "the rest in pitch, yaw and roll is a bias that stays" in found.text
+    other = propagate(POST, frames, n_draws=20, alignment="random", alignment_frames=400)  # type: ignore[arg-type]
+    np.testing.assert_allclose(found.alignment_arcsec / other.alignment_arcsec, 2.0, rtol=0.1)
+    # Noise of n frames falls with their root.
+    single = propagate(POST, table(align), n_draws=2, alignment="observed").nea_arcsec  # type: ignore[arg-type]
+    np.testing.assert_allclose(10.0 * found.alignment_arcsec, single, rtol=0.2)
+    # Control: an alignment on the stare itself takes the error of its field for common.
+    own = propagate(POST, frames, n_draws=20, alignment="observed")  # type: ignore[arg-type]
+    assert own.rest_arcsec.max() < 1e-6 < 1e-3 < found.rest_arcsec.min()
+    np.testing.assert_allclose(found.calibration_total_arcsec, own.common_arcsec, rtol=1e-3)
+
+
+def test_an_alignment_that_is_none_is_refused() -> None:
+    frames = table(scenes()["random"][1])
+    for options, words in (
+        ({"alignment": "sky"}, "give 'random', 'observed' or a table"),
+        ({"alignment_frames": 0}, "at least 1"),
+        ({"alignment": "observed", "alignment_frames": 5}, "belongs to a random sky"),
+    ):
+        with pytest.raises(ObservationError, match=words):
+            propagate(POST, frames, **options)  # type: ignore[arg-type]
+
+
+def test_the_file_keeps_alignment_and_covariances(tmp_path) -> None:  # type: ignore[no-untyped-def]
+    found = propagate(POST, table(scenes()["slew"][1]), n_draws=20)  # type: ignore[arg-type]
+    found.save(tmp_path / "attitude.csv")
+    again = AttitudeError.load(tmp_path / "attitude.csv")
+    assert again.alignment == found.alignment
+    for name in ("total_arcsec", "rest_constant_arcsec", "covariance_arcsec2", "alignment_covariance_arcsec2"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(found, name))
+    sigma = [np.sqrt(np.diag(matrix)) for matrix in found.covariance_arcsec2[:4]]
+    parts = [found.nea_arcsec, found.common_arcsec, found.rest_arcsec, found.calibration_total_arcsec]
+    np.testing.assert_allclose(sigma, parts, rtol=1e-9)
