@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -20,6 +21,8 @@ from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.marginal import MarginalLikelihood, Profile
 from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
+
+_pairs = cache(np.triu_indices)
 
 
 @dataclass(frozen=True)
@@ -56,13 +59,18 @@ class CompressedLikelihood:
     def whiten(self, theta: FloatArray) -> FloatArray:
         """Whitened parameters z (n, p) of theta (n, p)."""
         shift = np.atleast_2d(np.asarray(theta, dtype=np.float64)) - self.theta_hat
-        inverse = np.linalg.inv(self.whitening / np.diag(self.whitening)[:, None])
-        z: FloatArray = (shift / np.diag(self.whitening)) @ inverse.T
+        diagonal, inverse = self._unwhitening
+        z: FloatArray = (shift / diagonal) @ inverse
         return z
+
+    @cached_property
+    def _unwhitening(self) -> tuple[FloatArray, FloatArray]:
+        diagonal = np.diag(self.whitening)
+        return diagonal, np.asarray(np.linalg.inv(self.whitening / diagonal[:, None]).T)
 
     def sum_of_squares(self, z: FloatArray) -> FloatArray:
         """Sum of squared residuals (n,) at whitened parameters z (n, p)."""
-        rows, columns = np.triu_indices(z.shape[1])
+        rows, columns = _pairs(z.shape[1])
         m = np.concatenate([np.ones((len(z), 1)), z, z[:, rows] * z[:, columns]], axis=1)
         s: FloatArray = np.sum((m @ self.gram) * m, axis=1)
         return s

@@ -12,6 +12,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -137,12 +138,18 @@ class Priors(Shown, ABC):
 
     def log_density_theta(self, theta: FloatArray) -> FloatArray:
         """Log density (n,) of camera parameters (n, p), per unit of each parameter."""
+        mean, sd, whitening, log_volume = self._normal
+        z = (np.atleast_2d(theta) - mean) / sd @ whitening
+        return np.asarray(-0.5 * np.sum(z * z, axis=1) - log_volume - 0.5 * len(sd) * _LOG_2PI)
+
+    @cached_property
+    def _normal(self) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+        """Mean, standard deviation, whitening of the correlation and log volume of the camera's parameters."""
         names = parameter_names(self.distortion)
         sd = self.sd(names)
         factor = np.linalg.cholesky(self._correlation())
-        z = (np.atleast_2d(theta) - self.mean(names)) / sd @ np.linalg.inv(factor).T
         log_volume = np.sum(np.log(sd)) + np.sum(np.log(np.diag(factor)))
-        return np.asarray(-0.5 * np.sum(z * z, axis=1) - log_volume - 0.5 * len(names) * _LOG_2PI)
+        return self.mean(names), sd, np.linalg.inv(factor).T, float(log_volume)
 
     def log_density_log_sigma(self, log_sigma: FloatArray) -> FloatArray:
         """Log density (n,) of the logarithm of the noise, per unit of the logarithm."""
@@ -395,7 +402,8 @@ class GaussianPriors(Priors):
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for files."""
         arrays = {"theta_mean": self.theta_mean.tolist(), "theta_covariance": self.theta_covariance.tolist()}
-        return {"kind": KIND, **vars(self), **arrays, "source": dict(self.source)}
+        values = {item.name: getattr(self, item.name) for item in dataclasses.fields(self)}
+        return {"kind": KIND, **values, **arrays, "source": dict(self.source)}
 
     def _statement(self, name: str) -> str:
         mean, sd = float(self.mean([name])[0]), float(self.sd([name])[0])

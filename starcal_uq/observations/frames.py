@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -71,7 +72,7 @@ class StarFrames:
         """Number of frames."""
         return len(self.starts) - 1
 
-    @property
+    @cached_property
     def sizes(self) -> IntArray:
         """Stars per frame, (K,)."""
         return np.diff(self.starts)
@@ -117,6 +118,7 @@ class StarFrames:
 
     def rotated(self, rotations: FloatArray) -> FloatArray:
         """Catalogue directions in the camera frame: ``b = R r`` with R_cam_icrs (K, 3, 3); (3, N)."""
-        rows = [[self.spread(np.ascontiguousarray(rotations[:, i, j])) for j in range(3)] for i in range(3)]
+        columns = self.spread(rotations.reshape(-1, 9).T).reshape(3, 3, -1)
         x, y, z = self.r
-        return np.stack([a * x + b * y + c * z for a, b, c in rows])
+        turned: FloatArray = columns[:, 0] * x + columns[:, 1] * y + columns[:, 2] * z
+        return turned
