@@ -196,6 +196,14 @@ def plan_command(
         Path | None,
         typer.Option(metavar="RUN", help="Count the data of this run first, and take its calibrated camera."),
     ] = None,
+    distortion_percent: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            metavar="LOW HIGH",
+            help="Distortion that a sheet with zero coefficients leaves open: displacement of the corner, per cent, "
+            "barrel negative; from an f-theta lens to as much pincushion by default.",
+        ),
+    ] = None,
     check: Annotated[
         int | None, typer.Option(min=10, metavar="N", help="Also simulate N campaigns of each size and compare.")
     ] = None,
@@ -237,6 +245,7 @@ def plan_command(
         confidence=confidence,
         scope=scope,
         after=known,
+        distortion_percent=distortion_percent,
         seed=seed,
     )
     choice = simulated = None
@@ -281,16 +290,16 @@ def plan_command(
 
 
 def _show_plan(found: Plan, choice: FrameChoice | None, simulated: ForecastCheck | None) -> None:
-    from starcal_uq.presentation.words.planning import choice_table, plan_table
+    from starcal_uq.presentation.words.planning import choice_table, distortion_sentence, plan_table
 
     print_table(plan_table(found))
-    words = [found.text, *(f"{need.scope}: {need.text}" for need in found.needs)]
+    words = [found.text, distortion_sentence(found), *(f"{need.scope}: {need.text}" for need in found.needs)]
     if choice is not None:
         print_table(choice_table(choice))
         words.append(choice.text)
     if simulated is not None:
         words.append(simulated.text)
-    for sentence in words:
+    for sentence in filter(None, words):
         console.print(sentence, highlight=False, soft_wrap=True)
 
 

@@ -22,6 +22,7 @@ from starcal_uq.core.provenance import provenance
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.planning.forecast import N_CAMPAIGNS, N_FRAMES, SCOPES, Forecast, Forecaster, nea_arcsec
 from starcal_uq.planning.information import FrameSet, Noise, largest_noise, noise_of, random_frames
+from starcal_uq.planning.open_distortion import DistortionRange, distortion_range, open_range, with_distortion
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky
 
 if TYPE_CHECKING:
@@ -61,6 +62,7 @@ def plan(
     confidence: float = 0.997,
     scope: str = "common",
     after: HasInformation | None = None,
+    distortion_percent: tuple[float, float] | None = None,
     sweeps: bool = True,
     n_geometries: int = 3000,
     n_campaigns: int = N_CAMPAIGNS,
@@ -91,6 +93,11 @@ def plan(
         with the centroid noise of a frame.
     after : Calibration or Posterior, optional
         Data that are there already, whose information counts.
+    distortion_percent : (float, float), optional
+        Least and largest displacement of the corner by the distortion, per cent of its distance from the centre (barrel
+        is negative), that a sheet with zero coefficients leaves open: frames and errors are forecast over this range.
+        By default from the barrel distortion of an f-theta lens to as much pincushion distortion, at most 30 %;
+        coefficients that are not zero are known, and nothing is open.
     sweeps : bool
         Also forecast 1000 frames with other magnitude limits, noise, and parts of the detector.
     n_geometries : int
@@ -112,6 +119,9 @@ def plan(
         raise PlanningError(
             f"the centroid noise is {sigma_px:g} px: give a number above zero, at most {_WORST_NOISE_PX:g} px per axis."
         )
+    bounds = open_range(camera, distortion_percent, after is not None)
+    if bounds is not None:
+        camera = with_distortion(camera, min(max(0.0, bounds[0]), bounds[1]))
     start = start_information(after, camera)
     limit = float(np.max(stars.mag, initial=-np.inf)) if max_mag is None else float(max_mag)
     seen = stars.select(stars.mag <= limit)
@@ -134,7 +144,22 @@ def plan(
         "stars": stars.source,
         "band": stars.band,
         "after": None if after is None else type(after).__name__,
+        "distortion_percent": None if bounds is None else list(bounds),
     }
+    spread = None
+    if bounds is not None and bounds[0] < bounds[1]:
+        spread = distortion_range(
+            frames,
+            seen,
+            sigma_px,
+            bounds,
+            n_frames=n_frames,
+            min_stars=min_stars,
+            target_arcsec=target_arcsec,
+            scope=scope,
+            options=options,
+            seed=seed,
+        )
     table = None
     if sweeps:
         base = _Base(stars, camera, sigma_px, limit, min_stars, seed)
@@ -153,6 +178,7 @@ def plan(
         target_arcsec=target_arcsec,
         needs=() if target_arcsec is None else _needs(frames, target_arcsec, options),
         sweeps=table,
+        distortion=spread,
         seed=seed,
         provenance=provenance(seed, settings, None),
     )
@@ -341,6 +367,8 @@ class Plan(Shown):
         Frames that keep the target, for each part of the error; empty without a target.
     sweeps : pandas.DataFrame or None
         Forecasts with another magnitude limit, noise or part of the detector.
+    distortion : DistortionRange or None
+        What the distortion does that the sheet leaves open; None where it is known.
     seed : int
         Seed of the drawn geometries.
     provenance : dict
@@ -360,8 +388,19 @@ class Plan(Shown):
     target_arcsec: float | None
     needs: tuple[Need, ...]
     sweeps: pd.DataFrame | None
+    distortion: DistortionRange | None
     seed: int
     provenance: AnyDict
+
+    @property
+    def frames_range(self) -> tuple[float, float] | None:
+        """Least and most frames for the target over the distortion that is open, in the scope asked for.
+
+        Infinite where no number does; None without a target, or where the distortion is known.
+        """
+        if self.distortion is None or self.target_arcsec is None:
+            return None
+        return self.distortion.frames_range(self.scope)
 
     @property
     def frames_needed(self) -> int | None:
@@ -379,9 +418,12 @@ class Plan(Shown):
         Columns are ``n_frames``; 1 sigma of every parameter, of the displacement that its distortion error causes in
         the farthest corner, and per axis of common rotation, rest and NEA; ``noise_relative``, the relative standard
         error of the noise; and ``radius_arcsec``, the two-axis error at the confidence, with the range of 90 % of the
-        campaigns.
+        campaigns, and its range over the distortion that is open (``radius_least_arcsec``, ``radius_most_arcsec``).
         """
         table = self.forecast.to_dataframe()
+        if self.distortion is not None:
+            radii = self.distortion.radius_arcsec
+            table = table.assign(radius_least_arcsec=radii.min(axis=0), radius_most_arcsec=radii.max(axis=0))
         place = int(table.columns.get_loc("noise_relative"))
         for axis, value in zip(AXES, self.nea_arcsec, strict=True):
             table.insert(place, f"nea_{axis}_arcsec", float(value))

@@ -41,13 +41,15 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def small_plans(monkeypatch: pytest.MonkeyPatch) -> None:
     """Plans over fewer attitudes and campaigns: what the options mean does not depend on how many there are."""
-    from starcal_uq.planning import check, design, plan
+    from starcal_uq.planning import check, design, open_distortion, plan
 
     monkeypatch.setattr(plan, "plan", partial(plan.plan, n_geometries=300, n_campaigns=40))
     monkeypatch.setattr(design, "choose_frames", partial(design.choose_frames, candidates=300, n_geometries=100))
     monkeypatch.setattr(check, "check_forecast", partial(check.check_forecast, n_geometries=300))
     for name in ("_SWEEP_GEOMETRIES", "_TRIED_ATTITUDES"):
         monkeypatch.setattr(plan, name, 200)
+    monkeypatch.setattr(open_distortion, "_GEOMETRIES", 100)
+    monkeypatch.setattr(open_distortion, "_CAMPAIGNS", 20)
 
 
 @pytest.fixture

@@ -15,13 +15,17 @@ from starcal_uq.core.errors import PlanningError
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.maths.circular import mixture_radius
 from starcal_uq.maths.linear import inverses
+from starcal_uq.planning import open_distortion
 from starcal_uq.planning.check import ForecastCheck, check_forecast
 from starcal_uq.planning.design import choose_frames
 from starcal_uq.planning.forecast import Forecaster, nea_arcsec, quantities, spreads, student_factor
 from starcal_uq.planning.information import FrameSet, look_at, random_frames
+from starcal_uq.planning.open_distortion import with_distortion
 from starcal_uq.planning.plan import Plan, plan
-from starcal_uq.presentation.pages.planning import write_plan
+from starcal_uq.presentation.pages.planning import render_plan, write_plan
+from starcal_uq.presentation.words.planning import distortion_sentence
 from starcal_uq.presentation.words.planning import frames as frames_words
+from tests.helpers.outside import campaign
 from tests.helpers.scenes import COEFFICIENTS, camera, observations
 
 ARCSEC = 648_000.0 / np.pi
@@ -326,6 +330,94 @@ def test_sweeps_change_one_thing():
         for rows, at in ((magnitudes, 6.0), (noise, 0.05), (groups["part of the detector"], 1.0))
     ]
     assert [row["radius_arcsec"] for row in here] == pytest.approx([here[0]["radius_arcsec"]] * 3, rel=0.05)
+
+
+# --- distortion that the sheet leaves open ---------------------------------------------------------------------------
+
+
+def sheet(percent: float = 0.0, distortion: str = "brown") -> sc.Camera:
+    """A field of 20 degrees, whose corner the distortion displaces by so much."""
+    n = len(camera(distortion).coefficients)
+    focal_mm = 5.12 / np.tan(np.radians(10.0))
+    plain = {
+        "width_px": 1024,
+        "height_px": 1024,
+        "pixel_um": 10.0,
+        "focal_mm": focal_mm,
+        "x0_px": 511.5,
+        "y0_px": 511.5,
+    }
+    bare = sc.Camera(**plain, distortion=distortion, coefficients=(0.0,) * n)
+    return with_distortion(bare, percent) if percent else bare
+
+
+SMALL = {"max_mag": 5.0, "n_geometries": 200, "n_campaigns": 40, "sweeps": False, "n_frames": (30, 300)}
+
+
+def test_a_sheet_without_distortion_leaves_a_range_and_known_distortion_none(monkeypatch):
+    monkeypatch.setattr(open_distortion, "_GEOMETRIES", 200)
+    monkeypatch.setattr(open_distortion, "_CAMPAIGNS", 24)
+    found = plan(sheet(), sky(5.0), target_arcsec=20.0, **SMALL)
+    f_theta = -100.0 / 3.0 * np.tan(np.radians(10.0)) ** 2 * 2.0
+    assert found.distortion.percent[[0, -1]] == pytest.approx([f_theta, -f_theta], rel=1e-6)
+    least, most = found.frames_range
+    assert least / found.frames_needed < 0.5 and most / found.frames_needed > 5.0
+    assert found.distortion.frames_range("rest") == (1.0, 1.0)
+    # Each end is what a sheet that states it gets, and such a sheet has no range.
+    for percent, frames in ((-f_theta, least), (f_theta, most)):
+        known = plan(sheet(percent), sky(5.0), target_arcsec=20.0, **SMALL)
+        assert known.frames_needed == pytest.approx(frames, rel=0.1) and known.frames_range is None
+        assert "distortion" not in known.text
+    assert f"{frames_words(int(least)).split()[0]} to {frames_words(int(most))}" in found.text
+    assert "principal point" in distortion_sentence(found) and "2.1 % of barrel" in distortion_sentence(found)
+    table = found.to_dataframe()
+    assert (table["radius_least_arcsec"] < table["radius_arcsec"]).all()
+    assert (table["radius_arcsec"] < table["radius_most_arcsec"]).all()
+    assert "distortion of −2.1 % to 2.1 %" in render_plan(found, {})
+    rest = plan(sheet(), sky(5.0), scope="rest", distortion_percent=(-1.0, 0.5), **SMALL)
+    assert "hardly matters for the rest" in distortion_sentence(rest)
+    assert plan(sheet(), sky(5.0), distortion_percent=(0.0, 0.0), **SMALL).distortion is None
+
+
+def test_the_inverse_model_bends_the_same_way():
+    for name in ("brown", "inverse", "k1"):
+        images = (sc.camera.project(sheet(percent, name), [[0.1, 0.0, 1.0]]) for percent in (-2.0, 0.0, 2.0))
+        radii = [float(np.hypot(*(xy[0] - 511.5))) for xy in images]
+        assert radii[0] < radii[1] < radii[2]
+
+
+@pytest.mark.parametrize(
+    ("camera_", "given", "words"),
+    [
+        (sheet(1.0), (-1.0, 1.0), "known from the coefficients"),
+        (sheet(), (1.0, -1.0), "least and the largest"),
+        (sheet(), (-50.0, 0.0), "within 30"),
+    ],
+)
+def test_ranges_that_make_no_sense_are_refused(camera_, given, words):
+    with pytest.raises(PlanningError, match=words):
+        plan(camera_, sky(5.0), distortion_percent=given, **SMALL)
+
+
+@pytest.mark.slow
+def test_calibrations_of_a_second_make_err_as_much_more_with_barrel_distortion():
+    """The range is no property of our formula: errors of the principal point in simulated campaigns have it, too."""
+
+    def spread(percent: float) -> float:
+        corner = (0.01 * percent * 512.0 * np.sqrt(2.0), 0.0)
+        errors = []
+        for seed in range(40):
+            c = campaign(
+                np.random.default_rng([13, seed]), n_frames=12, stars_per_frame=30, field_deg=20.0, corner_px=corner
+            )
+            cal = sc.calibrate(sc.Observations(**c.columns), sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)))
+            errors.append(cal.theta[:2] - c.theta[:2])
+        return float(np.sqrt(np.mean(np.square(errors))))
+
+    plain = spread(0.0)
+    # From the plan's own range: 2.95 and 0.56; 80 errors tell a spread to 8 %.
+    assert spread(-2.07) / plain == pytest.approx(2.95, rel=0.3)
+    assert spread(2.07) / plain == pytest.approx(0.56, rel=0.3)
 
 
 # --- refusals, words and files ---------------------------------------------------------------------------------------

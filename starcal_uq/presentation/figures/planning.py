@@ -48,7 +48,8 @@ _CHECKED = (
 def plot_forecast(plan: Plan) -> Figure:
     """Attitude errors across and about the boresight, the two-axis error with the target, and the parameters.
 
-    All against number of frames, on logarithmic axes. The band of the two-axis error holds 90 % of the campaigns; where
+    All against number of frames, on logarithmic axes. The band of the two-axis error holds 90 % of the campaigns, the
+    grey one its range over the distortion that the sheet leaves open; where
     the target needs more frames than were forecast, the curve is continued with dots.
     """
     figure = style.new_figure(11.0, 7.6)
@@ -82,6 +83,9 @@ def _attitude_panel(ax: Axes, table: pd.DataFrame, n: FloatArray, axes: tuple[st
 def _radius_panel(ax: Axes, plan: Plan, n: FloatArray) -> None:
     _logarithmic(ax)
     found = plan.forecast
+    if plan.distortion is not None:
+        radii = plan.distortion.radius_arcsec
+        ax.fill_between(n, radii.min(axis=0), radii.max(axis=0), color=style.LIGHT, linewidth=0, zorder=0)
     ax.fill_between(n, found.radius_low, found.radius_high, color=style.BLUE, alpha=0.2, linewidth=0)
     ax.plot(n, found.radius, color=style.BLUE, marker="o", markersize=4, linewidth=1.5)
     if plan.target_arcsec is not None:
@@ -165,10 +169,13 @@ def plot_plan_sweeps(plan: Plan) -> Figure:
         raise ValueError("this plan was made without sweeps: call plan with sweeps=True.")
     of_frames = plan.frames_needed is not None
     column = "frames_needed" if of_frames else "radius_arcsec"
+    open_distortion = plan.distortion is not None
     figure = style.new_figure(11.0, 3.6)
-    panels = figure.subplots(1, 3, sharey=True)
+    panels = figure.subplots(1, 3 + open_distortion, sharey=True)
     here = {"magnitude limit": plan.max_mag, "noise": plan.sigma_px, "part of the detector": 1.0}
-    for ax, (name, words, logarithmic) in zip(panels, _SWEEPS, strict=True):
+    if plan.distortion is not None:
+        _distortion_panel(panels[3], plan, of_frames)
+    for ax, (name, words, logarithmic) in zip(panels[:3], _SWEEPS, strict=True):
         rows = plan.sweeps[plan.sweeps["sweep"] == name]
         x, y = (np.asarray(rows[key], dtype=np.float64) for key in ("value", column))
         style.dress(ax, grid=True)
@@ -196,6 +203,27 @@ def plot_plan_sweeps(plan: Plan) -> Figure:
     style.label(panels[0], title)
     _plain_axis(panels[0].yaxis, panels[0].get_ylim())
     return figure
+
+
+def _distortion_panel(ax: Axes, plan: Plan, of_frames: bool) -> None:
+    found = plan.distortion
+    assert found is not None
+    y = found.frames[:, found.scopes.index(plan.scope)] if of_frames else found.radius_after_arcsec
+    style.dress(ax, grid=True)
+    ax.set_yscale("log")
+    ax.minorticks_off()
+    good = np.isfinite(y)
+    ax.plot(found.percent[good], y[good], color=style.BLUE, marker="o", markersize=4.5, linewidth=1.5)
+    ax.plot(
+        *(found.percent[~good], np.full((~good).sum(), 0.97), "^"),
+        color=style.GREY,
+        markersize=6,
+        transform=ax.get_xaxis_transform(),
+    )
+    own = int(np.argmin(np.abs(found.percent)))
+    if good[own]:
+        ax.plot(found.percent[own], y[own], marker="D", color=style.VERMILLION, markersize=7, linestyle="")
+    style.label(ax, "", "distortion at the corner [%]")
 
 
 def plot_frame_choice(choice: FrameChoice) -> Figure:

@@ -13,6 +13,7 @@ import numpy as np
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, new_folder, write_csv
 from starcal_uq.core.formatting import count, fixed, significant
+from starcal_uq.core.records import to_plain
 from starcal_uq.planning.check import ForecastCheck
 from starcal_uq.planning.design import FrameChoice
 from starcal_uq.planning.plan import Plan
@@ -29,10 +30,13 @@ from starcal_uq.presentation.words.planning import (
     SCOPE_NAMES,
     check_text,
     choice_text,
+    distortion_sentence,
     level,
     need_words,
     plan_text,
+    range_words,
     settings_sentence,
+    span,
 )
 
 PAGE = "plan.html"
@@ -106,6 +110,8 @@ def plan_record(plan: Plan) -> dict[str, Any]:
         "confidence": plan.confidence,
         "scope": plan.scope,
         "target_arcsec": plan.target_arcsec,
+        "distortion": None if plan.distortion is None else _finite(to_plain(plan.distortion)),
+        "distortion_words": distortion_sentence(plan),
         "needs": [
             {
                 "scope": need.scope,
@@ -122,6 +128,15 @@ def plan_record(plan: Plan) -> dict[str, Any]:
         ],
         "provenance": plan.provenance,
     }
+
+
+def _finite(value: Any) -> Any:
+    """JSON has no number for what is infinite."""
+    if isinstance(value, dict):
+        return {name: _finite(item) for name, item in value.items()}
+    if isinstance(value, list):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
 def plan_figures(plan: Plan, choice: FrameChoice | None = None, check: ForecastCheck | None = None) -> dict[str, bytes]:
@@ -168,16 +183,19 @@ def _frame_table(choice: FrameChoice) -> TextTable:
 
 def _needs_table(plan: Plan) -> TextTable:
     """Frames needed, by part of the error; the part that was asked for is marked."""
+    spread = plan.distortion
     rows = tuple(
         (
             SCOPE_NAMES[need.scope],
             need_words(need, need.frames),
             need_words(need, need.frames_surely),
+            *(() if spread is None else (range_words(*spread.frames_range(need.scope)),)),
             significant(need.floor_arcsec, 3) if need.floor_arcsec > 0.0 else "0",
         )
         for need in plan.needs
     )
-    heads = ("Part of the error", "On average", "In 95 % of campaigns", "Floor [arcsec]")
+    over = () if spread is None else (f"Distortion of {span(spread)}",)
+    heads = ("Part of the error", "On average", "In 95 % of campaigns", *over, "Floor [arcsec]")
     return TextTable(heads, rows, marks=tuple("chosen" if need.scope == plan.scope else "" for need in plan.needs))
 
 
@@ -192,6 +210,8 @@ def _context(plan: Plan, images: Mapping[str, bytes]) -> dict[str, Any]:
         "version": plan.provenance["versions"].get("starcal_uq") or "",
         "verdict": plan_text(plan),
         "settings": settings_sentence(plan),
+        "distortion_words": distortion_sentence(plan),
+        "distortion_span": "" if plan.distortion is None else span(plan.distortion),
         "level": level(plan.confidence),
         "scope": SCOPE_NAMES[plan.scope],
         "target": None if plan.target_arcsec is None else f"{plan.target_arcsec:g} arcsec",
@@ -205,6 +225,10 @@ def _context(plan: Plan, images: Mapping[str, bytes]) -> dict[str, Any]:
                 "radius": significant(float(row["radius_arcsec"]), 3),
                 "range": f"{significant(float(row['radius_low_arcsec']), 3)} to "
                 f"{significant(float(row['radius_high_arcsec']), 3)}",
+                "distortion": None
+                if plan.distortion is None
+                else f"{significant(float(row['radius_least_arcsec']), 3)} to "
+                f"{significant(float(row['radius_most_arcsec']), 3)}",
             }
             for row in table.to_dict("records")
         ],

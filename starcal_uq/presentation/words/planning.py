@@ -6,11 +6,15 @@ import numpy as np
 
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import MINUS, count, fixed, join_words, percent, plural, significant
+from starcal_uq.core.types import FloatArray
 from starcal_uq.planning.check import ForecastCheck
 from starcal_uq.planning.design import FrameChoice
+from starcal_uq.planning.open_distortion import AFTER_FRAMES, DistortionRange
 from starcal_uq.planning.plan import Need, Plan
 from starcal_uq.presentation.tables import TextTable
 
+# Radii that differ by less than this over the open distortion hardly matter.
+LITTLE = 1.2
 SCOPE_NAMES = {
     "common": "common rotation",
     "rest": "rest of the calibration",
@@ -49,7 +53,68 @@ def plan_text(plan: Plan) -> str:
     if plan.need is None:
         return _largest(plan)
     target = f"{plan.target_arcsec:g} arcsec across the boresight at {level(plan.confidence)}"
-    return f"{_needed(plan.need, target)}{_others(plan)}"
+    return f"{_needed(plan.need, target)}{_range(plan)}{_others(plan)}"
+
+
+def _range(plan: Plan) -> str:
+    """The range of frames over the distortion that the sheet leaves open."""
+    if plan.distortion is None or plan.frames_range is None:
+        return ""
+    words, percent = range_words(*plan.frames_range), _own_percent(plan)
+    own = "without distortion" if percent == 0.0 else f"at {corner(percent)}"
+    return (
+        f" That is {own}; over the distortion that the sheet leaves open "
+        f"({span(plan.distortion)} at the corner) it is {words}."
+    )
+
+
+def range_words(least: float, most: float) -> str:
+    """A range of numbers of frames; infinite where none does."""
+    ends = [frames(None if np.isinf(n) else int(n)) for n in (least, most)]
+    return ends[0] if ends[0] == ends[1] else f"{ends[0].removesuffix('s').removesuffix(' frame')} to {ends[1]}"
+
+
+def corner(percent: float) -> str:
+    """A displacement of the corner by the distortion."""
+    if percent == 0.0:
+        return "no distortion"
+    kind = "barrel" if percent < 0.0 else "pincushion"
+    return f"{significant(abs(percent))} % of {kind} distortion"
+
+
+def span(found: DistortionRange) -> str:
+    """The range of the displacement of the corner."""
+    low, high = (f"{significant(float(p))} %" for p in (found.percent[0], found.percent[-1]))
+    return f"{low} to {high}".replace("-", MINUS)
+
+
+def _own_percent(plan: Plan) -> float:
+    assert plan.distortion is not None
+    return float(np.clip(0.0, plan.distortion.percent[0], plan.distortion.percent[-1]))
+
+
+def distortion_sentence(plan: Plan) -> str:
+    """What the open distortion does, which distortion is the worst, and why; empty where the distortion is known."""
+    found = plan.distortion
+    if found is None:
+        return ""
+    radius = found.radius_after_arcsec
+    open_words = f"The sheet leaves the distortion open ({span(found)} at the corner)."
+    if np.max(radius) < LITTLE * np.min(radius):
+        return f"{open_words} It hardly matters for the {SCOPE_NAMES[plan.scope]}."
+    worst = corner(float(found.percent[np.argmax(radius)]))
+    point, focal = (_px_range(sigmas) for sigmas in (found.principal_point_px, found.focal_px))
+    return (
+        f"{open_words} The worst is {worst}. What decides is how well the principal point can be told from a rotation "
+        f"of the camera: its sigma after {frames(AFTER_FRAMES)} is {point}, that of the focal length {focal}. A "
+        "rotation moves stars the more the further out they are; barrel distortion undoes that, most nearly in an "
+        f"f-theta lens ({significant(abs(found.f_theta_percent))} %). If the lens is known better, narrow the range "
+        "with --distortion-percent LOW HIGH, or give the coefficients."
+    )
+
+
+def _px_range(sigmas: FloatArray) -> str:
+    return f"{significant(float(sigmas.min()))} to {significant(float(sigmas.max()))} px"
 
 
 def _needed(need: Need, target: str) -> str:
