@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.special import chdtrc
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
@@ -31,6 +32,7 @@ import starcal_uq as sc  # noqa: E402
 from starcal_uq.core.status import Level  # noqa: E402
 from starcal_uq.core.tasks import processors, run_tasks  # noqa: E402
 from starcal_uq.diagnostics.verdict.judge import judge  # noqa: E402
+from starcal_uq.maths.intervals import binomial_interval  # noqa: E402
 from tests.helpers.outside import Campaign, campaign  # noqa: E402
 
 # A fact of the data and no test: few frames and empty corners are warned of in every run of such a regime.
@@ -64,6 +66,8 @@ class Outcome:
         Checks that did not pass, those of FACTS left out.
     figures : dict
         Further numbers by column name; the table shows their medians.
+    shares : dict
+        Further answers by column name; the table shows in how many per cent of the runs they are yes.
     """
 
     inside: tuple[bool, ...] = ()
@@ -71,6 +75,7 @@ class Outcome:
     verdict: str = ""
     alarms: tuple[str, ...] = ()
     figures: Mapping[str, float] = field(default_factory=dict)
+    shares: Mapping[str, bool] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -127,6 +132,23 @@ def clean(name: str, runs: int, **options: Any) -> Regime:
     return Regime(name, partial(plain, options=options), runs)
 
 
+def frame_scatter(rng: np.random.Generator, n_frames: int) -> Outcome:
+    """The test of the scatter of frames on clean data, and the one of before: leave-one-out against chi-square."""
+    c = campaign(rng, n_frames=n_frames)
+    obs = sc.Observations(**c.columns, meta={"directions": "apparent"})
+    cal = sc.calibrate(obs, sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)))
+    found = sc.diagnostics.jackknife_frames(obs, cal)
+    p = len(found.ratio)
+    before = chdtrc(found.dof, found.dof * found.jackknife_ratio**2)
+    alarms = {
+        "Alarm (nominal 1 %)": bool(np.any((p * found.p_values < 0.01) & (found.ratio > 1.1))),
+        "Alarm before": bool(np.any((p * before < 0.01) & (found.jackknife_ratio > 1.1))),
+    }
+    small = {f"p < 5 %: {n}": bool(v < 0.05) for n, v in zip(found.parameter_names, found.p_values, strict=True)}
+    least = float(found.detectable(0.01 / p).min())
+    return Outcome(figures={"Ratio seen nine times in ten": least}, shares=alarms | small)
+
+
 REGIMES: list[Regime] = [
     clean("clean: 3 frames", 400, n_frames=3),
     clean("clean: 5 frames", 400, n_frames=5),
@@ -138,6 +160,7 @@ REGIMES: list[Regime] = [
     clean("clean: 5 stars in each of 20 frames", 200, n_frames=20, stars_per_frame=5),
     clean("clean: field of 4°, 50 frames", 200, n_frames=50, field_deg=4.0),
     clean("clean: field of 55°, 50 frames", 200, n_frames=50, field_deg=55.0),
+    *(Regime(f"scatter of {k} frames", partial(frame_scatter, n_frames=k), 400, "misfit") for k in (3, 5, 10, 20, 100)),
 ]
 
 
@@ -167,6 +190,8 @@ def cells(regime: Regime, found: Sequence[Outcome]) -> dict[str, str]:
         row["Most frequent alarms"] = ", ".join(f"{name} {_share(k, n)}" for name, k in named + counted) or "–"
     for name in dict.fromkeys(name for o in found for name in o.figures):
         row[name] = f"{np.median([o.figures[name] for o in found if name in o.figures]):.3g}"
+    for name in dict.fromkeys(name for o in found for name in o.shares):
+        row[name] = _share(sum(o.shares[name] for o in found), n)
     return row
 
 
@@ -204,8 +229,23 @@ def write(name: str, rows: Sequence[Mapping[str, str]], seed: int) -> None:
     if not found or f"<!-- /{word} -->" not in rest:
         raise SystemExit(f"{path} has no markers <!-- {word} --> and <!-- /{word} -->")
     after = rest.partition(f"<!-- /{word} -->")[2]
-    made = f"Made by `python benchmarks/regimes.py --seed {seed} --write`; do not edit."
+    made = f"Made by `python benchmarks/regimes.py --seed {seed} --write`; do not edit.{_together(ordered)}"
     path.write_text(f"{before}{found}\n\n{made}\n\n{markdown(ordered)}\n\n<!-- /{word} -->{after}", encoding="utf-8")
+
+
+def _together(rows: Sequence[Mapping[str, str]]) -> str:
+    """What the verdict said of all clean regimes together."""
+    counted = [row for row in rows if row["Regime"].startswith("clean") and row.get("Passed", "–") != "–"]
+    n = sum(int(row["Runs"]) for row in counted)
+    if n == 0:
+        return ""
+
+    def total(column: str) -> str:
+        count = round(sum(0.01 * float(row[column].removesuffix(" %")) * int(row["Runs"]) for row in counted))
+        low, high = binomial_interval(count, n)
+        return f"{_share(count, n)} (95 % interval {100.0 * low:.1f} to {100.0 * high:.1f} %)"
+
+    return f" All clean runs together ({n}): warning {total('Warning')}, do not use {total('Do not use')}."
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -139,7 +139,7 @@ def test_accepted_inflation_covers_what_formal_errors_do_not():
         accepted = accept_inflation(cal, jackknife_frames(bad, cal))
         error = np.abs(cal.theta - camera().theta)
         formal.append((error < 1.96 * cal.sigmas)[2])
-        inflated.append((error < 1.96 * accepted.sigmas)[2])
+        inflated.append((error < 0.5 * np.diff(accepted.interval())[:, 0])[2])
     assert np.mean(formal) < 0.85
     assert np.mean(inflated) > 0.86
     assert np.mean(inflated) > np.mean(formal)
@@ -151,6 +151,11 @@ def test_accepting_inflation_is_on_record_and_never_shrinks(obs, cal):
     assert np.all(accepted.sigmas >= cal.sigmas * (1.0 - 1e-12))
     assert accepted.correlation == pytest.approx(cal.correlation)
     assert set(accepted.provenance["settings"]["inflation"]) == set(cal.parameter_names)
+    # An inflated sigma is known as well as frames know it, and its interval is as much longer.
+    grown = found.factors > 1.0
+    half, sigmas = 0.5 * np.diff(accepted.interval())[:, 0], accepted.sigmas
+    assert half[grown] == pytest.approx(stats.t.ppf(0.975, found.dof[grown]) * sigmas[grown])
+    assert half[~grown] == pytest.approx(stats.t.ppf(0.975, cal.dof) * sigmas[~grown])
     assert np.all(np.linalg.eigvalsh(accepted.covariance / np.outer(cal.sigmas, cal.sigmas)) > 0.0)
     other = sc.calibrate(obs, nominal(camera("k1")))
     with pytest.raises(sc.errors.CalibrationError, match="same run"):

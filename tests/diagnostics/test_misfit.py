@@ -10,6 +10,7 @@ import pytest
 from scipy import stats
 
 import starcal_uq as sc
+from benchmarks import regimes
 from benchmarks.misfit_power import SCENARIOS, main, power
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.diagnostics.misfit import ALPHA, Misfit, misfit_tests
@@ -244,6 +245,20 @@ def test_power_table_has_a_row_for_every_error(capsys):
     lines = capsys.readouterr().out.strip().splitlines()
     assert len(lines) == len(SCENARIOS) + 2
     assert all(line.count("|") == 7 for line in lines)
+
+
+def test_regimes_are_written_between_their_markers(monkeypatch, tmp_path, capsys):
+    page = tmp_path / "docs" / "explanation" / "misfit.md"
+    page.parent.mkdir(parents=True)
+    page.write_text("before\n<!-- misfit regimes -->\n<!-- /misfit regimes -->\nafter\n")
+    monkeypatch.setattr(regimes, "ROOT", tmp_path)
+    for frames in (5, 3):
+        assert regimes.main(["--only", f"scatter of {frames} f", "--runs", "2", "--processes", "0", "--write"]) == 0
+    assert "Alarm (nominal 1 %)" in capsys.readouterr().out
+    text = page.read_text()
+    assert text.startswith("before\n") and text.endswith("after\n") and "--seed 1 --write" in text
+    # Rows keep the order of the registry, whatever was run last, and another run replaces its own.
+    assert [row["Regime"] for row in regimes.stored("misfit")] == ["scatter of 3 frames", "scatter of 5 frames"]
 
 
 @pytest.mark.slow
