@@ -149,6 +149,14 @@ def frame_scatter(rng: np.random.Generator, n_frames: int) -> Outcome:
     return Outcome(figures={"Ratio seen nine times in ten": least}, shares=alarms | small)
 
 
+def recurring(name: str, *, star_errors: bool = False, runs: int = 150, **options: Any) -> Regime:
+    """Frames that see the same stars again and again; without other models and starts, which take most of the time."""
+    chosen: dict[str, Any] = {"calibrate": {"star_errors": True}} if star_errors else {}
+    return Regime(name, partial(plain, options=options, models=(), n_starts=0, **chosen), runs)
+
+
+PATCH: dict[str, Any] = {"n_frames": 60, "patch_stars": 40}
+FEW: dict[str, Any] = {"n_frames": 20, "patch_stars": 15, "star_sigma_px": 0.03}
 REGIMES: list[Regime] = [
     clean("clean: 3 frames", 400, n_frames=3),
     clean("clean: 5 frames", 400, n_frames=5),
@@ -161,6 +169,13 @@ REGIMES: list[Regime] = [
     clean("clean: field of 4°, 50 frames", 200, n_frames=50, field_deg=4.0),
     clean("clean: field of 55°, 50 frames", 200, n_frames=50, field_deg=55.0),
     *(Regime(f"scatter of {k} frames", partial(frame_scatter, n_frames=k), 400, "misfit") for k in (3, 5, 10, 20, 100)),
+    recurring("40 stars again and again in 60 frames, without errors of their own", runs=300, **PATCH),
+    recurring("40 stars: errors of 0.01 px of their own", star_sigma_px=0.01, **PATCH),
+    recurring("40 stars: errors of 0.03 px of their own", star_sigma_px=0.03, **PATCH),
+    recurring("40 stars: 0.03 px, with `--star-errors`", star_errors=True, star_sigma_px=0.03, **PATCH),
+    recurring("40 stars: no errors, with `--star-errors`", star_errors=True, **PATCH),
+    recurring("15 stars in 20 frames: errors of 0.03 px of their own", **FEW),
+    recurring("15 stars: the same, with `--star-errors`", star_errors=True, **FEW),
 ]
 
 

@@ -22,7 +22,7 @@ ObsFile = Annotated[
     typer.Argument(
         metavar="OBS",
         help="Stars in pixels: CSV, ECSV or Parquet with columns frame, x_px, y_px, ra_deg, dec_deg and optionally "
-        "sigma_px, star_id, mag, time_utc, temperature_c.",
+        "sigma_px, star_id, mag, direction_mas, time_utc, temperature_c.",
     ),
 ]
 CameraFile = Annotated[

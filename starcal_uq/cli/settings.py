@@ -38,6 +38,10 @@ class EstimationSettings:
         bool, typer.Option("--robust", help="Refine with Student-t tails, which wrong identifications hardly move.")
     ] = False
 
+    star_errors: Annotated[
+        bool,
+        typer.Option("--star-errors", help="Estimate and marginalise errors that a star brings into every frame."),
+    ] = False
     noise: Annotated[
         str,
         typer.Option(
@@ -56,6 +60,7 @@ class EstimationSettings:
             "noise": self.noise,
             "duplicates": self.duplicates,
         }
+        options |= {"star_errors": True} if self.star_errors else {}
         return options | {"likelihood": "student_t"} if self.robust else options
 
 

@@ -191,6 +191,9 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
     side = _START_CENTRE * max(nominal.width_px, nominal.height_px)
     same = better = failed = 0
     largest = 0.0
+    # Errors of the stars weigh an estimate that was found without them: that is what a start leads to.
+    reached = None if cal.star_errors is None else cal.stages[-2]
+    reference, lowest = (cal.theta, cal.chi2) if reached is None else (reached.theta, float(reached.cost[-1]))
     for _ in range(n):
         shift = rng.standard_normal(3)
         start = nominal.replace(
@@ -203,11 +206,11 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
         except StarcalError:
             failed += 1
             continue
-        difference = float(np.max(np.abs(theta - cal.theta) / cal.sigmas))
+        difference = float(np.max(np.abs(theta - reference) / cal.sigmas))
         if difference < _SAME_SIGMA:
             same += 1
             largest = max(largest, difference)
-        elif chi2 < cal.chi2 * (1.0 - _BETTER):
+        elif chi2 < lowest * (1.0 - _BETTER):
             better += 1
     return MultiStart(n, same, better, failed, largest)
 
@@ -221,6 +224,8 @@ def _optimum(obs: Observations, cal: Calibration, start: Camera) -> tuple[FloatA
         other = calibrate(obs, start, method=method, duplicates="keep", **options)
         return other.theta, other.chi2
     found = fit(obs, start, method=method)
+    if cal.star_errors is not None:
+        return found.theta, found.chi2
     # The last, small step of a calibration, which is the same for all that end in its optimum.
     step = 0.5 * cal.compressed.whitening @ cal.compressed.log_determinant_slope if method == "efficient" else 0.0
     return found.theta - step, found.chi2

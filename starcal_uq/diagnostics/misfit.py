@@ -24,6 +24,7 @@ from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.shapes import Shape, View, run_clock, shapes
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import NoiseModel, fit_noise, sigma_ratios, weighed
+from starcal_uq.estimation.star_errors import StarModel
 from starcal_uq.maths.intervals import holm
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.observations.frames import StarFrames
@@ -202,8 +203,7 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = 8) -> 
     if (test := sums.frame_by_frame()) is not None:
         tests.append(test)
     of_noise = [
-        (f"noise that changes with {name}", name, z, p)
-        for name, z, p in sums.noise.tests(sums.parameters, sums.projection, sums.rss, sums.dof)
+        (f"noise that changes with {name}", name, z, p) for name, z, p in sums.noise.tests(*sums.independent, sums.dof)
     ]
     if (frames := sums.noise_by_frame()) is not None:
         of_noise.append(("noise that differs from frame to frame", "frame", *frames))
@@ -241,7 +241,11 @@ def _detectable(test: MisfitTest, level: float) -> float:
 
 @dataclass
 class _Sums:
-    """Sums over all stars from which every test follows; the table is visited once, some frames at a time."""
+    """Sums over all stars from which every test follows; the table is visited once, some frames at a time.
+
+    Where stars bring errors along, `gram` is weighted by them. `plain` is of the parameters and the residuals that are
+    left after each star's offset, which are independent: frame by frame, and for unequal noise.
+    """
 
     families: tuple[Shape, ...]
     noise: NoiseSums
@@ -250,6 +254,7 @@ class _Sums:
     n_stars: int
     noise_px: float
     gram: FloatArray
+    plain: FloatArray
     raw: FloatArray
     block_matrix: FloatArray
     block_slope: FloatArray
@@ -272,6 +277,7 @@ class _Sums:
             n_stars=obs.n_stars,
             noise_px=1.0 if obs.sigma_px is None else float(np.sqrt(np.mean(obs.sigma_px**2))),
             gram=np.zeros((size, size)),
+            plain=np.zeros((p + 1, p + 1)),
             raw=np.zeros(size),
             block_matrix=np.zeros((p, p)),
             block_slope=np.zeros(p),
@@ -279,13 +285,30 @@ class _Sums:
         )
         rotations = quaternion_to_rotation(cal.quaternions)
         starts = likelihood.frames.starts
+        model = None if cal.star_errors is None else StarModel(obs, cal.star_errors.focal_px)
+        stars = None if model is None else model.sums()
         for first, last in likelihood.frames.parts(_STARS_AT_ONCE):
             part = MarginalLikelihood(likelihood.frames.part(first, last), cal.camera.distortion)
             state, _ = part.profile(theta, rotations[first:last])
-            found._add(part, state, theta, slice(int(starts[first]), int(starts[last])))
+            rows = slice(int(starts[first]), int(starts[last]))
+            projected, view = found._add(part, state, theta, rows)
+            h, e = projected[:p], projected[p]
+            if stars is not None:
+                stars.add(part, state, projected, rows)
+                e = cal.residuals_px[rows].T * (1.0 if part.frames.weight is None else part.frames.weight)
+            flat = np.concatenate([h, e[None]]).reshape(p + 1, -1)
+            found.plain += flat @ flat.T
+            found._add_blocks(part, state, view, h, e)
+            found.noise.add(part.frames, state, h, e, rows)
+            matrices = np.moveaxis(part.frames.sum(np.einsum("axn,bxn->abn", h, h)), 2, 0)
+            squares = part.frames.sum(np.sum(e**2, axis=0))
+            found.frames.append((squares, np.asarray(2.0 * part.frames.sizes - 3.0), matrices))
+        if model is not None and stars is not None and cal.star_errors is not None:
+            found.gram -= stars.solved(model.ratio(cal.star_errors.tau_px**2, cal.sigma)).correction()
         return found
 
-    def _add(self, part: MarginalLikelihood, state: Any, theta: FloatArray, rows: slice) -> None:
+    def _add(self, part: MarginalLikelihood, state: Any, theta: FloatArray, rows: slice) -> tuple[FloatArray, View]:
+        """Add all columns of some frames; they come back with the attitudes projected out."""
         weight = part.frames.weight
         h = part.derivatives(theta, state)
         pixels = part.frames.pixel - part.frames.in_pixels(state.e)
@@ -298,11 +321,7 @@ class _Sums:
         projected = part.project_out(state, everything)
         flat = projected.reshape(len(projected), -1)
         self.gram += flat @ flat.T
-        h, e = projected[: self.p], projected[self.p]
-        self._add_blocks(part, state, view, h, e)
-        self.noise.add(part.frames, state, h, e, rows)
-        matrices = np.moveaxis(part.frames.sum(np.einsum("axn,bxn->abn", h, h)), 2, 0)
-        self.frames.append((part.frames.sum(np.sum(e**2, axis=0)), np.asarray(2.0 * part.frames.sizes - 3.0), matrices))
+        return projected, view
 
     def _add_blocks(self, part: MarginalLikelihood, state: Any, view: View, h: FloatArray, e: FloatArray) -> None:
         """Scale and quadrupole of every frame by itself: three columns per frame, which no other frame sees."""
@@ -341,6 +360,13 @@ class _Sums:
         slope = self.gram[: self.p, self.p]
         return float(self.gram[self.p, self.p] - slope @ self.projection @ slope)
 
+    @property
+    def independent(self) -> tuple[FloatArray, FloatArray, float]:
+        """`parameters`, `projection` and `rss` of residuals that are independent."""
+        matrix, slope = self.plain[: self.p, : self.p], self.plain[: self.p, self.p]
+        inverse = scaled_inverse(matrix)
+        return matrix, inverse, float(self.plain[self.p, self.p] - slope @ inverse @ slope)
+
     def family(self, index: int) -> MisfitTest | None:
         """The test of one family; None where nothing of it is left, or too few data."""
         family = self.families[index]
@@ -359,7 +385,7 @@ class _Sums:
             return None
         scores = (vectors.T @ (slope / norm))[kept]
         explained = float(np.sum(scores**2 / values[kept]))
-        test = self._f_test(family.name, family.against, explained, rank)
+        test = self._f_test(family.name, family.against, explained, rank, self.rss)
         visible = float(np.trace(left) / max(np.count_nonzero(present), 1))
         # What fitting the shapes takes from the parameters, in units of their standard deviations.
         fitted = vectors[:, kept] @ (scores / values[kept]) / norm
@@ -380,17 +406,18 @@ class _Sums:
 
     def frame_by_frame(self) -> MisfitTest | None:
         """Does scale or shape change from frame to frame?"""
-        scale = 1.0 / np.sqrt(np.diag(self.parameters))
-        left = (self.parameters - self.block_matrix) * np.outer(scale, scale)
-        slope = (self.gram[: self.p, self.p] - self.block_slope) * scale
+        matrix, _, rss = self.independent
+        scale = 1.0 / np.sqrt(np.diag(matrix))
+        left = (matrix - self.block_matrix) * np.outer(scale, scale)
+        slope = (self.plain[: self.p, self.p] - self.block_slope) * scale
         values, vectors = np.linalg.eigh(0.5 * (left + left.T))
         kept = values > _ABSORBED
-        full = self.gram[self.p, self.p] - self.block_square
+        full = self.plain[self.p, self.p] - self.block_square
         full -= float(np.sum((vectors.T @ slope)[kept] ** 2 / values[kept]))
         rank = self.block_rank + int(np.count_nonzero(kept)) - self.p
         if rank <= 0 or self.dof - rank < _LEAST_DOF:
             return None
-        return self._f_test("scale and shape that change from frame to frame", "frame", self.rss - full, rank)
+        return self._f_test("scale and shape that change from frame to frame", "frame", rss - full, rank, rss)
 
     def noise_by_frame(self) -> tuple[float, float] | None:
         """Normal z and p-value of Bartlett's test that all frames have one noise; None for too few frames.
@@ -402,7 +429,7 @@ class _Sums:
         from scipy.special import digamma, gammaincc, ndtri, polygamma
 
         squares, dof, matrices = (np.concatenate(column) for column in zip(*self.frames, strict=True))
-        dof = dof - np.einsum("kab,ba->k", matrices, self.projection)
+        dof = dof - np.einsum("kab,ba->k", matrices, self.independent[1])
         nu = float(dof.sum())
         if len(dof) < _LEAST_FRAMES or nu < _LEAST_DOF or dof.min() < _LEAST_FRAME_DOF or squares.min() <= 0.0:
             return None
@@ -412,11 +439,11 @@ class _Sums:
         p = float(gammaincc(mean**2 / variance, found * mean / variance))
         return float(-ndtri(np.clip(p, 1e-300, 1.0 - 1e-16))), p
 
-    def _f_test(self, name: str, against: str, explained: float, rank: int) -> MisfitTest:
+    def _f_test(self, name: str, against: str, explained: float, rank: int, rss: float) -> MisfitTest:
         from scipy.special import fdtrc
 
         rest = self.dof - rank
-        variance = (self.rss - explained) / rest
+        variance = (rss - explained) / rest
         statistic = float(max(explained, 0.0) / rank / variance)
         excess = max(explained - rank * variance, 0.0) / (2.0 * self.n_stars)
         p = float(fdtrc(rank, rest, statistic))

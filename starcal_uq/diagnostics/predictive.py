@@ -16,6 +16,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import weighed
+from starcal_uq.estimation.star_errors import StarLikelihood
 from starcal_uq.maths.linear import scaled_cholesky
 
 if TYPE_CHECKING:
@@ -107,13 +108,24 @@ def predictive_check(
     part = MarginalLikelihood(frames.part(0, last), cal.camera.distortion)
     frames = part.frames
     state, _ = part.profile(cal.theta, quaternion_to_rotation(cal.quaternions[:last]))
-    h = part.project_out(state, part.derivatives(cal.theta, state))
+    e, h = state.e, part.project_out(state, part.derivatives(cal.theta, state))
+    stars = None
+    if cal.star_errors is not None:
+        # Residuals after each star's offset, as they follow the parameters; replicates go the same way.
+        some = weighed(obs, cal).select_frames(obs.frame_ids[:last])
+        stars = StarLikelihood(some, part.model_name, cal.theta, state.rotations, cal.star_errors, cal.sigma)
+        columns, _ = stars.conditioned(state, np.concatenate([h, e[None]]))
+        h, e = columns[:-1], columns[-1]
     theta, sigma = _draws(cal, post, n_draws, rng)
     summary = _Summary(part, cal)
     measured, replicated = [], []
     for shift, noise in zip(theta - cal.theta, sigma, strict=True):
-        measured.append(summary((state.e - np.tensordot(shift, h, axes=1)) / noise))
-        replicated.append(summary(part.project_out(state, rng.standard_normal((1, 2, frames.n_stars)))[0]))
+        measured.append(summary((e - np.tensordot(shift, h, axes=1)) / noise))
+        fresh = rng.standard_normal((1, 2, frames.n_stars))
+        if stars is None:
+            replicated.append(summary(part.project_out(state, fresh)[0]))
+        else:
+            replicated.append(summary(stars.conditioned(state, fresh + stars.random_shifts(state, rng))[0][0]))
     data, fake = np.array(measured), np.array(replicated)
     low, middle, high = np.quantile(fake, (0.025, 0.5, 0.975), axis=0)
     p = np.mean(fake >= data, axis=0)

@@ -23,6 +23,7 @@ from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import StarNormals
 from starcal_uq.estimation.star_errors import StarSums, star_numbers
 from starcal_uq.observations.frames import StarFrames
@@ -62,6 +63,8 @@ class StarTest(Shown):
         Error that a test of 5 % would have seen nine times in ten, px.
     arcsec_per_px : float
         Scale at the boresight.
+    included_px, included_px_std : float
+        Error that the calibration has estimated and marginalised, and its standard error; zero where it has none.
     formal_covariance : (p, p) array
         Covariance if all images err independently.
     model_covariance : (p, p) array
@@ -85,6 +88,8 @@ class StarTest(Shown):
     model_covariance: FloatArray
     sandwich_covariance: FloatArray
     jackknife_covariance: FloatArray
+    included_px: float = 0.0
+    included_px_std: float = 0.0
 
     @property
     def applicable(self) -> bool:
@@ -119,7 +124,7 @@ def star_test(obs: Observations, cal: Calibration) -> StarTest:
         The data and the estimate made from them. Stars are told apart by `star_id` where all have one, else by
         direction.
     """
-    focal = float(cal.theta[2])
+    obs, focal = weighed(obs, cal), float(cal.theta[2])
     numbers = star_numbers(obs, focal)
     normals = StarNormals.at(obs, cal, numbers)
     found = _likeness(obs, cal, numbers)
@@ -129,7 +134,7 @@ def star_test(obs: Observations, cal: Calibration) -> StarTest:
     pull = normals.response.reshape(-1, len(unit)) @ inverse
     pulled = pull.T @ pull * found.tau2
     # The images' own noise is what is left when the stars' errors are taken off.
-    noise = max(normals.squares / normals.dof, 0.0)
+    noise = normals.squares / normals.dof
     own = max(noise - found.tau2 * float(np.mean(1.0 if obs.sigma_px is None else obs.sigma_px**-2.0)), 0.1 * noise)
     steps = normals.left_out()
     spread = steps - steps.mean(axis=0)
@@ -148,6 +153,8 @@ def star_test(obs: Observations, cal: Calibration) -> StarTest:
         model_covariance=(inverse * own + pulled) * unit if found.tau2 > 0.0 else inverse * noise * unit,
         sandwich_covariance=scores.T @ scores * s / (s - 1.0) * unit,
         jackknife_covariance=spread.T @ spread * (s - 1.0) / s * unit,
+        included_px=0.0 if cal.star_errors is None else cal.star_errors.tau_px,
+        included_px_std=0.0 if cal.star_errors is None else cal.star_errors.tau_px_std,
     )
 
 

@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import rotation_to_quaternion
+from starcal_uq.attitude.rotations import exp_rotation, quaternion_to_rotation, rotation_to_quaternion
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import sigma_parameter
 from starcal_uq.camera.projection import fold_radius_px
 from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.formatting import plural
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibration import Calibration
-from starcal_uq.estimation.compressed import compress
+from starcal_uq.estimation.compressed import compress, optimum
 from starcal_uq.estimation.fingerprints import Fingerprints
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.solvers import is_singular
 from starcal_uq.estimation.stages import Stage
+from starcal_uq.estimation.star_errors import StarLikelihood, StarModel
 from starcal_uq.maths.linear import scaled_inverse
 
 if TYPE_CHECKING:
@@ -27,6 +31,8 @@ if TYPE_CHECKING:
 
 # Noise above this fraction of the detector's width means that the stars are not the ones they are said to be.
 IMPLAUSIBLE_NOISE = 0.01
+# Fewer stars than this that are seen twice do not tell their errors from noise.
+_FEWEST_STARS = 5
 
 
 def assemble(
@@ -98,6 +104,72 @@ def assemble(
         compressed=compressed,
         provenance=provenance(None, record | (settings or {}), obs.data_hash),
         fingerprints=Fingerprints.of(obs, residuals, nominal.centre_px),
+    )
+
+
+def with_star_errors(obs: Observations, cal: Calibration) -> Calibration:
+    """The calibration with errors that stars bring along estimated and marginalised, and the estimate that they weight.
+
+    Raises
+    ------
+    CalibrationError
+        When no star is seen twice and none states its error, or for more stars and frames than fit into memory.
+    """
+    began = perf_counter()
+    likelihood = MarginalLikelihood(obs, cal.camera.distortion)
+    likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
+    model = StarModel(obs, float(cal.theta[2]))
+    if model.n_recurring < _FEWEST_STARS and not np.any(model.stated2 > 0.0):
+        raise CalibrationError(
+            f"errors of the stars cannot be told from noise: {plural(model.n_recurring, 'star')} of "
+            f"{len(model.images)} seen in more than one frame, and the table states no direction_mas; leave "
+            "star_errors out."
+        )
+    errors, sigma, spread = model.estimate(likelihood, cal.theta, cal.sigmas, cal.sigma)
+    theta, covariance = cal.theta, cal.covariance
+    trajectory, cost = [theta], []
+    rotations = likelihood.rotations_at(theta)
+    for _ in range(2):
+        ratio = model.ratio(errors.tau_px**2, sigma)
+        compressed = compress(likelihood, theta, covariance, rotations, model.sums(), ratio)
+        cost.append(float(compressed.gram[0, 0]))
+        found = optimum(compressed)
+        theta, covariance, sigma = found.theta, found.covariance, found.sigma
+        rotations = likelihood.rotations_at(theta)
+        trajectory.append(theta)
+    cost.append(found.sum_of_squares)
+    stage = Stage("stars", np.array(trajectory), np.array(cost), Status.CONVERGED, 2, perf_counter() - began)
+    compressed = found.compressed
+    theta = theta - 0.5 * compressed.whitening @ compressed.log_determinant_slope
+    exact = StarLikelihood(obs, likelihood.model_name, theta, rotations, errors, sigma)
+    state, _ = exact.profile(theta, rotations)
+    rest, offsets = exact.conditioned(state, state.e[None])
+    shifts = state.e[None] - exact.offset_shifts(state, offsets)
+    turned = exact.attitude_response(state, shifts)[0].T
+    weight = likelihood.frames.weight
+    # The stars of a frame err each by themselves: to its attitude that is more noise, which a stare does not average.
+    own = errors.total_px**2 * (1.0 if weight is None else float(np.mean(weight**2)))
+    settings = cal.provenance.get("settings", {}) | {"star_errors": True}
+    camera = cal.nominal.with_theta(theta)
+    return replace(
+        cal,
+        camera=camera,
+        theta=theta,
+        covariance=covariance,
+        sigma=sigma,
+        sigma_std=sigma / float(np.sqrt(2.0 * found.dof)),
+        stages=(*cal.stages, stage),
+        status=check_camera(camera, cal.status),
+        quaternions=rotation_to_quaternion(exp_rotation(turned) @ state.rotations),
+        residuals_px=likelihood.frames.in_pixels(rest[0]).T,
+        chi2=found.sum_of_squares,
+        information=found.information,
+        attitude_noise=np.mean(state.inverse, axis=2) * (sigma**2 + own),
+        # The interstar angles err with the same stars.
+        pair_covariance=cal.pair_covariance + spread,
+        compressed=compressed,
+        provenance=cal.provenance | {"settings": settings},
+        star_errors=errors,
     )
 
 

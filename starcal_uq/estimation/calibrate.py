@@ -14,14 +14,14 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, assemble, check_camera, noise_px
+from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, assemble, check_camera, noise_px, with_star_errors
 from starcal_uq.estimation.baselines import check_count, least_squares, recursive
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.composite import pair_covariance
 from starcal_uq.estimation.duplicates import check_duplicates, repeating_frames
 from starcal_uq.estimation.fingerprints import Fingerprints
 from starcal_uq.estimation.marginal import MarginalLikelihood
-from starcal_uq.estimation.noise_model import NOISES, fit_noise
+from starcal_uq.estimation.noise_model import NOISES, fit_noise, weighed
 from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.estimation.recursive.start import RECURSIVE_METHODS, RecursionOptions
 from starcal_uq.estimation.recursive.stream import raise_unless_good
@@ -53,6 +53,7 @@ def calibrate(
     recursion: RecursionOptions | None = None,
     noise: str = "common",
     duplicates: str = "refuse",
+    star_errors: bool = False,
 ) -> Calibration:
     """Estimate optics and distortion from identified stars.
 
@@ -103,6 +104,10 @@ def calibrate(
         stars (`starcal_uq.estimation.repeated_frames`): they would count twice. ``drop`` leaves them out
         (``obs.select_frames(calibration.frame_ids)`` is then what was calibrated), ``keep`` does not ask. Streams are
         not asked.
+    star_errors : bool
+        Take into account that a star's direction errs alike in every frame (catalogue, blend, colour): the size of such
+        errors is estimated, beyond what the column ``direction_mas`` of the table states, and they are marginalised in
+        estimate, covariance and `compressed`. For ``efficient`` with ``marginal``.
 
     Returns
     -------
@@ -137,6 +142,8 @@ def calibrate(
             "noise='model' weighs the stars in the Gaussian likelihood of their pixels: use method='efficient' and "
             "likelihood='marginal', or noise='common'."
         )
+    if star_errors and (method != "efficient" or likelihood != "marginal"):
+        raise CalibrationError("errors of the stars (star_errors) need method='efficient' and likelihood='marginal'.")
     if recursion is not None and method not in RECURSIVE_METHODS:
         raise CalibrationError(f"method {method!r} is not recursive: leave recursion out, or use samaan or griffith.")
     if method in RECURSIVE_METHODS:
@@ -159,6 +166,8 @@ def calibrate(
             calibration = _robust(obs, camera, frames, solver, max_iterations, nu)
         else:
             calibration = _gaussian(obs, camera, gaussian, method, solver, max_iterations)
+        if star_errors and calibration.status.ok:
+            calibration = with_star_errors(weighed(obs, calibration), calibration)
     if throw:
         raise_unless_good(calibration.status)
     repeating = repeating_frames(calibration, duplicates)
@@ -175,6 +184,7 @@ def calibrate(
         dof=dof,
         recursion=recursion,
         noise=noise,
+        star_errors=star_errors,
         duplicates="keep",
     )
     return replace(rest, provenance={**rest.provenance, "dropped_frames": repeating.tolist()})

@@ -19,6 +19,7 @@ from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.estimation.compressed import CompressedLikelihood
 from starcal_uq.estimation.fingerprints import Fingerprints
 from starcal_uq.estimation.stages import Stage
+from starcal_uq.estimation.star_errors import StarErrors
 from starcal_uq.maths.intervals import student_quantile
 from starcal_uq.maths.linear import correlation_of
 
@@ -33,7 +34,7 @@ _APART = ("frame_ids", "quaternions", "residuals_px", "trajectory", "cost", "sig
 _DOCUMENT = (
     *("status", "parameter_names", "method", "solver", "sigma", "sigma_std", "sigma_name", "chi2", "dof", "provenance"),
     *("theta", "covariance", "information", "rotation_per_theta", "attitude_noise", "pair_theta", "pair_covariance"),
-    *("camera", "nominal", "stages", "compressed", "fingerprints"),
+    *("camera", "nominal", "stages", "compressed", "fingerprints", "star_errors"),
 )
 # What the document says of a stage; its last estimate is there for readers.
 _STAGE = ("name", "status", "iterations", "evaluations", "seconds", "theta")
@@ -99,6 +100,9 @@ class Calibration(Shown):
     fingerprints : Fingerprints or None
         What identifies the frames, so that a measurement is not counted twice; None for a stream, and for a calibration
         by a version before this one.
+    star_errors : StarErrors or None
+        Direction errors of the stars, where they were asked for: `covariance`, `information` and `compressed` hold
+        them, and residuals and attitudes are those after each star's own offset.
     """
 
     camera: Camera
@@ -125,6 +129,7 @@ class Calibration(Shown):
     compressed: CompressedLikelihood
     provenance: AnyDict
     fingerprints: Fingerprints | None = None
+    star_errors: StarErrors | None = None
 
     @property
     def parameter_names(self) -> tuple[str, ...]:

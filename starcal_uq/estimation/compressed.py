@@ -20,6 +20,7 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.marginal import MarginalLikelihood, Profile
+from starcal_uq.estimation.star_errors import StarSums
 from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
 
 _pairs = cache(np.triu_indices)
@@ -140,7 +141,12 @@ def _columns(part: MarginalLikelihood, state: Profile, theta: FloatArray, whiten
 
 
 def compress(
-    likelihood: MarginalLikelihood, theta_hat: FloatArray, covariance: FloatArray, rotations: FloatArray | None = None
+    likelihood: MarginalLikelihood,
+    theta_hat: FloatArray,
+    covariance: FloatArray,
+    rotations: FloatArray | None = None,
+    stars: StarSums | None = None,
+    ratio: FloatArray | None = None,
 ) -> CompressedLikelihood:
     """Compress a likelihood around an estimate.
 
@@ -154,6 +160,10 @@ def compress(
         Covariance there; sets the whitened coordinates.
     rotations : (K, 3, 3) array, optional
         Attitudes to start from.
+    stars : StarSums, optional
+        Stars that bring errors along, nothing added yet.
+    ratio : (2 S,) array, optional
+        Variances of their errors, in units of sigma^2.
     """
     whitening = scaled_cholesky(covariance)
     frames, p = likelihood.frames, len(theta_hat)
@@ -164,8 +174,13 @@ def compress(
         state, _ = part.profile(theta_hat, None if rotations is None else rotations[first:last])
         piece = _columns(part, state, theta_hat, whitening)
         gram += piece.columns @ piece.columns.T
+        if stars is not None:
+            rows = slice(int(frames.starts[first]), int(frames.starts[last]))
+            stars.add(part, state, piece.columns.reshape(q, 2, -1), rows)
         slope += piece.log_determinant_slope
         log_determinant += float(np.sum(state.log_determinant))
+    if stars is not None and ratio is not None:
+        gram -= stars.solved(ratio).correction()
     return CompressedLikelihood(
         theta_hat=np.array(theta_hat),
         whitening=whitening,

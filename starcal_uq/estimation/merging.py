@@ -231,6 +231,11 @@ def check_mergeable(
                 f"{name}: was calibrated with the likelihood {likelihood!r}, which does not add up in compressed "
                 "form: calibrate it with the marginal likelihood, or calibrate all observations together."
             )
+        if cal.star_errors is not None:
+            raise CalibrationError(
+                f"{name}: holds errors of its stars, which other runs of the same stars share: calibrate all "
+                "observations together, or calibrate it without star errors."
+            )
         for value in data_hashes(cal.provenance) if duplicates == "refuse" else ():
             if value in seen:
                 raise CalibrationError(

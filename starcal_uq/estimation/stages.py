@@ -34,7 +34,8 @@ class Stage:
     Attributes
     ----------
     name : str
-        ``optics``, ``distortion``, ``all`` (the paper's three), ``refinement``, or ``filter`` (recursive methods).
+        ``optics``, ``distortion``, ``all`` (the paper's three), ``refinement``, ``stars``, or ``filter`` (recursive
+        methods).
     trajectory : (n, p) array
         Estimates after each iteration, px units, the start first; of a filter, after each frame.
     cost : (n,) array

@@ -11,16 +11,20 @@ After the attitudes are projected out (P), products with W = V^-1 - V^-1 A (A^T 
     sigma^2 x^T W y = x^T (I-P) y - c_x^T G^-1 c_y,   c_x = Z^T (I-P) x,   G = Lambda^-1 + Z^T (I-P) Z.
 
 G couples stars that were seen together. Z^T Z is block-diagonal over stars and P over frames, so that either side can
-be eliminated; the smaller one is left over, and is solved densely.
+be eliminated; the smaller one is left over, and is solved as a sparse or a dense matrix.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.core.constants import ARCSEC
+from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.marginal import MarginalLikelihood, Profile
 
@@ -33,6 +37,13 @@ _SAME_PX = 0.3
 _SAME_NAME_PX, _SAME_NAME_RAD = 5.0, 6e-4
 # A star variance, in units of the noise, that is none.
 _NO_RATIO = 1e-10
+# Rows of a dense matrix, 400 MB; a larger one must have few entries, as frames all over the sky give.
+_LARGEST, _THIN = 7000, 0.01
+# Share of entries from which a matrix is solved as a dense one.
+_FULL = 0.2
+_STARS_AT_ONCE = 20_000
+# Range of log(tau^2 / sigma^2).
+_LOG_RATIO = (-14.0, 9.0)
 
 
 def star_numbers(obs: Observations, focal_px: float) -> IntArray:
@@ -188,29 +199,48 @@ class StarSums:
         return SolvedStars(self, ratio)
 
 
-class SolvedStars:
-    """``G = Lambda^-1 + Z^T (I-P) Z`` with a factor of its smaller side."""
+def _factor(matrix: Any) -> tuple[Callable[[FloatArray], FloatArray], float]:
+    """What solves with a sparse positive definite matrix, and the log of its determinant."""
+    from scipy.linalg import cho_factor, cho_solve
+    from scipy.sparse.linalg import splu
 
-    def __init__(self, sums: StarSums, ratio: FloatArray) -> None:
-        from scipy.linalg import cho_factor
+    n = matrix.shape[0]
+    density = matrix.nnz / n**2
+    if n > _LARGEST and density > _THIN:
+        raise CalibrationError(
+            f"the stars' errors need a full matrix of {n} rows, and {_LARGEST} are possible: calibrate fewer frames, "
+            "or leave star_errors out."
+        )
+    if density > _FULL:
+        dense = cho_factor(matrix.toarray(), lower=True, overwrite_a=True, check_finite=False)
+        volume = 2.0 * float(np.sum(np.log(np.diag(dense[0]))))
+        return lambda columns: np.asarray(cho_solve(dense, columns, check_finite=False)), volume
+    sparse = splu(matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+    volume = float(np.sum(np.log(np.abs(sparse.U.diagonal()))))
+    return lambda columns: np.asarray(sparse.solve(np.asfortranarray(columns))), volume
+
+
+class SolvedStars:
+    """``G = Lambda^-1 + Z^T (I-P) Z`` with a factor of its smaller side, or of the stars' or the frames'."""
+
+    def __init__(self, sums: StarSums, ratio: FloatArray, by_star: bool | None = None) -> None:
+        from scipy.sparse import diags_array, eye_array
 
         self._sums, self.ratio = sums, np.maximum(ratio, _NO_RATIO)
         precision = 1.0 / self.ratio
         b = sums.coupling
-        self._by_star = b.shape[0] <= b.shape[1]
+        self._by_star = b.shape[0] <= b.shape[1] if by_star is None else by_star
         log_own = 0.0
         if self._by_star:
-            left = sums.matrix.toarray()
-            left[np.diag_indices_from(left)] += precision
+            left = sums.matrix + diags_array(precision)
         else:
             own = sums.own.copy()
             own[:, 0, 0] += precision[0::2]
             own[:, 1, 1] += precision[1::2]
             self._inverse: FloatArray = np.asarray(np.linalg.inv(own), dtype=np.float64)
             log_own = float(np.sum(np.log(np.linalg.det(own))))
-            left = np.eye(b.shape[1]) - (b.T @ self._own_solve(b)).toarray()
-        self._factor = cho_factor(left, lower=True, overwrite_a=True, check_finite=False)
-        log_factor = 2.0 * float(np.sum(np.log(np.diag(self._factor[0]))))
+            left = eye_array(b.shape[1]) - b.T @ self._own_solve(b)
+        self._solve, log_factor = _factor(left)
         # log |I + Lambda Z^T (I-P) Z|
         self.log_determinant = log_factor + log_own + float(np.sum(np.log(self.ratio)))
 
@@ -219,16 +249,236 @@ class SolvedStars:
 
     def offsets(self, cross: FloatArray) -> FloatArray:
         """``G^-1 c`` (2 S, q): best offsets, px, for ``c = Z^T (I-P) X``."""
-        from scipy.linalg import cho_solve
-
         if self._by_star:
-            return np.asarray(cho_solve(self._factor, cross, check_finite=False))
+            return self._solve(cross)
         b, first = self._sums.coupling, self._own_solve(cross)
-        inner = cho_solve(self._factor, b.T @ first, check_finite=False)
-        return np.asarray(first + self._own_solve(b @ inner))
+        return np.asarray(first + self._own_solve(b @ self._solve(b.T @ first)))
 
     def correction(self) -> FloatArray:
         """What star errors take off the Gram matrix (q, q) of the columns that were added."""
         cross = self._sums.cross
         taken = cross.T @ self.offsets(cross)
         return np.asarray(0.5 * (taken + taken.T))
+
+
+@dataclass(frozen=True)
+class StarErrors:
+    """Direction errors of stars that the covariance of a calibration holds.
+
+    Attributes
+    ----------
+    tau_px, tau_px_std : float
+        Error of a star per axis beyond what its catalogue states, estimated by restricted maximum likelihood, and its
+        standard error; px at the boresight.
+    stated_px : float
+        Root mean square of what the catalogue states, px; zero where the table states nothing.
+    focal_px : float
+        Focal length that turns directions into these px.
+    n_stars, n_recurring : int
+        Distinct stars, and those seen in more than one frame.
+    """
+
+    tau_px: float
+    tau_px_std: float
+    stated_px: float
+    focal_px: float
+    n_stars: int
+    n_recurring: int
+
+    @property
+    def tau_arcsec(self) -> float:
+        """`tau_px` as an angle."""
+        return self.tau_px / self.focal_px * ARCSEC
+
+    @property
+    def total_px(self) -> float:
+        """Error of a star per axis with what its catalogue states, px."""
+        return float(np.hypot(self.tau_px, self.stated_px))
+
+
+class StarModel:
+    """The stars of a table and the variances of their direction errors.
+
+    Parameters
+    ----------
+    obs : Observations
+        Stars; their stated direction errors are taken, where there are any.
+    focal_px : float
+        Focal length, px.
+    """
+
+    def __init__(self, obs: Observations, focal_px: float) -> None:
+        self.numbers = star_numbers(obs, focal_px)
+        self.directions = np.ascontiguousarray(obs.directions_icrs.T)
+        self.focal_px = focal_px
+        self.images = np.bincount(self.numbers)
+        self.stated2 = np.zeros(len(self.images))
+        if obs.direction_mas is not None:
+            stated = np.nan_to_num(obs.direction_mas) * (1e-3 / ARCSEC * focal_px)
+            self.stated2 = np.bincount(self.numbers, stated**2) / self.images
+
+    @property
+    def n_recurring(self) -> int:
+        """Stars with more than one image."""
+        return int(np.count_nonzero(self.images > 1))
+
+    def sums(self) -> StarSums:
+        """Sums with nothing added yet."""
+        return StarSums(self.numbers, self.directions, self.focal_px)
+
+    def ratio(self, tau2: float, sigma: float) -> FloatArray:
+        """Variance of each star's offset along its two axes, (2 S,), in units of sigma^2."""
+        return np.repeat((tau2 + self.stated2) / sigma**2, 2)
+
+    def estimate(
+        self, likelihood: MarginalLikelihood, theta: FloatArray, scale: FloatArray, sigma: float
+    ) -> tuple[StarErrors, float, FloatArray]:
+        """Estimate tau by restricted maximum likelihood, linearised at theta (p,); `scale` (p,) makes parameters alike.
+
+        Attitudes, parameters and sigma are integrated or profiled out; `sigma` is a first value.
+
+        Returns
+        -------
+        errors : StarErrors
+            Size of the errors.
+        sigma : float
+            Noise of the images themselves.
+        spread : (p, p) array
+            What the errors add to the covariance of the estimate that takes images as independent, px units.
+        """
+        from scipy.optimize import minimize_scalar
+
+        p, frames, sums = len(theta), likelihood.frames, self.sums()
+        gram = np.zeros((p + 1, p + 1))
+        rotations = likelihood.rotations_at(theta)
+        for first, last in frames.parts(_STARS_AT_ONCE):
+            part = MarginalLikelihood(frames.part(first, last), likelihood.model_name)
+            state, _ = part.profile(theta, rotations[first:last])
+            h = part.derivatives(theta, state) * scale[:, None, None]
+            columns = part.project_out(state, np.concatenate([h, state.e[None]]))
+            flat = columns.reshape(p + 1, -1)
+            gram += flat @ flat.T
+            sums.add(part, state, columns, slice(int(frames.starts[first]), int(frames.starts[last])))
+        dof = likelihood.dof - p
+
+        def restricted(log_ratio: float, noise: float) -> tuple[float, float]:
+            """Minus the restricted log likelihood, and the noise there."""
+            solved = sums.solved(self.ratio(float(np.exp(log_ratio)) * noise**2, noise))
+            left = gram - solved.correction()
+            rest = left[p, p] - left[:p, p] @ np.linalg.solve(left[:p, :p], left[:p, p])
+            value = dof * np.log(rest) + np.linalg.slogdet(left[:p, :p])[1] + solved.log_determinant
+            return float(0.5 * value), float(np.sqrt(rest / dof))
+
+        def cost(log_ratio: float) -> float:
+            return restricted(log_ratio, sigma)[0]
+
+        # What is stated is known in px: its share of the noise settles in a second round.
+        for _ in range(2 if np.any(self.stated2 > 0.0) else 1):
+            bounds = self._range(sums, gram, dof)
+            best = float(minimize_scalar(cost, bounds=bounds, method="bounded", options={"xatol": 0.02}).x)
+            sigma = restricted(best, sigma)[1]
+        step = 0.2
+        curvature = (cost(best + step) + cost(best - step) - 2.0 * cost(best)) / step**2
+        tau = float(np.exp(0.5 * best) * sigma)
+        # The standard error of log ratio is twice that of log tau; near none at all the likelihood has no curvature.
+        relative = 0.5 / np.sqrt(curvature) if curvature > 0.25 else 1.0
+        inverse = np.linalg.inv(gram[:p, :p])
+        pull = np.sqrt(self.ratio(tau**2, 1.0))[:, None] * sums.cross[:, :p] @ inverse
+        errors = StarErrors(
+            tau_px=tau,
+            tau_px_std=float(tau * relative),
+            stated_px=float(np.sqrt(np.mean(self.stated2))),
+            focal_px=self.focal_px,
+            n_stars=len(self.images),
+            n_recurring=self.n_recurring,
+        )
+        return errors, sigma, pull.T @ pull * np.outer(scale, scale)
+
+    def _range(self, sums: StarSums, gram: FloatArray, dof: int) -> tuple[float, float]:
+        """Where to look for log(tau^2 / sigma^2): around what likeness within stars says (see `diagnostics.stars`)."""
+        low, high = _LOG_RATIO
+        if np.any(self.stated2 > 0.0):
+            return low, high
+        p = len(gram) - 1
+        step = np.linalg.solve(gram[:p, :p], gram[:p, p])
+        pull = sums.cross[:, p] - sums.cross[:, :p] @ step
+        total = float(gram[p, p] - gram[:p, p] @ step)
+        g = sums.matrix
+        first, second = float(g.trace()), float(g.multiply(g).sum())
+        curvature = second - first**2 / dof
+        likeness = (float(pull @ pull) / total * dof - first) / curvature
+        error = np.sqrt(2.0 / curvature)
+        if likeness < 3.0 * error:
+            return low, min(float(np.log(6.0 * error)), high)
+        # The noise of the images themselves is below that of all together: the ratio may be several times larger.
+        return max(float(np.log(likeness)) - 2.0, low), high
+
+
+class StarLikelihood(MarginalLikelihood):
+    """Exact likelihood with the stars' errors marginalised at a given scale, in units of sigma.
+
+    Offsets are linear over fractions of a pixel; they are the best ones of the estimate's system, and the cost that
+    they and the attitudes leave is that of these residuals. Beyond the attitudes' volume, determinants do not depend on
+    theta enough to matter (1e-3 nat).
+
+    Parameters
+    ----------
+    obs : Observations
+        Data.
+    model_name : str
+        Distortion model.
+    theta : (p,) array
+        Estimate, px units.
+    rotations : (K, 3, 3) array
+        Attitudes there.
+    errors : StarErrors
+        Errors of the stars.
+    sigma : float
+        Noise that they are relative to.
+    """
+
+    def __init__(
+        self,
+        obs: Observations,
+        model_name: str,
+        theta: FloatArray,
+        rotations: FloatArray,
+        errors: StarErrors,
+        sigma: float,
+    ) -> None:
+        super().__init__(obs, model_name)
+        model = StarModel(obs, errors.focal_px)
+        state, _ = self.profile(theta, rotations)
+        self.use_rotations(state.rotations)
+        sums = model.sums()
+        sums.add(self, state, np.zeros((1, 2, self.frames.n_stars)), slice(None))
+        self._sums, self._solved = sums, sums.solved(model.ratio(errors.tau_px**2, sigma))
+
+    def conditioned(self, state: Profile, columns: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Columns (q, 2, N) less what attitudes and offsets take of them, and those offsets (2 S, q), px."""
+        projected = self.project_out(state, columns)
+        z, q = self._sums.columns(self, state, slice(None)), len(columns)
+        cross = np.zeros((self._sums.n_stars, 2, q))
+        add_by_star(cross, np.einsum("ixn,qxn->iqn", z, projected), self._sums.numbers)
+        offsets = self._solved.offsets(cross.reshape(-1, q))
+        return projected - self.project_out(state, self.offset_shifts(state, offsets)), offsets
+
+    def offset_shifts(self, state: Profile, offsets: FloatArray) -> FloatArray:
+        """Whitened shifts (q, 2, N) of all images by offsets (2 S, q), px."""
+        z = self._sums.columns(self, state, slice(None))
+        by_image = offsets.reshape(self._sums.n_stars, 2, -1)[self._sums.numbers]
+        return np.asarray(np.einsum("niq,ixn->qxn", by_image, z, optimize=True))
+
+    def random_shifts(self, state: Profile, rng: np.random.Generator) -> FloatArray:
+        """Whitened shifts (1, 2, N) of all images by random errors of their stars, in units of sigma."""
+        return self.offset_shifts(
+            state, (np.sqrt(self._solved.ratio) * rng.standard_normal(len(self._solved.ratio)))[:, None]
+        )
+
+    def log_likelihood(self, theta: FloatArray, sigma: float) -> float:
+        state, cost = self.profile(theta, self._rotations)
+        if not np.isfinite(cost):
+            return -np.inf
+        rest, offsets = self.conditioned(state, state.e[None])
+        cost = float(np.sum(rest**2) + np.sum(offsets[:, 0] ** 2 / self._solved.ratio))
+        return float(-0.5 * cost / sigma**2 - self.dof * np.log(sigma) - 0.5 * np.sum(state.log_determinant))

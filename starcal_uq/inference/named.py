@@ -146,6 +146,11 @@ def _named_source(likelihood: str, obs: Observations | None, cal: Calibration, d
         )
     if likelihood == "marginal":
         return _marginal(obs, cal)
+    if cal.star_errors is not None:
+        raise SamplingError(
+            f"the calibration holds errors of the stars, which the likelihood {likelihood!r} does not know: sample "
+            "with likelihood='marginal', or calibrate without star_errors."
+        )
     if obs is None:
         raise SamplingError(f"the likelihood {likelihood!r} needs the observations: give obs.")
     if not cal.has_residuals:
@@ -181,9 +186,14 @@ class _ExactMarginal:
 
     def __init__(self, obs: Observations, cal: Calibration) -> None:
         from starcal_uq.estimation.marginal import MarginalLikelihood
+        from starcal_uq.estimation.star_errors import StarLikelihood
 
-        self._one = MarginalLikelihood(obs, cal.camera.distortion)
-        self._one.use_rotations(self._one.rotations_at(cal.theta))
+        model, theta = cal.camera.distortion, cal.theta
+        self._one = MarginalLikelihood(obs, model)
+        if cal.star_errors is not None:
+            rotations = quaternion_to_rotation(cal.quaternions)
+            self._one = StarLikelihood(obs, model, theta, rotations, cal.star_errors, cal.sigma)
+        self._one.use_rotations(self._one.rotations_at(theta))
 
     def log_likelihood(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
         return np.array([self._one.log_likelihood(t, float(s)) for t, s in zip(theta, sigma, strict=True)])

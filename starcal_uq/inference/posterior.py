@@ -195,6 +195,8 @@ class Posterior(Shown):
         Seed, settings, versions, time and data hash.
     dof_draws : array (n,) or None
         Draws of the degrees of freedom of a Student-t likelihood where they were free.
+    star_error_px : float
+        Direction error of a star per axis, px, where the calibration holds such errors; a frame's attitude has it, too.
     """
 
     parameter_names: tuple[str, ...]
@@ -213,6 +215,7 @@ class Posterior(Shown):
     camera: Camera
     provenance: AnyDict
     dof_draws: FloatArray | None = None
+    star_error_px: float = 0.0
 
     @property
     def camera_names(self) -> tuple[str, ...]:
@@ -408,5 +411,5 @@ _ARRAYS = {
 
 _RECORD = (
     *("parameter_names", "camera", "priors", "laplace", "diagnostics"),
-    *("n_ensembles", "n_walkers", "n_steps", "sigma_sampled", "provenance"),
+    *("n_ensembles", "n_walkers", "n_steps", "sigma_sampled", "provenance", "star_error_px"),
 )

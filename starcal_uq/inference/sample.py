@@ -319,6 +319,7 @@ def _assemble(run: _Run, outcome: _Outcome, compression: CompressionCheck) -> Po
         camera=cal.camera,
         provenance=run.provenance,
         dof_draws=None if extra is None else extra.reshape(-1),
+        star_error_px=0.0 if cal.star_errors is None else cal.star_errors.total_px,
     )
     checks = (*source.checks, *check_draws(posterior, source.notes))
     if outcome.checkpoint is not None:

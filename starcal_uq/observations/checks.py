@@ -152,6 +152,9 @@ def check_columns(
     if "sigma_px" in columns:
         sigma = columns["sigma_px"]
         problems += _each("sigma_px", sigma, sigma <= 0.0, "is not above 0")
+    if "direction_mas" in columns:
+        stated = columns["direction_mas"]
+        problems += _each("direction_mas", stated, stated < 0.0, "is below 0")
     if camera is not None:
         for name, size in (("x_px", camera.width_px), ("y_px", camera.height_px)):
             values = columns[name]

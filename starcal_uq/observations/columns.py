@@ -45,6 +45,7 @@ COLUMNS: dict[str, Column] = {
         Column("sigma_px", "number", "pix", False, False, "centroid noise per axis"),
         Column("star_id", "text", "", False, True, "name of the star in its catalogue"),
         Column("mag", "number", "mag", False, True, "magnitude"),
+        Column("direction_mas", "number", "mas", False, True, "stated error of the direction per axis"),
         Column("time_utc", "time", "", False, False, "middle of the exposure, UTC, ISO 8601"),
         Column("temperature_c", "number", "deg_C", False, True, "temperature of the optics, Celsius"),
     )

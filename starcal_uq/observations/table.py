@@ -50,6 +50,9 @@ class Observations(FrameRows, Shown):
         Name in a catalogue; empty where unknown.
     mag : array, shape (N,), or None
         Magnitude; NaN where unknown.
+    direction_mas : array, shape (N,), or None
+        Error of the direction per axis that its catalogue states, milliarcseconds; NaN where unknown. Used where star
+        errors are asked for.
     time_utc : array of str, shape (N,), or None
         Middle of the exposure, UTC, such as ``2026-11-21T01:02:03.5``.
     temperature_c : array, shape (N,), or None
@@ -75,6 +78,7 @@ class Observations(FrameRows, Shown):
     sigma_px: FloatArray | None = None
     star_id: StrArray | None = None
     mag: FloatArray | None = None
+    direction_mas: FloatArray | None = None
     time_utc: StrArray | None = None
     temperature_c: FloatArray | None = None
     meta: AnyDict = field(default_factory=dict)

@@ -285,17 +285,17 @@ def _with_noise(frames: FrameGeometry, draws: FloatArray, seed: int) -> tuple[Fl
 
 
 def _noise(post: Posterior, obs: Observations) -> tuple[FloatArray, FloatArray | None]:
-    """Centroid noise of every star (N,) in px at the posterior mean, and the weights of QUEST."""
+    """Noise of every star (N,) in px at the posterior mean, its own direction error included, and QUEST's weights."""
     sigma = float(np.mean(post.sigma_draws))
     if post.sigma_name != "sigma_scale":
-        return np.full(obs.n_stars, sigma), None
+        return np.full(obs.n_stars, np.hypot(sigma, post.star_error_px)), None
     if obs.sigma_px is None:
         raise ObservationError(
             "the posterior scales the stated noise of the stars, but these observations have no sigma_px: "
             "pass the observations that it was sampled from, or mission_frames(..., noise_like=observations).",
             column="sigma_px",
         )
-    return sigma * obs.sigma_px, obs.sigma_px**-2.0
+    return np.hypot(sigma * obs.sigma_px, post.star_error_px), obs.sigma_px**-2.0
 
 
 def _frame_sums(values: Any, starts: IntArray) -> FloatArray:

@@ -18,6 +18,7 @@ from starcal_uq.core.status import Level, Status
 from starcal_uq.diagnostics.verdict import draws, estimate, observed
 from starcal_uq.inference import checks
 from tests.helpers.ground_scenes import NOMINAL, SITE, ground_frames
+from tests.helpers.outside import campaign
 from tests.helpers.scenes import observations
 
 PACKAGE = Path(sc.__file__).parent
@@ -39,6 +40,10 @@ def small(tmp_path_factory):
     ground_frames(sc.load_catalogue(max_mag=6.5, epoch=2026.9), np.linspace(20.0, 80.0, 12)).save(
         folder / "GROUND_OBS.csv"
     )
+    c = campaign(np.random.default_rng(1), n_frames=12, patch_stars=20, star_sigma_px=0.05)
+    patch, sheet = sc.Observations(**c.columns), sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
+    patch.save(folder / "PATCH_OBS.csv")
+    sheet.save(folder / "PATCH_CAMERA.toml")
     for name, seed in (("RUN_B", 5), ("RUN_A", 3)):
         obs = observations(n_frames=12, seed=seed)
         run = sc.Run(folder / name)
@@ -47,7 +52,7 @@ def small(tmp_path_factory):
         run.propagate(n_draws=50, seed=0)
     obs.save(folder / "OBS.csv")
     shutil.copytree(folder / "RUN_A", folder / "RUN")
-    return SimpleNamespace(folder=folder, obs=obs, camera=camera, cal=cal, post=post)
+    return SimpleNamespace(folder=folder, obs=obs, camera=camera, cal=cal, post=post, patch=patch, sheet=sheet)
 
 
 def short_of(kind, small):
@@ -94,6 +99,9 @@ EXAMPLES = {
     ],
     "diagnostics.verdict.estimate.jackknife": lambda s: [
         estimate.jackknife(dataclasses.replace(s.jackknife, sandwich_covariance=9.0 * s.jackknife.formal_covariance))
+    ],
+    "diagnostics.verdict.estimate.stars": lambda s: [
+        estimate.stars(sc.diagnostics.star_test(s.patch, sc.calibrate(s.patch, s.sheet)))
     ],
     "diagnostics.verdict.observed.directions": lambda s: [
         observed.directions(dataclasses.replace(s.obs, meta=meta), s.cal)
@@ -203,7 +211,7 @@ def execute(small, cli, tmp_path):
         folder = tmp_path / f"files{len(list(tmp_path.iterdir()))}"
         shutil.copytree(small.folder, folder)
         words = [*shlex.split(command), *shlex.split(more)]
-        ground = "GROUND_" if "SITE" in words else ""
+        ground = "GROUND_" if "SITE" in words else "PATCH_" if "--star-errors" in words else ""
         files = {"OBS": f"{ground}OBS.csv", "CAMERA": f"{ground}CAMERA.toml", "SITE": "SITE.toml", "FILE": "new.toml"}
         files |= {name: name for name in ("RUN", "RUN_A", "RUN_B", "DIR")}
         status, out, err = cli(*(folder / files[word] if word in files else word for word in words))
@@ -222,7 +230,8 @@ def test_every_remedy_of_a_check_can_be_executed(small, remedies, execute):
             execute(command, "--ensembles 2 --walkers 14 --steps 20" if command.startswith("sample") else "")
         else:
             assert remedy.startswith("sc."), remedy
-            eval(remedy, names)
+            stars = {"obs": small.patch, "camera": small.sheet} if "star_errors" in remedy else {}
+            eval(remedy, names | stars)
 
 
 def named(pattern):
