@@ -67,6 +67,7 @@ def random_table(n_frames: int = 4, m: int = 5, seed: int = 0, **changes: object
         "sigma_px": rng.uniform(0.01, 0.2, n),
         "star_id": np.array([f'Gaia DR3 {10**15 + i}, "{i}" é' for i in range(n)]),
         "mag": np.where(np.arange(n) % 4 == 1, np.nan, rng.normal(5.0, 1.0, n)),
+        "direction_mas": np.where(np.arange(n) % 5 == 2, np.nan, np.linspace(0.01, 1.0 / 0.3, n)),
         "time_utc": np.repeat(times, m),
         "temperature_c": rng.normal(10.0, 5.0, n),
         "meta": {
