@@ -57,6 +57,7 @@ def gaussian_calibration(dof: int = 25_000, sigma: float = 0.05, **changes: Any)
         "rotation_per_theta": np.arange(15.0).reshape(3, 5) * 1e-4,
         "attitude_noise": np.eye(3) * 1e-12,
         "provenance": {"data_sha256": "0" * 64},
+        "star_errors": None,
     }
     return SimpleNamespace(**{**values, **changes})
 
@@ -78,5 +79,7 @@ def gaussian_posterior(cal: Calibration, n: int = 4000, scale: float = 1.0, seed
         covariance=np.cov(theta, rowvar=False),
         rotation_per_theta=cal.rotation_per_theta,
         attitude_noise=cal.attitude_noise,
+        provenance={},
+        star_error_px=0.0,
         thin=lambda count, seed: draws[np.random.default_rng(seed).permutation(n)[:count]],
     )
