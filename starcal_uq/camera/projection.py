@@ -23,8 +23,9 @@ from starcal_uq.core.errors import DistortionError
 from starcal_uq.core.types import FloatArray, IntArray
 
 _NEWTON_STEPS = 60
-# The kernels take one more Newton step from the root, which squares the error of the root.
-_NEWTON_TOLERANCE_PX = 1e-8
+# After a last step of this size the error is its square times what the distortion bends per px, below rounding; the
+# kernels take one more Newton step from the root, which squares it again.
+_NEWTON_TOLERANCE_PX = 1e-5
 
 
 @dataclass(frozen=True)
@@ -238,11 +239,12 @@ def backward_root(model_name: str, theta: FloatArray, pixel: FloatArray) -> Floa
     """The `root` input of a backward kernel for pixels (2, n): (2,) zeros where the model is explicit."""
     if get_model(model_name).direction == "inverse":
         return np.zeros(2)
-    return solve_displacement(model_name, theta, pixel - theta[:2, None])
+    centre = theta[:2] if theta.ndim == 2 else theta[:2, None]
+    return solve_displacement(model_name, theta, pixel - centre)
 
 
 def unproject_theta(model_name: str, theta: FloatArray, xy: FloatArray) -> FloatArray:
-    """Unit vectors (N, 3) in the camera frame of pixels xy (N, 2) for parameters theta (p,)."""
+    """Unit vectors (N, 3) in the camera frame of pixels xy (N, 2) for parameters theta (p,), or a column each."""
     pixel = np.ascontiguousarray(np.asarray(xy, dtype=np.float64).T)
     theta = np.asarray(theta, dtype=np.float64)
     (b,) = backward_kernel(model_name, False)(pixel.shape[1], theta, pixel, backward_root(model_name, theta, pixel))

@@ -33,6 +33,9 @@ if TYPE_CHECKING:
 
 _AZIMUTHS_DEG = (0.0, 45.0, 90.0, 135.0, 180.0, 225.0, 270.0, 315.0)
 
+# Points that are inverted together: few calls, and little memory.
+_POINTS_AT_ONCE = 50_000
+
 
 @dataclass(frozen=True, eq=False)
 class DistortionCurve(Shown):
@@ -148,7 +151,9 @@ def distortion_curve(
     offsets = (radius[None, :, None] * outward[:, None]).reshape(-1, 2)
     unproject(camera, offsets + post.mean[:2])
     draws = post.thin(n_draws, seed)[:, :-1]
-    curves = np.stack([_radial(model.name, theta, offsets, outward, n) for theta in draws])
+    step = max(1, _POINTS_AT_ONCE // len(offsets))
+    parts = (draws[first : first + step] for first in range(0, len(draws), step))
+    curves = np.concatenate([_radial(model.name, part, offsets, outward) for part in parts])
     if not np.isfinite(curves).all():
         raise DistortionError(
             f"at some posterior draws the distortion {model.name!r} folds over within the detector: use more frames, a "
@@ -186,9 +191,12 @@ def _farthest(width: int, height: int, theta: FloatArray) -> float:
     return float(np.hypot(x, y))
 
 
-def _radial(model: str, theta: FloatArray, offsets: FloatArray, outward: FloatArray, n: int) -> FloatArray:
-    """Radial part (A, n) of distorted minus ideal points, at offsets (A * n, 2) from the draw's principal point."""
-    b = unproject_theta(model, theta, offsets + theta[:2])
-    displacement = offsets - theta[2] * b[:, :2] / b[:, 2:]
-    radial: FloatArray = np.sum(displacement.reshape(len(outward), n, 2) * outward[:, None], axis=2)
+def _radial(model: str, thetas: FloatArray, offsets: FloatArray, outward: FloatArray) -> FloatArray:
+    """Radial part (d, A, n) of distorted minus ideal points, at offsets (A * n, 2) from each draw's principal point."""
+    count, directions = len(thetas), len(outward)
+    theta = np.repeat(thetas, len(offsets), axis=0)
+    b = unproject_theta(model, theta.T, np.tile(offsets, (count, 1)) + theta[:, :2])
+    ideal = (theta[:, 2:3] * b[:, :2] / b[:, 2:]).reshape(count, directions, -1, 2)
+    displacement = offsets.reshape(directions, -1, 2) - ideal
+    radial: FloatArray = np.sum(displacement * outward[:, None], axis=3)
     return radial

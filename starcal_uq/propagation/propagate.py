@@ -100,11 +100,18 @@ def propagate(
     aligned = frames if aligning is obs else FrameGeometry.of(post, aligning)
     weights, alignment_covariance = alignment_weights(aligned.noise_covariance)
     common = np.empty((count, 3))
-    for part, phi in aligned.rotations(draws):
-        common[part] = np.einsum("nij,dnj->di", weights, phi)
+    # Where the same frames align and are propagated to, their attitudes are found once.
+    if aligned is not frames:
+        for part, phi in aligned.rotations(draws):
+            common[part] = np.einsum("nij,dnj->di", weights, phi)
     rest, whole = _Moments(obs.n_frames), _Moments(obs.n_frames)
     constant = np.empty((count, 3))
+    quiet: list[FloatArray] = []
     for part, phi in frames.rotations(draws):
+        if aligned is frames:
+            common[part] = np.einsum("nij,dnj->di", weights, phi)
+        if part.start < _NOISY_DRAWS:
+            quiet.append(phi[: _NOISY_DRAWS - part.start])
         whole.add(phi)
         rest.add(phi - common[part, None])
         constant[part] = phi.mean(axis=1) - common[part]
@@ -118,7 +125,7 @@ def propagate(
     constant_variance = np.maximum(constant.var(axis=0, ddof=1) + spread(staying, chance), 0.0)
     rest_variance = np.maximum(rest.variance + spread(apart, chance), 0.0)
     whole_variance = np.maximum(whole.variance + spread(frames.response, chance), 0.0).mean(axis=0)
-    noise_excess, interaction = _with_noise(frames, draws[:_NOISY_DRAWS], seed)
+    noise_excess, interaction = _with_noise(frames, draws[:_NOISY_DRAWS], np.concatenate(quiet), seed)
     half_widths = [_noise_half_widths(nea, seed)]
     sigmas = (np.sqrt(common_variance), _rms(rest_variance))
     half_widths += [*_calibration_half_widths(post, together, apart, sigmas, seed), _half_widths(interaction)]
@@ -265,8 +272,13 @@ class FrameGeometry:
         return (slice(first, min(first + step, count)) for first in range(0, count, step))
 
 
-def _with_noise(frames: FrameGeometry, draws: FloatArray, seed: int) -> tuple[FloatArray, FloatArray]:
-    """What noise does beyond first order: excess variance (3,) of noise alone, and the interaction (d, K, 3), rad."""
+def _with_noise(
+    frames: FrameGeometry, draws: FloatArray, quiet: FloatArray, seed: int
+) -> tuple[FloatArray, FloatArray]:
+    """What noise does beyond first order: excess variance (3,) of noise alone, and the interaction (d, K, 3), rad.
+
+    `quiet` (d, K, 3) are the rotations at the draws without noise.
+    """
     rng = np.random.default_rng(seed)
     xy, starts, mean = frames.obs.xy, frames.obs.frame_starts, frames.post.mean[None]
     reference = frames.attitudes(mean, xy)
@@ -277,10 +289,9 @@ def _with_noise(frames: FrameGeometry, draws: FloatArray, seed: int) -> tuple[Fl
         noisy = xy + frames.noise_px[:, None] * e
         noise = left_error(frames.attitudes(np.repeat(mean, len(thetas), axis=0), noisy), reference)
         both = left_error(frames.attitudes(thetas, noisy), reference)
-        camera = left_error(frames.attitudes(thetas, xy), reference)
         linear = np.add.reduceat(np.einsum("dna,ani->dni", e, frames.noise_response), starts[:-1], axis=1)
         excess += np.sum(noise * noise - linear * linear, axis=(0, 1))
-        interactions.append(both - camera - noise)
+        interactions.append(both - quiet[part] - noise)
     return excess / (len(draws) * frames.obs.n_frames), np.concatenate(interactions)
 
 
