@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from starcal_uq.budgeting.result import Budget
     from starcal_uq.camera.camera import Camera
     from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.noise_model import NoiseModel
     from starcal_uq.planning.check import ForecastCheck
     from starcal_uq.planning.design import FrameChoice
     from starcal_uq.planning.plan import Plan
@@ -223,11 +224,12 @@ def plan_command(
     check_output(out, force)
     if after is not None and check is not None:
         raise typer.BadParameter("--check simulates campaigns from nothing: leave it out with --after.")
-    sheet, known, noise = sc.Camera.load(camera), None, 0.05
+    sheet, known = sc.Camera.load(camera), None
+    noise: float | NoiseModel = 0.05
     if after is not None:
         known, noise = _known(after, sheet, camera)
         sheet = known.camera
-    sigma = noise if sigma is None else sigma
+    used = noise if sigma is None else sigma
     if max_mag > FAINTEST:
         raise typer.BadParameter(f"--max-mag {max_mag:g}: the embedded catalogue ends at G = {FAINTEST:g}.")
     # Deeper than the sensor, so that the sweep over the magnitude limit has somewhere to go.
@@ -237,7 +239,7 @@ def plan_command(
     found = sc.plan(
         sheet,
         deep,
-        sigma_px=sigma,
+        sigma_px=used,
         n_frames=sizes,
         min_stars=min_stars,
         max_mag=max_mag,
@@ -254,7 +256,7 @@ def plan_command(
             sheet,
             stars,
             n_frames=choose,
-            sigma_px=sigma,
+            sigma_px=used,
             min_stars=min_stars,
             criterion=criterion,
             scope="calibration" if scope == "total" else scope,
@@ -266,7 +268,7 @@ def plan_command(
             simulated = sc.planning.check_forecast(
                 sheet,
                 stars,
-                sigma_px=sigma,
+                sigma_px=0.05 if sigma is None else sigma,
                 n_frames=sizes,
                 min_stars=min_stars,
                 n_campaigns=check,
@@ -303,12 +305,17 @@ def _show_plan(found: Plan, choice: FrameChoice | None, simulated: ForecastCheck
         console.print(sentence, highlight=False, soft_wrap=True)
 
 
-def _known(run: Path, sheet: Camera, path: Path) -> tuple[Calibration, float]:
+def _known(run: Path, sheet: Camera, path: Path) -> tuple[Calibration, float | NoiseModel]:
     """Calibration of a run of this sensor, and its noise in px: the median where stars state their own."""
+    from dataclasses import replace
+
     import numpy as np
 
     known = sc.Run(run)
     obs, calibration = known.observations, known.calibration
     check_same_sensor(calibration.camera, run, sheet, path)
+    model = calibration.noise_model
+    if model is not None and model.varies and not model.multiplies:
+        return calibration, replace(model, level_px=model.level_px * calibration.sigma)
     stated = 1.0 if obs.sigma_px is None or calibration.sigma_name == "sigma" else float(np.median(obs.sigma_px))
     return calibration, float(calibration.sigma) * stated

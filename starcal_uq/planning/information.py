@@ -17,6 +17,7 @@ import numpy as np
 from starcal_uq.core.errors import PlanningError
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.noise_model import NoiseModel
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky, choose_attitudes
 
@@ -24,8 +25,8 @@ if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.sky.catalogue import StarCatalogue
 
-# Centroid noise, px per axis: one number, or a function from magnitudes (n,) to (n,).
-Noise = float | Callable[[FloatArray], FloatArray]
+# Centroid noise, px per axis: one number, a function from magnitudes (n,) to (n,), or the model of a calibration.
+Noise = float | Callable[[FloatArray], FloatArray] | NoiseModel
 
 # An attitude needs this many stars before it says anything about the camera.
 LEAST_STARS = 3
@@ -118,7 +119,7 @@ def look_at(stars: StarCatalogue, camera: Camera, rotations: FloatArray, noise: 
     PlanningError
         When none shows `min_stars`.
     """
-    views = Sky(stars, camera, EDGE_SIGMAS * largest_noise(noise, stars.mag)).views(rotations)
+    views = Sky(stars, camera, EDGE_SIGMAS * largest_noise(noise, stars.mag, camera)).views(rotations)
     enough = np.array([len(seen) >= min_stars for seen, _ in views], dtype=np.bool_)
     if not enough.any():
         raise PlanningError(
@@ -140,19 +141,21 @@ def random_frames(
     CatalogueError
         When the field is too narrow for the catalogue to show `min_stars`.
     """
-    sky = Sky(stars, camera, EDGE_SIGMAS * largest_noise(noise, stars.mag))
+    sky = Sky(stars, camera, EDGE_SIGMAS * largest_noise(noise, stars.mag, camera))
     rng = np.random.default_rng(seed)
     return _frame_set(stars, camera, *choose_attitudes(sky, rng, n_frames=n_frames, min_stars=min_stars), noise)
 
 
-def noise_of(noise: Noise, mag: FloatArray) -> FloatArray:
-    """Noise of stars, px per axis, (n,).
+def noise_of(noise: Noise, mag: FloatArray, pixel: FloatArray) -> FloatArray:
+    """Noise of stars with magnitudes (n,) at pixels (2, n), px per axis, (n,).
 
     Raises
     ------
     PlanningError
         When it is not positive and finite for every star.
     """
+    if isinstance(noise, NoiseModel):
+        return noise.at(pixel[0], pixel[1], mag)
     values = np.asarray(noise(mag), dtype=np.float64) if callable(noise) else np.full(mag.shape, float(noise))
     if values.shape != mag.shape or not np.all((values > 0.0) & np.isfinite(values)):
         raise PlanningError(
@@ -161,9 +164,10 @@ def noise_of(noise: Noise, mag: FloatArray) -> FloatArray:
     return values
 
 
-def largest_noise(noise: Noise, mag: FloatArray) -> float:
-    """The noise of the faintest star, px per axis: stars this near to the edge are left out."""
-    return float(np.max(noise_of(noise, mag), initial=0.0))
+def largest_noise(noise: Noise, mag: FloatArray, camera: Camera) -> float:
+    """The noise of the faintest star at the edge, px per axis: stars this near to the edge are left out."""
+    edge = np.array([[camera.width_px - 1.0], camera.centre_px[1:]]) * np.ones(len(mag))
+    return float(np.max(noise_of(noise, mag, edge), initial=0.0))
 
 
 def _frame_set(
@@ -175,10 +179,11 @@ def _frame_set(
 ) -> FrameSet:
     index = np.concatenate([seen for seen, _ in views])
     mag = stars.mag[index]
+    pixel = np.ascontiguousarray(np.concatenate([xy for _, xy in views]).T)
     frames = StarFrames(
-        pixel=np.ascontiguousarray(np.concatenate([xy for _, xy in views]).T),
+        pixel=pixel,
         r=np.ascontiguousarray(stars.directions_icrs[index].T),
-        weight=1.0 / noise_of(noise, mag),
+        weight=1.0 / noise_of(noise, mag, pixel),
         starts=np.concatenate([[0], np.cumsum([len(seen) for seen, _ in views])]).astype(np.int64),
     )
     return FrameSet(camera, rotations, frames, mag, *_matrices(camera, frames, rotations))

@@ -76,8 +76,9 @@ def plan(
         The sheet; optics and distortion are those that one expects.
     stars : StarCatalogue
         The sky.
-    sigma_px : float or callable
-        Centroid noise, px per axis; a function from magnitudes (n,) to noise (n,) where it depends on them.
+    sigma_px : float, callable or NoiseModel
+        Centroid noise, px per axis; a function from magnitudes (n,) to noise (n,) where it depends on them; the noise
+        model of a calibration where it depends on the place in the field as well.
     n_frames : sequence of int
         Sizes of campaigns to forecast.
     min_stars : int
@@ -137,7 +138,7 @@ def plan(
         "seed": seed,
     }
     forecast = _forecaster(frames, scope, options).forecast(n_frames)
-    noise = float(np.sqrt(np.mean(noise_of(sigma_px, frames.mag) ** 2)))
+    noise = float(np.sqrt(np.mean(noise_of(sigma_px, frames.mag, frames.frames.pixel) ** 2)))
     settings = {
         "n_geometries": n_geometries,
         "n_campaigns": n_campaigns,
@@ -272,7 +273,7 @@ def _sky_fraction(stars: StarCatalogue, camera: Camera, noise: Noise, min_stars:
     """Part of random attitudes that show enough stars."""
     if len(stars) == 0:
         return 0.0
-    sky = Sky(stars, camera, EDGE_SIGMAS * largest_noise(noise, stars.mag))
+    sky = Sky(stars, camera, EDGE_SIGMAS * largest_noise(noise, stars.mag, camera))
     views = sky.views(random_rotations(_TRIED_ATTITUDES, np.random.default_rng([seed, 1])))
     return float(np.mean([len(seen) >= min_stars for seen, _ in views]))
 
