@@ -157,6 +157,31 @@ def recurring(name: str, *, star_errors: bool = False, runs: int = 150, **option
 
 PATCH: dict[str, Any] = {"n_frames": 60, "patch_stars": 40}
 FEW: dict[str, Any] = {"n_frames": 20, "patch_stars": 15, "star_sigma_px": 0.03}
+
+
+def worse_outside(radius: np.ndarray, mag: np.ndarray, frame: np.ndarray) -> np.ndarray:
+    """Three times the noise at the edge of the field, which is at 0.75 of the half diagonal on average."""
+    return 0.05 * (1.0 + 2.0 * (radius / 0.75) ** 4)
+
+
+def worse_for_faint(radius: np.ndarray, mag: np.ndarray, frame: np.ndarray) -> np.ndarray:
+    """Photon noise over a floor: 2.8 times as much at magnitude 6 as at 2."""
+    return 0.05 * np.sqrt(0.3 + 10.0 ** (0.4 * (mag - 4.0)))
+
+
+def by_frame(radius: np.ndarray, mag: np.ndarray, frame: np.ndarray) -> np.ndarray:
+    """A factor of its own in every frame, log-normal with a spread of 0.4."""
+    factors = np.random.default_rng(5).standard_normal(10_000)
+    return 0.05 * np.exp(0.4 * factors[frame])
+
+
+def uneven(name: str, *, noise: str = "common", runs: int = 100, **options: Any) -> Regime:
+    """Noise that varies over 40 frames, calibrated with one noise or with the fitted model."""
+    steps = {"calibrate": {"noise": noise}, "models": (), "n_starts": 0}
+    words = name if noise == "common" else f"{name}, with `--noise model`"
+    return Regime(words, partial(plain, options={"n_frames": 40} | options, **steps), runs)
+
+
 REGIMES: list[Regime] = [
     clean("clean: 3 frames", 400, n_frames=3),
     clean("clean: 5 frames", 400, n_frames=5),
@@ -176,6 +201,13 @@ REGIMES: list[Regime] = [
     recurring("40 stars: no errors, with `--star-errors`", star_errors=True, **PATCH),
     recurring("15 stars in 20 frames: errors of 0.03 px of their own", **FEW),
     recurring("15 stars: the same, with `--star-errors`", star_errors=True, **FEW),
+    uneven("noise three times larger at the edge", runs=200, sigma_px=worse_outside),
+    uneven("noise three times larger at the edge", runs=200, noise="model", sigma_px=worse_outside),
+    uneven("noise larger for faint stars", sigma_px=worse_for_faint),
+    uneven("noise larger for faint stars", noise="model", sigma_px=worse_for_faint),
+    uneven("noise of its own in every frame", sigma_px=by_frame),
+    uneven("noise of its own in every frame", noise="model", sigma_px=by_frame),
+    uneven("clean: 40 frames", noise="model"),
 ]
 
 

@@ -13,6 +13,7 @@ import starcal_uq as sc
 from starcal_uq.budgeting.shapes import two_axis_radius
 from starcal_uq.core.errors import PlanningError
 from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.noise_model import NoiseModel
 from starcal_uq.maths.circular import mixture_radius
 from starcal_uq.maths.linear import inverses
 from starcal_uq.planning import open_distortion
@@ -330,6 +331,22 @@ def test_sweeps_change_one_thing():
         for rows, at in ((magnitudes, 6.0), (noise, 0.05), (groups["part of the detector"], 1.0))
     ]
     assert [row["radius_arcsec"] for row in here] == pytest.approx([here[0]["radius_arcsec"]] * 3, rel=0.05)
+
+
+def test_the_noise_model_of_a_calibration_gives_stars_the_noise_of_their_place():
+    corner = np.hypot(camera().width_px, camera().height_px) / 2.0
+    empty, nothing = np.zeros(0), np.zeros(0, dtype=np.int64)
+    model = NoiseModel(
+        ("radius",),
+        *(np.array([2.0]), np.array([0.1]), 0.05, False, np.array(camera().centre_px), corner, np.array([0.0, 1.0])),
+        *(np.zeros(2), 0.0, None, nothing, empty, 1.0),
+    )
+    frames = random_frames(sky(), camera(), model, n_frames=50, min_stars=10, seed=1)
+    radius = np.hypot(*(frames.frames.pixel - np.array(camera().centre_px)[:, None])) / corner
+    assert 1.0 / frames.frames.weight == pytest.approx(0.05 * np.exp(radius), rel=1e-9)
+    noisy = plan(camera(), sky(), sigma_px=model, n_geometries=100, n_campaigns=20, sweeps=False)
+    quiet = plan(camera(), sky(), sigma_px=0.05, n_geometries=100, n_campaigns=20, sweeps=False)
+    assert (noisy.forecast.of("f_px") > 1.5 * quiet.forecast.of("f_px")).all()
 
 
 # --- distortion that the sheet leaves open ---------------------------------------------------------------------------
