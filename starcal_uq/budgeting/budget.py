@@ -29,6 +29,7 @@ from starcal_uq.core.constants import AXES
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.provenance import provenance
+from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
     from starcal_uq.diagnostics.diagnose import Diagnosis
@@ -95,11 +96,18 @@ def budget(
     known = (_seen(row, attitude) for row in posterior_rows(attitude, post))
     rows = (*known, *_from_file(stated, (*untested, *FROM_FILE), alignment_rows(attitude)))
     found, samples = totals(rows, chosen, n_samples=n_samples, seed=seed)
-    settings = {"confidence": chosen, "n_samples": n_samples, "file": stated.path, "alignment": attitude.alignment}
+    settings: AnyDict = {
+        "confidence": chosen,
+        "n_samples": n_samples,
+        "file": stated.path,
+        "alignment": attitude.alignment,
+    }
+    if stated.frames:
+        settings["frames"] = {name: rotation.tolist() for name, rotation in stated.frames.items()}
     return Budget(
         rows=rows,
         totals=found,
-        outcomes=judge(stated.requirements, rows, samples),
+        outcomes=judge(stated.requirements, rows, samples, stated.frames),
         confidence=chosen,
         title=stated.title or "Attitude error budget",
         notes=(
@@ -144,6 +152,7 @@ def _silent(stated: Contributor, axis: str) -> Contributor:
         mean_arcsec=math.nan,
         sigma_arcsec=math.nan,
         correlation_group="",
+        axis_correlation=(),
         conditions="",
         provenance="",
         source="not assessed",

@@ -10,6 +10,9 @@ from dataclasses import dataclass, field
 from textwrap import wrap
 from typing import Any
 
+import numpy as np
+
+from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.budgeting.rows import (
     ABSORBED,
     DISTRIBUTIONS,
@@ -27,6 +30,7 @@ from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.files import atomic_write_text, ensure_new
 from starcal_uq.core.toml import read_toml, unknown_key
+from starcal_uq.core.types import FloatArray
 
 # As people write them: X and Y are across the boresight, Z is along it.
 _AXIS_NAMES = {
@@ -71,7 +75,12 @@ REQUIREMENT_KEYS: Keys = {
     "scope": SCOPES,
     "interpretation": INTERPRETATIONS,
     "judged_by": JUDGED_BY,
+    "frame": str,
 }
+SENSOR = "sensor"
+FRAME_KEYS: Keys = {"rotation": list}
+# Rows of a matrix that people round to six digits.
+_ORTHONORMAL = 1e-5
 # Keys of earlier versions, and why to delete them.
 _GONE = {"time_class": "interpretation alone decides how a row is combined"}
 
@@ -96,6 +105,8 @@ class Requirement:
         Cases of what: ``mixed``, ``ensemble`` or ``temporal``.
     judged_by : str
         ``rule``, ``sampling``, or ``both``: the larger of the two bounds.
+    frame : str
+        Frame whose axes are meant: ``sensor``, or one that the file names.
     """
 
     name: str
@@ -105,6 +116,7 @@ class Requirement:
     scope: str = SCOPES[1]
     interpretation: str = "mixed"
     judged_by: str = "both"
+    frame: str = SENSOR
 
 
 @dataclass(frozen=True)
@@ -123,6 +135,8 @@ class BudgetFile:
         Probability of the totals; None to leave it to the caller.
     path : str
         Path that it was read from.
+    frames : dict of str to (3, 3) array
+        Rotations R of the frames that requirements may name, with v_frame = R v_sensor.
     """
 
     contributors: tuple[Contributor, ...] = field(default=())
@@ -130,6 +144,7 @@ class BudgetFile:
     title: str = ""
     confidence: float | None = None
     path: str = ""
+    frames: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
 class _Table:
@@ -209,10 +224,12 @@ def load_budget_file(path: str | os.PathLike[str]) -> BudgetFile:
     missing = "check the path, or write a starter with `starcal-uq budget RUN --template FILE`"
     content = read_toml(path, "budget", BudgetError, missing)
     for key in content:
-        if key not in ("budget", "contributor", "requirement"):
+        if key not in ("budget", "contributor", "requirement", "frame"):
             raise BudgetError(
-                f"{path}: {key} is not known; write [budget], [[contributor]] and [[requirement]] tables only."
+                f"{path}: {key} is not known; write [budget], [frame.NAME], [[contributor]] and [[requirement]] tables "
+                "only."
             )
+    frames = _frames(content.get("frame", {}), path)
     head = _Table(content.get("budget", {}), f"{path}, [budget]", BUDGET_KEYS)
     confidence = head.confidence("confidence") if "confidence" in head else None
     rows: list[Contributor] = []
@@ -220,11 +237,40 @@ def load_budget_file(path: str | os.PathLike[str]) -> BudgetFile:
         rows += _contributor(_Table(table, f"{path}, [[contributor]] {number}", CONTRIBUTOR_KEYS))
     _no_doubles([(row.name, row.axis) for row in rows], f"{path}: contributor")
     requirements = tuple(
-        _requirement(_Table(table, f"{path}, [[requirement]] {number}", REQUIREMENT_KEYS), confidence)
+        _requirement(_Table(table, f"{path}, [[requirement]] {number}", REQUIREMENT_KEYS), confidence, tuple(frames))
         for number, table in enumerate(_tables(content, "requirement", path), start=1)
     )
     _no_doubles([(requirement.name,) for requirement in requirements], f"{path}: requirement")
-    return BudgetFile(tuple(rows), requirements, head.text("title", ""), confidence, str(path))
+    return BudgetFile(tuple(rows), requirements, head.text("title", ""), confidence, str(path), frames)
+
+
+def _frames(tables: Any, path: str | os.PathLike[str]) -> dict[str, FloatArray]:
+    """Rotations by frame: a matrix, or a quaternion with its scalar last."""
+    if not isinstance(tables, Mapping) or not all(isinstance(table, Mapping) for table in tables.values()):
+        raise BudgetError(f"{path}: frame needs a name; write [frame.payload] above its rotation.")
+    frames = {}
+    for name, data in tables.items():
+        where = f"{path}, [frame.{name}]"
+        table = _Table(data, where, FRAME_KEYS)
+        if name == SENSOR:
+            raise BudgetError(f"{where}: this is the frame of the rows; give yours another name.")
+        if "rotation" not in table:
+            raise BudgetError(f"{where}: key rotation is missing; write a matrix of three rows, or a quaternion.")
+        try:
+            values = np.array(table.data["rotation"], dtype=np.float64)
+        except (TypeError, ValueError):
+            values = np.zeros(0)
+        if values.shape == (4,) and np.isfinite(values).all() and np.any(values):
+            values = quaternion_to_rotation(values / np.linalg.norm(values))
+        if values.shape != (3, 3) or not np.abs(values @ values.T - np.eye(3)).max() < _ORTHONORMAL:
+            raise BudgetError(
+                f"{where}: key rotation is no rotation; write three rows of three numbers (v_{name} = R v_sensor), or "
+                "the four of a quaternion, scalar last."
+            )
+        if np.linalg.det(values) < 0.0:
+            raise BudgetError(f"{where}: key rotation mirrors; change the sign of one row.")
+        frames[name] = values
+    return frames
 
 
 def _tables(content: Mapping[str, Any], key: str, path: str | os.PathLike[str]) -> list[Any]:
@@ -336,10 +382,16 @@ def _moments(table: _Table, distribution: str) -> tuple[float, float]:
     return table.number("mean_arcsec", RAYLEIGH_MEAN * value if distribution == "rayleigh" else 0.0), value
 
 
-def _requirement(table: _Table, confidence: float | None) -> Requirement:
+def _requirement(table: _Table, confidence: float | None, frames: tuple[str, ...]) -> Requirement:
     name = table.text("name")
     table.where += f" ({name!r})"
     axis = table.choice("axis").lower()
+    frame = table.text("frame", SENSOR)
+    if frame not in (SENSOR, *frames):
+        raise BudgetError(
+            f"{table.where}: key frame is {frame!r}, which no table of the file describes; write [frame.{frame}] with "
+            "its rotation."
+        )
     limit = table.number("limit_arcsec")
     if not limit > 0.0:
         raise BudgetError(f"{table.where}: key limit_arcsec is {limit!r}; write a positive number of arcsec.")
@@ -351,6 +403,7 @@ def _requirement(table: _Table, confidence: float | None) -> Requirement:
         scope=table.choice("scope", SCOPES[1]),
         interpretation=table.choice("interpretation", "mixed"),
         judged_by=table.choice("judged_by", "both"),
+        frame=frame,
     )
 
 
@@ -375,7 +428,8 @@ _HEADER = f"""\
 #   interpretation         what it is random over: {", ".join(INTERPRETATIONS)}
 #   absorbed_by_alignment  by an alignment calibration with the same camera parameters:
 #                          {", ".join(ABSORBED)} (exists only after it)
-#   correlation_group      rows with the same text here err together: their sigmas add
+#   correlation_group      rows with the same text here err together, on all axes: their sigmas add; "-text" errs
+#                          against those with "text"
 #   conditions             under what conditions the number holds
 #   provenance             where the number is from (a report, an analysis); it must be given
 
@@ -391,6 +445,11 @@ confidence = 0.997
 # scope = "after alignment"            # or "before alignment"
 # interpretation = "mixed"             # or "ensemble" (a sensor at its worst moment), "temporal" (the worst sensor)
 # judged_by = "both"                   # the larger of "rule" and "sampling"
+# frame = "sensor"                     # or one with a table of its own:
+#
+# [frame.payload]
+# rotation = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]   # v_payload = R v_sensor; or a quaternion (scalar
+#                                                                  # last)
 
 """
 

@@ -22,6 +22,7 @@ from starcal_uq.budgeting.rows import (
 )
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import plural
+from starcal_uq.core.types import FloatArray
 from starcal_uq.propagation.attitude_error import CONTRIBUTORS, IF_MODEL_HOLDS, WITH_MISFIT_FOUND
 
 if TYPE_CHECKING:
@@ -42,12 +43,15 @@ def posterior_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributo
     if found is not None:
         reasons = {COMMON: found.common_reasons, REST: found.rest_reasons}
     tails = _tails(attitude)
+    places = {name: place for place, name in enumerate(CONTRIBUTORS)}
     rows = []
     for entry in expected:
         place = CONTRIBUTORS.index(entry.name)
         held, with_misfit = attitude.if_model_holds_arcsec[place], attitude.with_misfit_found_arcsec[place]
         counted = attitude.headline_arcsec[place]
         factor = found.factor if found is not None and entry.name in reasons else 1.0
+        scale = np.divide(factor * held[:3], counted[:3], out=np.zeros(3), where=counted[:3] > 0.0)
+        correlation = axis_correlations(attitude.covariance_arcsec2[places[entry.name]], scale)
         for index, axis in enumerate(AXES):
             # What the misfit adds has no frame-by-frame sigma: the excess of the tail shrinks with its share.
             share = (factor * held[index] / counted[index]) ** 2 if counted[index] > 0.0 else 1.0
@@ -63,6 +67,7 @@ def posterior_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributo
                     distribution=entry.distribution,
                     interpretation=entry.interpretation,
                     absorbed_by_alignment=entry.absorbed_by_alignment,
+                    axis_correlation=correlation[index],
                     tail_997=GAUSSIAN_997 + float(share) * excess,
                     conditions=conditions + (f"; inflated: {why}" if why else ""),
                     provenance=provenance,
@@ -92,19 +97,31 @@ def misfit_notes(attitude: AttitudeError) -> tuple[str, ...]:
     return (*notes, *found.notes)
 
 
+def axis_correlations(covariance: FloatArray, scale: FloatArray) -> tuple[tuple[float, ...], ...]:
+    """Lines of the correlation matrix, off-diagonal elements scaled down by what is added independently; or nothing."""
+    sigma = np.sqrt(np.diag(covariance))
+    if not (np.isfinite(covariance).all() and (sigma > 0.0).all()):
+        return ((),) * len(AXES)
+    matrix = covariance / np.outer(sigma, sigma) * np.outer(scale, scale)
+    np.fill_diagonal(matrix, 1.0)
+    return tuple(tuple(float(value) for value in line) for line in matrix)
+
+
 def alignment_rows(attitude: AttitudeError) -> tuple[Contributor, ...]:
     """The error of the alignment from the noise of its frames, where it was propagated; a file may state another."""
     expected = next(entry for entry in FROM_FILE if entry.name == ALIGNMENT)
+    correlations = axis_correlations(attitude.alignment_covariance_arcsec2, np.ones(3))
     rows = (
         replace(
             not_assessed(expected, axis),
             mean_arcsec=0.0,
             sigma_arcsec=float(sigma),
+            axis_correlation=correlation,
             conditions=f"noise of {attitude.alignment}, reference attitude without error",
             provenance="propagated with the posterior",
             source="posterior",
         )
-        for axis, sigma in zip(AXES, attitude.alignment_arcsec, strict=True)
+        for axis, sigma, correlation in zip(AXES, attitude.alignment_arcsec, correlations, strict=True)
     )
     return tuple(row for row in rows if math.isfinite(row.sigma_arcsec))
 

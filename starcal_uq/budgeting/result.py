@@ -10,16 +10,17 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
-from starcal_uq.budgeting.file import Requirement
+from starcal_uq.budgeting.file import SENSOR, Requirement
 from starcal_uq.budgeting.rows import AXIS_LABELS, ECSS_CLASSES, SCOPES, Contributor
 from starcal_uq.budgeting.totals import Samples, Total, grouped_sigma, total
 from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.files import atomic_path, reading
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.types import AnyDict, FloatArray
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -141,11 +142,12 @@ class Budget(Shown):
 
     @property
     def comparable(self) -> tuple[Outcome, ...]:
-        """Requirements at the budget's own confidence, mixed: those that its totals may be held against."""
+        """Requirements in the sensor's frame, mixed, at the budget's own confidence: its totals are about these."""
         return tuple(
             outcome
             for outcome in self.outcomes
             if outcome.requirement.interpretation == "mixed"
+            and outcome.requirement.frame == SENSOR
             and math.isclose(1.0 - outcome.requirement.confidence, 1.0 - self.confidence, rel_tol=1e-9)
         )
 
@@ -329,8 +331,13 @@ def _unknown(value: Any) -> bool:
     return isinstance(value, float) and math.isnan(value)
 
 
-def judge(requirements: Sequence[Requirement], rows: Sequence[Contributor], samples: Samples) -> tuple[Outcome, ...]:
-    """Every requirement against the total at its own confidence."""
+def judge(
+    requirements: Sequence[Requirement],
+    rows: Sequence[Contributor],
+    samples: Samples,
+    rotations: Mapping[str, FloatArray] = MappingProxyType({}),
+) -> tuple[Outcome, ...]:
+    """Every requirement against the total at its own confidence, in its own frame."""
     return tuple(
         Outcome(
             asked,
@@ -341,6 +348,7 @@ def judge(requirements: Sequence[Requirement], rows: Sequence[Contributor], samp
                 axis=asked.axis,
                 interpretation=asked.interpretation,
                 confidence=asked.confidence,
+                rotation=rotations.get(asked.frame),
             ),
         )
         for asked in requirements
@@ -363,6 +371,7 @@ _READERS: dict[str, Callable[[str], Any]] = {
     "bool": {"True": True, "False": False}.__getitem__,
     "str": str,
     "tuple[str, ...]": lambda text: tuple(text.split(_SEPARATOR)) if text else (),
+    "tuple[float, ...]": lambda text: tuple(float(value) for value in text.split(_SEPARATOR)) if text else (),
 }
 
 _DERIVED = ("combination", "margin_arcsec", "verdict")
@@ -380,7 +389,7 @@ def _plain(entry: Contributor | Total | Requirement) -> dict[str, str]:
 
 def _text(value: Any) -> str:
     if isinstance(value, tuple):
-        return _SEPARATOR.join(value)
+        return _SEPARATOR.join(entry if isinstance(entry, str) else repr(entry) for entry in value)
     return repr(float(value)) if isinstance(value, float) else str(value)
 
 

@@ -69,7 +69,10 @@ class Contributor:
         Does an alignment calibration with the same camera parameters take it up? ``caused by it`` marks what exists
         only after it. ``in part`` counts in full for upper bounds, and not at all for the least ones.
     correlation_group : str
-        Rows of one group and axis err together, their sigmas add; empty if it errs alone.
+        Rows with the same text err together, on all axes: their sigmas add. With ``-`` in front they err against
+        those without. Empty if it errs alone.
+    axis_correlation : tuple of float
+        Correlations with pitch, yaw and roll of the same contributor; empty if its axes are independent.
     tail_997 : float
         Half-width that holds 99.7 % of the absolute deviations, standard deviations. Above 2.968 for a Gaussian error
         whose sigma changes from frame to frame.
@@ -93,6 +96,7 @@ class Contributor:
     interpretation: str = "ensemble"
     absorbed_by_alignment: str = "no"
     correlation_group: str = ""
+    axis_correlation: tuple[float, ...] = ()
     tail_997: float = GAUSSIAN_997
     conditions: str = ""
     provenance: str = ""
@@ -112,6 +116,12 @@ class Contributor:
         return self.with_misfit_found_arcsec > self.if_model_holds_arcsec
 
     @property
+    def group(self) -> tuple[str, float]:
+        """Correlation group without its sign, and the sign."""
+        text = self.correlation_group.strip()
+        return (text[1:].strip(), -1.0) if text.startswith("-") else (text, 1.0)
+
+    @property
     def combination(self) -> str:
         """How it enters the totals."""
         if not self.assessed:
@@ -120,8 +130,9 @@ class Contributor:
             return "none"
         if self.distribution == "constant":
             return "mean: linear"
-        group = f"linear within group {self.correlation_group!r}, then in squares" if self.correlation_group else ""
-        return group or "in squares"
+        group = f"linear within group {self.group[0]!r}, then in squares" if self.correlation_group else ""
+        against = " (against the others)" if self.group[1] < 0.0 else ""
+        return group + against if group else "in squares"
 
     def counts(self, scope: str) -> bool:
         """True if it exists in this scope, one of `SCOPES` or `AFTER_AT_LEAST`."""

@@ -33,7 +33,7 @@ from starcal_uq.budgeting.rows import (
     Contributor,
     confidence_text,
 )
-from starcal_uq.budgeting.shapes import deviates, half_width, mixture_spread, one_axis_factor, two_axis_radius
+from starcal_uq.budgeting.shapes import deviates, half_width, mixture_spread, two_axis_radius
 from starcal_uq.core.constants import AXES, CROSS_BORESIGHT, TOTAL_AXES
 from starcal_uq.core.formatting import join_words, percent, significant
 from starcal_uq.core.types import FloatArray
@@ -51,6 +51,8 @@ _AGREE = 0.02
 _BOUNDED = ("uniform", "arcsine")
 # A mean of this many sigmas moves the bounds apart.
 _MEAN_COUNTS = 0.05
+# Rounding of a rotation: an axis with less of another's error sees nothing of it.
+_PERPENDICULAR = 1e-9
 _TAILED = 1.01 * GAUSSIAN_997
 # Smaller ones, relative to the largest, are left out of a sentence.
 _WORTH_NAMING = 0.25
@@ -136,27 +138,71 @@ class Samples:
 def draw(rows: Sequence[Contributor], n_samples: int = N_SAMPLES, seed: int = 0) -> Samples:
     """Sample every assessed row around its mean and add up what has the same kind of randomness.
 
-    Rows of one correlation group share their probabilities on each axis. A sigma that changes from frame to frame is
-    the same for all axes of a contributor.
+    Rows of one correlation group share their probabilities, and axes of one contributor are correlated as it states. A
+    sigma that changes from frame to frame is the same for all axes of a contributor.
     """
+    from scipy.special import ndtr
+
     scopes = (*SCOPES, AFTER_AT_LEAST) if any(row.absorbed_by_alignment == "in part" for row in rows) else SCOPES
     sums = {(scope, kind): np.zeros((n_samples, 3)) for scope in scopes for kind in INTERPRETATIONS}
-    shared: dict[tuple[str, str], FloatArray] = {}
+    shared: dict[str, FloatArray] = {}
     scales: dict[str, FloatArray] = {}
+    joint = {name: _joint(rows, name, n_samples, seed) for name in {row.name for row in rows if row.axis_correlation}}
     for index, row in enumerate(rows):
         if not (row.assessed and row.applies and row.sigma_arcsec > 0.0):
             continue
-        uniform = np.random.default_rng((seed, 1, index)).random(n_samples)
-        if row.correlation_group:
-            uniform = shared.setdefault((row.correlation_group, row.axis), uniform)
+        group, sign = row.group
+        if group and group in shared:
+            uniform = shared[group]
+        elif row.axis_correlation:
+            uniform = ndtr(joint[row.name][:, AXES.index(row.axis)])
+        else:
+            uniform = np.random.default_rng((seed, 1, index)).random(n_samples)
+        if group:
+            shared[group] = uniform
         if row.tail_997 > GAUSSIAN_997 and row.name not in scales:
             scales[row.name] = np.random.default_rng((seed, 2, index)).standard_normal(n_samples)
         log_scale = scales.get(row.name, uniform)
-        errors = row.sigma_arcsec * deviates(row.distribution, uniform, log_scale, row.tail_997)
+        errors = sign * row.sigma_arcsec * deviates(row.distribution, uniform, log_scale, row.tail_997)
         for scope in scopes:
             if row.counts(scope):
                 sums[scope, row.interpretation][:, AXES.index(row.axis)] += errors
     return Samples(sums)
+
+
+def _joint(rows: Sequence[Contributor], name: str, n_samples: int, seed: int) -> FloatArray:
+    """Standard normal deviates (n, 3) with the correlations of a contributor's axes."""
+    own = {row.axis: row for row in rows if row.name == name and row.axis_correlation}
+    matrix = np.eye(3)
+    for axis, row in own.items():
+        matrix[AXES.index(axis)] = row.axis_correlation
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    index = next(place for place, row in enumerate(rows) if row.name == name)
+    plain = np.random.default_rng((seed, 1, index)).standard_normal((n_samples, 3))
+    deviate: FloatArray = plain @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    return deviate
+
+
+def covariance(rows: Sequence[Contributor]) -> FloatArray:
+    """Covariance (3, 3) of the sum of rows, arcsec^2: groups err as one, axes as their contributor says."""
+    together: dict[str, FloatArray] = {}
+    apart: dict[str, list[Contributor]] = {}
+    for row in rows:
+        group, sign = row.group
+        if group:
+            together.setdefault(group, np.zeros(3))[AXES.index(row.axis)] += sign * row.sigma_arcsec
+        else:
+            apart.setdefault(row.name, []).append(row)
+    matrix = sum((np.outer(sigma, sigma) for sigma in together.values()), start=np.zeros((3, 3)))
+    for members in apart.values():
+        for row in members:
+            i = AXES.index(row.axis)
+            matrix[i, i] += row.sigma_arcsec**2
+            for other in members:
+                j = AXES.index(other.axis)
+                if i != j and row.axis_correlation:
+                    matrix[i, j] += row.axis_correlation[j] * row.sigma_arcsec * other.sigma_arcsec
+    return matrix
 
 
 def total(
@@ -167,22 +213,28 @@ def total(
     axis: str,
     interpretation: str,
     confidence: float,
+    rotation: FloatArray | None = None,
 ) -> Total:
-    """One total, by the rule and from the samples, with their difference explained."""
-    axes = (CROSS_BORESIGHT, AXES[:2]) if axis == CROSS_BORESIGHT else (axis, (axis,))
-    chosen = [row for row in rows if row.axis in axes[1] and row.counts(scope)]
+    """One total, by the rule and from the samples, with their difference explained.
+
+    The axes are those of the sensor, or of a frame with v_frame = `rotation` @ v_sensor.
+    """
+    names = AXES[:2] if axis == CROSS_BORESIGHT else (axis,)
+    along = (np.eye(3) if rotation is None else rotation)[[AXES.index(name) for name in names]]
+    seen = {name for name, column in zip(AXES, along.T, strict=True) if np.abs(column).max() > _PERPENDICULAR}
+    chosen = [row for row in rows if row.axis in seen and row.counts(scope)]
     missing = tuple(dict.fromkeys(row.name for row in chosen if not row.assessed))
     counted = [row for row in chosen if row.assessed and row.applies]
     if not counted:
         nan = math.nan
         return Total(scope, axis, interpretation, confidence, *(nan,) * 7, not_assessed=missing)
-    here = _bounds(counted, samples, scope, axes[1], interpretation, confidence)
+    here = _bounds(counted, samples, scope, along, interpretation, confidence)
     certain, at_least = counted, here
     if scope == SCOPES[1]:
         certain = [row for row in counted if row.counts(AFTER_AT_LEAST)]
     if len(certain) < len(counted):
-        at_least = _bounds(certain, samples, AFTER_AT_LEAST, axes[1], interpretation, confidence)
-    dominant, share = _dominant(counted, axes[1], confidence)
+        at_least = _bounds(certain, samples, AFTER_AT_LEAST, along, interpretation, confidence)
+    dominant, share = _dominant(counted, along, confidence)
     result = Total(
         scope=scope,
         axis=axis,
@@ -227,20 +279,19 @@ def _bounds(
     rows: Sequence[Contributor],
     samples: Samples,
     scope: str,
-    axes: Sequence[str],
+    along: FloatArray,
     interpretation: str,
     confidence: float,
 ) -> _Bounds:
     random = _spread(rows, interpretation)
     worst = [row for row in rows if row not in random]
-    mean = np.array([sum(row.mean_arcsec for row in rows if row.axis == name) for name in axes])
-    sigma = np.array([grouped_sigma([row for row in random if row.axis == name]) for name in axes])
-    radius = _radius(confidence, sigma)
-    together, apart = _worst(worst, axes, confidence, by_shape=False)
-    by_shape, _ = _worst(worst, axes, confidence, by_shape=True)
-    columns = [AXES.index(name) for name in axes]
+    mean = along @ [sum(row.mean_arcsec for row in rows if row.axis == name) for name in AXES]
+    spread = along @ covariance(random) @ along.T
+    radius = _radius(confidence, spread)
+    together, apart = _worst(worst, along, confidence, by_shape=False)
+    by_shape, _ = _worst(worst, along, confidence, by_shape=True)
     chance, rest = (
-        sum((samples.sums[scope, kind][:, columns] for kind in kinds), start=np.zeros((1, len(columns))))
+        sum((samples.sums[scope, kind] for kind in kinds), start=np.zeros((1, 3))) @ along.T
         for kinds in (_random(interpretation), _worst_kinds(interpretation))
     )
     sampled, error = _quantile(_meeting(mean, by_shape, chance) + chance, confidence)
@@ -248,7 +299,7 @@ def _bounds(
     length = float(np.linalg.norm(mean))
     return _Bounds(
         mean=length if len(mean) > 1 else float(mean[0]),
-        sigma=float(np.sqrt(np.mean(sigma**2))),
+        sigma=math.sqrt(float(np.trace(spread)) / len(along)),
         radius=radius,
         worst=together,
         rule=length + radius + together,
@@ -351,23 +402,23 @@ def _heaviest(rows: Sequence[Contributor]) -> Contributor | None:
 
 
 def _grouped(rows: Sequence[Contributor]) -> bool:
-    groups = [row.correlation_group for row in rows if row.correlation_group]
+    groups = [row.group[0] for row in rows if row.correlation_group]
     return len(set(groups)) < len(groups)
 
 
 def grouped_sigma(rows: Sequence[Contributor]) -> float:
     """Standard deviation of the sum of rows on one axis: linear within groups, in squares otherwise."""
-    groups: dict[str, float] = {}
-    for index, row in enumerate(rows):
-        key = f"group {row.correlation_group}" if row.correlation_group else f"row {index}"
-        groups[key] = groups.get(key, 0.0) + row.sigma_arcsec
-    return math.sqrt(sum(value * value for value in groups.values()))
+    return math.sqrt(max(float(np.trace(covariance(rows))), 0.0))
 
 
-def _radius(confidence: float, sigma: FloatArray) -> float:
-    if len(sigma) == 1:
-        return one_axis_factor(confidence) * float(sigma[0])
-    return two_axis_radius(confidence, float(sigma[0]), float(sigma[1]))
+def _radius(confidence: float, spread: FloatArray, tail: float = GAUSSIAN_997) -> float:
+    """Half-width that holds a Gaussian error of this covariance (k, k) on one axis or two."""
+    if len(spread) == 1:
+        return half_width("gaussian", confidence, tail) * math.sqrt(max(float(spread[0, 0]), 0.0))
+    # Independent in the axes of its ellipse; rounded, that equal ellipses are found again.
+    sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(spread), 0.0))
+    small, large = (float(f"{value:.12g}") for value in sigma)
+    return two_axis_radius(confidence, large, small, mixture_spread(tail))
 
 
 def _random(interpretation: str) -> tuple[str, ...]:
@@ -379,9 +430,7 @@ def _worst_kinds(interpretation: str) -> tuple[str, ...]:
     return tuple(kind for kind in INTERPRETATIONS if kind not in _random(interpretation))
 
 
-def _worst(
-    rows: Sequence[Contributor], axes: Sequence[str], confidence: float, *, by_shape: bool
-) -> tuple[float, float]:
+def _worst(rows: Sequence[Contributor], along: FloatArray, confidence: float, *, by_shape: bool) -> tuple[float, float]:
     """Half-widths of the contributors, added linearly, and in squares: groups err together in both.
 
     Half-widths are those of the distributions themselves, or take the rule's Gaussian factor where they are unbounded.
@@ -391,29 +440,23 @@ def _worst(
         by_name.setdefault(row.name, []).append(row)
     apart: dict[tuple[str, str], float] = {}
     for name, members in by_name.items():
-        group = members[0].correlation_group
+        group, _ = members[0].group
         key = ("group", group) if group else ("row", name)
-        apart[key] = apart.get(key, 0.0) + _reach(members, axes, confidence, by_shape=by_shape)
+        apart[key] = apart.get(key, 0.0) + _reach(members, along, confidence, by_shape=by_shape)
     return sum(apart.values(), start=0.0), math.hypot(*apart.values())
 
 
-def _reach(rows: Sequence[Contributor], axes: Sequence[str], confidence: float, *, by_shape: bool) -> float:
-    """Half-width of one contributor on the axis, or on both axes together."""
-    sigma = np.zeros(len(axes))
-    bounded = np.zeros(len(axes))
-    tail = GAUSSIAN_997
+def _reach(rows: Sequence[Contributor], along: FloatArray, confidence: float, *, by_shape: bool) -> float:
+    """Half-width of one contributor on an axis, or on two together."""
+    gaussian = [row for row in rows if row.distribution == "gaussian"]
+    tail = max([GAUSSIAN_997, *(row.tail_997 for row in gaussian)]) if by_shape else GAUSSIAN_997
+    bounded = np.zeros(3)
     for row in rows:
-        place = axes.index(row.axis)
-        if row.distribution == "gaussian":
-            sigma[place] = row.sigma_arcsec
-            tail = max(tail, row.tail_997) if by_shape else tail
-        else:
-            bounded[place] = half_width(row.distribution, confidence) * row.sigma_arcsec
-    if len(axes) == 1:
-        spread = half_width("gaussian", confidence, tail) * float(sigma[0])
-    else:
-        spread = two_axis_radius(confidence, float(sigma[0]), float(sigma[1]), mixture_spread(tail))
-    return spread + float(np.linalg.norm(bounded))
+        if row.distribution != "gaussian":
+            bounded[AXES.index(row.axis)] += half_width(row.distribution, confidence) * row.sigma_arcsec
+    spread = along @ covariance(gaussian) @ along.T
+    # Seen from other axes, ends of several axes meet in a corner.
+    return _radius(confidence, spread, tail) + float(np.linalg.norm(np.abs(along) @ bounded))
 
 
 def _meeting(mean: FloatArray, worst: float, chance: FloatArray) -> FloatArray:
@@ -456,12 +499,13 @@ def _quantile(errors: FloatArray, confidence: float) -> tuple[float, float]:
     return here, (high - low) / (2.0 * _SPREAD)
 
 
-def _dominant(rows: Sequence[Contributor], axes: Sequence[str], confidence: float) -> tuple[Contributor, float]:
+def _dominant(rows: Sequence[Contributor], along: FloatArray, confidence: float) -> tuple[Contributor, float]:
     """The row that matters most, and its share of the squares of means and half-widths."""
     weight: dict[str, float] = {}
+    part = dict(zip(AXES, np.linalg.norm(along, axis=0), strict=True))
     for row in rows:
         size = abs(row.mean_arcsec) + half_width(row.distribution, confidence, row.tail_997) * row.sigma_arcsec
-        weight[row.name] = weight.get(row.name, 0.0) + size * size
+        weight[row.name] = weight.get(row.name, 0.0) + float(part[row.axis] * size) ** 2
     whole = sum(weight.values())
     name = max(weight, key=lambda key: weight[key])
     first = max((row for row in rows if row.name == name), key=lambda row: row.sigma_arcsec)

@@ -259,7 +259,7 @@ PROBE = {
     "provenance": "note 1",
     "applies": True,
 }
-ASKED = {"name": "R-1", "axis": "roll", "limit_arcsec": 30.0, "confidence": 0.997}
+ASKED = {"name": "R-1", "axis": "roll", "limit_arcsec": 30.0, "confidence": 0.997, "frame": "sensor"}
 TABLES = {
     "[budget]": (BUDGET_KEYS, {"title": "one", "confidence": 0.997}),
     "[[contributor]]": (CONTRIBUTOR_KEYS, PROBE),
@@ -278,6 +278,7 @@ def result(folder: Path, head: str, table: dict[str, Any]) -> str:
     others = [{**other, "axis": "X"}, {**other, "axis": "Z", "correlation_group": "text of its own"}]
     text = "".join(f"{name}\n{lines(entry)}" for name, entry in tables.items())
     text += "".join(f"[[contributor]]\n{lines(entry)}" for entry in others)
+    text += '[frame."text of its own"]\nrotation = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]\n'
     (folder / "key.toml").write_text(text, encoding="utf-8")
     found = made(folder / "key.toml", n_samples=10_000)
     shown = found.to_dict()

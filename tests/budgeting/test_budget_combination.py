@@ -19,7 +19,7 @@ from starcal_uq.budgeting.shapes import (
     one_axis_factor,
     two_axis_radius,
 )
-from starcal_uq.budgeting.totals import Total, draw, grouped_sigma, total
+from starcal_uq.budgeting.totals import Total, covariance, draw, grouped_sigma, total
 from starcal_uq.presentation.words.budgeting import outcome_text
 
 
@@ -398,3 +398,77 @@ def test_no_reason_is_a_bare_share() -> None:
     for rows, confidence, words in cases:
         found = combined(rows, confidence=confidence)
         assert words in found.explanation and "'tiny'" not in found.explanation
+
+
+# --- correlated axes, and other frames --------------------------------------------------------------------------------
+
+
+CORRELATION = np.array([[1.0, 0.3, -0.1], [0.3, 1.0, 0.8], [-0.1, 0.8, 1.0]])
+# The payload looks along the sensor's -X, turned by 20 degrees.
+TURN = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])
+ROLLED = np.array([[np.cos(0.35), np.sin(0.35), 0.0], [-np.sin(0.35), np.cos(0.35), 0.0], [0.0, 0.0, 1.0]])
+PAYLOAD = ROLLED @ TURN
+
+
+def correlated(sigmas: tuple[float, float, float]) -> list[Contributor]:
+    lines = [tuple(float(value) for value in line) for line in CORRELATION]
+    return [
+        row("calibration", sigma, axis, axis_correlation=line)
+        for sigma, axis, line in zip(sigmas, ("pitch", "yaw", "roll"), lines, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("rotation", [None, TURN, PAYLOAD])
+@pytest.mark.parametrize("axis", ["pitch", "cross-boresight"])
+def test_totals_of_correlated_axes_in_any_frame_against_monte_carlo(rotation: np.ndarray | None, axis: str) -> None:
+    rng = np.random.default_rng(6)
+    rows = [*correlated((4.0, 5.0, 3.0)), row("shift", 2.0, "yaw", distribution="uniform", mean_arcsec=1.0)]
+    found = combined(rows, axis, 0.95, rotation=rotation)
+    errors = rng.multivariate_normal(np.zeros(3), CORRELATION * np.outer([4.0, 5.0, 3.0], [4.0, 5.0, 3.0]), 400_000)
+    errors[:, 1] += 1.0 + 2.0 * rng.uniform(-math.sqrt(3.0), math.sqrt(3.0), len(errors))
+    turned = errors @ (np.eye(3) if rotation is None else rotation).T
+    size = np.abs(turned[:, 0]) if axis == "pitch" else np.hypot(turned[:, 0], turned[:, 1])
+    assert found.sampled_arcsec == pytest.approx(np.quantile(size, 0.95), rel=0.01)
+    # Control: axes taken as independent, as the totals were before.
+    apart = combined([dataclasses.replace(r, axis_correlation=()) for r in rows], axis, 0.95, rotation=rotation)
+    if axis == "cross-boresight" and rotation is TURN:
+        assert apart.sampled_arcsec < 0.97 * found.sampled_arcsec
+        assert apart.rule_arcsec < 0.97 * found.rule_arcsec
+    # Control: the axes of another frame.
+    if axis == "pitch" and rotation is PAYLOAD:
+        assert abs(combined(rows, axis, 0.95).sampled_arcsec / found.sampled_arcsec - 1.0) > 0.05
+
+
+def test_the_worst_of_correlated_axes_follows_the_rotation() -> None:
+    found = combined(correlated((4.0, 5.0, 3.0)), "yaw", interpretation="temporal", rotation=PAYLOAD)
+    sigma = math.sqrt(PAYLOAD[1] @ (CORRELATION * np.outer([4.0, 5.0, 3.0], [4.0, 5.0, 3.0])) @ PAYLOAD[1])
+    assert found.worst_arcsec == pytest.approx(sigma * one_axis_factor(0.997)) == pytest.approx(found.rule_arcsec)
+
+
+def test_groups_err_together_on_all_axes_with_their_signs() -> None:
+    bend = [
+        row("bend", 3.0, correlation_group="thermal"),
+        row("bend", 3.0, "yaw", correlation_group="-thermal"),
+        row("twist", 2.0, correlation_group="thermal"),
+    ]
+    np.testing.assert_allclose(covariance(bend), [[25.0, -15.0, 0.0], [-15.0, 9.0, 0.0], [0.0, 0.0, 0.0]])
+    both_axes = combined(bend, "cross-boresight", 0.95)
+    # One cause: the angle is that of one deviate, 5.83 arcsec long.
+    assert both_axes.rule_arcsec == pytest.approx(math.hypot(5.0, 3.0) * one_axis_factor(0.95), rel=1e-6)
+    assert both_axes.sampled_arcsec == pytest.approx(both_axes.rule_arcsec, rel=0.01)
+    # About an axis between them the signs decide.
+    between = np.array([[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, math.sqrt(2.0)]]) / math.sqrt(2.0)
+    there, across = (combined(bend, axis, 0.95, rotation=between) for axis in ("pitch", "yaw"))
+    assert there.sigma_arcsec == pytest.approx(2.0 / math.sqrt(2.0))
+    assert across.sigma_arcsec == pytest.approx(8.0 / math.sqrt(2.0))
+    assert across.sampled_arcsec == pytest.approx(across.rule_arcsec, rel=0.01)
+    # Control: without signs it is the other way round.
+    plain = [dataclasses.replace(entry, correlation_group="thermal") for entry in bend]
+    assert combined(plain, "pitch", 0.95, rotation=between).sigma_arcsec > 5.0
+
+
+def test_what_is_missing_on_an_axis_is_missing_wherever_it_is_seen() -> None:
+    rows = [row("noise", 1.0), row("noise", 1.0, "yaw"), Contributor("pixel", "pixel spatial", "roll")]
+    assert not combined(rows, "cross-boresight").at_least
+    assert combined(rows, "pitch", rotation=TURN).not_assessed == ("pixel",)
+    assert not combined(rows, "yaw", rotation=TURN).at_least

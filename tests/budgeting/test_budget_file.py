@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from starcal_uq.budgeting.file import load_budget_file, template_text, write_budget_template
@@ -192,7 +193,7 @@ def test_an_uncommented_template_loads_once_numbers_are_in(tmp_path: Path) -> No
     lines = ["[[requirement]]"]
     for line in body.splitlines():
         bare = line.removeprefix("# ")
-        if line.startswith("# ") and (" = " in f"{bare} " or bare.startswith("[[")):
+        if line.startswith("# ") and (" = " in f"{bare} " or bare.startswith("[")):
             bare = bare.replace('provenance = ""', 'provenance = "test"')
             lines.append(bare + "1.5" if bare.rstrip().endswith("arcsec =") else bare)
             lines[-1] = lines[-1].replace("arcsec =1.5", "arcsec = 1.5")
@@ -246,3 +247,23 @@ def test_the_documented_keys_are_all_there_are(root: Path) -> None:
         table = page.split(f"## {heading}", 1)[1].split("##", 1)[0]
         listed = [line.split("`")[1] for line in table.splitlines() if line.startswith("| `")]
         assert sorted(listed) == sorted(keys)
+
+
+def test_frames_are_rotations_that_requirements_name(tmp_path: Path) -> None:
+    half = math.sqrt(0.5)
+    text = f"[frame.payload]\nrotation = [0.0, {half}, 0.0, {half}]\n" + LIMIT + 'frame = "payload"\n'
+    found = load_budget_file(written(tmp_path, text))
+    # A quarter turn about Y: the payload's X is the sensor's Z.
+    np.testing.assert_allclose(found.frames["payload"][0], [0.0, 0.0, 1.0], atol=1e-9)
+    assert found.requirements[0].frame == "payload"
+    for rotation, words in (
+        ("[[1, 0, 0], [0, 1, 0], [0, 0, -1]]", "mirrors"),
+        ("[[1, 0, 0], [0, 1, 0.1], [0, 0, 1]]", "is no rotation"),
+        ('"north"', "is no rotation"),
+    ):
+        with pytest.raises(BudgetError, match=words):
+            load_budget_file(written(tmp_path, f"[frame.payload]\nrotation = {rotation}\n"))
+    with pytest.raises(BudgetError, match="no table of the file describes"):
+        load_budget_file(written(tmp_path, LIMIT + 'frame = "payload"\n'))
+    with pytest.raises(BudgetError, match="needs a name"):
+        load_budget_file(written(tmp_path, "[frame]\nrotation = 1\n"))

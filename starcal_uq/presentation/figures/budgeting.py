@@ -9,6 +9,7 @@ import numpy as np
 
 from starcal_uq.budgeting.rows import SCOPES, Contributor, confidence_text
 from starcal_uq.budgeting.shapes import one_axis_factor, two_axis_radius
+from starcal_uq.budgeting.totals import covariance
 from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.formatting import significant
 from starcal_uq.presentation.figures import style
@@ -107,7 +108,8 @@ def _reach(rows: list[Contributor], axis: str, confidence: float) -> float | Non
         return None
     mean = math.hypot(*(row.mean_arcsec for row in chosen))
     if len(chosen) == 2:
-        return mean + two_axis_radius(confidence, chosen[0].sigma_arcsec, chosen[1].sigma_arcsec)
+        sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance(chosen)[:2, :2]), 0.0))
+        return mean + two_axis_radius(confidence, float(sigma[1]), float(sigma[0]))
     return mean + one_axis_factor(confidence) * chosen[0].sigma_arcsec
 
 

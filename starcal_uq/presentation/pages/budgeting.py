@@ -17,7 +17,7 @@ from starcal_uq.presentation.figures.budgeting import plot_budget
 from starcal_uq.presentation.figures.style import png_bytes
 from starcal_uq.presentation.html import embedded_image, template_environment
 from starcal_uq.presentation.tables import tex
-from starcal_uq.presentation.words.budgeting import NOT_RESOLVED, headline, outcome_text, tables
+from starcal_uq.presentation.words.budgeting import NOT_RESOLVED, axis_label, headline, outcome_text, tables
 from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND
 
 if TYPE_CHECKING:
@@ -163,7 +163,7 @@ def _requirements(sheet: Worksheet, budget: Budget) -> None:
         asked = outcome.requirement
         rows.append(
             [
-                *(asked.name, AXIS_LABELS[asked.axis], asked.scope, asked.interpretation, asked.confidence),
+                *(asked.name, axis_label(asked), asked.scope, asked.interpretation, asked.confidence),
                 *(asked.limit_arcsec, *_numbers(outcome.total)[2:], asked.judged_by, outcome.least_arcsec),
                 outcome.margin_arcsec,
                 *(outcome.verdict, outcome_text(outcome)),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from starcal_uq.budgeting.file import SENSOR, Requirement
 from starcal_uq.budgeting.result import Budget, Outcome, by_contributor
 from starcal_uq.budgeting.rows import AXIS_LABELS, SCOPES, Contributor, confidence_text
 from starcal_uq.budgeting.shapes import one_axis_factor, two_axis_radius
@@ -204,11 +205,17 @@ def _pair(total: Total) -> dict[str, str]:
     return {"rule": bound(total.rule_arcsec, total.at_least), "sampled": _sampled(total)}
 
 
+def axis_label(asked: Requirement) -> str:
+    """Axis of a requirement, with the frame where it is not the sensor's."""
+    label = AXIS_LABELS[asked.axis]
+    return label if asked.frame == SENSOR else f"{label.split(' (')[0]} of {asked.frame}"
+
+
 def _requirement_row(outcome: Outcome) -> Row:
     asked = outcome.requirement
     return {
         "name": asked.name,
-        "axis": AXIS_LABELS[asked.axis],
+        "axis": axis_label(asked),
         "scope": asked.scope,
         "interpretation": asked.interpretation,
         "confidence": confidence_text(asked.confidence),
@@ -247,7 +254,8 @@ def factor_sentence(budget: Budget) -> str:
 def outcome_text(outcome: Outcome) -> str:
     """A requirement and what became of it, in one sentence."""
     asked, total = outcome.requirement, outcome.total
-    what = f"{AXIS_LABELS[asked.axis]}, {confidence_text(asked.confidence)}, {asked.scope}, {asked.interpretation}"
+    axis = axis_label(asked)
+    what = f"{axis}, {confidence_text(asked.confidence)}, {asked.scope}, {asked.interpretation}"
     numbers = f"{significant(outcome.bound_arcsec, 3)} arcsec against a limit of {significant(asked.limit_arcsec, 3)}"
     least = "at least " if total.at_least else ""
     if outcome.unresolved:
