@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.core.constants import ARCSEC
-from starcal_uq.core.formatting import join_words, plural, significant
+from starcal_uq.core.constants import AXES
+from starcal_uq.core.formatting import join_words, significant
 from starcal_uq.core.types import FloatArray
-from starcal_uq.diagnostics.verdict.estimate import JACKKNIFE_P, JACKKNIFE_RATIO, MISFIT_P
+from starcal_uq.diagnostics.pattern import Response, response
+from starcal_uq.diagnostics.verdict.estimate import JACKKNIFE_P, JACKKNIFE_RATIO
 from starcal_uq.propagation.attitude_error import CONTRIBUTORS, MisfitFound
 
 if TYPE_CHECKING:
@@ -19,16 +20,15 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
     from starcal_uq.propagation.attitude_error import AttitudeError
 
-_PIXEL_PHASE = ("pixel phase in x", "pixel phase in y")
-
 
 def with_misfit(error: AttitudeError, diagnosis: Diagnosis, post: Posterior, obs: Observations) -> AttitudeError:
     """The attitude error with what the tests of the model found.
 
-    - A pattern over the field that a misfit test finds counts with its whole size, as if all stars of a frame shared
-      it; about the boresight it is divided by the root mean square distance of the stars from the principal point.
+    - The pattern that the misfit tests found goes through the geometry of the frames: what it does to their attitudes
+      counts, as common rotation and rest, the noise of its amplitudes taken off.
     - A distortion model that predicts as well, but moves the attitudes by more than the standard deviation within the
       fitted one, counts with that difference; every one does if the fitted model is rejected.
+      Pattern and model are two views of one error, of which the larger counts.
     - Frames that disagree more than their formal errors allow multiply common rotation and rest by the jackknife ratio.
 
     Parameters
@@ -45,49 +45,49 @@ def with_misfit(error: AttitudeError, diagnosis: Diagnosis, post: Posterior, obs
     AttitudeError
         The same, with its `misfit`.
     """
-    pattern, pattern_reasons = _pattern(diagnosis, post, obs)
+    if diagnosis.misfit.pattern is None:
+        # Of an earlier version: what was found has no shape there.
+        return error
+    pattern, pattern_reasons = _pattern(error, diagnosis, post, obs)
     common_shift, rest_shift, common_models, rest_models = _models(error, diagnosis)
     factor, frames = _frames(diagnosis)
-    phase = [t for t in diagnosis.misfit.found(MISFIT_P) if t.against in _PIXEL_PHASE]
+    phase = [name for name in diagnosis.misfit.pattern.families if "pixel phase" in name]
     notes: tuple[str, ...] = ()
     if phase:
-        sizes = join_words([f"{significant(t.size_px)} px with the {t.against}" for t in phase])
         notes = (
-            f"Residuals follow the pixel phase ({sizes}): this pixel spatial error is in the estimated noise, and so "
-            f"in the {CONTRIBUTORS[0]}; on stars that rest on their pixels it is a bias and not noise.",
+            f"Part of the estimated noise is {join_words(phase)}: it counts as a pattern, and in the {CONTRIBUTORS[0]} "
+            "as well.",
         )
     found = MisfitFound(
         factor=factor,
-        common_arcsec=common_shift,
-        rest_arcsec=np.hypot(pattern, rest_shift),
-        common_reasons=(*frames, *common_models),
-        rest_reasons=(*pattern_reasons, *frames, *rest_models),
+        common_arcsec=np.maximum(pattern.common_arcsec, common_shift),
+        rest_arcsec=np.maximum(pattern.rest_arcsec, rest_shift),
+        common_reasons=(*pattern_reasons[0], *frames, *common_models),
+        rest_reasons=(*pattern_reasons[1], *frames, *rest_models),
         notes=notes,
     )
     return replace(error, misfit=found)
 
 
-def _pattern(diagnosis: Diagnosis, post: Posterior, obs: Observations) -> tuple[FloatArray, tuple[str, ...]]:
-    """The largest pattern over the field that a misfit test found, arcsec per axis."""
-    found = [
-        test
-        for test in diagnosis.misfit.found(MISFIT_P)
-        if test.dof > 0 and test.against not in _PIXEL_PHASE and test.size_px > 0.0
-    ]
-    if not found:
-        return np.zeros(3), ()
-    # The tests overlap: they may well see one and the same pattern, so the largest stands for all.
-    worst = max(found, key=lambda test: test.size_px)
-    x0, y0, focal_px = post.mean[:3]
-    radius_px = float(np.sqrt(np.mean((obs.x_px - x0) ** 2 + (obs.y_px - y0) ** 2)))
-    cross, roll = worst.size_px / focal_px * ARCSEC, worst.size_px / radius_px * ARCSEC
-    others = len(found) - 1
-    more = f" (the largest of {plural(others + 1, 'rejected test')})" if others else ""
-    reason = (
-        f"misfit, {worst.name}{more}: {significant(worst.size_px)} px rms (p = {significant(worst.p_holm)}), counted "
-        "whole, not averaged over the stars of a frame"
-    )
-    return np.array([cross, cross, roll]), (reason,)
+def _pattern(
+    error: AttitudeError, diagnosis: Diagnosis, post: Posterior, obs: Observations
+) -> tuple[Response, tuple[tuple[str, ...], tuple[str, ...]]]:
+    """What the pattern that was found does to the attitudes of the frames, and how to say it of each part."""
+    pattern = diagnosis.misfit.pattern
+    if pattern is None or not pattern.families:
+        nothing = np.zeros(3)
+        return Response(nothing, nothing, nothing, nothing), ((), ())
+    seen = obs if error.seen is None else error.seen
+    found = response(pattern, diagnosis.theta, post, obs, seen, error.aligned)
+    names = join_words(list(pattern.families))
+
+    def said(value: FloatArray, upper: FloatArray) -> tuple[str, ...]:
+        pairs = zip(value, upper, strict=True)
+        values = ", ".join(f"{significant(float(v))} (at most {significant(float(u))})" for v, u in pairs)
+        return (f"misfit, {names}, through the attitudes of these frames: {values} arcsec of {join_words(list(AXES))}",)
+
+    reasons = said(found.common_arcsec, found.common_upper_arcsec), said(found.rest_arcsec, found.rest_upper_arcsec)
+    return found, reasons
 
 
 def _models(

@@ -12,6 +12,7 @@ unequal noise compare the residuals' weighted and unweighted sums of squares wit
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +22,8 @@ from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.display import Shown
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.types import FloatArray
-from starcal_uq.diagnostics.shapes import Shape, View, run_clock, shapes
+from starcal_uq.diagnostics.pattern import Fit, Pattern, frame_covariance
+from starcal_uq.diagnostics.shapes import FRAME_BY_FRAME, MAX_CELLS, Shape, View, frame_shapes, run_clock, shapes
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import NoiseModel, fit_noise, sigma_ratios, weighed
 from starcal_uq.estimation.star_errors import StarModel
@@ -155,6 +157,8 @@ class Misfit(Shown):
     uneven : UnevenNoise or None
         How the noise varies, and what that does to the stated sigmas; None where no test found that it does, or where
         the calibration knows it already.
+    pattern : Pattern or None
+        What the tests found, fitted; of no shapes where they found nothing. None of an earlier version.
     """
 
     tests: tuple[MisfitTest, ...]
@@ -162,6 +166,7 @@ class Misfit(Shown):
     n_stars: int
     n_frames: int
     uneven: UnevenNoise | None = None
+    pattern: Pattern | None = None
 
     @property
     def p_value(self) -> float:
@@ -180,7 +185,7 @@ class Misfit(Shown):
         return pd.DataFrame(rows).rename(columns={"name": "test"})
 
 
-def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = 8) -> Misfit:
+def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CELLS) -> Misfit:
     """Test the residuals of a calibration for unexplained structure.
 
     Parameters
@@ -219,7 +224,12 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = 8) -> 
     if any(test.is_of_noise and test.p_holm < ALPHA for test in tests) and cal.noise_model is None:
         model, _ = fit_noise(obs, cal.camera, rounds=_NOISE_ROUNDS)
         uneven = UnevenNoise(model, cal.parameter_names, sigma_ratios(obs, cal.camera, model, cal.sigma))
-    return Misfit(tuple(tests), float(np.sqrt(sums.rss / sums.dof)), obs.n_stars, obs.n_frames, uneven)
+    pattern = sums.pattern([test.name for test in tests if test.dof > 0 and test.p_holm < ALPHA], len(tests))
+    pattern = replace(pattern, n_frames=obs.n_frames, max_cells=max_cells)
+    if FRAME_BY_FRAME in pattern.families:
+        pattern = replace(pattern, frame_covariance=frame_covariance(pattern, obs, cal))
+    sigma = float(np.sqrt(sums.rss / sums.dof))
+    return Misfit(tuple(tests), sigma, obs.n_stars, obs.n_frames, uneven, pattern)
 
 
 def _detectable(test: MisfitTest, level: float) -> float:
@@ -256,9 +266,8 @@ class _Sums:
     gram: FloatArray
     plain: FloatArray
     raw: FloatArray
-    block_matrix: FloatArray
-    block_slope: FloatArray
-    block_square: float = 0.0
+    blocks: FloatArray
+    own: Shape
     block_rank: int = 0
     # Sums of squares of the frames, degrees of freedom that attitudes leave them, and their normal matrices.
     frames: list[tuple[FloatArray, FloatArray, FloatArray]] = field(default_factory=list)
@@ -279,8 +288,8 @@ class _Sums:
             gram=np.zeros((size, size)),
             plain=np.zeros((p + 1, p + 1)),
             raw=np.zeros(size),
-            block_matrix=np.zeros((p, p)),
-            block_slope=np.zeros(p),
+            blocks=np.zeros((size, size)),
+            own=frame_shapes(cal.camera),
             names=cal.parameter_names,
         )
         rotations = quaternion_to_rotation(cal.quaternions)
@@ -298,7 +307,7 @@ class _Sums:
                 e = cal.residuals_px[rows].T * (1.0 if part.frames.weight is None else part.frames.weight)
             flat = np.concatenate([h, e[None]]).reshape(p + 1, -1)
             found.plain += flat @ flat.T
-            found._add_blocks(part, state, view, h, e)
+            found._add_blocks(part, state, view, np.concatenate([h, e[None], projected[p + 1 :]]))
             found.noise.add(part.frames, state, h, e, rows)
             matrices = np.moveaxis(part.frames.sum(np.einsum("axn,bxn->abn", h, h)), 2, 0)
             squares = part.frames.sum(np.sum(e**2, axis=0))
@@ -311,8 +320,7 @@ class _Sums:
         """Add all columns of some frames; they come back with the attitudes projected out."""
         weight = part.frames.weight
         h = part.derivatives(theta, state)
-        pixels = part.frames.pixel - part.frames.in_pixels(state.e)
-        view = View(rows, part, state, part.frames.in_pixels(h), pixels - theta[:2, None])
+        view = View.of(part, state, theta, rows)
         columns = np.concatenate([family.columns(view) for family in self.families])
         if weight is not None:
             columns = columns * weight
@@ -323,10 +331,10 @@ class _Sums:
         self.gram += flat @ flat.T
         return projected, view
 
-    def _add_blocks(self, part: MarginalLikelihood, state: Any, view: View, h: FloatArray, e: FloatArray) -> None:
+    def _add_blocks(self, part: MarginalLikelihood, state: Any, view: View, projected: FloatArray) -> None:
         """Scale and quadrupole of every frame by itself: three columns per frame, which no other frame sees."""
-        frames, (u, v) = part.frames, view.uv
-        columns = np.stack([view.parameter_columns[2], np.stack([u, -v]), np.stack([v, u])])
+        frames = part.frames
+        columns = self.own.columns(view)
         if frames.weight is not None:
             columns = columns * frames.weight
         raw = np.sqrt(frames.sum(np.sum(columns**2, axis=1)))
@@ -335,13 +343,9 @@ class _Sums:
         values, vectors = np.linalg.eigh(gram)
         kept = values > _ABSORBED
         root = vectors * np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)[:, None, :]
-        with_h = np.moveaxis(frames.sum(np.einsum("axn,bxn->abn", columns, h)), 2, 0)
-        with_e = frames.sum(np.sum(columns * e, axis=1)).T
-        q_h = np.einsum("kab,kac->kbc", root, with_h)
-        q_e = np.einsum("kab,ka->kb", root, with_e)
-        self.block_matrix += np.einsum("kab,kac->bc", q_h, q_h)
-        self.block_slope += np.einsum("kab,ka->b", q_h, q_e)
-        self.block_square += float(np.sum(q_e**2))
+        with_all = np.stack([frames.sum(np.sum(column * projected, axis=1)) for column in columns])
+        explained = np.einsum("kab,ajk->kbj", root, with_all).reshape(-1, len(projected))
+        self.blocks += explained.T @ explained
         self.block_rank += int(np.count_nonzero(kept))
 
     @property
@@ -408,16 +412,27 @@ class _Sums:
         """Does scale or shape change from frame to frame?"""
         matrix, _, rss = self.independent
         scale = 1.0 / np.sqrt(np.diag(matrix))
-        left = (matrix - self.block_matrix) * np.outer(scale, scale)
-        slope = (self.plain[: self.p, self.p] - self.block_slope) * scale
+        left = (matrix - self.blocks[: self.p, : self.p]) * np.outer(scale, scale)
+        slope = (self.plain[: self.p, self.p] - self.blocks[: self.p, self.p]) * scale
         values, vectors = np.linalg.eigh(0.5 * (left + left.T))
         kept = values > _ABSORBED
-        full = self.plain[self.p, self.p] - self.block_square
+        full = self.plain[self.p, self.p] - self.blocks[self.p, self.p]
         full -= float(np.sum((vectors.T @ slope)[kept] ** 2 / values[kept]))
         rank = self.block_rank + int(np.count_nonzero(kept)) - self.p
         if rank <= 0 or self.dof - rank < _LEAST_DOF:
             return None
-        return self._f_test("scale and shape that change from frame to frame", "frame", rss - full, rank, rss)
+        return self._f_test(FRAME_BY_FRAME, "frame", rss - full, rank, rss)
+
+    def pattern(self, found: Sequence[str], n_tests: int) -> Pattern:
+        """The shapes of the tests that rejected, fitted together."""
+        fit = Fit(self.gram, self.blocks, self.raw, self.p, self.dof, self.block_rank)
+        places, first = {}, self.p + 1
+        for family in self.families:
+            places[family.name] = slice(first, first + family.size)
+            first += family.size
+        return fit.pattern(
+            {name: place for name, place in places.items() if name in found}, FRAME_BY_FRAME in found, ALPHA / n_tests
+        )
 
     def noise_by_frame(self) -> tuple[float, float] | None:
         """Normal z and p-value of Bartlett's test that all frames have one noise; None for too few frames.

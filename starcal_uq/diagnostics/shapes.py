@@ -16,7 +16,7 @@ import numpy as np
 
 from starcal_uq.camera.distortion import get_model, model_names
 from starcal_uq.core.constants import LIGHT_SPEED_KM_S
-from starcal_uq.core.types import FloatArray, StrArray
+from starcal_uq.core.types import FloatArray, IntArray, StrArray
 from starcal_uq.estimation.marginal import MarginalLikelihood, Profile
 
 if TYPE_CHECKING:
@@ -28,7 +28,8 @@ _AZIMUTH_ORDERS = 3
 _RADIAL_DEGREE, _TWIST_DEGREE = 6, 3
 _TIME_DEGREE = 3
 _STARS_PER_CELL = 25.0
-_MAX_CELLS = 8
+MAX_CELLS = 8
+FRAME_BY_FRAME = "scale and shape that change from frame to frame"
 _LEAST_SPREAD = 1e-9
 
 
@@ -55,6 +56,13 @@ class View:
     state: Profile
     parameter_columns: FloatArray
     uv: FloatArray
+
+    @classmethod
+    def of(cls, part: MarginalLikelihood, state: Profile, theta: FloatArray, rows: slice) -> View:
+        """The stars of `part`, which are these rows of the table."""
+        frames = part.frames
+        predicted = frames.pixel - frames.in_pixels(state.e)
+        return cls(rows, part, state, frames.in_pixels(part.derivatives(theta, state)), predicted - theta[:2, None])
 
 
 @dataclass(frozen=True)
@@ -83,20 +91,49 @@ class Shape:
     per_amplitude: tuple[float, ...] = ()
 
 
-def shapes(obs: Observations, camera: Camera, *, max_cells: int = _MAX_CELLS) -> tuple[Shape, ...]:
+def shapes(
+    obs: Observations, camera: Camera, *, max_cells: int = MAX_CELLS, seen: Observations | None = None
+) -> tuple[Shape, ...]:
     """Every family of shapes that the table allows; magnitude, time and temperature are used where they vary.
 
-    `max_cells` is the largest number of field cells along the longer side.
+    Parameters
+    ----------
+    obs : Observations
+        The table.
+    camera : Camera
+        The calibrated camera.
+    max_cells : int
+        Largest number of field cells along the longer side.
+    seen : Observations, optional
+        Other frames that the same shapes are wanted on. What these do not state is drawn from the table: the time of a
+        frame and its temperature together, the magnitude of a star by itself.
     """
+    seen = obs if seen is None else seen
     found = [*_missing_terms(camera), _axes(camera), _aberration()]
     clock, called = run_clock(obs)
+    warmth = None if obs.temperature_c is None else _standardised(obs.temperature_c, obs.temperature_c)
+    magnitude = None if obs.mag is None else _standardised(obs.mag, obs.mag)
+    if seen is not obs:
+        rng = np.random.default_rng(0)
+        frame = np.repeat(_drawn(rng, obs.n_frames, seen.n_frames), np.diff(seen.frame_starts))
+        like = obs.frame_starts[frame]
+        clock = None if clock is None else clock[like]
+        if warmth is not None:
+            warmth = (
+                warmth[like] if seen.temperature_c is None else _standardised(seen.temperature_c, obs.temperature_c)
+            )
+        if magnitude is not None:
+            own = seen.mag
+            magnitude = (
+                magnitude[_drawn(rng, obs.n_stars, seen.n_stars)] if own is None else _standardised(own, obs.mag)
+            )
     if clock is not None:
         found.append(_drift(clock, called))
-    if obs.temperature_c is not None and (warmth := _standardised(obs.temperature_c)) is not None:
-        spread = float(np.nanstd(obs.temperature_c))
+    if warmth is not None:
+        spread = float(np.nanstd(obs.temperature_c)) if obs.temperature_c is not None else 1.0
         found.append(_focal_against(warmth, "focal length with temperature", "temperature", ("df/dT", "px/K"), spread))
     found += [_radius(camera), _azimuth(camera), _phase(0), _phase(1)]
-    if obs.mag is not None and (magnitude := _standardised(obs.mag)) is not None:
+    if magnitude is not None:
         found.append(_magnitude(magnitude, camera))
     if clock is not None:
         found.append(_over_time(clock, called))
@@ -126,12 +163,31 @@ def _seconds(times: StrArray) -> FloatArray | None:
     return np.asarray(stamps, dtype=np.float64)[inverse.reshape(-1)]
 
 
-def _standardised(values: FloatArray) -> FloatArray | None:
-    """Zero mean and unit spread; zero where unknown; None where nothing varies."""
-    spread = float(np.nanstd(values))
+def frame_shapes(camera: Camera) -> Shape:
+    """Scale and two components of shape of a frame by itself, px at the corner."""
+    radius = camera.corner_radius_px
+
+    def columns(view: View) -> FloatArray:
+        u, v = view.uv / radius
+        scale = view.parameter_columns[2] * (float(camera.focal_px) / radius)
+        return np.stack([scale, np.stack([u, -v]), np.stack([v, u])])
+
+    return Shape(FRAME_BY_FRAME, "frame", 3, columns)
+
+
+def _drawn(rng: np.random.Generator, n: int, size: int) -> IntArray:
+    """Places among n, each as often as the others as far as `size` allows, in random order."""
+    found: IntArray = rng.permutation(np.arange(size) % n)
+    return found
+
+
+def _standardised(values: FloatArray, like: FloatArray | None) -> FloatArray | None:
+    """By mean and spread of others, and within their range; zero where unknown; None where nothing varies."""
+    assert like is not None
+    spread = float(np.nanstd(like))
     if not spread > _LEAST_SPREAD:
         return None
-    z: FloatArray = np.nan_to_num((values - np.nanmean(values)) / spread)
+    z: FloatArray = np.nan_to_num((np.clip(values, np.nanmin(like), np.nanmax(like)) - np.nanmean(like)) / spread)
     return z
 
 

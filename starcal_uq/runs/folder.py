@@ -36,7 +36,7 @@ DIAGNOSIS_TABLES = {
 }
 
 # Files that rest on the draws, and all files that rest on the calibration, which is among them.
-DERIVED = ("coupling", "attitude", "mission", "field_map", "spectrum", "budget", "report")
+DERIVED = ("coupling", "attitude", "mission", "alignment", "field_map", "spectrum", "budget", "report")
 RESULTS = ("observations", "camera", "calibration", "arrays", "posterior", "rejected", "diagnosis", *DERIVED)
 
 
@@ -64,6 +64,8 @@ class RunFolder:
         Table of attitude errors (CSV).
     mission : Path
         Frames that the attitude errors are of, where they are not the observed ones (Parquet).
+    alignment : Path
+        Frames on which alignment is calibrated, where they are not the observed ones (Parquet).
     field_map : Path
         Direction uncertainty over the field (NPZ).
     spectrum : Path
@@ -90,6 +92,7 @@ class RunFolder:
     coupling = _File("coupling.csv", "run `starcal-uq coupling RUN` first")
     attitude = _File("attitude.csv", "run `starcal-uq propagate RUN` first")
     mission = _File("mission_frames.parquet", "run `starcal-uq propagate RUN --attitudes random` first")
+    alignment = _File("alignment_frames.parquet", "run `starcal-uq propagate RUN` first")
     field_map = _File("field_map.npz", "run `starcal-uq propagate RUN` first")
     spectrum = _File("error_spectrum.npz", "run `starcal-uq propagate RUN --attitudes PROFILE` first")
     budget = _File("budget.csv", "run `starcal-uq budget RUN` first")

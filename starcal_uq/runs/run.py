@@ -460,10 +460,12 @@ class Run:
                 f"the budget rested on the numbers of before and was removed: run `starcal-uq budget {self.path}`."
             )
         # What rests on the attitude error of before goes with it.
-        self._remove(("spectrum", "budget", "mission"))
+        self._remove(("spectrum", "budget", "mission", "alignment"))
+        # A diagnosis of later is carried to the same frames.
         if sky is not None:
-            # A diagnosis of later is carried to the same frames.
             frames.save(self.folder.mission)
+        if error.aligned is not None:
+            error.aligned.save(self.folder.alignment)
         error = self._with_misfit(error)
         error.save(self.folder.attitude)
         fields.save(self.folder.field_map)
@@ -508,7 +510,8 @@ class Run:
 
         if error.seen is None:
             mission = load_observations(self.folder.mission) if self.has("mission") else self.observations
-            error = replace(error, seen=mission)
+            aligned = load_observations(self.folder.alignment) if self.has("alignment") else None
+            error = replace(error, seen=mission, aligned=aligned)
         return with_misfit(error, diagnosis, self.posterior, self.observations)
 
     def budget(

@@ -30,9 +30,10 @@ from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
 from starcal_uq.core.errors import BudgetError, RunFolderError
 from starcal_uq.diagnostics.inflation import with_misfit
 from starcal_uq.diagnostics.misfit import Misfit, MisfitTest
+from starcal_uq.diagnostics.pattern import Pattern
 from starcal_uq.presentation.pages.budgeting import budget_context, write_budget
 from starcal_uq.presentation.tables import tex
-from starcal_uq.propagation.attitude_error import AttitudeError
+from starcal_uq.propagation.attitude_error import AttitudeError, MisfitFound
 from tests.helpers.scenes import observations
 
 FILE = """
@@ -119,7 +120,9 @@ def stated(tmp_path: Path) -> Path:
 
 
 def diagnosis(*tests: MisfitTest, comparison: Any = None, jackknife: Any = None) -> Any:
-    return SimpleNamespace(misfit=Misfit(tests, 1.0, 1000, 100), comparison=comparison, jackknife=jackknife)
+    nothing = Pattern((), *(np.zeros((0, 0)),) * 4, np.zeros((3, 3)), 1.0)
+    misfit = Misfit(tests, 1.0, 1000, 100, None, nothing)
+    return SimpleNamespace(misfit=misfit, comparison=comparison, jackknife=jackknife)
 
 
 def pattern(size_px: float, p: float, against: str = "radius", dof: int = 5) -> MisfitTest:
@@ -194,23 +197,24 @@ def test_without_a_diagnosis_the_budget_says_that_the_model_was_not_tested() -> 
 
 
 def test_nothing_found_nothing_inflated() -> None:
-    found = made(misfit=diagnosis(pattern(0.02, 0.4), pattern(0.1, 1e-9, "pixel phase in x")))
+    found = made(misfit=diagnosis(pattern(0.02, 0.4)))
     assert not any(row.inflated for row in found.rows)
-    assert any("found nothing" in note for note in found.notes) and any("pixel phase" in note for note in found.notes)
+    assert any("found nothing" in note for note in found.notes)
 
 
-def test_a_pattern_over_the_field_inflates_the_rest_with_its_whole_size() -> None:
-    found = made(misfit=diagnosis(pattern(0.02, 1e-6), pattern(0.01, 1e-9, "field")))
-    rows = {(row.name, row.axis): row for row in found.rows}
-    arcsec = 648000.0 / np.pi
-    assert rows[REST, "pitch"].sigma_arcsec == pytest.approx(np.hypot(0.006, 0.02 / 5850.0 * arcsec))
-    assert rows[REST, "roll"].sigma_arcsec == pytest.approx(np.hypot(0.05, 0.02 / 400.0 * arcsec))
+def test_what_a_misfit_adds_is_in_the_row_with_its_reason() -> None:
+    """The attitude error brings it along; from pixels to there see `tests/diagnostics/test_pattern.py`."""
+    found = MisfitFound(1.0, np.zeros(3), np.array([0.7, 0.7, 10.0]), (), ("misfit, pattern over radius",))
+    made_of = budget(POST, OBS, attitude(misfit=found), n_samples=20_000)  # type: ignore[arg-type]
+    rows = {(row.name, row.axis): row for row in made_of.rows}
+    assert rows[REST, "pitch"].sigma_arcsec == pytest.approx(np.hypot(0.006, 0.7))
+    assert rows[REST, "roll"].sigma_arcsec == pytest.approx(np.hypot(0.05, 10.0))
     # The added part has no tail of its own; with next to all of the variance it leaves next to nothing of the tail.
     assert GAUSSIAN_997 < rows[REST, "pitch"].tail_997 < GAUSSIAN_997 + 0.01
     assert rows[REST, "pitch"].if_model_holds_arcsec == 0.006 and rows[REST, "pitch"].inflated
-    assert "0.020 px" in rows[REST, "pitch"].conditions and "2 rejected tests" in rows[REST, "pitch"].conditions
+    assert "pattern over radius" in rows[REST, "pitch"].conditions
     assert not rows[COMMON, "pitch"].inflated and not rows[NEA, "pitch"].inflated
-    assert any(REST in note and "inflated" in note for note in found.notes)
+    assert any(REST in note and "inflated" in note for note in made_of.notes)
 
 
 def comparison(rejected: bool) -> Any:

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 Noise = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+# Shifts (2, n) in px of stars at (2, n) px from the principal point, at (2, n) px, with their magnitudes, of a frame.
+Displacement = Callable[[np.ndarray, np.ndarray, np.ndarray, int], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,8 @@ def campaign(
     frame_focal: float = 0.0,
     pointings: int | None = None,
     drift_px: float = 0.0,
+    displaced: Displacement | None = None,
+    path: np.ndarray | None = None,
 ) -> Campaign:
     """Observe.
 
@@ -58,7 +62,9 @@ def campaign(
     otherwise every frame has stars of its own. `star_sigma_px` is the error per axis of each star's own direction, the
     same whenever it is seen; `frame_focal` the relative spread of the focal length from frame to frame. With
     `pointings` the camera stares: frames take turns at so many attitudes, each with the same stars whenever it comes
-    round, and `drift_px` further along the rows from one turn to the next.
+    round, and `drift_px` further along the rows from one turn to the next. `displaced` moves what is seen, after the
+    distortion. Along a `path` (n_frames, 3, 3) of attitudes all frames see one sky, whose stars stay while they are in
+    the field.
     """
     focal = 0.5 * size_px / np.tan(np.radians(0.5 * field_deg))
     x0, y0 = 0.5 * size_px - 12.0, 0.5 * size_px + 18.0
@@ -70,8 +76,16 @@ def campaign(
     rows: dict[str, list[np.ndarray]] = {name: [] for name in ("frame", "x", "y", "r", "id", "mag")}
     attitudes: list[np.ndarray] = []
     views: list[tuple[np.ndarray, ...]] = []
+    if path is not None:
+        # As many to the sky as give a frame its stars.
+        number = round(1.3 * stars_per_frame * 4.0 * np.pi / (2.0 * np.tan(np.radians(0.5 * field_deg))) ** 2)
+        sky = np.array([random_unit(rng) for _ in range(number)])
+        patch, magnitudes, offsets = sky, rng.uniform(2.0, 6.0, number), np.zeros((number, 2))
     for frame in range(n_frames):
-        if pointings is not None and frame >= pointings:
+        if path is not None:
+            attitude = path[frame]
+            stars, mag, number, own = patch, magnitudes, np.arange(len(patch)), offsets
+        elif pointings is not None and frame >= pointings:
             attitude, stars, mag, number, own = views[frame % pointings]
             angle = drift_px / focal * (frame // pointings)
             turn = np.array(
@@ -95,14 +109,22 @@ def campaign(
         r2 = (x - x0) ** 2 + (y - y0) ** 2
         stretch = 1.0 + k1 * r2 + k2 * r2**2
         x, y = x0 + (x - x0) * stretch, y0 + (y - y0) * stretch
-        seen = np.flatnonzero((b[:, 2] > 0.3) & (x > 0) & (x < size_px - 1) & (y > 0) & (y < size_px - 1))
-        chosen = np.arange(len(seen)) if pointings is not None else rng.permutation(len(seen))
+        # Far outside the field the polynomial folds back onto the detector.
+        near = 0.3 if path is None else np.cos(np.radians(0.75 * field_deg))
+        seen = np.flatnonzero((b[:, 2] > near) & (x > 0) & (x < size_px - 1) & (y > 0) & (y < size_px - 1))
+        if path is not None:
+            chosen = np.argsort(mag[seen], kind="stable")
+        else:
+            chosen = np.arange(len(seen)) if pointings is not None else rng.permutation(len(seen))
         seen = seen[chosen[:stars_per_frame]]
         radius = np.sqrt(r2[seen]) / corner
         sigma = sigma_px(radius, mag[seen], np.full(len(seen), frame)) if callable(sigma_px) else sigma_px
         noise = sigma * rng.standard_normal((2, len(seen)))
         attitudes.append(attitude)
-        xy = np.array([x[seen], y[seen]]) + noise
+        xy = np.array([x[seen], y[seen]])
+        if displaced is not None:
+            xy = xy + displaced(xy - np.array([[x0], [y0]]), xy, mag[seen], frame)
+        xy = xy + noise
         values = (np.full(len(seen), frame), *xy, moved(stars[seen], own[seen]), number[seen], mag[seen])
         for name, column in zip(rows, values, strict=True):
             rows[name].append(column)
@@ -138,6 +160,39 @@ def measured_again(
     for name in ("x_px", "y_px"):
         again[name] = again[name] + origin_px + error_px * rng.standard_normal(len(order))
     return again | {"frame": 1000 + frame.max() - again["frame"]}
+
+
+def slew(n_frames: int, step_deg: float) -> np.ndarray:
+    """Attitudes (n, 3, 3) of a camera that turns about its y axis by a step a frame, and slowly about the others."""
+    found = []
+    for a in np.radians(step_deg) * np.arange(n_frames):
+        turn_y = np.array([[np.cos(a), 0.0, -np.sin(a)], [0.0, 1.0, 0.0], [np.sin(a), 0.0, np.cos(a)]])
+        roll = 0.3 * a
+        turn_z = np.array([[np.cos(roll), np.sin(roll), 0.0], [-np.sin(roll), np.cos(roll), 0.0], [0.0, 0.0, 1.0]])
+        found.append(turn_z @ turn_y)
+    return np.array(found)
+
+
+def attitude_errors(c: Campaign, theta: np.ndarray) -> np.ndarray:
+    """Rotation vectors (K, 3), arcsec, by which attitudes err that a camera `theta` finds: Wahba's problem by SVD."""
+    x0, y0, f, k1, k2 = theta
+    d = np.array([c.columns["x_px"] - x0, c.columns["y_px"] - y0])
+    ideal = d.copy()
+    for _ in range(50):
+        r2 = np.sum(ideal**2, axis=0)
+        ideal = d / (1.0 + k1 * r2 + k2 * r2**2)
+    b = np.column_stack([ideal.T, np.full(d.shape[1], f)])
+    b /= np.linalg.norm(b, axis=1)[:, None]
+    ra, dec = np.radians(c.columns["ra_deg"]), np.radians(c.columns["dec_deg"])
+    r = np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    errors = []
+    for frame, truth in enumerate(c.attitudes):
+        mine = c.columns["frame"] == frame
+        u, _, vt = np.linalg.svd(b[mine].T @ r[mine])
+        found = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+        turn = found @ truth.T
+        errors.append(0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]))
+    return np.array(errors) * 648000.0 / np.pi
 
 
 def random_unit(rng: np.random.Generator) -> np.ndarray:

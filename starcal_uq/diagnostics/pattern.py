@@ -1,0 +1,407 @@
+"""The pattern that the misfit tests found, fitted, and what it does to attitudes.
+
+A test says that residuals hold structure; it does not say what that does to a mission. So the shapes that the tests
+found are fitted together, the strongest first and each further one only as far as it explains what those before leave.
+The attitude of a frame then errs by its least-squares response
+
+    phi = (A^T W A)^-1 A^T W (C - B G) a,
+
+with A the attitude Jacobian of that frame, C the shapes at its own stars, a their amplitudes, B the derivatives by the
+camera's parameters and G what the calibration's parameters took up of each shape. Amplitudes have an error, so that the
+square of what they give is too large by its own variance on average: that is taken off, and what is left has a bound.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import quaternion_to_rotation
+from starcal_uq.core.constants import ARCSEC
+from starcal_uq.core.types import FloatArray
+from starcal_uq.diagnostics.shapes import FRAME_BY_FRAME, MAX_CELLS, View, frame_shapes, shapes
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.maths.linear import scaled_inverse
+from starcal_uq.propagation.alignment import alignment_weights
+from starcal_uq.propagation.propagate import FrameGeometry
+
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.observations.table import Observations
+
+_STARS_AT_ONCE = 10_000
+# One-sided 95 % quantile of the normal distribution.
+_UPPER = 1.645
+# Directions of which attitudes and parameters absorb all but this share of the square are not there.
+_ABSORBED = 1e-8
+_DIRECTION_P = 0.05
+# Standard errors that a variance over frames has to exceed.
+_SAID = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Pattern:
+    """Shapes of displacement that the residuals ask for, fitted together.
+
+    Attributes
+    ----------
+    families : tuple of str
+        Names of the tests whose shapes are in it, the strongest first.
+    directions : (q, J) array
+        Combinations of the families' columns, px, that the residuals determine, but for frames by themselves.
+    amplitudes : (J,) array
+        Amplitude of every direction.
+    covariance : (J, J) array
+        Covariance of the amplitudes.
+    parameters : (J, p) array
+        What the calibrated parameters took up of every direction, px units.
+    frame_covariance : (3, 3) array
+        Covariance over frames of scale and of two components of shape, px at the corner; zero where frames agree.
+    variance : float
+        Variance of the noise that is left, px^2, or relative to what stars state.
+    n_frames : int
+        Number of frames behind it.
+    max_cells : int
+        Largest number of field cells along the longer side.
+    """
+
+    families: tuple[str, ...]
+    directions: FloatArray
+    amplitudes: FloatArray
+    covariance: FloatArray
+    parameters: FloatArray
+    frame_covariance: FloatArray
+    variance: float
+    n_frames: int = 0
+    max_cells: int = MAX_CELLS
+
+
+@dataclass(frozen=True, eq=False)
+class Response:
+    """What a pattern does to the attitudes of some frames.
+
+    Attributes
+    ----------
+    common_arcsec, rest_arcsec : (3,) array
+        Common rotation, and root mean square over frames of the rest, about pitch, yaw and roll; the noise of the
+        amplitudes is taken off their squares.
+    common_upper_arcsec, rest_upper_arcsec : (3,) array
+        Bounds of both at 95 %.
+    """
+
+    common_arcsec: FloatArray
+    rest_arcsec: FloatArray
+    common_upper_arcsec: FloatArray
+    rest_upper_arcsec: FloatArray
+
+
+def response(
+    pattern: Pattern,
+    theta: Sequence[float],
+    post: Posterior,
+    obs: Observations,
+    seen: Observations,
+    aligned: Observations | None = None,
+) -> Response:
+    """What a pattern does to attitudes.
+
+    Parameters
+    ----------
+    pattern : Pattern
+        The pattern, at least of one family.
+    theta : sequence of float
+        Estimate of the camera that it was found beside, px units.
+    post, obs : Posterior, Observations
+        Posterior and data of the calibration.
+    seen, aligned : Observations
+        Frames of the mission, and those of its alignment, which decide what is common; `seen` if they are not given.
+        Where frames have no time, temperature or magnitudes, they get those of the calibration's frames and stars.
+    """
+    camera = post.camera.with_theta(np.asarray(theta, dtype=np.float64))
+    here = _Turned.of(pattern, camera, post, obs, seen)
+    there = here if aligned is None or aligned is seen else _Turned.of(pattern, camera, post, obs, aligned)
+    weights, _ = alignment_weights(there.noise_covariance)
+    together = np.einsum("nij,njk->ik", weights, there.direct)
+    apart = here.direct - together
+    common = common_error = rest = rest_error = np.zeros(3)
+    if len(pattern.amplitudes):
+        common, common_error = _square(np.einsum("ij,ik->ijk", together, together), pattern)
+        rest, rest_error = _square(np.einsum("kij,kil->ijl", apart, apart) / len(apart), pattern)
+    own = np.mean(np.einsum("kia,ab,kib->ki", here.moving, pattern.frame_covariance, here.moving), axis=0)
+    rest = rest + own
+    # A variance over this many frames is known to this share of itself.
+    rest_error = np.hypot(rest_error, own * np.sqrt(2.0 / max(pattern.n_frames - 1, 1)))
+
+    def arcsec(square: FloatArray) -> FloatArray:
+        root: FloatArray = np.sqrt(np.maximum(square, 0.0)) * ARCSEC
+        return root
+
+    return Response(
+        common_arcsec=arcsec(common),
+        rest_arcsec=arcsec(rest),
+        common_upper_arcsec=arcsec(np.maximum(common, 0.0) + _UPPER * common_error),
+        rest_upper_arcsec=arcsec(np.maximum(rest, 0.0) + _UPPER * rest_error),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Turned:
+    """Turns of frames by directions (K, 3, J) and by scale and shape of their own (K, 3, 3), rad; their noise."""
+
+    direct: FloatArray
+    moving: FloatArray
+    noise_covariance: FloatArray
+
+    @classmethod
+    def of(cls, pattern: Pattern, camera: Camera, post: Posterior, obs: Observations, frames: Observations) -> _Turned:
+        families = {f.name: f for f in shapes(obs, camera, max_cells=pattern.max_cells, seen=frames)}
+        chosen = [families[name] for name in pattern.families if name in families]
+        geometry = FrameGeometry.of(post, frames)
+        turns = geometry.noise_response / geometry.noise_px[:, None]
+        likelihood = MarginalLikelihood(frames, camera.distortion)
+        starts = likelihood.frames.starts
+        turned = []
+        for first, last in likelihood.frames.parts(_STARS_AT_ONCE):
+            part = MarginalLikelihood(likelihood.frames.part(first, last), camera.distortion)
+            rows = slice(int(starts[first]), int(starts[last]))
+            view = View.of(part, part.profile(camera.theta)[0], camera.theta, rows)
+            columns = frame_shapes(camera).columns(view)
+            if chosen:
+                found = np.concatenate([family.columns(view) for family in chosen])
+                columns = np.concatenate([columns, np.einsum("qj,qan->jan", pattern.directions, found)])
+            edges = starts[first:last] - starts[first]
+            turned.append(np.add.reduceat(np.einsum("jan,ani->nij", columns, turns[:, rows]), edges, axis=0))
+        moving, direct = np.split(np.concatenate(turned), [3], axis=2)
+        if chosen:
+            direct = direct + geometry.response @ pattern.parameters.T
+        return cls(direct, moving, geometry.noise_covariance)
+
+
+def _square(matrices: FloatArray, pattern: Pattern) -> tuple[FloatArray, FloatArray]:
+    """Quadratic forms (3,) of the true amplitudes, free of bias, and their standard errors."""
+    a, C = pattern.amplitudes, pattern.covariance
+    noisy = matrices @ C
+    value = np.einsum("j,ijk,k->i", a, matrices, a) - np.einsum("ijj->i", noisy)
+    variance = 4.0 * np.einsum("j,ijk,k->i", a, noisy @ matrices, a) - 2.0 * np.einsum("ijk,ikj->i", noisy, noisy)
+    # At the estimate the first term counts the noise once too often; it can then not fall below the second.
+    floor = 2.0 * np.einsum("ijk,ikj->i", noisy, noisy)
+    return value, np.sqrt(np.maximum(variance, floor))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Sums over all stars from which shapes are fitted.
+
+    Attributes
+    ----------
+    gram, blocks : (p + 1 + q, p + 1 + q) array
+        Products of parameters, residuals and columns of all families, attitudes removed; and the part of them that
+        scale and shape of every frame by itself explain.
+    raw : (p + 1 + q,) array
+        Squares of the same before attitudes were removed.
+    p, dof, block_rank : int
+        Parameters, degrees of freedom of the residuals, and those that frames by themselves take.
+    """
+
+    gram: FloatArray
+    blocks: FloatArray
+    raw: FloatArray
+    p: int
+    dof: int
+    block_rank: int
+
+    def pattern(self, places: dict[str, slice], frame_by_frame: bool, alpha: float) -> Pattern:
+        """Fit the families at these places, and frames by themselves, the strongest first.
+
+        `alpha` is the level of a single test; what does not reach it beside those before is left out.
+        """
+        size = len(self.gram) - self.p - 1
+        left = dict(places)
+        chosen: list[str] = []
+        directions = np.zeros((size, 0))
+        own = False
+        while left or (frame_by_frame and not own):
+            system = self._system(own)
+            rest, dof = _without(system, directions), self._dof(own) - directions.shape[1]
+            steps = {
+                name: self._step(rest, dof, slice(at.start - self.p, at.stop - self.p), alpha)
+                for name, at in left.items()
+            }
+            gains = {name: step[0] for name, step in steps.items() if step is not None}
+            if frame_by_frame and not own:
+                with_frames = _without(self._system(True), directions)[0, 0]
+                gain = _gain(
+                    rest[0, 0], rest[0, 0] - with_frames, dof, dof - self._dof(True) + directions.shape[1], alpha
+                )
+                gains |= {} if gain is None else {FRAME_BY_FRAME: gain}
+            if not gains:
+                break
+            best = max(gains, key=lambda name: gains[name])
+            chosen.append(best)
+            if best == FRAME_BY_FRAME:
+                own = True
+                continue
+            step = steps[best]
+            assert step is not None
+            directions = np.column_stack((directions, _placed(step[1], left[best].start - self.p - 1, size)))
+            del left[best]
+        return self._fitted(tuple(chosen), places, directions, own)
+
+    def _system(self, own: bool) -> FloatArray:
+        """Residuals and columns (1 + q, 1 + q) with the parameters removed, and frames by themselves if `own`."""
+        gram = self.gram - self.blocks if own else self.gram
+        scale = 1.0 / np.sqrt(np.diag(self.gram)[: self.p])
+        values, vectors = np.linalg.eigh(gram[: self.p, : self.p] * np.outer(scale, scale))
+        kept = values > _ABSORBED
+        root = scale[:, None] * vectors[:, kept] / np.sqrt(values[kept])
+        explained = root.T @ gram[: self.p, self.p :]
+        system: FloatArray = gram[self.p :, self.p :] - explained.T @ explained
+        return system
+
+    def _dof(self, own: bool) -> int:
+        if not own:
+            return self.dof
+        scale = 1.0 / np.sqrt(np.diag(self.gram)[: self.p])
+        left = (self.gram - self.blocks)[: self.p, : self.p] * np.outer(scale, scale)
+        return self.dof - self.block_rank + self.p - int(np.count_nonzero(np.linalg.eigvalsh(left) > _ABSORBED))
+
+    def _step(self, rest: FloatArray, dof: int, at: slice, alpha: float) -> tuple[float, FloatArray] | None:
+        """Gain and directions (columns, j) of one family beside what was removed; None if it is not significant."""
+        from scipy.special import fdtrc
+
+        norm = np.sqrt(self.raw[at.start + self.p : at.stop + self.p])
+        norm = np.where(norm > 0.0, norm, 1.0)
+        values, vectors = np.linalg.eigh(rest[at, at] / np.outer(norm, norm))
+        kept = values > _ABSORBED
+        rank = int(np.count_nonzero(kept))
+        if rank == 0 or dof - rank < 1:
+            return None
+        values, vectors = values[kept], vectors[:, kept]
+        squares = (vectors.T @ (rest[at, 0] / norm)) ** 2 / values
+        explained = float(np.sum(squares))
+        gain = _gain(rest[0, 0], explained, dof, rank, alpha)
+        if gain is None:
+            return None
+        # What is found is what the test found: directions that say nothing by themselves would add their noise only.
+        variance = (rest[0, 0] - explained) / (dof - rank)
+        said = fdtrc(1.0, dof - rank, squares / variance) * rank < _DIRECTION_P
+        return gain, vectors[:, said if said.any() else slice(None)] / norm[:, None]
+
+    def _fitted(self, chosen: tuple[str, ...], places: dict[str, slice], directions: FloatArray, own: bool) -> Pattern:
+        system = self._system(own)
+        matrix, slope = directions.T @ system[1:, 1:] @ directions, directions.T @ system[1:, 0]
+        inverse = _inverse(matrix)
+        amplitudes = inverse @ slope
+        variance = float(system[0, 0] - slope @ amplitudes) / (self._dof(own) - len(slope))
+        absorbed = scaled_inverse(self.gram[: self.p, : self.p]) @ self.gram[: self.p, self.p + 1 :] @ directions
+        rows = [np.arange(self.p, len(self.gram) - 1)[:0]]
+        names = [name for name in chosen if name != FRAME_BY_FRAME]
+        rows += [np.arange(places[name].start, places[name].stop) - self.p - 1 for name in names]
+        arrays = (directions[np.concatenate(rows)], amplitudes, variance * inverse, absorbed.T)
+        # Nothing is nothing, also when it is read from a file.
+        directions, amplitudes, covariance, parameters = (a if a.size else np.zeros(0) for a in arrays)
+        return Pattern(
+            families=chosen,
+            directions=directions,
+            amplitudes=amplitudes,
+            covariance=covariance,
+            parameters=parameters,
+            frame_covariance=np.zeros((3, 3)),
+            variance=variance,
+        )
+
+
+def _placed(columns: FloatArray, first: int, size: int) -> FloatArray:
+    found = np.zeros((size, columns.shape[1]))
+    found[first : first + len(columns)] = columns
+    return found
+
+
+def _without(system: FloatArray, directions: FloatArray) -> FloatArray:
+    """The system with some directions of its columns removed."""
+    if not directions.shape[1]:
+        return system
+    along = system[:, 1:] @ directions
+    inverse = _inverse(directions.T @ along[1:])
+    left: FloatArray = system - along @ inverse @ along.T
+    return left
+
+
+def _inverse(matrix: FloatArray) -> FloatArray:
+    """Inverse of products of directions, whose length was 1; what frames by themselves absorb of them is left out."""
+    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    kept = values > _ABSORBED
+    inverse: FloatArray = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
+    return inverse
+
+
+def _gain(rss: float, explained: float, dof: int, rank: int, alpha: float) -> float | None:
+    """How much likelier the data become, less the price of the columns (Akaike); None if that may be chance."""
+    from scipy.special import fdtrc
+
+    if rank <= 0 or dof - rank < 1 or not 0.0 < explained < rss:
+        return None
+    statistic = explained / rank / ((rss - explained) / (dof - rank))
+    if fdtrc(rank, dof - rank, statistic) >= alpha:
+        return None
+    return dof * float(np.log(rss / (rss - explained))) - 2.0 * rank
+
+
+def frame_covariance(pattern: Pattern, obs: Observations, cal: Calibration) -> FloatArray:
+    """Covariance (3, 3) over frames of their own scale and shape, beside the rest of a pattern, px at the corner.
+
+    By moments: with w = C^T e of a frame and L = C^T C, both without its attitude, E[w w^T] = L S L + variance L.
+    """
+    families = {family.name: family for family in shapes(obs, cal.camera, max_cells=pattern.max_cells)}
+    chosen = [families[name] for name in pattern.families if name in families]
+    own = frame_shapes(cal.camera)
+    likelihood = MarginalLikelihood(obs, cal.camera.distortion)
+    rotations, starts = quaternion_to_rotation(cal.quaternions), likelihood.frames.starts
+    grams, slopes = [], []
+    for first, last in likelihood.frames.parts(_STARS_AT_ONCE):
+        part = MarginalLikelihood(likelihood.frames.part(first, last), cal.camera.distortion)
+        state, _ = part.profile(cal.theta, rotations[first:last])
+        view = View.of(part, state, cal.theta, slice(int(starts[first]), int(starts[last])))
+        weight = 1.0 if part.frames.weight is None else part.frames.weight
+        e = state.e.copy()
+        if chosen:
+            columns = np.concatenate([family.columns(view) for family in chosen])
+            shift = np.einsum("q,qan->an", pattern.directions @ pattern.amplitudes, columns)
+            shift -= np.einsum("p,pan->an", pattern.amplitudes @ pattern.parameters, view.parameter_columns)
+            e -= weight * shift
+        projected = part.project_out(state, np.concatenate([own.columns(view) * weight, e[None]]))
+        products = np.stack([part.frames.sum(np.sum(column * projected, axis=1)) for column in projected[:3]])
+        grams.append(np.moveaxis(products[:, :3], 2, 0))
+        slopes.append(products[:, 3].T)
+    # The mean over frames went into the parameters, and with it one frame's worth of the spread.
+    lost = obs.n_frames / max(obs.n_frames - 1, 1)
+    return _moments(np.concatenate(grams), np.concatenate(slopes), pattern.variance) * lost
+
+
+def _moments(grams: FloatArray, slopes: FloatArray, variance: float) -> FloatArray:
+    """The covariance (3, 3) from L (K, 3, 3) and w (K, 3), without components whose variance is within its error."""
+    covariance, error = _solved(grams, slopes, variance)
+    kept = np.flatnonzero(np.diag(covariance) > _SAID * np.diag(error))
+    if not len(kept):
+        kept = np.arange(3)
+    covariance, _ = _solved(grams[:, kept][:, :, kept], slopes[:, kept], variance)
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    found = np.zeros((3, 3))
+    found[np.ix_(kept, kept)] = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return found
+
+
+def _solved(grams: FloatArray, slopes: FloatArray, variance: float) -> tuple[FloatArray, FloatArray]:
+    """Solution of the equations of moments, and its standard errors by their scatter over frames."""
+    size = slopes.shape[1]
+    pairs = np.einsum("kab,kcd->kacbd", grams, grams).reshape(len(grams), size**2, size**2)
+    moments = (slopes[:, :, None] * slopes[:, None, :] - variance * grams).reshape(len(grams), -1)
+    inverse = np.linalg.inv(pairs.sum(axis=0))
+    solution = inverse @ moments.sum(axis=0)
+    left = (moments - pairs @ solution) @ inverse
+    return solution.reshape(size, size), np.sqrt(np.sum(left**2, axis=0)).reshape(size, size)
