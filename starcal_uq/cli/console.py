@@ -71,6 +71,8 @@ def show_calibration(calibration: Calibration, truth: Camera | None = None) -> N
 
     print_table(calibration_table(calibration, truth))
     out.print(f"Focal length {focal_length(calibration)}. Status: {calibration.status.name.lower()}.")
+    if calibration.noise_model is not None:
+        out.print(f"Fitted noise: {calibration.noise_model}.", highlight=False, soft_wrap=True)
 
 
 def show_posterior(posterior: Posterior) -> None:
