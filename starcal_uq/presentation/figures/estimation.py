@@ -34,7 +34,8 @@ def plot_convergence(cal: Calibration, truth: Camera | None = None) -> Figure:
     values, starts = _joined(cal)
     reference = np.asarray(truth.theta) if _comparable(truth, cal) and truth is not None else np.asarray(cal.theta)
     figure = style.new_figure(1.2 + 2.0 * len(parameters), 5.1)
-    axes = figure.subplots(2, len(parameters), sharex=True, squeeze=False)
+    grid = style.panels(figure, 2, len(parameters), (0.9, 0.12, 0.5, 0.72), (0.56, 0.18))
+    axes = grid.subplots(sharex=True, squeeze=False)
     iteration = np.arange(len(values))
     to_mm = cal.camera.pixel_um / 1000.0
     for i, parameter in enumerate(parameters):
@@ -53,9 +54,12 @@ def plot_convergence(cal: Calibration, truth: Camera | None = None) -> Figure:
         lower.plot(iteration, error, color=style.BLUE, marker="o", markersize=3.2, linewidth=1.2)
         _error_axis(lower, float(np.abs(error).max()))
         lower.set_xlabel("iteration", fontsize=style.LABEL_SIZE, color=style.INK)
+        style.label_distance(lower, x_in=0.23)
     what = "truth" if _comparable(truth, cal) else "final estimate"
     axes[0, 0].set_ylabel("value", fontsize=style.LABEL_SIZE, color=style.INK)
     axes[1, 0].set_ylabel(f"distance from {what}\n[final sigma]", fontsize=style.LABEL_SIZE, color=style.INK)
+    for ax in axes[:, 0]:
+        style.label_distance(ax, y_in=0.46)
     _key(figure, cal, what)
     return figure
 
@@ -70,7 +74,7 @@ def _key(figure: Figure, cal: Calibration, what: str) -> None:
         Patch(facecolor=style.GREEN, alpha=0.2, label="within 1 sigma"),
         style.key(f"Stages: {stages}", style.INK, linestyle="none"),
     ]
-    options = {"loc": "outside upper left", "fontsize": style.LABEL_SIZE, "columnspacing": 1.6, "handlelength": 1.8}
+    options = {"loc": "upper left", "fontsize": style.LABEL_SIZE, "columnspacing": 1.6, "handlelength": 1.8}
     style.legend_above(figure, handles, **options)
 
 

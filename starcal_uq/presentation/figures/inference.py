@@ -49,8 +49,9 @@ def plot_corner(post: Posterior, cal: Calibration | None = None, truth: Camera |
     gaussian = _gaussian(cal, scales, len(names)) if cal is not None else None
     marks = truth_marks(truth, names, scales)
     size = len(names)
-    figure = style.new_figure(1.0 + 1.62 * size, 0.9 + 1.5 * size)
-    grid = figure.add_gridspec(size, size)
+    figure = style.new_figure(1.0 + 1.65 * size, 0.8 + 1.5 * size)
+    # The last title is wider than its panel.
+    grid = style.panels(figure, size, size, (0.74, 0.34, 0.52, 0.28), (0.13, 0.28))
     for row in range(size):
         for column in range(row + 1):
             ax = style.dress(figure.add_subplot(grid[row, column]))
@@ -64,7 +65,6 @@ def plot_corner(post: Posterior, cal: Calibration | None = None, truth: Camera |
                 _mark(ax, marks[column], marks[row])
             _ticks(ax, row, column, size, scales, ends)
     _corner_key(figure, gaussian is not None, truth is not None, len(post.draws))
-    figure.align_labels()
     return figure
 
 
@@ -139,10 +139,12 @@ def _ticks(
         ax.set_ylim(*ends[row])
     if row == size - 1:
         ax.set_xlabel(scales[column].label, fontsize=style.TICK_SIZE, color=style.INK)
+        style.label_distance(ax, x_in=0.25)
     else:
         ax.tick_params(labelbottom=False)
     if column == 0 and row > 0:
         ax.set_ylabel(scales[row].label, fontsize=style.TICK_SIZE, color=style.INK)
+        style.label_distance(ax, y_in=0.52)
     else:
         ax.tick_params(labelleft=False)
 
@@ -179,7 +181,7 @@ def plot_prior_posterior(post: Posterior, truth: Camera | None = None) -> Figure
     scales, columns = scaled_draws(post)
     marks = truth_marks(truth, names, scales)
     figure = style.new_figure(1.0 + 1.75 * len(names), 4.1)
-    grid = figure.add_gridspec(2, len(names))
+    grid = style.panels(figure, 2, len(names), (0.46, 0.14, 0.5, 0.6), (0.22, 0.56))
     for i, name in enumerate(names):
         parameter = post.parameters[post.sampled[i]]
         upper = style.dress(figure.add_subplot(grid[0, i]))
@@ -204,6 +206,8 @@ def plot_prior_posterior(post: Posterior, truth: Camera | None = None) -> Figure
         lower.set_xlim(*ends)
         lower.set_xlabel(scales[i].label, fontsize=style.TICK_SIZE, color=style.INK)
         sparse(lower, y=False)
+        for ax in (upper, lower):
+            style.label_distance(ax, x_in=0.25, y_in=0.08)
         if i == 0:
             upper.set_ylabel("scale of\nthe prior", fontsize=style.LABEL_SIZE, color=style.INK)
             lower.set_ylabel("scale of\nthe posterior", fontsize=style.LABEL_SIZE, color=style.INK)
@@ -233,7 +237,7 @@ def _prior_key(figure: Figure, truth: bool) -> None:
     ]
     if truth:
         handles.append(style.key("truth of the simulation", style.VERMILLION, linewidth=1.3))
-    style.legend_above(figure, handles, loc="outside upper left", ncols=3, fontsize=style.LABEL_SIZE)
+    style.legend_above(figure, handles, loc="upper left", ncols=3, fontsize=style.LABEL_SIZE)
 
 
 def _unit(text: str) -> str:

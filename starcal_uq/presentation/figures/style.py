@@ -15,6 +15,7 @@ import numpy as np
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from matplotlib.gridspec import GridSpec
     from matplotlib.lines import Line2D
     from numpy.typing import NDArray
 
@@ -40,6 +41,39 @@ def new_figure(width_in: float, height_in: float) -> Figure:
             return png_bytes(self, dpi=110)
 
     return NotebookFigure(figsize=(width_in, height_in), layout="constrained", facecolor="white")
+
+
+def panels(
+    figure: Figure, rows: int, columns: int, margins_in: tuple[float, float, float, float], gaps_in: tuple[float, float]
+) -> GridSpec:
+    """A grid of equal panels with margins (left, right, bottom, top) and gaps (across, down) in inches.
+
+    Many small panels of known labels are laid out at once: measuring every label takes longer than drawing all of them.
+    """
+    figure.set_layout_engine("none")
+    width, height = figure.get_size_inches()
+    left, right, bottom, top = margins_in
+    across, down = gaps_in
+    return figure.add_gridspec(
+        rows,
+        columns,
+        left=left / width,
+        right=1.0 - right / width,
+        bottom=bottom / height,
+        top=1.0 - top / height,
+        wspace=across * columns / (width - left - right - across * (columns - 1)),
+        hspace=down * rows / (height - bottom - top - down * (rows - 1)),
+    )
+
+
+def label_distance(ax: Axes, *, x_in: float | None = None, y_in: float | None = None) -> None:
+    """Begin the axis labels so many inches below and to the left of a panel whose place is fixed."""
+    figure = figure_of(ax)
+    width, height = figure.get_size_inches() * ax.get_position().size
+    if x_in is not None:
+        ax.xaxis.set_label_coords(0.5, -x_in / height)
+    if y_in is not None:
+        ax.yaxis.set_label_coords(-y_in / width, 0.5)
 
 
 def new_axes(width_in: float, height_in: float) -> Axes:
