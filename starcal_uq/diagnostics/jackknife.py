@@ -53,6 +53,8 @@ class Jackknife(Shown):
         K.
     residual_dof : int
         Degrees of freedom of the noise in `formal_covariance`; 0 in files of before, which took it as known.
+    tail_dof : (p,) array or None
+        Degrees of freedom of a chi-square as skew as `sandwich_covariance`; None in files of before.
     """
 
     parameter_names: tuple[str, ...]
@@ -63,6 +65,7 @@ class Jackknife(Shown):
     effective_frames: FloatArray
     n_frames: int
     residual_dof: int = 0
+    tail_dof: FloatArray | None = None
 
     @property
     def ratio(self) -> FloatArray:
@@ -79,7 +82,7 @@ class Jackknife(Shown):
         from scipy.special import betaincinv
 
         tail = 0.5 * (1.0 - probability)
-        low, high = (np.sqrt(betaincinv(*self._shape, q) / self._share) for q in (tail, 1.0 - tail))
+        low, high = (self._ratio(betaincinv(*self._shape, q)) for q in (tail, 1.0 - tail))
         return low, high
 
     @property
@@ -87,29 +90,38 @@ class Jackknife(Shown):
         """Degrees of freedom (p,) of the cluster-robust variances."""
         return np.maximum(self.effective_frames - 1.0, 1.0)
 
+    # A squared ratio has mean 1, variance 2 / dof and the skewness of tail_dof; shifted and scaled it is, to these
+    # three moments, a chi-square of tail_dof (Hall 1983, Buckley & Eagleson 1988), as a part of all squares a beta.
+
     @property
-    def _share(self) -> FloatArray:
-        # A ratio squared is to its degrees of freedom as the frames' scatter is to all squares, of which it is a part.
-        return self.dof / (self.residual_dof or _MANY)
+    def _tail(self) -> FloatArray:
+        return self.dof if self.tail_dof is None else np.clip(self.tail_dof, 0.5, self.dof)
 
     @property
     def _shape(self) -> tuple[FloatArray, FloatArray]:
-        rest = np.maximum((self.residual_dof or _MANY) - self.dof, 1.0)
-        return 0.5 * self.dof, 0.5 * rest
+        rest = np.maximum((self.residual_dof or _MANY) - self._tail, 1.0)
+        return 0.5 * self._tail, 0.5 * rest
+
+    def _ratio(self, share: FloatArray) -> FloatArray:
+        excess = (share * (self.residual_dof or _MANY) - self._tail) / np.sqrt(self.dof * self._tail)
+        return np.sqrt(np.maximum(1.0 + excess, 0.0))
 
     @property
     def p_values(self) -> FloatArray:
         """Probability (p,) of a ratio at least this large if the formal errors hold."""
         from scipy.special import betaincc
 
-        return np.asarray(betaincc(*self._shape, np.minimum(self._share * self.ratio**2, 1.0)), dtype=np.float64)
+        share = (self._tail + (self.ratio**2 - 1.0) * np.sqrt(self.dof * self._tail)) / (self.residual_dof or _MANY)
+        return np.asarray(betaincc(*self._shape, np.clip(share, 0.0, 1.0)), dtype=np.float64)
 
     def detectable(self, alpha: float, power: float = 0.9) -> FloatArray:
         """Ratios (p,) of true uncertainties that a test at this level finds with this probability."""
-        from scipy.special import betaincinv
+        from scipy.special import betaincinv, gammaincinv
 
-        found, missed = (betaincinv(*self._shape, q) for q in (1.0 - alpha, 1.0 - power))
-        return np.asarray(np.sqrt(found / missed), dtype=np.float64)
+        found = self._ratio(betaincinv(*self._shape, 1.0 - alpha))
+        # Frames that err by more scatter as evenly as they weigh: Satterthwaite's approximation, which is never zero.
+        missed = np.sqrt(2.0 / self.dof * gammaincinv(0.5 * self.dof, 1.0 - power))
+        return np.asarray(found / missed, dtype=np.float64)
 
     @property
     def factors(self) -> FloatArray:
@@ -164,7 +176,7 @@ def jackknife_frames(obs: Observations, cal: Calibration, normals: FrameNormals 
     k = obs.n_frames
     unit = np.outer(found.scale, found.scale)
     spread = z - z.mean(axis=0)
-    clustered, dof = found.clustered()
+    clustered, dof, tail_dof = found.clustered()
     return Jackknife(
         parameter_names=cal.parameter_names,
         formal_covariance=np.linalg.inv(found.matrix) * found.variance * unit,
@@ -174,6 +186,7 @@ def jackknife_frames(obs: Observations, cal: Calibration, normals: FrameNormals 
         effective_frames=dof + 1.0,
         n_frames=k,
         residual_dof=int(np.sum(found.dof)) - len(found.theta),
+        tail_dof=tail_dof,
     )
 
 

@@ -45,8 +45,8 @@ _LEAST_DOF = 10
 # Frames with less than one degree of freedom have no noise of their own to compare.
 _LEAST_FRAMES, _LEAST_FRAME_DOF = 3, 1.0
 _NOISE_ROUNDS = 3
-# Level of all tests together: what is left of the verdict's 5 % for the other checks is 3 %.
-ALPHA = 0.02
+# Level of all tests together, of the verdict's 5 % for all of its checks.
+ALPHA = 0.01
 POWER = 0.9
 
 

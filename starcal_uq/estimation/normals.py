@@ -100,13 +100,13 @@ class FrameNormals:
             dof=2 * likelihood.frames.sizes - 3,
         )
 
-    def clustered(self) -> tuple[FloatArray, FloatArray]:
-        """Covariance (p, p) of z from the scatter of the frames, and the degrees of freedom (p,) of its diagonal.
+    def clustered(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Covariance (p, p) of z from the scatter of the frames, and two degrees of freedom (p,) of its diagonal.
 
         Bell & McCaffrey (2002): residuals of frame k are multiplied by (I - h_k H^-1 h_k^T)^(-1/2), which frees the
-        covariance of what the fit takes up wherever noise is independent, and Satterthwaite's degrees of freedom are
-        those of a chi-square of the same variance. Both need only H_k, H and the slopes. Not finite where a frame
-        alone determines a parameter.
+        covariance of what the fit takes up wherever noise is independent. Degrees of freedom are those of a chi-square
+        of the same variance (Satterthwaite), and of the same skewness, which are fewer where frames are uneven. All of
+        it needs only H_k, H and the slopes. Not finite where a frame alone determines a parameter.
         """
         root = np.linalg.inv(np.linalg.cholesky(self.matrix))
         shares = root @ self.matrices @ root.T
@@ -126,7 +126,10 @@ class FrameNormals:
         inner = np.einsum("kja,kjb->jab", own, own)
         square = np.sum(diagonal**2 - 2.0 * diagonal * np.sum(own**2, axis=2), axis=0) + np.sum(inner**2, axis=(1, 2))
         trace = np.sum(diagonal - np.sum(own**2, axis=2), axis=0)
-        return scatter.T @ scatter, trace**2 / square
+        middle = np.einsum("kj,kja,kjb->jab", diagonal, own, own)
+        cube = np.sum(diagonal**3 - 3.0 * diagonal**2 * np.sum(own**2, axis=2), axis=0)
+        cube += 3.0 * np.einsum("jab,jab->j", middle, inner) - np.einsum("jab,jbc,jca->j", inner, inner, inner)
+        return scatter.T @ scatter, trace**2 / square, square**3 / cube**2
 
     def left_out(self) -> tuple[FloatArray, FloatArray]:
         """Estimates z (K, p) without each frame, and the matrices (K, p, p) of the remaining ones.

@@ -119,7 +119,7 @@ def test_frame_scatter_is_nominal_with_few_uneven_frames(k):
     data = SimpleNamespace(n_frames=k, frame_ids=np.arange(k))
     found = [jackknife_frames(data, names, linear_frames(rng, designs)) for _ in range(400)]
     p = np.array([f.p_values for f in found])
-    # Satterthwaite's distribution has the right mean and variance, so that the tail, not each quantile, is nominal.
+    # Three moments are right, so that the tail, not each quantile, is nominal.
     assert np.all(np.abs(np.mean(p < 0.05, axis=0) - 0.05) < 4.0 * np.sqrt(0.05 * 0.95 / 400))
     assert np.mean(p.min(axis=1) * 5 < 0.01) < 0.01 + 3.0 * np.sqrt(0.01 * 0.99 / 400)
     assert np.mean([f.ratio**2 for f in found], axis=0) == pytest.approx(1.0, abs=6.0 * np.sqrt(2.0 / (k - 1) / 400))

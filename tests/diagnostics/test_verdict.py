@@ -158,7 +158,7 @@ class TestDiagnosis:
         return dataclasses.replace(found, misfit=dataclasses.replace(found.misfit, tests=tests))
 
     def test_structure_warns_or_fails_by_what_it_does(self, run, found):
-        weak = self.check(run, self.reject(found, "decentring", 0.01), "Unexplained structure")
+        weak = self.check(run, self.reject(found, "decentring", 0.005), "Unexplained structure")
         strong = self.check(run, self.reject(found, "decentring", 1e-6), "Unexplained structure")
         phase = self.check(run, self.reject(found, "error with the pixel phase in x", 1e-9), "Unexplained structure")
         noise = self.check(run, self.reject(found, "noise that changes with mag", 1e-9), "Evenness of the noise")
