@@ -21,6 +21,7 @@ from starcal_uq.core.files import (
     atomic_write_text,
     check_new_folder,
     ensure_new,
+    reading,
     write_csv,
 )
 from starcal_uq.core.tasks import Progress
@@ -509,8 +510,8 @@ class Run:
         from starcal_uq.diagnostics.inflation import with_misfit
 
         if error.seen is None:
-            mission = load_observations(self.folder.mission) if self.has("mission") else self.observations
-            aligned = load_observations(self.folder.alignment) if self.has("alignment") else None
+            mission = _frames_of(self.folder.mission) if self.has("mission") else self.observations
+            aligned = _frames_of(self.folder.alignment) if self.has("alignment") else None
             error = replace(error, seen=mission, aligned=aligned)
         return with_misfit(error, diagnosis, self.posterior, self.observations)
 
@@ -590,3 +591,12 @@ class Run:
         """Load results again when they are next asked for."""
         for name in ("results", *names):
             vars(self).pop(name, None)
+
+
+def _frames_of(path: Path) -> Observations:
+    """Frames that a run keeps for itself; random places of a drawn sky may coincide, which no measured table may."""
+    import pandas as pd
+
+    with reading(path, "a table of frames", "run `starcal-uq propagate RUN` again"):
+        table = pd.read_parquet(path)
+        return Observations(**{str(name): table[name].to_numpy() for name in table.columns})
