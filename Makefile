@@ -19,9 +19,12 @@ PYTEST := -m pytest --numprocesses=$(WORKERS) --dist=loadfile --no-loadscope-reo
 # posteriors, run folders, the report, whole runs at the command line, and how the package is put together.
 OTHER_TESTS := tests/inference tests/runs tests/presentation/test_report.py tests/cli/test_cli.py tests/test_project.py
 
+# What is compiled once serves all processes of the tests, and the next run; `make clean` removes it.
+unexport PYTHONDONTWRITEBYTECODE
+
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-other test-second test-slow lint docs bench clean
+.PHONY: help demo test test-other test-second test-slow lint lint-types lint-style docs bench clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -45,9 +48,14 @@ test-slow: .venv/.installed-test ## the Monte Carlo tests
 	$(BIN)/python $(PYTEST) -m slow
 
 lint: .venv/.installed-test ## style, types and layers
+	@$(MAKE) --no-print-directory --jobs=2 lint-types lint-style
+
+lint-types:
+	$(BIN)/mypy
+
+lint-style:
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
 	$(BIN)/lint-imports
 
 docs: .venv/.installed-docs ## the documentation, into docs/_build/html; a warning is an error

@@ -15,6 +15,7 @@ from starcal_uq.pipeline.images import counted, epoch_of
 from starcal_uq.pipeline.refine import identify_and_calibrate
 from starcal_uq.sky.neighbours import disturbed_stars, without_disturbed
 
+N_IMAGES = 16
 ESA = Path(__file__).resolve().parents[3] / "shared" / "data" / "esa-tetra3"
 
 
@@ -23,7 +24,7 @@ def frames(tmp_path_factory):
     folder = tmp_path_factory.mktemp("frames")
     stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
     sc.simulation.render_frames(
-        stars, sc.paper.paper_camera(), folder, n_frames=25, seed=3, times_utc=["2026-11-25T00:00:00"] * 25
+        stars, sc.paper.paper_camera(), folder, n_frames=N_IMAGES, seed=3, times_utc=["2026-11-25T00:00:00"] * N_IMAGES
     )
     return folder
 
@@ -47,6 +48,7 @@ def test_simulated_images_go_through_the_commands_one_by_one(cli, tmp_path):
     assert len(wrong) <= 0.03 * found.n_stars
 
 
+@pytest.mark.usefixtures("centroids_once")
 def test_run_from_images_to_report(cli, frames, tmp_path):
     sc.paper.paper_start().save(tmp_path / "camera.toml")
     options = ("--directions", "apparent", "--max-mag", 6, "--screen", "--steps", 40)
@@ -55,8 +57,8 @@ def test_run_from_images_to_report(cli, frames, tmp_path):
     assert "with the nominal camera" in err
     run = sc.runs.RunFolder(tmp_path / "run")
     assert "identified anew" in run.report.read_text("utf-8")
-    assert len(pd.read_csv(run.path / "identification.csv")) == 25
-    assert sc.images.Centroids.load(run.path / "centroids.parquet").n_frames == 25
+    assert len(pd.read_csv(run.path / "identification.csv")) == N_IMAGES
+    assert sc.images.Centroids.load(run.path / "centroids.parquet").n_frames == N_IMAGES
     cal, truth = sc.Calibration.load(run.calibration), sc.paper.paper_camera().theta
     assert np.all(np.abs(cal.theta - truth) < 4.0 * cal.sigmas)
     # What centroiding predicted is what the calibration finds.
@@ -87,6 +89,7 @@ def test_identify_refuses_the_calibration_of_another_sensor(cli, frames, tmp_pat
     assert "one sensor" in err
 
 
+@pytest.mark.usefixtures("centroids_once")
 def test_too_few_stars_say_what_was_identified(cli, frames, tmp_path, monkeypatch):
     def stuck(*_arguments, **_options):
         raise sc.errors.CalibrationError("it went nowhere.")
@@ -95,9 +98,9 @@ def test_too_few_stars_say_what_was_identified(cli, frames, tmp_path, monkeypatc
     sc.paper.paper_start().save(tmp_path / "camera.toml")
     status, _, err = cli("run", frames, "camera.toml", "-o", "run", "--max-mag", 6, "--in-space")
     assert status == 2
-    assert "stars in 25 frames were identified, but they do not determine the camera (it went nowhere.)" in err
+    assert f"stars in {N_IMAGES} frames were identified, but they do not determine the camera (it went nowhere.)" in err
     # What was found in the images was said before.
-    assert "stars in 25 frames.\n" in err
+    assert f"stars in {N_IMAGES} frames.\n" in err
     assert not (tmp_path / "run").exists()
 
 
@@ -106,7 +109,7 @@ def test_bootstrap_says_what_changed(frames):
     stars = sc.load_catalogue(max_mag=6.0, epoch=epoch_of(table))
     found = identify_and_calibrate(table, sc.paper.paper_start(), stars)
     assert len(found.rounds) == 2
-    assert found.identification.n_identified == 25
+    assert found.identification.n_identified == N_IMAGES
     assert "new" in found.text
     assert "standard deviations" in found.text
     # The focal length is compared with the data sheet's, not with that of the first calibration.

@@ -78,7 +78,7 @@ def drawn(result):
 
 def overlapping(figure):
     """Pairs of tick labels of one axis that cover each other."""
-    figure.canvas.draw()
+    figure.draw_without_rendering()
     pairs = []
     for ax in figure.axes:
         for axis in (ax.xaxis, ax.yaxis):
