@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.special import fdtrc
+from scipy.stats import kstest
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError, RunFolderError
@@ -15,9 +17,9 @@ from starcal_uq.core.provenance import data_hashes
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.calibration import Calibration
-from starcal_uq.estimation.compressed import moved, optimum, scaled, total
+from starcal_uq.estimation.compressed import Optimum, moved, optimum, scaled, total
 from starcal_uq.estimation.marginal import MarginalLikelihood
-from starcal_uq.estimation.merging import Consistency, consistency_of, merge
+from starcal_uq.estimation.merging import Consistency, consistency_of, merge, welch_james
 from starcal_uq.inference.sample import sample
 from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.propagation.coupling import coupling
@@ -25,6 +27,7 @@ from starcal_uq.runs.merge import join_observations, merge_runs
 from starcal_uq.simulation.frames import simulate
 from starcal_uq.sky.catalogue import load_catalogue
 from tests.helpers import scenes
+from tests.helpers.outside import campaign
 
 NOMINAL = scenes.nominal(scenes.camera())
 
@@ -303,3 +306,65 @@ def test_total_of_one_part_is_the_part() -> None:
     theta = points(cal)
     value = total([cal.compressed]).log_likelihood(theta, 0.05)
     assert np.allclose(value, cal.compressed.log_likelihood(theta, 0.05), rtol=0.0, atol=1e-6)
+
+
+# --- runs of unequal noise --------------------------------------------------------------------------------------------
+
+
+def old_p_value(runs: list[Optimum]) -> float:
+    """The control: the F test of the version before, which has one noise for all runs."""
+    p = len(runs[0].theta)
+    own = sum(run.sum_of_squares for run in runs)
+    dof = (len(runs) - 1) * p, sum(run.dof for run in runs)
+    between = optimum(total([run.compressed for run in runs])).sum_of_squares - own
+    return float(fdtrc(*dof, between / dof[0] / (own / dof[1])))
+
+
+@pytest.mark.parametrize(("noise", "dof"), [((1.0, 1.0), (200, 30)), ((1.0, 5.0), (200, 30)), ((1.0, 2.0), (10, 40))])
+def test_agreement_is_tested_at_any_ratio_of_noises(noise: tuple[float, float], dof: tuple[int, int]) -> None:
+    rng = np.random.default_rng(7)
+    sigma, nu, p = np.array(noise), np.array(dof, dtype=float), 5
+    root = np.array([np.eye(p) + 0.4 * rng.standard_normal((p, p)) for _ in nu]) * np.sqrt(nu)[:, None, None]
+    unit = root @ root.transpose(0, 2, 1)
+    new, old = [], []
+    for _ in range(1000):
+        away = np.linalg.solve(root.transpose(0, 2, 1), rng.standard_normal((2, p, 1)))[..., 0] * sigma[:, None]
+        variance = sigma**2 * rng.chisquare(nu) / nu
+        for information, values in ((unit / variance[:, None, None], new), (unit, old)):
+            mean = np.linalg.solve(information.sum(axis=0), np.einsum("rij,rj->i", information, away))
+            square = float(np.einsum("ri,rij,rj", away - mean, information, away - mean))
+            pooled = float(fdtrc(p, nu.sum(), square / p / (nu @ variance / nu.sum())))
+            values.append(welch_james(square, information, nu)[2] if values is new else pooled)
+    assert kstest(new, "uniform").pvalue > 0.01
+    if noise[0] != noise[1]:
+        assert kstest(old, "uniform").pvalue < 1e-6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ratio", [1.0, 2.0, 5.0])
+def test_merged_runs_of_unequal_noise_agree_and_cover(ratio: float) -> None:
+    """150 pairs of runs from outside, the smaller with more noise: uniform p, and errors of the stated size."""
+    new, old, squares, common = [], [], [], []
+    for seed in range(150):
+        runs, truth = [], None
+        for part, (frames, sigma) in enumerate(((10, 0.05), (4, 0.05 * ratio))):
+            c = campaign(np.random.default_rng((seed, part)), n_frames=frames, stars_per_frame=12, sigma_px=sigma)
+            sheet = Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
+            runs.append(calibrate(Observations(**c.columns), sheet))
+            truth = c.theta
+        new.append(consistency_of(merge(runs, allow_inconsistent=True)).p_value)
+        old.append(old_p_value([optimum(run.compressed) for run in runs]))
+        for noise, values in (("auto", squares), ("common", common)):
+            merged = merge(runs, noise=noise, allow_inconsistent=True)
+            away = (merged.theta - truth) / merged.sigmas
+            values.append(float(away @ np.linalg.solve(merged.correlation, away)) / 5.0)
+    print(
+        f"ratio {ratio:g}: KS {kstest(new, 'uniform').pvalue:.2g}, before {kstest(old, 'uniform').pvalue:.2g}; "
+        f"p < 0.001 {np.mean(np.less(new, 1e-3)):.3f}, before {np.mean(np.less(old, 1e-3)):.3f}; "
+        f"NEES/p {np.mean(squares):.3f}, common {np.mean(common):.3f}"
+    )
+    assert kstest(new, "uniform").pvalue > 0.01
+    # Five degrees of freedom each: the mean of 150 has a standard error of 0.05.
+    assert abs(np.mean(squares) - 1.0) < 0.16
+    if ratio > 1.0:
+        assert kstest(old, "uniform").pvalue < 1e-3
