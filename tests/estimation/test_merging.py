@@ -341,30 +341,27 @@ def test_agreement_is_tested_at_any_ratio_of_noises(noise: tuple[float, float], 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("ratio", [1.0, 2.0, 5.0])
+@pytest.mark.parametrize("ratio", [1.0, 5.0])
 def test_merged_runs_of_unequal_noise_agree_and_cover(ratio: float) -> None:
-    """150 pairs of runs from outside, the smaller with more noise: uniform p, and errors of the stated size."""
-    new, old, squares, common = [], [], [], []
-    for seed in range(150):
-        runs, truth = [], None
+    """100 pairs of runs from outside, the smaller with more noise: uniform p, and errors of the stated size."""
+    new, old, squares = [], [], []
+    for seed in range(100):
+        runs, truth = [], np.zeros(5)
         for part, (frames, sigma) in enumerate(((10, 0.05), (4, 0.05 * ratio))):
             c = campaign(np.random.default_rng((seed, part)), n_frames=frames, stars_per_frame=12, sigma_px=sigma)
             sheet = Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
             runs.append(calibrate(Observations(**c.columns), sheet))
             truth = c.theta
-        new.append(consistency_of(merge(runs, allow_inconsistent=True)).p_value)
+        merged = merge(runs, allow_inconsistent=True)
+        new.append(consistency_of(merged).p_value)
         old.append(old_p_value([optimum(run.compressed) for run in runs]))
-        for noise, values in (("auto", squares), ("common", common)):
-            merged = merge(runs, noise=noise, allow_inconsistent=True)
-            away = (merged.theta - truth) / merged.sigmas
-            values.append(float(away @ np.linalg.solve(merged.correlation, away)) / 5.0)
+        away = (merged.theta - truth) / merged.sigmas
+        squares.append(float(away @ np.linalg.solve(merged.correlation, away)) / 5.0)
     print(
-        f"ratio {ratio:g}: KS {kstest(new, 'uniform').pvalue:.2g}, before {kstest(old, 'uniform').pvalue:.2g}; "
-        f"p < 0.001 {np.mean(np.less(new, 1e-3)):.3f}, before {np.mean(np.less(old, 1e-3)):.3f}; "
-        f"NEES/p {np.mean(squares):.3f}, common {np.mean(common):.3f}"
+        f"ratio {ratio:g}: KS {kstest(new, 'uniform').pvalue:.2g}, before {kstest(old, 'uniform').pvalue:.2g}; below "
+        f"0.001: {np.sum(np.less(new, 1e-3))}, before {np.sum(np.less(old, 1e-3))}; NEES/p {np.mean(squares):.3f}"
     )
     assert kstest(new, "uniform").pvalue > 0.01
-    # Five degrees of freedom each: the mean of 150 has a standard error of 0.05.
-    assert abs(np.mean(squares) - 1.0) < 0.16
-    if ratio > 1.0:
-        assert kstest(old, "uniform").pvalue < 1e-3
+    # Five degrees of freedom each: the mean of 100 has a standard error of 0.063.
+    assert abs(np.mean(squares) - 1.0) < 0.2
+    assert (kstest(old, "uniform").pvalue < 1e-3) == (ratio > 1.0)
