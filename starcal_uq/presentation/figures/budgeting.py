@@ -123,6 +123,8 @@ def _write(ax: Axes, x: float, y: float, text: str, colour: str, *, italic: bool
         fontsize=style.TICK_SIZE,
         color=colour,
         style="italic" if italic else "normal",
+        # The limits of the axis leave room for it.
+        in_layout=False,
     )
 
 

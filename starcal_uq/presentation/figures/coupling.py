@@ -123,6 +123,8 @@ def _heat_map(ax: Axes, matrix: FloatArray, names: Sequence[str]) -> AxesImage:
             fontsize=style.TICK_SIZE,
             color=colour,
             weight=weight,
+            # Inside its cell: nothing for the layout to make room for.
+            in_layout=False,
         )
     return image
 

@@ -113,11 +113,9 @@ def plot_residual_profiles(cal: Calibration, obs: Observations) -> Figure:
     columns = 3
     rows = -(-len(profiles) // columns)
     figure = style.new_figure(11.0, 2.75 * rows)
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for panel, profile in zip(panels, profiles, strict=False):
-        _plot_profile(panel, profile)
-    for panel in panels[len(profiles) :]:
-        panel.set_visible(False)
+    grid = style.panels(figure, rows, columns, (0.92, 0.14, 0.5, 0.34), (0.92, 0.76))
+    for place, profile in enumerate(profiles):
+        _plot_profile(figure.add_subplot(grid[place]), profile)
     return figure
 
 
@@ -130,6 +128,7 @@ def _plot_profile(ax: Axes, profile: Profile1D) -> None:
         ax.errorbar(at, means, profile.errors, color=colour, marker=marker, label=name, **style.BARS)
     style.about_zero(ax)
     style.label(ax, profile.title, profile.label, "mean residual [px]")
+    style.label_distance(ax, x_in=0.25, y_in=0.67)
 
 
 _BAND = 0.95
