@@ -209,13 +209,13 @@ class Budget(Shown):
         """Standard deviations by class of the standard: ``ecss_class``, ``axis``, ``sigma_arcsec``, ``at_least``."""
         import pandas as pd
 
-        counted = [row for row in self.rows if row.counts(scope)]
+        counted = [row for row in self.rows if row.counts(scope) and row.applies]
         classes = [name for name in ECSS_CLASSES if any(row.ecss_class == name for row in counted)]
         records = []
         for name, axis in itertools.product(classes, AXES):
             rows = [row for row in counted if (row.ecss_class, row.axis) == (name, axis)]
-            known = [row for row in rows if row.assessed and row.applies]
-            sigma = grouped_sigma(known) if any(row.assessed for row in rows) else math.nan
+            known = [row for row in rows if row.assessed]
+            sigma = grouped_sigma(known) if known or not rows else math.nan
             records.append((name, axis, sigma, any(not row.assessed for row in rows)))
         return pd.DataFrame(records, columns=["ecss_class", "axis", "sigma_arcsec", "at_least"])
 

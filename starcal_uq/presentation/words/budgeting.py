@@ -268,7 +268,11 @@ def outcome_text(outcome: Outcome) -> str:
         return f"{asked.name!r} ({what}) is open: no contributor is assessed."
     if outcome.verdict == "violated":
         cause = f"; {total.dominant!r} dominates" if total.dominant else ""
-        return f"{asked.name!r} ({what}) is violated: {least}{numbers}{cause}."
+        reached = (
+            f"{significant(outcome.least_arcsec, 3)} arcsec against a limit of {significant(asked.limit_arcsec, 3)}"
+        )
+        least = least or ("at least " if outcome.least_arcsec < outcome.bound_arcsec else "")
+        return f"{asked.name!r} ({what}) is violated: {least}{reached}{cause}."
     if outcome.between:
         so_far = " so far" if total.at_least else ""
         lower = significant(outcome.least_arcsec, 3)
