@@ -35,7 +35,7 @@ from starcal_uq.diagnostics.verdict.judge import judge  # noqa: E402
 from starcal_uq.estimation.pairs import PairObjective  # noqa: E402
 from starcal_uq.maths.intervals import binomial_interval  # noqa: E402
 from starcal_uq.observations.frames import StarFrames  # noqa: E402
-from tests.helpers.outside import Campaign, campaign  # noqa: E402
+from tests.helpers.outside import Campaign, campaign, measured_again  # noqa: E402
 
 # A fact of the data and no test: few frames and empty corners are warned of in every run of such a regime.
 FACTS = ("Coverage of the field",)
@@ -129,6 +129,25 @@ def verdict_of(
 def plain(rng: np.random.Generator, options: Mapping[str, Any], **chain_options: Any) -> Outcome:
     """A campaign with these options, through the chain."""
     return chain(campaign(rng, **options), **chain_options)
+
+
+def twice(rng: np.random.Generator, duplicates: str) -> Outcome:
+    """Every frame of a campaign a second time, as another program measures it."""
+    c = campaign(rng, n_frames=20)
+    again = measured_again(rng, c.columns, 0.005)
+    columns = {name: np.concatenate([c.columns[name], values]) for name, values in again.items()}
+    return chain(replace(c, columns=columns), calibrate={"duplicates": duplicates})
+
+
+def merged(rng: np.random.Generator, ratio: float) -> Outcome:
+    """Two runs, the smaller with so many times the noise, merged."""
+    parts = [campaign(rng, n_frames=n, sigma_px=sigma) for n, sigma in ((20, 0.05), (8, 0.05 * ratio))]
+    sheets = [sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)) for c in parts]
+    runs = [sc.calibrate(sc.Observations(**c.columns), sheet) for c, sheet in zip(parts, sheets, strict=True)]
+    try:
+        return against_truth(parts[0], sc.estimation.merge(runs), "passed")
+    except sc.StarcalError:
+        return Outcome(verdict="refused")
 
 
 def clean(name: str, runs: int, **options: Any) -> Regime:
@@ -236,6 +255,11 @@ REGIMES: list[Regime] = [
     uneven("noise of its own in every frame", sigma_px=by_frame),
     uneven("noise of its own in every frame", noise="model", sigma_px=by_frame),
     uneven("clean: 40 frames", noise="model"),
+    Regime("every frame twice, 20 frames", partial(twice, duplicates="refuse"), 100),
+    Regime("every frame twice, kept (`--duplicates keep`: as before)", partial(twice, duplicates="keep"), 100),
+    Regime("every frame twice, left out (`--duplicates drop`)", partial(twice, duplicates="drop"), 100),
+    Regime("20 and 8 frames merged, equal noise", partial(merged, ratio=1.0), 200),
+    Regime("20 and 8 frames merged, 5 times the noise in the second", partial(merged, ratio=5.0), 200),
 ]
 
 

@@ -74,6 +74,7 @@ class BinnedResiduals:
 
 def bin_residuals(cal: Calibration, obs: Observations) -> BinnedResiduals:
     """Mean residual vectors in cells that hold about 25 stars each (4 to 12 cells along the longer side)."""
+    obs = weighed(obs, cal)
     width, height = cal.camera.width_px, cal.camera.height_px
     longer = max(width, height)
     along = int(np.clip(np.sqrt(obs.n_stars / _STARS_PER_CELL * longer / min(width, height)), 4, 12))
@@ -152,6 +153,7 @@ def residual_profiles(cal: Calibration, obs: Observations) -> tuple[Profile1D, .
     The phase is that of the predicted position, from -0.5 to 0.5 px around the centre of a pixel. Quantities that the
     table lacks, or that do not vary, are left out.
     """
+    obs = weighed(obs, cal)
     residuals = np.asarray(cal.residuals_px).T
     predicted = obs.xy.T - residuals
     offset = predicted - cal.theta[:2, None]

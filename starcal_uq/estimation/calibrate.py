@@ -101,9 +101,9 @@ def calibrate(
         and the ``marginal`` likelihood.
     duplicates : {"refuse", "drop", "keep"}
         What to do with frames that hold the same measurement as an earlier one, whatever their numbers, order and
-        stars (`starcal_uq.estimation.repeated_frames`): they would count twice. ``drop`` leaves them out
-        (``obs.select_frames(calibration.frame_ids)`` is then what was calibrated), ``keep`` does not ask. Streams are
-        not asked.
+        stars (`starcal_uq.estimation.repeated_frames`): they would count twice. ``drop`` leaves them out, there and in
+        all that takes the table with the result (`frame_ids` are those that stay); ``keep`` does not ask, nor are
+        streams asked.
     star_errors : bool
         Take into account that a star's direction errs alike in every frame (catalogue, blend, colour): the size of such
         errors is estimated, beyond what the column ``direction_mas`` of the table states, and they are marginalised in

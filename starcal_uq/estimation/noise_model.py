@@ -168,8 +168,12 @@ def noise_model_of(result: Any) -> NoiseModel | None:
 def weighed(obs: Observations, result: Any) -> Observations:
     """Observations as a calibration or posterior weighs them: with the noise of its model, if it has one that varies.
 
-    The data and their hash stay what they are. Without a model, weights of another result's are what the table states.
+    The data and their hash stay what they are, but for repeated frames that a calibration left out. Without a model,
+    weights of another result's are what the table states.
     """
+    left_out = np.isin(obs.frame, result.provenance.get("dropped_frames", ()))
+    if left_out.any():
+        obs = obs.select(~left_out)
     model = noise_model_of(result)
     if model is None or not model.varies:
         return obs if obs.stated_px is None else replace(obs, stated_px=None)

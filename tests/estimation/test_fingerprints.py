@@ -14,6 +14,7 @@ from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.fingerprints import Fingerprints, repeats
 from starcal_uq.estimation.merging import consistency_of, merge
+from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.runs.merge import merge_runs
 from tests.helpers.outside import Campaign, campaign, measured_again
 
@@ -63,6 +64,7 @@ def test_every_frame_twice_is_refused_left_out_or_kept() -> None:
     assert np.array_equal(rest.frame_ids, np.arange(16))
     assert rest.provenance["dropped_frames"] == list(range(1000, 1016))
     assert np.all(np.abs(rest.theta - calibrated().theta) < 1e-6 * calibrated().sigmas)
+    assert weighed(obs, rest).n_frames == 16
     # The old behaviour, which counts all twice: sigmas that are 0.7 times too small.
     kept = sc.calibrate(obs, sheet, duplicates="keep")
     assert np.all(np.abs(kept.sigmas / calibrated().sigmas - np.sqrt(0.5)) < 0.06)
