@@ -146,23 +146,49 @@ def test_no_exposures_are_called_one(options: dict[str, object]) -> None:
         assert len(repeats(cal.fingerprints)) == 0
 
 
+def marks(place: np.ndarray, errors: np.ndarray) -> Fingerprints:
+    """Fingerprints of frames with their stars at places (n, m, 2), up to errors."""
+    xy, length = place + errors, np.linalg.norm(errors, axis=2)
+    order = np.argsort(np.hypot(*(xy - 500.0).transpose(2, 0, 1)), axis=1)
+    return Fingerprints(
+        np.full(len(errors), errors.shape[1]),
+        np.take_along_axis(xy, order[..., None], axis=1).reshape(-1, 2).astype(np.float32),
+        np.take_along_axis(length, order, axis=1).ravel().astype(np.float32),
+    )
+
+
 def test_noise_of_their_own_tells_pairs_apart_whatever_its_size() -> None:
     """300 pointings with two exposures each, noise of 0.01 to 0.2 px; the control shares 99 % of its variance."""
     rng = np.random.default_rng(6)
     n, m = 300, 8
     place = np.repeat(rng.uniform(50.0, 950.0, (n, m, 2)), 2, axis=0)
     noise = np.repeat(rng.uniform(0.01, 0.2, n), 2)[:, None, None]
-
-    def marks(errors: np.ndarray) -> Fingerprints:
-        xy, length = place + errors, np.linalg.norm(errors, axis=2)
-        order = np.argsort(np.hypot(*(xy - 500.0).transpose(2, 0, 1)), axis=1)
-        return Fingerprints(
-            np.full(2 * n, m),
-            np.take_along_axis(xy, order[..., None], axis=1).reshape(-1, 2).astype(np.float32),
-            np.take_along_axis(length, order, axis=1).ravel().astype(np.float32),
-        )
-
     errors = noise * rng.standard_normal((2 * n, m, 2))
-    assert len(repeats(marks(errors))) == 0
+    assert len(repeats(marks(place, errors))) == 0
     errors[1::2] = errors[::2] + 0.1 * noise[1::2] * rng.standard_normal((n, m, 2))
-    assert len(repeats(marks(errors))) > 0.98 * n
+    assert len(repeats(marks(place, errors))) > 0.98 * n
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("m", "least"), [(5, (1.0, 0.9, 0.7)), (8, (1.0, 0.98, 0.9)), (12, (1.0, 0.99, 0.95))])
+def test_power_and_false_alarms(m: int, least: tuple[float, float, float]) -> None:
+    """500 pointings: images measured again to within eta sigma, and two exposures that share some of their error."""
+    rng = np.random.default_rng(m)
+    n = 500
+    place = np.repeat(rng.uniform(50.0, 950.0, (n, m, 2)), 2, axis=0)
+    for eta, expected in zip((0.1, 0.2, 0.3, 0.4), (*least, 0.0), strict=True):
+        errors = np.repeat(0.05 * rng.standard_normal((n, m, 2)), 2, axis=0)
+        errors[1::2] += eta * 0.05 * rng.standard_normal((n, m, 2))
+        seen = len(repeats(marks(place, errors))) / n
+        alone = [len(repeats(marks(place[i : i + 2], errors[i : i + 2]))) for i in range(0, 200, 2)]
+        print(f"{m} stars, eta {eta:g}: {seen:.3f} found, of single pairs {np.mean(alone):.2f}")
+        assert seen >= expected
+    for share in (0.0, 0.25, 0.5, 0.7, 0.9):
+        alarms = 0
+        for _ in range(4):
+            common = np.repeat(rng.standard_normal((n, m, 2)), 2, axis=0)
+            own = rng.standard_normal((2 * n, m, 2))
+            alarms += len(repeats(marks(place, 0.05 * (np.sqrt(share) * common + np.sqrt(1.0 - share) * own))))
+        print(f"{m} stars, share {share:g}: {alarms} of {4 * n}")
+        # Where nearly all of the error is common, two exposures are hardly more than one.
+        assert (alarms > 0) == (share == 0.9)
