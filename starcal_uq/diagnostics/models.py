@@ -11,17 +11,18 @@ parameters, 1 / sigma): normal times scaled inverse chi-square. Two estimates of
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import left_error, rotation_to_quaternion
+from starcal_uq.attitude.rotations import left_error, quaternion_to_rotation, rotation_to_quaternion
 from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibrate import refit
+from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.inference.arviz import psis
@@ -161,6 +162,8 @@ def compare_models(
         When no model can be calibrated.
     """
     obs = weighed(obs, cal)
+    if cal.star_errors is not None:
+        cal = _without_star_errors(obs, cal)
     names = tuple(dict.fromkeys((cal.camera.distortion, *models)))
     fits, failed = {}, {}
     for name in names:
@@ -201,6 +204,14 @@ def compare_models(
         )
     scores.sort(key=lambda score: -score.elpd)
     return ModelComparison(tuple(scores), cal.camera.distortion, failed)
+
+
+def _without_star_errors(obs: Observations, cal: Calibration) -> Calibration:
+    """The estimate that knows of no errors of the stars, as those of the other models: moves are then the models'."""
+    theta = cal.stages[-2].theta
+    likelihood = MarginalLikelihood(obs, cal.camera.distortion)
+    state, _ = likelihood.profile(theta, quaternion_to_rotation(cal.quaternions))
+    return replace(cal, theta=theta, quaternions=rotation_to_quaternion(state.rotations))
 
 
 def _normals(obs: Observations, cal: Calibration, name: str) -> FrameNormals:

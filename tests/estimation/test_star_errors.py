@@ -146,6 +146,12 @@ def test_what_cannot_be_is_refused(made):
         sc.estimation.merge([cal, cal])
 
 
+def test_other_models_are_compared_on_equal_terms(made):
+    _, obs, _, plain, cal = made
+    moves = [sc.diagnostics.compare_models(obs, one, ("brown3",)).of("brown3").common_arcsec for one in (plain, cal)]
+    assert moves[1] == pytest.approx(moves[0], abs=0.05)
+
+
 @pytest.mark.slow
 def test_coverage_is_nominal_with_the_option_and_not_without():
     """Forty runs; `benchmarks/regimes.py` has 150 of each regime."""
