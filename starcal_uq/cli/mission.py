@@ -292,10 +292,10 @@ def plan_command(
 
 
 def _show_plan(found: Plan, choice: FrameChoice | None, simulated: ForecastCheck | None) -> None:
-    from starcal_uq.presentation.words.planning import choice_table, distortion_sentence, plan_table
+    from starcal_uq.presentation.words.planning import choice_table, distortion_sentence, need_sentence, plan_table
 
     print_table(plan_table(found))
-    words = [found.text, distortion_sentence(found), *(f"{need.scope}: {need.text}" for need in found.needs)]
+    words = [found.text, distortion_sentence(found), *(need_sentence(found, need) for need in found.needs)]
     if choice is not None:
         print_table(choice_table(choice))
         words.append(choice.text)

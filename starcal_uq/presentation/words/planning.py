@@ -207,7 +207,15 @@ def plan_table(plan: Plan) -> TextTable:
     """The forecast by number of frames."""
     columns = ("n_frames", "x0_px", "f_mm", "common_pitch_arcsec", "rest_pitch_arcsec", "nea_pitch_arcsec")
     title = "Forecast, standard deviations; the radius holds the stated confidence"
-    return TextTable.of(plan.to_dataframe(), title, (*columns, "radius_arcsec"))
+    spread = () if plan.distortion is None else ("radius_least_arcsec", "radius_most_arcsec")
+    return TextTable.of(plan.to_dataframe(), title, (*columns, "radius_arcsec", *spread))
+
+
+def need_sentence(plan: Plan, need: Need) -> str:
+    """`need_text` after the part of the error, with the range over the open distortion."""
+    spread = plan.distortion
+    words = "" if spread is None else f" ({range_words(*spread.frames_range(need.scope))} over the open distortion)"
+    return f"{need.scope}: {need_text(need)}{words}"
 
 
 def choice_table(choice: FrameChoice, n: int = 20) -> TextTable:
