@@ -75,14 +75,15 @@ def _model_choice(cal: Calibration, diagnosis: Diagnosis) -> str:
     if not others:
         return ""
     score = max(others, key=lambda s: float(np.hypot(*s.common_arcsec[:2])))
-    moved = float(np.hypot(*score.common_arcsec[:2]))
+    # Per axis, as the attitude error is stated.
+    moved = float(np.hypot(*score.common_arcsec[:2])) / np.sqrt(2.0)
     covariance = cal.rotation_per_theta @ cal.covariance @ cal.rotation_per_theta.T
-    within = float(np.sqrt(np.trace(covariance[:2, :2]))) * ARCSEC
+    within = float(np.sqrt(0.5 * np.trace(covariance[:2, :2]))) * ARCSEC
     if moved <= _MODEL_SIGMAS * within:
         return ""
     return (
         f"The choice of the distortion model: {score.model!r} fits as well and moves attitudes by {significant(moved)} "
-        f"arcsec in common across the boresight; the uncertainty within {cal.camera.distortion!r} is "
+        f"arcsec per axis in common across the boresight; the uncertainty within {cal.camera.distortion!r} is "
         f"{significant(within)} arcsec."
     )
 

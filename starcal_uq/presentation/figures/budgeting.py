@@ -13,6 +13,7 @@ from starcal_uq.budgeting.totals import covariance
 from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.formatting import significant
 from starcal_uq.presentation.figures import style
+from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, WITH_MISFIT_FOUND
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -131,8 +132,9 @@ def _write(ax: Axes, x: float, y: float, text: str, colour: str, *, italic: bool
 def _handles(budget: Budget) -> list[object]:
     from matplotlib.patches import Patch
 
+    tested = any(row.with_misfit_found_arcsec >= 0.0 for row in budget.rows)
     handles: list[object] = [
-        Patch(facecolor=style.SKY, label="from the posterior"),
+        Patch(facecolor=style.SKY, label=f"from the posterior, {WITH_MISFIT_FOUND if tested else IF_MODEL_HOLDS}"),
         Patch(facecolor=style.ORANGE, label="from the budget file"),
         Patch(facecolor=style.GREY, hatch="///", edgecolor="white", label="absorbed by alignment"),
         style.key("total by the rule", style.INK, marker="o", linestyle="", markersize=7),

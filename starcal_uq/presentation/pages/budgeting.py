@@ -114,7 +114,7 @@ def _contributors(sheet: Worksheet, budget: Budget) -> None:
 
 
 def _with_misfit(row: Contributor) -> float | str:
-    untested = row.source == "posterior" and math.isnan(row.with_misfit_found_arcsec)
+    untested = not math.isnan(row.if_model_holds_arcsec) and math.isnan(row.with_misfit_found_arcsec)
     return NOT_ASSESSED if untested else row.with_misfit_found_arcsec
 
 

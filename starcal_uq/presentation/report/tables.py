@@ -143,7 +143,7 @@ def _small(arcsec: float) -> str:
     """The interaction is shown to be small, and no more: twelve columns leave no room for powers of ten."""
     if np.isnan(arcsec):
         return "—"
-    return "< 0.001".replace(" ", "\N{NO-BREAK SPACE}") if 0.0 < arcsec < 0.0005 else significant(arcsec)
+    return "< 0.001".replace(" ", "\N{NO-BREAK SPACE}") if 0.0 < arcsec < 0.001 else significant(arcsec)
 
 
 def weak_directions(coupling: Coupling) -> list[Row]:

@@ -128,7 +128,7 @@ def _sigma(row: Contributor | None) -> str:
 def _figures(axes: dict[str, Contributor]) -> list[tuple[str, list[str]]]:
     """What the posterior fills, by the two names that every attitude error has; empty for other rows."""
     rows = list(axes.values())
-    if any(row.source != "posterior" for row in rows):
+    if any(math.isnan(row.if_model_holds_arcsec) for row in rows):
         return []
     pairs = (
         (WITH_MISFIT_FOUND, [row.with_misfit_found_arcsec for row in rows]),

@@ -81,10 +81,11 @@ def misfit_sentence(error: AttitudeError) -> str:
             f"What the errors are {WITH_MISFIT_FOUND} is {NOT_ASSESSED}: the model was not tested "
             "(`starcal-uq diagnose RUN`)."
         )
-    reasons = error.misfit.reasons
-    if not reasons:
+    found = error.misfit
+    if not found.reasons:
         return f"The tests of the model found nothing: an error {WITH_MISFIT_FOUND} is that {IF_MODEL_HOLDS}."
-    return f"Found: {'; '.join(reasons)}."
+    parts = (("common rotation", found.common_reasons), ("rest", found.rest_reasons))
+    return " ".join(f"Found for the {name}: {'; '.join(reasons)}." for name, reasons in parts if reasons)
 
 
 def alignment_sentence(error: AttitudeError) -> str:
