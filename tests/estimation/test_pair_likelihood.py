@@ -174,11 +174,11 @@ def test_fewer_frames_than_parameters_have_the_covariance_of_gaussian_noise() ->
 
 
 @pytest.mark.slow
-def test_intervals_of_the_pair_estimate_cover_with_four_frames() -> None:
+def test_intervals_of_the_pair_estimate_cover_with_three_frames() -> None:
     """Against a simulator of another make; the sandwich over frames of before is the control."""
     inside, before = [], []
     for seed in range(100):
-        c = campaign(np.random.default_rng(seed), n_frames=4)
+        c = campaign(np.random.default_rng(seed), n_frames=3)
         obs = Observations(**c.columns, meta={"directions": "apparent"})
         cal = calibrate(obs, Camera(**c.camera_toml(), coefficients=(0.0, 0.0)), method="three_stage")
         low, high = cal.interval().T
