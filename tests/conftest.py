@@ -77,7 +77,10 @@ def few_importance_draws(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 # Files that take long, so that no process is left with one of them at the end.
-LONG = ("test_notebook.py", "paper/", "cli/", "diagnostics/", "planning/", "estimation/", "presentation/")
+LONG = (
+    *("test_notebook.py", "paper/", "cli/", "diagnostics/", "planning/", "estimation/", "presentation/"),
+    *("identification/", "inference/", "sky/", "budgeting/", "runs/", "comparison/", "propagation/"),
+)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

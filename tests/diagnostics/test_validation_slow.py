@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -20,14 +18,8 @@ COVERED = ("x0", "y0", "f", "k1", "k2", "sigma", "pitch", "yaw", "roll")
 
 @pytest.fixture(scope="module")
 def fixed():
-    """2000 replicates of 50 frames of the paper's camera."""
-    return validate(sc.paper.paper_camera(), n_replicates=2000, seed=1)
-
-
-def first(found, n):
-    """The first n replicates of a validation, which are those of a shorter one."""
-    arrays = {f.name: getattr(found, f.name) for f in dataclasses.fields(found)}
-    return dataclasses.replace(found, **{k: v[:n] for k, v in arrays.items() if isinstance(v, np.ndarray)})
+    """1000 replicates of 50 frames of the paper's camera: NEES/p is known to 0.02, a coverage to 0.007."""
+    return validate(sc.paper.paper_camera(), n_replicates=1000, seed=1)
 
 
 def calibration_ratio(found):
@@ -52,9 +44,7 @@ def test_coverage_and_squared_errors(fixed):
 
 
 def test_ranks_of_a_fixed_truth(fixed):
-    thousand = first(fixed, 1000)
-    assert thousand.n_replicates == 1000
-    assert (thousand.rank_p_value > 0.01).all(), thousand.rank_p_value
+    assert fixed.n_replicates == 1000
     assert (fixed.rank_p_value > 0.01).all(), fixed.rank_p_value
 
 

@@ -204,7 +204,7 @@ def test_quantities_are_what_they_say():
 
 @lru_cache
 def small_check() -> ForecastCheck:
-    return check_forecast(camera(), sky(), n_frames=(10, 30), n_campaigns=60, n_geometries=1000, workers=0, seed=3)
+    return check_forecast(camera(), sky(), n_frames=(10, 30), n_campaigns=40, n_geometries=1000, workers=0, seed=3)
 
 
 def test_forecast_is_what_small_campaigns_state_and_do():
@@ -212,7 +212,7 @@ def test_forecast_is_what_small_campaigns_state_and_do():
     assert check.ok, check.text
     assert not check.failures
     assert check.to_dataframe().shape == (2 * len(check.forecast.names), 9)
-    assert "60 simulated campaigns" in check.text
+    assert "40 simulated campaigns" in check.text
 
 
 def test_a_forecast_that_forgets_the_attitudes_fails():
