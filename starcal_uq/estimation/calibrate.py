@@ -296,10 +296,12 @@ def _with_noise_model(obs: Observations, camera: Camera, method: str, solver: st
             obs = obs.weighted(model.sigma_px(obs))
             likelihood = MarginalLikelihood(obs, camera.distortion)
             likelihood.use_rotations(likelihood.start_rotations(theta))
-            # Interstar angles had one noise, and their sandwich needs none: only the refinement knows the weights.
+            # The estimate from interstar angles has no weights; its covariance and the refinement do.
             stages = [*calibration.stages[:-1], refinement_stage(likelihood, theta, max_iterations)]
-            pair = calibration.pair_theta, calibration.pair_covariance
-            calibration = assemble(obs, camera, method, solver, likelihood, stages, stages[-1].status, *pair)
+            pair_theta = calibration.pair_theta
+            covariance = _pair_covariance(PairObjective(likelihood.frames, camera.distortion), likelihood, pair_theta)
+            status = stages[-1].status
+            calibration = assemble(obs, camera, method, solver, likelihood, stages, status, pair_theta, covariance)
         settings = {**calibration.provenance["settings"], "noise": "model"}
         record = {**calibration.provenance, "settings": settings, "noise_model": model.record()}
         calibration = replace(calibration, provenance=record)
