@@ -35,6 +35,7 @@ from starcal_uq.diagnostics.verdict.judge import judge  # noqa: E402
 from starcal_uq.estimation.pairs import PairObjective  # noqa: E402
 from starcal_uq.maths.intervals import binomial_interval  # noqa: E402
 from starcal_uq.observations.frames import StarFrames  # noqa: E402
+from tests.diagnostics import test_pattern  # noqa: E402
 from tests.helpers.outside import Campaign, campaign, measured_again  # noqa: E402
 
 # A fact of the data and no test: few frames and empty corners are warned of in every run of such a regime.
@@ -218,6 +219,20 @@ def uneven(name: str, *, noise: str = "common", runs: int = 100, **options: Any)
     return Regime(words, partial(plain, options={"n_frames": 40} | options, **steps), runs)
 
 
+def misfit_to_attitude(rng: np.random.Generator, planted: str) -> Outcome:
+    """A planted misfit: what it is said to do to the rest over what it does, and by its whole size in each axis."""
+    seed = int(rng.integers(2**31))
+    run, found = test_pattern.calibrated(planted, seed), {}
+    for where in ("observed", "random", "slew"):
+        through, whole = test_pattern.ratios(run, where, seed + 1)
+        for part, at in (("across", slice(0, 2)), ("about", slice(2, 3))):
+            if len(through[at]):
+                found[f"{where}, {part}"] = float(np.mean(through[at]))
+                if where == "random":
+                    found[f"whole size, {part}"] = float(np.mean(whole[at]))
+    return Outcome(figures=found)
+
+
 REGIMES: list[Regime] = [
     clean("clean: 3 frames", 400, n_frames=3),
     clean("clean: 5 frames", 400, n_frames=5),
@@ -260,6 +275,10 @@ REGIMES: list[Regime] = [
     Regime("every frame twice, left out (`--duplicates drop`)", partial(twice, duplicates="drop"), 100),
     Regime("20 and 8 frames merged, equal noise", partial(merged, ratio=1.0), 200),
     Regime("20 and 8 frames merged, 5 times the noise in the second", partial(merged, ratio=5.0), 200),
+    *(
+        Regime(f"misfit planted: {name}", partial(misfit_to_attitude, planted=name), 4, "attitude")
+        for name in test_pattern.PLANTED
+    ),
 ]
 
 

@@ -64,10 +64,10 @@ def table(c: Campaign, planted: str) -> sc.Observations:
     return sc.Observations(**columns, meta={"directions": "apparent"})
 
 
-def calibrated(planted: str) -> SimpleNamespace:
+def calibrated(planted: str, seed: int = 1) -> SimpleNamespace:
     """A campaign with the misfit, its calibration, and the tests of it; the posterior is the normal approximation."""
     options = PLANTED[planted]
-    c, clean = (campaign(np.random.default_rng(1), n_frames=200, **more) for more in (options, {}))
+    c, clean = (campaign(np.random.default_rng(seed), n_frames=200, **more) for more in (options, {}))
     obs, start = table(c, planted), sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0))  # type: ignore[arg-type]
     cal = sc.calibrate(obs, start)
     # What the same noise does without the misfit is no part of it. What scales of frames do to the parameters is
@@ -85,17 +85,20 @@ def calibrated(planted: str) -> SimpleNamespace:
     diagnosis = SimpleNamespace(
         misfit=misfit_tests(obs, cal), jackknife=None, comparison=None, theta=cal.theta.tolist()
     )
-    return SimpleNamespace(obs=obs, cal=cal, post=post, diagnosis=diagnosis, options=options, theta=c.theta + bias)
+    found = {"obs": obs, "cal": cal, "post": post, "diagnosis": diagnosis}
+    return SimpleNamespace(**found, options=options, theta=c.theta + bias, seed=seed)
 
 
-def mission(run: SimpleNamespace, where: str) -> Campaign:
+def mission(run: SimpleNamespace, where: str, seed: int) -> Campaign:
     """Frames of the same sensor without noise: those of the calibration, others at random, or along a slew."""
     if where == "observed":
-        return campaign(np.random.default_rng(1), n_frames=200, sigma_px=0.0, **run.options)
+        return campaign(np.random.default_rng(run.seed), n_frames=200, sigma_px=0.0, **run.options)
     # Scales of frames are chance, which takes more of them.
     count = 300 if "displaced" in run.options else 1200
     path = {"path": slew(count, 0.3)} if where == "slew" else {}
-    return campaign(np.random.default_rng(77), n_frames=count, sigma_px=0.0, stars_per_frame=20, **path, **run.options)
+    return campaign(
+        np.random.default_rng(seed), n_frames=count, sigma_px=0.0, stars_per_frame=20, **path, **run.options
+    )
 
 
 def stated(run: SimpleNamespace, seen: sc.Observations) -> FloatArray:
@@ -107,9 +110,9 @@ def stated(run: SimpleNamespace, seen: sc.Observations) -> FloatArray:
     return misfit.rest_arcsec
 
 
-def ratios(run: SimpleNamespace, where: str) -> tuple[FloatArray, FloatArray]:
+def ratios(run: SimpleNamespace, where: str, seed: int = 77) -> tuple[FloatArray, FloatArray]:
     """Stated over true rest (3,): through geometry, and by the whole rms of the largest pattern in each axis."""
-    c = mission(run, where)
+    c = mission(run, where, seed)
     # Noise-free frames of the calibration are in the same order, and so have its temperatures.
     seen = run.obs if where == "observed" else sc.Observations(**c.columns, meta={"directions": "apparent"})
     true = np.std(attitude_errors(c, run.theta), axis=0)
