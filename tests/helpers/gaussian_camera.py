@@ -58,6 +58,7 @@ def gaussian_calibration(dof: int = 25_000, sigma: float = 0.05, **changes: Any)
         "attitude_noise": np.eye(3) * 1e-12,
         "provenance": {"data_sha256": "0" * 64},
         "star_errors": None,
+        "noise_model": None,
     }
     return SimpleNamespace(**{**values, **changes})
 
