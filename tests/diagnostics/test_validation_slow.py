@@ -49,7 +49,7 @@ def test_ranks_of_a_fixed_truth(fixed):
 
 
 def test_ranks_of_truths_from_the_prior():
-    found = validate(sc.paper.paper_camera(), n_replicates=1000, truth="prior", seed=2)
+    found = validate(sc.paper.paper_camera(), n_replicates=500, truth="prior", seed=2)
     show("truth from the prior", found)
     assert found.ok, found.text
     assert (found.rank_p_value > 0.01).all(), found.rank_p_value
@@ -85,7 +85,7 @@ def test_biased_moves_are_found():
 
 
 def test_noise_understated_by_a_tenth_is_found_by_coverage():
-    found = validate_study(few_frames(assumed_sigma_px=0.045, n_steps=40), sc.load_catalogue(max_mag=6.0), 1000)
+    found = validate_study(few_frames(assumed_sigma_px=0.045, n_steps=40), sc.load_catalogue(max_mag=6.0), 500)
     show("sigma understated", found)
     assert not found.ok
     assert found.nees_ratio > 1.15
