@@ -16,7 +16,7 @@ from tests.helpers.scenes import camera, observations
 def test_validate_writes_figure_table_and_verdict(cli, inputs, tmp_path):
     camera().save(tmp_path / "truth.toml")
     status, out, _ = cli(
-        "validate", "truth.toml", "-o", "val", "--replicates", 8, "--frames", 12, "--workers", 1, "--json"
+        "validate", "truth.toml", "-o", "val", "--replicates", 20, "--frames", 12, "--workers", 1, "--json"
     )
     assert status in (0, 1)
     found = json.loads(out)

@@ -42,6 +42,8 @@ def small(tmp_path_factory):
     )
     c = campaign(np.random.default_rng(1), n_frames=12, patch_stars=20, star_sigma_px=0.05)
     patch, sheet = sc.Observations(**c.columns), sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
+    c = campaign(np.random.default_rng(2), n_frames=30, sigma_px=lambda radius, mag, frame: 0.03 * (1.0 + 3.0 * radius))
+    uneven = sc.Observations(**c.columns)
     patch.save(folder / "PATCH_OBS.csv")
     sheet.save(folder / "PATCH_CAMERA.toml")
     for name, seed in (("RUN_B", 5), ("RUN_A", 3)):
@@ -52,7 +54,8 @@ def small(tmp_path_factory):
         run.propagate(n_draws=50, seed=0)
     obs.save(folder / "OBS.csv")
     shutil.copytree(folder / "RUN_A", folder / "RUN")
-    return SimpleNamespace(folder=folder, obs=obs, camera=camera, cal=cal, post=post, patch=patch, sheet=sheet)
+    tables = {"obs": obs, "patch": patch, "uneven": uneven}
+    return SimpleNamespace(folder=folder, camera=camera, cal=cal, post=post, sheet=sheet, **tables)
 
 
 def short_of(kind, small):
@@ -97,6 +100,9 @@ EXAMPLES = {
     "diagnostics.verdict.estimate.estimation": lambda s: [
         estimate.estimation(dataclasses.replace(s.cal, status=status)) for status in Status if not status.ok
     ],
+    "diagnostics.verdict.estimate.even_noise": lambda s: [
+        estimate.even_noise(sc.diagnostics.misfit_tests(s.uneven, sc.calibrate(s.uneven, s.sheet)))
+    ],
     "diagnostics.verdict.estimate.jackknife": lambda s: [
         estimate.jackknife(dataclasses.replace(s.jackknife, sandwich_covariance=9.0 * s.jackknife.formal_covariance))
     ],
@@ -122,6 +128,7 @@ COMMANDS = {
     "compare RUN_A RUN_B -o DIR": "",
     "coupling RUN": "",
     "propagate RUN": "--draws 50",
+    "propagate RUN --attitudes random": "--draws 50",
     "report RUN": "",
     "sample RUN": "--force --steps 20",
     "sample RUN --force": "--steps 20",
