@@ -497,9 +497,11 @@ class Run:
         diagnosis.save(self.folder.diagnosis)
         self._forget("diagnosis")
         if posterior is not None and self.has("attitude"):
-            self._with_misfit(self.attitude).save(self.folder.attitude)
+            found = self._with_misfit(self.attitude)
+            found.save(self.folder.attitude)
             self._remove(("budget",))
-            self._forget("attitude")
+            # As the file holds it, without its frames.
+            self.attitude = replace(found, seen=None, aligned=None)
         return diagnosis
 
     def _with_misfit(self, error: AttitudeError) -> AttitudeError:
