@@ -265,7 +265,7 @@ def test_regimes_are_written_between_their_markers(monkeypatch, tmp_path, capsys
 @pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.name)
 def test_power_at_a_thousand_frames(scenario):
     """What is flagged, and what cannot be: as the table of the documentation says."""
-    found = power(scenario, 12, 1000, seed=900)
+    found = power(scenario, 8, 1000, seed=900)
     if not scenario.test:
         assert found.specific < 0.14 and found.overall <= 0.25
         assert found.error < 2.0

@@ -231,11 +231,11 @@ def test_does_not_depend_on_processes(small, tmp_path) -> None:
 
 @pytest.mark.slow
 def test_the_full_experiment(tmp_path) -> None:
-    found = field_experiment(tmp_path / "out")
+    found = field_experiment(tmp_path / "out", n_frames=100, n_calibration_frames=100)
     errors, parts = found.errors, found.parts()
-    # A third of random attitudes show more than six stars, as 200 of 600 frames.
+    # A third of random attitudes show more than six stars, as 200 of the paper's 600 frames.
     assert 0.25 < found.frames.share < 0.42
-    assert found.identified(TRUE_CAMERA).correct.sum() >= 190
+    assert found.identified(TRUE_CAMERA).correct.sum() >= 95
     assert not any(result.wrong.any() for (name, _), result in found.sweep.items() if name == TRUE_CAMERA)
     # The better the camera the smaller the rest, on every axis.
     for worse, better in itertools.pairwise(FIELD_METHODS):
