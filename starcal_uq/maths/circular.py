@@ -8,7 +8,6 @@ from starcal_uq.core.types import FloatArray
 
 # Midpoints of the quarter circle: the integrand is smooth and periodic, so that few points give all digits.
 _ANGLES = (np.arange(48) + 0.5) * (0.5 * np.pi / 48)
-_BISECTIONS = 52
 
 
 def mixture_radius(covariances: FloatArray, confidence: float) -> float:
@@ -50,11 +49,12 @@ def mixture_radius(covariances: FloatArray, confidence: float) -> float:
     if largest <= 0.0:
         return 0.0
     half_inverse = 0.5 / np.maximum(variance / largest, 1e-300)
-    low, high = 0.0, -2.0 * np.log1p(-confidence)
-    for _ in range(_BISECTIONS):
-        square = 0.5 * (low + high)
-        if float(np.mean(np.exp(-square * half_inverse))) > 1.0 - confidence:
-            low = square
-        else:
-            high = square
-    return float(np.sqrt(high * largest))
+    from scipy.optimize import brentq
+
+    def excess(square: float) -> float:
+        return float(np.mean(np.exp(-square * half_inverse))) - (1.0 - confidence)
+
+    high = -2.0 * float(np.log1p(-confidence))
+    # For equal axes the upper end is the quantile itself, to rounding.
+    square = high if excess(high) >= 0.0 else brentq(excess, 0.0, high, xtol=1e-300, rtol=8.9e-16)
+    return float(np.sqrt(square * largest))

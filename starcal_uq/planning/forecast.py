@@ -338,9 +338,9 @@ class Forecaster:
 
 def student_factor(confidence: float, dof: float) -> float:
     """How much wider a two-axis interval is because the noise is estimated, with that many degrees of freedom."""
-    from scipy.stats import f as fisher
-
-    return float(np.sqrt(2.0 * fisher.ppf(confidence, 2.0, dof) / (-2.0 * np.log1p(-confidence))))
+    # Fisher's quantile with 2 and d degrees of freedom is d/2 ((1 - P)^(-2/d) - 1), Rayleigh's the limit of many.
+    exponent = -2.0 * float(np.log1p(-confidence)) / dof
+    return float(np.sqrt(np.expm1(exponent) / exponent))
 
 
 def _band(values: FloatArray) -> tuple[FloatArray, FloatArray]:
