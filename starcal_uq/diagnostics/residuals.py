@@ -107,8 +107,8 @@ def residual_scale(cal: Calibration, obs: Observations) -> FloatArray:
     The fit takes up part of the noise: with d degrees of freedom in 2N numbers, residuals are smaller than the noise by
     sqrt(d / 2N) on average.
     """
-    shrink = np.sqrt(max(cal.dof, 1) / (2.0 * obs.n_stars))
     obs = weighed(obs, cal)
+    shrink = np.sqrt(max(cal.dof, 1) / (2.0 * obs.n_stars))
     stated = np.ones(obs.n_stars) if obs.sigma_px is None else np.asarray(obs.sigma_px)
     return np.asarray(cal.sigma * shrink * stated, dtype=np.float64)
 

@@ -11,6 +11,7 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
+from starcal_uq.diagnostics.residuals import normalised_residuals
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.fingerprints import Fingerprints, repeats
 from starcal_uq.estimation.merging import consistency_of, merge
@@ -65,6 +66,9 @@ def test_every_frame_twice_is_refused_left_out_or_kept() -> None:
     assert rest.provenance["dropped_frames"] == list(range(1000, 1016))
     assert np.all(np.abs(rest.theta - calibrated().theta) < 1e-6 * calibrated().sigmas)
     assert weighed(obs, rest).n_frames == 16
+    # Judged is what was calibrated: with what was left out, each residual would be 1.4 times too many sigmas.
+    alone = normalised_residuals(calibrated(), table(night()))
+    assert np.allclose(normalised_residuals(rest, obs), alone, atol=1e-4)
     # The old behaviour, which counts all twice: sigmas that are 0.7 times too small.
     kept = sc.calibrate(obs, sheet, duplicates="keep")
     assert np.all(np.abs(kept.sigmas / calibrated().sigmas - np.sqrt(0.5)) < 0.06)

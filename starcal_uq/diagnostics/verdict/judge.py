@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.status import Check, Level, Question, worst
 from starcal_uq.diagnostics.verdict import draws, estimate, observed
+from starcal_uq.estimation.noise_model import weighed
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -65,8 +66,9 @@ def judge(
         checks += [estimate.starts(diagnosis.starts)]
     if post is not None:
         checks += [draws.same_data(post, obs), *post.diagnostics.checks]
-    checks += [observed.directions(obs, cal), observed.residual_pattern(obs, cal), observed.outliers(obs, cal)]
-    checks += [observed.noise(cal), observed.coverage(obs, cal)]
+    used = weighed(obs, cal)
+    checks += [observed.directions(used, cal), observed.residual_pattern(used, cal), observed.outliers(used, cal)]
+    checks += [observed.noise(cal), observed.coverage(used, cal)]
     if diagnosis is not None:
         checks += estimate.model_checks(diagnosis)
     if attitude is not None:
