@@ -38,7 +38,11 @@ def _legacy() -> Any:
     with warnings.catch_warnings():
         # 0.23 announces 1.x once a day; nothing that a user of this package could act on.
         warnings.filterwarnings("ignore", message=r"\s*ArviZ is undergoing a major refactor", category=FutureWarning)
-        return importlib.import_module("arviz")
+        module = importlib.import_module("arviz")
+    # Where Numba is installed, 0.23 compiles its functions at first use, which costs more than it saves here, and its
+    # standard error fails with NumPy 2.4.
+    module.Numba.disable_numba()
+    return module
 
 
 @lru_cache(maxsize=1)
