@@ -43,7 +43,6 @@ def posterior_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributo
     if found is not None:
         reasons = {COMMON: found.common_reasons, REST: found.rest_reasons}
     tails = _tails(attitude)
-    places = {name: place for place, name in enumerate(CONTRIBUTORS)}
     rows = []
     for entry in expected:
         place = CONTRIBUTORS.index(entry.name)
@@ -51,7 +50,7 @@ def posterior_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributo
         counted = attitude.headline_arcsec[place]
         factor = found.factor if found is not None and entry.name in reasons else 1.0
         scale = np.divide(factor * held[:3], counted[:3], out=np.zeros(3), where=counted[:3] > 0.0)
-        correlation = axis_correlations(attitude.covariance_arcsec2[places[entry.name]], scale)
+        correlation = axis_correlations(attitude.covariance_arcsec2[place], scale)
         for index, axis in enumerate(AXES):
             # What the misfit adds has no frame-by-frame sigma: the excess of the tail shrinks with its share.
             share = (factor * held[index] / counted[index]) ** 2 if counted[index] > 0.0 else 1.0

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 
 from starcal_uq.core.constants import CROSS_BORESIGHT, INTERACTION
+from starcal_uq.maths.intervals import HALF_WIDTH_997
 
 AXIS_LABELS = {
     "pitch": "X (pitch)",
@@ -44,7 +45,7 @@ REST = "calibration, rest"
 ALIGNMENT = "alignment calibration in flight"
 _NAN = float("nan")
 # Two-sided 99.7 % quantile of a Gaussian error, standard deviations.
-GAUSSIAN_997 = 2.9677379253417833
+GAUSSIAN_997 = HALF_WIDTH_997
 
 
 @dataclass(frozen=True)

@@ -123,6 +123,11 @@ class Camera(Shown):
         dy = max(abs(-0.5 - self.y0_px), abs(self.height_px - 0.5 - self.y0_px))
         return math.hypot(dx, dy)
 
+    @property
+    def half_diagonal_px(self) -> float:
+        """Half of the detector's diagonal, pixels: the corner's distance from the centre."""
+        return 0.5 * math.hypot(self.width_px, self.height_px)
+
     def contains(self, xy: ArrayLike) -> BoolArray:
         """Whether each point lies on the detector, edges included.
 

@@ -67,12 +67,12 @@ def records(frame: pd.DataFrame) -> list[AnyDict]:
 
 def show_calibration(calibration: Calibration, truth: Camera | None = None) -> None:
     """Table of start, estimate and sigma; with a truth, also truth and z."""
-    from starcal_uq.presentation.words.estimation import calibration_table, focal_length
+    from starcal_uq.presentation.words.estimation import calibration_table, fitted_noise_text, focal_length
 
     print_table(calibration_table(calibration, truth))
     out.print(f"Focal length {focal_length(calibration)}. Status: {calibration.status.name.lower()}.")
-    if calibration.noise_model is not None:
-        out.print(f"Fitted noise: {calibration.noise_model}.", highlight=False, soft_wrap=True)
+    if words := fitted_noise_text(calibration).strip():
+        out.print(words, highlight=False, soft_wrap=True)
 
 
 def show_posterior(posterior: Posterior) -> None:

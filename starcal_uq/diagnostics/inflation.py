@@ -11,7 +11,7 @@ from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import join_words, significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.pattern import Response, response
-from starcal_uq.diagnostics.verdict.estimate import JACKKNIFE_P, JACKKNIFE_RATIO
+from starcal_uq.diagnostics.verdict.estimate import disagreeing
 from starcal_uq.propagation.attitude_error import CONTRIBUTORS, MisfitFound
 
 if TYPE_CHECKING:
@@ -122,7 +122,7 @@ def _frames(diagnosis: Diagnosis) -> tuple[float, tuple[str, ...]]:
     found = diagnosis.jackknife
     if found is None:
         return 1.0, ()
-    flagged = (found.p_values * len(found.p_values) < JACKKNIFE_P) & (found.ratio > JACKKNIFE_RATIO)
+    flagged = disagreeing(found)
     if not flagged.any():
         return 1.0, ()
     factor = float(found.ratio[flagged].max())

@@ -234,19 +234,12 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
 
 def _detectable(test: MisfitTest, level: float) -> float:
     """Root of the noncentrality at which an F test of this level has its power; NaN for a test for unequal noise."""
-    from scipy.special import fdtri, ncfdtr
+    from scipy.special import fdtri, ncfdtrinc
 
     if test.dof == 0:
         return float("nan")
     limit = fdtri(test.dof, test.dof_residual, 1.0 - level)
-    low, high = 0.0, 1.0
-    while ncfdtr(test.dof, test.dof_residual, high, limit) > 1.0 - POWER:
-        low, high = high, 2.0 * high
-    for _ in range(20):
-        middle = 0.5 * (low + high)
-        weak = ncfdtr(test.dof, test.dof_residual, middle, limit) > 1.0 - POWER
-        low, high = (middle, high) if weak else (low, middle)
-    return float(np.sqrt(high))
+    return float(np.sqrt(ncfdtrinc(test.dof, test.dof_residual, 1.0 - POWER, limit)))
 
 
 @dataclass

@@ -187,10 +187,9 @@ def _square(matrices: FloatArray, pattern: Pattern) -> tuple[FloatArray, FloatAr
     a, C = pattern.amplitudes, pattern.covariance
     noisy = matrices @ C
     value = np.einsum("j,ijk,k->i", a, matrices, a) - np.einsum("ijj->i", noisy)
-    variance = 4.0 * np.einsum("j,ijk,k->i", a, noisy @ matrices, a) - 2.0 * np.einsum("ijk,ikj->i", noisy, noisy)
+    linear, quadratic = np.einsum("j,ijk,k->i", a, noisy @ matrices, a), np.einsum("ijk,ikj->i", noisy, noisy)
     # At the estimate the first term counts the noise once too often; it can then not fall below the second.
-    floor = 2.0 * np.einsum("ijk,ikj->i", noisy, noisy)
-    return value, np.sqrt(np.maximum(variance, floor))
+    return value, np.sqrt(np.maximum(4.0 * linear - 2.0 * quadratic, 2.0 * quadratic))
 
 
 @dataclass(frozen=True)

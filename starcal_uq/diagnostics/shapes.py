@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -111,26 +111,21 @@ def shapes(
     seen = obs if seen is None else seen
     found = [*_missing_terms(camera), _axes(camera), _aberration()]
     clock, called = run_clock(obs)
-    warmth = None if obs.temperature_c is None else _standardised(obs.temperature_c, obs.temperature_c)
-    magnitude = None if obs.mag is None else _standardised(obs.mag, obs.mag)
+    like: Any = slice(None)
     if seen is not obs:
         rng = np.random.default_rng(0)
         frame = np.repeat(_drawn(rng, obs.n_frames, seen.n_frames), np.diff(seen.frame_starts))
         like = obs.frame_starts[frame]
         clock = None if clock is None else clock[like]
-        if warmth is not None:
-            warmth = (
-                warmth[like] if seen.temperature_c is None else _standardised(seen.temperature_c, obs.temperature_c)
-            )
-        if magnitude is not None:
-            own = seen.mag
-            magnitude = (
-                magnitude[_drawn(rng, obs.n_stars, seen.n_stars)] if own is None else _standardised(own, obs.mag)
-            )
+        star = _drawn(rng, obs.n_stars, seen.n_stars)
+    else:
+        star = like
+    warmth = _standardised(obs.temperature_c, seen.temperature_c, like)
+    magnitude = _standardised(obs.mag, seen.mag, star)
     if clock is not None:
         found.append(_drift(clock, called))
-    if warmth is not None:
-        spread = float(np.nanstd(obs.temperature_c)) if obs.temperature_c is not None else 1.0
+    if warmth is not None and obs.temperature_c is not None:
+        spread = float(np.nanstd(obs.temperature_c))
         found.append(_focal_against(warmth, "focal length with temperature", "temperature", ("df/dT", "px/K"), spread))
     found += [_radius(camera), _azimuth(camera), _phase(0), _phase(1)]
     if magnitude is not None:
@@ -181,13 +176,15 @@ def _drawn(rng: np.random.Generator, n: int, size: int) -> IntArray:
     return found
 
 
-def _standardised(values: FloatArray, like: FloatArray | None) -> FloatArray | None:
-    """By mean and spread of others, and within their range; zero where unknown; None where nothing varies."""
-    assert like is not None
-    spread = float(np.nanstd(like))
-    if not spread > _LEAST_SPREAD:
+def _standardised(table: FloatArray | None, seen: FloatArray | None, rows: Any) -> FloatArray | None:
+    """A quantity of the stars seen by mean and spread of the table's, and within its range; zero where unknown.
+
+    Where it is not stated, it is taken from these rows of the table. None where nothing varies.
+    """
+    if table is None or not (spread := float(np.nanstd(table))) > _LEAST_SPREAD:
         return None
-    z: FloatArray = np.nan_to_num((np.clip(values, np.nanmin(like), np.nanmax(like)) - np.nanmean(like)) / spread)
+    values = table[rows] if seen is None else np.clip(seen, np.nanmin(table), np.nanmax(table))
+    z: FloatArray = np.nan_to_num((values - np.nanmean(table)) / spread)
     return z
 
 

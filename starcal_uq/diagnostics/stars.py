@@ -25,7 +25,7 @@ from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import StarNormals
-from starcal_uq.estimation.star_errors import StarSums, star_numbers
+from starcal_uq.estimation.star_errors import StarSums, add_linearised, star_numbers
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.observations.table import Observations
 
-_STARS_AT_ONCE = 20_000
 _LEAST_DOF = 10
 _ABSORBED = 1e-10
 # More stars than this, and what the parameters absorb of them is too little to be worth a dense matrix.
@@ -192,16 +191,8 @@ def _likeness(obs: Observations, cal: Calibration, numbers: IntArray) -> _Likene
     rotations = quaternion_to_rotation(cal.quaternions)[present]
     stars = np.unique(numbers[used], return_inverse=True)[1]
     sums = StarSums(stars, frames.r, float(cal.theta[2]), rigid=True)
-    p = len(cal.theta)
-    gram = np.zeros((p + 1, p + 1))
-    for first, last in frames.parts(_STARS_AT_ONCE):
-        part = MarginalLikelihood(frames.part(first, last), cal.camera.distortion)
-        state, _ = part.profile(cal.theta, rotations[first:last])
-        h = part.derivatives(cal.theta, state) * cal.sigmas[:, None, None]
-        columns = part.project_out(state, np.concatenate([h, state.e[None]]))
-        flat = columns.reshape(p + 1, -1)
-        gram += flat @ flat.T
-        sums.add(part, state, columns, slice(int(frames.starts[first]), int(frames.starts[last])))
+    p, likelihood = len(cal.theta), MarginalLikelihood(frames, cal.camera.distortion)
+    gram = add_linearised(sums, likelihood, cal.theta, cal.sigmas, rotations)
     values, vectors = np.linalg.eigh(gram[:p, :p])
     kept = values > _ABSORBED * values.max()
     root = vectors[:, kept] / np.sqrt(values[kept])

@@ -170,6 +170,12 @@ class Calibration(Shown):
         return noise_model_of(self)
 
     @property
+    def fitted_noise(self) -> NoiseModel | None:
+        """The noise model where it found that the noise varies; otherwise stars have what they state, or one noise."""
+        model = self.noise_model
+        return model if model is not None and model.varies else None
+
+    @property
     def n_stars(self) -> int:
         """Number of stars."""
         return len(self.residuals_px) or self.compressed.n_stars

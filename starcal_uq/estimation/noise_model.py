@@ -294,7 +294,7 @@ class _Stars(NamedTuple):
     @classmethod
     def of(cls, obs: Observations, camera: Camera, squares: FloatArray, share: FloatArray) -> _Stars:
         x0, y0 = camera.theta[:2]
-        radius = np.hypot(obs.x_px - x0, obs.y_px - y0) / _corner_px(camera)
+        radius = np.hypot(obs.x_px - x0, obs.y_px - y0) / camera.half_diagonal_px
         mag = np.zeros(obs.n_stars) if obs.mag is None else np.nan_to_num(obs.mag - np.nanmean(obs.mag))
         return cls(squares, share, radius, mag, np.searchsorted(obs.frame_ids, obs.frame), obs.n_frames)
 
@@ -416,10 +416,6 @@ def _frames_cost(x: FloatArray, stars: _Stars, design: FloatArray, dof: FloatArr
     return -float(np.sum(value) - 0.5 * stars.share @ eta), -slope
 
 
-def _corner_px(camera: Camera) -> float:
-    return 0.5 * float(np.hypot(camera.width_px, camera.height_px))
-
-
 def _model(obs: Observations, camera: Camera, stars: _Stars, fit: _Fit) -> NoiseModel:
     known = np.zeros(1) if obs.mag is None else obs.mag[np.isfinite(obs.mag)]
     apart = fit.frame_dof is not None
@@ -430,7 +426,7 @@ def _model(obs: Observations, camera: Camera, stars: _Stars, fit: _Fit) -> Noise
         level_px=float(np.exp(0.5 * fit.beta[0])),
         multiplies=obs.sigma_px is not None,
         centre_px=np.array(camera.theta[:2]),
-        corner_px=_corner_px(camera),
+        corner_px=camera.half_diagonal_px,
         radius_range=np.array([stars.radius.min(), stars.radius.max()]),
         mag_range=np.array([known.min(), known.max()]),
         mag_reference=float(np.mean(known)),

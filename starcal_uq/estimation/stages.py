@@ -80,7 +80,7 @@ def constraints_for(camera: Camera, n_parameters: int) -> Constraints:
     upper[:3] = (camera.width_px - 1.0, camera.height_px - 1.0, 100.0 * camera.focal_px)
     if n_parameters < p:
         return Constraints(lower[:n_parameters], upper[:n_parameters])
-    radius = float(np.hypot(camera.width_px, camera.height_px)) / 2.0
+    radius = camera.half_diagonal_px
     return Constraints(lower, upper, lambda theta: monotonic_expression(camera.distortion, theta, radius))
 
 

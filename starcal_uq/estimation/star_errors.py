@@ -348,17 +348,8 @@ class StarModel:
         """
         from scipy.optimize import minimize_scalar
 
-        p, frames, sums = len(theta), likelihood.frames, self.sums()
-        gram = np.zeros((p + 1, p + 1))
-        rotations = likelihood.rotations_at(theta)
-        for first, last in frames.parts(_STARS_AT_ONCE):
-            part = MarginalLikelihood(frames.part(first, last), likelihood.model_name)
-            state, _ = part.profile(theta, rotations[first:last])
-            h = part.derivatives(theta, state) * scale[:, None, None]
-            columns = part.project_out(state, np.concatenate([h, state.e[None]]))
-            flat = columns.reshape(p + 1, -1)
-            gram += flat @ flat.T
-            sums.add(part, state, columns, slice(int(frames.starts[first]), int(frames.starts[last])))
+        p, sums = len(theta), self.sums()
+        gram = add_linearised(sums, likelihood, theta, scale, likelihood.rotations_at(theta))
         dof = likelihood.dof - p
 
         def restricted(log_ratio: float, noise: float) -> tuple[float, float]:
@@ -412,6 +403,23 @@ class StarModel:
             return low, min(float(np.log(6.0 * error)), high)
         # The noise of the images themselves is below that of all together: the ratio may be several times larger.
         return max(float(np.log(likeness)) - 2.0, low), high
+
+
+def add_linearised(
+    sums: StarSums, likelihood: MarginalLikelihood, theta: FloatArray, scale: FloatArray, rotations: FloatArray
+) -> FloatArray:
+    """Gram matrix (p + 1, p + 1) of parameters in units of `scale` (p,) and residuals; their sums by star are added."""
+    frames, p = likelihood.frames, len(theta)
+    gram = np.zeros((p + 1, p + 1))
+    for first, last in frames.parts(_STARS_AT_ONCE):
+        part = MarginalLikelihood(frames.part(first, last), likelihood.model_name)
+        state, _ = part.profile(theta, rotations[first:last])
+        h = part.derivatives(theta, state) * scale[:, None, None]
+        columns = part.project_out(state, np.concatenate([h, state.e[None]]))
+        flat = columns.reshape(p + 1, -1)
+        gram += flat @ flat.T
+        sums.add(part, state, columns, slice(int(frames.starts[first]), int(frames.starts[last])))
+    return gram
 
 
 class StarLikelihood(MarginalLikelihood):

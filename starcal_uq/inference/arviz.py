@@ -51,6 +51,20 @@ def _array_stats() -> Any:
     return importlib.import_module("arviz_stats.base").array_stats
 
 
+def _diagnostic(name: str, values: FloatArray, **options: Any) -> float:
+    if not is_legacy():
+        return float(getattr(_array_stats(), name)(values, **options))
+    az = _legacy()
+    # Where Numba is installed, 0.23 takes it unasked, compiles for seconds, and may return an array instead of
+    # a number.
+    switch = az.utils.Numba
+    on, switch.numba_flag = switch.numba_flag, False
+    try:
+        return float(getattr(az, name)(values, **options))
+    finally:
+        switch.numba_flag = on
+
+
 def to_arviz(groups: Mapping[str, xr.Dataset]) -> Any:
     """Wrap datasets (chain, draw), by their names in ArviZ's schema, in the container of the installed ArviZ."""
     if is_legacy():
@@ -62,25 +76,22 @@ def to_arviz(groups: Mapping[str, xr.Dataset]) -> Any:
 
 def rhat(values: FloatArray) -> float:
     """Rank-normalised split R-hat of draws (chain, draw)."""
-    return float(_legacy().rhat(values) if is_legacy() else _array_stats().rhat(values))
+    return _diagnostic("rhat", values)
 
 
 def ess_bulk(values: FloatArray) -> float:
     """Bulk effective sample size of draws (chain, draw)."""
-    stats = _legacy() if is_legacy() else _array_stats()
-    return float(stats.ess(values, method="bulk"))
+    return _diagnostic("ess", values, method="bulk")
 
 
 def ess_tail(values: FloatArray) -> float:
     """Tail effective sample size (5 % and 95 % quantiles) of draws (chain, draw)."""
-    stats = _legacy() if is_legacy() else _array_stats()
-    return float(stats.ess(values, method="tail", prob=_TAIL))
+    return _diagnostic("ess", values, method="tail", prob=_TAIL)
 
 
 def mcse_mean(values: FloatArray) -> float:
     """Monte Carlo standard error of the mean of draws (chain, draw)."""
-    stats = _legacy() if is_legacy() else _array_stats()
-    return float(stats.mcse(values, method="mean"))
+    return _diagnostic("mcse", values, method="mean")
 
 
 def psis(log_weights: FloatArray) -> tuple[FloatArray, FloatArray]:

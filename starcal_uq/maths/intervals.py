@@ -13,7 +13,7 @@ import numpy as np
 from starcal_uq.core.types import FloatArray
 
 # Standard deviations of a normal 95 % interval.
-HALF_WIDTH_95 = 1.959963984540054
+HALF_WIDTH_95, HALF_WIDTH_997 = 1.959963984540054, 2.9677379253417833
 
 
 def student_quantile(probability: float, dof: float) -> float:

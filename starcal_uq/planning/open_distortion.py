@@ -66,6 +66,11 @@ class DistortionRange:
     focal_px: FloatArray
     f_theta_percent: float
 
+    @property
+    def own_percent(self) -> float:
+        """Distortion of the plan itself: none, or the end of the range that is nearest to it."""
+        return float(np.clip(0.0, self.percent[0], self.percent[-1]))
+
     def frames_range(self, scope: str) -> tuple[float, float]:
         """Least and most frames that the target takes for a part of the error."""
         column = self.frames[:, self.scopes.index(scope)]
@@ -109,14 +114,14 @@ def open_range(camera: Camera, given: tuple[float, float] | None, calibrated: bo
 
 def f_theta_percent(camera: Camera) -> float:
     """Displacement of the corner in an f-theta lens, to third order, per cent of its distance from the centre."""
-    return 100.0 * F_THETA * (_corner_px(camera) / camera.focal_px) ** 2
+    return 100.0 * F_THETA * (camera.half_diagonal_px / camera.focal_px) ** 2
 
 
 def with_distortion(camera: Camera, percent: float) -> Camera:
     """The camera with a first coefficient that displaces the corner by so much, the others zero."""
     model = get_model(camera.distortion)
     sign = 1.0 if model.direction == "forward" else -1.0
-    coefficient = sign * 0.01 * percent / _corner_px(camera) ** 2
+    coefficient = sign * 0.01 * percent / camera.half_diagonal_px**2
     return camera.replace(coefficients=(coefficient, *(0.0 for _ in camera.coefficients[1:])))
 
 
@@ -185,7 +190,3 @@ def distortion_range(
 
 def _forecaster(seen: FrameSet, scope: str, options: dict[str, Any]) -> Forecaster:
     return Forecaster(seen.information, seen.mean_stars, seen, scope=scope, **options)
-
-
-def _corner_px(camera: Camera) -> float:
-    return 0.5 * float(np.hypot(camera.width_px, camera.height_px))

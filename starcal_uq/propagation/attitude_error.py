@@ -23,6 +23,7 @@ from starcal_uq.core.formatting import significant
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.maths.circular import mixture_radius
+from starcal_uq.maths.intervals import HALF_WIDTH_95, HALF_WIDTH_997
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -51,7 +52,7 @@ IF_MODEL_HOLDS, WITH_MISFIT_FOUND = "if the model holds", "with the misfit found
 NOT_ASSESSED = "not assessed"
 # Confidences of the half-widths, and the two-sided quantiles of a Gaussian error.
 _CONFIDENCES = (0.95, 0.997)
-_GAUSSIAN = (1.959963984540054, 2.9677379253417833)
+_GAUSSIAN = (HALF_WIDTH_95, HALF_WIDTH_997)
 
 
 @dataclass(frozen=True, eq=False)

@@ -432,14 +432,16 @@ class Run:
                 f"{self.path}: holds no observations, so that there are no frames to propagate to: calibrate a table "
                 "that fits into memory with `starcal-uq calibrate`."
             )
+        from starcal_uq.propagation import attitude_error
+        from starcal_uq.propagation.alignment import OBSERVED, RANDOM
         from starcal_uq.propagation.field import field_map
         from starcal_uq.propagation.propagate import propagate
 
         frames = self.observations if sky is None else sky.frames(posterior, self.observations, seed)
         aligning: Observations | str = str(alignment)
-        if aligning == "observed":
-            aligning = self.observations.with_meta(frames="observed frames")
-        elif aligning != "random":
+        if aligning == OBSERVED:
+            aligning = self.observations.with_meta(frames=attitude_error.OBSERVED)
+        elif aligning != RANDOM:
             aligning = load_observations(alignment).with_meta(frames=str(alignment))
         error = propagate(
             posterior, frames, n_draws=n_draws, seed=seed, alignment=aligning, alignment_frames=alignment_frames

@@ -1,6 +1,6 @@
 """Many calibration campaigns of one sensor with known true attitudes, and what attitude errors they make.
 
-Run as ``python -m tests.attitude_campaigns`` for the table of the documentation.
+Run as ``python -m tests.helpers.attitude_campaigns`` for the table of the documentation.
 
 Every campaign has its own noise on the same stars. The camera that it would estimate is the linear, efficient one,
 theta = truth + G e with G = (M^T M)^-1 M^T and M the derivatives of the pixels after each frame's attitude has been

@@ -9,6 +9,7 @@ import numpy as np
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.formatting import fixed, join_words, plural, significant
 from starcal_uq.core.status import Check, Level, Question, Status, pass_or_fail, pass_or_warn
+from starcal_uq.core.types import BoolArray
 from starcal_uq.diagnostics.misfit import ALPHA
 from starcal_uq.diagnostics.verdict.observed import CALIBRATE, SCREEN
 from starcal_uq.maths.intervals import student_quantile
@@ -189,14 +190,17 @@ def sensitivity(diagnosis: Diagnosis) -> str:
     return f"What {data} let these checks see nine times in ten: {join_words(seen)}; less may be there."
 
 
+def disagreeing(found: Jackknife) -> BoolArray:
+    """Parameters (p,) in which frames scatter by more than chance and by enough to matter."""
+    return np.asarray((found.p_values * len(found.p_values) < JACKKNIFE_P) & (found.ratio > JACKKNIFE_RATIO))
+
+
 def jackknife(found: Jackknife) -> Check:
     """Do frames scatter as their formal errors say?"""
-    p_values = np.minimum(found.p_values * len(found.p_values), 1.0)
-    worst = int(np.argmax(found.ratio))
-    bad = (p_values < JACKKNIFE_P) & (found.ratio > JACKKNIFE_RATIO)
+    worst, bad = int(np.argmax(found.ratio)), disagreeing(found)
     low, high = float(found.ratio.min()), float(found.ratio.max())
     value = f"ratios {fixed(low, 2)} to {fixed(high, 2)} ({found.parameter_names[worst]})"
-    chance = found.expected(1.0 - 2.0 * JACKKNIFE_P / len(p_values))[1]
+    chance = found.expected(1.0 - 2.0 * JACKKNIFE_P / len(bad))[1]
     bound = f"≤ {fixed(max(float(chance[worst]), JACKKNIFE_RATIO), 2)}"
     if np.any(bad):
         names = [name for name, flag in zip(found.parameter_names, bad, strict=True) if flag]

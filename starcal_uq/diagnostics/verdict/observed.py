@@ -64,7 +64,7 @@ def aberration_words(cal: Calibration) -> str:
 
 def aberration_size(camera: Camera) -> str:
     """What annual aberration can do to a camera of this field, as the end of a sentence."""
-    diagonal_rad = 2.0 * np.arctan(np.hypot(camera.width_px, camera.height_px) / 2.0 / camera.focal_px)
+    diagonal_rad = 2.0 * np.arctan(camera.half_diagonal_px / camera.focal_px)
     angle = fixed(ABERRATION_RAD * diagonal_rad * ARCSEC, 1)
     return (
         f"changes angles by up to {angle} arcsec from corner to corner of this field and can move f by up to "
@@ -118,7 +118,7 @@ def noise(cal: Calibration) -> Check:
     """Is the estimated noise that of star centroids?"""
     scaled = cal.sigma_name == "sigma_scale"
     low, high = PLAUSIBLE_SCALE if scaled else PLAUSIBLE_NOISE_PX
-    fitted = cal.noise_model if scaled and cal.noise_model is not None and cal.noise_model.varies else None
+    fitted = cal.fitted_noise if scaled else None
     good = low <= cal.sigma <= high
     if fitted is not None and not fitted.multiplies:
         good = PLAUSIBLE_NOISE_PX[0] <= cal.sigma * fitted.level_px <= PLAUSIBLE_NOISE_PX[1]

@@ -47,7 +47,7 @@ class StartPrior:
 def prior_of(camera: Camera, options: RecursionOptions, per_star: bool) -> StartPrior:
     """Diffuse start for a camera; `per_star` where the stars state their own noise."""
     orders = [coefficient.order for coefficient in get_model(camera.distortion).coefficients]
-    radius = float(np.hypot(camera.width_px, camera.height_px)) / 2.0
+    radius = camera.half_diagonal_px
     point, bent = _PRINCIPAL_POINT_WIDTHS * camera.width_px, _DISTORTION_WIDTHS * camera.width_px
     deviation = np.array([point, point, _FOCAL_FRACTION * camera.focal_px, *(bent for _ in orders)])
     stated = _REFERENCE_PX if options.sigma_px is None else options.sigma_px

@@ -220,7 +220,7 @@ def _distortion_panel(ax: Axes, plan: Plan, of_frames: bool) -> None:
         markersize=6,
         transform=ax.get_xaxis_transform(),
     )
-    own = int(np.argmin(np.abs(found.percent)))
+    own = int(np.argmin(np.abs(found.percent - found.own_percent)))
     if good[own]:
         ax.plot(found.percent[own], y[own], marker="D", color=style.VERMILLION, markersize=7, linestyle="")
     style.label(ax, "", "distortion at the corner [%]")

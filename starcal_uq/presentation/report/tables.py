@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from starcal_uq.propagation.coupling import Coupling
 
 Row = dict[str, Any]
-# Two-sided 95 % quantile of the normal distribution.
 
 
 def all_parameters(results: Results) -> tuple[Parameter, ...]:
@@ -257,8 +256,7 @@ def pair_table(cal: Calibration) -> TextTable:
 
 def noise_table(cal: Calibration) -> TextTable | None:
     """The fitted noise model, term by term; None where there is none."""
-    model = cal.noise_model
-    if model is None or not model.varies:
+    if (model := cal.fitted_noise) is None:
         return None
     rows = [
         (term.replace("^2", "²"), f"{with_sigma(float(value), float(error))} ± {significant(float(error))}")

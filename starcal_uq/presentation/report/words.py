@@ -11,6 +11,7 @@ import numpy as np
 from starcal_uq.core.formatting import count, fixed, percent, plural, significant
 from starcal_uq.diagnostics.verdict.draws import propagation_difference
 from starcal_uq.diagnostics.verdict.observed import air, conditional_words, corrected_words
+from starcal_uq.presentation.words.estimation import noise_kind
 from starcal_uq.presentation.words.propagation import equivalent_shift
 
 if TYPE_CHECKING:
@@ -65,8 +66,8 @@ def _air_words(results: Results) -> str:
 
 def _noise_words(results: Results) -> str:
     cal, post = results.calibration, results.posterior
-    if cal.noise_model is not None and cal.noise_model.varies:
-        return f"fitted: {cal.noise_model}; the data ask for {significant(cal.sigma, 3)} times that"
+    if cal.fitted_noise is not None:
+        return f"fitted: {cal.fitted_noise}; the data ask for {significant(cal.sigma, 3)} times that"
     if cal.sigma_name == "sigma_scale":
         floor = results.observations.meta.get("noise_floor_px")
         more = (
@@ -85,9 +86,7 @@ def sigma_sentence(results: Results) -> str:
     post = results.posterior
     kind = "px per axis, the same for all stars"
     if results.calibration.sigma_name == "sigma_scale":
-        kind = "a common factor on the noise that each star states"
-        if results.calibration.noise_model is not None:
-            kind = "a common factor on the noise that was fitted to each star"
+        kind = f"a common factor on the {noise_kind(results.calibration)} noise of each star"
     if post is None:
         return f"The noise σ ({kind}) is estimated from the residuals and their degrees of freedom."
     if post.sigma_sampled:

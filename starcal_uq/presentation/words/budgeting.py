@@ -89,6 +89,8 @@ def _contributor_row(name: str, axes: dict[str, Contributor]) -> Row:
     first = next(iter(axes.values()))
     every = stated or [first]
 
+    figures = _figures(axes)
+
     def listed(values: list[str]) -> str:
         return " / ".join(dict.fromkeys(value for value in values if value))
 
@@ -96,8 +98,8 @@ def _contributor_row(name: str, axes: dict[str, Contributor]) -> Row:
         "name": name,
         "ecss_class": listed([row.ecss_class for row in every]),
         "sigma": [_sigma(axes.get(axis)) for axis in AXES],
-        "figures": _figures(axes),
-        "figures_text": "; ".join(f"{name}: {', '.join(values)} arcsec" for name, values in _figures(axes)),
+        "figures": figures,
+        "figures_text": "; ".join(f"{name}: {', '.join(values)} arcsec" for name, values in figures),
         "mean": _means(axes),
         "missing": [axis in axes and not axes[axis].assessed for axis in AXES],
         "distribution": " / ".join(

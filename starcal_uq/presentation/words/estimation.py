@@ -24,15 +24,19 @@ def focal_length(cal: Calibration) -> str:
 
 def noise_kind(cal: Calibration) -> str:
     """Which noise of each star a common factor multiplies."""
-    return "stated" if cal.noise_model is None else "fitted"
+    return "stated" if cal.fitted_noise is None else "fitted"
+
+
+def fitted_noise_text(cal: Calibration) -> str:
+    """How the noise varies, where that was asked for."""
+    return "" if cal.noise_model is None else f" Fitted noise: {cal.noise_model}."
 
 
 def calibration_text(cal: Calibration) -> str:
     """What was calibrated, how it ended, the focal length, and how the noise varies where that was fitted."""
-    noise = "" if cal.noise_model is None else f" Fitted noise: {cal.noise_model}."
     return (
         f"{plural(cal.n_stars, 'star')} in {plural(cal.n_frames, 'frame')}, {cal.method} ({cal.solver}): "
-        f"{cal.status.name.lower().replace('_', ' ')}; focal length {focal_length(cal)}.{noise}"
+        f"{cal.status.name.lower().replace('_', ' ')}; focal length {focal_length(cal)}.{fitted_noise_text(cal)}"
     )
 
 

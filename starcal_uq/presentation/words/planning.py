@@ -60,7 +60,7 @@ def _range(plan: Plan) -> str:
     """The range of frames over the distortion that the sheet leaves open."""
     if plan.distortion is None or plan.frames_range is None:
         return ""
-    words, percent = range_words(*plan.frames_range), _own_percent(plan)
+    words, percent = range_words(*plan.frames_range), plan.distortion.own_percent
     own = "without distortion" if percent == 0.0 else f"at {corner(percent)}"
     return (
         f" That is {own}; over the distortion that the sheet leaves open "
@@ -86,11 +86,6 @@ def span(found: DistortionRange) -> str:
     """The range of the displacement of the corner."""
     low, high = (f"{significant(float(p))} %" for p in (found.percent[0], found.percent[-1]))
     return f"{low} to {high}".replace("-", MINUS)
-
-
-def _own_percent(plan: Plan) -> float:
-    assert plan.distortion is not None
-    return float(np.clip(0.0, plan.distortion.percent[0], plan.distortion.percent[-1]))
 
 
 def distortion_sentence(plan: Plan) -> str:
