@@ -52,17 +52,7 @@ def _array_stats() -> Any:
 
 
 def _diagnostic(name: str, values: FloatArray, **options: Any) -> float:
-    if not is_legacy():
-        return float(getattr(_array_stats(), name)(values, **options))
-    az = _legacy()
-    # Where Numba is installed, 0.23 takes it unasked, compiles for seconds, and may return an array instead of
-    # a number.
-    switch = az.utils.Numba
-    on, switch.numba_flag = switch.numba_flag, False
-    try:
-        return float(getattr(az, name)(values, **options))
-    finally:
-        switch.numba_flag = on
+    return float(getattr(_legacy() if is_legacy() else _array_stats(), name)(values, **options))
 
 
 def to_arviz(groups: Mapping[str, xr.Dataset]) -> Any:
