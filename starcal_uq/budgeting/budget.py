@@ -16,9 +16,7 @@ from starcal_uq.budgeting.posterior import alignment_rows, misfit_notes, posteri
 from starcal_uq.budgeting.result import Budget, by_contributor, judge
 from starcal_uq.budgeting.rows import (
     AXIS_LABELS,
-    COMMON,
     FROM_FILE,
-    REST,
     UNTESTED,
     Contributor,
     Expected,
@@ -93,8 +91,7 @@ def budget(
 
         attitude = with_misfit(attitude, misfit, post, obs)
     untested = () if attitude.misfit is not None else (UNTESTED,)
-    known = (_seen(row, attitude) for row in posterior_rows(attitude, post))
-    rows = (*known, *_from_file(stated, (*untested, *FROM_FILE), alignment_rows(attitude)))
+    rows = (*posterior_rows(attitude, post), *_from_file(stated, (*untested, *FROM_FILE), alignment_rows(attitude)))
     found, samples = totals(rows, chosen, n_samples=n_samples, seed=seed)
     settings: AnyDict = {
         "confidence": chosen,
@@ -117,16 +114,6 @@ def budget(
         ),
         provenance=provenance(seed, settings, post.provenance.get("data_sha256")),
     )
-
-
-def _seen(row: Contributor, attitude: AttitudeError) -> Contributor:
-    """A row of the posterior with what depends on the frames of alignment and mission."""
-    if row.name == COMMON:
-        return replace(row, conditions=f"{row.conditions}; alignment on {attitude.alignment}")
-    if row.name == REST and attitude.stays[AXES.index(row.axis)]:
-        # Frames that all see the same field: a bias that no moment changes.
-        return replace(row, interpretation="ensemble")
-    return row
 
 
 def _from_file(

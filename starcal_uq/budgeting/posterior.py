@@ -51,6 +51,7 @@ def posterior_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributo
         factor = found.factor if found is not None and entry.name in reasons else 1.0
         scale = np.divide(factor * held[:3], counted[:3], out=np.zeros(3), where=counted[:3] > 0.0)
         correlation = axis_correlations(attitude.covariance_arcsec2[place], scale)
+        alignment = f"; alignment on {attitude.alignment}" if entry.name == COMMON else ""
         for index, axis in enumerate(AXES):
             # What the misfit adds has no frame-by-frame sigma: the excess of the tail shrinks with its share.
             share = (factor * held[index] / counted[index]) ** 2 if counted[index] > 0.0 else 1.0
@@ -64,11 +65,12 @@ def posterior_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributo
                     mean_arcsec=0.0,
                     sigma_arcsec=float(counted[index]),
                     distribution=entry.distribution,
-                    interpretation=entry.interpretation,
+                    # Frames that all see the same field: a bias that no moment changes.
+                    interpretation="ensemble" if entry.name == REST and attitude.stays[index] else entry.interpretation,
                     absorbed_by_alignment=entry.absorbed_by_alignment,
                     axis_correlation=correlation[index],
                     tail_997=GAUSSIAN_997 + float(share) * excess,
-                    conditions=conditions + (f"; inflated: {why}" if why else ""),
+                    conditions=conditions + (f"; inflated: {why}" if why else "") + alignment,
                     provenance=provenance,
                     source="posterior",
                     if_model_holds_arcsec=float(held[index]),

@@ -26,7 +26,7 @@ from starcal_uq.core.files import (
 )
 from starcal_uq.core.tasks import Progress
 from starcal_uq.estimation.calibration import Calibration
-from starcal_uq.estimation.noise_model import noise_model_of, weighed
+from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.presentation.report.results import Missing, Results
 from starcal_uq.runs.folder import DERIVED, DIAGNOSIS_TABLES, RESULTS, RunFolder
@@ -87,11 +87,7 @@ class MissionSky:
 
         stars = load_catalogue(max_mag=self.max_mag, epoch=self.epoch)
         camera = posterior.camera.with_theta(posterior.mean)
-        like = obs.unweighted if posterior.sigma_name == sigma_parameter(True).name else None
-        model = noise_model_of(posterior)
-        if model is not None and not model.multiplies:
-            # The model itself says what each star's noise is, when the frames are propagated to.
-            like = None
+        like = obs if posterior.sigma_name == sigma_parameter(True).name else None
         if self.profile is None:
             return mission_frames(
                 stars, camera, n_frames=self.n_frames, min_stars=self.min_stars or 5, seed=seed, noise_like=like
