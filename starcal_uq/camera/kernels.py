@@ -135,6 +135,10 @@ class Kernel:
             )
         return tuple(output.reshape(*shape, n) for output, shape in zip(outputs, self.shapes, strict=True))
 
+    def into(self, inputs: Sequence[FloatArray], outputs: Sequence[FloatArray]) -> None:
+        """Evaluate stars whose arrays fit into the cache, into arrays (elements, n) that the caller keeps."""
+        self.run([value.tolist() if value.ndim == 1 else value for value in inputs], outputs)
+
 
 def build_kernel(name: str, inputs: Sequence[Any], outputs: Sequence[Any], shapes: Sequence[tuple[int, ...]]) -> Kernel:
     """Build a kernel from CasADi expressions.

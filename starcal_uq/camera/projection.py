@@ -112,6 +112,21 @@ def second_index(n: int) -> tuple[IntArray, IntArray]:
     return rows.astype(np.int64), columns.astype(np.int64)
 
 
+@lru_cache(maxsize=32)
+def bent_index(model_name: str) -> tuple[IntArray, IntArray]:
+    """Rows and columns (row <= column) of the second derivatives over (theta, phi) that are not zero everywhere."""
+    import casadi as ca
+
+    s = _symbols(model_name)
+    variables = ca.vertcat(s.theta, s.phi)
+    xy = forward_expression(model_name, s, newton_steps=2)
+    patterns = [ca.hessian(xy[axis], variables)[0].sparsity() for axis in range(2)]
+    n = variables.numel()
+    there = [(i, j) for i in range(n) for j in range(i, n) if any(pattern.has_nz(i, j) for pattern in patterns)]
+    rows, columns = np.array(there, dtype=np.int64).T
+    return rows, columns
+
+
 @lru_cache(maxsize=64)
 def forward_kernel(model_name: str, order: str) -> Kernel:
     """Kernel of the forward model at phi = 0.
@@ -120,28 +135,30 @@ def forward_kernel(model_name: str, order: str) -> Kernel:
     ----------
     model_name : str
         Registry name.
-    order : {"value", "attitude", "first", "second"}
+    order : {"value", "attitude", "first", "second", "bent"}
         Outputs: value (2,); with ``attitude`` also d/dphi (3, 2); with ``first`` also d/dtheta (p, 2) before it; with
-        ``second`` also the unique second derivatives over (theta, phi), ((p + 3)(p + 4) / 2, 2).
+        ``second`` also the unique second derivatives over (theta, phi), ((p + 3)(p + 4) / 2, 2); with ``bent`` only
+        those of `bent_index`.
     """
     import casadi as ca
 
     s = _symbols(model_name)
     p = s.theta.numel()
-    xy = forward_expression(model_name, s, newton_steps=2 if order == "second" else 1)
+    with_second = order in ("second", "bent")
+    xy = forward_expression(model_name, s, newton_steps=2 if with_second else 1)
     outputs: list[Any] = [xy]
     shapes: list[tuple[int, ...]] = [(2,)]
-    if order in ("first", "second"):
+    if order == "first" or with_second:
         # casadi.vec is column-major, so the Jacobian (2, p) becomes rows of (p, 2).
         outputs.append(ca.jacobian(xy, s.theta))
         shapes.append((p, 2))
     if order != "value":
         outputs.append(ca.jacobian(xy, s.phi))
         shapes.append((3, 2))
-    if order == "second":
+    if with_second:
         variables = ca.vertcat(s.theta, s.phi)
         hessians = [ca.hessian(xy[axis], variables)[0] for axis in range(2)]
-        rows, columns = second_index(p + 3)
+        rows, columns = second_index(p + 3) if order == "second" else bent_index(model_name)
         entries = [hessians[axis][int(i), int(j)] for i, j in zip(rows, columns, strict=True) for axis in range(2)]
         outputs.append(ca.vertcat(*entries))
         shapes.append((len(rows), 2))

@@ -70,14 +70,14 @@ def assemble(
     dof = likelihood.dof - p
     sigma = float(np.sqrt(normal.cost / dof))
     efficient = scaled_inverse(normal.matrix) * sigma**2
-    compressed = compress(likelihood, theta, efficient, likelihood.rotations_at(theta))
+    compressed = compress(likelihood, theta, efficient, likelihood.rotations)
     if refined:
         # The rotation-volume term of the likelihood moves its maximum by about 0.01 sigma: one Newton step.
         theta = theta - 0.5 * compressed.whitening @ compressed.log_determinant_slope
-    state, cost = likelihood.profile(theta, likelihood.rotations_at(theta))
-    response = likelihood.attitude_response(state, likelihood.derivatives(theta, state))
+    e = np.empty((2, likelihood.frames.n_stars))
+    sums, attitudes = likelihood.sums(theta, e)
     camera = nominal.with_theta(theta)
-    residuals = likelihood.frames.in_pixels(state.e).T
+    residuals = likelihood.frames.in_pixels(e).T
     record: dict[str, Any] = {"method": method, "solver": solver, "distortion": nominal.distortion}
     return Calibration(
         camera=camera,
@@ -92,13 +92,13 @@ def assemble(
         stages=tuple(stages),
         status=check_camera(camera, status),
         frame_ids=obs.frame_ids,
-        quaternions=rotation_to_quaternion(state.rotations),
+        quaternions=rotation_to_quaternion(attitudes.rotations),
         residuals_px=residuals,
-        chi2=cost,
+        chi2=sums.normal.cost,
         dof=dof,
         information=normal.matrix / sigma**2,
-        rotation_per_theta=-np.mean(response, axis=2).T,
-        attitude_noise=np.mean(state.inverse, axis=2) * sigma**2,
+        rotation_per_theta=np.mean(attitudes.response, axis=2),
+        attitude_noise=np.mean(attitudes.inverse, axis=2) * sigma**2,
         pair_theta=pair_theta,
         pair_covariance=pair_covariance,
         compressed=compressed,
@@ -175,7 +175,7 @@ def with_star_errors(obs: Observations, cal: Calibration) -> Calibration:
 
 def noise_px(likelihood: MarginalLikelihood, theta: FloatArray) -> float:
     """Root mean square of the residuals per axis, px; infinite when the model is not finite."""
-    state, cost = likelihood.profile(theta)
+    state, cost = likelihood.profile(theta, likelihood.rotations)
     if not np.isfinite(cost):
         return float("inf")
     return float(np.sqrt(np.mean(likelihood.frames.in_pixels(state.e) ** 2)))

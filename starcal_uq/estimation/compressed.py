@@ -15,14 +15,19 @@ from functools import cache, cached_property
 
 import numpy as np
 
-from starcal_uq.camera.projection import forward_kernel, forward_root, second_index
+from starcal_uq.attitude.rotations import exp_rotation
+from starcal_uq.camera.projection import bent_index, forward_kernel, forward_root
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.marginal import MarginalLikelihood, Profile
+from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.star_errors import StarSums
-from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
+from starcal_uq.estimation.sums import ATTITUDE_STEPS, ATTITUDE_TOLERANCE_RAD
+from starcal_uq.maths.linear import COLUMNS, ROWS, inverse_symmetric, scaled_cholesky, symmetric_inverse
+from starcal_uq.observations.frames import StarFrames
 
+# Stars whose columns stay in the second-level cache.
+_BLOCK_STARS = 2048
 _pairs = cache(np.triu_indices)
 
 
@@ -102,42 +107,194 @@ class CompressedLikelihood:
 
 
 @dataclass(frozen=True)
-class _Columns:
-    """Whitened-parameter derivatives of the residuals of some frames, attitudes projected out."""
+class GramSums:
+    """What a part of the frames adds to a compressed likelihood around a given point; they add up.
+
+    Attributes
+    ----------
+    gram : (q, q) array
+        As in `CompressedLikelihood`.
+    log_determinant : float
+        ``sum_k log |A_k^T A_k|``.
+    log_determinant_slope : (p,) array
+        Its derivative with respect to z.
+    n_stars, n_frames : int
+        What was summed.
+    """
+
+    gram: FloatArray
+    log_determinant: float
+    log_determinant_slope: FloatArray
+    n_stars: int
+    n_frames: int
+
+    def __add__(self, other: GramSums) -> GramSums:
+        return GramSums(
+            self.gram + other.gram,
+            self.log_determinant + other.log_determinant,
+            self.log_determinant_slope + other.log_determinant_slope,
+            self.n_stars + other.n_stars,
+            self.n_frames + other.n_frames,
+        )
+
+    def likelihood(self, theta_hat: FloatArray, whitening: FloatArray) -> CompressedLikelihood:
+        """The compressed likelihood of all that was summed around theta_hat (p,) with the whitening (p, p)."""
+        return CompressedLikelihood(
+            theta_hat=np.array(theta_hat),
+            whitening=whitening,
+            gram=0.5 * (self.gram + self.gram.T),
+            log_determinant=self.log_determinant,
+            log_determinant_slope=self.log_determinant_slope,
+            dof=2 * self.n_stars - 3 * self.n_frames,
+            n_stars=self.n_stars,
+            n_frames=self.n_frames,
+        )
+
+
+class _Expansion:
+    """The residuals of frames expanded around one point, block by block.
+
+    Second derivatives Q over (theta, phi) are contracted with the directions (L z, phi(z)), in which the attitudes
+    phi(z) = K z follow the parameters; most entries of Q that belong to theta alone vanish and are not formed.
+    """
+
+    def __init__(self, model_name: str, theta: FloatArray, whitening: FloatArray) -> None:
+        self.model_name, self.theta, self.whitening = model_name, theta, whitening
+        p = self.p = len(theta)
+        self.q = (p + 1) * (p + 2) // 2
+        self._kernel = forward_kernel(model_name, "bent")
+        rows, columns = bent_index(model_name)
+        own, mixed, turned = columns < p, (rows < p) & (columns >= p), rows >= p
+        self._own, self._mixed = np.flatnonzero(own), np.flatnonzero(mixed)
+        self._turned = {(int(rows[n]) - p, int(columns[n]) - p): int(n) for n in np.flatnonzero(turned)}
+        i, j = np.triu_indices(p)
+        # A diagonal entry of z z^T stands once in the expansion, halved; the others stand for both orders.
+        self._halved = np.where(i == j, 0.5, 1.0)
+        r, c = rows[own], columns[own]
+        both = whitening[r][:, i] * whitening[c][:, j] + np.where(r == c, 0.0, 1.0)[:, None] * (
+            whitening[c][:, i] * whitening[r][:, j]
+        )
+        self._to_square = (both * self._halved).T
+        # From the entries (theta_t, phi_c) to (z_a, phi_c), rows a, c.
+        self._to_mixed = np.zeros((p, 3, len(self._mixed)))
+        for n, entry in enumerate(self._mixed):
+            self._to_mixed[:, columns[entry] - p, n] = whitening[rows[entry]]
+
+    def block(self, part: StarFrames, rotations: FloatArray) -> _Block:
+        """Columns and sums of frames that fit into the cache."""
+        p, n = self.p, part.n_stars
+        xy, h, a = np.empty((2, n)), np.empty((p, 2, n)), np.empty((3, 2, n))
+        bent = np.empty((self._kernel.shapes[3][0], 2, n))
+        for _ in range(ATTITUDE_STEPS):
+            b = part.rotated(rotations)
+            outputs = (xy, h.reshape(-1, n), a.reshape(-1, n), bent.reshape(-1, n))
+            self._kernel.into((self.theta, b, forward_root(self.model_name, self.theta, b)), outputs)
+            e = part.pixel - xy
+            if part.weight is not None:
+                for array in (e, h, a, bent):
+                    array *= part.weight
+            d = (self.whitening.T @ h.reshape(p, -1)).reshape(p, 2, n)
+            packed = np.stack([np.sum(a[i] * a[j], axis=0) for i, j in zip(ROWS, COLUMNS, strict=True)])
+            inverse, determinant = inverse_symmetric(part.sum(packed))
+            slopes = np.stack([part.sum(np.sum(column * d, axis=1)) for column in a])
+            slope = part.sum(np.sum(a * e, axis=1))
+            shift = np.einsum("ijk,jk->ik", inverse, slope)
+            if not np.max(np.abs(shift)) >= ATTITUDE_TOLERANCE_RAD:
+                break
+            rotations = exp_rotation(shift.T) @ rotations
+        path = part.spread(-np.einsum("ijk,jak->iak", inverse, slopes))
+        columns = np.empty((self.q, 2, n))
+        columns[0] = e - np.sum(part.spread(shift)[:, None] * a, axis=0)
+        first, second = columns[1 : p + 1], columns[p + 1 :]
+        np.copyto(first, d)
+        for c in range(3):
+            first += path[c][:, None] * a[c]
+        np.negative(first, out=first)
+        bend = self._curves(bent, path, second)
+        pseudo = np.einsum("ijn,jxn->ixn", part.spread(inverse), a)
+        log_slope = 2.0 * (bend.reshape(p, -1) @ pseudo.ravel())
+        return _Block(columns, a, inverse, float(np.sum(np.log(determinant))), log_slope, rotations)
+
+    def _curves(self, bent: FloatArray, path: FloatArray, second: FloatArray) -> FloatArray:
+        """Second derivatives along z into `second`; the derivatives (p, 3, 2, n) of the attitude columns come back."""
+        p, n = self.p, bent.shape[2]
+        flat = bent.reshape(len(bent), -1)
+        bend = (self._to_mixed.reshape(3 * p, -1) @ flat[self._mixed]).reshape(p, 3, 2, n)
+        turned = np.zeros((p, 3, 2, n))
+        for (c, d), entry in self._turned.items():
+            turned[:, c] += path[d][:, None] * bent[entry]
+            if c != d:
+                turned[:, d] += path[c][:, None] * bent[entry]
+        half = bend + 0.5 * turned
+        np.matmul(self._to_square, flat[self._own], out=second.reshape(len(second), -1))
+        start = 0
+        for i in range(p):
+            rows = second[start : start + p - i]
+            for c in range(3):
+                rows[0] += half[i, c] * path[c, i]
+                rows[1:] += half[i, c] * path[c, i + 1 :, None]
+                rows[1:] += half[i + 1 :, c] * path[c, i]
+            start += p - i
+        np.negative(second, out=second)
+        bend += turned
+        return bend
+
+
+@dataclass(frozen=True)
+class _Block:
+    """One block of an expansion.
+
+    `columns` (q, 2, n) are derivatives of the residuals along the attitudes' first-order path: value and first
+    derivatives are free of what attitudes can reproduce, second derivatives are not.
+    """
 
     columns: FloatArray
+    attitude: FloatArray
+    inverse: FloatArray
+    log_determinant: float
     log_determinant_slope: FloatArray
+    rotations: FloatArray
+
+    def gram(self, part: StarFrames, p: int) -> FloatArray:
+        """Products (q, q) of the columns with the attitudes projected out."""
+        flat = self.columns.reshape(len(self.columns), -1)
+        gram = flat @ flat.T
+        second = self.columns[p + 1 :]
+        slopes = np.stack([part.sum(np.sum(column * second, axis=1)) for column in self.attitude])
+        solved = np.einsum("ijk,jqk->iqk", self.inverse, slopes)
+        gram[p + 1 :, p + 1 :] -= np.tensordot(slopes, solved, axes=([0, 2], [0, 2]))
+        return np.asarray(gram)
 
 
-def _columns(part: MarginalLikelihood, state: Profile, theta: FloatArray, whitening: FloatArray) -> _Columns:
-    frames, p = part.frames, len(theta)
-    _, d_theta, d_phi, second = forward_kernel(part.model_name, "second")(
-        frames.n_stars, theta, state.b, forward_root(part.model_name, theta, state.b)
-    )
-    rows, columns = second_index(p + 3)
-    full = np.empty((p + 3, p + 3, 2, frames.n_stars))
-    full[rows, columns] = second
-    full[columns, rows] = second
-    if frames.weight is not None:
-        d_theta, d_phi, full = d_theta * frames.weight, d_phi * frames.weight, full * frames.weight
-    d_z = np.tensordot(whitening, d_theta, axes=([0], [0]))
-    # First-order path of the best attitude: phi(z) = K z.
-    path = -frames.spread(part.attitude_response(state, d_z))
-    # Mixed derivatives of the attitude columns along z: Q_(theta phi) L + Q_(phi phi) K.
-    q_z_phi = np.tensordot(whitening, full[:p, p:], axes=([0], [0]))
-    phi_part = np.einsum("bcxn,abn->acxn", full[p:, p:], path, optimize=True)
-    d_attitude = q_z_phi + phi_part
-    q_zz = np.tensordot(whitening, np.tensordot(whitening, full[:p, :p], axes=([0], [0])), axes=([0], [1]))
-    mixed = np.einsum("acxn,bcn->abxn", q_z_phi, path, optimize=True)
-    curved = np.einsum("bcn,acxn->abxn", path, phi_part, optimize=True)
-    total = q_zz + mixed + mixed.transpose(1, 0, 2, 3) + curved
-    i, j = np.triu_indices(p)
-    weight = np.where(i == j, 0.5, 1.0)[:, None, None]
-    stacked = np.concatenate([state.e[None], -d_z, -weight * total[i, j]])
-    inverse = frames.spread(state.inverse)
-    pseudo = np.einsum("abn,bxn->axn", inverse, state.attitude, optimize=True)
-    slope = 2.0 * np.einsum("cxn,acxn->a", pseudo, d_attitude, optimize=True)
-    return _Columns(part.project_out(state, stacked).reshape(len(stacked), -1), slope)
+def gram_sums(
+    frames: StarFrames, model_name: str, theta: FloatArray, whitening: FloatArray, rotations: FloatArray
+) -> GramSums:
+    """What a part of the frames adds to the compressed likelihood around theta (p,), in one pass.
+
+    Parameters
+    ----------
+    frames : StarFrames
+        The part.
+    model_name : str
+        Distortion model.
+    theta : (p,) array
+        Point of expansion, px units; the same for all parts.
+    whitening : (p, p) array
+        L in ``theta = theta_hat + L z``; the same for all parts.
+    rotations : (K, 3, 3) array
+        Attitudes to start from.
+    """
+    theta = np.asarray(theta, dtype=np.float64)
+    expansion, p = _Expansion(model_name, theta, whitening), len(theta)
+    gram, slope, log_determinant = np.zeros((expansion.q, expansion.q)), np.zeros(p), 0.0
+    with np.errstate(all="ignore"):
+        for first, last in frames.parts(_BLOCK_STARS):
+            part = frames.part(first, last)
+            block = expansion.block(part, rotations[first:last])
+            gram += block.gram(part, p)
+            slope += block.log_determinant_slope
+            log_determinant += block.log_determinant
+    return GramSums(gram, log_determinant, slope, frames.n_stars, frames.n_frames)
 
 
 def compress(
@@ -165,32 +322,21 @@ def compress(
     ratio : (2 S,) array, optional
         Variances of their errors, in units of sigma^2.
     """
-    whitening = scaled_cholesky(covariance)
-    frames, p = likelihood.frames, len(theta_hat)
-    q = (p + 1) * (p + 2) // 2
-    gram, slope, log_determinant = np.zeros((q, q)), np.zeros(p), 0.0
-    for first, last in frames.parts(20_000):
-        part = MarginalLikelihood(frames.part(first, last), likelihood.model_name)
-        state, _ = part.profile(theta_hat, None if rotations is None else rotations[first:last])
-        piece = _columns(part, state, theta_hat, whitening)
-        gram += piece.columns @ piece.columns.T
-        if stars is not None:
-            rows = slice(int(frames.starts[first]), int(frames.starts[last]))
-            stars.add(part, state, piece.columns.reshape(q, 2, -1), rows)
-        slope += piece.log_determinant_slope
-        log_determinant += float(np.sum(state.log_determinant))
+    whitening, theta = scaled_cholesky(covariance), np.asarray(theta_hat, dtype=np.float64)
+    frames, model_name = likelihood.frames, likelihood.model_name
+    if rotations is None:
+        rotations = likelihood.start_rotations(theta)
+    sums = gram_sums(frames, model_name, theta, whitening, rotations)
     if stars is not None and ratio is not None:
-        gram -= stars.solved(ratio).correction()
-    return CompressedLikelihood(
-        theta_hat=np.array(theta_hat),
-        whitening=whitening,
-        gram=0.5 * (gram + gram.T),
-        log_determinant=log_determinant,
-        log_determinant_slope=slope,
-        dof=likelihood.dof,
-        n_stars=frames.n_stars,
-        n_frames=frames.n_frames,
-    )
+        expansion = _Expansion(model_name, theta, whitening)
+        for first, last in frames.parts(_BLOCK_STARS):
+            part = MarginalLikelihood(frames.part(first, last), model_name)
+            block = expansion.block(part.frames, rotations[first:last])
+            state, _ = part.profile(theta, block.rotations)
+            rows = slice(int(frames.starts[first]), int(frames.starts[last]))
+            stars.add(part, state, part.project_out(state, block.columns), rows)
+        sums = dataclasses.replace(sums, gram=sums.gram - stars.solved(ratio).correction())
+    return sums.likelihood(theta, whitening)
 
 
 _STEPS = 50

@@ -20,14 +20,19 @@ from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.projection import forward_kernel, forward_root, unproject_theta
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.solvers import Normal
+from starcal_uq.estimation.sums import (
+    ATTITUDE_STEPS,
+    ATTITUDE_TOLERANCE_RAD,
+    BLOCK_STARS,
+    Attitudes,
+    NormalSums,
+    settled_sums,
+)
 from starcal_uq.maths.linear import COLUMNS, ROWS, inverse_symmetric
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
-
-_ATTITUDE_STEPS = 12
-_ATTITUDE_TOLERANCE_RAD = 1e-9
 
 
 @dataclass(frozen=True)
@@ -87,50 +92,68 @@ class MarginalLikelihood:
     def _quest_weights(self) -> FloatArray | None:
         return None if self.frames.weight is None else self.frames.weight**2
 
-    def _attitude_step(self, theta: FloatArray, rotations: FloatArray) -> tuple[Profile, FloatArray, FloatArray]:
-        """The model at given attitudes, the Gauss-Newton step (3, K), and the cost (K,) predicted after it."""
-        frames = self.frames
-        b = frames.rotated(rotations)
-        xy, a = forward_kernel(self.model_name, "attitude")(
-            frames.n_stars, theta, b, forward_root(self.model_name, theta, b)
-        )
-        e = frames.pixel - xy
-        if frames.weight is not None:
-            e *= frames.weight
-            a *= frames.weight
-        packed = frames.sum(np.stack([np.sum(a[i] * a[j], axis=0) for i, j in zip(ROWS, COLUMNS, strict=True)]))
-        inverse, determinant = inverse_symmetric(packed)
-        slope = frames.sum(np.sum(a * e[None], axis=1))
-        step = np.einsum("ijk,jk->ik", inverse, slope)
-        cost = frames.sum(np.sum(e * e, axis=0)) - np.sum(step * slope, axis=0)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            log_determinant = np.log(determinant)
-        return Profile(rotations, b, e, a, inverse, log_determinant), step, cost
-
     def profile(self, theta: FloatArray, rotations: FloatArray | None = None) -> tuple[Profile, float]:
         """The model at the best attitudes for theta (p,), px units, searched from `rotations` (K, 3, 3) or QUEST's.
 
         The second value is the sum of squared whitened residuals S(theta); infinite when the model is not finite.
         """
-        theta = np.asarray(theta, dtype=np.float64)
+        theta, frames = np.asarray(theta, dtype=np.float64), self.frames
+        n, k = frames.n_stars, frames.n_frames
+        state = Profile(
+            rotations=np.empty((k, 3, 3)),
+            b=np.empty((3, n)),
+            e=np.empty((2, n)),
+            attitude=np.empty((3, 2, n)),
+            inverse=np.empty((3, 3, k)),
+            log_determinant=np.empty(k),
+        )
+        total = 0.0
         with np.errstate(all="ignore"):
             if rotations is None:
                 rotations = self.start_rotations(theta)
-            for _ in range(_ATTITUDE_STEPS):
-                state, step, cost = self._attitude_step(theta, rotations)
-                total = float(np.sum(cost))
-                if not np.isfinite(total):
-                    return state, float("inf")
-                if np.max(np.abs(step)) < _ATTITUDE_TOLERANCE_RAD:
-                    # Noise-free data leave rounding, of either sign.
-                    return state, max(total, 0.0)
-                rotations = exp_rotation(step.T) @ rotations
-        # Stars that fit no attitude: nothing here is a minimum.
-        return state, float("inf")
+            # Blocks whose arrays stay in the cache while their attitudes are searched.
+            for first, last in frames.parts(BLOCK_STARS):
+                stars = slice(int(frames.starts[first]), int(frames.starts[last]))
+                total += self._settle(state, slice(first, last), stars, theta, rotations[first:last])
+        # Noise-free data leave rounding, of either sign.
+        return state, max(total, 0.0) if np.isfinite(total) else float("inf")
+
+    def _settle(self, state: Profile, which: slice, stars: slice, theta: FloatArray, rotations: FloatArray) -> float:
+        """Search the attitudes of some frames and write the model at them into `state`; the sum of squares, or NaN."""
+        part = self.frames.part(which.start, which.stop)
+        n = part.n_stars
+        e, a = np.empty((2, n)), np.empty((3, 2, n))
+        kernel, cost = forward_kernel(self.model_name, "attitude"), np.nan
+        for _ in range(ATTITUDE_STEPS):
+            b = part.rotated(rotations)
+            kernel.into((theta, b, forward_root(self.model_name, theta, b)), (e, a.reshape(6, n)))
+            np.subtract(part.pixel, e, out=e)
+            if part.weight is not None:
+                e *= part.weight
+                a *= part.weight
+            products = np.stack([np.sum(a[i] * a[j], axis=0) for i, j in zip(ROWS, COLUMNS, strict=True)])
+            inverse, determinant = inverse_symmetric(part.sum(products))
+            slope = part.sum(np.sum(a * e[None], axis=1))
+            step = np.einsum("ijk,jk->ik", inverse, slope)
+            left = float(np.sum(e * e) - np.sum(step * slope))
+            if not np.isfinite(left):
+                break
+            if np.max(np.abs(step)) < ATTITUDE_TOLERANCE_RAD:
+                cost = left
+                break
+            # Stars that fit no attitude never come here for the last time: nothing there is a minimum.
+            rotations = exp_rotation(step.T) @ rotations
+        state.rotations[which], state.inverse[..., which], state.log_determinant[which] = (
+            rotations,
+            inverse,
+            np.log(determinant),
+        )
+        state.b[:, stars], state.e[:, stars], state.attitude[..., stars] = b, e, a
+        return cost
 
     def rotations_at(self, theta: FloatArray) -> FloatArray:
         """Best attitudes (K, 3, 3) at theta."""
-        return self.profile(theta)[0].rotations
+        return self.profile(theta, self._rotations)[0].rotations
 
     @property
     def rotations(self) -> FloatArray | None:
@@ -171,10 +194,13 @@ class MarginalLikelihood:
 
     def evaluate(self, theta: FloatArray) -> Normal:
         """Cost S, gradient and Gauss-Newton matrix with the attitudes eliminated (variable projection)."""
-        state, cost = self.profile(theta, self._rotations)
-        p = len(theta)
-        if not np.isfinite(cost):
-            return Normal(float("inf"), np.full(p, np.nan), np.full((p, p), np.nan))
-        h = self.project_out(state, self.derivatives(theta, state)).reshape(p, -1)
-        e = self.project_out(state, state.e[None]).reshape(-1)
-        return Normal(cost, -(h @ e), h @ h.T)
+        return self.sums(theta)[0].normal
+
+    def sums(self, theta: FloatArray, residuals: FloatArray | None = None) -> tuple[NormalSums, Attitudes]:
+        """Normal equations and attitudes at theta, searched from `rotations` or QUEST's.
+
+        The whitened residuals there are written into `residuals` (2, N).
+        """
+        theta = np.asarray(theta, dtype=np.float64)
+        rotations = self.start_rotations(theta) if self._rotations is None else self._rotations
+        return settled_sums(self.frames, self.model_name, theta, rotations, residuals)

@@ -17,6 +17,7 @@ from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.estimation.solvers import Constraints, Solution, levenberg_marquardt, minpack
+from starcal_uq.estimation.sums import Descent
 from starcal_uq.observations.frames import StarFrames
 
 # Predicted gain of a pair stage that is not worth an evaluation: 1e-4 sigma or less for 30,000 residuals.
@@ -152,11 +153,18 @@ def joint_stage(objective: PairObjective, camera: Camera, theta: FloatArray, sol
 
 
 def refinement_stage(likelihood: MarginalLikelihood, theta: FloatArray, max_iterations: int) -> Stage:
-    """Stage 4: all parameters on the attitude-marginalised likelihood, which reaches the Cramer-Rao bound."""
-    return _timed(
+    """Stage 4: all parameters on the attitude-marginalised likelihood, which reaches the Cramer-Rao bound.
+
+    The attitudes move along; `likelihood` starts its later searches from where they end.
+    """
+    start = likelihood.start_rotations(theta) if likelihood.rotations is None else likelihood.rotations
+    descent = Descent(likelihood.frames, likelihood.model_name, start)
+    stage = _timed(
         "refinement",
         lambda: levenberg_marquardt(
-            likelihood.evaluate, theta, max_iterations=max_iterations, tolerance=_REFINEMENT_TOLERANCE
+            descent.evaluate, theta, max_iterations=max_iterations, tolerance=_REFINEMENT_TOLERANCE
         ),
         np.zeros(0),
     )
+    likelihood.use_rotations(descent.rotations(stage.theta))
+    return stage
