@@ -16,6 +16,7 @@ from . import propagation as propagation
 from . import runs as runs
 from . import simulation as simulation
 from . import sky as sky
+from . import studies as studies
 from .budgeting.budget import budget as budget
 from .camera.camera import Camera as Camera
 from .comparison.compare import compare as compare
@@ -38,5 +39,6 @@ from .runs.run import Run as Run
 from .simulation.frames import simulate as simulate
 from .sky.catalogue import StarCatalogue as StarCatalogue
 from .sky.catalogue import load_catalogue as load_catalogue
+from .studies.study import study as study
 
 __version__: str

@@ -101,6 +101,10 @@ class PlanningError(StarcalError):
     """A calibration cannot be planned with what was given, or its aim cannot be reached."""
 
 
+class StudyError(StarcalError):
+    """The definition of a study is unreadable or makes no sense, or its results are not there."""
+
+
 class ComparisonError(StarcalError):
     """Two calibrations cannot be compared, or a table of frames cannot be split."""
 

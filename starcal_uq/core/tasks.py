@@ -34,6 +34,7 @@ def run_tasks(
     chunk: int,
     workers: int | None = None,
     progress: Progress | None = None,
+    each: Callable[[T], None] | None = None,
 ) -> tuple[list[T], bool]:
     """Run task 0 .. n_tasks - 1; the results in order, and whether Ctrl-C was pressed before all were complete.
 
@@ -51,6 +52,8 @@ def run_tasks(
         Processes; 0 stays in this one, None takes as many as there are processors.
     progress : callable, optional
         Called as ``progress(done, total)``.
+    each : callable, optional
+        Called with every result as it arrives, in this process; what it keeps survives whatever comes later.
 
     Raises
     ------
@@ -66,6 +69,9 @@ def run_tasks(
 
     def keep(some: Numbered[T]) -> None:
         results.extend(some)
+        if each is not None:
+            for _, result in some:
+                each(result)
         if progress is not None:
             progress(len(results), n_tasks)
 

@@ -106,7 +106,7 @@ class FrameSet:
         kept = inside & np.repeat(enough, self.frames.sizes)
         information = np.zeros_like(self.information)
         if enough.any():
-            some, _, _ = _matrices(self.camera, self.frames.select(kept), self.rotations[enough])
+            some, _, _ = frame_matrices(self.camera, self.frames.select(kept), self.rotations[enough])
             information[enough] = some
         return information
 
@@ -186,11 +186,13 @@ def _frame_set(
         weight=1.0 / noise_of(noise, mag, pixel),
         starts=np.concatenate([[0], np.cumsum([len(seen) for seen, _ in views])]).astype(np.int64),
     )
-    return FrameSet(camera, rotations, frames, mag, *_matrices(camera, frames, rotations))
+    return FrameSet(camera, rotations, frames, mag, *frame_matrices(camera, frames, rotations))
 
 
-def _matrices(camera: Camera, frames: StarFrames, rotations: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Information (M, p, p), attitude response (M, 3, p) and attitude noise (M, 3, 3) of every frame."""
+def frame_matrices(
+    camera: Camera, frames: StarFrames, rotations: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Information (M, p, p), attitude response (M, 3, p) and attitude noise (M, 3, 3) of noise-free frames."""
     information, response, noise = [], [], []
     for first, last in frames.parts(_STARS_AT_ONCE):
         likelihood = MarginalLikelihood(frames.part(first, last), camera.distortion)

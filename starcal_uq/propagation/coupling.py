@@ -174,7 +174,7 @@ def coupling(result: Posterior | Calibration) -> Coupling:
         crlb_sigma=bound,
         prior_sigma=prior_sigma,
         contraction=None if prior_sigma is None else 1.0 - (sigma / prior_sigma) ** 2,
-        weak_directions=_directions(correlation, names),
+        weak_directions=weak_directions(correlation, names),
         extended_names=names + AXES,
         extended_correlation=extended,
         common_rotation_arcsec=np.rad2deg(common) * 3600.0,
@@ -189,7 +189,8 @@ def _extended(covariance: FloatArray, response: FloatArray) -> tuple[FloatArray,
     return correlation, sigma[-3:]
 
 
-def _directions(correlation: FloatArray, names: tuple[str, ...]) -> tuple[WeakDirection, ...]:
+def weak_directions(correlation: FloatArray, names: tuple[str, ...]) -> tuple[WeakDirection, ...]:
+    """Eigenvectors of a correlation matrix (p, p), from the least to the best determined."""
     values, vectors = np.linalg.eigh(correlation)
     directions = []
     for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):

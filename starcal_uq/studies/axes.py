@@ -1,0 +1,194 @@
+"""What a study can vary, and the camera that follows from it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import get_model, model_names
+from starcal_uq.camera.projection import fold_radius_px
+from starcal_uq.core.errors import StudyError
+from starcal_uq.core.types import AnyDict
+from starcal_uq.estimation.calibrate import METHODS
+from starcal_uq.inference.named import LIKELIHOODS
+from starcal_uq.simulation.pointing import POINTINGS
+
+FLAT = "flat"
+# Terms of a distortion that cancel to less than this share of their sum have no size that could be scaled.
+_CANCELLED = 0.02
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Something that a study can vary.
+
+    Attributes
+    ----------
+    name : str
+        Key in files, coordinate in results.
+    words : str
+        Description, for labels.
+    unit : str
+        Unit; empty for names and counts.
+    kind : {"number", "whole", "name"}
+        Values that it takes.
+    low, high : float
+        Bounds, both allowed.
+    choices : tuple of str
+        Names that it takes; empty where any will do.
+    base : float, int, str or None
+        Value where nothing is said; None leaves it to the camera, or to nature.
+    """
+
+    name: str
+    words: str
+    unit: str = ""
+    kind: str = "number"
+    low: float = -math.inf
+    high: float = math.inf
+    choices: tuple[str, ...] = ()
+    base: Any = None
+
+    def check(self, value: Any, where: str) -> Any:
+        """The value in its own type; `StudyError` with `where` in front if it does not fit."""
+        if self.kind == "name":
+            if not isinstance(value, str) or (self.choices and value not in self.choices):
+                raise StudyError(f"{where}: {self.name} is {value!r}; {self.wanted}.")
+            return value
+        number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+        if not number or (self.kind == "whole" and value != int(value)) or not self.low <= value <= self.high:
+            raise StudyError(f"{where}: {self.name} is {value!r}; {self.wanted}.")
+        return int(value) if self.kind == "whole" else float(value)
+
+    @property
+    def wanted(self) -> str:
+        """What to write, as an order."""
+        if self.kind == "name":
+            return f"write one of {', '.join(self.choices)}" if self.choices else "write a name in quotes"
+        noun = "a whole number" if self.kind == "whole" else "a number"
+        if self.low == -math.inf:
+            return f"write {noun}"
+        bounds = f"of at least {self.low:g}" if self.high == math.inf else f"from {self.low:g} to {self.high:g}"
+        return f"write {noun} {bounds}"
+
+
+_TINY = 1e-6
+_COEFFICIENTS = {c.name: c for name in model_names() for c in get_model(name).coefficients}
+AXES = {
+    axis.name: axis
+    for axis in (
+        Axis("fov_deg", "field of view, full width", "deg", low=0.1, high=120.0),
+        Axis("focal_mm", "focal length", "mm", low=_TINY),
+        Axis("pixels", "width and height of the detector", "px", "whole", 16, 100_000),
+        Axis("pixel_um", "pixel pitch", "um", low=_TINY),
+        Axis("x0_offset_px", "offset of the principal point along x", "px"),
+        Axis("y0_offset_px", "offset of the principal point along y", "px"),
+        Axis("distortion", "distortion model", "", "name", choices=model_names()),
+        Axis("distortion_px", "displacement of the corner by the distortion", "px"),
+        *(Axis(name, c.description, c.unit) for name, c in _COEFFICIENTS.items()),
+        Axis("max_mag", "magnitude limit", "mag", high=10.0, low=-1.0, base=6.0),
+        Axis("stars", "brightest stars of a frame that are used", "", "whole", 3, 100_000),
+        Axis("frames", "frames", "", "whole", 1, 10_000_000, base=200),
+        Axis("min_stars", "least stars in a frame", "", "whole", 3, 10_000, base=5),
+        Axis("pointing", "pointing pattern", "", "name", choices=POINTINGS, base="random"),
+        Axis("sigma_px", "centroid noise per axis", "px", low=_TINY, high=20.0, base=0.05),
+        # Photon noise grows by 0.2, noise of the background by 0.4.
+        Axis("noise_per_mag", "growth of the noise per magnitude", "dex", low=0.0, high=1.0, base=0.0),
+        Axis("noise_mag", "magnitude at which the noise is as stated", "mag", base=6.0),
+        Axis("noise_floor_px", "noise that even bright stars have", "px", low=0.0, high=20.0, base=0.0),
+        Axis("direction_mas", "error of the catalogue's directions per axis", "mas", low=0.0, high=1e6, base=0.0),
+        Axis("prior", "prior", "", "name", base=FLAT),
+        Axis("method", "method of calibration", "", "name", choices=METHODS, base="efficient"),
+        Axis("likelihood", "likelihood", "", "name", choices=LIKELIHOODS, base="marginal"),
+    )
+}  # fmt: skip
+# Both set the focal length; the coefficients and the size of the distortion both set the distortion.
+EXCLUSIVE = (("fov_deg", "focal_mm"), *((name, "distortion_px") for name in _COEFFICIENTS))
+
+
+def base_settings(given: Mapping[str, Any]) -> AnyDict:
+    """Values of every axis that has one, those that are given before the usual ones."""
+    usual = {axis.name: axis.base for axis in AXES.values() if axis.base is not None}
+    return usual | dict(given)
+
+
+def camera_of(base: Camera, settings: Mapping[str, Any]) -> Camera:
+    """The camera of a cell.
+
+    The distortion stays what it is in millimetres on the detector when pixels change, and in pixels when the focal
+    length does.
+
+    Raises
+    ------
+    StudyError
+        Where the settings make no camera: a distortion that folds over inside the field, or terms that cancel.
+    """
+    camera = base
+    if "pixels" in settings:
+        n = settings["pixels"]
+        camera = _resampled(camera, n / camera.width_px, n, n)
+    if "pixel_um" in settings:
+        camera = _resampled(camera, camera.pixel_um / settings["pixel_um"], camera.width_px, camera.height_px)
+    if "fov_deg" in settings:
+        focal_px = camera.width_px / (2.0 * math.tan(0.5 * math.radians(settings["fov_deg"])))
+        camera = camera.replace(focal_mm=focal_px * camera.pixel_um / 1000.0)
+    if "focal_mm" in settings:
+        camera = camera.replace(focal_mm=settings["focal_mm"])
+    if "x0_offset_px" in settings:
+        camera = camera.replace(x0_px=camera.centre_px[0] + settings["x0_offset_px"])
+    if "y0_offset_px" in settings:
+        camera = camera.replace(y0_px=camera.centre_px[1] + settings["y0_offset_px"])
+    if "distortion" in settings:
+        camera = camera.replace(distortion=settings["distortion"])
+    names = [c.name for c in get_model(camera.distortion).coefficients]
+    own = {name: settings[name] for name in names if name in settings}
+    if own:
+        known = dict(zip(names, camera.coefficients, strict=True)) | own
+        camera = camera.replace(coefficients=tuple(known.values()))
+    if "distortion_px" in settings and names:
+        camera = _with_displacement(camera, settings["distortion_px"])
+    radius = camera.corner_radius_px
+    if fold_radius_px(camera.distortion, camera.theta, radius) <= radius:
+        raise StudyError("the distortion folds over inside the field: make it smaller.")
+    return camera
+
+
+def _resampled(camera: Camera, finer: float, width: int, height: int) -> Camera:
+    """The same optics over `width` x `height` pixels, `finer` of them to an old one."""
+    orders = [c.order for c in get_model(camera.distortion).coefficients]
+    new = camera.replace(
+        width_px=width,
+        height_px=height,
+        pixel_um=camera.pixel_um / finer,
+        coefficients=tuple(k * finer ** (1 - n) for k, n in zip(camera.coefficients, orders, strict=True)),
+    )
+    x, y = camera.centre_px
+    return new.replace(
+        x0_px=new.centre_px[0] + finer * (camera.x0_px - x), y0_px=new.centre_px[1] + finer * (camera.y0_px - y)
+    )
+
+
+def _with_displacement(camera: Camera, wanted_px: float) -> Camera:
+    """All coefficients scaled alike, so that the corner moves outwards by so much; the first alone, where all are 0."""
+    model = get_model(camera.distortion)
+    given = camera.coefficients if any(camera.coefficients) else (1.0, *(0.0 for _ in camera.coefficients[1:]))
+    terms = [_outwards(camera, [k * (i == j) for j in range(len(given))]) for i, k in enumerate(given)]
+    total = sum(terms)
+    if abs(total) <= _CANCELLED * sum(map(abs, terms)):
+        raise StudyError(
+            "distortion_px: the terms of the camera's distortion cancel in the corner, so that it has no size; "
+            "change the coefficients of [camera], or set them to zero."
+        )
+    sign = 1.0 if model.direction == "forward" else -1.0
+    return camera.replace(coefficients=tuple(sign * wanted_px / total * k for k in given))
+
+
+def _outwards(camera: Camera, coefficients: list[float]) -> float:
+    """Displacement of the farthest corner away from the principal point, px."""
+    ends = (-0.5, camera.width_px - 0.5), (-0.5, camera.height_px - 0.5)
+    u, v = (max((end - c for end in side), key=abs) for side, c in zip(ends, (camera.x0_px, camera.y0_px), strict=True))
+    du, dv = get_model(camera.distortion).displacement(u, v, coefficients)
+    return float((u * du + v * dv) / math.hypot(u, v))

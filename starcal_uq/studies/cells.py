@@ -1,0 +1,270 @@
+"""One cell of a study: from its settings to its numbers, by Fisher information.
+
+The covariance after n frames is that of an estimate which weighs stars by their noise,
+
+    C = (n F + P)^-1 (n F + P + tau^2 (n A + n (n - 1) B)) (n F + P)^-1,
+
+with F the mean information of a frame (attitudes eliminated), P the prior's precision, and tau the error that a star's
+direction has in all of its images; A and B are mean products of scores within a frame and between frames. Everything
+else follows from C: it is what `coupling` says of a posterior, before there is any.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import get_model, model_names, parameter_names
+from starcal_uq.core.constants import ARCSEC
+from starcal_uq.core.errors import StarcalError, StudyError
+from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.inference.priors import Priors
+from starcal_uq.maths.linear import correlation_of, inverses, scaled_inverse, unit_inverse
+from starcal_uq.propagation.coupling import weak_directions
+from starcal_uq.studies.axes import camera_of
+from starcal_uq.studies.definition import Cell, StudyDefinition
+from starcal_uq.studies.geometry import (
+    Geometry,
+    GeometryKey,
+    Heaven,
+    Statements,
+    geometry_key,
+    noise_shape,
+    offset_px,
+    star_noise,
+    statements,
+    take_frames,
+)
+
+# Numbers of frames, relative to a cell's own, at which its errors are kept: what a target takes follows from them.
+FRAME_FACTORS = 10.0 ** np.arange(-3.0, 3.01, 0.25)
+# Entries of a `priors` table, and the parameters that they are about.
+_PRIOR_OF = {"principal_point_px": slice(0, 2), "focal_fraction": slice(2, 3), "distortion_corner_px": slice(3, None)}
+_WORST_CONDITION = 1e13
+Numbers = AnyDict
+
+
+def simpler_models(model: str) -> tuple[str, ...]:
+    """Models that a model becomes when some of its coefficients are zero."""
+    own = get_model(model)
+    names = {c.name for c in own.coefficients}
+    return tuple(
+        other
+        for other in model_names()
+        if {c.name for c in get_model(other).coefficients} < names
+        and get_model(other).direction in (own.direction, "forward" if other == "none" else own.direction)
+    )
+
+
+class FisherCells:
+    """Numbers of cells, one after the other; what neighbours share is kept from one to the next.
+
+    Parameters
+    ----------
+    definition : StudyDefinition
+        The study.
+    heaven : Heaven
+        Its stars.
+    """
+
+    def __init__(self, definition: StudyDefinition, heaven: Heaven) -> None:
+        self.definition, self.heaven = definition, heaven
+        self._key: GeometryKey | None = None
+        self._geometry: Geometry | StudyError | None = None
+        self._stated: tuple[Any, Statements] | None = None
+
+    def numbers(self, cell: Cell) -> Numbers:
+        """All numbers of a cell; `status` is a sentence where there are none."""
+        try:
+            camera = camera_of(self.definition.camera, cell.settings)
+            return self._numbers(cell, camera)
+        except StarcalError as error:
+            return {"status": str(error)}
+
+    def _numbers(self, cell: Cell, camera: Camera) -> Numbers:
+        settings = cell.settings
+        stated, scale = self.stated(cell, camera)
+        n = settings["frames"]
+        m = len(stated.information)
+        counts = self._campaign(cell, n, m)
+        frame = np.tensordot(counts, stated.information, 1) / (scale**2 * n)
+        prior = prior_precision(self.definition.priors.get(settings["prior"]), camera)
+        spread = None
+        if stated.star_own is not None and stated.star_common is not None:
+            spread = star_spread(
+                stated.star_own, stated.star_common, m, scale, offset_px(camera, settings["direction_mas"])
+            )
+        found = coupling_numbers(frame, prior, spread, n, stated)
+        found |= simpler_numbers(frame, n, float(counts @ stated.weights) / scale**2, stated)
+        found |= {
+            "status": "ok",
+            "n_frames": n,
+            "mean_stars": stated.mean_stars,
+            "field_deg": camera.fov_deg[0],
+            "truth": camera.theta,
+            "nea_arcsec": ARCSEC * scale * np.sqrt(stated.noise),
+        }
+        return found
+
+    def _campaign(self, cell: Cell, n: int, m: int) -> FloatArray:
+        """How often each of m frames is in a campaign of n."""
+        if cell.settings["pointing"] != "random" or cell.settings["direction_mas"] > 0.0:
+            return np.full(m, n / m)
+        rng = np.random.default_rng([self.definition.seed, cell.seed_index, n, 12])
+        if 4 * n <= m:
+            counts = np.zeros(m)
+            counts[rng.choice(m, n, replace=False)] = 1.0
+            return counts
+        return rng.multinomial(n, np.full(m, 1.0 / m)).astype(np.float64)
+
+    def geometry(self, key: GeometryKey) -> Geometry:
+        """Frames of that key, the last ones if they are the same."""
+        if key != self._key:
+            self._stated = None
+            try:
+                self._geometry = take_frames(key, self.heaven, self.definition.geometries)
+            except StudyError as error:
+                self._geometry = error
+            self._key = key
+        if isinstance(self._geometry, StudyError):
+            raise self._geometry
+        assert self._geometry is not None
+        return self._geometry
+
+    def stated(self, cell: Cell, camera: Camera) -> tuple[Statements, float]:
+        """What the frames of a cell say, and the noise to scale it by."""
+        settings = cell.settings
+        geometry = self.geometry(geometry_key(camera, settings, self.definition.seed, cell.seed_index, False))
+        shape, scale = noise_shape(settings)
+        key = (settings.get("stars"), shape, settings["direction_mas"] > 0.0)
+        if self._stated is None or self._stated[0] != key:
+            chosen = geometry.brightest(settings.get("stars"))
+            noise = star_noise(chosen.mag, shape)
+            self._stated = key, statements(chosen, noise, settings["direction_mas"] > 0.0)
+        return self._stated[1], scale
+
+
+def prior_precision(table: Mapping[str, Any] | None, camera: Camera) -> FloatArray | None:
+    """Precision (p,) of the entries that a prior set states; None for no prior."""
+    if table is None:
+        return None
+    precision = np.zeros(len(camera.theta))
+    stated = Priors.default(camera).replace(**table).sd(parameter_names(camera.distortion))
+    for entry, place in _PRIOR_OF.items():
+        if entry in table:
+            precision[place] = stated[place] ** -2.0
+    return precision
+
+
+def star_spread(
+    own: FloatArray, common: FloatArray, m: int, scale: float, offset: float
+) -> tuple[FloatArray, FloatArray]:
+    """tau^2 A and tau^2 B of the module's formula, from sums over m frames."""
+    factor = offset**2 / scale**4
+    a = own / m
+    b = (common - own) / (m * (m - 1)) if m > 1 else np.zeros_like(own)
+    # A difference of sums over stars that hardly repeat may be negative by chance.
+    size = np.sqrt(np.diag(a))
+    values, vectors = np.linalg.eigh(b / np.outer(size, size))
+    b = (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(size, size)
+    return factor * a, factor * b
+
+
+def covariances(
+    frame: FloatArray, prior: FloatArray, spread: tuple[FloatArray, FloatArray] | None, n: FloatArray
+) -> FloatArray:
+    """Covariances (k, p, p) after numbers of frames (k,): the module's formula."""
+    total = n[:, None, None] * frame + np.diag(prior)
+    inverse = inverses(total)
+    if spread is None:
+        return inverse
+    a, b = spread
+    extra = n[:, None, None] * a + (n * np.maximum(n - 1.0, 0.0))[:, None, None] * b
+    return inverse + inverse @ extra @ inverse
+
+
+def coupling_numbers(
+    frame: FloatArray,
+    prior: FloatArray | None,
+    spread: tuple[FloatArray, FloatArray] | None,
+    n: int,
+    stated: Statements,
+) -> Numbers:
+    """What couples after n frames with a mean information of `frame` each."""
+    precision = np.zeros(len(frame)) if prior is None else prior
+    numbers = np.concatenate([[1.0], FRAME_FACTORS]) * n
+    every = covariances(frame, precision, spread, numbers)
+    if not np.isfinite(every[0]).all():
+        raise StudyError("the frames do not determine every parameter: use more stars, a simpler model, or a prior.")
+    data = every[0] if prior is None else covariances(frame, np.zeros(len(frame)), spread, numbers[:1])[0]
+    common, forms = stated.common, stated.rest_forms
+    cross = 0.5 * (forms[0] + forms[1])
+    with np.errstate(invalid="ignore"):
+        curve = ARCSEC * np.sqrt(np.einsum("kpq,pq->k", every[1:], cross))
+        sigma_curve = np.sqrt(np.diagonal(every[1:], axis1=1, axis2=2))
+    total = n * frame + np.diag(precision)
+    return covariance_numbers(every[0], stated.camera.distortion, common, forms) | {
+        "sigma_data": np.sqrt(np.diag(data)),
+        "condition_number": condition(total),
+        "error_curve_arcsec": curve,
+        "sigma_curve": sigma_curve.T,
+    }
+
+
+def covariance_numbers(covariance: FloatArray, model: str, common: FloatArray, forms: FloatArray) -> Numbers:
+    """What couples in a covariance (p, p), and what it does to attitudes."""
+    names = parameter_names(model)
+    correlation, sigma = correlation_of(covariance)
+    conditional = sigma / np.sqrt(np.diag(np.linalg.inv(correlation)))
+    weakest = weak_directions(correlation, names)[0]
+    rotation = common @ covariance @ common.T
+    turn = np.sqrt(np.diag(rotation))
+    return {
+        "sigma": sigma,
+        "sigma_conditional": conditional,
+        "variance_inflation": (sigma / conditional) ** 2,
+        "correlation": correlation,
+        "weak_direction": weakest.weights,
+        "weak_variance": weakest.variance,
+        "weak_words": weakest.words,
+        "attitude_correlation": (covariance @ common.T) / np.outer(sigma, turn),
+        "common_rotation_arcsec": ARCSEC * turn,
+        "frame_error_arcsec": ARCSEC * np.sqrt(np.einsum("pq,apq->a", covariance, forms)),
+    }
+
+
+def condition(information: FloatArray) -> float:
+    """Condition number of an information matrix scaled to a unit diagonal."""
+    scale = 1.0 / np.sqrt(np.diag(information))
+    return float(np.linalg.cond(information * np.outer(scale, scale)))
+
+
+def simpler_numbers(frame: FloatArray, n: int, weight: float, stated: Statements) -> Numbers:
+    """What goes wrong when a simpler model is fitted, to first order in the coefficients that it lacks.
+
+    The fit of the common parameters s to data with coefficients c of the others moves by ``F_ss^-1 F_sc c``; what
+    remains of the residuals after every attitude is the error of directions over the field.
+    """
+    camera = stated.camera
+    names = list(camera.parameter_names)
+    found: Numbers = {"model_bias_arcsec": {}, "model_bias_attitude_arcsec": {}, "model_bias_sigma": {}}
+    for model in simpler_models(camera.distortion):
+        kept = np.array([name in parameter_names(model) for name in names])
+        inner = frame[np.ix_(kept, kept)]
+        shift: FloatArray = scaled_inverse(inner) @ frame[np.ix_(kept, ~kept)] @ camera.theta[~kept]
+        error = np.zeros(len(names))
+        error[kept], error[~kept] = shift, -camera.theta[~kept]
+        # Two coordinates to a star.
+        rms = float(np.sqrt(max(float(n * error @ frame @ error) / (2.0 * weight), 0.0)))
+        inverse, scale = unit_inverse(n * inner)
+        sigmas = np.full(len(names), np.nan)
+        sigmas[kept] = shift / (np.sqrt(np.diag(inverse)) * scale)
+        found["model_bias_arcsec"][model] = ARCSEC * rms / camera.focal_px
+        found["model_bias_attitude_arcsec"][model] = ARCSEC * np.sqrt(
+            np.maximum(np.einsum("p,apq,q->a", error, stated.rest_forms, error), 0.0)
+        )
+        found["model_bias_sigma"][model] = sigmas
+    return found

@@ -1,0 +1,430 @@
+"""What a study is: a base camera and observation, what is varied around them, and how cells are counted."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib.resources import files
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import get_model
+from starcal_uq.core.errors import CameraError, PriorError, StudyError
+from starcal_uq.core.files import PathLike, atomic_write_text, ensure_new
+from starcal_uq.core.toml import Key, Section, read_toml, unknown_key
+from starcal_uq.core.types import AnyDict
+from starcal_uq.inference.priors import PRIORS
+from starcal_uq.studies.axes import AXES, EXCLUSIVE, FLAT, base_settings, camera_of
+
+MODES = ("fisher", "simulate")
+POSTERIORS = ("importance", "ensemble", "none")
+# One of each, in the order in which a reader would try them.
+TEMPLATES = ("fov-distortion", "frames-stars", "magnitude-noise", "distortion-models")
+MAX_CELLS = 1_000_000
+# Changes whenever the same settings would give other numbers: results from before are then computed anew.
+VERSION = 1
+_SECTIONS = ("study", "camera", "observation", "sweep", "priors")
+_SPACINGS = ("linear", "log")
+
+_STUDY = Section(
+    {
+        "name": Key(str, "a name in quotes"),
+        "question": Key(str, "the question that the study answers, in quotes"),
+        "mode": Key(str, f"one of {', '.join(MODES)}, in quotes"),
+        "seeds": Key(int | list[int], "a number of repetitions of at least 1, or a list of whole numbers"),
+        "seed": Key(int, "a whole number of at least 0", ge=0),
+        "target_arcsec": Key(float, "an error above zero in arcsec", gt=0.0),
+        "target_sigma": Key(dict[str, float], "a table of errors above zero by parameter, such as {f = 0.05}"),
+        "camera": Key(str, "the path of a camera file in quotes"),
+        "epoch": Key(float, "a Julian year such as 2026.9", ge=1800.0, le=2200.0),
+        "geometries": Key(int, "a number of frames from 20 to 100000", ge=20, le=100_000),
+        "posterior": Key(str, f"one of {', '.join(POSTERIORS)}, in quotes"),
+        "draws": Key(int, "a number of draws from 100 to 1000000", ge=100, le=1_000_000),
+    },
+    StudyError,
+)
+_SPAN = {
+    "start": Key(float, "a number", required=True),
+    "stop": Key(float, "a number", required=True),
+    "n": Key(int, "a number of values of at least 1", required=True, ge=1, le=MAX_CELLS),
+    "spacing": Key(str, "linear or log, in quotes"),
+}
+_RANGE = {name: key for name, key in _SPAN.items() if name != "n"}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One combination of settings, once.
+
+    Attributes
+    ----------
+    settings : dict
+        Value of every axis that has one.
+    seed_index : int
+        Repetition: another sky, other noise.
+    """
+
+    settings: AnyDict
+    seed_index: int
+
+
+@dataclass(frozen=True, eq=False)
+class StudyDefinition:
+    """What is varied, around what, and how often.
+
+    Attributes
+    ----------
+    camera : Camera
+        Base camera.
+    sweep : dict
+        Values of each axis of the grid, which is their product.
+    observation : dict
+        Base values of the axes that are not varied.
+    latin : dict
+        Ranges of the axes of a Latin hypercube: ``start``, ``stop`` and ``spacing``; each of its points is combined
+        with the grid.
+    latin_n : int
+        Points of the hypercube.
+    priors : dict
+        Named prior sets: entries as of a ``[priors]`` table, of which those that are given count.
+    name, question : str
+        Title, and what a reader wants to know.
+    mode : {"fisher", "simulate"}
+        Information of the frames, or frames drawn, calibrated and sampled.
+    seeds : tuple of int
+        Repetitions of every combination.
+    seed : int
+        Root of all that is random.
+    target_arcsec : float or None
+        Error that is aimed at: the frame-dependent one, 1 sigma per axis across the boresight.
+    target_sigma : dict
+        Errors of single parameters that are aimed at, px units.
+    epoch : float
+        Julian year of the star positions.
+    geometries : int
+        Frames at random attitudes that campaigns are drawn from, at most.
+    posterior : {"importance", "ensemble", "none"}
+        Sampling of a simulated cell: by importance around the Laplace approximation, or by one ensemble of emcee.
+    draws : int
+        Draws of a simulated cell.
+    """
+
+    camera: Camera
+    sweep: dict[str, tuple[Any, ...]]
+    observation: AnyDict = field(default_factory=dict)
+    latin: dict[str, AnyDict] = field(default_factory=dict)
+    latin_n: int = 0
+    priors: dict[str, AnyDict] = field(default_factory=dict)
+    name: str = "Study"
+    question: str = ""
+    mode: str = "fisher"
+    seeds: tuple[int, ...] = (0,)
+    seed: int = 0
+    target_arcsec: float | None = None
+    target_sigma: dict[str, float] = field(default_factory=dict)
+    epoch: float = 2026.9
+    geometries: int = 300
+    posterior: str = "importance"
+    draws: int = 1000
+
+    @classmethod
+    def load(cls, path: PathLike) -> StudyDefinition:
+        """Read a STUDY.toml.
+
+        Raises
+        ------
+        StudyError
+            If the file cannot be read or makes no sense; the message names file, key and remedy.
+        """
+        remedy = "write one with `starcal-uq study --template fov-distortion`"
+        return cls.from_dict(read_toml(path, "study", StudyError, remedy), str(path), Path(path).parent)
+
+    @classmethod
+    def from_dict(cls, content: Mapping[str, Any], where: str = "study", folder: Path | None = None) -> StudyDefinition:
+        """A definition from the tables of a STUDY.toml; `folder` is where a camera's path starts from.
+
+        Raises
+        ------
+        StudyError
+            If they make no sense; the message names key and remedy.
+        """
+        for name, table in content.items():
+            if name not in _SECTIONS:
+                raise StudyError(f"{where}: {unknown_key(name, _SECTIONS).replace('key', 'section', 1)}.")
+            if not isinstance(table, Mapping):
+                raise StudyError(f"{where}: {name} is no section; write [{name}] above its keys.")
+        study = _STUDY.check(content.get("study", {}), f"{where}, section [study]")
+        camera = _camera(content, study.pop("camera", None), where, folder)
+        sweep, latin, latin_n = _swept(dict(content.get("sweep", {})), f"{where}, section [sweep]")
+        given = _observation(content.get("observation", {}), f"{where}, section [observation]")
+        priors = {name: _prior(name, table, where) for name, table in content.get("priors", {}).items()}
+        seeds = study.pop("seeds", 1)
+        study["seeds"] = tuple(range(seeds)) if isinstance(seeds, int) else tuple(seeds)
+        made = cls(camera=camera, sweep=sweep, observation=given, latin=latin, latin_n=latin_n, priors=priors, **study)
+        made.check(where)
+        return made
+
+    def to_dict(self) -> AnyDict:
+        """The tables of a STUDY.toml, as `from_dict` reads them."""
+        plain = ("name", "question", "mode", "seed", "epoch", "geometries", "posterior", "draws")
+        study: AnyDict = {name: getattr(self, name) for name in plain} | {"seeds": list(self.seeds)}
+        if self.target_arcsec is not None:
+            study["target_arcsec"] = self.target_arcsec
+        if self.target_sigma:
+            study["target_sigma"] = self.target_sigma
+        sweep: AnyDict = {name: list(values) for name, values in self.sweep.items()}
+        if self.latin:
+            sweep["latin"] = {"n": self.latin_n, **self.latin}
+        tables = {"study": study, "camera": self.camera.to_dict(), "observation": self.observation, "sweep": sweep}
+        return tables | ({"priors": self.priors} if self.priors else {})
+
+    def check(self, where: str = "study") -> None:
+        """Raise `StudyError` for what fits no study; `where` names the file."""
+        for good, text in (
+            (self.mode in MODES, f"mode is {self.mode!r}; write one of {', '.join(MODES)}"),
+            (
+                self.posterior in POSTERIORS,
+                f"posterior is {self.posterior!r}; write one of {', '.join(POSTERIORS)}",
+            ),
+            (
+                len(self.seeds) > 0 and len(set(self.seeds)) == len(self.seeds) and min(self.seeds) >= 0,
+                "seeds holds no number, one below 0 or one twice; write how many repetitions you want",
+            ),
+        ):
+            if not good:
+                raise StudyError(f"{where}, section [study]: {text}.")
+        every = {**self.observation, **self.sweep, **self.latin}
+        self._check_names(every, where)
+        for name in self.target_sigma:
+            if name not in self.parameter_names or not self.target_sigma[name] > 0.0:
+                raise StudyError(
+                    f"{where}, section [study]: target_sigma of {name} is no error above zero of one of "
+                    f"{', '.join(self.parameter_names)}; correct it."
+                )
+        if not self.sweep and not self.latin:
+            raise StudyError(f"{where}, section [sweep]: nothing is varied; add an axis such as frames = [50, 200].")
+        if self.n_cells > MAX_CELLS:
+            raise StudyError(
+                f"{where}, section [sweep]: the axes make {self.n_cells:,} cells, more than {MAX_CELLS:,}; use fewer "
+                "values, or a Latin hypercube."
+            )
+        try:
+            camera_of(self.camera, {k: v for k, v in self.observation.items() if k not in self.sweep})
+        except StudyError as error:
+            raise StudyError(f"{where}, section [camera]: {error}") from None
+
+    def _check_names(self, every: AnyDict, where: str) -> None:
+        for one, other in EXCLUSIVE:
+            if one in every and other in every:
+                raise StudyError(f"{where}: {one} and {other} set the same thing; leave one of them out.")
+        coefficients = {c.name for model in self.models for c in get_model(model).coefficients}
+        known = {c.name for model in AXES["distortion"].choices for c in get_model(model).coefficients}
+        for name in every:
+            if name in known and name not in coefficients:
+                raise StudyError(
+                    f"{where}: {name} is no coefficient of distortion {' or '.join(map(repr, self.models))}; remove "
+                    "it, or use another model."
+                )
+            if self.mode == "fisher" and name in ("method", "likelihood"):
+                raise StudyError(
+                    f"{where}: {name} makes no difference to Fisher information; set mode to 'simulate', or remove it."
+                )
+        for name in (*self.sweep.get("prior", ()), self.observation.get("prior", FLAT)):
+            if name != FLAT and name not in self.priors:
+                raise StudyError(f"{where}: prior {name!r} is not defined; add a section [priors.{name}].")
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """Distortion models that occur."""
+        base = self.observation.get("distortion", self.camera.distortion)
+        return tuple(dict.fromkeys(self.sweep.get("distortion", (base,))))
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Parameters of all models, in the order of the registry."""
+        used = {c.name for model in self.models for c in get_model(model).coefficients}
+        names = {c.name: None for model in AXES["distortion"].choices for c in get_model(model).coefficients}
+        return ("x0", "y0", "f", *(name for name in names if name in used))
+
+    @property
+    def n_cells(self) -> int:
+        """Number of cells."""
+        return math.prod(len(values) for values in self.sweep.values()) * max(1, self.latin_n) * len(self.seeds)
+
+    @cached_property
+    def axes(self) -> dict[str, tuple[Any, ...]]:
+        """Values of every axis that is varied, those of a hypercube in ascending order."""
+        points = {name: tuple(sorted(point[name] for point in self._points)) for name in self.latin}
+        return {**self.sweep, **points}
+
+    @cached_property
+    def _points(self) -> list[AnyDict]:
+        """Points of the Latin hypercube; one without any axis where there is none."""
+        if not self.latin:
+            return [{}]
+        from scipy.stats import qmc
+
+        unit = qmc.LatinHypercube(len(self.latin), rng=np.random.default_rng(self.seed)).random(self.latin_n)
+        columns = {}
+        for (name, span), u in zip(self.latin.items(), unit.T, strict=True):
+            ends = span["start"], span["stop"]
+            if span["spacing"] == "log":
+                values = np.exp(np.interp(u, (0.0, 1.0), np.log(ends)))
+            else:
+                values = np.interp(u, (0.0, 1.0), ends)
+            columns[name] = np.round(values).astype(int).tolist() if AXES[name].kind == "whole" else values.tolist()
+        return [dict(zip(columns, point, strict=True)) for point in zip(*columns.values(), strict=True)]
+
+    def cells(self) -> list[Cell]:
+        """Every cell: the grid, the hypercube within it, and the repetitions within that."""
+        fixed = base_settings({k: v for k, v in self.observation.items() if k not in self.sweep})
+        made = []
+        for values in product(*self.sweep.values()):
+            grid = fixed | dict(zip(self.sweep, values, strict=True))
+            for point in self._points:
+                made += [Cell(grid | point, index) for index in self.seeds]
+        return made
+
+    def key(self, cell: Cell, stars: str) -> str:
+        """Hash of all that the numbers of a cell depend on; `stars` is that of the catalogue to its magnitude limit."""
+        return _hash(
+            {
+                "version": VERSION,
+                "camera": {k: v for k, v in self.camera.to_dict().items() if k != "name"},
+                "settings": cell.settings,
+                "prior": self.priors.get(cell.settings["prior"]),
+                "seeds": [self.seed, cell.seed_index],
+                "stars": stars,
+                "how": [self.mode, self.geometries]
+                if self.mode == "fisher"
+                else [self.mode, self.posterior, self.draws],
+            }
+        )
+
+
+def template(name: str) -> str:
+    """Text of a commented STUDY.toml that comes with the package.
+
+    Raises
+    ------
+    StudyError
+        For a name that is not one of `TEMPLATES`.
+    """
+    if name not in TEMPLATES:
+        raise StudyError(f"template {name!r} is unknown: use one of {', '.join(TEMPLATES)}.")
+    return (files("starcal_uq.studies") / "templates" / f"{name}.toml").read_text("utf-8")
+
+
+def write_study_template(name: str, path: PathLike, force: bool = False) -> None:
+    """Write the template of that name to a file."""
+    text = template(name)
+    ensure_new(path, force)
+    atomic_write_text(path, text)
+
+
+def _hash(value: Any) -> str:
+    return hashlib.sha256(json.dumps(value, sort_keys=True).encode()).hexdigest()[:32]
+
+
+def _camera(content: Mapping[str, Any], path: str | None, where: str, folder: Path | None) -> Camera:
+    if ("camera" in content) == (path is not None):
+        both = "given twice" if path is not None else "missing"
+        raise StudyError(
+            f'{where}: the camera is {both}; write a section [camera], or camera = "camera.toml" in [study].'
+        )
+    try:
+        if path is not None:
+            return Camera.load((folder or Path()) / path)
+        return Camera.from_dict(content["camera"])
+    except CameraError as error:
+        raise StudyError(str(error) if path is not None else f"{where}, section [camera]: {error}") from None
+
+
+def _observation(table: Mapping[str, Any], where: str) -> AnyDict:
+    return {name: _axis(name, where).check(value, where) for name, value in table.items()}
+
+
+def _axis(name: str, where: str) -> Any:
+    if name not in AXES:
+        hint = unknown_key(name, AXES)
+        raise StudyError(f"{where}: {hint}{'' if hint.endswith('?') else '.'}")
+    return AXES[name]
+
+
+def _swept(table: AnyDict, where: str) -> tuple[dict[str, tuple[Any, ...]], dict[str, AnyDict], int]:
+    """Grid, ranges and points of the hypercube."""
+    latin = table.pop("latin", None)
+    grid = {name: _values(name, value, where) for name, value in table.items()}
+    if latin is None:
+        return grid, {}, 0
+    inside = f"{where[:-1]}.latin]"
+    if not isinstance(latin, Mapping):
+        raise StudyError(f"{where}: latin is no section; write [sweep.latin] above its keys.")
+    n = latin.get("n")
+    if not isinstance(n, int) or isinstance(n, bool) or n < 1 or len(latin) < 2:
+        raise StudyError(f"{inside}: write n, a number of points of at least 1, and at least one axis.")
+    ranges = {}
+    for name, span in latin.items():
+        if name == "n":
+            continue
+        axis = _axis(name, inside)
+        if name in grid:
+            raise StudyError(f"{inside}: {name} stands in [sweep] too; leave one of them out.")
+        if axis.kind == "name" or not isinstance(span, Mapping):
+            raise StudyError(f"{inside}: {name} is {span!r}; write a range of numbers such as {{start = 1, stop = 2}}.")
+        ranges[name] = {"spacing": "linear"} | _span(axis, span, _RANGE, inside)
+    return grid, ranges, n
+
+
+def _values(name: str, value: Any, where: str) -> tuple[Any, ...]:
+    axis = _axis(name, where)
+    if isinstance(value, Mapping):
+        if axis.kind == "name":
+            raise StudyError(f"{where}: {name} is {dict(value)!r}; write a list of names in quotes.")
+        span = _span(axis, value, _SPAN, where)
+        spread = np.geomspace if span.get("spacing") == "log" else np.linspace
+        numbers = spread(span["start"], span["stop"], span["n"]).tolist()
+        # Twelve digits, so that 0.1 is 0.1 on every machine.
+        values = [round(v) if axis.kind == "whole" else float(f"{v:.12g}") for v in numbers]
+        return tuple(dict.fromkeys(values))
+    if not isinstance(value, (list, tuple)):
+        raise StudyError(f"{where}: {name} is {value!r}; write a list, or {{start = 1, stop = 2, n = 5}}.")
+    if not value:
+        raise StudyError(f"{where}: {name} is an empty list; give at least one value.")
+    values = [axis.check(v, where) for v in value]
+    if len(set(values)) < len(values):
+        raise StudyError(f"{where}: {name} holds a value twice; remove one of them.")
+    return tuple(values)
+
+
+def _span(axis: Any, span: Mapping[str, Any], keys: dict[str, Key], where: str) -> AnyDict:
+    inside = f"{where}, {axis.name}"
+    checked = Section(keys, StudyError).check(span, inside)
+    if checked.get("spacing", "linear") not in _SPACINGS:
+        raise StudyError(f"{inside}: spacing is {checked['spacing']!r}; write one of {', '.join(_SPACINGS)}.")
+    for end in ("start", "stop"):
+        if axis.kind != "whole":
+            axis.check(checked[end], f"{inside}, {end}")
+        elif not axis.low <= checked[end] <= axis.high:
+            raise StudyError(f"{inside}, {end}: {axis.name} is {checked[end]:g}; {axis.wanted}.")
+    if checked.get("spacing") == "log" and min(checked["start"], checked["stop"]) <= 0.0:
+        raise StudyError(f"{inside}: a range with spacing 'log' starts and stops above zero; correct it.")
+    return checked
+
+
+def _prior(name: str, table: Any, where: str) -> AnyDict:
+    inside = f"{where}, section [priors.{name}]"
+    if name == FLAT or not isinstance(table, Mapping):
+        raise StudyError(f"{inside}: write a table under another name than {FLAT!r}, which is no prior at all.")
+    try:
+        return PRIORS.check(table, inside)
+    except PriorError as error:
+        raise StudyError(str(error)) from None

@@ -1,0 +1,359 @@
+"""Frames that a cell is about: which stars fall where, and what each frame says of the camera.
+
+Nothing here knows the noise's size, the number of frames or a prior: cells that differ in those alone share it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.projection import project
+from starcal_uq.core.constants import ARCSEC
+from starcal_uq.core.errors import StudyError
+from starcal_uq.core.formatting import count
+from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.star_errors import add_by_star, offset_columns, sky_axes
+from starcal_uq.observations.frames import StarFrames
+from starcal_uq.planning.information import frame_matrices
+from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky
+from starcal_uq.simulation.pointing import pattern_rotations
+
+if TYPE_CHECKING:
+    from starcal_uq.sky.catalogue import StarCatalogue
+
+# Stars that a set of frames holds: more of them make its mean information hardly better known.
+_STARS, _LEAST_FRAMES = 6000, 64
+# Frames of one campaign in which stars bring their own errors, and of a pattern: more repeat what these hold.
+_MOST_FRAMES = 2000
+_BATCH, _PLACES = 256, 200
+# Fewer attitudes than this that show enough stars are no night's work.
+_LEAST_SKY = 0.01
+_DEPTH_STEP = 0.5
+
+
+class Depth:
+    """Stars to a magnitude, found by direction."""
+
+    def __init__(self, stars: StarCatalogue) -> None:
+        self.stars, self.directions = stars, stars.directions_icrs
+
+    @cached_property
+    def tree(self) -> Any:
+        """KD-tree over the directions."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.directions)
+
+
+class Heaven:
+    """The catalogue of a study, by magnitude limit."""
+
+    def __init__(self, stars: StarCatalogue) -> None:
+        self.stars = stars
+        self._depths: dict[float, Depth] = {}
+        self._hashes: dict[float, str] = {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"stars": self.stars, "_depths": {}, "_hashes": {}}
+
+    def depth(self, max_mag: float) -> Depth:
+        """Stars at least to this limit; few trees serve many limits."""
+        step = float(np.ceil(max_mag / _DEPTH_STEP) * _DEPTH_STEP)
+        if step not in self._depths:
+            self._depths[step] = Depth(self.stars.select(self.stars.mag <= step))
+        return self._depths[step]
+
+    def hash(self, max_mag: float) -> str:
+        """What identifies the stars to this limit."""
+        if max_mag not in self._hashes:
+            some = self.stars.mag <= max_mag
+            columns = (self.stars.ra_deg, self.stars.dec_deg, self.stars.mag)
+            content = b"".join(np.ascontiguousarray(column[some]).tobytes() for column in columns)
+            self._hashes[max_mag] = hashlib.sha256(content).hexdigest()[:16]
+        return self._hashes[max_mag]
+
+
+class _Window(Sky):
+    """The detector on the sky, for stars that a tree has found."""
+
+    def __init__(self, depth: Depth, camera: Camera, max_mag: float, margin_px: float) -> None:
+        super().__init__(depth.stars.select(slice(0, 0)), camera, margin_px)  # type: ignore[arg-type]
+        self.depth, self.max_mag = depth, max_mag
+
+    def seen(self, rotations: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
+        """Frame numbers (n,), catalogue indices (n,) and noise-free pixels (n, 2), by frame and then by index."""
+        radius = np.sqrt(2.0 - 2.0 * max(self.min_cosine, -1.0))
+        near = self.depth.tree.query_ball_point(rotations[:, 2], radius, return_sorted=True)
+        frame = np.repeat(np.arange(len(rotations)), [len(found) for found in near])
+        star = np.concatenate([np.asarray(found, dtype=np.int64) for found in near])
+        bright = self.depth.stars.mag[star] <= self.max_mag
+        frame, star = frame[bright], star[bright]
+        xy = project(self.camera, np.einsum("nij,nj->ni", rotations[frame], self.depth.directions[star]))
+        inside = np.all((xy > self.low) & (xy < self.high), axis=1)
+        return frame[inside], star[inside], xy[inside]
+
+
+@dataclass(frozen=True, eq=False)
+class Geometry:
+    """M frames without noise, N stars.
+
+    Attributes
+    ----------
+    camera : Camera
+        Seen through which.
+    depth : Depth
+        Catalogue that `star` counts in.
+    rotations : (M, 3, 3) array
+        R_cam_icrs.
+    starts : (M + 1,) array of int
+        Stars of each frame.
+    star : (N,) array of int
+        Which they are.
+    pixel : (N, 2) array
+        Where they are, px.
+    """
+
+    camera: Camera
+    depth: Depth
+    rotations: FloatArray
+    starts: IntArray
+    star: IntArray
+    pixel: FloatArray
+
+    @property
+    def n_frames(self) -> int:
+        """Number M of frames."""
+        return len(self.rotations)
+
+    @property
+    def mag(self) -> FloatArray:
+        """Magnitudes, (N,)."""
+        return self.depth.stars.mag[self.star]
+
+    def brightest(self, n: int | None) -> Geometry:
+        """The same frames with their n brightest stars."""
+        if n is None:
+            return self
+        frame = np.repeat(np.arange(self.n_frames), np.diff(self.starts))
+        order = np.lexsort((self.mag, frame))
+        rank = np.arange(len(order)) - self.starts[:-1][frame]
+        kept = np.sort(order[rank < n])
+        sizes = np.minimum(np.diff(self.starts), n)
+        starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+        return Geometry(self.camera, self.depth, self.rotations, starts, self.star[kept], self.pixel[kept])
+
+    def frames(self, sigma_px: FloatArray) -> StarFrames:
+        """Stars with this noise (N,), px per axis."""
+        return StarFrames(
+            pixel=np.ascontiguousarray(self.pixel.T),
+            r=np.ascontiguousarray(self.depth.directions[self.star].T),
+            weight=1.0 / sigma_px,
+            starts=self.starts,
+        )
+
+
+NoiseShape = tuple[float, float, float, float]
+
+
+def noise_shape(settings: Mapping[str, Any]) -> tuple[NoiseShape, float]:
+    """How noise depends on magnitude (size, dex per magnitude, magnitude, floor), and a factor on all of it."""
+    size, slope = settings["sigma_px"], settings["noise_per_mag"]
+    if settings["noise_floor_px"] > 0.0:
+        return (size, slope, settings["noise_mag"], settings["noise_floor_px"]), 1.0
+    return (1.0, slope, settings["noise_mag"] if slope else 0.0, 0.0), size
+
+
+def star_noise(mag: FloatArray, shape: NoiseShape) -> FloatArray:
+    """Noise of stars of these magnitudes (n,), px per axis."""
+    size, slope, at, floor = shape
+    noise: FloatArray = np.hypot(size * 10.0 ** (slope * (mag - at)), floor)
+    return noise
+
+
+class GeometryKey(NamedTuple):
+    """What a geometry depends on."""
+
+    camera: Camera
+    max_mag: float
+    min_stars: int
+    margin_px: float
+    pointing: str
+    n_frames: int | None
+    seed: tuple[int, ...]
+
+
+def geometry_key(camera: Camera, settings: Mapping[str, Any], seed: int, seed_index: int, exact: bool) -> GeometryKey:
+    """What the frames of a cell depend on; `exact` asks for its own number of frames.
+
+    Frames at random attitudes serve all repetitions, which draw campaigns from them; a pattern starts at another place
+    each time, and stars that bring their own errors have to be counted over the frames that there are.
+    """
+    own = exact or settings["pointing"] != "random" or settings["direction_mas"] > 0.0
+    # Powers of two, so that many noises share their frames.
+    faintest = (
+        float(star_noise(np.array([settings["max_mag"]]), noise_shape(settings)[0])[0]) * noise_shape(settings)[1]
+    )
+    margin = max(1.0, 2.0 ** np.ceil(np.log2(EDGE_SIGMAS * faintest)))
+    return GeometryKey(
+        camera,
+        settings["max_mag"],
+        settings["min_stars"],
+        float(margin),
+        settings["pointing"],
+        (settings["frames"] if exact else min(settings["frames"], _MOST_FRAMES)) if own else None,
+        (seed, seed_index) if own else (seed,),
+    )
+
+
+def take_frames(key: GeometryKey, heaven: Heaven, most: int) -> Geometry:
+    """Frames of a geometry; `most` limits those of random attitudes that serve many campaigns.
+
+    Raises
+    ------
+    StudyError
+        When the catalogue cannot fill them.
+    """
+    depth = heaven.depth(key.max_mag)
+    window = _Window(depth, key.camera, key.max_mag, key.margin_px)
+    # What seeds a place must not depend on what is swept: neighbouring cells then look at one sky.
+    rng = np.random.default_rng([*key.seed, 11])
+    if key.pointing == "random":
+        n = key.n_frames
+        if n is None:
+            sky = float(np.prod(np.deg2rad(key.camera.fov_deg))) / (4.0 * np.pi)
+            expected = max(float(np.sum(depth.stars.mag <= key.max_mag)) * sky, float(key.min_stars))
+            n = int(np.clip(_STARS / expected, min(_LEAST_FRAMES, most), most))
+        return _random(key, window, rng, n)
+    assert key.n_frames is not None
+    for _ in range(_PLACES):
+        start = pattern_rotations("stare", 1, rng, key.camera.fov_deg[0])
+        if len(window.seen(start)[0]) >= key.min_stars:
+            break
+    rotations = pattern_rotations(key.pointing, key.n_frames, rng, key.camera.fov_deg[0], start[0])
+    found = _enough(key, window, rotations)
+    if found.n_frames == 0:
+        raise StudyError(
+            f"no frame of the pattern {key.pointing!r} shows {key.min_stars} stars: raise max_mag, or lower min_stars."
+        )
+    return found
+
+
+def _random(key: GeometryKey, window: _Window, rng: np.random.Generator, n: int) -> Geometry:
+    parts: list[Geometry] = []
+    tries = good = 0
+    while good < n:
+        parts.append(_enough(key, window, pattern_rotations("random", min(_BATCH, 2 * n), rng, 0.0)))
+        tries += min(_BATCH, 2 * n)
+        good += parts[-1].n_frames
+        if tries >= 10 * _BATCH and good < _LEAST_SKY * tries:
+            raise StudyError(
+                f"only {good} of {count(tries)} random attitudes show {key.min_stars} stars to magnitude "
+                f"{key.max_mag:g}: raise max_mag, widen the field, or lower min_stars."
+            )
+    sizes = np.concatenate([np.diff(part.starts) for part in parts])[:n]
+    starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+    last = int(starts[-1])
+    return Geometry(
+        key.camera,
+        window.depth,
+        np.concatenate([part.rotations for part in parts])[:n],
+        starts,
+        np.concatenate([part.star for part in parts])[:last],
+        np.concatenate([part.pixel for part in parts])[:last],
+    )
+
+
+def _enough(key: GeometryKey, window: _Window, rotations: FloatArray) -> Geometry:
+    """Those of the attitudes that show enough stars."""
+    frame, star, xy = window.seen(rotations)
+    sizes = np.bincount(frame, minlength=len(rotations))
+    good = sizes >= key.min_stars
+    kept = good[frame]
+    starts = np.concatenate([[0], np.cumsum(sizes[good])]).astype(np.int64)
+    return Geometry(key.camera, window.depth, rotations[good], starts, star[kept], xy[kept])
+
+
+@dataclass(frozen=True, eq=False)
+class Statements:
+    """What M frames say of p parameters, and what the parameters do to M attitudes, for a noise of `scale` times one.
+
+    Attributes
+    ----------
+    camera : Camera
+        Linearised at which.
+    information : (M, p, p) array
+        Of each frame, its attitude eliminated.
+    weights : (M,) array
+        Sum over the stars of each frame of the squared inverse noise, px^-2.
+    mean_stars : float
+        Stars in a frame on average.
+    common : (3, p) array
+        Common rotation, rad per unit of a parameter.
+    rest_forms : (3, p, p) array
+        Mean square over frames of what an attitude adds to it, rad^2.
+    noise : (3,) array
+        Mean over frames of the variance of an attitude, rad^2.
+    star_own, star_common : (p, p) array or None
+        Sum over frames of what errors of stars do to the score: within frames, and of all frames together; for
+        errors of one px.
+    """
+
+    camera: Camera
+    information: FloatArray
+    weights: FloatArray
+    mean_stars: float
+    common: FloatArray
+    rest_forms: FloatArray
+    noise: FloatArray
+    star_own: FloatArray | None = None
+    star_common: FloatArray | None = None
+
+
+def statements(geometry: Geometry, sigma_px: FloatArray, with_star_errors: bool) -> Statements:
+    """What the frames of a geometry say when its stars have this noise (N,), px per axis."""
+    frames = geometry.frames(sigma_px)
+    camera = geometry.camera
+    information, response, noise = frame_matrices(camera, frames, geometry.rotations)
+    common = response.mean(axis=0)
+    rest = response - common
+    star: tuple[FloatArray | None, FloatArray | None] = (None, None)
+    if with_star_errors:
+        star = _star_scores(geometry, frames)
+    return Statements(
+        camera=camera,
+        information=information,
+        weights=frames.sum(np.asarray(frames.weight) ** 2),
+        mean_stars=frames.n_stars / frames.n_frames,
+        common=common,
+        rest_forms=np.einsum("kap,kaq->apq", rest, rest, optimize=True) / len(rest),
+        noise=np.diagonal(noise, axis1=1, axis2=2).mean(axis=0),
+        star_own=star[0],
+        star_common=star[1],
+    )
+
+
+def _star_scores(geometry: Geometry, frames: StarFrames) -> tuple[FloatArray, FloatArray]:
+    """Sums over images, and over stars of the sum of their images, of the squared score for one px of star error."""
+    camera = geometry.camera
+    likelihood = MarginalLikelihood(frames, camera.distortion)
+    state, _ = likelihood.profile(camera.theta, geometry.rotations)
+    h = likelihood.project_out(state, likelihood.derivatives(camera.theta, state))
+    numbers = np.unique(geometry.star, return_inverse=True)[1]
+    z = offset_columns(likelihood, state, sky_axes(frames.r, numbers), camera.focal_px)
+    score = np.einsum("pxn,jxn->pjn", h, z)
+    total = np.zeros((int(numbers.max()) + 1, len(h), 2))
+    add_by_star(total, score, numbers)
+    return np.einsum("pjn,qjn->pq", score, score), np.einsum("spj,sqj->pq", total, total)
+
+
+def offset_px(camera: Camera, direction_mas: float) -> float:
+    """An error of a direction in px at the boresight."""
+    return camera.focal_px * direction_mas / 1000.0 / ARCSEC

@@ -1,0 +1,376 @@
+"""The result of a study: one labelled data set over all cells, and the questions that are asked of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.core.constants import AXES as ATTITUDE
+from starcal_uq.core.display import Shown
+from starcal_uq.core.errors import StudyError
+from starcal_uq.core.files import PathLike, atomic_path, new_folder, reading
+from starcal_uq.core.types import BoolArray, FloatArray
+from starcal_uq.studies.axes import AXES
+from starcal_uq.studies.definition import StudyDefinition
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import xarray as xr
+
+NETCDF, PARQUET = "study.nc", "study.parquet"
+BAND = (0.05, 0.95)
+# More values than this along an axis of a hypercube are drawn in so many groups.
+_GROUPS = 12
+# An error that falls more slowly than this power of the frames, a thousand times more of them, is at its floor.
+_NO_GAIN = -0.05
+_PARAMETER, _OTHER, _AXIS, _FACTOR, _SIMPLER = "parameter", "parameter_2", "axis", "frames_factor", "simpler"
+
+# Dimensions beyond `cell`, unit, and words of every variable.
+VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
+    "n_frames": ((), "", "frames of a campaign"),
+    "mean_stars": ((), "", "stars used in a frame on average"),
+    "field_deg": ((), "deg", "full width of the field"),
+    "truth": ((_PARAMETER,), "px", "parameters of the cell's camera"),
+    "sigma": ((_PARAMETER,), "px", "standard deviation, all other parameters unknown"),
+    "sigma_data": ((_PARAMETER,), "px", "standard deviation without the prior"),
+    "sigma_conditional": ((_PARAMETER,), "px", "standard deviation, all other parameters known"),
+    "variance_inflation": ((_PARAMETER,), "", "square of marginal over conditional standard deviation"),
+    "correlation": ((_PARAMETER, _OTHER), "", "correlation of two parameters"),
+    "condition_number": ((), "", "condition number of the information with unit diagonal"),
+    "weak_direction": ((_PARAMETER,), "", "least determined direction, in units of the parameters' own sigmas"),
+    "weak_variance": ((), "", "variance along it, 1 for uncoupled parameters"),
+    "attitude_correlation": ((_PARAMETER, _AXIS), "", "correlation with the common rotation"),
+    "common_rotation_arcsec": ((_AXIS,), "arcsec", "rotation common to all frames, 1 sigma"),
+    "frame_error_arcsec": ((_AXIS,), "arcsec", "frame-dependent attitude error by the calibration, 1 sigma"),
+    "nea_arcsec": ((_AXIS,), "arcsec", "noise-equivalent angle of one frame, 1 sigma"),
+    "model_bias_arcsec": ((_SIMPLER,), "arcsec", "error of directions over the field, per axis, if it were fitted"),
+    "model_bias_attitude_arcsec": ((_SIMPLER, _AXIS), "arcsec", "frame-dependent attitude error if it were fitted"),
+    "model_bias_sigma": ((_SIMPLER, _PARAMETER), "", "shift of a parameter in its own sigmas if it were fitted"),
+    "error_curve_arcsec": ((_FACTOR,), "arcsec", "frame-dependent error across the boresight per axis, 1 sigma"),
+    "sigma_curve": ((_PARAMETER, _FACTOR), "px", "standard deviation with other numbers of frames"),
+    "estimate": ((_PARAMETER,), "px", "estimate from simulated frames"),
+    "sigma_predicted": ((_PARAMETER,), "px", "standard deviation by the information of the same frames"),
+    "z": ((_PARAMETER,), "", "estimate minus truth in sigmas"),
+    "covered_95": ((_PARAMETER,), "", "1 where the 95 % interval holds the truth, 0 where not"),
+    "posterior_sigma": ((_PARAMETER,), "px", "standard deviation of the posterior"),
+    "posterior_correlation": ((_PARAMETER, _OTHER), "", "correlation in the posterior"),
+    "noise_estimate": ((), "px", "estimated centroid noise, or factor on the stated one"),
+    "khat": ((), "", "Pareto shape of the importance weights; above 0.7 they are not to be trusted"),
+    "seconds": ((), "s", "processor time of the cell"),
+}
+TEXTS = ("weak_words",)
+
+
+@dataclass(frozen=True, eq=False)
+class Study(Shown):
+    """What a study found.
+
+    Attributes
+    ----------
+    data : xarray.Dataset
+        Dimension ``cell``; coordinates are the swept axes, ``seed_index`` and ``key``. A cell whose `status` is not
+        ``ok`` holds NaN.
+    definition : StudyDefinition
+        What was varied.
+    """
+
+    data: xr.Dataset
+    definition: StudyDefinition
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Swept axes with more than one value."""
+        return tuple(name for name, values in self.definition.axes.items() if len(set(values)) > 1)
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """Parameters of all models."""
+        return tuple(str(name) for name in self.data["parameter"].values)
+
+    @property
+    def n_cells(self) -> int:
+        """Number of cells."""
+        return int(self.data.sizes["cell"])
+
+    @cached_property
+    def ok(self) -> BoolArray:
+        """Cells that have numbers, (C,)."""
+        good: BoolArray = np.asarray(self.data["status"].values == "ok")
+        return good
+
+    @property
+    def complete(self) -> bool:
+        """False for a study that was interrupted: run it again, and it goes on."""
+        return not bool(self.data.attrs.get("missing_cells", 0))
+
+    @property
+    def problems(self) -> dict[str, int]:
+        """Reasons why cells have no numbers, with how many have each."""
+        texts, counts = np.unique(self.data["status"].values[~self.ok].astype(str), return_counts=True)
+        return {str(text): int(n) for text, n in zip(texts, counts, strict=True)}
+
+    def values(
+        self,
+        variable: str,
+        *,
+        parameter: str | None = None,
+        parameter_2: str | None = None,
+        axis: str | None = None,
+        simpler: str | None = None,
+    ) -> FloatArray:
+        """One number per cell, (C,): a variable at the labels of its other dimensions.
+
+        `axis` may also be ``cross``: root mean square of pitch and yaw.
+
+        Raises
+        ------
+        StudyError
+            For an unknown variable or label, or one that is missing.
+        """
+        labels = {_PARAMETER: parameter, _OTHER: parameter_2, _AXIS: axis, _SIMPLER: simpler}
+        if variable == "frames_needed" and variable not in self.data:
+            raise StudyError("the study has no target: use needed(along, target_arcsec).")
+        if variable not in self.data:
+            raise StudyError(f"the study has no variable {variable!r}: use one of {', '.join(map(str, self.data))}.")
+        array = self.data[variable]
+        cross = axis == "cross" and _AXIS in array.dims
+        for name, label in labels.items():
+            if name not in array.dims or (cross and name == _AXIS):
+                continue
+            known = [str(v) for v in array[name].values]
+            if label not in known:
+                raise StudyError(f"{variable} needs {name}=: give one of {', '.join(known)}.")
+            array = array.sel({name: label})
+        if cross:
+            array = (0.5 * (array**2).sel({_AXIS: list(ATTITUDE[:2])}).sum(_AXIS, skipna=False)) ** 0.5
+        numbers: FloatArray = np.asarray(array.values, dtype=np.float64)
+        if numbers.ndim != 1:
+            raise StudyError(
+                f"{variable} has more than one number per cell along {', '.join(map(str, array.dims[1:]))}."
+            )
+        return numbers
+
+    def at(self, at: Mapping[str, Any] | None = None) -> BoolArray:
+        """Cells (C,) with numbers, at given values of some axes; the nearest value of an axis of numbers.
+
+        Raises
+        ------
+        StudyError
+            For an axis that is not swept, or a name that does not occur.
+        """
+        mask = self.ok.copy()
+        for name, wanted in (at or {}).items():
+            found = self._coordinate(name)
+            if found.dtype.kind in "OU":
+                if wanted not in found:
+                    raise StudyError(f"{name} is never {wanted!r}: use one of {', '.join(sorted(set(found)))}.")
+                mask &= found == wanted
+            else:
+                mask &= found == found[np.argmin(np.abs(found - wanted))]
+        return mask
+
+    def _coordinate(self, name: str) -> Any:
+        if name not in self.definition.axes:
+            raise StudyError(f"{name} is not varied in this study: use one of {', '.join(self.definition.axes)}.")
+        return self.data[name].values
+
+    def _grouped(self, name: str) -> tuple[Any, list[Any]]:
+        """Group (C,) of every cell along an axis, and the value of each group; a hypercube's values share groups."""
+        found = self._coordinate(name)
+        values, group = np.unique(found, return_inverse=True)
+        if found.dtype.kind in "OU":
+            order = [str(v) for v in self.definition.axes[name] if v in values]
+            place = {value: order.index(str(value)) for value in values}
+            return np.array([place[v] for v in values])[group], order
+        if name not in self.definition.latin or len(values) <= _GROUPS:
+            return group, values.tolist()
+        part = np.minimum(np.arange(len(values)) * _GROUPS // len(values), _GROUPS - 1)
+        return part[group], [float(np.median(values[part == k])) for k in range(_GROUPS)]
+
+    def band(
+        self,
+        variable: str,
+        along: str,
+        *,
+        parameter: str | None = None,
+        parameter_2: str | None = None,
+        axis: str | None = None,
+        simpler: str | None = None,
+        at: Mapping[str, Any] | None = None,
+    ) -> pd.DataFrame:
+        """A variable along an axis: median and the middle 90 % over seeds and all axes that `at` does not fix.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns ``value`` (of the axis), ``median``, ``low``, ``high`` and ``n``, the number of cells.
+        """
+        numbers = self.values(variable, parameter=parameter, parameter_2=parameter_2, axis=axis, simpler=simpler)
+        return self._band(numbers, along, at)
+
+    def _band(self, numbers: FloatArray, along: str, at: Mapping[str, Any] | None) -> pd.DataFrame:
+        import pandas as pd
+
+        mask = self.at(at) & ~np.isnan(numbers)
+        group, values = self._grouped(along)
+        rows = []
+        for place, value in enumerate(values):
+            some = numbers[mask & (group == place)]
+            # Observations, not interpolated between: some may be infinite.
+            low, middle, high = (
+                np.quantile(some, (BAND[0], 0.5, BAND[1]), method="closest_observation") if len(some) else (np.nan,) * 3
+            )
+            if len(some) and np.isfinite(some).all():
+                middle = np.median(some)
+            rows.append({"value": value, "median": middle, "low": low, "high": high, "n": len(some)})
+        return pd.DataFrame(rows)
+
+    def image(
+        self,
+        variable: str,
+        x: str,
+        y: str,
+        *,
+        parameter: str | None = None,
+        parameter_2: str | None = None,
+        axis: str | None = None,
+        simpler: str | None = None,
+        at: Mapping[str, Any] | None = None,
+    ) -> xr.DataArray:
+        """A variable over two axes, (y, x): median over seeds and all axes that `at` does not fix."""
+        import xarray as xr
+
+        if x == y:
+            raise StudyError(f"an image needs two axes, not {x} twice.")
+        numbers = self.values(variable, parameter=parameter, parameter_2=parameter_2, axis=axis, simpler=simpler)
+        mask = self.at(at) & ~np.isnan(numbers)
+        (column, columns), (row, rows) = self._grouped(x), self._grouped(y)
+        pixels = np.full((len(rows), len(columns)), np.nan)
+        for i in range(len(rows)):
+            for j in range(len(columns)):
+                some = numbers[mask & (row == i) & (column == j)]
+                if len(some):
+                    pixels[i, j] = np.median(some)
+        return xr.DataArray(pixels, coords={y: rows, x: columns}, dims=(y, x), name=variable)
+
+    def frames_for(self, target_arcsec: float) -> FloatArray:
+        """Frames (C,) that bring the frame-dependent error, 1 sigma per axis across the boresight, to a target.
+
+        Infinite where errors of the stars, which more frames do not average, leave more than that; NaN without numbers.
+        """
+        curve, factors, frames = (self.data[name].values for name in ("error_curve_arcsec", _FACTOR, "n_frames"))
+        return frames_for(curve, factors, frames, target_arcsec)
+
+    def needed(
+        self, along: str, target_arcsec: float | None = None, *, at: Mapping[str, Any] | None = None
+    ) -> pd.DataFrame:
+        """Frames that a target takes, along an axis: as `band` gives a variable; by default the study's own target.
+
+        Raises
+        ------
+        StudyError
+            Without any target.
+        """
+        target = self.definition.target_arcsec if target_arcsec is None else target_arcsec
+        if target is None or not target > 0.0:
+            raise StudyError("no target is set: give target_arcsec above zero, here or in [study].")
+        return self._band(self.frames_for(target), along, at)
+
+    def met(
+        self, along: str, target_arcsec: float | None = None, *, at: Mapping[str, Any] | None = None
+    ) -> list[float]:
+        """Values of an axis of numbers at which the median frame-dependent error crosses the target, interpolated."""
+        target = self.definition.target_arcsec if target_arcsec is None else target_arcsec
+        if target is None or AXES[along].kind == "name":
+            raise StudyError("give target_arcsec above zero, and an axis of numbers.")
+        table = self.band("frame_error_arcsec", along, axis="cross", at=at).dropna()
+        value = table["value"].to_numpy(dtype=np.float64)
+        excess = np.log(table["median"].to_numpy(dtype=np.float64) / target)
+        changes = np.flatnonzero(np.sign(excess[:-1]) * np.sign(excess[1:]) < 0)
+        return [float(value[i] + (value[i + 1] - value[i]) * excess[i] / (excess[i] - excess[i + 1])) for i in changes]
+
+    def table(self) -> pd.DataFrame:
+        """One row per cell and parameter: the axes, what a cell has one number of, and the parameter's own."""
+        import pandas as pd
+
+        data, names = self.data, self.parameter_names
+        cells, p = self.n_cells, len(names)
+        columns: dict[str, Any] = {"cell": np.repeat(np.arange(cells), p)}
+        for name in (*self.definition.axes, "seed_index", "key", "status"):
+            columns[name] = np.repeat(data[name].values, p)
+        columns[_PARAMETER] = np.tile(np.array(names), cells)
+        late: dict[str, Any] = {}
+        for key, array in data.data_vars.items():
+            name = str(key)
+            dims, values = array.dims[1:], array.values
+            if name == "status" or _FACTOR in dims:
+                continue
+            if dims == ():
+                columns[name] = np.repeat(values, p)
+            elif dims == (_PARAMETER,):
+                late[name] = values.ravel()
+            elif dims == (_PARAMETER, _OTHER):
+                late |= {f"{name}_{other}": values[:, :, j].ravel() for j, other in enumerate(names)}
+            elif dims == (_PARAMETER, _AXIS):
+                late |= {f"{name}_{axis}": values[:, :, j].ravel() for j, axis in enumerate(ATTITUDE)}
+            elif dims in ((_AXIS,), (_SIMPLER,)):
+                labels = [str(v) for v in data[dims[0]].values]
+                columns |= {f"{name}_{label}": np.repeat(values[:, j], p) for j, label in enumerate(labels)}
+            elif dims == (_SIMPLER, _PARAMETER):
+                late |= {f"{name}_{m}": values[:, j].ravel() for j, m in enumerate(data[_SIMPLER].values)}
+        return pd.DataFrame(columns | late)
+
+    def save(self, folder: PathLike) -> None:
+        """Write ``study.nc`` and ``study.parquet`` into a folder, each all or nothing."""
+        path = new_folder(folder)
+        with atomic_path(path / NETCDF) as temporary:
+            packed = {name: {"zlib": True, "complevel": 1} for name, v in self.data.items() if v.dtype.kind in "fi"}
+            self.data.to_netcdf(temporary, engine="h5netcdf", encoding=packed)
+        with atomic_path(path / PARQUET) as temporary:
+            self.table().to_parquet(temporary, index=False)
+
+    @classmethod
+    def load(cls, path: PathLike) -> Study:
+        """Read a study from its folder, or from its ``study.nc``.
+
+        Raises
+        ------
+        RunFolderError
+            If the file is missing or is no study.
+        """
+        import xarray as xr
+
+        file = Path(path)
+        file = file / NETCDF if file.is_dir() else file
+        with reading(file, "a study", "run `starcal-uq study` again"):
+            with xr.open_dataset(file, engine="h5netcdf") as opened:
+                data = opened.load()
+            return cls(data, StudyDefinition.from_dict(json.loads(data.attrs["definition"])))
+
+    def __repr__(self) -> str:
+        swept = ", ".join(f"{name} ({len(values)})" for name, values in self.definition.axes.items())
+        return f"<Study {self.definition.name!r}: {int(self.ok.sum())} of {self.n_cells} cells, {swept}>"
+
+
+def frames_for(curve: FloatArray, factors: FloatArray, frames: FloatArray, target: float) -> FloatArray:
+    """Frames (C,) at which error curves (C, k), over factors (k,) on numbers of frames (C,), come down to a target."""
+    x, wanted = np.log(factors), np.log(target)
+    needed = np.full(len(frames), np.nan)
+    for cell in np.flatnonzero(~np.isnan(curve).all(axis=1)):
+        known = np.isfinite(curve[cell])
+        step, errors = x[known], np.log(curve[cell][known])
+        # Errors fall with every frame; beyond the ends they go on as they did.
+        after = int(np.clip(np.sum(errors > wanted), 1, len(errors) - 1))
+        slope = (errors[after] - errors[after - 1]) / (step[after] - step[after - 1])
+        if errors[after] > wanted and slope > _NO_GAIN:
+            needed[cell] = np.inf
+            continue
+        factor = np.exp(step[after] + (wanted - errors[after]) / slope)
+        needed[cell] = max(np.ceil(frames[cell] * factor - 1e-6), 1.0)
+    return needed

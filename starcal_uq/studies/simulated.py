@@ -1,0 +1,303 @@
+"""One cell of a study by simulation: frames drawn, calibrated and sampled, beside what their information foretold."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.core.constants import ARCSEC
+from starcal_uq.core.errors import SamplingError, StarcalError
+from starcal_uq.core.types import FloatArray
+from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.inference.ensemble import PROPOSAL_DF, EnsembleSettings, run_ensembles
+from starcal_uq.inference.named import NaivePairsWarning, find_source
+from starcal_uq.inference.priors import GaussianPriors, Priors
+from starcal_uq.inference.surrogate import fit_polynomial
+from starcal_uq.inference.target import Target, laplace_approximation, start_target, student_t_log_density
+from starcal_uq.maths.intervals import student_quantile
+from starcal_uq.maths.linear import correlation_of, scaled_inverse
+from starcal_uq.observations.table import Observations
+from starcal_uq.sky.positions import ra_dec_deg
+from starcal_uq.studies.axes import camera_of
+from starcal_uq.studies.cells import (
+    Numbers,
+    coupling_numbers,
+    covariance_numbers,
+    prior_precision,
+    simpler_numbers,
+    star_spread,
+)
+from starcal_uq.studies.definition import Cell, StudyDefinition
+from starcal_uq.studies.geometry import (
+    Geometry,
+    Heaven,
+    Statements,
+    geometry_key,
+    noise_shape,
+    offset_px,
+    star_noise,
+    statements,
+    take_frames,
+)
+from starcal_uq.studies.result import VARIABLES
+
+if TYPE_CHECKING:
+    from starcal_uq.estimation.calibration import Calibration
+
+# What is decided after the frames were taken: cells that differ in nothing else share their data.
+_AFTERWARDS = ("method", "likelihood", "prior")
+_WALKERS, _BURN = 64, 20
+_PROBABILITY = 0.95
+_CUBIC = 3
+
+
+class SimulatedCells:
+    """Numbers of simulated cells.
+
+    Parameters
+    ----------
+    definition : StudyDefinition
+        The study.
+    heaven : Heaven
+        Its stars.
+    """
+
+    def __init__(self, definition: StudyDefinition, heaven: Heaven) -> None:
+        self.definition, self.heaven = definition, heaven
+
+    def numbers(self, cell: Cell) -> Numbers:
+        """All numbers of a cell; `status` is a sentence where there are none."""
+        try:
+            return self._numbers(cell, camera_of(self.definition.camera, cell.settings))
+        except StarcalError as error:
+            return {"status": str(error)}
+
+    def _numbers(self, cell: Cell, camera: Camera) -> Numbers:
+        definition, settings = self.definition, cell.settings
+        key = geometry_key(camera, settings, definition.seed, cell.seed_index, True)
+        geometry = take_frames(key, self.heaven, definition.geometries).brightest(settings.get("stars"))
+        shape, scale = noise_shape(settings)
+        noise = scale * star_noise(geometry.mag, shape)
+        random, sampling = np.random.SeedSequence(self._seed(cell)).spawn(2)
+        rng = np.random.default_rng(random)
+        obs = observe(geometry, noise, settings, rng)
+        likelihood = settings["likelihood"]
+        cal = calibrate(
+            obs,
+            camera.data_sheet(),
+            method=settings["method"],
+            likelihood="student_t" if likelihood == "student_t" else "marginal",
+            star_errors=settings["direction_mas"] > 0.0,
+        )
+        stated, found = self._foretold(geometry, noise, cell, camera)
+        prior = self._prior(cell, camera, cal, obs.sigma_px is not None, rng)
+        own = estimated(cal, camera, stated, prior)
+        if definition.posterior != "none":
+            own |= self._sampled(obs, cal, camera, prior.full, likelihood, sampling)
+        found |= {
+            name: embedded(name, value, cal.parameter_names, camera.parameter_names) for name, value in own.items()
+        }
+        return found | {"status": "ok", "noise_estimate": cal.sigma}
+
+    def _seed(self, cell: Cell) -> int:
+        """Seed of the noise: another one for all other settings, so that cells are independent of each other."""
+        settings = {k: v for k, v in cell.settings.items() if k not in _AFTERWARDS}
+        content = [settings, self.definition.camera.to_dict(), self.definition.seed, cell.seed_index]
+        return int(hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32], 16)
+
+    def _foretold(
+        self, geometry: Geometry, noise: FloatArray, cell: Cell, camera: Camera
+    ) -> tuple[Statements, Numbers]:
+        """What the same frames say by their information."""
+        settings, n = cell.settings, geometry.n_frames
+        stated = statements(geometry, noise, settings["direction_mas"] > 0.0)
+        frame = stated.information.sum(axis=0) / n
+        prior = prior_precision(self.definition.priors.get(settings["prior"]), camera)
+        spread = None
+        if stated.star_own is not None and stated.star_common is not None:
+            offset = offset_px(camera, settings["direction_mas"])
+            spread = star_spread(stated.star_own, stated.star_common, n, 1.0, offset)
+        found = coupling_numbers(frame, prior, spread, n, stated)
+        found |= simpler_numbers(frame, n, float(stated.weights.sum()), stated)
+        return stated, found | {
+            "sigma_predicted": found["sigma"],
+            "n_frames": n,
+            "mean_stars": stated.mean_stars,
+            "field_deg": camera.fov_deg[0],
+            "truth": camera.theta,
+            "nea_arcsec": ARCSEC * np.sqrt(stated.noise),
+        }
+
+    def _prior(
+        self, cell: Cell, camera: Camera, cal: Calibration, per_star: bool, rng: np.random.Generator
+    ) -> GroundPrior:
+        """Prior of the parameters that were estimated.
+
+        A prior set is a measurement from the ground: its centre is off by as much as it says, drawn at random. Around
+        the truth itself it would make every estimate better than its sigma.
+        """
+        table = self.definition.priors.get(cell.settings["prior"])
+        known = [camera.parameter_names.index(name) for name in cal.parameter_names]
+        stated = prior_precision(table, camera)
+        precision = np.zeros(len(known)) if stated is None else stated[known]
+        # Drawn in any case, so that cells with and without a prior have the same data.
+        shift = rng.standard_normal(len(camera.theta))[known]
+        wide = Priors.default(cal.nominal.replace(distortion=cal.camera.distortion), per_star)
+        mean, covariance = wide.theta_moments()
+        given = precision > 0.0
+        sd = np.sqrt(np.where(given, 1.0 / np.where(given, precision, 1.0), np.diag(covariance)))
+        centre = np.where(given, camera.theta[known] + sd * shift, mean)
+        full = GaussianPriors(
+            centre, np.diag(sd**2), wide.sigma_median, wide.sigma_log_sd, cal.camera.distortion, per_star
+        )
+        return GroundPrior(precision, centre, full)
+
+    def _sampled(
+        self,
+        obs: Observations,
+        cal: Calibration,
+        camera: Camera,
+        priors: GaussianPriors,
+        likelihood: str,
+        seed: np.random.SeedSequence,
+    ) -> Numbers:
+        """Moments of the posterior, and whether its intervals hold the truth."""
+        with warnings.catch_warnings():
+            # That pairs are not independent is what a study of them shows.
+            warnings.simplefilter("ignore", NaivePairsWarning)
+            source = find_source(likelihood, obs, cal, None)
+        evaluate = source.exact if source.fast is None else source.fast
+        if evaluate is None:
+            raise SamplingError(f"the likelihood {likelihood!r} cannot be evaluated: use another.")
+        start = start_target(
+            evaluate, priors, source.theta, source.information, source.sigma, source.dof, False, source.extra
+        )
+        target, _ = laplace_approximation(start)
+        design, draws = seed.spawn(2)
+        if source.fast is None:
+            polynomial = fit_polynomial(target, _CUBIC, np.random.default_rng(design))
+            target = replace(target, log_likelihood=polynomial.log_likelihood)
+        if self.definition.posterior == "ensemble":
+            steps = max(20, -(-self.definition.draws // _WALKERS))
+            chains = run_ensembles(
+                target.log_density, target.dim, [draws], EnsembleSettings(_WALKERS, steps, _BURN, "mixture")
+            )
+            natural = target.natural(chains.u[0].reshape(-1, target.dim))
+            weights, khat = np.full(len(natural), 1.0 / len(natural)), np.nan
+        else:
+            natural, weights, khat = importance_draws(target, self.definition.draws, np.random.default_rng(draws))
+        truth = truth_of(camera, cal)
+        shift = natural[:, : len(truth)] - truth
+        mean = weights @ shift
+        covariance = (shift - mean).T @ ((shift - mean) * weights[:, None])
+        correlation, sigma = correlation_of(covariance)
+        below = np.sum(weights[:, None] * (shift < 0.0), axis=0)
+        tail = 0.5 * (1.0 - _PROBABILITY)
+        return {
+            "posterior_sigma": sigma,
+            "posterior_correlation": correlation,
+            "covered_95": ((below >= tail) & (below <= 1.0 - tail)).astype(np.float64),
+            "khat": khat,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class GroundPrior:
+    """A prior of p parameters.
+
+    Attributes
+    ----------
+    precision : (p,) array
+        Of what the prior set states; 0 elsewhere.
+    centre : (p,) array
+        Means, px units.
+    full : GaussianPriors
+        With wide priors elsewhere, to sample with.
+    """
+
+    precision: FloatArray
+    centre: FloatArray
+    full: GaussianPriors
+
+
+def observe(
+    geometry: Geometry, noise: FloatArray, settings: Mapping[str, Any], rng: np.random.Generator
+) -> Observations:
+    """A table of the frames with noise; stars whose catalogue errs have other directions in it than in the sky."""
+    stars, frame = geometry.depth.stars, np.repeat(np.arange(geometry.n_frames), np.diff(geometry.starts))
+    xy = geometry.pixel + noise[:, None] * rng.standard_normal(geometry.pixel.shape)
+    ra, dec = stars.ra_deg[geometry.star], stars.dec_deg[geometry.star]
+    error = settings["direction_mas"]
+    if error > 0.0:
+        which, image = np.unique(geometry.star, return_inverse=True)
+        offset = error / 1000.0 / ARCSEC * rng.standard_normal((len(which), 3))
+        r = geometry.depth.directions[which]
+        # What is along the direction itself does not turn it.
+        turned = r + offset - np.sum(offset * r, axis=1, keepdims=True) * r
+        ra, dec = (column[image] for column in ra_dec_deg(turned / np.linalg.norm(turned, axis=1, keepdims=True)))
+    uneven = settings["noise_per_mag"] > 0.0 or settings["noise_floor_px"] > 0.0
+    return Observations(
+        frame=frame,
+        x_px=xy[:, 0],
+        y_px=xy[:, 1],
+        ra_deg=ra,
+        dec_deg=dec,
+        sigma_px=noise if uneven else None,
+        star_id=stars.star_id[geometry.star],
+        mag=geometry.mag,
+        direction_mas=np.full(len(xy), error) if error > 0.0 else None,
+        meta={"source": "simulated", "directions": "apparent"},
+    )
+
+
+def truth_of(camera: Camera, cal: Calibration) -> FloatArray:
+    """True values of the parameters that were estimated."""
+    return camera.theta[[camera.parameter_names.index(name) for name in cal.parameter_names]]
+
+
+def estimated(cal: Calibration, camera: Camera, stated: Statements, prior: GroundPrior) -> Numbers:
+    """Estimate, covariance and what follows, of the parameters that were estimated; a prior set is combined with it."""
+    truth = truth_of(camera, cal)
+    kept = [camera.parameter_names.index(name) for name in cal.parameter_names]
+    covariance, theta = cal.covariance, cal.theta
+    if prior.precision.any():
+        information = scaled_inverse(covariance)
+        covariance = scaled_inverse(information + np.diag(prior.precision))
+        theta = theta + covariance @ (prior.precision * (prior.centre - theta))
+    forms = stated.rest_forms[:, kept][:, :, kept]
+    found = covariance_numbers(covariance, cal.camera.distortion, stated.common[:, kept], forms)
+    z = (theta - truth) / found["sigma"]
+    return found | {
+        "sigma_data": cal.sigmas,
+        "estimate": theta,
+        "z": z,
+        "covered_95": (np.abs(z) <= student_quantile(_PROBABILITY, cal.dof)).astype(np.float64),
+    }
+
+
+def embedded(name: str, value: Any, own: tuple[str, ...], names: tuple[str, ...]) -> Any:
+    """A variable over parameters `own` as one over all `names`, NaN where a method did not estimate one."""
+    dims = VARIABLES[name][0] if name in VARIABLES else ()
+    if own == names or not dims or not dims[0].startswith("parameter"):
+        return value
+    place = [names.index(parameter) for parameter in own]
+    square = len(dims) == 2 and dims[1].startswith("parameter")
+    wide = np.full((len(names), *((len(names),) if square else value.shape[1:])), np.nan)
+    wide[np.ix_(place, place) if square else place] = value
+    return wide
+
+
+def importance_draws(target: Target, n: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray, float]:
+    """Draws (n, d) of a multivariate t around the mode, their smoothed weights (n,), and the weights' Pareto shape."""
+    from starcal_uq.inference.arviz import psis
+
+    u = rng.standard_normal((n, target.dim)) / np.sqrt(rng.chisquare(PROPOSAL_DF, (n, 1)) / PROPOSAL_DF)
+    log_weights, khat = psis(target.log_density(u) - student_t_log_density(u, PROPOSAL_DF))
+    return target.natural(u), np.exp(log_weights), float(khat)

@@ -1,0 +1,291 @@
+"""Every cell of a study, over processes, kept as it is made."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.camera.distortion import model_names, parameter_names
+from starcal_uq.core.constants import AXES as ATTITUDE
+from starcal_uq.core.errors import StarcalError
+from starcal_uq.core.files import PathLike
+from starcal_uq.core.provenance import provenance
+from starcal_uq.core.tasks import Progress, run_tasks
+from starcal_uq.core.types import AnyDict
+from starcal_uq.sky.catalogue import load_catalogue
+from starcal_uq.studies.axes import AXES, camera_of
+from starcal_uq.studies.cells import FRAME_FACTORS, FisherCells, simpler_models
+from starcal_uq.studies.definition import Cell, StudyDefinition
+from starcal_uq.studies.geometry import Heaven, geometry_key
+from starcal_uq.studies.result import TEXTS, VARIABLES, Study, frames_for
+from starcal_uq.studies.store import Store, row
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from starcal_uq.sky.catalogue import StarCatalogue
+
+# Guesses of processor time, by which cells are put together: a second's work goes to a process at once.
+_GEOMETRY_S, _CELL_S, _SIMULATED_S, _BATCH_S = 0.01, 0.0007, 0.12, 1.0
+MISSING = "not computed yet: run the study again, and it goes on."
+
+
+def study(
+    definition: StudyDefinition | PathLike,
+    *,
+    out: PathLike | None = None,
+    seed: int | None = None,
+    stars: StarCatalogue | None = None,
+    n_workers: int | None = None,
+    force: bool = False,
+    progress: Progress | None = None,
+) -> Study:
+    """Sweep a camera and its observation, and say what couples with what in every cell.
+
+    Parameters
+    ----------
+    definition : StudyDefinition or path
+        What is varied, or a STUDY.toml (`starcal_uq.studies.write_study_template`).
+    out : path, optional
+        Folder in which cells are kept as they are made, and at the end the results (``study.nc``, ``study.parquet``).
+        Cells that are there already, by the hash of all that they depend on, are not computed again.
+    seed : int, optional
+        Root seed, instead of that of the definition; it repeats bit for bit.
+    stars : StarCatalogue, optional
+        The sky; the embedded catalogue at the epoch of the definition by default.
+    n_workers : int, optional
+        Processes; 0 stays in this one, None takes as many as there are processors.
+    force : bool
+        Compute all cells anew.
+    progress : callable, optional
+        Called as ``progress(done, total)``, in cells.
+
+    Returns
+    -------
+    Study
+        After Ctrl-C with the cells that were complete; their `status` says of the others that they are missing.
+
+    Raises
+    ------
+    StudyError
+        For a definition that makes no sense.
+    KeyboardInterrupt
+        If Ctrl-C was pressed before the first cell.
+    """
+    wanted = definition if isinstance(definition, StudyDefinition) else StudyDefinition.load(definition)
+    wanted = wanted if seed is None else replace(wanted, seed=seed)
+    wanted.check()
+    cells = wanted.cells()
+    if stars is None:
+        stars = load_catalogue(max_mag=max(cell.settings["max_mag"] for cell in cells), epoch=wanted.epoch)
+    heaven = Heaven(stars)
+    keys = [wanted.key(cell, heaven.hash(cell.settings["max_mag"])) for cell in cells]
+    store = Store(out)
+    if force:
+        store.clear()
+    known = store.keys()
+    todo = [i for i, key in enumerate(keys) if key not in known]
+    work = Work(wanted, heaven, [cells[i] for i in todo], [keys[i] for i in todo])
+    done = len(cells) - len(todo)
+
+    def keep(rows: list[AnyDict]) -> None:
+        nonlocal done
+        store.append(rows)
+        done += len(rows)
+        if progress is not None:
+            progress(done, len(cells))
+
+    interrupted = False
+    if todo:
+        interrupted = run_batches(work, keep, n_workers)
+    data = dataset(wanted, cells, keys, store)
+    found = Study(data, wanted)
+    if out is not None:
+        if not interrupted:
+            store.consolidate()
+        found.save(out)
+    return found
+
+
+@dataclass(eq=False)
+class Work:
+    """Cells to compute, in batches of neighbours; called with the number of a batch, in any process.
+
+    Attributes
+    ----------
+    definition : StudyDefinition
+        The study.
+    heaven : Heaven
+        Its stars.
+    cells : list of Cell
+        What is to be computed.
+    keys : list of str
+        Their hashes.
+    """
+
+    definition: StudyDefinition
+    heaven: Heaven
+    cells: list[Cell]
+    keys: list[str]
+
+    @cached_property
+    def batches(self) -> list[list[int]]:
+        """Numbers of the cells of each batch; cells that share frames stand together."""
+        simulated = self.definition.mode == "simulate"
+        groups: dict[Any, list[int]] = {}
+        for number, cell in enumerate(self.cells):
+            groups.setdefault(number if simulated else self._group(cell), []).append(number)
+        batches: list[list[int]] = [[]]
+        load = 0.0
+        for members in groups.values():
+            for place, number in enumerate(members):
+                if load >= _BATCH_S:
+                    batches.append([])
+                    load = 0.0
+                batches[-1].append(number)
+                load += _SIMULATED_S if simulated else _CELL_S + (_GEOMETRY_S if place == 0 else 0.0)
+        return batches
+
+    def _group(self, cell: Cell) -> Any:
+        try:
+            camera = camera_of(self.definition.camera, cell.settings)
+        except StarcalError:
+            return None
+        return geometry_key(camera, cell.settings, self.definition.seed, cell.seed_index, False)
+
+    @cached_property
+    def computer(self) -> Callable[[Cell], AnyDict]:
+        """From a cell to its numbers."""
+        if self.definition.mode == "fisher":
+            return FisherCells(self.definition, self.heaven).numbers
+        from starcal_uq.studies.simulated import SimulatedCells
+
+        return SimulatedCells(self.definition, self.heaven).numbers
+
+    def __getstate__(self) -> AnyDict:
+        return {name: value for name, value in self.__dict__.items() if name != "computer"}
+
+    def __call__(self, index: int) -> list[AnyDict]:
+        rows = []
+        for number in self.batches[index]:
+            cell = self.cells[number]
+            start = time.process_time()
+            numbers = self.computer(cell)
+            numbers["seconds"] = time.process_time() - start
+            rows.append(row(self.keys[number], model_of(self.definition, cell), numbers))
+        return rows
+
+
+def run_batches(work: Work, keep: Callable[[list[AnyDict]], None], n_workers: int | None) -> bool:
+    """Compute all batches and keep each as it arrives; whether Ctrl-C was pressed before the end."""
+    # A process takes seconds to start: what is done sooner is done here.
+    workers = 0 if n_workers is None and len(work.batches) < 4 else n_workers
+    _, interrupted = run_tasks(work, len(work.batches), caller="starcal_uq.study", chunk=1, workers=workers, each=keep)
+    return interrupted
+
+
+def model_of(definition: StudyDefinition, cell: Cell) -> str:
+    """Distortion model of a cell."""
+    return str(cell.settings.get("distortion", definition.camera.distortion))
+
+
+def dataset(definition: StudyDefinition, cells: Sequence[Cell], keys: Sequence[str], store: Store) -> xr.Dataset:
+    """All cells of a definition as one data set; those that the store lacks are marked."""
+    import xarray as xr
+
+    table = store.table()
+    place = {key: number for number, key in enumerate(table["key"].to_pylist())}
+    rows = np.array([place.get(key, -1) for key in keys])
+    simpler = sorted({m for model in definition.models for m in simpler_models(model)}, key=model_names().index)
+    labels = {
+        "parameter": list(definition.parameter_names),
+        "parameter_2": list(definition.parameter_names),
+        "axis": list(ATTITUDE),
+        "frames_factor": FRAME_FACTORS.tolist(),
+        "simpler": simpler,
+    }
+    models = np.array([model_of(definition, cell) for cell in cells])
+    status = np.full(len(cells), MISSING, dtype=object)
+    there = np.flatnonzero(rows >= 0)
+    status[there] = np.array(table["status"].to_pylist(), dtype=object)[rows[there]]
+    good = status == "ok"
+    variables: AnyDict = {"status": ("cell", status.astype(str))}
+    for name in TEXTS:
+        texts = np.full(len(cells), "", dtype=object)
+        texts[good] = np.array(table[name].to_pylist(), dtype=object)[rows[good]]
+        variables[name] = ("cell", texts.astype(str))
+    for name, (dims, unit, words) in VARIABLES.items():
+        column = table[name].combine_chunks()
+        if column.null_count == len(column):
+            continue
+        values = np.full((len(cells), *(len(labels[d]) for d in dims)), np.nan)
+        for model in dict.fromkeys(models[good]):
+            members = np.flatnonzero(good & (models == model))
+            own = {**labels, "parameter": list(parameter_names(model)), "parameter_2": list(parameter_names(model))}
+            own["simpler"] = list(simpler_models(model))
+            index = [[labels[d].index(label) for label in own[d]] for d in dims]
+            some = column.take(rows[members])
+            # A variable that only some cells have, such as what sampling finds.
+            known = ~np.asarray(some.is_null())
+            if not known.any():
+                continue
+            flat = some.drop_null()
+            numbers = np.asarray(flat.flatten() if dims else flat, dtype=np.float64)
+            shape = [len(i) for i in index]
+            values[np.ix_(members[known], *index)] = numbers.reshape(-1, *shape)
+        attributes = {"long_name": words} | ({"units": unit} if unit else {})
+        variables[name] = (("cell", *dims), values, attributes)
+    if definition.target_arcsec is not None or definition.target_sigma:
+        variables |= _targets(definition, variables, labels)
+    coordinates: AnyDict = {k: v for k, v in labels.items() if v}
+    for name in definition.axes:
+        axis = AXES[name]
+        content = [cell.settings[name] for cell in cells]
+        coordinates[name] = (
+            "cell",
+            np.array(content),
+            {"long_name": axis.words} | ({"units": axis.unit} if axis.unit else {}),
+        )
+    coordinates["seed_index"] = ("cell", np.array([cell.seed_index for cell in cells]))
+    coordinates["key"] = ("cell", np.array(list(keys)))
+    record = provenance(definition.seed, {}, None)
+    return xr.Dataset(
+        variables,
+        coordinates,
+        {
+            "title": definition.name,
+            "definition": json.dumps(definition.to_dict()),
+            "versions": json.dumps(record["versions"]),
+            "starcal_uq": str(record["versions"]["starcal_uq"]),
+            "seed": definition.seed,
+            "missing_cells": int(np.sum(rows < 0)),
+            "created_by": "starcal-uq study",
+        },
+    )
+
+
+def _targets(definition: StudyDefinition, variables: AnyDict, labels: AnyDict) -> AnyDict:
+    """Frames that the targets of a definition take."""
+    factors = np.array(labels["frames_factor"])
+    found: AnyDict = {}
+    if "n_frames" not in variables:
+        return {}
+    frames = variables["n_frames"][1]
+    if definition.target_arcsec is not None:
+        needed = frames_for(variables["error_curve_arcsec"][1], factors, frames, definition.target_arcsec)
+        words = f"frames that bring the frame-dependent error to {definition.target_arcsec:g} arcsec"
+        found["frames_needed"] = ("cell", needed, {"long_name": words})
+    if definition.target_sigma:
+        every = np.full((len(frames), len(labels["parameter"])), np.nan)
+        for name, target in definition.target_sigma.items():
+            column = labels["parameter"].index(name)
+            every[:, column] = frames_for(variables["sigma_curve"][1][:, column], factors, frames, target)
+        words = "frames that bring a standard deviation to its target"
+        found["frames_needed_sigma"] = (("cell", "parameter"), every, {"long_name": words})
+    return found
