@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.estimation.screening.result import Screening
     from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
     from starcal_uq.propagation.attitude_error import AttitudeError
     from starcal_uq.propagation.coupling import Coupling
@@ -139,7 +140,7 @@ def end_with(level: Level) -> None:
         raise typer.Exit(level.exit_status)
 
 
-def warn_air(obs: Observations, cal: Calibration) -> None:
+def warn_air(obs: Observations | PartitionedObservations, cal: Calibration) -> None:
     """Say what refraction does to the focal length where nothing is known of the air."""
     from starcal_uq.diagnostics.verdict.observed import REMEDY, air, conditional_words
 
@@ -147,7 +148,7 @@ def warn_air(obs: Observations, cal: Calibration) -> None:
         err.print(f"warning: {conditional_words(cal)} {REMEDY}", style="yellow", highlight=False, soft_wrap=True)
 
 
-def warn_undeclared(obs: Observations, camera: Camera) -> None:
+def warn_undeclared(obs: Observations | PartitionedObservations, camera: Camera) -> None:
     """Say what follows for this camera when nothing is known of the observer's motion, and what was left out."""
     from starcal_uq.diagnostics.verdict.observed import aberration_size
 

@@ -22,7 +22,8 @@ ObsFile = Annotated[
     typer.Argument(
         metavar="OBS",
         help="Stars in pixels: CSV, ECSV or Parquet with columns frame, x_px, y_px, ra_deg, dec_deg and optionally "
-        "sigma_px, star_id, mag, direction_mas, time_utc, temperature_c.",
+        "sigma_px, star_id, mag, direction_mas, time_utc, temperature_c; or a folder of Parquet files of whole frames, "
+        "which may exceed memory.",
     ),
 ]
 CameraFile = Annotated[
@@ -49,6 +50,14 @@ TimeUtc = Annotated[
     ),
 ]
 Engine = Annotated[str, typer.Option(help="What finds attitudes: pyramid, or tetra3rs (extra of that name).")]
+SchedulerAddress = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Dask scheduler whose workers do it; local processes otherwise.",
+    ),
+]
 Duplicates = Annotated[
     str,
     typer.Option(

@@ -34,6 +34,8 @@ from starcal_uq.cli.steps import load_table, sample_run
 from starcal_uq.core.files import check_new_folder
 
 if TYPE_CHECKING:
+    from starcal_uq.observations.partitions import PartitionedObservations
+    from starcal_uq.observations.table import Observations
     from starcal_uq.runs.run import Run
 
 
@@ -68,8 +70,8 @@ def run_command(
         list[Path],
         typer.Argument(
             metavar="OBS|IMAGES...",
-            help="A table of identified stars (see `calibrate`), or images (FITS, TIFF, PNG, JPEG) or folders of them, "
-            "whose stars are then found and identified.",
+            help="A table of identified stars or a folder of partitions (see `calibrate`), or images (FITS, TIFF, PNG, "
+            "JPEG) or folders of them, whose stars are then found and identified.",
         ),
     ],
     camera: CameraFile,
@@ -95,15 +97,18 @@ def run_command(
     if budget is not None:
         # A mistake in it should not show after the work.
         sc.budgeting.load_budget_file(budget)
-    from_images = are_images(inputs)
+    folder = len(inputs) == 1 and inputs[0].is_dir() and any(inputs[0].glob("*.parquet"))
+    from_images = not folder and are_images(inputs)
     refuse_others(from_images, sky, images)
+    obs: Observations | PartitionedObservations
     if from_images:
         obs, nominal, centroids, identified = load_images(inputs, camera, images, sky)
     elif len(inputs) == 1:
         obs, nominal = load_table(inputs[0], camera, sky)
     else:
         raise typer.BadParameter(f"{inputs[1]} is no image: give one table of observations, or images only.")
-    calibration = run.calibrate(obs, nominal, force=force, **estimation.options())
+    with progress_bar("passes over the files") as progress:
+        calibration = run.calibrate(obs, nominal, force=force, progress=progress, **estimation.options())
     if from_images:
         run.keep_images(centroids, identified)
     if run.screening is not None:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 import starcal_uq as sc
-from starcal_uq.cli.options import Columns, Duplicates, Seed, TimeUtc, parse_choice
+from starcal_uq.cli.options import Columns, Duplicates, SchedulerAddress, Seed, TimeUtc, parse_choice
 from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
@@ -50,6 +50,7 @@ class EstimationSettings:
         ),
     ] = "common"
     duplicates: Duplicates = "refuse"
+    scheduler: SchedulerAddress = None
 
     def options(self) -> AnyDict:
         """Keyword arguments of `Run.calibrate`."""
@@ -61,6 +62,7 @@ class EstimationSettings:
             "duplicates": self.duplicates,
         }
         options |= {"star_errors": True} if self.star_errors else {}
+        options |= {"scheduler": self.scheduler} if self.scheduler is not None else {}
         return options | {"likelihood": "student_t"} if self.robust else options
 
 

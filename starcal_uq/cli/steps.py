@@ -46,6 +46,7 @@ from starcal_uq.core.files import check_new_folder, ensure_new
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
     from starcal_uq.runs.run import Run
 
@@ -60,12 +61,16 @@ def register(app: typer.Typer) -> None:
     app.command("report")(report_command)
 
 
-def load_table(path: Path, camera_path: Path, sky: SkySettings) -> tuple[Observations, Camera]:
-    """Observations of a table with the nominal camera, and what is worth telling on the way."""
-    from starcal_uq.pipeline.tables import observations_from_table
+def load_table(
+    path: Path, camera_path: Path, sky: SkySettings
+) -> tuple[Observations | PartitionedObservations, Camera]:
+    """Observations of a table, or of a folder of them, with the nominal camera; and what is worth telling."""
+    from starcal_uq.pipeline.tables import observations_from_table, partitions_from_folder
 
     known, camera = sky.options(), sc.Camera.load(camera_path)
-    obs = observations_from_table(
+    obs: Observations | PartitionedObservations = (
+        partitions_from_folder if path.is_dir() else observations_from_table
+    )(
         path,
         camera,
         columns=parse_columns(sky.column),
@@ -134,7 +139,8 @@ def calibrate_command(
     run = sc.Run(out)
     check_new_folder(out, force)
     obs, nominal = load_table(observations, camera, sky)
-    calibration = run.calibrate(obs, nominal, force=force, **estimation.options())
+    with progress_bar("passes over the files") as progress:
+        calibration = run.calibrate(obs, nominal, force=force, progress=progress, **estimation.options())
     if run.screening is not None:
         show_screening(run.screening)
     warn_air(obs, calibration)

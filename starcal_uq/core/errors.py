@@ -117,5 +117,9 @@ class BudgetError(StarcalError):
     """An error budget is incomplete, contradicts itself or is unreadable."""
 
 
+class ClusterError(StarcalError):
+    """Processes, of this machine or of a Dask cluster, cannot do the work."""
+
+
 class RunFolderError(StarcalError):
     """A run folder lacks a file, or holds one that would be overwritten."""

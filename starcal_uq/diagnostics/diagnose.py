@@ -8,7 +8,7 @@ from another calibration.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,6 +33,7 @@ from starcal_uq.estimation.normals import FrameNormals
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
 
 # How far the other starts are from the nominal camera: of its focal length, and of the detector's longer side.
@@ -120,7 +121,7 @@ class Diagnosis(Shown):
 
 
 def diagnose(
-    obs: Observations,
+    obs: Observations | PartitionedObservations,
     cal: Calibration,
     post: Posterior | None = None,
     *,
@@ -134,7 +135,8 @@ def diagnose(
     Parameters
     ----------
     obs, cal
-        The data and the estimate.
+        The data and the estimate. Of partitioned observations the sample of frames that the calibration has kept is
+        questioned, and what compares estimates starts from that of the sample.
     post : Posterior, optional
         For the posterior predictive check; the calibration's normal approximation otherwise.
     models : sequence of str
@@ -147,18 +149,22 @@ def diagnose(
         Called with the number of steps done and their total.
     """
     step = progress or (lambda done, total: None)
-    obs = weighed(obs, cal)
+    obs, whole = weighed(obs, cal), cal
     misfit = misfit_tests(obs, cal)
+    if whole.partitions is not None:
+        cal = calibrate(obs, whole.nominal, duplicates="keep")
     step(1, 5)
     normals = FrameNormals.at(obs, cal)
     found = _jackknife(obs, cal, normals)
     step(2, 5)
-    predictive = predictive_check(obs, cal, post, seed=seed)
+    predictive = predictive_check(obs, whole, post, seed=seed)
     step(3, 5)
     starts = multi_start(obs, cal, n_starts, seed) if n_starts > 0 else None
     step(4, 5)
     # A single frame cannot be left out.
     comparison = compare_models(obs, cal, models, seed=seed) if models and obs.n_frames > 1 else None
+    if comparison is not None and whole.partitions is not None:
+        comparison = replace(comparison, share=obs.n_frames / whole.n_frames)
     step(5, 5)
     settings = {"models": list(models), "n_starts": n_starts}
     return Diagnosis(
@@ -167,8 +173,8 @@ def diagnose(
         jackknife=found,
         comparison=comparison,
         starts=starts,
-        theta=tuple(cal.theta.tolist()),
-        provenance=provenance(seed, settings, obs.data_hash),
+        theta=tuple(whole.theta.tolist()),
+        provenance=provenance(seed, settings, whole.data_hash_of(obs)),
         stars=star_test(obs, cal),
     )
 

@@ -105,9 +105,9 @@ def _models(
         if score.rejected or score.model == found.fitted:
             continue
         shifts = (np.abs(score.common_arcsec), np.abs(score.rest_arcsec))
-        for total, shift, sigma, which in zip(
-            (common, rest), shifts, (attitude.common_arcsec, attitude.rest_arcsec), names, strict=True
-        ):
+        # A sample of the frames sees no shift below the sigma that it would give by itself.
+        sigmas = [sigma / np.sqrt(found.share) for sigma in (attitude.common_arcsec, attitude.rest_arcsec)]
+        for total, shift, sigma, which in zip((common, rest), shifts, sigmas, names, strict=True):
             counted = (shift > sigma) | rejected
             if counted.any():
                 total[:] = np.maximum(total, np.where(counted, shift, 0.0))

@@ -101,11 +101,14 @@ class ModelComparison(Shown):
         The model of the calibration that was compared.
     failed : dict
         Models that could not be calibrated, and why.
+    share : float
+        Frames that were compared, of those that the calibration rests on.
     """
 
     scores: tuple[ModelScore, ...]
     fitted: str
     failed: dict[str, str]
+    share: float = 1.0
 
     @property
     def accepted(self) -> tuple[ModelScore, ...]:

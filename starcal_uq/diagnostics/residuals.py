@@ -9,13 +9,13 @@ import numpy as np
 
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.noise_model import weighed
+from starcal_uq.estimation.residual_map import ResidualMap
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.observations.table import Observations
 
 _MIN_STARS = 5
-_STARS_PER_CELL = 25.0
 
 
 @dataclass(frozen=True)
@@ -73,29 +73,28 @@ class BinnedResiduals:
 
 
 def bin_residuals(cal: Calibration, obs: Observations) -> BinnedResiduals:
-    """Mean residual vectors in cells that hold about 25 stars each (4 to 12 cells along the longer side)."""
-    obs = weighed(obs, cal)
-    width, height = cal.camera.width_px, cal.camera.height_px
-    longer = max(width, height)
-    along = int(np.clip(np.sqrt(obs.n_stars / _STARS_PER_CELL * longer / min(width, height)), 4, 12))
-    cell = longer / along
-    nx, ny = int(np.ceil(width / cell - 1e-9)), int(np.ceil(height / cell - 1e-9))
-    column = np.clip(((obs.x_px + 0.5) / cell).astype(int), 0, nx - 1)
-    row = np.clip(((obs.y_px + 0.5) / cell).astype(int), 0, ny - 1)
-    index = row * nx + column
-    residuals = np.asarray(cal.residuals_px)
-    counts = np.bincount(index, minlength=nx * ny).astype(np.float64)
-    keep = counts >= _MIN_STARS
-    sums = np.stack([np.bincount(index, residuals[:, i], nx * ny) for i in (0, 1)], axis=1)[keep]
-    variance = np.bincount(index, residual_scale(cal, obs) ** 2, nx * ny)[keep]
+    """Mean residual vectors in cells that hold about 25 stars each (4 to 12 cells along the longer side).
+
+    Of partitioned observations they are those of all stars, of which `obs` is a sample.
+    """
+    if cal.partitions is not None:
+        found, scale2 = cal.partitions.residuals, _unit_scale(cal, cal.n_stars) ** 2
+    else:
+        obs = weighed(obs, cal)
+        stated = np.ones(obs.n_stars) if obs.sigma_px is None else np.asarray(obs.sigma_px)
+        found = ResidualMap.of(cal.camera, obs.n_stars, obs.xy.T, np.asarray(cal.residuals_px).T, stated)
+        scale2 = _unit_scale(cal, obs.n_stars) ** 2
+    cell, nx = found.cell_px, int(found.shape[1])
+    keep = found.counts >= _MIN_STARS
+    counts, sums, variance = found.counts[keep], found.sums[keep], found.stated2[keep] * scale2
     flat = np.flatnonzero(keep)
     centres = np.stack([(flat % nx + 0.5) * cell - 0.5, (flat // nx + 0.5) * cell - 0.5], axis=1)
     return BinnedResiduals(
-        centres=np.minimum(centres, [width - 0.5, height - 0.5]),
-        means=sums / counts[keep, None],
-        counts=counts[keep],
+        centres=np.minimum(centres, [cal.camera.width_px - 0.5, cal.camera.height_px - 0.5]),
+        means=sums / counts[:, None],
+        counts=counts,
         chi2=np.sum(sums**2, axis=1) / variance,
-        noise_px=np.sqrt(variance) / counts[keep],
+        noise_px=np.sqrt(variance) / counts,
         cell_px=cell,
         n_empty=int(np.count_nonzero(~keep)),
     )
@@ -108,9 +107,14 @@ def residual_scale(cal: Calibration, obs: Observations) -> FloatArray:
     sqrt(d / 2N) on average.
     """
     obs = weighed(obs, cal)
-    shrink = np.sqrt(max(cal.dof, 1) / (2.0 * obs.n_stars))
     stated = np.ones(obs.n_stars) if obs.sigma_px is None else np.asarray(obs.sigma_px)
-    return np.asarray(cal.sigma * shrink * stated, dtype=np.float64)
+    n_stars = obs.n_stars if cal.partitions is None else cal.n_stars
+    return np.asarray(_unit_scale(cal, n_stars) * stated, dtype=np.float64)
+
+
+def _unit_scale(cal: Calibration, n_stars: int) -> float:
+    """Expected standard deviation of the residuals of `n_stars` stars with a stated noise of one."""
+    return float(cal.sigma * np.sqrt(max(cal.dof, 1) / (2.0 * n_stars)))
 
 
 def normalised_residuals(cal: Calibration, obs: Observations) -> FloatArray:

@@ -10,9 +10,11 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation, rotation_to_quaternion
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model, sigma_parameter
+from starcal_uq.core.cluster import Scheduler, cluster
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.status import Status
+from starcal_uq.core.tasks import Progress, processors
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, assemble, check_camera, noise_px, with_star_errors
 from starcal_uq.estimation.baselines import check_count, least_squares, recursive
@@ -23,6 +25,7 @@ from starcal_uq.estimation.fingerprints import Fingerprints
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import NOISES, fit_noise, weighed
 from starcal_uq.estimation.pairs import PairObjective
+from starcal_uq.estimation.partitioned import calibrate_partitions
 from starcal_uq.estimation.recursive.start import RECURSIVE_METHODS, RecursionOptions
 from starcal_uq.estimation.recursive.stream import raise_unless_good
 from starcal_uq.estimation.robust import compress_reweighted, refine, robust_start
@@ -30,6 +33,7 @@ from starcal_uq.estimation.solvers import is_singular
 from starcal_uq.estimation.stages import Stage, distortion_stage, joint_stage, optics_stage, refinement_stage
 from starcal_uq.estimation.student import parse_dof
 from starcal_uq.observations.frames import StarFrames
+from starcal_uq.observations.partitions import PartitionedObservations
 from starcal_uq.observations.table import Observations
 
 METHODS = ("efficient", "three_stage", "least_squares", "samaan", "griffith")
@@ -38,10 +42,12 @@ SOLVERS = ("lm", "minpack", "ipopt")
 # Stage 1 that moves the principal point by more than this fraction of the width has met strong distortion.
 _FAR = 0.05
 _ITERATIONS = 200
+# Starting processes takes two seconds.
+_STARS_WORTH_PROCESSES = 1_000_000
 
 
 def calibrate(
-    obs: Observations | Iterable[Observations],
+    obs: Observations | PartitionedObservations | Iterable[Observations],
     camera: Camera,
     *,
     method: str = "efficient",
@@ -54,13 +60,18 @@ def calibrate(
     noise: str = "common",
     duplicates: str = "refuse",
     star_errors: bool = False,
+    scheduler: Scheduler = None,
+    workers: int | None = None,
+    progress: Progress | None = None,
 ) -> Calibration:
     """Estimate optics and distortion from identified stars.
 
     Parameters
     ----------
-    obs : Observations or iterable of Observations
-        Stars with pixel positions and catalogue directions; at least three per frame. The recursive methods also take
+    obs : Observations, PartitionedObservations or iterable of Observations
+        Stars with pixel positions and catalogue directions; at least three per frame. Partitioned ones may exceed
+        memory: a sample of their frames goes through the stages, then all of them are refined on, pass by pass; the
+        result has residuals and attitudes of that sample. The recursive methods also take
         a stream: any iterable of Observations of one or several frames, such as `stream_frames`. They keep none of
         them, so that the result has no residuals and attitudes.
     camera : Camera
@@ -108,6 +119,12 @@ def calibrate(
         Take into account that a star's direction errs alike in every frame (catalogue, blend, colour): the size of such
         errors is estimated, beyond what the column ``direction_mas`` of the table states, and they are marginalised in
         estimate, covariance and `compressed`. For ``efficient`` with ``marginal``.
+    scheduler : str or distributed.Client, optional
+        Dask scheduler, whose workers read partitioned observations; processes of this machine otherwise.
+    workers : int, optional
+        Number of these processes: as many as processors by default; 0 stays in this one.
+    progress : callable, optional
+        Called with (partitions done, partitions) in every pass over partitioned observations.
 
     Returns
     -------
@@ -146,7 +163,35 @@ def calibrate(
         raise CalibrationError("errors of the stars (star_errors) need method='efficient' and likelihood='marginal'.")
     if recursion is not None and method not in RECURSIVE_METHODS:
         raise CalibrationError(f"method {method!r} is not recursive: leave recursion out, or use samaan or griffith.")
-    if method in RECURSIVE_METHODS:
+    if scheduler is not None and not isinstance(obs, PartitionedObservations):
+        raise CalibrationError(
+            "a Dask scheduler is of use to partitioned observations (sc.observations.open_partitions, a folder of "
+            "Parquet files): leave it out."
+        )
+    if isinstance(obs, PartitionedObservations) and method not in RECURSIVE_METHODS:
+        if (method, likelihood, noise, star_errors) != ("efficient", "marginal", "common", False):
+            raise CalibrationError(
+                "partitioned observations are calibrated by the efficient method on the Gaussian likelihood, with one "
+                "noise: leave out the other options, or calibrate the frames of `obs.sample()` with them."
+            )
+        if duplicates == "drop":
+            raise CalibrationError(
+                "repeated frames of partitioned observations cannot be dropped: remove them from the files, or use "
+                "duplicates='keep'."
+            )
+        sample = obs.sample()
+        start = calibrate(sample, camera, solver=solver, max_iterations=max_iterations, duplicates=duplicates)
+        with cluster(scheduler, workers=_enough(workers, obs), caller="calibrate") as processes:
+            calibration = calibrate_partitions(
+                obs,
+                sample,
+                start,
+                processes,
+                max_iterations=max_iterations,
+                duplicates=duplicates,
+                progress=progress,
+            )
+    elif method in RECURSIVE_METHODS:
         calibration = recursive(obs, camera, method, recursion)
     elif not isinstance(obs, Observations):
         raise CalibrationError(
@@ -188,6 +233,13 @@ def calibrate(
         duplicates="keep",
     )
     return replace(rest, provenance={**rest.provenance, "dropped_frames": repeating.tolist()})
+
+
+def _enough(workers: int | None, obs: PartitionedObservations) -> int | None:
+    """Processes that are worth their start: none for what one of them does in the same time."""
+    if workers is None and obs.n_stars < _STARS_WORTH_PROCESSES:
+        return 0
+    return workers if workers is not None else min(processors(), len(obs.parts))
 
 
 def _gaussian(

@@ -18,6 +18,7 @@ from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.estimation.compressed import CompressedLikelihood
 from starcal_uq.estimation.fingerprints import Fingerprints
+from starcal_uq.estimation.residual_map import PartitionSums
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.estimation.star_errors import StarErrors
 from starcal_uq.maths.intervals import student_quantile
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from starcal_uq.estimation.noise_model import NoiseModel
+    from starcal_uq.observations.table import Observations
 
 # Fields whose arrays grow with the data or the iterations: they stand in an archive beside the document.
 _APART = ("frame_ids", "quaternions", "residuals_px", "trajectory", "cost", "sigmas", "sizes", "xy_px", "error_px")
@@ -34,7 +36,7 @@ _APART = ("frame_ids", "quaternions", "residuals_px", "trajectory", "cost", "sig
 _DOCUMENT = (
     *("status", "parameter_names", "method", "solver", "sigma", "sigma_std", "sigma_name", "chi2", "dof", "provenance"),
     *("theta", "covariance", "information", "rotation_per_theta", "attitude_noise", "pair_theta", "pair_covariance"),
-    *("camera", "nominal", "stages", "compressed", "fingerprints", "star_errors"),
+    *("camera", "nominal", "stages", "compressed", "fingerprints", "star_errors", "partitions"),
 )
 # What the document says of a stage; its last estimate is there for readers.
 _STAGE = ("name", "status", "iterations", "evaluations", "seconds", "theta")
@@ -103,6 +105,9 @@ class Calibration(Shown):
     star_errors : StarErrors or None
         Direction errors of the stars, where they were asked for: `covariance`, `information` and `compressed` hold
         them, and residuals and attitudes are those after each star's own offset.
+    partitions : PartitionSums or None
+        Of a calibration of partitioned observations, sums over all of their residuals: `frame_ids`, `quaternions`,
+        `residuals_px`, `pair_theta` and `pair_covariance` are those of a sample of frames, everything else of all.
     """
 
     camera: Camera
@@ -130,6 +135,7 @@ class Calibration(Shown):
     provenance: AnyDict
     fingerprints: Fingerprints | None = None
     star_errors: StarErrors | None = None
+    partitions: PartitionSums | None = None
 
     @property
     def parameter_names(self) -> tuple[str, ...]:
@@ -178,12 +184,19 @@ class Calibration(Shown):
     @property
     def n_stars(self) -> int:
         """Number of stars."""
-        return len(self.residuals_px) or self.compressed.n_stars
+        return self.compressed.n_stars if self.partitions else len(self.residuals_px) or self.compressed.n_stars
 
     @property
     def n_frames(self) -> int:
         """Number of frames."""
-        return len(self.frame_ids) or self.compressed.n_frames
+        return self.compressed.n_frames if self.partitions else len(self.frame_ids) or self.compressed.n_frames
+
+    def data_hash_of(self, obs: Observations) -> str:
+        """Hash of the data that a table stands for: that of all partitions for the sample that was kept of them."""
+        record = self.provenance.get("partitions", {})
+        if record.get("sample_sha256") == obs.data_hash:
+            return str(self.provenance["data_sha256"])
+        return obs.data_hash
 
     @property
     def has_residuals(self) -> bool:

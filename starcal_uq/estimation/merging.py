@@ -90,6 +90,11 @@ def merge(
     began = perf_counter()
     names = [f"run {i}" for i in range(1, len(calibrations) + 1)] if names is None else list(names)
     check_mergeable(calibrations, names, noise, duplicates)
+    if any(cal.partitions is not None for cal in calibrations):
+        # What a run of partitions holds is a sample of its frames, which does not add up with the frames of others.
+        nothing: AnyDict = {"frame_ids": np.zeros(0, dtype=np.int64), "quaternions": np.zeros((0, 4))}
+        nothing |= {"residuals_px": np.zeros((0, 2)), "fingerprints": None, "partitions": None}
+        calibrations, observations = [replace(cal, **nothing) for cal in calibrations], None
     marks = _fingerprints(calibrations, observations)
     unchecked = [name for name, mark in zip(names, marks, strict=True) if mark is None]
     if duplicates == "refuse":

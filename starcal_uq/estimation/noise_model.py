@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.formatting import fixed, join_words, significant
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
@@ -27,6 +28,7 @@ from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.stages import refinement_stage
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.observations.frames import StarFrames
+from starcal_uq.observations.partitions import PartitionedObservations
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -165,12 +167,20 @@ def noise_model_of(result: Any) -> NoiseModel | None:
     return None if record is None else from_plain(NoiseModel, record)
 
 
-def weighed(obs: Observations, result: Any) -> Observations:
+def weighed(obs: Observations | PartitionedObservations, result: Any) -> Observations:
     """Observations as a calibration or posterior weighs them: with the noise of its model, if it has one that varies.
 
     The data and their hash stay what they are, but for repeated frames that a calibration left out. Without a model,
-    weights of another result's are what the table states.
+    weights of another result's are what the table states. Of partitioned observations it is the sample of frames that
+    their calibration has kept.
+
+    Raises
+    ------
+    CalibrationError
+        When partitioned observations are not those of the result.
     """
+    if isinstance(obs, PartitionedObservations):
+        return _sample_of(obs, result)
     left_out = np.isin(obs.frame, result.provenance.get("dropped_frames", ()))
     if left_out.any():
         obs = obs.select(~left_out)
@@ -183,6 +193,16 @@ def weighed(obs: Observations, result: Any) -> Observations:
         # A posterior keeps no factors of frames; the calibration that weighed these does.
         return obs
     return obs.weighted(model.sigma_px(obs))
+
+
+def _sample_of(obs: PartitionedObservations, result: Any) -> Observations:
+    """The sample of frames that a calibration has kept, read again."""
+    sample = obs.sample()
+    if result.provenance.get("partitions", {}).get("sample_sha256") != sample.data_hash:
+        raise CalibrationError(
+            f"the calibration was made from other observations than those in {obs.folder}: calibrate these first."
+        )
+    return sample
 
 
 def _columns(terms: tuple[str, ...], radius: FloatArray, mag: FloatArray) -> FloatArray:

@@ -153,6 +153,11 @@ def _named_source(likelihood: str, obs: Observations | None, cal: Calibration, d
         )
     if obs is None:
         raise SamplingError(f"the likelihood {likelihood!r} needs the observations: give obs.")
+    if cal.partitions is not None:
+        raise SamplingError(
+            f"the likelihood {likelihood!r} needs all stars at once, which partitioned observations do not give: use "
+            "likelihood='marginal'."
+        )
     if not cal.has_residuals:
         raise SamplingError(
             f"the likelihood {likelihood!r} needs the attitudes and residuals of every frame, which a stream does not "
@@ -199,6 +204,28 @@ class _ExactMarginal:
         return np.array([self._one.log_likelihood(t, float(s)) for t, s in zip(theta, sigma, strict=True)])
 
 
+class _Extrapolated:
+    """The exact likelihood of all partitions, as far as a sample of their frames knows it.
+
+    To the compressed one, which holds all stars, comes what it leaves out: of the sample, times the frames that each of
+    its own stands for.
+    """
+
+    def __init__(self, obs: Observations, cal: Calibration) -> None:
+        from starcal_uq.estimation.compressed import compress
+        from starcal_uq.estimation.marginal import MarginalLikelihood
+
+        self._whole, likelihood = cal.compressed, MarginalLikelihood(obs, cal.camera.distortion)
+        self._sample = _ExactMarginal(obs, cal)
+        covariance = self._whole.whitening @ self._whole.whitening.T
+        self._compressed = compress(likelihood, self._whole.theta_hat, covariance)
+        self._share = cal.n_frames / obs.n_frames
+
+    def log_likelihood(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
+        left_out = self._sample.log_likelihood(theta, sigma) - self._compressed.log_likelihood(theta, sigma)
+        return self._whole.log_likelihood(theta, sigma) + self._share * left_out
+
+
 def _marginal(obs: Observations | None, cal: Calibration) -> Source:
     if _settings(cal).get("likelihood") == "student_t":
         raise SamplingError(
@@ -206,6 +233,8 @@ def _marginal(obs: Observations | None, cal: Calibration) -> Source:
             "likelihood='marginal'."
         )
     exact = None if obs is None else _ExactMarginal(obs, cal).log_likelihood
+    if obs is not None and cal.partitions is not None:
+        exact = _Extrapolated(obs, cal).log_likelihood
     at = (cal.theta, cal.information, cal.sigma, float(cal.dof))
     return Source("marginal", *at, exact=exact, fast=cal.compressed.log_likelihood)
 

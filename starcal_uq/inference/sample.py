@@ -45,6 +45,7 @@ from starcal_uq.inference.update import check_chain
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
 
 # Starts are draws of the Laplace approximation, so the mixture, which forgets in two or three steps, needs a short
@@ -60,7 +61,7 @@ _DEGREES = (3, 4)
 
 
 def sample(
-    obs: Observations | None,
+    obs: Observations | PartitionedObservations | None,
     cal: Calibration,
     priors: Priors | None = None,
     *,
@@ -81,8 +82,9 @@ def sample(
 
     Parameters
     ----------
-    obs : Observations or None
-        The stars of the calibration. None leaves the compressed likelihood unchecked.
+    obs : Observations, PartitionedObservations or None
+        The stars of the calibration. None leaves the compressed likelihood unchecked; of partitioned ones, the sample
+        of frames that the calibration has kept checks it, its error counted for all frames.
     cal : Calibration
         Start, Fisher information and compressed likelihood.
     priors : Priors, optional
@@ -152,7 +154,7 @@ def sample(
         "evaluation": evaluation if isinstance(likelihood, str) else "exact",
         **({"dof": dof} if dof is not None else {}),
     }
-    data_hash = cal.provenance.get("data_sha256") if obs is None else obs.data_hash
+    data_hash = cal.provenance.get("data_sha256") if obs is None else cal.data_hash_of(obs)
     source = find_source(likelihood, obs, cal, dof)
     record = provenance(seed, chosen, data_hash)
     if cal.noise_model is not None:

@@ -9,7 +9,8 @@ import csv
 import io
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -80,9 +81,18 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def read_table(
-    path: str | os.PathLike[str], camera: Camera | None, mapping: Mapping[str, str]
+    path: str | os.PathLike[str],
+    camera: Camera | None,
+    mapping: Mapping[str, str],
+    only: Sequence[str] = tuple(COLUMNS),
+    check: bool = True,
+    frames: IntArray | None = None,
 ) -> tuple[dict[str, Any], AnyDict]:
-    """Checked columns and metadata of a file; see `starcal_uq.observations.table.load_observations`."""
+    """Checked columns and metadata of a file; see `starcal_uq.observations.table.load_observations`.
+
+    The columns are those of `only`; without `check`, rows are taken to have been checked before. Of a Parquet file,
+    the rows can be those of some `frames` alone.
+    """
     if unknown := [name for name in mapping if name not in COLUMNS]:
         raise ObservationError(
             f"columns: {unknown[0]!r} is no column of observations; use {', '.join(COLUMNS)}.",
@@ -90,15 +100,20 @@ def read_table(
         )
     path = Path(path)
     if os.path.isdir(path):
-        raise ObservationError(f"{path}: is a directory; name a file of observations.")
+        raise ObservationError(
+            f"{path}: is a directory; name a file of observations, or open a folder of partitions with "
+            "sc.observations.open_partitions."
+        )
     ending = table_ending(path)
     names = {name: mapping.get(name, name) for name in COLUMNS}
-    raw = _read(path, _read_bytes(path), ending, set(names.values()))
+    wanted, data = {names[name] for name in only}, _read_bytes(path)
+    raw = _read(path, data, ending, wanted) if frames is None else _read_frames(path, data, wanted, names, frames)
     check_names(path, raw, names, mapping)
     if not len(raw.numbers):
         raise ObservationError(f"{path}: the table has a header but no rows; give a table with observations.")
-    columns, problems, unknown_frame = convert_columns(path, raw, names)
-    problems += check_columns(columns, camera, unknown_frame)
+    columns, problems, unknown_frame = convert_columns(path, raw, {name: names[name] for name in only})
+    if check:
+        problems += check_columns(columns, camera, unknown_frame)
     # A message names the column as it is called in this file.
     named = [replace(p, column=names[p.column] if p.column else None) for p in problems]
     raise_problems(str(path), raw.word, raw.numbers, named)
@@ -276,20 +291,106 @@ def _ecsv_meta(header: AnyDict) -> AnyDict:
 
 
 def _read_parquet(path: Path, data: bytes, wanted: set[str]) -> RawTable:
+    table, names, meta = _arrow_table(path, data, wanted)
+    columns = {name: arrow_values(table.column(name)) for name in table.column_names}
+    return RawTable(columns, names, np.arange(1, table.num_rows + 1), "row", meta)
+
+
+def _read_frames(path: Path, data: bytes, wanted: set[str], own: Mapping[str, str], frames: IntArray) -> RawTable:
+    table, names, meta = _arrow_table(path, data, wanted)
+    # Before anything becomes Python's: texts of all rows would take longer than the rest.
+    rows = np.flatnonzero(np.isin(table.column(own["frame"]).to_numpy(), frames))
+    table = table.take(rows)
+    columns = {name: arrow_values(table.column(name)) for name in table.column_names}
+    return RawTable(columns, names, rows + 1, "row", meta)
+
+
+def _arrow_table(path: Path, data: bytes, wanted: set[str]) -> tuple[Any, list[str], AnyDict]:
+    """The wanted columns of a Parquet file, the names of all, and our metadata."""
     import pyarrow as pa
     from pyarrow import parquet
 
-    try:
+    with _readable(path):
         file = parquet.ParquetFile(pa.BufferReader(data))
         names = list(file.schema_arrow.names)
-        table = file.read(columns=[name for name in names if name in wanted])
+        table = file.read(columns=[name for name in names if name in wanted], use_threads=False)
+    return table, names, _own_meta(file.schema_arrow)
+
+
+@contextmanager
+def _readable(path: Path) -> Iterator[None]:
+    import pyarrow as pa
+
+    try:
+        yield
+    except FileNotFoundError:
+        raise ObservationError(f"{path}: the file does not exist; check the path.") from None
     except (pa.ArrowException, OSError) as error:
         reason = str(error).splitlines()[0]
         raise ObservationError(f"{path}: is no readable Parquet file ({reason}); write it again.") from None
-    columns = {name: arrow_values(table.column(name)) for name in table.column_names}
-    stored = (file.schema_arrow.metadata or {}).get(_META_KEY)
-    meta = json.loads(stored) if stored else {}
-    return RawTable(columns, names, np.arange(1, table.num_rows + 1), "row", meta)
+
+
+def _own_meta(schema: Any) -> AnyDict:
+    stored = (schema.metadata or {}).get(_META_KEY)
+    meta: AnyDict = json.loads(stored) if stored else {}
+    return meta
+
+
+@dataclass(frozen=True)
+class ParquetSummary:
+    """What a Parquet file says of itself without being read.
+
+    Attributes
+    ----------
+    n_rows : int
+        Rows.
+    names : tuple of str
+        Columns.
+    meta : dict
+        Metadata of the table.
+    first, last : int or None
+        Smallest and largest value of the column asked for, where the file states them.
+    """
+
+    n_rows: int
+    names: tuple[str, ...]
+    meta: AnyDict
+    first: int | None
+    last: int | None
+
+
+def parquet_summary(path: Path, column: str) -> ParquetSummary:
+    """Rows, columns, metadata and the range of one column of whole numbers, from the end of the file.
+
+    Raises
+    ------
+    ObservationError
+        If it is no Parquet file.
+    """
+    from pyarrow import parquet
+
+    with _readable(path), parquet.ParquetFile(path) as file:
+        schema, rows = file.schema_arrow, file.metadata
+        names = tuple(schema.names)
+        ranges = []
+        if column in names:
+            place = rows.schema.names.index(column)
+            groups = [rows.row_group(i).column(place).statistics for i in range(rows.num_row_groups)]
+            ranges = [(s.min, s.max) for s in groups if s is not None and s.has_min_max]
+        whole = len(ranges) == rows.num_row_groups > 0 and all(isinstance(value, int) for r in ranges for value in r)
+        ends = (min(r[0] for r in ranges), max(r[1] for r in ranges)) if whole else (None, None)
+        return ParquetSummary(rows.num_rows, names, _own_meta(schema), *ends)
+
+
+def parquet_column(path: Path, column: str) -> IntArray:
+    """One column of whole numbers of a Parquet file, (N,)."""
+    from pyarrow import parquet
+
+    with _readable(path), parquet.ParquetFile(path) as file:
+        values = file.read(columns=[column], use_threads=False).column(column).to_numpy()
+    if values.dtype.kind not in "iu":
+        raise ObservationError(f"{path}: column {column} holds no whole numbers; write it again.", column=column)
+    return np.asarray(values, dtype=np.int64)
 
 
 def arrow_values(column: Any) -> Any:

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcal_uq.core.errors import ObservationError
+from starcal_uq.observations.partitions import open_partitions
 from starcal_uq.observations.table import load_observations
 from starcal_uq.sky.site import check_sky
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
+    from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
     from starcal_uq.sky.site import Site
 
@@ -57,6 +60,50 @@ def observations_from_table(
         For a site together with directions that need none.
     """
     obs = load_observations(path, camera=camera, columns=columns)
+    return _apparent(obs, path, directions, observer_velocity_km_s, site, in_space)
+
+
+def partitions_from_folder(
+    path: Path,
+    camera: Camera,
+    *,
+    columns: Mapping[str, str] | None = None,
+    directions: str | None = None,
+    observer_velocity_km_s: Sequence[float] | None = None,
+    site: Site | None = None,
+    in_space: bool = False,
+) -> PartitionedObservations:
+    """Open a folder of partitions, whose directions are made apparent as `observations_from_table` does, when read."""
+    obs = open_partitions(path, camera, columns)
+    if directions is not None:
+        obs = obs.with_meta(directions=directions)
+    if in_space:
+        obs = obs.with_meta(observer="space")
+    if obs.meta["directions"] == "undeclared" and observer_velocity_km_s is None and site is None:
+        return obs
+    prepare = partial(
+        _apparent,
+        path=path,
+        directions=None,
+        observer_velocity_km_s=observer_velocity_km_s,
+        site=site,
+        in_space=in_space,
+    )
+    if obs.meta["directions"] == "apparent":
+        # Nothing is left to be done but to refuse what contradicts it.
+        prepare(obs.reader.load(obs.parts[0]))
+        return obs
+    return obs.prepared(prepare, directions="apparent")
+
+
+def _apparent(
+    obs: Observations,
+    path: Path,
+    directions: str | None,
+    observer_velocity_km_s: Sequence[float] | None,
+    site: Site | None,
+    in_space: bool,
+) -> Observations:
     if directions is not None:
         obs = obs.with_meta(directions=directions)
     # A table that says nothing of its directions is taken to hold a catalogue's.

@@ -91,5 +91,7 @@ def compare_split(run: PathLike, how: str = "odd-even", *, seed: int = 0, **opti
 
 
 def _table(run: Run) -> Observations | None:
-    """The observations of a run; None for those of a stream, which kept none."""
+    """The observations of a run; None for those of a stream, which kept none, and of partitions, but for a sample."""
+    if run.calibration.partitions is not None:
+        return None
     return run.observations if run.has("observations") and run.observations.n_stars else None

@@ -205,7 +205,9 @@ def _drop_shared(calibrations: list[Calibration], tables: list[Observations | No
 
 
 def _own_observations(run: Run) -> Observations | None:
-    """The observations of a run; None where they are missing or no longer those of its calibration."""
+    """The observations of a run; None where they are missing, no longer those of its calibration, or a sample."""
+    if run.calibration.partitions is not None:
+        return None
     try:
         return run.observations
     except RunFolderError:

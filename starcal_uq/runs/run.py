@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import sigma_parameter
-from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.errors import CalibrationError, RunFolderError
 from starcal_uq.core.files import (
     PathLike,
     atomic_write_bytes,
@@ -27,6 +27,7 @@ from starcal_uq.core.files import (
 from starcal_uq.core.tasks import Progress
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.noise_model import weighed
+from starcal_uq.observations.partitions import PartitionedObservations
 from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.presentation.report.results import Missing, Results
 from starcal_uq.runs.folder import DERIVED, DIAGNOSIS_TABLES, RESULTS, RunFolder
@@ -158,7 +159,7 @@ class Run:
         """
         calibration = self.calibration
         table = load_observations(self.folder.require("observations"))
-        if table.data_hash != calibration.provenance.get("data_sha256"):
+        if calibration.data_hash_of(table) != calibration.provenance.get("data_sha256"):
             raise RunFolderError(
                 f"{self.path}: the calibration was made from other observations than {self.folder.observations.name} "
                 "holds; run `starcal-uq calibrate` again."
@@ -299,14 +300,21 @@ class Run:
         return path.exists()
 
     def calibrate(
-        self, obs: Observations, camera: Camera, *, screening: bool = False, force: bool = False, **options: Any
+        self,
+        obs: Observations | PartitionedObservations,
+        camera: Camera,
+        *,
+        screening: bool = False,
+        force: bool = False,
+        progress: Progress | None = None,
+        **options: Any,
     ) -> Calibration:
         """Calibrate and write observations, camera and calibration; nothing is written when the estimate fails.
 
         Parameters
         ----------
-        obs : Observations
-            Identified stars.
+        obs : Observations or PartitionedObservations
+            Identified stars. Of partitioned ones the run keeps the sample of frames that its results are shown by.
         camera : Camera
             The nominal camera.
         screening : bool
@@ -314,7 +322,7 @@ class Run:
             others with their reasons, and `screening` of this object all about it.
         force : bool
             Whether to replace what the folder holds.
-        **options
+        progress, **options
             Further options of `starcal_uq.calibrate`.
 
         Raises
@@ -328,13 +336,22 @@ class Run:
         if screening:
             from starcal_uq.estimation.screening.screening import screen
 
+            if isinstance(obs, PartitionedObservations):
+                raise CalibrationError(
+                    "partitioned observations cannot be screened: leave wrong identifications out of the files, or "
+                    "screen the frames of `obs.sample()`."
+                )
+
             screened = screen(obs, camera, **options)
             obs, calibration = screened.observations, screened.calibration
         else:
             from starcal_uq.estimation.calibrate import calibrate
 
-            calibration = calibrate(obs, camera, **options)
-            if calibration.n_frames < obs.n_frames:
+            calibration = calibrate(obs, camera, progress=progress, **options)
+            if isinstance(obs, PartitionedObservations):
+                # The stars stay where they are; the run holds the sample of frames that its results are shown by.
+                obs = obs.sample()
+            elif calibration.n_frames < obs.n_frames:
                 obs = obs.select_frames(calibration.frame_ids)
         check_new_folder(self.path, force)
         self.write(calibration, obs)

@@ -575,7 +575,7 @@ def test_bad_file_is_named(tmp_path, name, content, message):
 
 def test_missing_file_and_directory(tmp_path):
     assert str(caught(tmp_path / "none.csv")) == f"{tmp_path / 'none.csv'}: the file does not exist; check the path."
-    assert "is a directory; name a file of observations." in str(caught(tmp_path))
+    assert "is a directory; name a file of observations, or open a folder" in str(caught(tmp_path))
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root reads every file")

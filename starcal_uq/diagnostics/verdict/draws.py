@@ -11,23 +11,22 @@ from starcal_uq.core.status import Check, Question, pass_or_fail, pass_or_warn
 
 if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
-    from starcal_uq.observations.table import Observations
     from starcal_uq.propagation.attitude_error import AttitudeError
 
 # What first order leaves out, and how many Monte Carlo errors of a sampled sigma are tolerated beyond it.
 PROPAGATION_SLACK, PROPAGATION_ERRORS = 0.03, 4.0
 
 
-def same_data(post: Posterior, obs: Observations) -> Check:
-    """Was the posterior sampled from these observations?"""
-    good = post.provenance.get("data_sha256") == obs.data_hash
+def same_data(post: Posterior, data_hash: str) -> Check:
+    """Was the posterior sampled from the observations of this hash?"""
+    good = post.provenance.get("data_sha256") == data_hash
     sentence = (
         "The posterior was sampled from the observations at hand."
         if good
         else "The posterior was sampled from other observations than those at hand: sample again."
     )
     value = f"SHA-256 {str(post.provenance.get('data_sha256'))[:12]}…"
-    bound = f"{obs.data_hash[:12]}…"
+    bound = f"{data_hash[:12]}…"
     remedy = "" if good else "starcal-uq sample RUN --force or sc.sample(obs, cal)"
     return Check("Data of the posterior", Question.CONVERGED, pass_or_fail(good), value, bound, sentence, remedy)
 

@@ -65,7 +65,7 @@ def judge(
     if diagnosis is not None and diagnosis.starts is not None:
         checks += [estimate.starts(diagnosis.starts)]
     if post is not None:
-        checks += [draws.same_data(post, obs), *post.diagnostics.checks]
+        checks += [draws.same_data(post, cal.data_hash_of(obs)), *post.diagnostics.checks]
     used = weighed(obs, cal)
     checks += [observed.directions(used, cal), observed.residual_pattern(used, cal), observed.outliers(used, cal)]
     checks += [observed.noise(cal), observed.coverage(used, cal)]

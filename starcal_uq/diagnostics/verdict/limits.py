@@ -79,7 +79,7 @@ def _model_choice(cal: Calibration, diagnosis: Diagnosis) -> str:
     moved = float(np.hypot(*score.common_arcsec[:2])) / np.sqrt(2.0)
     covariance = cal.rotation_per_theta @ cal.covariance @ cal.rotation_per_theta.T
     within = float(np.sqrt(0.5 * np.trace(covariance[:2, :2]))) * ARCSEC
-    if moved <= _MODEL_SIGMAS * within:
+    if moved <= _MODEL_SIGMAS * within / np.sqrt(diagnosis.comparison.share):
         return ""
     return (
         f"The choice of the distortion model: {score.model!r} fits as well and moves attitudes by {significant(moved)} "

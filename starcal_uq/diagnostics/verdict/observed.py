@@ -10,12 +10,14 @@ from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.formatting import fixed, percent, plural, significant
 from starcal_uq.core.status import Check, Level, Question, pass_or_warn
 from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals
+from starcal_uq.estimation.residual_map import OUTLIER_SIGMA
 from starcal_uq.sky.refraction import refraction_constants, shrinking
 from starcal_uq.sky.site import Site
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
 
 # Earth's orbital speed over that of light: the constant of annual aberration, rad.
@@ -24,7 +26,6 @@ PLAUSIBLE_NOISE_PX = (0.003, 0.5)
 PLAUSIBLE_SCALE = (0.7, 1.5)
 PATTERN_P, OUTLIER_P = 1e-3, 1e-3
 PATTERN_FAIL_SIGMA = 0.5
-OUTLIER_SIGMA = 4.5
 COVERED_SHARE = 0.85
 MIN_FRAMES = 5
 # Commands and calls that checks give as remedies.
@@ -95,14 +96,18 @@ def outliers(obs: Observations, cal: Calibration) -> Check:
     """Are there more large residuals than Gaussian noise gives?"""
     from scipy.special import erfc, pdtrc
 
-    z = np.abs(normalised_residuals(cal, obs))
-    found = int(np.count_nonzero(np.any(z > OUTLIER_SIGMA, axis=1)))
-    expected = obs.n_stars * 2.0 * float(erfc(OUTLIER_SIGMA / np.sqrt(2.0)))
+    if cal.partitions is not None:
+        n_stars, found, largest = cal.n_stars, cal.partitions.n_beyond, cal.partitions.largest
+        frame = cal.partitions.largest_frame
+    else:
+        z = np.abs(normalised_residuals(cal, obs))
+        n_stars, found, largest = obs.n_stars, int(np.count_nonzero(np.any(z > OUTLIER_SIGMA, axis=1))), float(z.max())
+        frame = int(obs.frame[int(np.argmax(z.max(axis=1)))])
+    expected = n_stars * 2.0 * float(erfc(OUTLIER_SIGMA / np.sqrt(2.0)))
     # Probability of at least `found` where `expected` are expected (Poisson).
     p_value = 1.0 if found == 0 else float(pdtrc(found - 1, expected))
     good = p_value >= OUTLIER_P
-    worst_row = int(np.argmax(z.max(axis=1)))
-    place = f"largest {fixed(float(z.max()), 1)} sigma, in frame {obs.frame[worst_row]}"
+    place = f"largest {fixed(largest, 1)} sigma, in frame {frame}"
     sentence = (
         f"As many as Gaussian noise gives ({place})."
         if good
@@ -143,11 +148,12 @@ def coverage(obs: Observations, cal: Calibration) -> Check:
     """Did the stars cover the field, and how many frames were there?"""
     binned = bin_residuals(cal, obs)
     share = len(binned.counts) / max(len(binned.counts) + binned.n_empty, 1)
-    value = f"{percent(share, 3)} of the field, {plural(obs.n_frames, 'frame')}"
+    n_frames = obs.n_frames if cal.partitions is None else cal.n_frames
+    value = f"{percent(share, 3)} of the field, {plural(n_frames, 'frame')}"
     bound = f"≥ {percent(COVERED_SHARE)}, ≥ {MIN_FRAMES} frames"
     if share < COVERED_SHARE:
         level, sentence = Level.WARN, "Parts of the field hold no stars: the distortion is extrapolated there."
-    elif obs.n_frames < MIN_FRAMES:
+    elif n_frames < MIN_FRAMES:
         level, sentence = Level.WARN, "Few frames: errors common to a whole frame cannot be told from the camera."
     else:
         level, sentence = Level.PASS, "Stars covered the field, so that no part of it is extrapolated."
@@ -177,7 +183,7 @@ _HIGH_DEG, _MIDDLE_DEG = 90.0, 45.0
 _WEATHER = 0.04
 
 
-def air(obs: Observations) -> Air:
+def air(obs: Observations | PartitionedObservations) -> Air:
     """Whether refraction is in the directions, is out of the question, or is not known.
 
     Directions that the user declared as apparent are what the camera saw, with all there is to it.

@@ -35,6 +35,12 @@ def data_sentence(results: Results) -> str:
     each = f"{low} stars each" if low == high else f"{low} to {high} stars each, median {np.median(per_frame):g}"
     source = {"simulated": "Simulated data: "}.get(str(obs.meta.get("source", "")), "")
     stars = f"{plural(obs.n_stars, 'star')} in {plural(obs.n_frames, 'frame')} ({each})"
+    if cal.partitions is not None:
+        files = plural(len(cal.partitions.n_stars), "file")
+        stars = (
+            f"{plural(cal.n_stars, 'star')} in {plural(cal.n_frames, 'frame')} of {files}, of which a sample of "
+            f"{plural(obs.n_frames, 'frame')} ({each}) is shown and questioned star by star"
+        )
     unique = ""
     if obs.star_id is not None and len(np.unique(obs.star_id)) < obs.n_stars:
         unique = f", {count(len(np.unique(obs.star_id)))} different stars"
@@ -176,7 +182,7 @@ def sampling_sentence(results: Results) -> str:
 
 def provenance_rows(results: Results) -> list[tuple[str, str]]:
     """What is needed to repeat the run."""
-    rows: list[tuple[str, str]] = [("Data, SHA-256", results.observations.data_hash)]
+    rows: list[tuple[str, str]] = [("Data, SHA-256", results.calibration.data_hash_of(results.observations))]
     source = results.observations.meta.get("source")
     if source:
         rows.append(("Source of the data", str(source)))

@@ -1,0 +1,287 @@
+"""A calibration of observations in partitions, which need not fit into memory or stand on one machine.
+
+Each step is one pass: every partition is read where it is worked on, becomes a few small matrices, and these are added
+up in a fixed tree. The refinement solves the sums of the partitions' normal equations, whose attitudes are eliminated
+frame by frame; the partitions' Gram matrices at the estimate add up to the compressed likelihood. Only a stated sample
+of frames is kept, for what looks at stars one by one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import NDArray
+
+from starcal_uq.attitude.rotations import rotation_to_quaternion
+from starcal_uq.camera.camera import Camera
+from starcal_uq.core.cluster import Cluster
+from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
+from starcal_uq.core.provenance import provenance
+from starcal_uq.core.status import Status
+from starcal_uq.core.tasks import Progress
+from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, check_camera
+from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.compressed import CompressedLikelihood, compress
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.residual_map import OUTLIER_SIGMA, PartitionSums, ResidualMap
+from starcal_uq.estimation.solvers import Normal, is_singular, levenberg_marquardt
+from starcal_uq.estimation.stages import Stage
+from starcal_uq.maths.linear import scaled_inverse
+from starcal_uq.observations.partitions import Partition, PartitionedObservations, PartitionReader, joined_hash
+from starcal_uq.observations.table import Observations
+
+# Stars of a partition that are linearised at once.
+_STARS_AT_ONCE = 100_000
+# Last step of the refinement, standard deviations of the estimate.
+_LAST_STEP = 1e-8
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """What the first pass has seen: stars, data hashes, and number and content of every frame."""
+
+    n_stars: int
+    hashes: tuple[str, ...]
+    frames: IntArray
+    content: NDArray[np.uint64]
+
+
+def _look(reader: PartitionReader, part: Partition) -> _Seen:
+    obs = reader.load(part, check=True)
+    # Equal pixels in any order of the stars: a sum of mixed bits, by the finaliser of SplitMix64 (Steele et al. 2014).
+    with np.errstate(over="ignore"):
+        x, y = ((values + 0.0).view(np.uint64) for values in (obs.x_px, obs.y_px))
+        bits = _mixed(x) + np.uint64(3) * _mixed(y ^ np.uint64(0x9E3779B97F4A7C15))
+        content = np.add.reduceat(_mixed(bits), obs.frame_starts[:-1])
+    return _Seen(obs.n_stars, (obs.data_hash,), obs.frame_ids, content)
+
+
+def _mixed(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return np.asarray(bits ^ (bits >> np.uint64(31)))
+
+
+def _seen_together(parts: Sequence[_Seen]) -> _Seen:
+    return _Seen(
+        sum(part.n_stars for part in parts),
+        tuple(value for part in parts for value in part.hashes),
+        np.concatenate([part.frames for part in parts]),
+        np.concatenate([part.content for part in parts]),
+    )
+
+
+def _likelihood(reader: PartitionReader, model: str, part: Partition) -> MarginalLikelihood:
+    return MarginalLikelihood(reader.load(part), model)
+
+
+def _normal(reader: PartitionReader, model: str, theta: FloatArray, part: Partition) -> Normal:
+    whole = _likelihood(reader, model, part).frames
+    return _added(
+        [
+            MarginalLikelihood(whole.part(first, last), model).evaluate(theta)
+            for first, last in whole.parts(_STARS_AT_ONCE)
+        ]
+    )
+
+
+def _added(parts: Sequence[Normal]) -> Normal:
+    return Normal(
+        sum(part.cost for part in parts),
+        np.sum([part.gradient for part in parts], axis=0),
+        np.sum([part.matrix for part in parts], axis=0),
+    )
+
+
+def _compressed(
+    reader: PartitionReader, model: str, theta: FloatArray, covariance: FloatArray, part: Partition
+) -> CompressedLikelihood:
+    return compress(_likelihood(reader, model, part), theta, covariance)
+
+
+def _added_compressed(parts: Sequence[CompressedLikelihood]) -> CompressedLikelihood:
+    return replace(
+        parts[0],
+        gram=np.sum([part.gram for part in parts], axis=0),
+        log_determinant=sum(part.log_determinant for part in parts),
+        log_determinant_slope=np.sum([part.log_determinant_slope for part in parts], axis=0),
+        dof=sum(part.dof for part in parts),
+        n_stars=sum(part.n_stars for part in parts),
+        n_frames=sum(part.n_frames for part in parts),
+    )
+
+
+@dataclass(frozen=True)
+class _Residuals:
+    """Sums over stars and frames at the estimate: attitude response (p, 3) and covariance (3, 3), and the residuals."""
+
+    response: FloatArray
+    inverse: FloatArray
+    sums: PartitionSums
+
+
+def _residuals(
+    reader: PartitionReader, camera: Camera, theta: FloatArray, scale: float, n_stars: int, part: Partition
+) -> _Residuals:
+    obs = reader.load(part)
+    whole = MarginalLikelihood(obs, camera.distortion).frames
+    response, inverse, blocks = np.zeros((len(theta), 3)), np.zeros((3, 3)), []
+    for first, last in whole.parts(_STARS_AT_ONCE):
+        one = MarginalLikelihood(whole.part(first, last), camera.distortion)
+        state, _ = one.profile(theta)
+        response += np.sum(one.attitude_response(state, one.derivatives(theta, state)), axis=2)
+        inverse += np.sum(state.inverse, axis=2)
+        blocks.append(state.e)
+    e = np.concatenate(blocks, axis=1)
+    stated = np.ones(obs.n_stars) if obs.sigma_px is None else obs.sigma_px
+    size = np.max(np.abs(e), axis=0) / scale
+    worst = int(np.argmax(size))
+    sums = PartitionSums(
+        n_stars=np.array([obs.n_stars]),
+        n_frames=np.array([obs.n_frames]),
+        chi2=np.array([float(np.sum(e**2))]),
+        residuals=ResidualMap.of(camera, n_stars, whole.pixel, whole.in_pixels(e), stated),
+        stated2=float(np.sum(stated**2)),
+        n_beyond=int(np.count_nonzero(size > OUTLIER_SIGMA)),
+        largest=float(size[worst]),
+        largest_frame=int(obs.frame[worst]),
+    )
+    return _Residuals(response, inverse, sums)
+
+
+def _added_residuals(parts: Sequence[_Residuals]) -> _Residuals:
+    return _Residuals(
+        np.sum([part.response for part in parts], axis=0),
+        np.sum([part.inverse for part in parts], axis=0),
+        PartitionSums.joined([part.sums for part in parts]),
+    )
+
+
+def calibrate_partitions(
+    obs: PartitionedObservations,
+    sample: Observations,
+    start: Calibration,
+    cluster: Cluster,
+    *,
+    max_iterations: int,
+    duplicates: str,
+    progress: Progress | None = None,
+) -> Calibration:
+    """Refine a calibration of a sample of frames on all partitions.
+
+    Parameters
+    ----------
+    obs : PartitionedObservations
+        Data.
+    sample : Observations
+        Sample of their frames.
+    start : Calibration
+        Calibration of the sample by the ``efficient`` method; its estimate from interstar angles stays.
+    cluster : Cluster
+        Processes that read the partitions.
+    max_iterations : int
+        Limit of the refinement.
+    duplicates : {"refuse", "keep"}
+        What to do with frames that hold the same pixels as another.
+    progress : callable, optional
+        Called with (partitions done, partitions) in every pass.
+
+    Raises
+    ------
+    CalibrationError
+        When there is no estimate.
+    RepeatedFramesError
+        When frames hold the same pixels and are refused.
+    ObservationError
+        For bad rows, with the file.
+    """
+    reader, model, began = obs.reader, start.camera.distortion, perf_counter()
+    seen = cluster.reduce(partial(_look, reader), obs.parts, _seen_together, progress=progress)
+    if duplicates == "refuse":
+        _refuse_repeated(seen)
+    n_stars, n_frames, p = seen.n_stars, len(seen.frames), len(start.theta)
+    dof = 2 * n_stars - 3 * n_frames - p
+
+    def evaluate(theta: FloatArray) -> Normal:
+        return cluster.reduce(partial(_normal, reader, model, theta), obs.parts, _added, progress=progress)
+
+    # A last step of 1e-8 sigma, which leaves nothing of where the search began: that depends on the sample.
+    found = levenberg_marquardt(
+        evaluate, start.stages[-1].theta, max_iterations=max_iterations, tolerance=_LAST_STEP**2 / dof
+    )
+    sampled = replace(start.stages[-1], name="sample")
+    stage = Stage("refinement", found.trajectory, found.costs, found.status, found.evaluations, perf_counter() - began)
+    theta, normal, status = found.theta, found.normal, found.status
+    if not np.isfinite(normal.cost) or is_singular(normal.matrix):
+        reason = status if not status.ok else Status.SINGULAR if np.isfinite(normal.cost) else Status.NOT_FINITE
+        raise CalibrationError(f"the calibration failed ({reason.name}): {reason.remedy}.", reason)
+    sigma = float(np.sqrt(normal.cost / dof))
+    covariance = scaled_inverse(normal.matrix) * sigma**2
+    compressed = cluster.reduce(
+        partial(_compressed, reader, model, theta, covariance), obs.parts, _added_compressed, progress=progress
+    )
+    # As in `assemble`: the rotation-volume term moves the maximum by about 0.01 sigma of a small table.
+    theta = theta - 0.5 * compressed.whitening @ compressed.log_determinant_slope
+    camera = start.nominal.with_theta(theta)
+    scale = sigma * float(np.sqrt(dof / (2.0 * n_stars)))
+    rest = cluster.reduce(
+        partial(_residuals, reader, camera, theta, scale, n_stars), obs.parts, _added_residuals, progress=progress
+    )
+    likelihood = MarginalLikelihood(sample, model)
+    state, _ = likelihood.profile(theta)
+    if status.ok and float(np.sqrt(np.mean(likelihood.frames.in_pixels(state.e) ** 2))) > IMPLAUSIBLE_NOISE * (
+        camera.width_px
+    ):
+        status = Status.INCONSISTENT
+    record = provenance(None, start.provenance["settings"], joined_hash(seen.hashes))
+    record["partitions"] = {
+        "folder": str(obs.folder),
+        "n_files": len(obs.parts),
+        "n_stars": n_stars,
+        "n_frames": n_frames,
+        "sample_frames": sample.n_frames,
+        "sample_stars": sample.n_stars,
+        "sample_sha256": sample.data_hash,
+    }
+    return replace(
+        start,
+        camera=camera,
+        theta=theta,
+        covariance=covariance,
+        sigma=sigma,
+        sigma_std=sigma / float(np.sqrt(2.0 * dof)),
+        stages=(*start.stages[:-1], sampled, stage),
+        status=check_camera(camera, status),
+        quaternions=rotation_to_quaternion(state.rotations),
+        residuals_px=likelihood.frames.in_pixels(state.e).T,
+        chi2=float(np.sum(rest.sums.chi2)),
+        dof=dof,
+        information=normal.matrix / sigma**2,
+        rotation_per_theta=-(rest.response / n_frames).T,
+        attitude_noise=rest.inverse / n_frames * sigma**2,
+        compressed=compressed,
+        provenance=record,
+        fingerprints=None,
+        partitions=rest.sums,
+    )
+
+
+def _refuse_repeated(seen: _Seen) -> None:
+    order = np.argsort(seen.content, kind="stable")
+    same = np.flatnonzero(seen.content[order][1:] == seen.content[order][:-1])
+    if not len(same):
+        return
+    pairs = np.sort(np.column_stack([seen.frames[order[same]], seen.frames[order[same + 1]]]), axis=1)
+    more = len(pairs) - 1
+    others = f", and {more} more repeat others" if more > 1 else ", and one more repeats another" if more else ""
+    raise RepeatedFramesError(
+        f"frame {pairs[0, 1]} holds the same pixels as frame {pairs[0, 0]}{others}: they would count twice; remove the "
+        "later ones from the files, or, if you know them to be exposures of their own, keep them (duplicates='keep', "
+        "--duplicates keep).",
+        pairs=pairs.tolist(),
+    )

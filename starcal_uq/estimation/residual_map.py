@@ -1,0 +1,123 @@
+"""Residuals as sums that add up over any number of stars: by cells of the detector, and by partition of the data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.core.types import FloatArray, IntArray
+
+# Residuals beyond it are counted: noise alone gives 7 of a million.
+OUTLIER_SIGMA = 4.5
+_STARS_PER_CELL = 25.0
+
+
+@dataclass(frozen=True)
+class ResidualMap:
+    """Sums of residuals in square cells of the detector, row by row.
+
+    Attributes
+    ----------
+    shape : (2,) array of int
+        Rows and columns of cells.
+    cell_px : float
+        Side of a cell.
+    counts : (cells,) array
+        Stars in each.
+    sums : (cells, 2) array
+        Sums of their residuals, px.
+    stated2 : (cells,) array
+        Sums of their squared stated noise, px^2; of ones where they state none.
+    """
+
+    shape: IntArray
+    cell_px: float
+    counts: FloatArray
+    sums: FloatArray
+    stated2: FloatArray
+
+    @classmethod
+    def of(
+        cls, camera: Camera, n_stars: int, xy_px: FloatArray, residuals_px: FloatArray, stated_px: FloatArray
+    ) -> ResidualMap:
+        """Sums over stars at (2, N) with residuals (2, N) and stated noise (N,).
+
+        The cells are made for `n_stars` stars in all, about 25 to each: 4 to 12 along the longer side.
+        """
+        width, height = camera.width_px, camera.height_px
+        longer = max(width, height)
+        along = int(np.clip(np.sqrt(n_stars / _STARS_PER_CELL * longer / min(width, height)), 4, 12))
+        cell = longer / along
+        nx, ny = int(np.ceil(width / cell - 1e-9)), int(np.ceil(height / cell - 1e-9))
+        column, row = (
+            np.clip(((values + 0.5) / cell).astype(int), 0, n - 1) for values, n in zip(xy_px, (nx, ny), strict=True)
+        )
+        index = row * nx + column
+        return cls(
+            shape=np.array([ny, nx]),
+            cell_px=cell,
+            counts=np.bincount(index, minlength=nx * ny).astype(np.float64),
+            sums=np.stack([np.bincount(index, values, nx * ny) for values in residuals_px], axis=1),
+            stated2=np.bincount(index, stated_px**2, nx * ny).astype(np.float64),
+        )
+
+    @classmethod
+    def joined(cls, parts: Sequence[ResidualMap]) -> ResidualMap:
+        """That of all stars of several with the same cells."""
+        return cls(
+            shape=parts[0].shape,
+            cell_px=parts[0].cell_px,
+            counts=np.sum([part.counts for part in parts], axis=0),
+            sums=np.sum([part.sums for part in parts], axis=0),
+            stated2=np.sum([part.stated2 for part in parts], axis=0),
+        )
+
+
+@dataclass(frozen=True)
+class PartitionSums:
+    """What is known of all residuals of a calibration that has kept those of a sample of its frames.
+
+    Attributes
+    ----------
+    n_stars, n_frames : (n,) arrays of int
+        Stars and frames of each of n partitions.
+    chi2 : (n,) array
+        Their sums of squared residuals, px^2 (or in units of the stated noise).
+    residuals : ResidualMap
+        Residuals of all stars in cells of the detector.
+    stated2 : float
+        Sum of the squared stated noise of all stars, px^2; their number where they state none.
+    n_beyond : int
+        Stars with a residual beyond 4.5 standard deviations.
+    largest : float
+        Largest residual along an axis, standard deviations.
+    largest_frame : int
+        Frame of the largest.
+    """
+
+    n_stars: IntArray
+    n_frames: IntArray
+    chi2: FloatArray
+    residuals: ResidualMap
+    stated2: float
+    n_beyond: int
+    largest: float
+    largest_frame: int
+
+    @classmethod
+    def joined(cls, parts: Sequence[PartitionSums]) -> PartitionSums:
+        """Those of all partitions of several."""
+        worst = max(parts, key=lambda part: part.largest)
+        return cls(
+            n_stars=np.concatenate([part.n_stars for part in parts]),
+            n_frames=np.concatenate([part.n_frames for part in parts]),
+            chi2=np.concatenate([part.chi2 for part in parts]),
+            residuals=ResidualMap.joined([part.residuals for part in parts]),
+            stated2=sum(part.stated2 for part in parts),
+            n_beyond=sum(part.n_beyond for part in parts),
+            largest=worst.largest,
+            largest_frame=worst.largest_frame,
+        )

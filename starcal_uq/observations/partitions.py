@@ -1,0 +1,303 @@
+"""A folder of Parquet files of whole frames: a table of observations that need not fit into memory.
+
+Nothing but the files' metadata is read until a partition is asked for; whoever works on the table reads the partitions
+one by one, where he is, and keeps sums of them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.core.errors import ObservationError
+from starcal_uq.core.files import PathLike
+from starcal_uq.core.types import AnyDict, IntArray
+from starcal_uq.observations.columns import COLUMNS
+from starcal_uq.observations.files import ParquetSummary, parquet_column, parquet_summary, read_table
+from starcal_uq.observations.table import Observations
+
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+
+# What estimates are made of; the other columns are read for the sample of frames alone.
+STREAMED = ("frame", "x_px", "y_px", "ra_deg", "dec_deg", "sigma_px")
+# Frames that stand for all of them where stars are looked at one by one, and files that they are taken from.
+SAMPLE_FRAMES, _SAMPLE_PARTS = 2000, 16
+
+
+@dataclass(frozen=True)
+class Partition:
+    """One file.
+
+    Attributes
+    ----------
+    path : Path
+        File, absolute, so that other processes find it.
+    n_stars : int
+        Rows.
+    first_frame, last_frame : int
+        Smallest and largest frame number.
+    names : tuple of str
+        Columns of the file.
+    """
+
+    path: Path
+    n_stars: int
+    first_frame: int
+    last_frame: int
+    names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class PartitionReader:
+    """How a partition becomes observations; small, and sent to the processes that read.
+
+    Attributes
+    ----------
+    camera : Camera or None
+        Camera on whose detector every centroid must lie.
+    columns : dict
+        Names in the files of columns that are called otherwise.
+    meta : dict
+        Entries of `Observations.meta` that are declared for all partitions.
+    prepare : callable or None
+        Picklable function through which every table goes, such as one that makes directions apparent.
+    """
+
+    camera: Camera | None = None
+    columns: Mapping[str, str] = field(default_factory=dict)
+    meta: AnyDict = field(default_factory=dict)
+    prepare: Callable[[Observations], Observations] | None = None
+
+    def load(self, part: Partition, *, check: bool = False, frames: IntArray | None = None) -> Observations:
+        """The table of a partition with the columns that estimates are made of; of some `frames`, with all columns."""
+        only = STREAMED if self.prepare is None else (*STREAMED, "time_utc")
+        columns, meta = read_table(
+            part.path, self.camera, self.columns, only if frames is None else tuple(COLUMNS), check, frames
+        )
+        obs = Observations(**columns, meta={**meta, **self.meta})
+        try:
+            return obs if self.prepare is None else self.prepare(obs)
+        except ObservationError as error:
+            raise ObservationError(f"{part.path}: {error}", row=error.row, column=error.column) from error
+
+
+@dataclass(frozen=True)
+class PartitionedObservations:
+    """Observations in a folder of files, which are read when they are needed; see `open_partitions`.
+
+    Iterated over, it gives the partitions one after the other.
+
+    Attributes
+    ----------
+    folder : Path
+        Folder.
+    parts : tuple of Partition
+        Files, by their smallest frame number.
+    reader : PartitionReader
+        How they are read.
+    meta : dict
+        What the files say of themselves, alike in all: ``directions``, ``truth`` and more.
+    """
+
+    folder: Path
+    parts: tuple[Partition, ...]
+    reader: PartitionReader
+    meta: AnyDict
+
+    def __iter__(self) -> Iterator[Observations]:
+        return (self.reader.load(part, check=True) for part in self.parts)
+
+    def __len__(self) -> int:
+        return self.n_stars
+
+    def __repr__(self) -> str:
+        return f"PartitionedObservations({self.n_stars} stars in {len(self.parts)} files of {str(self.folder)!r})"
+
+    @property
+    def n_stars(self) -> int:
+        """Number of stars over all frames."""
+        return sum(part.n_stars for part in self.parts)
+
+    @cached_property
+    def n_frames(self) -> int:
+        """Number of frames; the column of their numbers is read for it."""
+        return sum(len(frame_numbers(part, self.reader)) for part in self.parts)
+
+    @cached_property
+    def data_hash(self) -> str:
+        """SHA-256 (hex) of the data, whatever the files are called; all of them are read for it.
+
+        It is that of the sorted `Observations.data_hash` of the partitions' columns that estimates are made of.
+        """
+        return joined_hash([observations.data_hash for observations in self])
+
+    @property
+    def directions_declared(self) -> bool:
+        """Whether the files say if their directions are apparent or straight from a catalogue."""
+        return bool(self.meta["directions"] != "undeclared")
+
+    def prepared(self, function: Callable[[Observations], Observations], **entries: Any) -> PartitionedObservations:
+        """The same table, each partition of which goes through a picklable function when it is read.
+
+        The entries are those of `meta` that the function changes, for whoever asks the whole.
+        """
+        return replace(self, reader=replace(self.reader, prepare=function), meta={**self.meta, **entries})
+
+    def with_meta(self, **entries: Any) -> PartitionedObservations:
+        """The same table with entries of `meta` added or changed, such as ``directions="apparent"``."""
+        reader = replace(self.reader, meta={**self.reader.meta, **entries})
+        return replace(self, reader=reader, meta={**self.meta, **entries})
+
+    def sample(self, n_frames: int = SAMPLE_FRAMES) -> Observations:
+        """About `n_frames` frames with all of their columns: evenly spaced ones of at most 16 files, evenly spaced too.
+
+        The same files give the same frames. All of a smaller table is taken.
+        """
+        place = np.linspace(0, len(self.parts) - 1, min(len(self.parts), _SAMPLE_PARTS)).round().astype(int)
+        chosen = [self.parts[i] for i in place]
+        numbers = [frame_numbers(part, self.reader) for part in chosen]
+        n = sum(map(len, numbers))
+        tables = []
+        for part, own in zip(chosen, numbers, strict=True):
+            share = max(1, round(n_frames * len(own) / n))
+            kept = own if share >= len(own) else own[((np.arange(share) + 0.5) * len(own) / share).astype(int)]
+            tables.append(self.reader.load(part, check=True, frames=kept))
+        return _joined(tables)
+
+
+def open_partitions(
+    folder: PathLike, camera: Camera | None = None, columns: Mapping[str, str] | None = None
+) -> PartitionedObservations:
+    """Open a folder of Parquet files as one table, however large; only their metadata are read.
+
+    Parameters
+    ----------
+    folder
+        Folder of ``.parquet`` files with the columns of `load_observations`. All rows of a frame stand in one file, and
+        no two files hold frames of the same number.
+    camera
+        If given, every centroid must lie on its detector.
+    columns
+        Names in the files of columns that are called otherwise.
+
+    Raises
+    ------
+    ObservationError
+        If a file is damaged, does not fit to the others, or repeats a frame number of another. Rows are checked when
+        they are first worked on.
+    """
+    if unknown := [name for name in columns or {} if name not in COLUMNS]:
+        raise ObservationError(
+            f"columns: {unknown[0]!r} is no column of observations; use {', '.join(COLUMNS)}.", column=unknown[0]
+        )
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise ObservationError(f"{folder}: is no directory; name one that holds .parquet files.")
+    paths = sorted(path.resolve() for path in folder.iterdir() if path.suffix.lower() == ".parquet")
+    if not paths:
+        raise ObservationError(
+            f"{folder}: is a directory that holds no .parquet file; name a table of observations, or a folder of them."
+        )
+    reader = PartitionReader(camera, dict(columns or {}))
+    frame = reader.columns.get("frame", "frame")
+    summaries = [parquet_summary(path, frame) for path in paths]
+    for path, summary in zip(paths, summaries, strict=True):
+        _check_alike(path, summary, paths[0], summaries[0], reader)
+    parts = [_partition(path, summary, frame) for path, summary in zip(paths, summaries, strict=True)]
+    parts.sort(key=lambda part: (part.first_frame, part.path))
+    _check_frames(parts, reader)
+    meta = {"directions": "undeclared", **summaries[0].meta, "source": str(folder)}
+    return PartitionedObservations(folder, tuple(parts), reader, meta)
+
+
+def frame_numbers(part: Partition, reader: PartitionReader) -> IntArray:
+    """Frame numbers of a partition, ascending; no other column is read."""
+    return np.unique(parquet_column(part.path, reader.columns.get("frame", "frame")))
+
+
+def joined_hash(hashes: Sequence[str]) -> str:
+    """SHA-256 (hex) of the data of several partitions, from their own, whatever their order."""
+    return hashlib.sha256("".join(sorted(hashes)).encode()).hexdigest()
+
+
+def _partition(path: Path, summary: ParquetSummary, frame: str) -> Partition:
+    first, last = summary.first, summary.last
+    if first is None or last is None:
+        numbers = parquet_column(path, frame)
+        first, last = int(numbers.min()), int(numbers.max())
+    return Partition(path, summary.n_rows, first, last, summary.names)
+
+
+def _check_alike(
+    path: Path, summary: ParquetSummary, first_path: Path, first: ParquetSummary, reader: PartitionReader
+) -> None:
+    """Columns that estimates are made of must be in all files or in none, and directions of one kind."""
+    for name in STREAMED:
+        own = reader.columns.get(name, name)
+        if own not in summary.names and (COLUMNS[name].required or name in reader.columns):
+            raise ObservationError(
+                f"{path}: column {own} is missing; add it, or map it from one of the file's columns "
+                f"({', '.join(summary.names)}).",
+                column=own,
+            )
+        if (own in summary.names) != (own in first.names):
+            there, missing = (path, first_path) if own in summary.names else (first_path, path)
+            raise ObservationError(
+                f"{missing}: column {own} is missing, and {there} has it; write it to all files, or to none.",
+                column=own,
+            )
+    if not summary.n_rows:
+        raise ObservationError(f"{path}: the table has no rows; remove the file.")
+    kinds = [s.meta.get("directions", "undeclared") for s in (first, summary)]
+    if kinds[0] != kinds[1]:
+        raise ObservationError(
+            f"{path}: its directions are {kinds[1]}, those of {first_path} {kinds[0]}; keep them in folders of their "
+            "own."
+        )
+
+
+def _check_frames(parts: Sequence[Partition], reader: PartitionReader) -> None:
+    """No frame number in two files; only of files whose ranges overlap are the numbers read."""
+    seen: dict[Path, IntArray] = {}
+
+    def numbers(part: Partition) -> IntArray:
+        if part.path not in seen:
+            seen[part.path] = frame_numbers(part, reader)
+        return seen[part.path]
+
+    open_: list[Partition] = []
+    for part in parts:
+        open_ = [earlier for earlier in open_ if earlier.last_frame >= part.first_frame]
+        for earlier in open_:
+            shared = np.intersect1d(numbers(earlier), numbers(part), assume_unique=True)
+            if len(shared):
+                raise ObservationError(
+                    f"{part.path}: frame {shared[0]} is in {earlier.path.name} too; keep all rows of a frame in one "
+                    "file, and give every frame its own number.",
+                    column="frame",
+                )
+        for path in set(seen) - {earlier.path for earlier in open_} - {part.path}:
+            del seen[path]
+        open_.append(part)
+
+
+def _joined(tables: Sequence[Observations]) -> Observations:
+    """All rows in one table; a column that only some have is filled, or left out where it may have no gaps."""
+    columns: AnyDict = {}
+    for name, column in COLUMNS.items():
+        values = [getattr(table, name) for table in tables]
+        missing = [value is None for value in values]
+        if all(missing) or (any(missing) and not column.gaps):
+            continue
+        gap: Any = "" if column.kind == "text" else np.nan
+        columns[name] = np.concatenate(
+            [np.full(len(t), gap) if v is None else v for t, v in zip(tables, values, strict=True)]
+        )
+    return Observations(**columns, meta=tables[0].meta)

@@ -1,0 +1,109 @@
+"""Calibration of partitioned observations: that of one table, whatever the partitions and processes."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.core.errors import CalibrationError, ObservationError, RepeatedFramesError
+from starcal_uq.observations.partitions import PartitionedObservations
+from tests.helpers.outside import campaign
+
+
+def sensor(n_frames: int, seed: int = 5) -> tuple[sc.Observations, sc.Camera]:
+    made = campaign(np.random.default_rng(seed), n_frames=n_frames)
+    obs = sc.Observations(**made.columns, meta={"directions": "apparent"})
+    return obs, sc.Camera(**made.camera_toml(), coefficients=(0.0, 0.0))
+
+
+def divided(obs: sc.Observations, folder: Path, edges: list[int]) -> PartitionedObservations:
+    """Write frames between the edges to files of their own."""
+    folder.mkdir()
+    for name, (first, last) in enumerate(pairwise(edges)):
+        obs.select((obs.frame >= first) & (obs.frame < last)).save(folder / f"part{name}.parquet")
+    return sc.observations.open_partitions(folder)
+
+
+def assert_equal(a: sc.Calibration, b: sc.Calibration, bound: float) -> None:
+    """Estimates within `bound` sigma, and everything that is made of all stars as near."""
+    assert np.max(np.abs(a.theta - b.theta) / b.sigmas) < bound
+    assert a.dof == b.dof and a.n_stars == b.n_stars and a.n_frames == b.n_frames
+    np.testing.assert_allclose(a.sigma, b.sigma, rtol=bound)
+    np.testing.assert_allclose(a.chi2, b.chi2, rtol=bound)
+    for one, other in ((a.covariance, b.covariance), (a.compressed.gram, b.compressed.gram)):
+        unit = np.sqrt(np.outer(np.diag(other), np.diag(other)))
+        assert np.max(np.abs(one - other) / unit) < 10 * bound
+    for name in ("rotation_per_theta", "attitude_noise"):
+        one, other = getattr(a, name), getattr(b, name)
+        assert np.max(np.abs(one - other)) < 10 * bound * np.max(np.abs(other))
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[sc.Observations, sc.Camera, PartitionedObservations]:
+    obs, camera = sensor(90)
+    return obs, camera, divided(obs, tmp_path_factory.mktemp("small") / "frames", [0, 25, 26, 71, 90])
+
+
+def test_partitions_give_the_calibration_of_the_table(small, tmp_path: Path) -> None:
+    obs, camera, parts = small
+    one, many = sc.calibrate(obs, camera), sc.calibrate(parts, camera)
+    assert_equal(many, one, 1e-7)
+    others = divided(obs, tmp_path / "others", [0, 50, 90])
+    assert_equal(sc.calibrate(others, camera), many, 1e-10)
+    np.testing.assert_array_equal(sc.calibrate(parts, camera).theta, many.theta)
+
+
+def test_partitioned_run_is_sampled_diagnosed_and_reported(small, tmp_path: Path) -> None:
+    _, camera, parts = small
+    run = sc.Run(tmp_path / "run")
+    cal = run.calibrate(parts, camera)
+    again = sc.Run(tmp_path / "run")
+    assert again.calibration.partitions is not None
+    np.testing.assert_array_equal(again.calibration.partitions.chi2, cal.partitions.chi2)
+    assert again.observations.n_frames == 90
+    sc.sample(parts, cal, seed=1, n_steps=60)
+    checks = {check.name: check for check in again.verdict.checks}
+    assert checks["Coverage of the field"].value.endswith("90 frames")
+    with pytest.raises(CalibrationError, match="other observations"):
+        sc.sample(divided(*sensor(40, 6)[:1], tmp_path / "b", [0, 40]), cal)
+
+
+def test_frames_are_counted_once(small, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    obs, camera, _ = small
+    table = obs.select_frames(np.arange(60))
+    twice = table.select_frames([7])
+    columns = {name: np.concatenate([table.columns[name], twice.columns[name][::-1]]) for name in table.columns}
+    columns["frame"][len(table) :] = 60
+    doubled = divided(sc.Observations(**columns, meta=obs.meta), tmp_path / "twice", [0, 30, 61])
+    with pytest.raises(RepeatedFramesError, match="frame 60 holds the same measurement as frame 7:"):
+        sc.calibrate(doubled, camera)
+    # Of a larger table the sample may not hold both.
+    monkeypatch.setattr("starcal_uq.estimation.calibrate.repeating_frames", lambda *_: np.empty(0))
+    with pytest.raises(RepeatedFramesError, match="frame 60 holds the same pixels as frame 7:"):
+        sc.calibrate(doubled, camera)
+    assert sc.calibrate(doubled, camera, duplicates="keep").n_frames == 61
+
+
+def test_what_partitions_cannot_do_is_said(small) -> None:
+    obs, camera, parts = small
+    for options in ({"method": "three_stage"}, {"likelihood": "student_t"}, {"noise": "model"}, {"duplicates": "drop"}):
+        with pytest.raises(CalibrationError, match="partitioned observations"):
+            sc.calibrate(parts, camera, **options)
+    with pytest.raises(CalibrationError, match="of use to partitioned observations"):
+        sc.calibrate(obs, camera, scheduler="tcp://127.0.0.1:1")
+    assert sc.calibrate(parts, camera, method="griffith").n_frames == 90
+
+
+def test_bad_row_names_its_file(small, tmp_path: Path) -> None:
+    obs, camera, _ = small
+    parts = divided(obs, tmp_path / "bad", [0, 45, 90])
+    bad = obs.select(obs.frame >= 45)
+    x = bad.x_px.copy()
+    x[3] = np.nan
+    sc.Observations(**{**bad.columns, "x_px": x}, meta=bad.meta).save(parts.parts[1].path, force=True)
+    with pytest.raises(ObservationError, match=r"part1.parquet, row 4, column x_px"):
+        sc.calibrate(sc.observations.open_partitions(parts.folder), camera)
