@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import partial, reduce
+from operator import add
 from time import perf_counter
 
 import numpy as np
@@ -26,17 +27,17 @@ from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, check_camera
 from starcal_uq.estimation.calibration import Calibration
-from starcal_uq.estimation.compressed import CompressedLikelihood, compress
+from starcal_uq.estimation.compressed import GramSums, gram_sums
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.residual_map import OUTLIER_SIGMA, PartitionSums, ResidualMap
 from starcal_uq.estimation.solvers import Normal, is_singular, levenberg_marquardt
 from starcal_uq.estimation.stages import Stage
-from starcal_uq.maths.linear import scaled_inverse
+from starcal_uq.estimation.sums import NormalSums, settled_sums, sum_of
+from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse
+from starcal_uq.observations.checks import mixed_bits
 from starcal_uq.observations.partitions import Partition, PartitionedObservations, PartitionReader, joined_hash
 from starcal_uq.observations.table import Observations
 
-# Stars of a partition that are linearised at once.
-_STARS_AT_ONCE = 100_000
 # Last step of the refinement, standard deviations of the estimate.
 _LAST_STEP = 1e-8
 
@@ -53,18 +54,10 @@ class _Seen:
 
 def _look(reader: PartitionReader, part: Partition) -> _Seen:
     obs = reader.load(part, check=True)
-    # Equal pixels in any order of the stars: a sum of mixed bits, by the finaliser of SplitMix64 (Steele et al. 2014).
+    # Equal pixels in any order of the stars have equal sums.
     with np.errstate(over="ignore"):
-        x, y = ((values + 0.0).view(np.uint64) for values in (obs.x_px, obs.y_px))
-        bits = _mixed(x) + np.uint64(3) * _mixed(y ^ np.uint64(0x9E3779B97F4A7C15))
-        content = np.add.reduceat(_mixed(bits), obs.frame_starts[:-1])
+        content = np.add.reduceat(mixed_bits(obs.x_px, obs.y_px), obs.frame_starts[:-1])
     return _Seen(obs.n_stars, (obs.data_hash,), obs.frame_ids, content)
-
-
-def _mixed(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    bits = (bits ^ (bits >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    bits = (bits ^ (bits >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    return np.asarray(bits ^ (bits >> np.uint64(31)))
 
 
 def _seen_together(parts: Sequence[_Seen]) -> _Seen:
@@ -76,49 +69,23 @@ def _seen_together(parts: Sequence[_Seen]) -> _Seen:
     )
 
 
-def _likelihood(reader: PartitionReader, model: str, part: Partition) -> MarginalLikelihood:
-    return MarginalLikelihood(reader.load(part), model)
+def _normal(reader: PartitionReader, model: str, theta: FloatArray, part: Partition) -> NormalSums:
+    likelihood = MarginalLikelihood(reader.load(part), model)
+    return settled_sums(likelihood.frames, model, theta, likelihood.start_rotations(theta))[0]
 
 
-def _normal(reader: PartitionReader, model: str, theta: FloatArray, part: Partition) -> Normal:
-    whole = _likelihood(reader, model, part).frames
-    return _added(
-        [
-            MarginalLikelihood(whole.part(first, last), model).evaluate(theta)
-            for first, last in whole.parts(_STARS_AT_ONCE)
-        ]
-    )
+def _gram(reader: PartitionReader, model: str, theta: FloatArray, whitening: FloatArray, part: Partition) -> GramSums:
+    likelihood = MarginalLikelihood(reader.load(part), model)
+    return gram_sums(likelihood.frames, model, theta, whitening, likelihood.start_rotations(theta))
 
 
-def _added(parts: Sequence[Normal]) -> Normal:
-    return Normal(
-        sum(part.cost for part in parts),
-        np.sum([part.gradient for part in parts], axis=0),
-        np.sum([part.matrix for part in parts], axis=0),
-    )
-
-
-def _compressed(
-    reader: PartitionReader, model: str, theta: FloatArray, covariance: FloatArray, part: Partition
-) -> CompressedLikelihood:
-    return compress(_likelihood(reader, model, part), theta, covariance)
-
-
-def _added_compressed(parts: Sequence[CompressedLikelihood]) -> CompressedLikelihood:
-    return replace(
-        parts[0],
-        gram=np.sum([part.gram for part in parts], axis=0),
-        log_determinant=sum(part.log_determinant for part in parts),
-        log_determinant_slope=np.sum([part.log_determinant_slope for part in parts], axis=0),
-        dof=sum(part.dof for part in parts),
-        n_stars=sum(part.n_stars for part in parts),
-        n_frames=sum(part.n_frames for part in parts),
-    )
+def _gram_together(parts: Sequence[GramSums]) -> GramSums:
+    return reduce(add, parts)
 
 
 @dataclass(frozen=True)
 class _Residuals:
-    """Sums over stars and frames at the estimate: attitude response (p, 3) and covariance (3, 3), and the residuals."""
+    """Sums over stars and frames at the estimate: attitude response (3, p) and covariance (3, 3), and the residuals."""
 
     response: FloatArray
     inverse: FloatArray
@@ -129,15 +96,9 @@ def _residuals(
     reader: PartitionReader, camera: Camera, theta: FloatArray, scale: float, n_stars: int, part: Partition
 ) -> _Residuals:
     obs = reader.load(part)
-    whole = MarginalLikelihood(obs, camera.distortion).frames
-    response, inverse, blocks = np.zeros((len(theta), 3)), np.zeros((3, 3)), []
-    for first, last in whole.parts(_STARS_AT_ONCE):
-        one = MarginalLikelihood(whole.part(first, last), camera.distortion)
-        state, _ = one.profile(theta)
-        response += np.sum(one.attitude_response(state, one.derivatives(theta, state)), axis=2)
-        inverse += np.sum(state.inverse, axis=2)
-        blocks.append(state.e)
-    e = np.concatenate(blocks, axis=1)
+    likelihood = MarginalLikelihood(obs, camera.distortion)
+    whole, e = likelihood.frames, np.empty((2, obs.n_stars))
+    _, attitudes = settled_sums(whole, camera.distortion, theta, likelihood.start_rotations(theta), e)
     stated = np.ones(obs.n_stars) if obs.sigma_px is None else obs.sigma_px
     size = np.max(np.abs(e), axis=0) / scale
     worst = int(np.argmax(size))
@@ -151,7 +112,7 @@ def _residuals(
         largest=float(size[worst]),
         largest_frame=int(obs.frame[worst]),
     )
-    return _Residuals(response, inverse, sums)
+    return _Residuals(np.sum(attitudes.response, axis=2), np.sum(attitudes.inverse, axis=2), sums)
 
 
 def _added_residuals(parts: Sequence[_Residuals]) -> _Residuals:
@@ -208,7 +169,7 @@ def calibrate_partitions(
     dof = 2 * n_stars - 3 * n_frames - p
 
     def evaluate(theta: FloatArray) -> Normal:
-        return cluster.reduce(partial(_normal, reader, model, theta), obs.parts, _added, progress=progress)
+        return cluster.reduce(partial(_normal, reader, model, theta), obs.parts, sum_of, progress=progress).normal
 
     # A last step of 1e-8 sigma, which leaves nothing of where the search began: that depends on the sample.
     found = levenberg_marquardt(
@@ -222,9 +183,9 @@ def calibrate_partitions(
         raise CalibrationError(f"the calibration failed ({reason.name}): {reason.remedy}.", reason)
     sigma = float(np.sqrt(normal.cost / dof))
     covariance = scaled_inverse(normal.matrix) * sigma**2
-    compressed = cluster.reduce(
-        partial(_compressed, reader, model, theta, covariance), obs.parts, _added_compressed, progress=progress
-    )
+    whitening = scaled_cholesky(covariance)
+    gram = cluster.reduce(partial(_gram, reader, model, theta, whitening), obs.parts, _gram_together, progress=progress)
+    compressed = gram.likelihood(theta, whitening)
     # As in `assemble`: the rotation-volume term moves the maximum by about 0.01 sigma of a small table.
     theta = theta - 0.5 * compressed.whitening @ compressed.log_determinant_slope
     camera = start.nominal.with_theta(theta)
@@ -234,9 +195,8 @@ def calibrate_partitions(
     )
     likelihood = MarginalLikelihood(sample, model)
     state, _ = likelihood.profile(theta)
-    if status.ok and float(np.sqrt(np.mean(likelihood.frames.in_pixels(state.e) ** 2))) > IMPLAUSIBLE_NOISE * (
-        camera.width_px
-    ):
+    residuals = likelihood.frames.in_pixels(state.e).T
+    if status.ok and float(np.sqrt(np.mean(residuals**2))) > IMPLAUSIBLE_NOISE * camera.width_px:
         status = Status.INCONSISTENT
     record = provenance(None, start.provenance["settings"], joined_hash(seen.hashes))
     record["partitions"] = {
@@ -258,11 +218,11 @@ def calibrate_partitions(
         stages=(*start.stages[:-1], sampled, stage),
         status=check_camera(camera, status),
         quaternions=rotation_to_quaternion(state.rotations),
-        residuals_px=likelihood.frames.in_pixels(state.e).T,
+        residuals_px=residuals,
         chi2=float(np.sum(rest.sums.chi2)),
         dof=dof,
         information=normal.matrix / sigma**2,
-        rotation_per_theta=-(rest.response / n_frames).T,
+        rotation_per_theta=rest.response / n_frames,
         attitude_noise=rest.inverse / n_frames * sigma**2,
         compressed=compressed,
         provenance=record,

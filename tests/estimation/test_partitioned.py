@@ -51,7 +51,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[sc.Observations, sc
 def test_partitions_give_the_calibration_of_the_table(small, tmp_path: Path) -> None:
     obs, camera, parts = small
     one, many = sc.calibrate(obs, camera), sc.calibrate(parts, camera)
-    assert_equal(many, one, 1e-7)
+    assert_equal(many, one, 1e-10)
     others = divided(obs, tmp_path / "others", [0, 50, 90])
     assert_equal(sc.calibrate(others, camera), many, 1e-10)
     np.testing.assert_array_equal(sc.calibrate(parts, camera).theta, many.theta)
