@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 
 # Noise above this fraction of the detector's width means that the stars are not the ones they are said to be.
 IMPLAUSIBLE_NOISE = 0.01
+# Attitudes this near to the best ones tell such a noise.
+_NEARLY_RAD = 1e-4
 # Fewer stars than this that are seen twice do not tell their errors from noise.
 _FEWEST_STARS = 5
 
@@ -174,11 +176,16 @@ def with_star_errors(obs: Observations, cal: Calibration) -> Calibration:
 
 
 def noise_px(likelihood: MarginalLikelihood, theta: FloatArray) -> float:
-    """Root mean square of the residuals per axis, px; infinite when the model is not finite."""
-    state, cost = likelihood.profile(theta, likelihood.rotations)
-    if not np.isfinite(cost):
+    """Root mean square of the residuals per axis, px; infinite when the model is not finite.
+
+    `likelihood` starts its later attitude searches from those found here.
+    """
+    e = np.empty((2, likelihood.frames.n_stars))
+    found = likelihood.sums(theta, e, _NEARLY_RAD)
+    if not np.isfinite(found[0].normal.cost):
         return float("inf")
-    return float(np.sqrt(np.mean(likelihood.frames.in_pixels(state.e) ** 2)))
+    likelihood.use_sums(*found)
+    return float(np.sqrt(np.mean(likelihood.frames.in_pixels(e) ** 2)))
 
 
 def check_camera(camera: Camera, status: Status) -> Status:

@@ -41,6 +41,8 @@ _FALSE_ALARM = 1e-6
 # From so many other frames of one pointing on, they tell how much error exposures share; so many are asked.
 _STARE, _ASKED = 5, 8
 _MOST_CANDIDATES, _PART = 2_000_000, 20_000
+# Pairs that are tried one by one before a tree is quicker, and the reach of a key that was rounded.
+_MOST_TRIED, _WINDOW = 20_000_000, 1.0 + 1e-6
 # Terms of a smooth misfit up to the fifth degree, with so many stars for each, from at most so many stars.
 _DEGREE, _STARS_PER_TERM, _MOST_STARS = 5, 20, 50_000
 
@@ -109,12 +111,24 @@ def _unsmooth(xy: FloatArray, residuals: FloatArray, rows: IntArray) -> FloatArr
         x, y = (np.vander(values, degree + 1, increasing=True) for values in at.T)
         return np.column_stack([x[:, i] * y[:, j] for i in range(degree + 1) for j in range(degree + 1 - i)])
 
+    def smooth(at: FloatArray, coefficients: FloatArray) -> FloatArray:
+        # Horner's scheme in both coordinates: no table of all terms.
+        x, y = np.ascontiguousarray(at.T)
+        value, last = np.zeros(len(at)), len(coefficients)
+        for i in range(degree, -1, -1):
+            first = last - (degree + 1 - i)
+            inner = np.full(len(at), coefficients[last - 1])
+            for j in range(last - 2, first - 1, -1):
+                inner = inner * y + coefficients[j]
+            value, last = value * x + inner, first
+        return value
+
     length = np.linalg.norm(residuals, axis=1)
     # A few wrong stars would bend the polynomial for all others.
     used = np.flatnonzero(length <= 5.0 * np.median(length))[::step]
     x = terms(place[used])
     solution = np.linalg.lstsq(x.T @ x, x.T @ residuals[used], rcond=None)[0]
-    return np.asarray(residuals[rows] - terms(place[rows]) @ solution)
+    return residuals[rows] - np.stack([smooth(place[rows], column) for column in solution.T], axis=1)
 
 
 def shared(a: Fingerprints, b: Fingerprints) -> IntArray:
@@ -158,6 +172,35 @@ def repeats(marks: Fingerprints, group: IntArray | None = None) -> IntArray:
     return pairs[search.judged(pairs, r, p)] if len(pairs) else nothing
 
 
+def _near(points: FloatArray) -> IntArray | None:
+    """Pairs (n, 2) of points (m, d) that differ by at most 1 in every coordinate; None where too many are to be tried.
+
+    Points are sorted into strips of the first coordinate and, within them, by the third.
+    """
+    strip = np.floor(points[:, 0])
+    strip -= strip.min(initial=0.0)
+    along = points[:, 2] - points[:, 2].min(initial=0.0)
+    length = along.max(initial=0.0) + 3.0
+    order = np.argsort(strip * length + along, kind="stable")
+    points, strip, along = points[order], strip[order], along[order]
+    keys = strip * length + along
+    found = []
+    for step in (0, 1):
+        at = (strip + step) * length + along
+        first = np.arange(1, len(keys) + 1) if step == 0 else np.searchsorted(keys, at - _WINDOW)
+        count = np.maximum(np.searchsorted(keys, at + _WINDOW, side="right") - first, 0)
+        if count.sum() > _MOST_TRIED:
+            return None
+        one = np.repeat(np.arange(len(keys)), count)
+        two = np.arange(len(one)) + np.repeat(first - (np.cumsum(count) - count), count)
+        for axis in (2, 0, *range(1, points.shape[1])):
+            column = points[:, axis]
+            alike = np.abs(column[one] - column[two]) <= 1.0
+            one, two = one[alike], two[alike]
+        found.append(np.column_stack([order[one], order[two]]))
+    return np.concatenate(found)
+
+
 class _Search:
     """Frames looked up by the triangles of their most central stars."""
 
@@ -182,21 +225,32 @@ class _Search:
         self.first[has] = np.arange(len(has))
         points = triangles[0] / _SHIFT
         self.partners = np.zeros(len(self.counts))
-        self.partners[has] = _tree(points).query_ball_point(points, 1.0, p=np.inf, return_length=True) - 1
+        near = _near(points)
+        if near is not None:
+            self.partners[has] = np.bincount(near.ravel(), minlength=len(has))
+        else:
+            self.partners[has] = _tree(points).query_ball_point(points, 1.0, p=np.inf, return_length=True) - 1
 
     def candidates(self, group: IntArray | None) -> IntArray:
         """Pairs of frames with a triangle in common."""
-        tree = _tree(self.triangle / np.array([_SHIFT, _SHIFT, *[self.sigma] * 4]))
-        reach = 1.0
-        # A stare of very many frames has too many neighbours: the nearer ones are then looked at.
-        if self.partners.sum() > _MOST_CANDIDATES:
-            while tree.count_neighbors(tree, reach, p=np.inf) > 2 * _MOST_CANDIDATES + len(self.frame):
-                reach *= 0.8
-        pairs = np.sort(self.frame[tree.query_pairs(reach, p=np.inf, output_type="ndarray")], axis=1)
+        points = self.triangle / np.array([_SHIFT, _SHIFT, *[self.sigma] * 4])
+        near = _near(points) if self.partners.sum() <= _MOST_CANDIDATES else None
+        if near is None:
+            near = self._nearest(points)
+        pairs = np.sort(self.frame[near], axis=1)
         pairs = pairs[pairs[:, 0] != pairs[:, 1]]
         if group is not None:
             pairs = pairs[group[pairs[:, 0]] != group[pairs[:, 1]]]
         return np.unique(pairs, axis=0)
+
+    def _nearest(self, points: FloatArray) -> IntArray:
+        """Pairs of triangles that look alike, by a tree."""
+        tree, reach = _tree(points), 1.0
+        # A stare of very many frames has too many neighbours: the nearer ones are then looked at.
+        if self.partners.sum() > _MOST_CANDIDATES:
+            while tree.count_neighbors(tree, reach, p=np.inf) > 2 * _MOST_CANDIDATES + len(self.frame):
+                reach *= 0.8
+        return np.asarray(tree.query_pairs(reach, p=np.inf, output_type="ndarray"), dtype=np.int64)
 
     def compared(
         self, pairs: IntArray, offset: FloatArray | None

@@ -78,6 +78,7 @@ class MarginalLikelihood:
         self.frames = obs if isinstance(obs, StarFrames) else StarFrames.from_observations(obs)
         self.model_name = model_name
         self._rotations: FloatArray | None = None
+        self._last: tuple[NormalSums, Attitudes] | None = None
 
     @property
     def dof(self) -> int:
@@ -87,7 +88,9 @@ class MarginalLikelihood:
     def start_rotations(self, theta: FloatArray) -> FloatArray:
         """Attitudes (K, 3, 3) by QUEST at theta."""
         b = unproject_theta(self.model_name, theta, self.frames.pixel.T)
-        return quest(b, self.frames.r.T, self.frames.starts, self._quest_weights(), on_degenerate="flag").rotations
+        weights = self._quest_weights()
+        found = quest(b, self.frames.r.T, self.frames.starts, weights, covariance=False, on_degenerate="flag")
+        return found.rotations
 
     def _quest_weights(self) -> FloatArray | None:
         return None if self.frames.weight is None else self.frames.weight**2
@@ -162,7 +165,20 @@ class MarginalLikelihood:
 
     def use_rotations(self, rotations: FloatArray) -> None:
         """Start later attitude searches here, which saves QUEST when theta moves little."""
-        self._rotations = rotations
+        self._rotations, self._last = rotations, None
+
+    @property
+    def last_sums(self) -> tuple[NormalSums, Attitudes] | None:
+        """What `use_sums` was told."""
+        return self._last
+
+    def use_sums(self, sums: NormalSums, attitudes: Attitudes) -> None:
+        """Start later attitude searches from those that follow from these sums, and take them for settled if they are.
+
+        `sums` and `attitudes` are those of all frames at one point, as `starcal_uq.estimation.sums.frame_sums` gives
+        them.
+        """
+        self._rotations, self._last = attitudes.at(attitudes.theta), (sums, attitudes)
 
     def log_likelihood(self, theta: FloatArray, sigma: float) -> float:
         """Log likelihood at theta (p,) and sigma (px, or the common factor on stated noise)."""
@@ -196,11 +212,20 @@ class MarginalLikelihood:
         """Cost S, gradient and Gauss-Newton matrix with the attitudes eliminated (variable projection)."""
         return self.sums(theta)[0].normal
 
-    def sums(self, theta: FloatArray, residuals: FloatArray | None = None) -> tuple[NormalSums, Attitudes]:
-        """Normal equations and attitudes at theta, searched from `rotations` or QUEST's.
+    def sums(
+        self, theta: FloatArray, residuals: FloatArray | None = None, tolerance: float = ATTITUDE_TOLERANCE_RAD
+    ) -> tuple[NormalSums, Attitudes]:
+        """Normal equations and attitudes at theta, searched from where they were last, from `rotations` or by QUEST.
 
-        The whitened residuals there are written into `residuals` (2, N).
+        The whitened residuals there are written into `residuals` (2, N). Attitudes are the best ones to `tolerance`
+        (rad), and the sums those of the best ones to first order.
         """
         theta = np.asarray(theta, dtype=np.float64)
-        rotations = self.start_rotations(theta) if self._rotations is None else self._rotations
-        return settled_sums(self.frames, self.model_name, theta, rotations, residuals)
+        if self._last is not None:
+            sums, attitudes = self._last
+            if residuals is None and sums.turn < tolerance and np.array_equal(theta, attitudes.theta):
+                return self._last
+            rotations = attitudes.at(theta)
+        else:
+            rotations = self.start_rotations(theta) if self._rotations is None else self._rotations
+        return settled_sums(self.frames, self.model_name, theta, rotations, residuals, tolerance)

@@ -81,6 +81,7 @@ class PairObjective:
         self._blocks = [frames.part(first, last) for first, last in frames.parts(_BLOCK_STARS)]
         self._turned_at: FloatArray | None = None
         self._turned: list[FloatArray] = []
+        self._rotations: list[FloatArray] = []
         self._last: tuple[FloatArray, Normal, FloatArray] | None = None
 
     @property
@@ -88,6 +89,13 @@ class PairObjective:
         """Number of star pairs."""
         m = self.frames.sizes
         return int(np.sum(m * (m - 1) // 2))
+
+    @property
+    def rotations(self) -> FloatArray | None:
+        """Attitudes (K, 3, 3) by QUEST near to the last point, if that was finite."""
+        if self._turned_at is None or len(self._rotations) < len(self._blocks):
+            return None
+        return np.concatenate(self._rotations)
 
     def directions(self, theta: FloatArray, frames: StarFrames) -> tuple[FloatArray, FloatArray]:
         """Measured unit vectors (3, N) and their derivatives (p, 3, N)."""
@@ -99,12 +107,13 @@ class PairObjective:
         """Terms of the objective, block by block."""
         turn = self._turned_at is None or np.max(np.abs(theta[:3] - self._turned_at)) > _TURN_AGAIN_PX
         if turn:
-            self._turned_at, self._turned = theta[:3].copy(), []
+            self._turned_at, self._turned, self._rotations = theta[:3].copy(), [], []
         for index, frames in enumerate(self._blocks):
             b, db = self.directions(theta, frames)
             if turn:
                 found = quest(b.T, frames.r.T, frames.starts, covariance=False, on_degenerate="flag")
                 self._turned.append(frames.rotated(found.rotations))
+                self._rotations.append(found.rotations)
                 if not found.ok.all():
                     # No reference to keep: the model is not finite here.
                     self._turned_at = None

@@ -41,7 +41,8 @@ class Stage:
         Estimates after each iteration, px units, the start first; of a filter, after each frame.
     cost : (n,) array
         The stage's own cost along the trajectory: rad^2 over pairs, px^2 in the linear stage and the refinement; of a
-        filter, the sum of its whitened innovations so far, px^2 (or in units of the stated noise).
+        filter, the sum of its whitened innovations so far, px^2 (or in units of the stated noise). Where the first
+        steps were taken on a sample of the frames, their costs are scaled to all.
     status : Status
         How it ended.
     evaluations : int
@@ -111,6 +112,18 @@ def _timed(name: str, run: Callable[[], Solution], tail: FloatArray) -> Stage:
     )
 
 
+def begun_on_sample(sample: Stage, whole: Stage, scale: float) -> Stage:
+    """One stage of two: its way on a sample of the frames, with costs times `scale`, and then on all."""
+    return Stage(
+        name=sample.name,
+        trajectory=np.concatenate([sample.trajectory[:-1], whole.trajectory]),
+        cost=np.concatenate([sample.cost[:-1] * scale, whole.cost]),
+        status=whole.status,
+        evaluations=sample.evaluations + whole.evaluations,
+        seconds=sample.seconds + whole.seconds,
+    )
+
+
 def optics_stage(frames: StarFrames, camera: Camera, solver: str, max_iterations: int) -> Stage:
     """Stage 1: x0, y0 and f on interstar angles, distortion ignored (the paper's section 2.1)."""
     objective = PairObjective(frames, "none")
@@ -158,7 +171,7 @@ def refinement_stage(likelihood: MarginalLikelihood, theta: FloatArray, max_iter
     The attitudes move along; `likelihood` starts its later searches from where they end.
     """
     start = likelihood.start_rotations(theta) if likelihood.rotations is None else likelihood.rotations
-    descent = Descent(likelihood.frames, likelihood.model_name, start)
+    descent = Descent(likelihood.frames, likelihood.model_name, start, likelihood.last_sums)
     stage = _timed(
         "refinement",
         lambda: levenberg_marquardt(
@@ -166,5 +179,6 @@ def refinement_stage(likelihood: MarginalLikelihood, theta: FloatArray, max_iter
         ),
         np.zeros(0),
     )
-    likelihood.use_rotations(descent.rotations(stage.theta))
+    if descent.best is not None:
+        likelihood.use_sums(*descent.best)
     return stage

@@ -89,11 +89,6 @@ class NormalSums:
         # Noise-free data leave rounding, of either sign.
         return Normal(max(self.cost, 0.0), self.gradient, 0.5 * (self.matrix + self.matrix.T))
 
-    @property
-    def settled(self) -> bool:
-        """Whether the attitudes are the best ones."""
-        return self.turn < ATTITUDE_TOLERANCE_RAD
-
 
 def sum_of(parts: Sequence[NormalSums]) -> NormalSums:
     """All parts together."""
@@ -268,12 +263,13 @@ def settled_sums(
     theta: FloatArray,
     rotations: FloatArray,
     residuals: FloatArray | None = None,
+    tolerance: float = ATTITUDE_TOLERANCE_RAD,
 ) -> tuple[NormalSums, Attitudes]:
     """As `frame_sums`, passes repeated until every attitude is the best one; a cost of infinity where there is none."""
     theta = np.asarray(theta, dtype=np.float64)
     for _ in range(ATTITUDE_STEPS):
         sums, attitudes = frame_sums(frames, model_name, theta, rotations, residuals)
-        if sums.settled or not np.isfinite(sums.cost):
+        if sums.turn < tolerance or not np.isfinite(sums.cost):
             return sums, attitudes
         rotations = attitudes.at(theta)
     # Stars that fit no attitude: nothing here is a minimum.
@@ -291,22 +287,38 @@ class Descent:
         Distortion model.
     rotations : (K, 3, 3) array
         Attitudes to start from.
+    best : tuple of NormalSums and Attitudes, optional
+        Sums at a first point.
+
+    Attributes
+    ----------
+    best : tuple of NormalSums and Attitudes, or None
+        Those of the best point so far; None before there is one.
     """
 
-    def __init__(self, frames: StarFrames, model_name: str, rotations: FloatArray) -> None:
+    def __init__(
+        self,
+        frames: StarFrames,
+        model_name: str,
+        rotations: FloatArray,
+        best: tuple[NormalSums, Attitudes] | None = None,
+    ) -> None:
         self.frames, self.model_name = frames, model_name
-        self._start = rotations
-        self._best: tuple[NormalSums, Attitudes] | None = None
+        self._start, self.best = rotations, best
 
     def evaluate(self, theta: FloatArray) -> Normal:
         """Cost, gradient and matrix at theta (p,), from the attitudes of the best point so far."""
-        rotations = self._start if self._best is None else self._best[1].at(theta)
+        theta = np.array(theta, dtype=np.float64)
+        if self.best is not None and np.array_equal(theta, self.best[1].theta):
+            return self.best[0].normal
+        rotations = self._start if self.best is None else self.best[1].at(theta)
         found = frame_sums(self.frames, self.model_name, theta, rotations)
         normal = found[0].normal
-        if np.isfinite(normal.cost) and (self._best is None or normal.cost <= self._best[0].cost):
-            self._best = found
+        if np.isfinite(normal.cost) and (self.best is None or _reaches(normal.cost, self.best[0].cost)):
+            self.best = found
         return normal
 
-    def rotations(self, theta: FloatArray) -> FloatArray:
-        """Best attitudes (K, 3, 3) at theta (p,), to first order from the best point."""
-        return self._start if self._best is None else self._best[1].at(np.asarray(theta, dtype=np.float64))
+
+def _reaches(cost: float, best: float) -> bool:
+    """Whether a cost is as low as the best one, but for rounding."""
+    return cost <= best + 1e-12 * abs(best)

@@ -147,7 +147,9 @@ class Observations(FrameRows, Shown):
             digest.update(f"{name}:{len(values)};".encode())
             if values.dtype.kind == "U":
                 # The length before each text: without it ("ab", "c") and ("a", "bc") would agree.
-                digest.update("".join(f"{len(text)}:{text}" for text in values.tolist()).encode())
+                texts = values.tolist()
+                marked = {text: f"{len(text)}:{text}" for text in set(texts)}
+                digest.update("".join(map(marked.__getitem__, texts)).encode())
             else:
                 # Adding zero makes -0.0 and 0.0, which compare equal, agree in their bytes.
                 values = values + values.dtype.type(0)
