@@ -2,7 +2,9 @@
 
 What differs between them and is settled here: the container of draws; a default `prob` of the tail ESS that went away;
 and Pareto smoothing, which takes log weights in 0.23 and *negated* log weights in 1.x, without complaint when given the
-wrong ones.
+wrong ones. Numbers come from the array functions of `arviz_stats`, the package behind 1.x, which Python 3.11 can install
+beside 0.23: they need NumPy and SciPy alone, while 0.23 loads matplotlib, xarray and all of its plots, which takes
+seconds. Without that package, 0.23 computes them.
 """
 
 from __future__ import annotations
@@ -47,12 +49,15 @@ def _legacy() -> Any:
 
 @lru_cache(maxsize=1)
 def _array_stats() -> Any:
-    # The array interface of 1.x needs neither matplotlib nor a container.
-    return importlib.import_module("arviz_stats.base").array_stats
+    """The array interface of 1.x, which needs neither matplotlib nor a container; None where it is not installed."""
+    try:
+        return importlib.import_module("arviz_stats.base").array_stats
+    except ModuleNotFoundError:
+        return None
 
 
 def _diagnostic(name: str, values: FloatArray, **options: Any) -> float:
-    return float(getattr(_legacy() if is_legacy() else _array_stats(), name)(values, **options))
+    return float(getattr(_array_stats() or _legacy(), name)(values, **options))
 
 
 def to_arviz(groups: Mapping[str, xr.Dataset]) -> Any:
@@ -106,7 +111,7 @@ def psis(log_weights: FloatArray) -> tuple[FloatArray, FloatArray]:
     if not np.all(flat):
         # Trial shapes of the tail fit that are out of the question get the weight exp(-large), by way of 1 / inf.
         with np.errstate(over="ignore"):
-            smoothed[~flat], khat[~flat] = (
-                _legacy().psislw(values[~flat]) if is_legacy() else _array_stats().psislw(-values[~flat])
-            )
+            stats = _array_stats()
+            found = _legacy().psislw(values[~flat]) if stats is None else stats.psislw(-values[~flat])
+            smoothed[~flat], khat[~flat] = found
     return smoothed, khat
