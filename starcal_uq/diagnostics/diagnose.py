@@ -29,6 +29,7 @@ from starcal_uq.estimation.calibrate import METHODS, calibrate, fit
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import FrameNormals
+from starcal_uq.observations.splits import frame_sample
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -39,6 +40,8 @@ if TYPE_CHECKING:
 # How far the other starts are from the nominal camera: of its focal length, and of the detector's longer side.
 _START_FOCAL, _START_CENTRE = 0.05, 0.1
 _SAME_SIGMA, _BETTER = 0.1, 1e-6
+# Stars and frames that fits from other starts need, and how far chance puts their optimum from that of all.
+_START_STARS, _FEWEST_FRAMES, _NEAR_SIGMA = 5000, 200, 6.0
 
 
 @dataclass(frozen=True)
@@ -57,6 +60,10 @@ class MultiStart:
         Starts that did not converge.
     largest_sigma : float
         Largest difference among those that reached the same optimum, standard deviations.
+    n_frames : int
+        Frames that were fitted, of `of_frames`; 0 in a diagnosis of a version that took all.
+    of_frames : int
+        Frames of the calibration.
     """
 
     n: int
@@ -64,6 +71,8 @@ class MultiStart:
     better: int
     failed: int
     largest_sigma: float
+    n_frames: int = 0
+    of_frames: int = 0
 
 
 @dataclass(frozen=True)
@@ -190,7 +199,9 @@ def _jackknife(obs: Observations, cal: Calibration, normals: FrameNormals) -> Ja
 def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> MultiStart:
     """Calibrate from n starts scattered around the nominal camera, and count the optima.
 
-    One standard deviation of the starts is 5 % of the focal length and a tenth of the detector.
+    One standard deviation of the starts is 5 % of the focal length and a tenth of the detector. Where there are many
+    frames, a few hundred of them have the same optima: the starts are then held against the optimum of these, if the
+    estimate is as near to it as chance has it.
     """
     rng = np.random.default_rng((seed, 11))
     nominal = cal.nominal
@@ -200,6 +211,17 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
     # Errors of the stars weigh an estimate that was found without them: that is what a start leads to.
     reached = None if cal.star_errors is None else cal.stages[-2]
     reference, lowest = (cal.theta, cal.chi2) if reached is None else (reached.theta, float(reached.cost[-1]))
+    some, sigmas = _few(obs), cal.sigmas
+    if some is not obs:
+        sigmas = sigmas * np.sqrt(obs.n_stars / some.n_stars)
+        try:
+            optimum, lowest = _optimum(some, cal, cal.camera)
+        except StarcalError:
+            some, sigmas = obs, cal.sigmas
+        else:
+            # An estimate that is not the optimum of all is not near that of some, and every start finds a better one.
+            near = bool(np.max(np.abs(optimum - reference) / sigmas) < _NEAR_SIGMA)
+            reference, lowest = (optimum, lowest) if near else (reference, np.inf)
     for _ in range(n):
         shift = rng.standard_normal(3)
         start = nominal.replace(
@@ -208,17 +230,22 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
             y0_px=float(np.clip(nominal.y0_px + side * shift[2], 0.0, nominal.height_px - 1.0)),
         )
         try:
-            theta, chi2 = _optimum(obs, cal, start)
+            theta, chi2 = _optimum(some, cal, start)
         except StarcalError:
             failed += 1
             continue
-        difference = float(np.max(np.abs(theta - reference) / cal.sigmas))
+        difference = float(np.max(np.abs(theta - reference) / sigmas))
         if difference < _SAME_SIGMA:
             same += 1
             largest = max(largest, difference)
         elif chi2 < lowest * (1.0 - _BETTER):
             better += 1
-    return MultiStart(n, same, better, failed, largest)
+    return MultiStart(n, same, better, failed, largest, some.n_frames, obs.n_frames)
+
+
+def _few(obs: Observations) -> Observations:
+    """All frames, or so many of them that they hold enough stars for an optimum."""
+    return frame_sample(obs, max(_FEWEST_FRAMES, _START_STARS * obs.n_frames // obs.n_stars))[0]
 
 
 def _optimum(obs: Observations, cal: Calibration, start: Camera) -> tuple[FloatArray, float]:

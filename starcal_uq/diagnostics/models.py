@@ -4,8 +4,9 @@ A frame is the unit, because its stars share an attitude. The log likelihood of 
 the posterior of the parameters and the noise is that of the linearised model under the reference prior (flat in the
 parameters, 1 / sigma): normal times scaled inverse chi-square. Two estimates of each frame's density without itself:
 
-- Pareto-smoothed importance sampling over posterior draws (Vehtari, Gelman & Gabry 2017), the default, and
-- the closed form, a multivariate t, exact for the linearised model, which stands in where k-hat exceeds 0.7.
+- the closed form, a multivariate t, exact for the linearised model, and
+- Pareto-smoothed importance sampling over posterior draws (Vehtari, Gelman & Gabry 2017), of some of the frames where
+  they are many; frames whose k-hat exceeds 0.7 keep the closed form.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.inference.arviz import psis
 from starcal_uq.maths.intervals import student_quantile
+from starcal_uq.observations.splits import one_of_each
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -40,6 +42,8 @@ KHAT_BOUND = 0.7
 # chance between equal models (Sivula et al. 2020: below four, a difference of elpd says nothing).
 REJECT_P, REJECT_ELPD = 0.005, 4.0
 _DRAWS = 1000
+# Frames whose densities are sampled as well; the closed form, which is exact for the same model, costs nothing.
+_SAMPLED_FRAMES = 200
 
 
 @dataclass(frozen=True)
@@ -63,9 +67,9 @@ class ModelScore:
     closed_form : float
         `elpd` in closed form.
     max_khat : float
-        Largest Pareto shape over frames.
+        Largest Pareto shape over the sampled frames.
     n_replaced : int
-        Frames whose importance weights could not be trusted, taken in closed form.
+        Sampled frames whose importance weights could not be trusted, taken in closed form.
     common_arcsec : tuple of float
         Mean rotation over frames from the calibration's attitudes to this model's: pitch, yaw, roll.
     rest_arcsec : tuple of float
@@ -103,12 +107,17 @@ class ModelComparison(Shown):
         Models that could not be calibrated, and why.
     share : float
         Frames that were compared, of those that the calibration rests on.
+    n_frames, n_sampled_frames : int
+        Frames, and those of them whose densities were sampled; the others are in closed form. 0 in a comparison of a
+        version that sampled all.
     """
 
     scores: tuple[ModelScore, ...]
     fitted: str
     failed: dict[str, str]
     share: float = 1.0
+    n_frames: int = 0
+    n_sampled_frames: int = 0
 
     @property
     def accepted(self) -> tuple[ModelScore, ...]:
@@ -206,7 +215,10 @@ def compare_models(
             )
         )
     scores.sort(key=lambda score: -score.elpd)
-    return ModelComparison(tuple(scores), cal.camera.distortion, failed)
+    sampled = min(obs.n_frames, _SAMPLED_FRAMES)
+    return ModelComparison(
+        tuple(scores), cal.camera.distortion, failed, n_frames=obs.n_frames, n_sampled_frames=sampled
+    )
 
 
 def _without_star_errors(obs: Observations, cal: Calibration) -> Calibration:
@@ -246,48 +258,56 @@ class _LeftOut:
 
 def _leave_out(normals: FrameNormals, n_draws: int, rng: np.random.Generator) -> _LeftOut:
     closed = closed_form(normals)
+    chosen = one_of_each(len(normals.dof), _SAMPLED_FRAMES)
     dof = int(np.sum(normals.dof)) - len(normals.theta)
     factor = np.linalg.cholesky(np.linalg.inv(normals.matrix))
     sigma = np.sqrt(np.sum(normals.squares) / rng.chisquare(dof, n_draws))
     centre = np.linalg.solve(normals.matrix, normals.slopes.sum(axis=0))
     z = centre + sigma[:, None] * (rng.standard_normal((n_draws, len(factor))) @ factor.T)
-    squares = (
-        normals.squares - 2.0 * z @ normals.slopes.T + np.einsum("sa,kab,sb->sk", z, normals.matrices, z, optimize=True)
-    )
-    log_density = -0.5 * squares / sigma[:, None] ** 2 - np.outer(np.log(sigma), normals.dof)
-    log_density += -0.5 * normals.log_determinant - 0.5 * normals.dof * np.log(2.0 * np.pi)
+    slopes, matrices, own_dof = normals.slopes[chosen], normals.matrices[chosen], normals.dof[chosen]
+    squares = normals.squares[chosen] - 2.0 * z @ slopes.T + np.einsum("sa,kab,sb->sk", z, matrices, z, optimize=True)
+    log_density = -0.5 * squares / sigma[:, None] ** 2 - np.outer(np.log(sigma), own_dof)
+    log_density += -0.5 * normals.log_determinant[chosen] - 0.5 * own_dof * np.log(2.0 * np.pi)
     by_frame = np.ascontiguousarray(log_density.T)
     weights, khats = psis(-by_frame)
-    pointwise = _log_mean_exp(weights + by_frame) + np.log(n_draws)
-    bad = ~(khats <= KHAT_BOUND)
-    pointwise[bad] = closed[bad]
-    return _LeftOut(pointwise, closed, _log_mean_exp(by_frame), float(np.max(khats)), int(np.count_nonzero(bad)))
+    good = khats <= KHAT_BOUND
+    pointwise, in_sample = closed.copy(), closed_form(normals, left_out=False)
+    pointwise[chosen[good]] = _log_mean_exp(weights + by_frame)[good] + np.log(n_draws)
+    in_sample[chosen] = _log_mean_exp(by_frame)
+    return _LeftOut(pointwise, closed, in_sample, float(np.max(khats)), int(np.count_nonzero(~good)))
 
 
-def closed_form(normals: FrameNormals) -> FloatArray:
-    """Log predictive density (K,) of every frame given the others, for the linearised model.
+def closed_form(normals: FrameNormals, *, left_out: bool = True) -> FloatArray:
+    """Log predictive density (K,) of every frame given the others, or given all, for the linearised model.
 
     A frame's projected residuals, given the others, are multivariate t with ``nu = d - d_k - p`` degrees of freedom,
     location ``h_k z_(k)`` and scale ``s_(k)^2 (I + h_k H_(k)^-1 h_k^T)``; determinant and inverse need matrices of
-    size p only.
+    size p only. Given all, H, z and s are those of all frames.
     """
     from scipy.special import gammaln
 
-    z, rest = normals.left_out()
     matrices, slopes, dof = normals.matrices, normals.slopes, normals.dof
+    squares, total = normals.squares.sum(), slopes.sum(axis=0)
+    if left_out:
+        z, rest = normals.left_out()
+        squares, total = squares - normals.squares, total - slopes
+        nu = dof.sum() - dof - len(normals.theta)
+    else:
+        rest = np.broadcast_to(normals.matrix, matrices.shape)
+        z = np.broadcast_to(np.linalg.solve(normals.matrix, total), slopes.shape)
+        nu = np.broadcast_to(dof.sum() - len(normals.theta), dof.shape)
+    together = rest + matrices
 
     def square(step: FloatArray, c: FloatArray, g: FloatArray, h: FloatArray) -> FloatArray:
         quadratic = np.einsum("ka,kab,kb->k", step, h, step)
         return np.asarray(c - 2.0 * np.sum(g * step, axis=1) + quadratic)
 
-    others = square(z, normals.squares.sum() - normals.squares, slopes.sum(axis=0) - slopes, rest)
     own = square(z, normals.squares, slopes, matrices)
-    nu = dof.sum() - dof - len(normals.theta)
-    variance = others / nu
+    variance = square(z, squares, total, rest) / nu
     # What the frame's residuals and its own pull on the parameters leave, by the Woodbury identity.
     pull = slopes - np.einsum("kab,kb->ka", matrices, z)
-    own = own - np.einsum("ka,ab,kb->k", pull, np.linalg.inv(normals.matrix), pull)
-    growth = np.linalg.slogdet(normals.matrix)[1] - np.linalg.slogdet(rest)[1]
+    own = own - np.sum(pull * np.linalg.solve(together, pull[..., None])[..., 0], axis=1)
+    growth = np.linalg.slogdet(together)[1] - np.linalg.slogdet(rest)[1]
     density: FloatArray = (
         gammaln(0.5 * (nu + dof))
         - gammaln(0.5 * nu)

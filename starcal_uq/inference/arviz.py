@@ -2,9 +2,9 @@
 
 What differs between them and is settled here: the container of draws; a default `prob` of the tail ESS that went away;
 and Pareto smoothing, which takes log weights in 0.23 and *negated* log weights in 1.x, without complaint when given the
-wrong ones. Numbers come from the array functions of `arviz_stats`, the package behind 1.x, which Python 3.11 can install
-beside 0.23: they need NumPy and SciPy alone, while 0.23 loads matplotlib, xarray and all of its plots, which takes
-seconds. Without that package, 0.23 computes them.
+wrong ones. Numbers come from the array functions of `arviz_stats`, the package behind 1.x, which Python 3.11 can
+install beside 0.23: they need NumPy and SciPy alone, while 0.23 loads matplotlib, xarray and all of its plots, which
+takes seconds. Without that package, 0.23 computes them.
 """
 
 from __future__ import annotations

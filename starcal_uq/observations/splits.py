@@ -1,4 +1,4 @@
-"""Two halves of one set of frames, and how many frames two tables share."""
+"""Parts of one set of frames: two halves, or a sample; and how many frames two tables share."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.core.errors import ComparisonError
+from starcal_uq.core.types import IntArray
 
 if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
@@ -49,6 +50,23 @@ def split_frames(obs: Observations, how: str = "odd-even", *, seed: int = 0) -> 
         first = np.random.default_rng(seed).permutation(obs.n_frames) < (obs.n_frames + 1) // 2
     parts = [obs.select_frames(obs.frame_ids[mask]) for mask in (first, ~first)]
     return parts[0].with_meta(split=labels[0]), parts[1].with_meta(split=labels[1])
+
+
+def one_of_each(n: int, limit: int, seed: int = 0) -> IntArray:
+    """Places of at most `limit` out of n in ascending order: one at random of each of `limit` equal stretches.
+
+    A stratified sample: it follows whatever changes along a run, and meets no pattern of its own.
+    """
+    if n <= limit:
+        return np.arange(n)
+    edges = np.arange(limit + 1) * n // limit
+    return np.asarray(edges[:-1] + np.random.default_rng((seed, 23)).integers(np.diff(edges)))
+
+
+def frame_sample(obs: Observations, limit: int, seed: int = 0) -> tuple[Observations, IntArray]:
+    """At most `limit` frames as a table, all if there are no more, and their places among the frames."""
+    chosen = one_of_each(obs.n_frames, limit, seed)
+    return (obs if len(chosen) == obs.n_frames else obs.select_frames(obs.frame_ids[chosen])), chosen
 
 
 def split_labels(how: str) -> tuple[str, str]:

@@ -163,7 +163,7 @@ VIEWS: Mapping[type, View] = {
         "Attitude error",
         propagation.attitude_text,
         propagation.attitude_table,
-        lambda error: [f"{error.n_draws} posterior draws through QUEST on {error.n_frames} frames ({error.frames})."],
+        lambda error: [f"{error.n_draws} posterior draws through QUEST on {error.told_frames}."],
         contributors=plot_attitude,
     ),
     Coupling: _view(

@@ -19,7 +19,7 @@ import numpy as np
 from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.files import reading, write_csv
-from starcal_uq.core.formatting import significant
+from starcal_uq.core.formatting import count, plural, significant
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.maths.circular import mixture_radius
@@ -142,6 +142,9 @@ class AttitudeError(Shown):
         Standard deviations by first-order propagation on the same frames, arcsec.
     n_draws, n_frames : int
         Numbers of draws and frames behind the result.
+    n_sampled_frames : int
+        Frames on which the draws went through QUEST; on the others the result is that of first order, and what the
+        sample shows beyond it. 0 in files of a version that took all.
     common_draws_arcsec : (D, 3) array or None
         Common rotation of every draw; None when read from a file.
     rest_rms_per_frame_arcsec : (K, 3) array or None
@@ -201,6 +204,14 @@ class AttitudeError(Shown):
     alignment: str = SAME_FRAMES
     alignment_covariance_arcsec2: FloatArray = field(default_factory=lambda: np.full((3, 3), np.nan))
     aligned: Observations | None = None
+    n_sampled_frames: int = 0
+
+    @property
+    def told_frames(self) -> str:
+        """The frames through which draws went, in words."""
+        if self.n_sampled_frames in (0, self.n_frames):
+            return f"{plural(self.n_frames, 'frame')} ({self.frames})"
+        return f"{count(self.n_sampled_frames)} of {plural(self.n_frames, 'frame')} ({self.frames})"
 
     @property
     def alignment_arcsec(self) -> FloatArray:
@@ -328,7 +339,12 @@ class AttitudeError(Shown):
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the table as CSV, atomically and to the last digit; overwritten. Single draws are not kept."""
         misfit = "" if self.misfit is None else json.dumps(to_plain(self.misfit))
-        table = self.to_written().assign(n_draws=self.n_draws, n_frames=self.n_frames, frames=self.frames)
+        table = self.to_written().assign(
+            n_draws=self.n_draws,
+            n_frames=self.n_frames,
+            n_sampled_frames=self.n_sampled_frames,
+            frames=self.frames,
+        )
         every = {"rest_constant_arcsec": self.rest_constant_arcsec, "alignment_sigma_arcsec": self.alignment_arcsec}
         columns = {name: np.tile(with_cross(values), len(CONTRIBUTORS)) for name, values in every.items()}
         # A line holds its row of the matrix; the angle across the boresight has none.
@@ -369,6 +385,7 @@ class AttitudeError(Shown):
                 raise ValueError("a number is missing")
             first = chosen[0][0]
             counts = {name: int(first[name]) for name in ("n_draws", "n_frames")}
+            n_sampled = int(first.get("n_sampled_frames") or 0)
             frames = first.get("frames") or OBSERVED
             misfit = from_plain(MisfitFound, json.loads(first["misfit"])) if first.get("misfit") else None
             later: dict[str, Any] = {}
@@ -395,6 +412,7 @@ class AttitudeError(Shown):
             *(analytic[0, :3], analytic[1, :3], analytic[2, :3]),
             n_draws=counts["n_draws"],
             n_frames=counts["n_frames"],
+            n_sampled_frames=n_sampled,
             interaction_arcsec=sigma[4, :3],
             frames=frames,
             misfit=misfit,

@@ -15,6 +15,9 @@ first-order response K is known, so it serves as a control variate: to the varia
 K (Sigma - Sigma_d) K^T, with Sigma the covariance of all draws and Sigma_d that of the draws that went through QUEST.
 What is sampled is then only the difference from linearity. Quantiles are those of K applied to all draws, scaled to
 that standard deviation. The same holds for noise, whose first-order response is known as well.
+
+For the same reason not every frame has to go through QUEST: what is sampled hardly varies between frames, so that a few
+hundred of them, one of each stretch of the run, tell it for all, while first order is that of every frame.
 """
 
 from __future__ import annotations
@@ -32,6 +35,7 @@ from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import DistortionError, ObservationError, SamplingError
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.noise_model import weighed
+from starcal_uq.observations.splits import frame_sample
 from starcal_uq.propagation.alignment import alignment_frames as _alignment_frames
 from starcal_uq.propagation.alignment import alignment_weights
 from starcal_uq.propagation.attitude_error import OBSERVED, AttitudeError
@@ -46,6 +50,8 @@ _STARS_AT_ONCE = 1_000_000
 _SAMPLES = 400_000
 # Draws that are given noise as well: the interaction is averaged over frames, and its size is what counts.
 _NOISY_DRAWS = 40
+# Frames that go through QUEST, of more.
+_SAMPLED_FRAMES = 300
 # Half a pixel: the map is so smooth that the central difference errs by (h / f)^2, while rounding stays below 1e-12.
 _STEP_PX = 0.5
 
@@ -99,38 +105,24 @@ def propagate(
     aligning, told = _alignment_frames(post, obs, alignment, alignment_frames, seed)
     aligned = frames if aligning is obs else FrameGeometry.of(post, aligning)
     weights, alignment_covariance = alignment_weights(aligned.noise_covariance)
-    common = np.empty((count, 3))
-    # Where the same frames align and are propagated to, their attitudes are found once.
-    if aligned is not frames:
-        for part, phi in aligned.rotations(draws):
-            common[part] = np.einsum("nij,dnj->di", weights, phi)
-    rest, whole = _Moments(obs.n_frames), _Moments(obs.n_frames)
-    constant = np.empty((count, 3))
-    quiet: list[FloatArray] = []
-    for part, phi in frames.rotations(draws):
-        if aligned is frames:
-            common[part] = np.einsum("nij,dnj->di", weights, phi)
-        if part.start < _NOISY_DRAWS:
-            quiet.append(phi[: _NOISY_DRAWS - part.start])
-        whole.add(phi)
-        rest.add(phi - common[part, None])
-        constant[part] = phi.mean(axis=1) - common[part]
-
-    nea = frames.noise_covariance
     together = np.einsum("nij,njp->ip", weights, aligned.response)
     apart = frames.response - together
-    staying = apart.mean(axis=0)
-    chance = post.covariance - np.cov(draws, rowvar=False)
-    common_variance = np.maximum(common.var(axis=0, ddof=1) + spread(together, chance), 0.0)
-    constant_variance = np.maximum(constant.var(axis=0, ddof=1) + spread(staying, chance), 0.0)
-    rest_variance = np.maximum(rest.variance + spread(apart, chance), 0.0)
-    whole_variance = np.maximum(whole.variance + spread(frames.response, chance), 0.0).mean(axis=0)
-    noise_excess, interaction = _with_noise(frames, draws[:_NOISY_DRAWS], np.concatenate(quiet), seed)
+    sampled = _sampled(post, frames, aligned, draws, seed)
+    shift = draws - post.mean
+    # First order is that of all frames; what is beyond it, that of the sample.
+    common = sampled.common + shift @ (together - sampled.together).T
+    nea = frames.noise_covariance
+    common_variance = np.maximum(spread(together, post.covariance) + sampled.beyond_common, 0.0)
+    constant_variance = np.maximum(spread(apart.mean(axis=0), post.covariance) + sampled.beyond_constant, 0.0)
+    rest_variance = np.maximum(spread(apart, post.covariance) + sampled.over(obs.n_frames, sampled.beyond_rest), 0.0)
+    whole = spread(frames.response, post.covariance) + sampled.over(obs.n_frames, sampled.beyond_whole)
+    whole_variance = np.maximum(whole, 0.0).mean(axis=0)
+    interaction = sampled.interaction
     half_widths = [_noise_half_widths(nea, seed)]
     sigmas = (np.sqrt(common_variance), _rms(rest_variance))
     half_widths += [*_calibration_half_widths(post, together, apart, sigmas, seed), _half_widths(interaction)]
     p95, p997 = np.swapaxes(half_widths, 0, 1) * ARCSEC
-    noise_sigma = np.sqrt(np.maximum(_diagonal(nea).mean(axis=0) + noise_excess, 0.0))
+    noise_sigma = np.sqrt(np.maximum(_diagonal(nea).mean(axis=0) + sampled.noise_excess, 0.0))
     met = interaction.reshape(-1, 3)
     covariances = [
         _with_sigmas(nea.mean(axis=0), noise_sigma),
@@ -153,6 +145,7 @@ def propagate(
         analytic_rest_arcsec=_rms(spread(apart, post.covariance)) * ARCSEC,
         n_draws=count,
         n_frames=obs.n_frames,
+        n_sampled_frames=len(sampled.places),
         common_draws_arcsec=common * ARCSEC,
         rest_rms_per_frame_arcsec=np.sqrt(rest_variance) * ARCSEC,
         nea_per_frame_arcsec=np.sqrt(_diagonal(nea)) * ARCSEC,
@@ -166,6 +159,91 @@ def propagate(
         alignment=told,
         alignment_covariance_arcsec2=alignment_covariance * ARCSEC**2,
         aligned=aligning,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Sampled:
+    """What draws through QUEST say, and what of it first order does not, on some of the frames.
+
+    Variances beyond first order are those of the draws less those that the responses give for the same draws.
+
+    Attributes
+    ----------
+    places : (k,) array
+        Places of the frames.
+    common : (D, 3) array
+        Common rotation of every draw, rad.
+    together : (3, p) array
+        Its first-order response on these frames.
+    beyond_common, beyond_constant : (3,) array
+        Variance beyond first order of the common rotation and of the mean of the rest, rad^2.
+    beyond_rest, beyond_whole : (k, 3) array
+        The same of the rest and of the whole rotation in each frame.
+    noise_excess : (3,) array
+        The same of noise.
+    interaction : (d, k, 3) array
+        Interaction of noise and camera, rad.
+    """
+
+    places: IntArray
+    common: FloatArray
+    together: FloatArray
+    beyond_common: FloatArray
+    beyond_constant: FloatArray
+    beyond_rest: FloatArray
+    beyond_whole: FloatArray
+    noise_excess: FloatArray
+    interaction: FloatArray
+
+    def over(self, n_frames: int, values: FloatArray) -> FloatArray:
+        """Values (n_frames, 3) of all frames: those of the sample (k, 3), and their mean elsewhere."""
+        every = np.tile(values.mean(axis=0), (n_frames, 1))
+        every[self.places] = values
+        return every
+
+
+def _sampled(
+    post: Posterior, every: FrameGeometry, every_aligned: FrameGeometry, draws: FloatArray, seed: int
+) -> _Sampled:
+    """Take draws (D, p) through QUEST on some of the frames and of those of the alignment."""
+    some, places = frame_sample(every.obs, _SAMPLED_FRAMES, seed)
+    frames = every if some is every.obs else FrameGeometry.of(post, some)
+    if every_aligned is every:
+        aligned = frames
+    else:
+        aligning, _ = frame_sample(every_aligned.obs, _SAMPLED_FRAMES, seed)
+        aligned = every_aligned if aligning is every_aligned.obs else FrameGeometry.of(post, aligning)
+    weights, _ = alignment_weights(aligned.noise_covariance)
+    common, constant = np.empty((len(draws), 3)), np.empty((len(draws), 3))
+    # Where the same frames align and are propagated to, their attitudes are found once.
+    if aligned is not frames:
+        for part, phi in aligned.rotations(draws):
+            common[part] = np.einsum("nij,dnj->di", weights, phi)
+    rest, whole = _Moments(some.n_frames), _Moments(some.n_frames)
+    quiet: list[FloatArray] = []
+    for part, phi in frames.rotations(draws):
+        if aligned is frames:
+            common[part] = np.einsum("nij,dnj->di", weights, phi)
+        if part.start < _NOISY_DRAWS:
+            quiet.append(phi[: _NOISY_DRAWS - part.start])
+        whole.add(phi)
+        rest.add(phi - common[part, None])
+        constant[part] = phi.mean(axis=1) - common[part]
+    together = np.einsum("nij,njp->ip", weights, aligned.response)
+    apart = frames.response - together
+    own = np.cov(draws, rowvar=False).reshape(draws.shape[1], -1)
+    noise_excess, interaction = _with_noise(frames, draws[:_NOISY_DRAWS], np.concatenate(quiet), seed)
+    return _Sampled(
+        places=places,
+        common=common,
+        together=together,
+        beyond_common=common.var(axis=0, ddof=1) - spread(together, own),
+        beyond_constant=constant.var(axis=0, ddof=1) - spread(apart.mean(axis=0), own),
+        beyond_rest=rest.variance - spread(apart, own),
+        beyond_whole=whole.variance - spread(frames.response, own),
+        noise_excess=noise_excess,
+        interaction=interaction,
     )
 
 

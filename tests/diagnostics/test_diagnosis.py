@@ -176,6 +176,17 @@ def test_importance_sampling_and_the_closed_form_agree(obs, cal):
         assert 2.0 < score.effective_parameters < 25.0
 
 
+def test_a_sample_of_frames_beside_the_closed_form_compares_as_all_do(obs, cal, monkeypatch):
+    every = compare_models(obs, cal, ("k1", "brown"))
+    monkeypatch.setattr("starcal_uq.diagnostics.models._SAMPLED_FRAMES", 10)
+    some = compare_models(obs, cal, ("k1", "brown"))
+    assert (every.n_sampled_frames, some.n_sampled_frames) == (obs.n_frames, 10)
+    for one, other in zip(every.scores, some.scores, strict=True):
+        assert (one.model, one.rejected) == (other.model, other.rejected)
+        assert other.difference == pytest.approx(one.difference, abs=0.5)
+        assert other.effective_parameters == pytest.approx(one.effective_parameters, abs=1.0)
+
+
 def test_closed_form_is_the_ratio_of_evidences(obs, cal):
     """p(y_k | others) = p(y) / p(others): evidences of the linear model, computed without any of its formulas."""
     from scipy.special import gammaln
@@ -257,6 +268,16 @@ def test_other_starts_find_the_same_optimum_or_say_so(obs, cal):
     assert found.largest_sigma < 0.01
     # The control: an estimate that is not the optimum.
     wrong = dataclasses.replace(cal, theta=cal.theta + 3 * cal.sigmas, chi2=cal.chi2 * 1.01)
+    assert multi_start(obs, wrong, 2, seed=1).better == 2
+
+
+def test_some_frames_tell_whether_other_starts_find_the_same_optimum(obs, cal, monkeypatch):
+    for name in ("_START_STARS", "_FEWEST_FRAMES"):
+        monkeypatch.setattr(f"starcal_uq.diagnostics.diagnose.{name}", 20)
+    found = multi_start(obs, cal, 3, seed=1)
+    assert (found.same, found.better, found.n_frames, found.of_frames) == (3, 0, 20, obs.n_frames)
+    # The control: an estimate farther from the optimum than twenty frames could be.
+    wrong = dataclasses.replace(cal, theta=cal.theta + 15 * cal.sigmas, camera=cal.camera)
     assert multi_start(obs, wrong, 2, seed=1).better == 2
 
 

@@ -137,6 +137,22 @@ def test_sampling_sees_what_first_order_does_not() -> None:
     assert found.agreement.text in found.agreement._repr_html_()
 
 
+@pytest.mark.parametrize("alignment", ["random", "observed"])
+def test_a_sample_of_the_frames_says_what_all_do(monkeypatch: pytest.MonkeyPatch, alignment: str) -> None:
+    """With a posterior so wide that first order alone is off by a tenth."""
+    obs, cal = scene()
+    post = gaussian_posterior(cal, n=500, scale=100.0)
+    every = propagate(post, obs, n_draws=100, alignment=alignment)
+    monkeypatch.setattr("starcal_uq.propagation.propagate._SAMPLED_FRAMES", 30)
+    some = propagate(post, obs, n_draws=100, alignment=alignment)
+    assert (every.n_sampled_frames, some.n_sampled_frames) == (obs.n_frames, 30)
+    assert f"30 of {obs.n_frames} frames" in some.told_frames
+    for name, within in (("nea", 1e-4), ("common", 0.1), ("rest", 0.03), ("total", 0.03)):
+        sampled, all_of_them = (getattr(error, f"{name}_arcsec") for error in (some, every))
+        np.testing.assert_allclose(sampled, all_of_them, rtol=within)
+    assert np.max(np.abs(every.analytic_rest_arcsec / every.rest_arcsec - 1.0)) > 0.1
+
+
 def test_interaction_is_what_the_sum_of_the_parts_misses() -> None:
     """Both at once, solved here, against the parts; it is a product of the two, so that each scales it."""
     obs, cal = scene()

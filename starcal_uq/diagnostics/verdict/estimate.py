@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.camera.distortion import get_model
-from starcal_uq.core.formatting import fixed, join_words, plural, significant
+from starcal_uq.core.formatting import count, fixed, join_words, plural, significant
 from starcal_uq.core.status import Check, Level, Question, Status, pass_or_fail, pass_or_warn
 from starcal_uq.core.types import BoolArray
 from starcal_uq.diagnostics.misfit import ALPHA
@@ -330,6 +330,8 @@ def predictive(found: PredictiveCheck) -> Check:
 def starts(found: MultiStart) -> Check:
     """Do other starts lead to the same optimum?"""
     value = f"{found.same} of {found.n} starts"
+    if found.n_frames < found.of_frames:
+        value += f", {count(found.n_frames)} of {plural(found.of_frames, 'frame')}"
     if found.better:
         level, sentence = Level.FAIL, "A start elsewhere reached a better optimum: calibrate again from there."
     elif found.same < found.n:

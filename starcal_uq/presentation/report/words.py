@@ -128,8 +128,8 @@ def attitude_sentence(results: Results) -> str:
     if error is None:
         return ""
     return (
-        f"{plural(error.n_draws, 'posterior draw')} through QUEST on {plural(error.n_frames, 'frame')} "
-        f"({error.frames}); first-order propagation gives the same σ within {percent(propagation_difference(error))}."
+        f"{plural(error.n_draws, 'posterior draw')} through QUEST on {error.told_frames}; "
+        f"first-order propagation gives the same σ within {percent(propagation_difference(error))}."
     )
 
 

@@ -122,7 +122,9 @@ def models_table(found: ModelComparison, sigma_unit: str = "", fitted: str = "fi
             )
         )
     heads = ("Model", "Parameters", "Noise", "Difference [nat]", "Outcome", "Common [arcsec]", "Rest [arcsec]", "k-hat")
-    return TextTable(heads, tuple(rows), "Distortion models", "lrrrlrrr")
+    some = found.n_sampled_frames < found.n_frames
+    of = f" (k-hat of {count(found.n_sampled_frames)} of {plural(found.n_frames, 'frame')})" if some else ""
+    return TextTable(heads, tuple(rows), f"Distortion models{of}", "lrrrlrrr")
 
 
 def predictive_text(found: PredictiveCheck) -> str:
