@@ -75,6 +75,11 @@ class DistortionModel:
     displacement: Displacement
     source: str
 
+    @property
+    def radial(self) -> bool:
+        """Whether it is the same in all directions from the principal point."""
+        return self.displacement in (_radial, _none)
+
 
 def _radial(u: Any, v: Any, k: Sequence[Any]) -> tuple[Any, Any]:
     r2 = u * u + v * v

@@ -280,10 +280,10 @@ def fold_radius_px(model_name: str, theta: FloatArray, max_radius_px: float) -> 
     """Smallest radius up to `max_radius_px` at which the distortion folds over; infinity when it does not.
 
     The map folds where the determinant of its Jacobian is not positive; it is sampled every 0.2 % of the range along
-    36 directions (radial models are the same in all of them).
+    36 directions; a radial model is the same in all of them.
     """
     radius = np.linspace(0.0, max_radius_px, 501)[1:]
-    angle = np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
+    angle = np.zeros(1) if get_model(model_name).radial else np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
     points = np.stack([np.outer(np.cos(angle), radius).ravel(), np.outer(np.sin(angle), radius).ravel()])
     _, determinant = _newton_kernel(model_name)(points.shape[1], theta, points, points)
     # det <= 0 marks a fold; a second crossing can make it positive again, so the first one counts.

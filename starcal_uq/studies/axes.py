@@ -105,6 +105,8 @@ AXES = {
         Axis("likelihood", "likelihood", "", "name", choices=LIKELIHOODS, base="marginal"),
     )
 }  # fmt: skip
+# Axes that make another camera.
+CAMERA_AXES = tuple(AXES)[: tuple(AXES).index("max_mag")]
 # Both set the focal length; the coefficients and the size of the distortion both set the distortion.
 EXCLUSIVE = (("fov_deg", "focal_mm"), *((name, "distortion_px") for name in _COEFFICIENTS))
 

@@ -24,7 +24,7 @@ from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.inference.priors import Priors
 from starcal_uq.maths.linear import correlation_of, inverses, scaled_inverse, unit_inverse
 from starcal_uq.propagation.coupling import weak_directions
-from starcal_uq.studies.axes import camera_of
+from starcal_uq.studies.axes import CAMERA_AXES, camera_of
 from starcal_uq.studies.definition import Cell, StudyDefinition
 from starcal_uq.studies.geometry import (
     Geometry,
@@ -75,12 +75,19 @@ class FisherCells:
         self._key: GeometryKey | None = None
         self._geometry: Geometry | StudyError | None = None
         self._stated: tuple[Any, Statements] | None = None
+        self._camera: tuple[Any, Camera] | None = None
+
+    def camera(self, cell: Cell) -> Camera:
+        """Camera of a cell, the last one if it is the same."""
+        key = tuple(cell.settings.get(name) for name in CAMERA_AXES)
+        if self._camera is None or self._camera[0] != key:
+            self._camera = key, camera_of(self.definition.camera, cell.settings)
+        return self._camera[1]
 
     def numbers(self, cell: Cell) -> Numbers:
         """All numbers of a cell; `status` is a sentence where there are none."""
         try:
-            camera = camera_of(self.definition.camera, cell.settings)
-            return self._numbers(cell, camera)
+            return self._numbers(cell, self.camera(cell))
         except StarcalError as error:
             return {"status": str(error)}
 

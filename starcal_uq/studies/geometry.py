@@ -6,13 +6,15 @@ Nothing here knows the noise's size, the number of frames or a prior: cells that
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections import OrderedDict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from starcal_uq.attitude.rotations import random_rotations
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import project
 from starcal_uq.core.constants import ARCSEC
@@ -25,6 +27,8 @@ from starcal_uq.observations.frames import StarFrames
 from starcal_uq.planning.information import frame_matrices
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky
 from starcal_uq.simulation.pointing import pattern_rotations
+from starcal_uq.studies.axes import CAMERA_AXES
+from starcal_uq.studies.definition import Cell
 
 if TYPE_CHECKING:
     from starcal_uq.sky.catalogue import StarCatalogue
@@ -33,10 +37,24 @@ if TYPE_CHECKING:
 _STARS, _LEAST_FRAMES = 6000, 64
 # Frames of one campaign in which stars bring their own errors, and of a pattern: more repeat what these hold.
 _MOST_FRAMES = 2000
-_BATCH, _PLACES = 256, 200
+_BLOCK, _BLOCKS, _LEAST_TRIES, _PLACES = 64, 128, 2560, 200
 # Fewer attitudes than this that show enough stars are no night's work.
 _LEAST_SKY = 0.01
 _DEPTH_STEP = 0.5
+
+
+class Attitudes(NamedTuple):
+    """Some attitudes (n, 3, 3), and stars in a cone around each boresight.
+
+    Frame number, index and cosine of the angle of every such star, by frame and then by index, for all cosines above
+    `least`.
+    """
+
+    rotations: FloatArray
+    least: float
+    frame: IntArray
+    star: IntArray
+    cosine: FloatArray
 
 
 class Depth:
@@ -44,6 +62,7 @@ class Depth:
 
     def __init__(self, stars: StarCatalogue) -> None:
         self.stars, self.directions = stars, stars.directions_icrs
+        self._blocks: OrderedDict[tuple[int, ...], Attitudes] = OrderedDict()
 
     @cached_property
     def tree(self) -> Any:
@@ -51,6 +70,29 @@ class Depth:
         from scipy.spatial import cKDTree
 
         return cKDTree(self.directions)
+
+    def around(self, rotations: FloatArray, least: float) -> Attitudes:
+        """Stars whose direction has at least this cosine with the boresight of each attitude."""
+        radius = np.sqrt(2.0 - 2.0 * max(least, -1.0))
+        near = self.tree.query_ball_point(rotations[:, 2], radius, return_sorted=True)
+        frame = np.repeat(np.arange(len(rotations)), [len(found) for found in near])
+        star = np.concatenate([np.asarray(found, dtype=np.int64) for found in near])
+        cosine = np.einsum("nj,nj->n", rotations[frame, 2], self.directions[star])
+        return Attitudes(rotations, least, frame, star, cosine)
+
+    def random(self, seed: tuple[int, ...], block: int, least: float) -> Attitudes:
+        """A block of random attitudes with at least those stars; cells of all fields look at the same attitudes."""
+        key = (*seed, block)
+        found = self._blocks.get(key)
+        if found is None or found.least > least:
+            rotations = random_rotations(_BLOCK, np.random.default_rng([*key, 11]))
+            # A little wider than asked for, so that a slightly wider field need not begin again.
+            found = self.around(rotations, float(np.cos(min(1.2 * np.arccos(max(least, -1.0)), np.pi))))
+        self._blocks[key] = found
+        self._blocks.move_to_end(key)
+        if len(self._blocks) > _BLOCKS:
+            self._blocks.popitem(last=False)
+        return found
 
 
 class Heaven:
@@ -88,17 +130,15 @@ class _Window(Sky):
         super().__init__(depth.stars.select(slice(0, 0)), camera, margin_px)  # type: ignore[arg-type]
         self.depth, self.max_mag = depth, max_mag
 
-    def seen(self, rotations: FloatArray) -> tuple[IntArray, IntArray, FloatArray]:
-        """Frame numbers (n,), catalogue indices (n,) and noise-free pixels (n, 2), by frame and then by index."""
-        radius = np.sqrt(2.0 - 2.0 * max(self.min_cosine, -1.0))
-        near = self.depth.tree.query_ball_point(rotations[:, 2], radius, return_sorted=True)
-        frame = np.repeat(np.arange(len(rotations)), [len(found) for found in near])
-        star = np.concatenate([np.asarray(found, dtype=np.int64) for found in near])
-        bright = self.depth.stars.mag[star] <= self.max_mag
-        frame, star = frame[bright], star[bright]
-        xy = project(self.camera, np.einsum("nij,nj->ni", rotations[frame], self.depth.directions[star]))
+    def seen(self, near: Attitudes) -> Geometry:
+        """Frames of some attitudes, whatever they show."""
+        chosen = (near.cosine > self.min_cosine) & (self.depth.stars.mag[near.star] <= self.max_mag)
+        frame, star = near.frame[chosen], near.star[chosen]
+        xy = project(self.camera, np.einsum("nij,nj->ni", near.rotations[frame], self.depth.directions[star]))
         inside = np.all((xy > self.low) & (xy < self.high), axis=1)
-        return frame[inside], star[inside], xy[inside]
+        sizes = np.bincount(frame[inside], minlength=len(near.rotations))
+        starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
+        return Geometry(self.camera, self.depth, near.rotations, starts, star[inside], xy[inside])
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,6 +172,33 @@ class Geometry:
     def n_frames(self) -> int:
         """Number M of frames."""
         return len(self.rotations)
+
+    def with_stars(self, n: int) -> Geometry:
+        """The frames with at least n stars."""
+        sizes = np.diff(self.starts)
+        good = sizes >= n
+        kept = np.repeat(good, sizes)
+        starts = np.concatenate([[0], np.cumsum(sizes[good])]).astype(np.int64)
+        return Geometry(self.camera, self.depth, self.rotations[good], starts, self.star[kept], self.pixel[kept])
+
+    def first(self, n: int) -> Geometry:
+        """The first n frames."""
+        stars = slice(0, int(self.starts[min(n, self.n_frames)]))
+        starts = self.starts[: n + 1]
+        return Geometry(self.camera, self.depth, self.rotations[:n], starts, self.star[stars], self.pixel[stars])
+
+    @classmethod
+    def joined(cls, parts: Sequence[Geometry]) -> Geometry:
+        """Frames of several parts, one after the other."""
+        sizes = np.concatenate([np.diff(part.starts) for part in parts])
+        return cls(
+            parts[0].camera,
+            parts[0].depth,
+            np.concatenate([part.rotations for part in parts]),
+            np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
+            np.concatenate([part.star for part in parts]),
+            np.concatenate([part.pixel for part in parts]),
+        )
 
     @property
     def mag(self) -> FloatArray:
@@ -213,6 +280,15 @@ def geometry_key(camera: Camera, settings: Mapping[str, Any], seed: int, seed_in
     )
 
 
+def frames_of(cell: Cell) -> tuple[Any, ...]:
+    """What differs between cells that cannot share frames, without asking for their cameras."""
+    settings = cell.settings
+    own = settings["pointing"] != "random" or settings["direction_mas"] > 0.0
+    frames = (settings["frames"], cell.seed_index) if own else ()
+    names = (*CAMERA_AXES, "max_mag", "min_stars", "pointing", "sigma_px")
+    return (*(settings.get(name) for name in names), *frames)
+
+
 def take_frames(key: GeometryKey, heaven: Heaven, most: int) -> Geometry:
     """Frames of a geometry; `most` limits those of random attitudes that serve many campaigns.
 
@@ -223,22 +299,23 @@ def take_frames(key: GeometryKey, heaven: Heaven, most: int) -> Geometry:
     """
     depth = heaven.depth(key.max_mag)
     window = _Window(depth, key.camera, key.max_mag, key.margin_px)
-    # What seeds a place must not depend on what is swept: neighbouring cells then look at one sky.
-    rng = np.random.default_rng([*key.seed, 11])
     if key.pointing == "random":
         n = key.n_frames
         if n is None:
             sky = float(np.prod(np.deg2rad(key.camera.fov_deg))) / (4.0 * np.pi)
             expected = max(float(np.sum(depth.stars.mag <= key.max_mag)) * sky, float(key.min_stars))
             n = int(np.clip(_STARS / expected, min(_LEAST_FRAMES, most), most))
-        return _random(key, window, rng, n)
+        return _random(key, window, n)
+    # What seeds a place does not depend on what is swept: neighbouring cells look at one part of the sky.
+    rng = np.random.default_rng([*key.seed, 12])
     assert key.n_frames is not None
+    field = key.camera.fov_deg[0]
     for _ in range(_PLACES):
-        start = pattern_rotations("stare", 1, rng, key.camera.fov_deg[0])
-        if len(window.seen(start)[0]) >= key.min_stars:
+        start = random_rotations(1, rng)
+        if window.seen(depth.around(start, window.min_cosine)).with_stars(key.min_stars).n_frames:
             break
-    rotations = pattern_rotations(key.pointing, key.n_frames, rng, key.camera.fov_deg[0], start[0])
-    found = _enough(key, window, rotations)
+    rotations = pattern_rotations(key.pointing, key.n_frames, rng, field, start[0])
+    found = window.seen(depth.around(rotations, window.min_cosine)).with_stars(key.min_stars)
     if found.n_frames == 0:
         raise StudyError(
             f"no frame of the pattern {key.pointing!r} shows {key.min_stars} stars: raise max_mag, or lower min_stars."
@@ -246,39 +323,20 @@ def take_frames(key: GeometryKey, heaven: Heaven, most: int) -> Geometry:
     return found
 
 
-def _random(key: GeometryKey, window: _Window, rng: np.random.Generator, n: int) -> Geometry:
+def _random(key: GeometryKey, window: _Window, n: int) -> Geometry:
     parts: list[Geometry] = []
-    tries = good = 0
+    good = 0
     while good < n:
-        parts.append(_enough(key, window, pattern_rotations("random", min(_BATCH, 2 * n), rng, 0.0)))
-        tries += min(_BATCH, 2 * n)
+        near = window.depth.random(key.seed, len(parts), window.min_cosine)
+        parts.append(window.seen(near).with_stars(key.min_stars))
         good += parts[-1].n_frames
-        if tries >= 10 * _BATCH and good < _LEAST_SKY * tries:
+        tries = _BLOCK * len(parts)
+        if tries >= _LEAST_TRIES and good < _LEAST_SKY * tries:
             raise StudyError(
                 f"only {good} of {count(tries)} random attitudes show {key.min_stars} stars to magnitude "
                 f"{key.max_mag:g}: raise max_mag, widen the field, or lower min_stars."
             )
-    sizes = np.concatenate([np.diff(part.starts) for part in parts])[:n]
-    starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    last = int(starts[-1])
-    return Geometry(
-        key.camera,
-        window.depth,
-        np.concatenate([part.rotations for part in parts])[:n],
-        starts,
-        np.concatenate([part.star for part in parts])[:last],
-        np.concatenate([part.pixel for part in parts])[:last],
-    )
-
-
-def _enough(key: GeometryKey, window: _Window, rotations: FloatArray) -> Geometry:
-    """Those of the attitudes that show enough stars."""
-    frame, star, xy = window.seen(rotations)
-    sizes = np.bincount(frame, minlength=len(rotations))
-    good = sizes >= key.min_stars
-    kept = good[frame]
-    starts = np.concatenate([[0], np.cumsum(sizes[good])]).astype(np.int64)
-    return Geometry(key.camera, window.depth, rotations[good], starts, star[kept], xy[kept])
+    return Geometry.joined(parts).first(n)
 
 
 @dataclass(frozen=True, eq=False)

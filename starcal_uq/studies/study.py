@@ -13,16 +13,15 @@ import numpy as np
 
 from starcal_uq.camera.distortion import model_names, parameter_names
 from starcal_uq.core.constants import AXES as ATTITUDE
-from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.files import PathLike
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import AnyDict
 from starcal_uq.sky.catalogue import load_catalogue
-from starcal_uq.studies.axes import AXES, camera_of
+from starcal_uq.studies.axes import AXES
 from starcal_uq.studies.cells import FRAME_FACTORS, FisherCells, simpler_models
 from starcal_uq.studies.definition import Cell, StudyDefinition
-from starcal_uq.studies.geometry import Heaven, geometry_key
+from starcal_uq.studies.geometry import Heaven, frames_of
 from starcal_uq.studies.result import TEXTS, VARIABLES, Study, frames_for
 from starcal_uq.studies.store import Store, row
 
@@ -42,7 +41,7 @@ def study(
     out: PathLike | None = None,
     seed: int | None = None,
     stars: StarCatalogue | None = None,
-    n_workers: int | None = None,
+    workers: int | None = None,
     force: bool = False,
     progress: Progress | None = None,
 ) -> Study:
@@ -59,7 +58,7 @@ def study(
         Root seed, instead of that of the definition; it repeats bit for bit.
     stars : StarCatalogue, optional
         The sky; the embedded catalogue at the epoch of the definition by default.
-    n_workers : int, optional
+    workers : int, optional
         Processes; 0 stays in this one, None takes as many as there are processors.
     force : bool
         Compute all cells anew.
@@ -103,7 +102,7 @@ def study(
 
     interrupted = False
     if todo:
-        interrupted = run_batches(work, keep, n_workers)
+        interrupted = run_batches(work, keep, workers)
     data = dataset(wanted, cells, keys, store)
     found = Study(data, wanted)
     if out is not None:
@@ -140,7 +139,7 @@ class Work:
         simulated = self.definition.mode == "simulate"
         groups: dict[Any, list[int]] = {}
         for number, cell in enumerate(self.cells):
-            groups.setdefault(number if simulated else self._group(cell), []).append(number)
+            groups.setdefault(number if simulated else frames_of(cell), []).append(number)
         batches: list[list[int]] = [[]]
         load = 0.0
         for members in groups.values():
@@ -151,13 +150,6 @@ class Work:
                 batches[-1].append(number)
                 load += _SIMULATED_S if simulated else _CELL_S + (_GEOMETRY_S if place == 0 else 0.0)
         return batches
-
-    def _group(self, cell: Cell) -> Any:
-        try:
-            camera = camera_of(self.definition.camera, cell.settings)
-        except StarcalError:
-            return None
-        return geometry_key(camera, cell.settings, self.definition.seed, cell.seed_index, False)
 
     @cached_property
     def computer(self) -> Callable[[Cell], AnyDict]:
@@ -182,10 +174,10 @@ class Work:
         return rows
 
 
-def run_batches(work: Work, keep: Callable[[list[AnyDict]], None], n_workers: int | None) -> bool:
+def run_batches(work: Work, keep: Callable[[list[AnyDict]], None], workers: int | None) -> bool:
     """Compute all batches and keep each as it arrives; whether Ctrl-C was pressed before the end."""
     # A process takes seconds to start: what is done sooner is done here.
-    workers = 0 if n_workers is None and len(work.batches) < 4 else n_workers
+    workers = 0 if workers is None and len(work.batches) < 4 else workers
     _, interrupted = run_tasks(work, len(work.batches), caller="starcal_uq.study", chunk=1, workers=workers, each=keep)
     return interrupted
 

@@ -24,7 +24,7 @@ def definition(**changes: object) -> StudyDefinition:
 @pytest.fixture(scope="module")
 def small() -> Study:
     """Six cells."""
-    return sc.study(definition(), n_workers=0)
+    return sc.study(definition(), workers=0)
 
 
 def test_sigma_follows_noise_exactly_and_frames_by_the_root(small: Study) -> None:
