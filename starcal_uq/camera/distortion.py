@@ -168,6 +168,21 @@ def parameter_names(model_name: str) -> tuple[str, ...]:
     return tuple(p.name for p in parameters(model_name))
 
 
+def parameter_called(name: str) -> Parameter:
+    """The parameter of this name, of whatever model has it.
+
+    Raises
+    ------
+    DistortionError
+        For a name that no model has.
+    """
+    known = {spec.name: spec for model in _MODELS.values() for spec in (*_OPTICS, *model.coefficients)}
+    try:
+        return known[name]
+    except KeyError:
+        raise DistortionError(f"parameter {name!r} is unknown: use one of {', '.join(known)}.") from None
+
+
 def sigma_parameter(per_star: bool) -> Parameter:
     """The noise parameter: px per axis, or a factor where every star states its own sigma."""
     return _SIGMA_SCALE if per_star else _SIGMA

@@ -59,6 +59,17 @@ from starcal_uq.presentation.figures.propagation import (
     plot_field_map,
     plot_spectrum,
 )
+from starcal_uq.presentation.figures.studies import (
+    plot_coverage,
+    plot_inflation,
+    plot_matrices,
+    plot_needed,
+    plot_simpler,
+    plot_study_correlation,
+    plot_study_map,
+    plot_study_maps,
+    plot_weakest,
+)
 from starcal_uq.presentation.html import card, listed
 from starcal_uq.presentation.pages.budgeting import section_html
 from starcal_uq.presentation.tables import TextTable
@@ -72,6 +83,7 @@ from starcal_uq.presentation.words import (
     inputs,
     planning,
     propagation,
+    studies,
 )
 from starcal_uq.propagation.attitude_error import Agreement, AttitudeError
 from starcal_uq.propagation.coupling import Coupling
@@ -79,6 +91,7 @@ from starcal_uq.propagation.distortion import DistortionCurve
 from starcal_uq.propagation.field import FieldMap
 from starcal_uq.propagation.spectrum import ErrorSpectrum
 from starcal_uq.sky.catalogue import StarCatalogue
+from starcal_uq.studies.result import Study
 
 
 def _view(
@@ -187,5 +200,20 @@ VIEWS: Mapping[type, View] = {
         _draws,
         spectrum=plot_spectrum,
         time_series=plot_error_series,
+    ),
+    Study: _view(
+        "Study",
+        studies.study_text,
+        studies.study_table,
+        studies.study_notes,
+        correlation=plot_study_correlation,
+        map=plot_study_map,
+        maps=plot_study_maps,
+        matrices=plot_matrices,
+        weakest=plot_weakest,
+        inflation=plot_inflation,
+        needed=plot_needed,
+        simpler=plot_simpler,
+        coverage=plot_coverage,
     ),
 }

@@ -18,6 +18,7 @@ from starcal_uq.core.files import PathLike, atomic_path, new_folder, reading
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.studies.axes import AXES
 from starcal_uq.studies.definition import StudyDefinition
+from starcal_uq.studies.findings import Sweep
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -103,6 +104,11 @@ class Study(Shown):
         """Cells that have numbers, (C,)."""
         good: BoolArray = np.asarray(self.data["status"].values == "ok")
         return good
+
+    @cached_property
+    def sweep(self) -> Sweep:
+        """The cells by their place in the sweep, and what they say together."""
+        return Sweep(self.data, self.axes)
 
     @property
     def complete(self) -> bool:

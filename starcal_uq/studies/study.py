@@ -230,7 +230,7 @@ def dataset(definition: StudyDefinition, cells: Sequence[Cell], keys: Sequence[s
             flat = some.drop_null()
             numbers = np.asarray(flat.flatten() if dims else flat, dtype=np.float64)
             shape = [len(i) for i in index]
-            values[np.ix_(members[known], *index)] = numbers.reshape(-1, *shape)
+            values[np.ix_(members[known], *index)] = numbers.reshape(int(known.sum()), *shape)
         attributes = {"long_name": words} | ({"units": unit} if unit else {})
         variables[name] = (("cell", *dims), values, attributes)
     if definition.target_arcsec is not None or definition.target_sigma:

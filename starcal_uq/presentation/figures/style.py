@@ -174,6 +174,16 @@ def png_bytes(figure: Figure, dpi: int = DPI) -> bytes:
     return buffer.getvalue()
 
 
+def small_png_bytes(figure: Figure, dpi: int) -> bytes:
+    """The figure as PNG of at most 192 colours, a third of the size: for pages of many figures without photographs."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    picture = Image.fromarray(painted(figure, dpi)).quantize(192, dither=Image.Dither.NONE)
+    picture.save(buffer, format="png", dpi=(dpi, dpi))
+    return buffer.getvalue()
+
+
 def painted(figure: Figure, dpi: int) -> NDArray[np.uint8]:
     """The figure's pixels (height, width, 3), drawn once, where `Figure.savefig` draws twice."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -12,18 +12,20 @@ from starcal_uq.planning.plan import Plan
 from starcal_uq.presentation.pages.budgeting import write_budget
 from starcal_uq.presentation.pages.comparison import write_comparison
 from starcal_uq.presentation.pages.planning import write_plan
+from starcal_uq.presentation.pages.studies import write_study
+from starcal_uq.studies.result import Study
 
 
-def write_page(what: Plan | CameraComparison | Budget, to: str | os.PathLike[str], **options: Any) -> Path:
+def write_page(what: Plan | CameraComparison | Budget | Study, to: str | os.PathLike[str], **options: Any) -> Path:
     """Write a result for people to read.
 
     Parameters
     ----------
-    what : Plan, CameraComparison or Budget
+    what : Plan, CameraComparison, Budget or Study
         The result.
     to : path
-        A folder for a plan or a comparison, made if it is missing; a file for a budget, whose ending names the format
-        (``.html``, ``.xlsx``, ``.tex``, ``.csv``). What is there is overwritten.
+        A folder for a plan, a comparison or a study, made if it is missing; a file for a budget, whose ending names
+        the format (``.html``, ``.xlsx``, ``.tex``, ``.csv``). What is there is overwritten.
     **options
         For a plan, ``choice`` and ``check``: frames to take, and the forecast against simulation.
 
@@ -45,4 +47,8 @@ def write_page(what: Plan | CameraComparison | Budget, to: str | os.PathLike[str
         return write_comparison(what, to, **options)
     if isinstance(what, Budget):
         return write_budget(what, to, **options)
-    raise TypeError(f"there is no page for a {type(what).__name__}: give a Plan, a CameraComparison or a Budget.")
+    if isinstance(what, Study):
+        return write_study(what, to, **options)
+    raise TypeError(
+        f"there is no page for a {type(what).__name__}: give a Plan, a CameraComparison, a Budget or a Study."
+    )

@@ -1,0 +1,839 @@
+"""Figures of coupling studies: what couples with what, what would decouple it, and at what cost."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.camera.distortion import parameter_called
+from starcal_uq.core.constants import AXES
+from starcal_uq.core.formatting import count, fixed, percent, pretty_unit, significant
+from starcal_uq.core.types import FloatArray
+from starcal_uq.maths.intervals import binomial_interval
+from starcal_uq.presentation.figures import style
+from starcal_uq.presentation.figures.coupling import correlation_text, symbol
+from starcal_uq.presentation.figures.scales import round_levels, ticks_at_levels
+from starcal_uq.presentation.words.axes import axis_label, place, said, value_words
+from starcal_uq.presentation.words.studies import model_bias
+from starcal_uq.studies.findings import Lines, Sweep
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+    from numpy.typing import NDArray
+
+    from starcal_uq.studies.result import Study
+
+_MOST_LINES = 5
+_MOST_PANELS = 3
+# A map of so many cells still shows their numbers.
+_MOST_CELLS = 80
+# Colours span at least this factor.
+_RELIEF = 2.0
+_PARAMETER_COLOURS = {
+    "x0": style.BLUE,
+    "y0": style.SKY,
+    "f": style.ORANGE,
+    "k1": style.PURPLE,
+    "k2": style.VERMILLION,
+    "k3": style.INK,
+    "p1": style.GREEN,
+    "p2": "#F0E442",
+}
+_NAMED = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.VERMILLION)
+_MARKERS = "osD^v"
+_CORRELATION_TICKS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999, 0.9999, 0.99999)
+# Variables that a map or a line may show: words, unit, and whether a small number is good news.
+_SHOWN = {
+    "correlation": ("correlation of {0} and {1}", ""),
+    "sigma": ("sigma of {0}", ""),
+    "sigma_conditional": ("sigma of {0}, others known", ""),
+    "variance_inflation": ("sigma of {0} / sigma if the others were known", ""),
+    "condition_number": ("condition number", ""),
+    "weak_variance": ("variance along the weakest direction", ""),
+    "frame_error_arcsec": ("error that differs from frame to frame", "arcsec"),
+    "common_rotation_arcsec": ("common rotation", "arcsec"),
+    "nea_arcsec": ("centroid noise of one frame (NEA)", "arcsec"),
+    "frames_needed": ("frames needed", ""),
+    "mean_stars": ("stars per frame", ""),
+}
+
+
+def numbers_of(
+    study: Study, variable: str, parameter: str | None = None, parameter_2: str | None = None
+) -> tuple[FloatArray, str]:
+    """A number of every cell as it is drawn (C,), and its label with the unit.
+
+    Errors of attitude are per axis across the boresight; sigmas stand in the units in which parameters are printed; the
+    inflation is that of the sigma, the root of the variance's.
+
+    Raises
+    ------
+    ValueError
+        For a variable or a parameter that the study does not have.
+    """
+    if variable not in _SHOWN or variable not in study.data:
+        known = ", ".join(name for name in _SHOWN if name in study.data)
+        raise ValueError(f"variable {variable!r} cannot be drawn: use one of {known}.")
+    found = study.data[variable]
+    words, unit = _SHOWN[variable]
+    for name in ("parameter", "parameter_2"):
+        if name not in found.dims:
+            continue
+        wanted = parameter if name == "parameter" else parameter_2
+        if wanted not in study.parameter_names:
+            raise ValueError(f"{variable} needs {name}: one of {', '.join(study.parameter_names)}.")
+        found = found.sel({name: wanted})
+    if "axis" in found.dims:
+        return _cross(found.values), f"{words} [{unit}]"
+    numbers = np.asarray(found.values, dtype=np.float64)
+    if variable == "variance_inflation":
+        numbers = np.sqrt(numbers)
+    if variable.startswith("sigma") and parameter is not None:
+        spec = parameter_called(parameter)
+        numbers, unit = numbers / spec.scale, pretty_unit(spec.scaled_unit)
+    text = words.format(*(symbol(name) for name in (parameter, parameter_2) if name is not None))
+    return numbers, f"{text} [{unit}]" if unit else text
+
+
+def _cross(by_axis: Any) -> FloatArray:
+    """Root mean square over pitch and yaw, the last index being the axis."""
+    return np.asarray(np.sqrt(np.mean(np.asarray(by_axis, dtype=np.float64)[..., :2] ** 2, axis=-1)))
+
+
+def plot_study_correlation(
+    study: Study,
+    pairs: Sequence[tuple[str, str]] | None = None,
+    *,
+    along: str | None = None,
+    by: str | None = None,
+    at: Mapping[str, Any] | None = None,
+) -> Figure:
+    """Size of the correlation of pairs against a swept axis, a line for every value of a second one.
+
+    The band is the range over seeds; in a simulated study, bars are the posterior's correlation, median and range over
+    seeds. The scale grows towards one as the price in sigma does.
+
+    Parameters
+    ----------
+    study : Study
+        Result of `starcal_uq.study`.
+    pairs : sequence of (str, str), optional
+        Names of parameters, or of a parameter and pitch, yaw or roll of the common rotation; those that are coupled
+        most by default.
+    along, by : str, optional
+        Axes; the first two that were swept by default.
+    at : dict, optional
+        Values at which other axes are held, their middle ones by default.
+    """
+    sweep = study.sweep
+    along, by = _two_axes(sweep, along, by)
+    chosen = [tuple(pair) for pair in pairs] if pairs is not None else _main_pairs(sweep)
+    figure = style.new_figure(2.4 + 2.9 * len(chosen), 3.9)
+    panels = figure.subplots(1, len(chosen), sharey=True, squeeze=False)[0]
+    top = 0.0
+    for ax, (first, second) in zip(panels, chosen, strict=True):
+        r = _correlation(study, first, second)
+        lines = sweep.lines(r, along, by, at)
+        style.dress(ax, grid=True)
+        _draw_lines(ax, _sizes(lines))
+        if "posterior_correlation" in study.data and second not in AXES:
+            sampled = study.data["posterior_correlation"].sel(parameter=first, parameter_2=second).values
+            _draw_bars(ax, _sizes(sweep.lines(sampled, along, by, at)))
+        known = np.abs(np.stack([lines.median, lines.low, lines.high]))
+        top = max(top, float(np.nanmax(known, initial=0.0)))
+        style.label(ax, f"{symbol(first)} and {symbol(second)}{_sign_words(lines.median)}", axis_label(along))
+    style.label(panels[0], "", "", "size of the correlation")
+    _correlation_axis(panels[0], top)
+    _legend(figure, lines, sampled="posterior_correlation" in study.data)
+    return figure
+
+
+def _correlation(study: Study, first: str, second: str) -> FloatArray:
+    """Correlation of two parameters, or of a parameter and an axis of the common rotation, of every cell."""
+    names = study.parameter_names
+    if first not in names or second not in (*names, *AXES):
+        raise ValueError(f"no pair {first}, {second}: name two of {', '.join((*names, *AXES))}, a parameter first.")
+    if second in AXES:
+        found = study.data["attitude_correlation"].sel(parameter=first, axis=second)
+    else:
+        found = study.data["correlation"].sel(parameter=first, parameter_2=second)
+    return np.asarray(found.values, dtype=np.float64)
+
+
+def _main_pairs(sweep: Sweep) -> list[tuple[str, str]]:
+    """The pairs to show where none was named: those that are coupled in most of the sweep, or the strongest."""
+    shown = sorted(sweep.coupled or sweep.pairs[:_MOST_PANELS], key=lambda pair: -pair.mean_size)
+    return [pair.names for pair in shown[:_MOST_PANELS]]
+
+
+def _sign_words(r: FloatArray) -> str:
+    signs = np.sign(r[np.abs(np.nan_to_num(r)) > 0.05])
+    return " (opposite)" if len(signs) and np.all(signs < 0) else " (alike)" if len(signs) and np.all(signs > 0) else ""
+
+
+def _sizes(lines: Lines) -> Lines:
+    """Absolute values, the range over seeds with them."""
+    from dataclasses import replace
+
+    ends = np.sort(np.abs(np.stack([lines.low, lines.high])), axis=0)
+    crosses = lines.low * lines.high < 0.0
+    return replace(lines, median=np.abs(lines.median), low=np.where(crosses, 0.0, ends[0]), high=ends[1])
+
+
+def _correlation_axis(ax: Axes, top: float) -> None:
+    """From zero to above the largest correlation, on the scale of Fisher's z."""
+    top = min(max(top, 0.3), 0.999999)
+    limit = float(np.tanh(np.arctanh(top) * 1.06 + 0.05))
+    ax.set_yscale("function", functions=(_to_z, np.tanh))
+    ax.set_ylim(0.0, limit)
+    ticks = [tick for tick in _CORRELATION_TICKS if tick < limit] if limit > 0.6 else [0.0, 0.1, 0.2, 0.3, 0.4, 0.5]
+    ax.set_yticks([tick for tick in ticks if tick < limit])
+    ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    ax.minorticks_off()
+
+
+def _to_z(r: FloatArray) -> FloatArray:
+    return np.asarray(np.arctanh(np.clip(r, -1.0 + 1e-12, 1.0 - 1e-12)))
+
+
+def plot_study_map(
+    study: Study,
+    variable: str = "frame_error_arcsec",
+    *,
+    parameter: str | None = None,
+    parameter_2: str | None = None,
+    x: str | None = None,
+    y: str | None = None,
+    at: Mapping[str, Any] | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """A number over two axes, median over seeds: cells with their numbers, or contours where they are many.
+
+    Parameters
+    ----------
+    study : Study
+        Result of `starcal_uq.study`.
+    variable : str
+        A variable of the study's data: ``sigma``, ``correlation``, ``variance_inflation``, ``condition_number``,
+        ``frame_error_arcsec``, ``common_rotation_arcsec``, ``nea_arcsec``, ``frames_needed``, ``mean_stars``.
+    parameter, parameter_2 : str, optional
+        For variables of a parameter or of a pair.
+    x, y : str, optional
+        Axes; the first two that were swept by default.
+    at : dict, optional
+        Values at which other axes are held, their middle ones by default.
+    ax : Axes, optional
+        Where to draw; a new figure if not given.
+
+    Raises
+    ------
+    ValueError
+        For a study of fewer than two axes, or a name that it does not have.
+    """
+    x, y = _two_axes(study.sweep, x, y, lines=False)
+    if y is None:
+        raise ValueError("a map needs two swept axes.")
+    numbers, text = numbers_of(study, variable, parameter, parameter_2)
+    if ax is None:
+        ax = style.new_axes(5.6, 4.2)
+    lines = study.sweep.lines(numbers, x, y, at)
+    style.label(ax, _capital(text), axis_label(x), axis_label(y))
+    style.dress(ax)
+    if not np.isfinite(lines.median).any():
+        _nothing(ax)
+        return ax
+    if (
+        _numeric(lines.values)
+        and _numeric(lines.by_values)
+        and min(lines.median.shape) >= 6
+        and lines.median.size > _MOST_CELLS
+    ):
+        _contours(ax, lines, variable)
+    else:
+        _cells(ax, lines, variable)
+    return ax
+
+
+def _cells(ax: Axes, lines: Lines, variable: str) -> None:
+    """One square a cell, with its number."""
+    z = np.where(np.isfinite(lines.median), lines.median, np.nan)
+    colours, norm, dark = _colours(z, variable)
+    ax.imshow(z, cmap=colours, norm=norm, origin="lower", aspect="auto")
+    n_y, n_x = z.shape
+    for spine in ax.spines.values():
+        spine.set_visible(False)
+    ax.tick_params(length=0.0)
+    _ticks(ax.xaxis, lines.values, np.arange(n_x))
+    _ticks(ax.yaxis, lines.by_values, np.arange(n_y))
+    ax.set_xticks(np.arange(1, n_x) - 0.5, minor=True)
+    ax.set_yticks(np.arange(1, n_y) - 0.5, minor=True)
+    ax.tick_params(which="minor", length=0.0)
+    ax.grid(True, which="minor", color="white", linewidth=1.4)
+    size = style.TICK_SIZE if n_x <= 7 else style.TICK_SIZE - 1.5
+    for (row, column), value in np.ndenumerate(lines.median):
+        if np.isnan(value):
+            text, colour = "–", style.GREY
+        else:
+            text = correlation_text(float(value)) if variable == "correlation" else _short(float(value))
+            colour = "white" if np.isfinite(value) and dark(value) else style.INK
+        ax.text(column, row, text, ha="center", va="center", fontsize=size, color=colour)
+
+
+def _contours(ax: Axes, lines: Lines, variable: str) -> None:
+    """Colours on true scales, with contours that carry their numbers."""
+    x, y = (np.asarray(values, dtype=np.float64) for values in (lines.values, lines.by_values))
+    z = np.ma.masked_invalid(lines.median)
+    _scale(ax.xaxis, lines.values)
+    _scale(ax.yaxis, lines.by_values)
+    colours, norm, _ = _colours(lines.median, variable)
+    levels, _ = round_levels(z.compressed())
+    image = ax.pcolormesh(x, y, z, cmap=colours, norm=norm, shading="gouraud" if not z.mask.any() else "nearest")
+    shown = levels[1:-1][:: max(1, len(levels) // 6)]
+    if len(shown) and np.ptp(z.compressed()) > 0.01 * abs(float(np.median(z.compressed()))):
+        from matplotlib.patheffects import withStroke
+
+        drawn = ax.contour(x, y, z, levels=shown, colors="white", linewidths=1.0)
+        for text in ax.clabel(drawn, fmt=lambda value: f"{value:.3g}", fontsize=style.TICK_SIZE):
+            text.set_path_effects([withStroke(linewidth=2.0, foreground=style.INK)])
+    bar = style.colour_bar(ax, image, "")
+    if variable != "correlation":
+        low, high = (float(end) for end in np.ravel([image.norm.vmin, image.norm.vmax]))
+        ticks_at_levels(bar, levels[(levels >= low) & (levels <= high)])
+
+
+def _colours(z: FloatArray, variable: str) -> tuple[str, Any, Any]:
+    """Colour map, its norm, and whether a value is dark enough for white words."""
+    from matplotlib.colors import LogNorm, Normalize
+
+    good = z[np.isfinite(z)]
+    if variable == "correlation":
+        return "RdBu_r", Normalize(-1.0, 1.0), lambda value: abs(value) > 0.62
+    low, high = float(good.min()), float(good.max())
+    if low > 0.0 and high < _RELIEF * low:
+        # Little relief gets little colour, so that chance does not look like a finding.
+        middle = np.sqrt(low * high)
+        low, high = middle / np.sqrt(_RELIEF), middle * np.sqrt(_RELIEF)
+    norm = LogNorm(low, high) if low > 0.0 and high > 5.0 * low else Normalize(low, high)
+    return "cividis_r", norm, lambda value: float(norm(value)) > 0.55
+
+
+def plot_study_maps(study: Study, x: str | None = None, y: str | None = None) -> Figure:
+    """Four maps over two axes: the coupling that changes most, the largest inflation, and both attitude errors."""
+    sweep = study.sweep
+    x, y = _two_axes(sweep, x, y, lines=False)
+    if y is None:
+        raise ValueError("maps need two swept axes.")
+    changing = max(sweep.coupled or sweep.pairs[:1], key=lambda pair: max((c.change for c in pair.costs), default=0.0))
+    first, second = changing.names
+    figure = style.new_figure(11.0, 2.2 + 0.72 * max(5, min(10, len(sweep.values[y]))))
+    panels = figure.subplots(2, 2).ravel()
+    plot_study_map(study, "correlation", parameter=first, parameter_2=second, x=x, y=y, ax=panels[0])
+    plot_study_map(study, "variance_inflation", parameter=_most_inflated(study), x=x, y=y, ax=panels[1])
+    plot_study_map(study, "frame_error_arcsec", x=x, y=y, ax=panels[2])
+    plot_study_map(study, "common_rotation_arcsec", x=x, y=y, ax=panels[3])
+    _held_title(figure, sweep.held(x, y))
+    return figure
+
+
+def _most_inflated(study: Study) -> str:
+    """The parameter whose sigma the others inflate most, over the whole sweep."""
+    factors = np.where(study.sweep.ok[:, None], study.data["variance_inflation"].values, np.nan)
+    return study.parameter_names[int(np.argmax(np.nan_to_num(np.sqrt(factors)).sum(axis=0)))]
+
+
+def plot_weakest(
+    study: Study, *, along: str | None = None, by: str | None = None, at: Mapping[str, Any] | None = None
+) -> Figure:
+    """What the weakest direction is made of along an axis, for up to three values of a second one.
+
+    The direction is the combination of parameters, each in its own sigma, that the data determine worst; shares are the
+    squares of its entries, and the numbers above the bars its variance over that of uncoupled parameters.
+
+    Parameters
+    ----------
+    study : Study
+        Result of `starcal_uq.study`.
+    along, by : str, optional
+        Axes; the first two that were swept by default.
+    at : dict, optional
+        Values at which other axes are held, their middle ones by default.
+    """
+    sweep = study.sweep
+    along, by = _two_axes(sweep, along, by, names=True)
+    shares = np.asarray(study.data["weak_direction"].values, dtype=np.float64) ** 2
+    variance = sweep.lines(study.data["weak_variance"].values, along, by, at)
+    rows = _some(len(variance.median), _MOST_PANELS)
+    figure = style.new_figure(2.2 + 2.9 * len(rows), 3.8)
+    panels = figure.subplots(1, len(rows), sharey=True, squeeze=False)[0]
+    places = np.arange(len(variance.values))
+    stack = {name: sweep.lines(shares[:, i], along, by, at).median for i, name in enumerate(study.parameter_names)}
+    total = np.nansum(list(stack.values()), axis=0)
+    for ax, row in zip(panels, rows, strict=True):
+        style.dress(ax)
+        below = np.zeros(len(places))
+        for name, share in stack.items():
+            height = np.nan_to_num(share[row] / np.where(total[row] > 0.0, total[row], np.nan))
+            ax.bar(places, height, 0.78, bottom=below, color=_colour_of(name), edgecolor="white", linewidth=0.8)
+            below = below + height
+        for at_x, value in zip(places, variance.median[row], strict=True):
+            words = "–" if np.isnan(value) else f"×{significant(float(value))}"
+            ax.annotate(words, (at_x, 1.02), ha="center", va="bottom", fontsize=style.TICK_SIZE - 0.5, color=style.INK)
+        ax.set_ylim(0.0, 1.12)
+        ax.set_yticks([0.0, 0.25, 0.5, 0.75, 1.0], ["0", "25 %", "50 %", "75 %", "100 %"])
+        _ticks(ax.xaxis, variance.values, places)
+        title = _capital(said(by, variance.by_values[row])) if by is not None else ""
+        style.label(ax, title, axis_label(along))
+    style.label(panels[0], "", "", "share of the weakest direction")
+    handles = [style.key(symbol(name), _colour_of(name), linewidth=7.0) for name in stack]
+    style.legend_above(figure, handles)
+    return figure
+
+
+def plot_matrices(
+    study: Study, *, along: str | None = None, by: str | None = None, at: Mapping[str, Any] | None = None
+) -> Figure:
+    """The correlation matrix along an axis, and down a second one, median over seeds.
+
+    Parameters
+    ----------
+    study : Study
+        Result of `starcal_uq.study`.
+    along, by : str, optional
+        Axes; the first two that were swept by default.
+    at : dict, optional
+        Values at which other axes are held, their middle ones by default.
+    """
+    sweep = study.sweep
+    along, by = _two_axes(sweep, along, by, names=True)
+    names = study.parameter_names
+    r = np.asarray(study.data["correlation"].values, dtype=np.float64)
+    p = len(names)
+    lines = [[sweep.lines(r[:, i, j], along, by, at) for j in range(p)] for i in range(p)]
+    grid = np.array([[entry.median for entry in row] for row in lines])
+    columns, rows = _some(grid.shape[3], 5), _some(grid.shape[2], _MOST_PANELS)
+    figure = style.new_figure(11.0, 0.9 + 1.9 * len(rows))
+    panels = style.panels(figure, len(rows), len(columns), (0.95, 0.8, 0.58, 0.32), (0.12, 0.12))
+    for row, at_row in enumerate(rows):
+        for column, at_column in enumerate(columns):
+            ax = figure.add_subplot(panels[row, column])
+            image = _matrix(ax, grid[:, :, at_row, at_column], names, row == 0, column == 0)
+            if column == 0 and by is not None:
+                ax.set_ylabel(value_words(lines[0][0].by_values[at_row]), fontsize=style.LABEL_SIZE, color=style.INK)
+            if row == len(rows) - 1:
+                ax.set_xlabel(value_words(lines[0][0].values[at_column]), fontsize=style.LABEL_SIZE, color=style.INK)
+    figure.supxlabel(axis_label(along), fontsize=style.LABEL_SIZE, color=style.INK, y=0.01)
+    if by is not None:
+        figure.supylabel(axis_label(by), fontsize=style.LABEL_SIZE, color=style.INK, x=0.005)
+    bar = figure.colorbar(image, cax=figure.add_axes((0.945, 0.2, 0.012, 0.6)))
+    style.dress_bar(bar, "correlation")
+    return figure
+
+
+def _matrix(ax: Axes, matrix: FloatArray, names: Sequence[str], top: bool, left: bool) -> Any:
+    ax.set_facecolor(style.LIGHT)
+    # The diagonal says nothing.
+    matrix = np.where(np.eye(len(names), dtype=np.bool_), np.nan, matrix)
+    image = ax.imshow(matrix, cmap="RdBu_r", vmin=-1.0, vmax=1.0, aspect="auto")
+    ticks = np.arange(len(names))
+    words = [symbol(name) for name in names]
+    ax.set_xticks(ticks, words if top else [], fontsize=style.TICK_SIZE)
+    ax.set_yticks(ticks, words if left else [], fontsize=style.TICK_SIZE)
+    ax.tick_params(length=0.0, top=False, labeltop=top, bottom=False, labelbottom=False, colors=style.INK)
+    ax.set_xticks(ticks[1:] - 0.5, minor=True)
+    ax.set_yticks(ticks[1:] - 0.5, minor=True)
+    ax.tick_params(which="minor", length=0.0)
+    ax.grid(True, which="minor", color="white", linewidth=1.0)
+    for spine in ax.spines.values():
+        spine.set_visible(False)
+    if len(names) <= 5:
+        for (i, j), value in np.ndenumerate(matrix):
+            if np.isfinite(value):
+                colour = "white" if abs(value) > 0.62 else style.INK
+                ax.text(j, i, correlation_text(float(value)), ha="center", va="center", fontsize=6.5, color=colour)
+    return image
+
+
+def plot_needed(
+    study: Study,
+    *,
+    along: str | None = None,
+    by: str | None = None,
+    target_arcsec: float | None = None,
+    at: Mapping[str, Any] | None = None,
+) -> Figure:
+    """Frame-dependent attitude error along an axis with its target, and the frames that the target takes.
+
+    Parameters
+    ----------
+    study : Study
+        Result of `starcal_uq.study`.
+    along, by : str, optional
+        Axes; the first two that were swept by default.
+    target_arcsec : float, optional
+        1 sigma per axis across the boresight; the study's own by default.
+    at : dict, optional
+        Values at which other axes are held, their middle ones by default.
+    """
+    sweep = study.sweep
+    along, by = _two_axes(sweep, along, by)
+    target = study.definition.target_arcsec if target_arcsec is None else target_arcsec
+    n = 1 if target is None else 2
+    figure = style.new_figure(5.8 * n, 4.0)
+    panels = figure.subplots(1, n, squeeze=False)[0]
+    lines = sweep.lines(sweep.frame_error, along, by, at)
+    style.dress(panels[0], grid=True)
+    _draw_lines(panels[0], lines)
+    _logarithmic(panels[0], lines)
+    if target is not None:
+        low, high = panels[0].get_ylim()
+        panels[0].set_ylim(min(low, float(target) / 1.5), max(high, float(target) * 1.5))
+        _plain(panels[0].yaxis)
+    style.label(panels[0], "Error that differs from frame to frame", axis_label(along), "1 sigma per axis [arcsec]")
+    if target is not None:
+        _target(panels[0], float(target), f"target {target:g} arcsec")
+        needed = sweep.lines(study.frames_for(float(target)), along, by, at)
+        style.dress(panels[1], grid=True)
+        _draw_lines(panels[1], needed)
+        _logarithmic(panels[1], needed)
+        style.label(panels[1], f"Frames for {target:g} arcsec", axis_label(along), "frames")
+    _legend(figure, lines)
+    return figure
+
+
+def plot_inflation(
+    study: Study, *, along: str | None = None, by: str | None = None, at: Mapping[str, Any] | None = None
+) -> Figure:
+    """Sigma of every parameter along an axis, with all others unknown and, dashed, with all others known.
+
+    The gap between both is the price of coupling.
+
+    Parameters
+    ----------
+    study : Study
+        Result of `starcal_uq.study`.
+    along, by : str, optional
+        Axes; the first two that were swept by default.
+    at : dict, optional
+        Values at which other axes are held, their middle ones by default.
+    """
+    sweep = study.sweep
+    along, by = _two_axes(sweep, along, by)
+    names = study.parameter_names
+    columns = len(names) if len(names) <= 3 else -(-len(names) // 2)
+    rows = -(-len(names) // columns)
+    figure = style.new_figure(11.0, 0.8 + 2.75 * rows)
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for ax, name in zip(panels, names, strict=False):
+        style.dress(ax, grid=True)
+        numbers, text = numbers_of(study, "sigma", name)
+        known, _ = numbers_of(study, "sigma_conditional", name)
+        lines = sweep.lines(numbers, along, by, at)
+        _draw_lines(ax, lines)
+        conditional = sweep.lines(known, along, by, at)
+        _draw_lines(ax, conditional, dashed=True)
+        _logarithmic(ax, lines, conditional)
+        style.label(ax, _capital(text), axis_label(along))
+    for ax in panels[len(names) :]:
+        ax.set_visible(False)
+    _legend(figure, lines, dashed="all others known")
+    return figure
+
+
+def plot_simpler(
+    study: Study, *, along: str | None = None, by: str | None = None, at: Mapping[str, Any] | None = None
+) -> Figure:
+    """Attitude error that a simpler distortion model would leave, beside the error of the calibration itself.
+
+    Where a model's line lies below the grey one, that model is rich enough.
+
+    Parameters
+    ----------
+    study : Study
+        Result of `starcal_uq.study`.
+    along, by : str, optional
+        Axes; the first two that were swept by default.
+    at : dict, optional
+        Values at which other axes are held, their middle ones by default.
+
+    Raises
+    ------
+    ValueError
+        For a study in which no simpler model was tried.
+    """
+    models = [str(model) for model in study.data["simpler"].values] if "simpler" in study.data else []
+    bias = np.stack([model_bias(study, i) for i in range(len(models))], axis=1) if models else np.empty((0, 0))
+    shown = [i for i in range(len(models)) if np.isfinite(bias[:, i]).any()]
+    if not shown:
+        raise ValueError("no simpler distortion model was tried in this study.")
+    sweep = study.sweep
+    along, by = _two_axes(sweep, along, by)
+    error = sweep.lines(sweep.frame_error, along, by, at)
+    curves = [sweep.lines(bias[:, i], along, by, at) for i in shown]
+    rows = _some(len(error.median), _MOST_PANELS)
+    figure = style.new_figure(2.2 + 2.9 * len(rows), 3.9)
+    panels = figure.subplots(1, len(rows), sharey=True, squeeze=False)[0]
+    x = _positions(error.values)
+    for ax, row in zip(panels, rows, strict=True):
+        style.dress(ax, grid=True)
+        ax.fill_between(x, error.low[row], error.high[row], color=style.GREY, alpha=0.25, linewidth=0)
+        ax.plot(x, error.median[row], color=style.GREY, linewidth=2.2)
+        for number, curve in enumerate(curves):
+            ax.plot(x, curve.median[row], color=_NAMED[number % 5], marker=_MARKERS[number % 5], markersize=4.5)
+        _scale(ax.xaxis, error.values)
+        style.label(ax, _capital(said(by, error.by_values[row])) if by is not None else "", axis_label(along))
+    _logarithmic(panels[0], error, *curves)
+    style.label(panels[0], "", "", "arcsec")
+    keys = [
+        style.key(f"left by the model {models[i]}", _NAMED[n % 5], marker=_MARKERS[n % 5], markersize=4.5)
+        for n, i in enumerate(shown)
+    ]
+    style.legend_above(figure, [style.key("error of the calibration", style.GREY, linewidth=2.2), *keys])
+    return figure
+
+
+def plot_coverage(study: Study, *, along: str | None = None) -> Figure:
+    """Part of the simulated cells whose 95 % interval holds the truth, with exact 95 % bounds of that part.
+
+    Parameters
+    ----------
+    study : Study
+        Result of `starcal_uq.study` in the mode ``simulate``.
+    along : str, optional
+        Axis; the first that was swept by default.
+
+    Raises
+    ------
+    ValueError
+        For a study that was not simulated.
+    """
+    if "covered_95" not in study.data:
+        raise ValueError('coverage needs simulated cells: set mode = "simulate" in [study].')
+    sweep = study.sweep
+    along, _ = _two_axes(sweep, along, None)
+    covered = np.asarray(study.data["covered_95"].values, dtype=np.float64)
+    others = [axis for axis in sweep.axes if axis != along]
+    figure = style.new_figure(8.6, 4.0)
+    ax = style.dress(figure.subplots(), grid=True)
+    places = np.arange(len(sweep.values[along]))
+    lowest = 0.9
+    for i, name in enumerate(study.parameter_names):
+        n = sweep.over(covered[:, i], "count", others).ravel()
+        rate = sweep.over(covered[:, i], "mean", others).ravel()
+        shift = 0.62 * ((i + 0.5) / len(study.parameter_names) - 0.5)
+        for at_x, part, size in zip(places + shift, rate, n, strict=True):
+            if np.isfinite(part):
+                low, high = binomial_interval(round(part * size), int(size))
+                ax.vlines(at_x, low, high, color=_colour_of(name), linewidth=1.4)
+                ax.plot(at_x, part, marker="o", markersize=6, color=_colour_of(name))
+                lowest = min(lowest, low)
+    ax.axhline(0.95, color=style.INK, linewidth=0.9)
+    _ticks(ax.xaxis, sweep.values[along], places)
+    ax.set_ylim(max(0.0, lowest - 0.06), 1.015)
+    ax.yaxis.set_major_formatter(lambda value, _: percent(value))
+    style.label(ax, "", axis_label(along), "95 % intervals that hold the truth")
+    style.legend_above(
+        figure,
+        [style.key(symbol(name), _colour_of(name), marker="o", markersize=6) for name in study.parameter_names],
+    )
+    return figure
+
+
+def _two_axes(
+    sweep: Sweep, along: str | None, by: str | None, *, names: bool = False, lines: bool = True
+) -> tuple[str, str | None]:
+    """The axis to draw along, and the one that tells lines apart: as named, or the first that are left.
+
+    Numbers come first, because lines are for them; with `names`, names do. With `lines`, axes of a Latin hypercube tell
+    no lines apart.
+    """
+    if not sweep.axes:
+        raise ValueError("nothing was swept: give [sweep] an axis with more than one value.")
+    named = [axis for axis in (along, by) if axis is not None]
+    for axis in named:
+        if axis not in sweep.axes:
+            raise ValueError(f"{axis!r} was not swept: use one of {', '.join(sweep.axes)}.")
+    free = [axis for axis in sweep.axes if axis not in named]
+    free.sort(key=lambda axis: _numeric(sweep.values[axis]) is names)
+    along = along or free.pop(0)
+    # What was drawn and not laid out makes no lines: the other drawn axes are in the band.
+    free = [axis for axis in free if not (axis in sweep.drawn and lines)]
+    return along, by or (free[0] if free else None)
+
+
+def _some(n: int, most: int) -> list[int]:
+    """Up to `most` of n indices, both ends among them."""
+    return sorted({round(i) for i in np.linspace(0, n - 1, min(n, most))})
+
+
+def _numeric(values: Sequence[Any]) -> bool:
+    return not any(isinstance(value, str) for value in values)
+
+
+def _geometric(values: Sequence[Any]) -> bool:
+    """Whether values are spaced by ratios rather than by differences."""
+    if not _numeric(values) or len(values) < 3:
+        return False
+    x = np.asarray(values, dtype=np.float64)
+    if np.any(x <= 0.0) or x[-1] < 4.0 * x[0]:
+        return False
+    steps, ratios = np.diff(x), np.diff(np.log(x))
+    return bool(np.std(ratios) / np.mean(ratios) < np.std(steps) / np.mean(steps))
+
+
+def _positions(values: Sequence[Any]) -> FloatArray:
+    """Where values stand on an axis: names side by side, numbers where they are."""
+    return np.asarray(values, dtype=np.float64) if _numeric(values) else np.arange(len(values), dtype=np.float64)
+
+
+def _scale(axis: Any, values: Sequence[Any]) -> None:
+    """Scale and ticks of an axis of the sweep."""
+    if _geometric(values):
+        axis._set_axes_scale("log")
+    _ticks(axis, values, _positions(values))
+    axis.set_minor_locator(_no_ticks())
+
+
+def _no_ticks() -> Any:
+    from matplotlib.ticker import NullLocator
+
+    return NullLocator()
+
+
+def _ticks(axis: Any, values: Sequence[Any], places: NDArray[Any]) -> None:
+    """Ticks at the swept values, every second or third where they are many; long names stand aslant."""
+    shown = _some(len(values), 8)
+    words = [value_words(values[i]) for i in shown]
+    axis.set_ticks(np.asarray(places)[shown], words)
+    if axis.axis_name == "x" and not _numeric(values) and max(map(len, words)) * len(words) > 26:
+        for tick in axis.get_ticklabels():
+            tick.set(rotation=28, ha="right", rotation_mode="anchor")
+
+
+def _line_colours(lines: Lines) -> dict[int, Any]:
+    """The lines to draw, by their number, each with its colour: in order of the second axis' values."""
+    rows = _some(len(lines.median), _MOST_LINES)
+    if lines.by is None:
+        return {rows[0]: style.BLUE}
+    if not _numeric(lines.by_values):
+        return {row: _NAMED[i % len(_NAMED)] for i, row in enumerate(rows)}
+    import matplotlib
+
+    ramp = matplotlib.colormaps["viridis"]
+    return {row: ramp(0.86 * i / max(1, len(rows) - 1)) for i, row in enumerate(rows)}
+
+
+def _draw_lines(ax: Axes, lines: Lines, *, dashed: bool = False) -> None:
+    """A line with its band over seeds for some values of the second axis."""
+    x = _positions(lines.values)
+    for number, (row, colour) in enumerate(_line_colours(lines).items()):
+        good = np.isfinite(lines.median[row])
+        if dashed:
+            ax.plot(x[good], lines.median[row][good], color=colour, linewidth=1.2, dashes=(4, 2))
+            continue
+        ax.fill_between(x[good], lines.low[row][good], lines.high[row][good], color=colour, alpha=0.2, linewidth=0)
+        marker = _MARKERS[number % len(_MARKERS)]
+        ax.plot(x[good], lines.median[row][good], color=colour, marker=marker, markersize=4.5, linewidth=1.5)
+    _scale(ax.xaxis, lines.values)
+
+
+def _draw_bars(ax: Axes, lines: Lines) -> None:
+    """What the posterior says beside the line: median and range over seeds."""
+    x = _positions(lines.values)
+    for row, colour in _line_colours(lines).items():
+        middle = lines.median[row]
+        good = np.isfinite(middle)
+        bars = np.stack([middle - lines.low[row], lines.high[row] - middle])[:, good]
+        ax.errorbar(
+            x[good], middle[good], yerr=np.abs(bars), color=colour, fmt="x", markersize=6, elinewidth=1.1, capsize=3
+        )
+
+
+def _legend(figure: Figure, lines: Lines, *, sampled: bool = False, dashed: str = "") -> None:
+    """One legend above all panels: the values of the second axis, and what is not a plain line."""
+    keys = []
+    if lines.by is not None:
+        for number, (row, colour) in enumerate(_line_colours(lines).items()):
+            words = (
+                value_words(lines.by_values[row])
+                if number
+                else _capital(f"{axis_label(lines.by)}: {value_words(lines.by_values[row])}")
+            )
+            keys.append(style.key(words, colour, marker=_MARKERS[number % len(_MARKERS)], markersize=4.5))
+    if sampled:
+        keys.append(style.key("posterior, range over seeds", style.GREY, marker="x", linestyle="none"))
+    if dashed:
+        keys.append(style.key(dashed, style.GREY, dashes=(4, 2)))
+    if keys:
+        style.legend_above(figure, keys, columnspacing=1.4)
+    _held_title(figure, lines.held)
+
+
+def _held_title(figure: Figure, held: Mapping[str, Any]) -> None:
+    if held:
+        figure.suptitle(f"For {place(held)}", fontsize=style.LABEL_SIZE, color=style.GREY, x=0.01, ha="left")
+
+
+def _logarithmic(ax: Axes, *lines: Lines) -> None:
+    """A logarithmic axis in plain numbers over what is drawn, of at least a factor of two."""
+    values = np.concatenate([array.ravel() for entry in lines for array in (entry.median, entry.low, entry.high)])
+    values = values[np.isfinite(values) & (values > 0.0)]
+    if not len(values):
+        _nothing(ax)
+        return
+    low, high = float(values.min()) / 1.15, float(values.max()) * 1.15
+    wider = max(1.0, np.sqrt(2.25 * low / high))
+    ax.set_ylim(low / wider, high * wider)
+    ax.set_yscale("log")
+    _plain(ax.yaxis)
+
+
+def _plain(axis: Any) -> None:
+    """Plain numbers on a logarithmic axis, at 1, 2 and 5 where it spans little."""
+    from matplotlib.ticker import FuncFormatter, LogLocator
+
+    low, high = axis.get_view_interval()
+    subs = (1.0, 2.0, 5.0) if high < 150.0 * low else (1.0,)
+    axis.set_major_locator(LogLocator(subs=subs, numticks=20))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: count(int(value)) if value >= 1.0 else f"{value:.6g}"))
+    axis.set_minor_locator(_no_ticks())
+
+
+def _target(ax: Axes, value: float, words: str) -> None:
+    ax.axhline(value, color=style.VERMILLION, linewidth=1.2, dashes=(5, 2))
+    ax.annotate(
+        words,
+        (0.02, value),
+        xycoords=("axes fraction", "data"),
+        xytext=(0, 4),
+        textcoords="offset points",
+        fontsize=style.TICK_SIZE,
+        color=style.VERMILLION,
+    )
+
+
+def _nothing(ax: Axes) -> None:
+    ax.text(
+        0.5, 0.5, "no cell has this", transform=ax.transAxes, ha="center", color=style.GREY, fontsize=style.LABEL_SIZE
+    )
+
+
+def _short(value: float) -> str:
+    """At most three digits, no power of ten where plain zeros are few."""
+    return (
+        significant(value, 3)
+        if abs(value) < 100.0
+        else fixed(float(f"{value:.3g}"), 0)
+        if abs(value) < 1e6
+        else significant(value, 2)
+    )
+
+
+def _colour_of(name: str) -> str:
+    return _PARAMETER_COLOURS.get(name, style.GREY)
+
+
+def _capital(text: str) -> str:
+    return text[:1].upper() + text[1:]

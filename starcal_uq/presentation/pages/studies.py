@@ -1,0 +1,193 @@
+"""A coupling study as one HTML file, and its figures beside it."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, new_folder
+from starcal_uq.core.formatting import count, plural
+from starcal_uq.presentation.figures.studies import (
+    plot_coverage,
+    plot_inflation,
+    plot_matrices,
+    plot_needed,
+    plot_simpler,
+    plot_study_correlation,
+    plot_study_maps,
+    plot_weakest,
+)
+from starcal_uq.presentation.figures.style import small_png_bytes
+from starcal_uq.presentation.html import embedded_image, template_environment
+from starcal_uq.presentation.tables import TextTable
+from starcal_uq.presentation.words.axes import axis_label, value_words
+from starcal_uq.presentation.words.studies import (
+    study_advice,
+    study_answer,
+    study_limits,
+    study_table,
+    study_text,
+    summary_columns,
+)
+from starcal_uq.studies.result import Study
+
+PAGE = "report.html"
+_TEMPLATE = "study.html.j2"
+_CELLS_SHOWN = 60
+# Sharp on a page of this width, and small enough for all of them in one file.
+_DPI = 180
+
+_CAPTIONS = {
+    "correlation": (
+        "What couples, and what changes it",
+        "Size of the correlation, on a scale that grows as its price in sigma does; a pair whose entries err together "
+        "is marked alike, else opposite. {band}",
+    ),
+    "maps": (
+        "Over two axes",
+        "Medians over seeds. Left below: the error of the calibration that differs from frame to frame, 1 sigma per "
+        "axis across the boresight; right below: the rotation common to all frames, which alignment absorbs.",
+    ),
+    "matrices": ("The whole matrix", "Correlations of the parameters; grey where a model lacks one."),
+    "weakest": (
+        "The weakest direction",
+        "The combination of parameters, each in its own sigma, that is determined worst: its parts, and above them its "
+        "variance over that of uncoupled parameters.",
+    ),
+    "inflation": (
+        "Sigmas and the price of coupling",
+        "Full lines: all parameters unknown. Dashed: all others known. The gap is the price of coupling. {band}",
+    ),
+    "needed": ("What a target takes", "{band}"),
+    "simpler": (
+        "Would a simpler model do?",
+        "Frame-dependent attitude error across the boresight that a simpler distortion model would leave, beside that "
+        "of the calibration (grey). Where a line lies below the grey one, the simpler model is rich enough.",
+    ),
+    "coverage": (
+        "Coverage",
+        "Simulated cells whose 95 % interval holds the truth, with exact 95 % bounds of that part.",
+    ),
+}
+_SIMULATED = " Crosses: the posterior's correlation, median and range over seeds."
+
+
+def write_study(study: Study, folder: str | os.PathLike[str]) -> Path:
+    """Write ``report.html`` (self-contained) and the figures into a folder.
+
+    Parameters
+    ----------
+    study : Study
+        What was found.
+    folder : path
+        Folder, made if it is missing; files of these names in it are overwritten.
+
+    Returns
+    -------
+    Path
+        The page, which is written last.
+    """
+    path = new_folder(folder)
+    images = study_figures(study)
+    page = render_study(study, images)
+    figures = new_folder(path / "figures")
+    for name, png in images.items():
+        atomic_write_bytes(figures / f"{name}.png", png)
+    atomic_write_text(path / PAGE, page)
+    return path / PAGE
+
+
+def study_figures(study: Study) -> dict[str, bytes]:
+    """Every figure that the study has something for, as PNG, by name."""
+    sweep = study.sweep
+    if not sweep.axes or not sweep.ok.any():
+        return {}
+    drawn = {"correlation": plot_study_correlation(study)} if sweep.pairs else {}
+    if len(sweep.axes) > 1:
+        drawn["maps"] = plot_study_maps(study)
+    drawn |= {
+        "matrices": plot_matrices(study),
+        "weakest": plot_weakest(study),
+        "inflation": plot_inflation(study),
+        "needed": plot_needed(study),
+    }
+    if "simpler" in study.data.dims and np.isfinite(study.data["model_bias_arcsec"].values).any():
+        drawn["simpler"] = plot_simpler(study)
+    if "covered_95" in study.data:
+        drawn["coverage"] = plot_coverage(study)
+    return {name: small_png_bytes(figure, _DPI) for name, figure in drawn.items()}
+
+
+def render_study(study: Study, images: Mapping[str, bytes]) -> str:
+    """The page; `images` are PNG by the names of `study_figures`."""
+    definition, data = study.definition, study.data
+    band = "Bands: range over what else was drawn." if study.sweep.drawn else "Bands: range over seeds."
+    figures = []
+    for name in images:
+        title, caption = _CAPTIONS[name]
+        simulated = _SIMULATED if name == "correlation" and "posterior_correlation" in data else ""
+        figures.append({"name": name, "title": title, "caption": caption.format(band=band) + simulated})
+    failed = int((~study.sweep.ok).sum())
+    context = {
+        "title": definition.name,
+        "question": definition.question,
+        "created": data.attrs.get("created_utc", ""),
+        "version": data.attrs.get("starcal_uq", ""),
+        "verdict": study_text(study),
+        "answer": study_answer(study),
+        "advice": study_advice(study),
+        "limits": study_limits(study),
+        "failed": failed,
+        "summary": study_table(study),
+        "figures": figures,
+        "cells": cells_table(study, _CELLS_SHOWN),
+        "cells_words": f"{plural(min(_CELLS_SHOWN, len(study.sweep.ok)), 'cell')} of {count(len(study.sweep.ok))}",
+        "provenance": _provenance(study),
+        "images": {name: embedded_image(png) | {"width": _width(png)} for name, png in images.items()},
+    }
+    return template_environment().get_template(_TEMPLATE).render(context) + "\n"
+
+
+def _width(png: bytes) -> int:
+    """Width on the page: 100 to an inch."""
+    return int.from_bytes(png[16:20], "big") * 100 // _DPI
+
+
+def cells_table(study: Study, n: int) -> TextTable:
+    """The first cells, one a row: where, and the numbers of the summary."""
+    sweep = study.sweep
+    columns = summary_columns(study) if sweep.ok.any() else []
+    rows = []
+    for cell in range(min(n, len(sweep.ok))):
+        where = [value_words(_plain(study.data[axis].values[cell])) for axis in sweep.axes]
+        numbers = [form(float(values[cell])) for _, values, form in columns]
+        status = str(study.data["status"].values[cell])
+        rows.append((*where, value_words(int(study.data["seed_index"].values[cell])), *numbers, status))
+    heads = (*map(axis_label, sweep.axes), "Seed", *(head for head, _, _ in columns), "Status")
+    marks = tuple("" if good else "warning" for good in sweep.ok[:n])
+    return TextTable(heads, tuple(rows), "", "l" * len(sweep.axes) + "r" * (1 + len(columns)) + "l", marks)
+
+
+def _plain(value: Any) -> Any:
+    return str(value) if isinstance(value, str) else float(value)
+
+
+def _provenance(study: Study) -> list[tuple[str, str]]:
+    """Settings and origin of the study, as rows."""
+    rows = []
+    for key, value in study.definition.to_dict().items():
+        entries = value.items() if isinstance(value, Mapping) else [("", value)]
+        rows += [(f"{key}: {name}" if name else key, _told(entry)) for name, entry in entries]
+    rows += [(str(key), _told(value)) for key, value in study.data.attrs.items() if key not in ("definition", "title")]
+    return rows
+
+
+def _told(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    return json.dumps(value, default=str).strip('"')

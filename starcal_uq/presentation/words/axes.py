@@ -1,0 +1,69 @@
+"""What is swept, in words: the names, units and values of the axes of a study."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from starcal_uq.core.formatting import count, fixed, join_words
+
+# Name, unit, and how a value is said; the name of an axis that is missing here is said as it is.
+_AXES = {
+    "fov_deg": ("field of view", "°", "a field of {}°"),
+    "focal_mm": ("focal length", "mm", "a focal length of {} mm"),
+    "pixels": ("detector's width", "px", "{} px of detector"),
+    "pixel_um": ("pixel pitch", "µm", "pixels of {} µm"),
+    "x0_offset_px": ("offset of the principal point in x", "px", "a principal point {} px off in x"),
+    "y0_offset_px": ("offset of the principal point in y", "px", "a principal point {} px off in y"),
+    "distortion": ("distortion model", "", "the model {}"),
+    "distortion_px": ("distortion at the corner", "px", "{} px of distortion"),
+    "max_mag": ("magnitude limit", "mag", "stars to magnitude {}"),
+    "stars": ("number of stars per frame", "", "{} stars a frame"),
+    "frames": ("number of frames", "", "{} frames"),
+    "min_stars": ("fewest stars of a frame", "", "at least {} stars a frame"),
+    "pointing": ("pointing", "", "{} pointing"),
+    "sigma_px": ("centroid noise", "px", "{} px of noise"),
+    "noise_per_mag": ("growth of the noise per magnitude", "dex", "noise growing by {} dex per magnitude"),
+    "noise_mag": ("magnitude of the stated noise", "mag", "noise as stated at magnitude {}"),
+    "noise_floor_px": ("noise of bright stars", "px", "a floor of {} px under the noise"),
+    "direction_mas": ("errors of the stars' directions", "mas", "star errors of {} mas"),
+    "prior": ("prior", "", "the prior {}"),
+    "method": ("method", "", "the method {}"),
+    "likelihood": ("likelihood", "", "the likelihood {}"),
+}
+
+
+def axis_name(axis: str) -> str:
+    """The axis in words, without its unit."""
+    return _AXES.get(axis, (axis,))[0]
+
+
+def axis_label(axis: str) -> str:
+    """The axis with its unit, for an axis of a figure or the head of a column."""
+    unit = _AXES[axis][1] if axis in _AXES else ""
+    return f"{axis_name(axis)} [{unit}]" if unit else axis_name(axis)
+
+
+def value_words(value: Any) -> str:
+    """A value of an axis, as short as it is exact to three digits."""
+    if isinstance(value, str):
+        return value
+    number = float(value)
+    if not math.isfinite(number):
+        return fixed(number, 0)
+    if number == round(number) and abs(number) < 1e7:
+        whole = round(number)
+        return count(whole) if abs(whole) >= 10_000 else str(whole).replace("-", "\N{MINUS SIGN}")
+    return f"{number:.3g}".replace("-", "\N{MINUS SIGN}")
+
+
+def said(axis: str, value: Any) -> str:
+    """A value with its axis: ``a field of 10°``."""
+    form = _AXES[axis][2] if axis in _AXES else axis + " {}"
+    return form.format(value_words(value))
+
+
+def place(values: Mapping[str, Any]) -> str:
+    """A place in the sweep: ``a field of 10° and 100 frames``."""
+    return join_words([said(axis, value) for axis, value in values.items()])

@@ -1,0 +1,638 @@
+"""Coupling studies in words: what couples with what, what would decouple it, and what a designer can do about it.
+
+Every sentence is made from the numbers at hand: a study that finds no coupling says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.camera.distortion import parameter_called, parameters
+from starcal_uq.core.constants import AXES
+from starcal_uq.core.formatting import count, fixed, join_words, percent, plural, pretty_unit, significant
+from starcal_uq.core.types import BoolArray, FloatArray
+from starcal_uq.maths.intervals import binomial_interval
+from starcal_uq.presentation.figures.coupling import correlation_text
+from starcal_uq.presentation.tables import TextTable
+from starcal_uq.presentation.words.axes import axis_label, axis_name, place, said, value_words
+from starcal_uq.studies.findings import COUPLED, Curve, Direction, Pair, Sweep
+
+if TYPE_CHECKING:
+    from starcal_uq.studies.result import Study
+
+# Pairs that are told one by one.
+_TOLD = 4
+# A parameter and the common rotation cannot be told apart from this correlation on.
+_SAME = 0.99
+# An error that changes by less than this factor along an axis hardly depends on it.
+_HARDLY = 1.1
+# A price in sigma from which it pays to do something about a coupling.
+_DEAR = 2.0
+
+
+def study_text(study: Study) -> str:
+    """The answer in two sentences: what is coupled most, and what would decouple it."""
+    sweep = study.sweep
+    if not sweep.ok.any():
+        return "No cell of the study has numbers."
+    if not sweep.coupled:
+        return _uncoupled(sweep)
+    pair = sweep.coupled[0]
+    found = [(other, *other.decoupling()[0]) for other in sweep.coupled if other.decoupling()]
+    text = f"{_capital(_names(pair))} are coupled most ({_range(pair)})."
+    if not sweep.axes:
+        return text
+    if not found:
+        return f"{text} {_capital(_nothing_decouples(sweep))}."
+    other, size, cost = max(found, key=lambda entry: entry[2].change)
+    return f"{text} {_capital(_decoupled(other, size, cost))}."
+
+
+def study_answer(study: Study) -> list[str]:
+    """The whole answer, a sentence or two for every question."""
+    sweep = study.sweep
+    if not sweep.ok.any():
+        return [study_text(study)]
+    parts = [
+        _couplings(sweep),
+        *_what_decouples(sweep),
+        _weakest(sweep),
+        _price(study),
+        _gauge(study),
+        _errors(sweep),
+        _target(study),
+        *_models(study),
+        *_simpler(study),
+        _coverage(study),
+    ]
+    return [part for part in parts if part]
+
+
+def _names(pair: Pair) -> str:
+    return f"{pair.names[0]} and {pair.names[1]}"
+
+
+def _dashed(pair: Pair) -> str:
+    return f"{pair.names[0]}\N{EN DASH}{pair.names[1]}"
+
+
+def _range(pair: Pair) -> str:
+    """The correlations of a pair over the sweep, and how much other seeds change them."""
+    low, high = sorted((pair.strongest, pair.weakest))
+    ends = f"{correlation_text(low)} to {correlation_text(high)}"
+    text = "correlation " + (correlation_text(high) if correlation_text(low) == correlation_text(high) else ends)
+    return text + (f", ±{significant(0.5 * pair.seeds, 1)} over seeds" if pair.seeds >= 5e-4 else "")
+
+
+def _uncoupled(sweep: Sweep) -> str:
+    if not sweep.pairs:
+        return "No two parameters were estimated together: there is nothing to couple."
+    pair = sweep.pairs[0]
+    at = f", with {place(pair.strongest_at)}" if pair.strongest_at else ""
+    return (
+        f"No pair of parameters is coupled: the largest correlation anywhere is {correlation_text(pair.strongest)} "
+        f"({_names(pair)}{at})."
+    )
+
+
+def _couplings(sweep: Sweep) -> str:
+    if not sweep.coupled:
+        return _uncoupled(sweep)
+    told = [f"{_dashed(pair)} ({_range(pair).removeprefix('correlation ')})" for pair in sweep.coupled[:_TOLD]]
+    more = len(sweep.coupled) - len(told)
+    rest = f"; {plural(more, 'more pair')} above {COUPLED:g} in size somewhere" if more > 0 else ""
+    others = len(sweep.pairs) - len(sweep.coupled)
+    free = f" The other {plural(others, 'pair')} stay below {COUPLED:g}." if others else ""
+    return f"Coupled are, with their correlations, {join_words(told)}{rest}.{free}"
+
+
+def _what_decouples(sweep: Sweep) -> list[str]:
+    """What changes each of the couplings, and which axes do nothing about any."""
+    if not sweep.axes or not sweep.coupled:
+        return []
+    parts = []
+    for pair in sweep.coupled[:_TOLD]:
+        for size, cost in pair.decoupling()[:1]:
+            parts.append(_capital(_decoupled(pair, size, cost)) + ".")
+    helping = {size.axis for pair in sweep.coupled for size, _ in pair.decoupling()}
+    idle = [axis for axis in sweep.axes if axis not in helping]
+    if not helping:
+        parts.append(_capital(_nothing_decouples(sweep)) + ".")
+    elif idle:
+        changes = [c for pair in sweep.coupled for c in pair.sizes if c.axis in idle]
+        names = join_words([_the(axis) for axis in idle])
+        do, them = ("does", "it") if len(idle) == 1 else ("do", "them")
+        most = f": along {them} no correlation changes by more than {_change(changes)}" if changes else ""
+        parts.append(f"{_capital(names)} {do} little to the couplings{most}.")
+    return parts
+
+
+def _decoupled(pair: Pair, size: Curve, cost: Curve) -> str:
+    """Which axis tells a pair apart, from what to what."""
+    high, low = cost.most, cost.least
+    prices = (fixed(float(np.exp(cost.median[i])), 1) for i in (high, low))
+    ends = [f"{correlation_text(float(size.median[i]))} with {said(size.axis, size.values[i])}" for i in (high, low)]
+    return (
+        f"{_the(size.axis)} changes how {_names(pair)} are coupled: from {ends[0]} to {ends[1]} in size, "
+        f"which takes the price in sigma from {' to '.join(prices)}"
+    )
+
+
+def _nothing_decouples(sweep: Sweep) -> str:
+    names = join_words([axis_name(axis) for axis in sweep.axes])
+    changes = [curve for pair in sweep.coupled for curve in pair.sizes]
+    return (
+        f"nothing that was varied ({names}) decouples {'them' if len(sweep.coupled) == 1 else 'any pair'}: along no "
+        f"axis does a correlation change by more than {_change(changes)}"
+    )
+
+
+def _change(curves: Sequence[Curve]) -> str:
+    largest = max((curve.change for curve in curves), default=0.0)
+    return significant(max(largest, 0.001), 1)
+
+
+def _the(axis: str) -> str:
+    return f"the {axis_name(axis)}"
+
+
+def _weakest(sweep: Sweep) -> str:
+    """The weakest direction, and where it becomes another one."""
+    kinds, _ = sweep.directions
+    if not kinds:
+        return ""
+    variance = sweep.over(sweep.data["weak_variance"].values)
+    sizes = _span(variance)
+    if len(kinds) == 1:
+        if not kinds[0].together:
+            return "No combination of parameters is much worse determined than the parameters themselves."
+        return (
+            f"The weakest direction is {_direction(kinds[0])} everywhere, with {sizes} times the variance of uncoupled "
+            "parameters."
+        )
+    turn = sweep.turn
+    if turn is None or turn.told < max(0.75, kinds[0].share + 0.05):
+        told = [f"{_direction(kind)} in {percent(kind.share)}" for kind in kinds[:3]]
+        return f"The weakest direction is {join_words(told)} of the places, and no one axis tells which."
+    runs = [f"{_direction(kinds[kind])} {_run(turn.axis, values)}" for values, kind in turn.runs[:6]]
+    right = "" if turn.told > 0.999 else f" (so in {percent(turn.told)} of the places)"
+    return f"The weakest direction turns with {_the(turn.axis)}: {'; '.join(runs)}{right}."
+
+
+def _direction(kind: Direction) -> str:
+    if not kind.together:
+        return "nothing in particular"
+    if not kind.against:
+        return f"{join_words(kind.together)} together"
+    return f"{join_words(kind.together)} against {join_words(kind.against)}"
+
+
+def _run(axis: str, values: Sequence[Any]) -> str:
+    if len(values) == 1 or isinstance(values[0], str):
+        return f"with {join_words([said(axis, value) for value in values[:1]] + list(map(value_words, values[1:])))}"
+    return f"from {said(axis, values[0])} to {value_words(values[-1])}"
+
+
+def _price(study: Study) -> str:
+    """How many times a sigma is what it would be if all other parameters were known."""
+    sweep = study.sweep
+    found = []
+    for i, name in enumerate(sweep.names):
+        factor = sweep.over(np.sqrt(study.data["variance_inflation"].values[:, i]))
+        if np.isfinite(factor).any():
+            found.append((float(np.nanmedian(factor)), name, _span(factor)))
+    dear = [entry for entry in sorted(found, reverse=True) if entry[0] >= _HARDLY]
+    if not dear:
+        return "Coupling costs nothing: every sigma is what it would be if the other parameters were known."
+    told = [f"{name} {words} times" for _, name, words in dear[:_TOLD]]
+    return f"The price, as sigma over what it would be if the other parameters were known: {join_words(told)}."
+
+
+def _span(values: FloatArray) -> str:
+    """Least to most of what is finite."""
+    good = values[np.isfinite(values)]
+    ends = [significant(float(v), 3 if abs(v) >= 1.0 else 2) for v in (good.min(), good.max())]
+    return ends[0] if ends[0] == ends[1] else f"{ends[0]} to {ends[1]}"
+
+
+def _gauge(study: Study) -> str:
+    """Parameters that cannot be told from a common rotation anywhere."""
+    sweep = study.sweep
+    found = []
+    for i, name in enumerate(sweep.names):
+        for j, axis in enumerate(AXES):
+            r = np.abs(sweep.over(study.data["attitude_correlation"].values[:, i, j]))
+            if np.isfinite(r).any() and float(np.nanmin(r)) >= _SAME:
+                found.append((f"{name} with {axis}", float(np.nanmin(r))))
+    if not found:
+        return ""
+    least = min(r for _, r in found)
+    return (
+        f"In the whole sweep, {join_words([words for words, _ in found])} cannot be told apart (at least "
+        f"{correlation_text(min(least, 0.9999))} in size): a rotation common to all frames, which an alignment with "
+        "the same parameters absorbs."
+    )
+
+
+@dataclass(frozen=True)
+class Effect:
+    """What an axis does to an error: the largest over the smallest median, and the law between if there is one."""
+
+    curve: Curve
+    factor: float
+    exponent: float | None
+
+
+def error_effects(sweep: Sweep, numbers: FloatArray) -> list[Effect]:
+    """What every axis does to an error, the strongest first."""
+    found = [
+        Effect(curve, float(curve.median.max() / curve.median.min()), curve.exponent)
+        for curve in sweep.curves(numbers)
+        if curve.median.min() > 0.0
+    ]
+    return sorted(found, key=lambda effect: -effect.factor)
+
+
+def _errors(sweep: Sweep) -> str:
+    """Sizes of the error that differs from frame to frame, and what each axis does to it."""
+    effects = error_effects(sweep, sweep.frame_error)
+    text = (
+        "The error that differs from frame to frame is "
+        f"{_span(sweep.over(sweep.frame_error))} arcsec (1 sigma per axis across the boresight)"
+    )
+    strong = [_effect(effect) for effect in effects if effect.factor >= _HARDLY]
+    weak = [axis_name(effect.curve.axis) for effect in effects if effect.factor < _HARDLY]
+    if strong:
+        text += f": {join_words(strong)}"
+    if weak:
+        text += f"; it hardly depends on {join_words(weak)}" if strong else f", whatever {join_words(weak)} may be"
+    return text + "."
+
+
+def _effect(effect: Effect) -> str:
+    curve = effect.curve
+    first, last = 0, len(curve.values) - 1
+    if not isinstance(curve.values[0], str) and curve.most not in (first, last):
+        ends = [curve.most, curve.least]
+    elif isinstance(curve.values[0], str):
+        ends = [curve.least, curve.most]
+    else:
+        ends = [first, last]
+    words = " to ".join(f"{significant(float(curve.median[i]))} with {said(curve.axis, curve.values[i])}" for i in ends)
+    law = ""
+    if effect.exponent is not None and curve.axis != "max_mag":
+        law = f", as the power {fixed(effect.exponent, 2)}"
+    return f"{words}{law}"
+
+
+def _target(study: Study) -> str:
+    """Where the target is met, and what it takes."""
+    target = study.definition.target_arcsec
+    if target is None:
+        return ""
+    sweep = study.sweep
+    errors = sweep.over(sweep.frame_error)
+    known = np.isfinite(errors)
+    met = known & (errors <= target)
+    head = f"The target of {target:g} arcsec is met"
+    if met.sum() == known.sum():
+        text = f"{head} everywhere"
+    elif not met.any():
+        text = f"{head} nowhere"
+    else:
+        text = f"{head} in {count(int(met.sum()))} of {count(int(known.sum()))} places{_where(sweep, met, known)}"
+    return f"{text}. {_frames_needed(study, target)}".strip()
+
+
+def _frames_needed(study: Study, target: float) -> str:
+    sweep = study.sweep
+    needed = sweep.over(study.frames_for(target)).ravel()
+    if not np.isfinite(needed).any():
+        return "No number of frames meets it." if np.isinf(needed).any() else ""
+    others = [axis for axis in sweep.axes if axis != "frames"]
+    good = np.where(np.isfinite(needed), needed, np.nan)
+    least, most = int(np.nanargmin(good)), int(np.nanargmax(good))
+
+    def told(index: int) -> str:
+        at = place({axis: value for axis, value in sweep.at(index).items() if axis in others})
+        return f"{plural(int(good[index]), 'frame')}{f' ({at})' if at else ''}"
+
+    never = int(np.isinf(needed).sum())
+    floor = f" In {plural(never, 'place')} no number of frames does: errors of the stars stay." if never else ""
+    if good[least] == good[most]:
+        return f"It takes {plural(int(good[least]), 'frame')}.{floor}"
+    return f"It takes from {told(least)} to {told(most)}.{floor}"
+
+
+def _where(sweep: Sweep, flag: BoolArray, known: BoolArray) -> str:
+    """The cut along one axis that tells best where something holds; nothing where none does."""
+    best: tuple[float, str] = (0.0, "")
+    base = max(float(flag.sum()), float((known & ~flag).sum())) / float(known.sum())
+    for position, axis in enumerate(sweep.axes):
+        values = sweep.values[axis]
+        if isinstance(values[0], str):
+            share = [float(np.take(flag, i, position).sum()) for i in range(len(values))]
+            total = [float(np.take(known, i, position).sum()) for i in range(len(values))]
+            inside = [i for i in range(len(values)) if 2.0 * share[i] > total[i]]
+            right = sum(share[i] if i in inside else total[i] - share[i] for i in range(len(values)))
+            if inside and len(inside) < len(values):
+                words = f"with {join_words([said(axis, values[inside[0]]), *(values[i] for i in inside[1:])])}"
+                best = max(best, (right / float(known.sum()), words))
+            continue
+        index = np.arange(len(values)).reshape([-1 if i == position else 1 for i in range(flag.ndim)])
+        for cut in range(1, len(values)):
+            for inside_is, value, side in ((index >= cut, values[cut], "on"), (index < cut, values[cut - 1], "down")):
+                right = float((known & (flag == inside_is)).sum()) / float(known.sum())
+                words = f"from {said(axis, value)} {'on' if side == 'on' else 'downwards'}"
+                best = max(best, (right, words), key=lambda entry: entry[0])
+    told, words = best
+    if told < max(0.8, base + 0.05):
+        return ""
+    return f": {words}" if told > 0.999 else f": {words} (so in {percent(told)} of the places)"
+
+
+def _models(study: Study) -> list[str]:
+    """What richer models cost, beside the simplest that was swept."""
+    sweep = study.sweep
+    if "distortion" not in sweep.axes:
+        return []
+    names = sorted(sweep.values["distortion"], key=lambda model: len(parameters(model)))
+    position = sweep.axes.index("distortion")
+    sigma_f = np.asarray(study.data["sigma"].sel(parameter="f").values, dtype=np.float64)
+    told = []
+    first = names[0]
+    for model in names[1:]:
+        factors = []
+        for numbers in (sigma_f, sweep.frame_error):
+            grid = sweep.over(numbers)
+            a, b = (np.take(grid, sweep.values["distortion"].index(m), position) for m in (first, model))
+            factors.append(b / a)
+        if all(np.isfinite(f).any() for f in factors):
+            told.append(f"{model} has {_span(factors[0])} times the sigma of f and {_span(factors[1])} times the error")
+    return [f"Beside the model {first}: {'; '.join(told)}."] if told else []
+
+
+def _simpler(study: Study) -> list[str]:
+    """Whether a simpler model would do."""
+    if "simpler" not in study.data.dims:
+        return []
+    sweep = study.sweep
+    parts = []
+    for i, model in enumerate(map(str, study.data["simpler"].values)):
+        bias = model_bias(study, i)
+        grid, error = sweep.over(bias), sweep.over(np.where(np.isfinite(bias), sweep.frame_error, np.nan))
+        known = np.isfinite(grid) & np.isfinite(error)
+        if not known.any():
+            continue
+        good = known & (grid < error)
+        size = f"{_span(grid[known])} arcsec against {_span(error[known])} of the calibration"
+        if good.sum() == known.sum():
+            parts.append(f"The model {model} would do everywhere: it leaves {size}.")
+        elif not good.any():
+            parts.append(f"The model {model} would do nowhere: it leaves {size}.")
+        else:
+            share = f"{count(int(good.sum()))} of {count(int(known.sum()))} places"
+            parts.append(f"The model {model} would do in {share}{_where(sweep, good, known)}: it leaves {size}.")
+    return parts
+
+
+def model_bias(study: Study, simpler: int) -> FloatArray:
+    """Frame-dependent attitude error across the boresight (C,) that a simpler model would leave, arcsec."""
+    by_axis = study.data["model_bias_attitude_arcsec"].values[:, simpler, :2]
+    return np.asarray(np.sqrt(np.mean(by_axis**2, axis=-1)), dtype=np.float64)
+
+
+def _coverage(study: Study) -> str:
+    """Whether intervals of simulated cells hold the truth as often as they say."""
+    if "covered_95" not in study.data:
+        return ""
+    told, wrong = [], []
+    covered = study.data["covered_95"].values
+    for i, name in enumerate(study.sweep.names):
+        held = covered[study.sweep.ok, i]
+        held = held[np.isfinite(held)]
+        if not len(held):
+            continue
+        n, hits = len(held), int(held.sum())
+        # One false alarm in a hundred studies, however many parameters there are.
+        low, high = binomial_interval(hits, n, 1.0 - 0.01 / len(study.sweep.names))
+        told.append(f"{name} {percent(hits / n, 3)}")
+        if not low <= 0.95 <= high:
+            wrong.append(f"{name} ({percent(low)} to {percent(high)})")
+    if not told:
+        return ""
+    cells = int(study.sweep.ok.sum())
+    text = f"In {count(cells)} simulated cells the 95 % intervals hold the truth as often as this: {join_words(told)}"
+    if wrong:
+        return f"{text}. That is not 95 % for {join_words(wrong)}: do not use these intervals as they are."
+    return f"{text}; chance explains what differs from 95 %."
+
+
+def study_limits(study: Study) -> list[str]:
+    """What was not assessed, and which cells failed."""
+    sweep = study.sweep
+    total, failed = len(sweep.ok), int((~sweep.ok).sum())
+    parts = []
+    if failed:
+        reasons = [f"{count(n)}: {reason.rstrip('.')}" for reason, n in sweep.failures[:3]]
+        more = len(sweep.failures) - len(reasons)
+        rest = f"; {plural(more, 'further reason')}" if more > 0 else ""
+        parts.append(f"{count(failed)} of {plural(total, 'cell')} have no numbers ({'; '.join(reasons)}{rest}).")
+    seeds = len(np.unique(study.data["seed_index"].values))
+    if seeds == 1:
+        parts.append("One seed: what another sky or other frames would change was not assessed.")
+    if study.definition.mode == "simulate":
+        parts.append("Simulated with the noise and the distortion model that the calibration assumes.")
+    else:
+        parts.append(
+            "From Fisher information: Gaussian noise, right identifications and a right distortion model are assumed. "
+            'Coverage, bias of the estimates and convergence were not assessed; mode = "simulate" does.'
+        )
+    return parts
+
+
+def study_advice(study: Study) -> list[str]:
+    """What a designer can do with the answer."""
+    sweep = study.sweep
+    if not sweep.ok.any():
+        return ["Nothing can be advised: see why the cells failed."]
+    parts = [*_advice_couplings(study), *_advice_errors(sweep), _advice_target(study), _advice_models(study)]
+    return [part for part in parts if part]
+
+
+def _advice_couplings(study: Study) -> list[str]:
+    sweep = study.sweep
+    parts = []
+    best: dict[tuple[str, Any], list[str]] = {}
+    stuck = []
+    for pair in sweep.coupled:
+        found = pair.decoupling()
+        if found:
+            size, cost = found[0]
+            best.setdefault((size.axis, size.values[cost.least]), []).append(_dashed(pair))
+        elif float(np.exp(max((c.median.min() for c in pair.costs), default=0.0))) >= _DEAR:
+            stuck.append(_dashed(pair))
+    for (axis, value), names in best.items():
+        if axis == "distortion":
+            parts.append(f"To tell {join_words(names)} apart, take the model {value} if its bias allows.")
+        else:
+            parts.append(f"To tell {join_words(names)} apart, go to {said(axis, value)}.")
+    if stuck:
+        parts.append(
+            f"Do not expect {join_words(stuck[:_TOLD])} to come apart by what was varied here. Report them with their "
+            "covariance, never one alone; to know one of them, measure it otherwise and give it as a prior, or take a "
+            "model with fewer coefficients where its bias allows."
+        )
+    return parts
+
+
+def _advice_errors(sweep: Sweep) -> list[str]:
+    """What is worth most for the attitude error, and what trades against what."""
+    effects = [e for e in error_effects(sweep, sweep.frame_error) if e.factor >= _HARDLY]
+    parts = []
+    numeric = [e for e in effects if not isinstance(e.curve.values[0], str)]
+    if numeric:
+        top = numeric[0]
+        parts.append(
+            f"For the attitude error, {_the(top.curve.axis)} is worth most within this sweep: a factor of "
+            f"{significant(top.factor)} between {said(top.curve.axis, top.curve.values[top.curve.most])} and "
+            f"{value_words(top.curve.values[top.curve.least])}."
+        )
+    laws = {e.curve.axis: e.exponent for e in effects if e.exponent is not None and e.curve.axis != "max_mag"}
+    deeper = next((_per_magnitude(e.curve) for e in effects if e.curve.axis == "max_mag"), None)
+    if deeper is not None and deeper > _HARDLY:
+        also = []
+        if laws.get("frames"):
+            also.append(f"{significant(deeper ** (-1.0 / laws['frames']))} times the frames")
+        if laws.get("sigma_px"):
+            also.append(f"noise {significant(deeper ** (1.0 / laws['sigma_px']))} times smaller")
+        same = f", as much as {join_words(also)}" if also else ""
+        parts.append(f"One magnitude more in the limit divides the attitude error by {significant(deeper)}{same}.")
+    if laws.get("frames") and laws.get("sigma_px"):
+        parts.append(
+            f"Half the noise is worth {significant(2.0 ** (-laws['sigma_px'] / laws['frames']))} times the frames."
+        )
+    return parts
+
+
+def _per_magnitude(curve: Curve) -> float | None:
+    """By how much a magnitude divides an error, on average over the axis."""
+    x = np.asarray(curve.values, dtype=np.float64)
+    return float(np.exp(-np.polyfit(x, np.log(curve.median), 1)[0])) if len(x) > 1 else None
+
+
+def _advice_target(study: Study) -> str:
+    """The place that meets the target with the fewest frames, if frames can be chosen."""
+    target, sweep = study.definition.target_arcsec, study.sweep
+    if target is None:
+        return ""
+    errors = sweep.over(sweep.frame_error).ravel()
+    met = np.flatnonzero(errors <= target)
+    if not len(met):
+        needed = sweep.over(study.frames_for(target)).ravel()
+        if not np.isfinite(needed).any():
+            return f"{target:g} arcsec is out of reach here: lower the noise, or relax the target."
+        best = int(np.argmin(np.where(np.isfinite(needed), needed, np.inf)))
+        at = place({axis: v for axis, v in sweep.at(best).items() if axis != "frames"})
+        return f"For {target:g} arcsec take {plural(int(needed[best]), 'frame')}{f' with {at}' if at else ''}."
+    if "frames" not in sweep.axes:
+        return ""
+    frames = np.array([sweep.at(int(i))["frames"] for i in met], dtype=np.float64)
+    fewest = met[frames == frames.min()]
+    # Of those, the one with most to spare.
+    best = int(fewest[np.argmin(errors[fewest])])
+    left = significant(float(errors[best]))
+    return f"The fewest frames that keep {target:g} arcsec: {place(sweep.at(best))} ({left} arcsec)."
+
+
+def _advice_models(study: Study) -> str:
+    """The simplest model that is rich enough."""
+    if "simpler" not in study.data.dims:
+        return ""
+    sweep = study.sweep
+    good: list[str] = []
+    bad: list[str] = []
+    for i, model in enumerate(map(str, study.data["simpler"].values)):
+        bias = model_bias(study, i)
+        known = sweep.ok & np.isfinite(bias)
+        if known.any():
+            (good if np.all(bias[known] < sweep.frame_error[known]) else bad).append(model)
+    order = sorted(good, key=lambda model: len(parameters(model)))
+    if order:
+        return f"The model {order[0]} is rich enough everywhere in this sweep: more coefficients only add sigma."
+    if bad and not good:
+        return (
+            "No simpler distortion model is safe over the whole sweep: keep the coefficients, and live with their "
+            "coupling."
+        )
+    return ""
+
+
+def study_notes(study: Study) -> list[str]:
+    """Advice and limits, for a notebook."""
+    return [*study_advice(study), *study_limits(study)]
+
+
+def study_table(study: Study) -> TextTable | None:
+    """One row for every value of every axis, all else at its median."""
+    sweep = study.sweep
+    if not sweep.axes or not sweep.ok.any():
+        return None
+    columns = summary_columns(study)
+    rows = []
+    for axis in sweep.axes:
+        pooled = [other for other in sweep.axes if other != axis]
+        grids = [sweep.over(numbers, "median", pooled).ravel() for _, numbers, _ in columns]
+        for i, value in enumerate(sweep.values[axis]):
+            cells = (form(float(grid[i])) for (_, _, form), grid in zip(columns, grids, strict=True))
+            rows.append((axis_label(axis) if i == 0 else "", value_words(value), *cells))
+    heads = ("Along", "Value", *(head for head, _, _ in columns))
+    title = "Medians over seeds and all other axes"
+    return TextTable(heads, tuple(rows), title, "ll" + "r" * len(columns))
+
+
+def summary_columns(study: Study) -> list[tuple[str, FloatArray, Any]]:
+    """Heads, numbers (C,) and forms of what a row of a table tells of a cell."""
+    sweep = study.sweep
+    columns: list[tuple[str, FloatArray, Any]] = []
+    for pair in sorted(sweep.coupled or sweep.pairs[:1], key=lambda pair: -pair.mean_size)[:2]:
+        r = study.data["correlation"].sel(parameter=pair.names[0], parameter_2=pair.names[1]).values
+        columns.append((f"Correlation {pair.names[0]}, {pair.names[1]}", np.asarray(r, dtype=np.float64), _correlation))
+    factor = np.sqrt(study.data["variance_inflation"].sel(parameter="f").values)
+    spec = parameter_called("f")
+    columns.append(
+        (f"Sigma f [{pretty_unit(spec.scaled_unit)}]", study.data["sigma"].sel(parameter="f").values, _number)
+    )
+    columns.append(("Price of coupling, f", np.asarray(factor, dtype=np.float64), _number))
+    columns.append(("Condition number", study.data["condition_number"].values, _number))
+    common = np.sqrt(np.mean(study.data["common_rotation_arcsec"].values[:, :2] ** 2, axis=-1))
+    columns.append(("Common rotation [arcsec]", common, _number))
+    columns.append(("Frame error [arcsec]", sweep.frame_error, _number))
+    target = study.definition.target_arcsec
+    if target is not None:
+        columns.append((f"Frames for {target:g} arcsec", study.frames_for(target), _frames))
+    return columns
+
+
+def _correlation(value: float) -> str:
+    return "–" if np.isnan(value) else correlation_text(value)
+
+
+def _number(value: float) -> str:
+    return "–" if np.isnan(value) else significant(value, 3)
+
+
+def _frames(value: float) -> str:
+    return "–" if np.isnan(value) else "never" if np.isinf(value) else count(int(np.ceil(value)))
+
+
+def _capital(text: str) -> str:
+    """First letter of a sentence; the name of a parameter stays as it is written."""
+    return text if text.split(" ")[0] in _PARAMETERS else text[:1].upper() + text[1:]
+
+
+_PARAMETERS = {"x0", "y0", "f", "k1", "k2", "k3", "p1", "p2"}

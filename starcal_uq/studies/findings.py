@@ -1,0 +1,492 @@
+"""What a study found: which pairs are coupled, which axis changes that, and where the weakest direction turns."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+# From this correlation on a pair counts as coupled, as in `Coupling.pairs`.
+COUPLED = 0.5
+# An axis matters where it changes what a pair's coupling costs in sigma by this factor, and by more than seeds do.
+MATTERS = 1.25
+_BEYOND_SEEDS = 2.0
+# A parameter takes part in a direction when its share of the direction's length exceeds this (as in `Coupling`).
+_PART = 0.25
+# Up to this variance a direction is that of uncoupled parameters.
+_ALONE = 1.4
+# An axis with more values than these, as of a Latin hypercube, is cut into this many parts of equal number.
+_MOST_VALUES, _PARTS = 16, 6
+
+Statistic = Literal["median", "low", "high", "mean", "count"]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A number along one axis, its median over seeds first and then over all other axes.
+
+    Attributes
+    ----------
+    axis : str
+        Name of the axis.
+    values : tuple
+        Its values; the median of each part where there are too many.
+    median, low, high : (n,) arrays
+        Median over the other axes, least and most over them.
+    change : float
+        Largest less smallest value along the axis, the median of it over the other axes.
+    seeds : float
+        Range over seeds at a place, the median over all places, 0 with one seed; for a Latin hypercube, two standard
+        errors of a median.
+    """
+
+    axis: str
+    values: tuple[Any, ...]
+    median: FloatArray
+    low: FloatArray
+    high: FloatArray
+    change: float
+    seeds: float
+
+    @property
+    def beyond_seeds(self) -> bool:
+        """Whether the change is more than what other seeds make of it."""
+        return self.change > _BEYOND_SEEDS * self.seeds
+
+    @property
+    def most(self) -> int:
+        """Where the number is largest."""
+        return int(np.argmax(self.median))
+
+    @property
+    def least(self) -> int:
+        """Where the number is smallest."""
+        return int(np.argmin(self.median))
+
+    @property
+    def exponent(self) -> float | None:
+        """Exponent of the power law between the ends of the axis; None where there is none."""
+        if any(isinstance(value, str) for value in self.values) or len(self.values) < 2:
+            return None
+        x, y = np.asarray(self.values, dtype=np.float64), self.median
+        if np.any(x <= 0.0) or np.any(y <= 0.0):
+            return None
+        slope = float(np.polyfit(np.log(x), np.log(y), 1)[0])
+        law = np.log(y) - slope * np.log(x)
+        return slope if float(np.ptp(law)) < 0.1 + 0.1 * float(np.ptp(np.log(y))) else None
+
+
+@dataclass(frozen=True)
+class Lines:
+    """A number along one axis, a line for every value of another one.
+
+    Attributes
+    ----------
+    along : str
+        The axis.
+    values : tuple
+        Its values (n).
+    by : str or None
+        The axis that tells the lines apart.
+    by_values : tuple
+        Its values, one for each line; empty without `by`.
+    held : dict
+        Where the other axes are held.
+    median, low, high : (lines, n) arrays
+        Median, least and most over seeds.
+    """
+
+    along: str
+    values: tuple[Any, ...]
+    by: str | None
+    by_values: tuple[Any, ...]
+    held: dict[str, Any]
+    median: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+@dataclass(frozen=True)
+class Pair:
+    """How two parameters are coupled over the sweep.
+
+    Attributes
+    ----------
+    names : tuple of str
+        The two parameters.
+    strongest, weakest : float
+        Correlations (median over seeds) where they are largest and smallest in size.
+    strongest_at, weakest_at : dict
+        Where that is, by axis.
+    seeds : float
+        Range of the correlation over seeds at a place, the median over all places.
+    mean_size : float
+        Size of the correlation, the mean over all places; 0 where a model lacks one of the two.
+    sizes : tuple of Curve
+        Size of the correlation along every axis.
+    costs : tuple of Curve
+        Logarithm of 1 / sqrt(1 - r^2), what the coupling of this pair alone costs in sigma, along every axis.
+    """
+
+    names: tuple[str, str]
+    strongest: float
+    weakest: float
+    strongest_at: dict[str, Any]
+    weakest_at: dict[str, Any]
+    seeds: float
+    mean_size: float
+    sizes: tuple[Curve, ...]
+    costs: tuple[Curve, ...]
+
+    def decoupling(self) -> list[tuple[Curve, Curve]]:
+        """Size and cost along the axes that change the coupling, the strongest first."""
+        both = zip(self.sizes, self.costs, strict=True)
+        return sorted((p for p in both if matters(p[1])), key=lambda pair: -pair[1].change)
+
+
+def matters(cost: Curve) -> bool:
+    """Whether an axis changes the logarithm of a sigma by enough, and by more than seeds do."""
+    return cost.change > np.log(MATTERS) and cost.beyond_seeds
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A kind of weakest direction.
+
+    Attributes
+    ----------
+    together, against : tuple of str
+        Parameters that grow together, and those that shrink meanwhile; both empty where nothing is coupled.
+    share : float
+        Part of the places of the sweep where the weakest direction is of this kind.
+    """
+
+    together: tuple[str, ...]
+    against: tuple[str, ...]
+    share: float
+
+
+@dataclass(frozen=True)
+class Turn:
+    """The kinds of weakest direction along the axis that tells them apart best.
+
+    Attributes
+    ----------
+    axis : str
+        Name of the axis.
+    runs : tuple of (tuple of values, int)
+        Neighbouring values that share a kind, and the number of that kind.
+    told : float
+        Part of the places that the axis alone tells right.
+    """
+
+    axis: str
+    runs: tuple[tuple[tuple[Any, ...], int], ...]
+    told: float
+
+
+class Sweep:
+    """The cells of a study by their place: every number as a dense array over the axes.
+
+    Parameters
+    ----------
+    data : Dataset
+        Of a study.
+    axes : sequence of str
+        Names of the swept axes.
+    """
+
+    def __init__(self, data: xr.Dataset, axes: Sequence[str]) -> None:
+        self.data = data
+        self.axes = tuple(axes)
+        self.ok: BoolArray = np.asarray(data["status"].values == "ok")
+        self.names: tuple[str, ...] = tuple(map(str, data["parameter"].values))
+        levels = [_levels(data[axis].values) for axis in self.axes]
+        self.values = {axis: values for axis, (_, values) in zip(self.axes, levels, strict=True)}
+        self.shape = tuple(len(values) for _, values in levels)
+        self._codes = [code for code, _ in levels]
+        # Axes that were drawn and not laid out: their cells are no lines, and are told apart along one axis at a time.
+        self.drawn = tuple(axis for axis in self.axes if len(np.unique(data[axis].values)) > len(self.values[axis]))
+
+    def over(
+        self, numbers: FloatArray, statistic: Statistic = "median", pooled: Sequence[str] = (), cells: Any = True
+    ) -> FloatArray:
+        """A statistic of a number of every cell, over seeds, as an array over the axes; NaN where no cell has it.
+
+        Parameters
+        ----------
+        numbers : (C,) array
+            One for each cell.
+        statistic : {"median", "low", "high", "mean", "count"}
+            What is taken over seeds.
+        pooled : sequence of str
+            Axes that count as seeds; the array has one value for them.
+        cells : (C,) array of bool, optional
+            Cells to count.
+        """
+        shape = tuple(1 if axis in pooled else n for axis, n in zip(self.axes, self.shape, strict=True))
+        numbers = np.asarray(numbers, dtype=np.float64)
+        good = self.ok & ~np.isnan(numbers) & cells
+        codes = [c[good] * (axis not in pooled) for axis, c in zip(self.axes, self._codes, strict=True)]
+        where = np.ravel_multi_index(codes, shape) if codes else np.zeros(int(good.sum()), dtype=np.int64)
+        grid = np.full(int(np.prod(shape, dtype=np.int64)), np.nan)
+        values = numbers[good]
+        order = np.lexsort((values, where))
+        places, first, n = np.unique(where[order], return_index=True, return_counts=True)
+        if len(places):
+            grid[places] = _statistic(values[order], first, n, statistic)
+        return grid.reshape(shape)
+
+    def at(self, index: int) -> dict[str, Any]:
+        """The values of the axes at a place, by its number in the flattened array."""
+        codes = np.unravel_index(index, self.shape) if self.axes else ()
+        return {axis: self.values[axis][int(code)] for axis, code in zip(self.axes, codes, strict=True)}
+
+    def along(self, numbers: FloatArray, axis: str) -> Curve | None:
+        """A number of every cell along an axis; None where fewer than two values of the axis have it.
+
+        Only what was found at all values of the axis is compared, so that missing cells do not pass for a change.
+        """
+        pooled = tuple(other for other in self.drawn if other != axis)
+        lines = np.moveaxis(self.over(numbers, pooled=pooled), self.axes.index(axis), 0)
+        lines = lines.reshape(len(self.values[axis]), -1)
+        has = np.isfinite(lines).any(axis=1)
+        lines = lines[has]
+        if len(lines) < 2:
+            return None
+        whole = np.isfinite(lines).all(axis=0)
+        lines = lines[:, whole] if whole.any() else lines[:, np.isfinite(lines).sum(axis=0) >= 2]
+        if lines.shape[1] == 0 or not np.isfinite(lines).any(axis=1).all():
+            return None
+        return Curve(
+            axis,
+            tuple(value for value, there in zip(self.values[axis], np.atleast_1d(has), strict=True) if there),
+            np.nanmedian(lines, axis=1),
+            np.nanmin(lines, axis=1),
+            np.nanmax(lines, axis=1),
+            float(np.median(np.nanmax(lines, axis=0) - np.nanmin(lines, axis=0))),
+            self._chance(numbers, pooled) if self.drawn else self.seeds(numbers),
+        )
+
+    def seeds(self, numbers: FloatArray) -> float:
+        """Range over seeds at a place, the median over all places."""
+        spread = self.over(numbers, "high") - self.over(numbers, "low")
+        return float(np.nanmedian(spread)) if np.isfinite(spread).any() else 0.0
+
+    def _chance(self, numbers: FloatArray, pooled: Sequence[str]) -> float:
+        """Two standard errors of a part's median: what the other drawn axes make of it."""
+
+        n = self.over(numbers, "count", pooled)
+        variance = self.over(numbers**2, "mean", pooled) - self.over(numbers, "mean", pooled) ** 2
+        # A median has 1.25 times the standard error of a mean.
+        error = 2.5 * np.sqrt(np.maximum(variance, 0.0) / n)
+        return float(np.nanmedian(error)) if np.isfinite(error).any() else 0.0
+
+    def curves(self, numbers: FloatArray) -> tuple[Curve, ...]:
+        """`along` every axis that has it."""
+        found = (self.along(numbers, axis) for axis in self.axes)
+        return tuple(curve for curve in found if curve is not None)
+
+    def lines(
+        self, numbers: FloatArray, along: str, by: str | None = None, at: Mapping[str, Any] | None = None
+    ) -> Lines:
+        """A number of every cell along an axis, a line for every value of another one, all others held.
+
+        Parameters
+        ----------
+        numbers : (C,) array
+            One for each cell.
+        along, by : str
+            Axes; without `by` there is one line.
+        at : dict, optional
+            Values of other axes; those that are not given are held at the middle one of their values, and what was
+            drawn from a Latin hypercube is not held at all.
+
+        Raises
+        ------
+        ValueError
+            For a name that is no axis, or a value that an axis does not have.
+        """
+        held = self.held(along, by, at)
+        cells = np.ones(len(self.ok), dtype=np.bool_)
+        for axis, value in held.items():
+            cells &= self._codes[self.axes.index(axis)] == self.values[axis].index(value)
+        pooled = [axis for axis in self.axes if axis not in (along, by)]
+        order = [self.axes.index(axis) for axis in (by, along) if axis is not None]
+        rest = [i for i in range(len(self.axes)) if i not in order]
+
+        def laid_out(statistic: Statistic) -> FloatArray:
+            grid = self.over(numbers, statistic, pooled, cells)
+            return grid.transpose(*rest, *order).reshape(-1, len(self.values[along]))
+
+        # Values at which no cell has numbers are left out.
+        seen = self.over(np.zeros(len(self.ok)), "median", pooled, cells).transpose(*rest, *order)
+        there = np.isfinite(seen.reshape(-1, len(self.values[along])))
+        rows, columns = np.flatnonzero(there.any(axis=1)), np.flatnonzero(there.any(axis=0))
+        median, low, high = (laid_out(statistic)[np.ix_(rows, columns)] for statistic in ("median", "low", "high"))
+        return Lines(
+            along,
+            tuple(self.values[along][i] for i in columns),
+            by,
+            () if by is None else tuple(self.values[by][i] for i in rows),
+            held,
+            median,
+            low,
+            high,
+        )
+
+    def held(self, along: str, by: str | None = None, at: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """Where the other axes are held."""
+        at = dict(at or {})
+        for axis in filter(None, (along, by, *at)):
+            if axis not in self.axes:
+                raise ValueError(f"{axis!r} was not swept: use one of {', '.join(self.axes) or 'none'}.")
+        for axis, value in at.items():
+            if value not in self.values[axis]:
+                raise ValueError(f"{axis} has no value {value!r}: use one of {', '.join(map(str, self.values[axis]))}.")
+        middle = {
+            axis: self.values[axis][len(self.values[axis]) // 2]
+            for axis in self.axes
+            if axis not in self.drawn and axis not in (along, by)
+        }
+        return middle | {axis: value for axis, value in at.items() if axis not in (along, by)}
+
+    @cached_property
+    def frame_error(self) -> FloatArray:
+        """Frame-dependent error of the calibration across the boresight, 1 sigma per axis, of every cell (arcsec)."""
+        cross = self.data["frame_error_arcsec"].sel(axis=["pitch", "yaw"]).values
+        return np.asarray(np.sqrt(np.mean(cross**2, axis=-1)), dtype=np.float64)
+
+    @cached_property
+    def pairs(self) -> tuple[Pair, ...]:
+        """All pairs of parameters, those that are coupled most somewhere first."""
+        found = []
+        for i, first in enumerate(self.names):
+            for second in self.names[i + 1 :]:
+                pair = self._pair(first, second)
+                if pair is not None:
+                    found.append(pair)
+        return tuple(sorted(found, key=lambda pair: -abs(pair.strongest)))
+
+    @property
+    def coupled(self) -> tuple[Pair, ...]:
+        """The pairs whose correlation exceeds `COUPLED` somewhere."""
+        return tuple(pair for pair in self.pairs if abs(pair.strongest) >= COUPLED)
+
+    def _pair(self, first: str, second: str) -> Pair | None:
+        r = np.asarray(self.data["correlation"].sel(parameter=first, parameter_2=second).values, dtype=np.float64)
+        grid = self.over(r).ravel()
+        if not np.isfinite(grid).any():
+            return None
+        size = np.abs(grid)
+        most, least = int(np.nanargmax(size)), int(np.nanargmin(size))
+        cost = -0.5 * np.log1p(-np.minimum(r**2, 1.0 - 1e-15))
+        sizes, costs = self.curves(np.abs(r)), self.curves(cost)
+        return Pair(
+            (first, second),
+            float(grid[most]),
+            float(grid[least]),
+            self.at(most),
+            self.at(least),
+            self.seeds(r),
+            float(np.nan_to_num(size).mean()),
+            sizes,
+            costs,
+        )
+
+    @cached_property
+    def directions(self) -> tuple[tuple[Direction, ...], IntArray]:
+        """The kinds of weakest direction, the most common first, and the kind of every place (-1 where unknown)."""
+        weights = np.nan_to_num(self.data["weak_direction"].values)
+        # Nothing takes part in a direction that is hardly worse than the parameters themselves.
+        part = (np.abs(weights) >= _PART) & (self.data["weak_variance"].values >= _ALONE)[:, None]
+        part &= part.sum(axis=1)[:, None] >= 2
+        first = weights[np.arange(len(weights)), np.argmax(part, axis=1)]
+        signs = np.where(part, np.sign(weights * first[:, None]), 0.0)[self.ok]
+        known, code = np.unique(signs, axis=0, return_inverse=True)
+        codes = np.full(len(self.ok), np.nan)
+        codes[self.ok] = code.ravel()
+        # At each place the kind of most seeds.
+        votes = np.stack([self.over(np.where(codes == i, 1.0, 0.0), "mean") for i in range(max(1, len(known)))])
+        seen = np.isfinite(votes[0])
+        places = np.where(seen, np.argmax(np.where(seen, votes, 0.0), axis=0), np.nan)
+        counts = Counter(places[np.isfinite(places)].astype(int).tolist())
+        order = [code for code, _ in counts.most_common()]
+        rank = {code: position for position, code in enumerate(order)}
+        whole = max(1, sum(counts.values()))
+        found = tuple(
+            Direction(self._members(known[code] > 0.0), self._members(known[code] < 0.0), counts[code] / whole)
+            for code in order
+        )
+        where = np.array([rank[int(code)] if np.isfinite(code) else -1 for code in places.ravel()], dtype=np.int64)
+        return found, where.reshape(self.shape)
+
+    def _members(self, flags: BoolArray) -> tuple[str, ...]:
+        return tuple(name for name, there in zip(self.names, flags.tolist(), strict=True) if there)
+
+    @cached_property
+    def turn(self) -> Turn | None:
+        """Where the weakest direction becomes another one, along the axis that tells it best; None where it stays."""
+        kinds, _ = self.directions
+        if len(kinds) < 2:
+            return None
+        turns = [turn for turn in map(self._turn, range(len(self.axes))) if len(turn.runs) > 1]
+        return max(turns, key=lambda turn: turn.told, default=None)
+
+    def _turn(self, position: int) -> Turn:
+        axis, (_, where) = self.axes[position], self.directions
+        lines = np.moveaxis(where, position, 0).reshape(len(self.values[axis]), -1)
+        runs: list[tuple[list[Any], int]] = []
+        right = 0
+        for value, line in zip(self.values[axis], lines, strict=True):
+            if not (line >= 0).any():
+                continue
+            kind, times = Counter(line[line >= 0].tolist()).most_common(1)[0]
+            right += times
+            if runs and runs[-1][1] == kind:
+                runs[-1][0].append(value)
+            else:
+                runs.append(([value], kind))
+        told = right / max(1, int((where >= 0).sum()))
+        return Turn(axis, tuple((tuple(values), kind) for values, kind in runs), told)
+
+    @cached_property
+    def failures(self) -> tuple[tuple[str, int], ...]:
+        """Why cells failed, and how many, the most frequent first."""
+        return tuple(Counter(map(str, self.data["status"].values[~self.ok])).most_common())
+
+
+def _statistic(values: FloatArray, first: IntArray, n: IntArray, statistic: Statistic) -> FloatArray:
+    """A statistic of groups of sorted values that begin at `first`."""
+    if statistic == "median":
+        return np.asarray(0.5 * (values[first + (n - 1) // 2] + values[first + n // 2]))
+    if statistic == "mean":
+        return np.asarray(np.add.reduceat(values, first) / n)
+    if statistic == "count":
+        return n.astype(np.float64)
+    return np.asarray(values[first] if statistic == "low" else values[first + n - 1])
+
+
+def _levels(values: Any) -> tuple[IntArray, tuple[Any, ...]]:
+    """Number of the level of every cell, and the levels: values of the axis, or parts of equal number of many."""
+    array = np.asarray(values)
+    if array.dtype.kind in "OUS":
+        # Names keep the order in which they were given.
+        known = {name: code for code, name in enumerate(dict.fromkeys(map(str, array)))}
+        return np.array([known[str(name)] for name in array], dtype=np.int64), tuple(known)
+    numbers = array.astype(np.float64)
+    distinct, codes = np.unique(numbers, return_inverse=True)
+    if len(distinct) <= _MOST_VALUES:
+        return codes.astype(np.int64), tuple(distinct.tolist())
+    cuts = np.quantile(numbers, np.linspace(0.0, 1.0, _PARTS + 1)[1:-1])
+    parts = np.searchsorted(cuts, numbers, side="right").astype(np.int64)
+    return parts, tuple(float(np.median(numbers[parts == part])) for part in range(_PARTS))

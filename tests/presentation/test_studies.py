@@ -1,0 +1,111 @@
+"""Coupling studies: sentences against studies whose answer is known, figures that draw, a page that holds together."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from starcal_uq.core.display import view_of
+from starcal_uq.presentation.figures.style import figure_of, png_bytes
+from starcal_uq.presentation.pages.studies import render_study
+from starcal_uq.presentation.pages.write import write_page
+from starcal_uq.presentation.words.studies import study_advice, study_answer, study_limits, study_table, study_text
+from starcal_uq.studies.result import Study
+from tests.helpers.studies import NAMES, made_study
+
+FIELDS = (5.0, 10.0, 20.0)
+FRAMES = (10, 100, 1000)
+COUPLING = dict(zip(FIELDS, (-0.97, -0.8, -0.3), strict=True))
+
+
+@pytest.fixture(scope="module")
+def decoupled() -> Study:
+    """The field decouples f and k1, frames do not; the error falls as one over the root of frames."""
+    return made_study(
+        {"fov_deg": FIELDS, "frames": FRAMES},
+        lambda cell: {("f", "k1"): COUPLING[cell["fov_deg"]]},
+        size=lambda cell: 10.0 / np.sqrt(cell["frames"]),
+        failing=lambda cell: "too few stars." if cell["fov_deg"] == 5.0 and cell["frames"] == 10 else "ok",
+    )
+
+
+def test_the_axis_that_decouples_is_named_with_its_numbers(decoupled: Study) -> None:
+    text = study_text(decoupled)
+    assert text.startswith("f and k1 are coupled most (correlation −0.97 to −0.30")
+    assert "The field of view changes how f and k1 are coupled: from 0.97 with a field of 5° to 0.30" in text
+    answer = " ".join(study_answer(decoupled))
+    assert "The number of frames does little to the couplings" in answer
+    assert "The weakest direction turns with the field of view: f against k1 from a field of 5° to 10" in answer
+    assert "as the power −0.50" in answer and "The target of 0.5 arcsec is met in 3 of 8 places: " in answer
+    assert "from 1000 frames on" in answer
+    advice = " ".join(study_advice(decoupled))
+    assert "To tell f–k1 apart, go to a field of 20°." in advice
+    assert "The fewest frames that keep 0.5 arcsec: " in advice and "1000 frames" in advice
+    limits = " ".join(study_limits(decoupled))
+    assert "3 of 27 cells have no numbers (3: too few stars)" in limits and "Coverage" in limits
+
+
+def test_nothing_is_claimed_where_nothing_couples() -> None:
+    """Small correlations that chance gives, and an axis without any effect."""
+    rng = np.random.default_rng(3)
+    study = made_study(
+        {"fov_deg": FIELDS, "frames": FRAMES},
+        lambda cell: {(a, b): 0.1 * rng.normal() for i, a in enumerate(NAMES) for b in NAMES[i + 1 :]},
+        bias_arcsec=lambda cell: 9.0,
+    )
+    assert study_text(study).startswith("No pair of parameters is coupled: the largest correlation anywhere is ")
+    told = " ".join([*study_answer(study), *study_advice(study)])
+    assert "decouple" not in told and "apart" not in told and "coupled most" not in told
+    assert "No combination of parameters is much worse determined" in told
+    assert "whatever field of view and number of frames may be" in told and "The model none would do nowhere" in told
+
+
+def test_a_coupling_that_only_seeds_change_has_no_remedy() -> None:
+    """Other seeds move the correlation as much as the axis seems to: no axis may be named."""
+    study = made_study({"fov_deg": FIELDS, "frames": FRAMES}, lambda cell: {("f", "k1"): -0.9}, jitter=0.03)
+    assert "Nothing that was varied (field of view and number of frames) decouples" in study_text(study)
+    assert "Do not expect f–k1 to come apart" in " ".join(study_advice(study))
+
+
+def test_coverage_is_judged_with_its_bounds() -> None:
+    honest, wrong = (
+        made_study({"fov_deg": FIELDS}, lambda cell: {("f", "k1"): -0.9}, seeds=60, covered=rate)
+        for rate in (0.95, 0.7)
+    )
+    assert "chance explains what differs from 95 %" in " ".join(study_answer(honest))
+    assert "do not use these intervals" in " ".join(study_answer(wrong))
+
+
+def test_every_figure_draws(decoupled: Study) -> None:
+    simulated = made_study({"pointing": ("random", "stare")}, lambda cell: {("f", "k1"): -0.9}, covered=0.95)
+    for study in (decoupled, simulated):
+        names = set(view_of(Study).figures) - ({"coverage"} if study is decoupled else {"map", "maps"})
+        for name in sorted(names):
+            drawn = getattr(study.plot, name)()
+            figure = drawn if isinstance(drawn, Figure) else figure_of(drawn)
+            assert png_bytes(figure, dpi=30).startswith(b"\x89PNG")
+    lines = decoupled.plot.correlation([("f", "k1")]).axes[0].get_lines()
+    np.testing.assert_allclose(lines[1].get_ydata(), [0.97, 0.8, 0.3], atol=0.003)
+    with pytest.raises(ValueError, match='mode = "simulate"'):
+        decoupled.plot.coverage()
+    with pytest.raises(ValueError, match="'stars' was not swept: use one of fov_deg, frames"):
+        decoupled.plot.needed(along="stars")
+
+
+def test_page_holds_answer_advice_and_provenance(decoupled: Study, tmp_path: Path) -> None:
+    page = write_page(decoupled, tmp_path / "study").read_text("utf-8")
+    assert len(page) < 2_000_000 and "A study &lt;made&gt; by hand" in page and "<script" not in page
+    for words in (study_text(decoupled), "go to a field of 20°", "too few stars", "study: seeds"):
+        assert words in page
+    assert len(list((tmp_path / "study" / "figures").glob("*.png"))) == page.count("data:image/png") >= 6
+    table = study_table(decoupled)
+    assert table is not None and len(table.rows) == 6 and "1000" in [row[1] for row in table.rows]
+
+
+def test_study_without_any_number_says_so() -> None:
+    study = made_study({"fov_deg": FIELDS}, lambda cell: {}, failing=lambda cell: "too few stars.")
+    assert study_text(study) == "No cell of the study has numbers."
+    assert "too few stars" in render_study(study, {}) and study._repr_html_()
