@@ -35,6 +35,7 @@ from starcal_uq.cli.options import (
     NewRun,
     ObsFile,
     RunPath,
+    SchedulerAddress,
     Seed,
     parse_choice,
     parse_columns,
@@ -83,7 +84,12 @@ def load_table(
 
 def simulate_command(
     camera: CameraFile,
-    out: Annotated[Path, typer.Option("-o", "--out", metavar="OBS", help="Table to write (.csv, .ecsv, .parquet).")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            "-o", "--out", metavar="OBS", help="Table to write (.csv, .ecsv, .parquet), or folder of partitions."
+        ),
+    ],
     frames: Annotated[int, typer.Option(min=1, help="Number of frames, at random attitudes.")] = 1000,
     sigma: Annotated[float, typer.Option(min=0.0, help="Centroid noise, px per axis.")] = 0.05,
     max_mag: Annotated[float, typer.Option(help="Magnitude limit, Gaia G.")] = 6.0,
@@ -96,14 +102,46 @@ def simulate_command(
         Path | None,
         typer.Option(help="Detector of the images (TOML with a [sensor] table); a small tracker's by default."),
     ] = None,
+    partition_frames: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            metavar="N",
+            help="Write OBS as a folder of Parquet files of N frames each (10000 is a good size), which may exceed "
+            "memory; an interrupted command goes on.",
+        ),
+    ] = None,
+    scheduler: SchedulerAddress = None,
     seed: Seed = 0,
     force: Force = False,
 ) -> None:
     """Simulate identified stars with the embedded catalogue; directions are written as the sensor saw them."""
-    ensure_new(out, force)
+    if partition_frames is None:
+        ensure_new(out, force)
+        if scheduler is not None:
+            raise typer.BadParameter("--scheduler makes a folder of partitions: give --partition-frames as well.")
+    elif images is not None:
+        raise typer.BadParameter("--images belongs to one table: leave out --partition-frames.")
     if sensor is not None and images is None:
         raise typer.BadParameter("--sensor describes the detector of images: give --images DIR as well.")
     stars, truth = sc.load_catalogue(max_mag=max_mag, epoch=epoch), sc.Camera.load(camera)
+    if partition_frames is not None:
+        with progress_bar("files") as progress:
+            made = sc.simulation.simulate_partitions(
+                stars,
+                truth,
+                out,
+                n_frames=frames,
+                partition_frames=partition_frames,
+                min_stars=min_stars,
+                sigma_px=sigma,
+                seed=seed,
+                force=force,
+                scheduler=scheduler,
+                progress=progress,
+            )
+        print(f"{made.n_stars} stars in {frames} frames, {len(made.parts)} files: {out}")
+        return
     obs = sc.simulate(stars, truth, n_frames=frames, min_stars=min_stars, sigma_px=sigma, seed=seed)
     if images is not None:
         with progress_bar("images") as progress:

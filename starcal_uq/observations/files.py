@@ -19,7 +19,7 @@ import numpy as np
 
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.files import as_plain, atomic_path, atomic_write_text, ensure_new, table_ending
-from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
+from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, StrArray
 from starcal_uq.observations.checks import (
     Problem,
     check_columns,
@@ -443,6 +443,42 @@ def _csv_text(columns: Mapping[str, Any]) -> str:
     writer.writerow(columns)
     writer.writerows(zip(*texts, strict=True))
     return text.getvalue()
+
+
+def write_partition(
+    columns: Mapping[str, Any], named: Mapping[str, tuple[IntArray, StrArray]], meta: AnyDict, path: Path
+) -> None:
+    """Write one Parquet file of a folder of partitions, atomically and quickly.
+
+    Parameters
+    ----------
+    columns : mapping
+        Columns (N,) of numbers.
+    named : mapping
+        Columns of texts: for each row its place (N,) in a list of different texts.
+    meta : dict
+        Metadata.
+    path : Path
+        File; overwritten.
+    """
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    arrays = {name: pa.array(values) for name, values in columns.items()}
+    for name, (place, texts) in named.items():
+        used, place = np.unique(place, return_inverse=True)
+        arrays[name] = pa.DictionaryArray.from_arrays(pa.array(place.astype(np.int32)), pa.array(texts[used].tolist()))
+    table = pa.table({name: arrays[name] for name in COLUMNS if name in arrays})
+    table = table.replace_schema_metadata({_META_KEY: json.dumps(meta, default=as_plain).encode()})
+    # Pixels repeat nowhere: looking for repeats in them, or compressing them, would take longer than all the rest.
+    pixels = {"x_px", "y_px"}
+    with atomic_path(path) as temporary:
+        parquet.write_table(
+            table,
+            temporary,
+            compression={name: "none" if name in pixels else "zstd" for name in table.column_names},
+            use_dictionary=[name for name in table.column_names if name not in pixels],
+        )
 
 
 def _write_parquet(columns: Mapping[str, Any], path: Path, meta: AnyDict) -> None:

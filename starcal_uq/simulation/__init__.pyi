@@ -2,6 +2,7 @@ from .campaign import render_frames as render_frames
 from .contamination import contaminate as contaminate
 from .mission import mission_frames as mission_frames
 from .mission import profile_frames as profile_frames
+from .partitions import simulate_partitions as simulate_partitions
 from .rendering import render as render
 from .sensor import Sensor as Sensor
 from .truth import FrameTruth as FrameTruth

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from itertools import pairwise
+from functools import cached_property
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,6 +17,8 @@ from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.observations.table import Observations
 
 if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
     from starcal_uq.sky.catalogue import StarCatalogue
 
 # Attitudes drawn at once; also how many are tried before a camera is declared too narrow for its catalogue.
@@ -25,6 +28,8 @@ _MAX_TRIES_PER_FRAME = 2000
 _MAX_TRIES = 500_000
 # Stars nearer to the edge than this many sigma are left out, so that noise does not decide which stars are seen.
 EDGE_SIGMAS = 6.0
+# Of cones wider than 60 degrees from the axis, a tree finds the stars no faster than a look at all of them.
+_TREE_COSINE = 0.5
 
 
 @dataclass(frozen=True)
@@ -121,26 +126,45 @@ def simulate(
         )
     rng = np.random.default_rng(seed)
     sky = Sky(stars, camera, EDGE_SIGMAS * sigma_px)
-    _, frames = choose_attitudes(sky, rng, n_frames=n_frames, min_stars=min_stars, attitudes=attitudes)
-    index = np.concatenate([seen for seen, _ in frames])
-    xy = np.concatenate([xy for _, xy in frames])
-    xy = xy + sigma_px * rng.standard_normal(xy.shape)
+    frame, index, xy = observed(sky, rng, sigma_px, n_frames=n_frames, min_stars=min_stars, attitudes=attitudes)
     return Observations(
-        frame=np.repeat(np.arange(len(frames)), [len(seen) for seen, _ in frames]),
+        frame=frame,
         x_px=xy[:, 0],
         y_px=xy[:, 1],
         ra_deg=stars.ra_deg[index],
         dec_deg=stars.dec_deg[index],
         star_id=stars.star_id[index],
         mag=stars.mag[index],
-        meta={
-            "source": "simulated",
-            "directions": "apparent",
-            "seed": seed,
-            "sigma_px": sigma_px,
-            "truth": camera.to_dict(),
-        },
+        meta=simulated_meta(camera, sigma_px, seed),
     )
+
+
+def simulated_meta(camera: Camera, sigma_px: float, seed: int) -> AnyDict:
+    """What a simulated table says of itself."""
+    return {
+        "source": "simulated",
+        "directions": "apparent",
+        "seed": seed,
+        "sigma_px": sigma_px,
+        "truth": camera.to_dict(),
+    }
+
+
+def observed(
+    sky: Sky,
+    rng: np.random.Generator,
+    sigma_px: float,
+    *,
+    n_frames: int,
+    min_stars: int,
+    attitudes: FloatArray | None = None,
+) -> tuple[IntArray, IntArray, FloatArray]:
+    """Frame (N,), catalogue index (N,) and noisy pixels (N, 2) of the stars in frames chosen by `choose_attitudes`."""
+    _, frames = choose_attitudes(sky, rng, n_frames=n_frames, min_stars=min_stars, attitudes=attitudes)
+    index = np.concatenate([seen for seen, _ in frames])
+    xy = np.concatenate([xy for _, xy in frames])
+    xy = xy + sigma_px * rng.standard_normal(xy.shape)
+    return np.repeat(np.arange(len(frames)), [len(seen) for seen, _ in frames]), index, xy
 
 
 def choose_attitudes(
@@ -210,10 +234,26 @@ class Sky:
 
     def views(self, rotations: FloatArray) -> list[tuple[IntArray, FloatArray]]:
         """Catalogue indices (m,) and noise-free pixels (m, 2) of the stars on the detector, for each rotation."""
-        frame, star = np.nonzero(rotations[:, 2] @ self.directions.T > self.min_cosine)
+        frame, star = self._near(rotations[:, 2])
         b = np.einsum("nij,nj->ni", rotations[frame], self.directions[star])
         xy = project(self.camera, b)
         inside = np.all((xy > self.low) & (xy < self.high), axis=1)
         edges = np.searchsorted(frame[inside], np.arange(len(rotations) + 1))
         star, xy = star[inside], xy[inside]
         return [(star[i:j], xy[i:j]) for i, j in pairwise(edges)]
+
+    def _near(self, axes: FloatArray) -> tuple[IntArray, IntArray]:
+        """Frames and stars within the cone around optical axes (n, 3), both ascending."""
+        if self.min_cosine < _TREE_COSINE:
+            frame, star = np.nonzero(axes @ self.directions.T > self.min_cosine)
+            return frame, star
+        found = self._tree.query_ball_point(axes, np.sqrt(2.0 - 2.0 * self.min_cosine), return_sorted=True)
+        sizes = np.fromiter(map(len, found), dtype=np.int64, count=len(found))
+        star = np.fromiter(chain.from_iterable(found), dtype=np.int64, count=int(sizes.sum()))
+        return np.repeat(np.arange(len(axes)), sizes), star
+
+    @cached_property
+    def _tree(self) -> cKDTree:
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.directions)

@@ -1,0 +1,163 @@
+"""Simulated observations of any size: a folder of partitions, each of them made by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.core.cluster import Scheduler, cluster
+from starcal_uq.core.errors import ObservationError, RunFolderError
+from starcal_uq.core.files import PathLike
+from starcal_uq.core.types import AnyDict
+from starcal_uq.observations.files import parquet_summary, write_partition
+from starcal_uq.observations.partitions import PartitionedObservations, open_partitions
+from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky, observed, simulated_meta
+
+if TYPE_CHECKING:
+    from starcal_uq.sky.catalogue import StarCatalogue
+
+# Of 17 stars each: a file of 4 MB, and half a gigabyte while it is linearised.
+PARTITION_FRAMES = 10_000
+_FRAMES_WORTH_PROCESSES = 100_000
+_NAME = "part-{:06d}.parquet"
+
+
+def simulate_partitions(
+    stars: StarCatalogue,
+    camera: Camera,
+    folder: PathLike,
+    *,
+    n_frames: int,
+    partition_frames: int = PARTITION_FRAMES,
+    min_stars: int = 10,
+    sigma_px: float = 0.05,
+    seed: int = 0,
+    force: bool = False,
+    scheduler: Scheduler = None,
+    workers: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> PartitionedObservations:
+    """Simulate identified stars, as `simulate` does, into a folder of Parquet files.
+
+    A file depends on the seed and its number alone; files that are there already and were made by the same call stay,
+    so that an interrupted call goes on.
+
+    Parameters
+    ----------
+    stars, camera, min_stars, sigma_px
+        As for `simulate`.
+    folder : path
+        Folder, made if it does not exist.
+    n_frames : int
+        Number of frames in all.
+    partition_frames : int
+        Frames of one file.
+    seed : int
+        Seed; each file is drawn from it and its number.
+    force : bool
+        Whether to replace what the folder holds.
+    scheduler : str or distributed.Client, optional
+        Dask scheduler whose workers make the files; processes of this machine otherwise.
+    workers : int, optional
+        Number of these processes: as many as processors by default; 0 stays in this one.
+    progress : callable, optional
+        Called with (files done, files).
+
+    Returns
+    -------
+    PartitionedObservations
+        The folder.
+
+    Raises
+    ------
+    RunFolderError
+        If the folder holds other files.
+    CatalogueError, DistortionError
+        As for `simulate`.
+    """
+    if n_frames < 1 or partition_frames < 1 or min_stars < 3 or not sigma_px >= 0.0:
+        raise ValueError(
+            f"n_frames={n_frames}, partition_frames={partition_frames}, min_stars={min_stars}, sigma_px={sigma_px}: "
+            "give at least one frame, 3 stars, and no negative noise."
+        )
+    folder = Path(folder).resolve()
+    known = {"min_stars": min_stars, "stars": stars.source, "n_stars": len(stars), "epoch": stars.epoch}
+    meta = simulated_meta(camera, sigma_px, seed) | known
+    make = _Maker(stars, camera, folder, n_frames, partition_frames, min_stars, sigma_px, seed, meta)
+    numbers = range(-(-n_frames // partition_frames))
+    _check_folder(folder, [make.path(number) for number in numbers], force)
+    missing = [number for number in numbers if force or not make.is_made(number)]
+    # Starting processes takes as long as making a few files.
+    few = workers is None and scheduler is None and len(missing) * partition_frames < _FRAMES_WORTH_PROCESSES
+    with cluster(scheduler, workers=0 if few else workers, caller="simulate_partitions") as processes:
+        processes.map(make, missing, progress=progress)
+    return open_partitions(folder)
+
+
+@dataclass(frozen=True)
+class _Maker:
+    """Makes the file of a number."""
+
+    stars: StarCatalogue
+    camera: Camera
+    folder: Path
+    n_frames: int
+    partition_frames: int
+    min_stars: int
+    sigma_px: float
+    seed: int
+    meta: AnyDict
+
+    def path(self, number: int) -> Path:
+        return self.folder / _NAME.format(number)
+
+    def _meta(self, number: int) -> AnyDict:
+        first = number * self.partition_frames
+        return {**self.meta, "first_frame": first, "frames": min(self.partition_frames, self.n_frames - first)}
+
+    def is_made(self, number: int) -> bool:
+        path = self.path(number)
+        if not path.exists():
+            return False
+        try:
+            found = parquet_summary(path, "frame").meta
+        except ObservationError:
+            found = {}
+        if found != self._meta(number):
+            raise RunFolderError(
+                f"{path}: is there already and was made with other settings; give --force, or another folder."
+            )
+        return True
+
+    def __call__(self, number: int) -> None:
+        stars, meta = self.stars, self._meta(number)
+        rng = np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(number,)))
+        sky = Sky(stars, self.camera, EDGE_SIGMAS * self.sigma_px)
+        frame, star, xy = observed(sky, rng, self.sigma_px, n_frames=meta["frames"], min_stars=self.min_stars)
+        columns: dict[str, Any] = {
+            "frame": frame + meta["first_frame"],
+            "x_px": xy[:, 0],
+            "y_px": xy[:, 1],
+            "ra_deg": stars.ra_deg[star],
+            "dec_deg": stars.dec_deg[star],
+            "mag": stars.mag[star],
+        }
+        write_partition(columns, {"star_id": (star, stars.star_id)}, meta, self.path(number))
+
+
+def _check_folder(folder: Path, paths: list[Path], force: bool) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        others = sorted({path for path in folder.iterdir() if path.suffix == ".parquet"} - set(paths))
+    except OSError as error:
+        raise RunFolderError(f"{folder}: the folder cannot be made ({error.strerror}); choose another.") from error
+    if others:
+        raise RunFolderError(
+            f"{others[0]}: the folder holds {len(others)} other files that would mix with the new ones; choose an "
+            "empty folder or remove them."
+        )

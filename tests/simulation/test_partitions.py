@@ -1,0 +1,68 @@
+"""Simulated partitions: each by itself, resumed, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.attitude.rotations import random_rotations
+from starcal_uq.core.errors import RunFolderError
+from starcal_uq.simulation.frames import Sky
+from starcal_uq.simulation.partitions import simulate_partitions
+
+
+@pytest.fixture(scope="module")
+def sky() -> tuple[sc.sky.StarCatalogue, sc.Camera]:
+    return sc.load_catalogue(max_mag=6.0), sc.paper.paper_camera()
+
+
+def test_files_depend_on_seed_and_number_alone(sky, tmp_path: Path) -> None:
+    stars, camera = sky
+    options = {"partition_frames": 20, "seed": 4, "workers": 0}
+    five = simulate_partitions(stars, camera, tmp_path / "five", n_frames=90, **options)
+    two = simulate_partitions(stars, camera, tmp_path / "two", n_frames=40, **options)
+    assert [obs.n_frames for obs in five] == [20, 20, 20, 20, 10] and five.n_frames == 90
+    a, b = list(five), list(two)
+    assert [obs.data_hash for obs in a[:2]] == [obs.data_hash for obs in b]
+    whole = sc.load_observations(five.parts[0].path)
+    again = sc.simulate(stars, camera, n_frames=20, seed=4)
+    assert set(whole.columns) == set(again.columns) and whole.meta["directions"] == "apparent"
+    # Not the table of the same seed, but one like it: another noise on the same pixels of the same stars.
+    assert not np.array_equal(whole.x_px[:10], again.x_px[:10])
+    clean = sc.simulate(stars, camera, n_frames=20, seed=4, sigma_px=0.0)
+    assert np.std(again.x_px - clean.x_px) == pytest.approx(0.05, rel=0.15)
+
+
+def test_interrupted_simulation_goes_on(sky, tmp_path: Path) -> None:
+    stars, camera = sky
+    options = {"n_frames": 60, "partition_frames": 20, "workers": 0}
+
+    def stop(done: int, total: int) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate_partitions(stars, camera, tmp_path, progress=stop, **options)
+    kept = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    assert len(kept) == 2
+    made = simulate_partitions(stars, camera, tmp_path, **options)
+    assert made.n_frames == 60
+    assert {name: (tmp_path / name).stat().st_mtime_ns for name in kept} == kept
+    with pytest.raises(RunFolderError, match=r"part-000000.parquet: .* other settings"):
+        simulate_partitions(stars, camera, tmp_path, seed=1, **options)
+    with pytest.raises(RunFolderError, match="1 other files that would mix"):
+        simulate_partitions(stars, camera, tmp_path, n_frames=40, partition_frames=20, workers=0)
+
+
+def test_tree_finds_the_stars_that_a_look_at_all_finds(sky, monkeypatch: pytest.MonkeyPatch) -> None:
+    stars, camera = sky
+    rotations = random_rotations(200, np.random.default_rng(3))
+    fast = Sky(stars, camera, 0.3).views(rotations)
+    monkeypatch.setattr("starcal_uq.simulation.frames._TREE_COSINE", 2.0)
+    slow = Sky(stars, camera, 0.3).views(rotations)
+    for (a, xy_a), (b, xy_b) in zip(fast, slow, strict=True):
+        np.testing.assert_array_equal(a, b)
+        np.testing.assert_array_equal(xy_a, xy_b)
