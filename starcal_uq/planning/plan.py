@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
@@ -20,6 +21,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PlanningError
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.planning.forecast import N_CAMPAIGNS, N_FRAMES, SCOPES, Forecast, Forecaster, nea_arcsec
 from starcal_uq.planning.information import FrameSet, Noise, largest_noise, noise_of, random_frames
 from starcal_uq.planning.open_distortion import DistortionRange, distortion_range, open_range, with_distortion
@@ -182,6 +184,10 @@ def plan(
         distortion=spread,
         seed=seed,
         provenance=provenance(seed, settings, None),
+        frame_information=frames.information.mean(axis=0),
+        start_information=start,
+        rotation_per_theta=frames.common,
+        attitude_noise=frames.noise.mean(axis=0),
     )
 
 
@@ -337,6 +343,32 @@ class Need(Shown):
 
 
 @dataclass(frozen=True, eq=False)
+class Expected:
+    """A calibration that is planned, for `coupling`, or for `after` of another plan.
+
+    Attributes
+    ----------
+    camera : Camera
+        The sheet.
+    n_frames : int
+        Number of frames.
+    covariance, information : (p, p) array
+        Covariance of the parameters, and information on them, px units.
+    rotation_per_theta : (3, p) array
+        Common rotation that a parameter causes, rad.
+    attitude_noise : (3, 3) array
+        Covariance of one frame's attitude due to centroid noise, rad^2.
+    """
+
+    camera: Camera
+    n_frames: int
+    covariance: FloatArray
+    information: FloatArray
+    rotation_per_theta: FloatArray
+    attitude_noise: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
 class Plan(Shown):
     """What a calibration will give, before any data.
 
@@ -374,6 +406,14 @@ class Plan(Shown):
         Seed of the drawn geometries.
     provenance : dict
         Versions, settings and time.
+    frame_information : (p, p) array
+        Mean information of a frame, its attitude eliminated, px units.
+    start_information : (p, p) array or None
+        Information that is there already.
+    rotation_per_theta : (3, p) array
+        Common rotation that a parameter causes, rad.
+    attitude_noise : (3, 3) array
+        Covariance of one frame's attitude due to centroid noise, rad^2.
     """
 
     camera: Camera
@@ -392,6 +432,33 @@ class Plan(Shown):
     distortion: DistortionRange | None
     seed: int
     provenance: AnyDict
+    frame_information: FloatArray
+    start_information: FloatArray | None
+    rotation_per_theta: FloatArray
+    attitude_noise: FloatArray
+
+    def expected(self, n_frames: int) -> Expected:
+        """What n frames will give; their information is that of so many average frames."""
+        total = n_frames * self.frame_information
+        total = total if self.start_information is None else total + self.start_information
+        return Expected(
+            self.camera, n_frames, scaled_inverse(total), total, self.rotation_per_theta, self.attitude_noise
+        )
+
+    @cached_property
+    def _expected(self) -> Expected:
+        """After the frames that the target takes, or 1000."""
+        return self.expected(self.frames_needed or SWEEP_FRAMES)
+
+    @property
+    def information(self) -> FloatArray:
+        """Information (p, p) after the frames that the target takes, or 1000 where there is none."""
+        return self._expected.information
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance (p, p) after as many."""
+        return self._expected.covariance
 
     @property
     def frames_range(self) -> tuple[float, float] | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -15,13 +15,41 @@ from starcal_uq.maths.linear import correlation_of, unit_inverse
 if TYPE_CHECKING:
     import pandas as pd
 
-    from starcal_uq.estimation.calibration import Calibration
-    from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.camera.camera import Camera
 
 # A parameter takes part in a direction when its share of the direction's length exceeds this.
 _PART = 0.25
 # Directions whose variance lies within these bounds are those of uncoupled parameters.
 _ALONE = (0.7, 1.4)
+
+
+class HasCovariance(Protocol):
+    """What a coupling is taken from: a `Posterior`, a `Calibration`, or a `Plan` before there are data."""
+
+    @property
+    def camera(self) -> Camera:
+        """The camera."""
+        ...
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance (p, p) of the parameters, px units."""
+        ...
+
+    @property
+    def information(self) -> FloatArray:
+        """Fisher information (p, p) of the data."""
+        ...
+
+    @property
+    def rotation_per_theta(self) -> FloatArray:
+        """Common rotation (3, p) that a parameter causes, rad."""
+        ...
+
+    @property
+    def attitude_noise(self) -> FloatArray:
+        """Covariance (3, 3) of one frame's attitude due to centroid noise, rad^2."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -133,14 +161,15 @@ class Coupling(Shown):
         return table
 
 
-def coupling(result: Posterior | Calibration) -> Coupling:
-    """Analyse the coupling of the parameters of a posterior or of a calibration.
+def coupling(result: HasCovariance) -> Coupling:
+    """Analyse the coupling of the parameters of a posterior, of a calibration, or of a plan.
 
     Parameters
     ----------
-    result : Posterior or Calibration
+    result : Posterior, Calibration or Plan
         Supplies the covariance (of the draws, or of the estimate), the Fisher information of the data, the response of
-        the common attitude to the parameters, and, for a posterior, the prior.
+        the common attitude to the parameters, and, for a posterior, the prior. Of a plan it is what the frames that
+        its target takes will give (`Plan.expected` for another number).
 
     Returns
     -------

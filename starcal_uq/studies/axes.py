@@ -21,6 +21,10 @@ FLAT = "flat"
 _CANCELLED = 0.02
 
 
+# Stands for zero where that itself makes no sense.
+_TINY = 1e-6
+
+
 @dataclass(frozen=True)
 class Axis:
     """Something that a study can vary.
@@ -71,11 +75,11 @@ class Axis:
         noun = "a whole number" if self.kind == "whole" else "a number"
         if self.low == -math.inf:
             return f"write {noun}"
-        bounds = f"of at least {self.low:g}" if self.high == math.inf else f"from {self.low:g} to {self.high:g}"
+        above = "above 0" if self.low == _TINY else f"of at least {self.low:g}"
+        bounds = above if self.high == math.inf else f"{above} and at most {self.high:g}"
         return f"write {noun} {bounds}"
 
 
-_TINY = 1e-6
 _COEFFICIENTS = {c.name: c for name in model_names() for c in get_model(name).coefficients}
 AXES = {
     axis.name: axis

@@ -30,8 +30,10 @@ from starcal_uq.studies.geometry import (
     Geometry,
     GeometryKey,
     Heaven,
+    NoiseShape,
     Statements,
     geometry_key,
+    mission_key,
     noise_shape,
     offset_px,
     star_noise,
@@ -43,7 +45,8 @@ from starcal_uq.studies.geometry import (
 FRAME_FACTORS = 10.0 ** np.arange(-3.0, 3.01, 0.25)
 # Entries of a `priors` table, and the parameters that they are about.
 _PRIOR_OF = {"principal_point_px": slice(0, 2), "focal_fraction": slice(2, 3), "distortion_corner_px": slice(3, None)}
-_WORST_CONDITION = 1e13
+# Sets of frames that are kept: the last ones, and those of the mission for the patterns of a camera.
+_KEPT = 8
 Numbers = AnyDict
 
 
@@ -72,8 +75,7 @@ class FisherCells:
 
     def __init__(self, definition: StudyDefinition, heaven: Heaven) -> None:
         self.definition, self.heaven = definition, heaven
-        self._key: GeometryKey | None = None
-        self._geometry: Geometry | StudyError | None = None
+        self._geometries: dict[GeometryKey, Geometry | StudyError] = {}
         self._stated: tuple[Any, Statements] | None = None
         self._camera: tuple[Any, Camera] | None = None
 
@@ -128,30 +130,36 @@ class FisherCells:
         return rng.multinomial(n, np.full(m, 1.0 / m)).astype(np.float64)
 
     def geometry(self, key: GeometryKey) -> Geometry:
-        """Frames of that key, the last ones if they are the same."""
-        if key != self._key:
-            self._stated = None
+        """Frames of that key, as they are or from before."""
+        if key not in self._geometries:
+            if len(self._geometries) >= _KEPT:
+                self._geometries.clear()
             try:
-                self._geometry = take_frames(key, self.heaven, self.definition.geometries)
+                self._geometries[key] = take_frames(key, self.heaven, self.definition.geometries)
             except StudyError as error:
-                self._geometry = error
-            self._key = key
-        if isinstance(self._geometry, StudyError):
-            raise self._geometry
-        assert self._geometry is not None
-        return self._geometry
+                self._geometries[key] = error
+        found = self._geometries[key]
+        if isinstance(found, StudyError):
+            raise found
+        return found
 
     def stated(self, cell: Cell, camera: Camera) -> tuple[Statements, float]:
-        """What the frames of a cell say, and the noise to scale it by."""
+        """What the frames of a cell say, and do to attitudes of a mission, and the noise to scale it by."""
         settings = cell.settings
-        geometry = self.geometry(geometry_key(camera, settings, self.definition.seed, cell.seed_index, False))
+        key = geometry_key(camera, settings, self.definition.seed, cell.seed_index, False)
         shape, scale = noise_shape(settings)
-        key = (settings.get("stars"), shape, settings["direction_mas"] > 0.0)
-        if self._stated is None or self._stated[0] != key:
-            chosen = geometry.brightest(settings.get("stars"))
-            noise = star_noise(chosen.mag, shape)
-            self._stated = key, statements(chosen, noise, settings["direction_mas"] > 0.0)
+        with_errors = settings["direction_mas"] > 0.0
+        whole = (key, settings.get("stars"), shape, with_errors)
+        if self._stated is None or self._stated[0] != whole:
+            stated = self._state(key, settings.get("stars"), shape, with_errors)
+            if key.pointing != "random":
+                stated = stated.for_mission(self._state(mission_key(key), settings.get("stars"), shape, False))
+            self._stated = whole, stated
         return self._stated[1], scale
+
+    def _state(self, key: GeometryKey, stars: int | None, shape: NoiseShape, with_errors: bool) -> Statements:
+        chosen = self.geometry(key).brightest(stars)
+        return statements(chosen, star_noise(chosen.mag, shape), with_errors)
 
 
 def prior_precision(table: Mapping[str, Any] | None, camera: Camera) -> FloatArray | None:

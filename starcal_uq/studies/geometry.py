@@ -8,7 +8,7 @@ from __future__ import annotations
 import hashlib
 from collections import OrderedDict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -280,6 +280,11 @@ def geometry_key(camera: Camera, settings: Mapping[str, Any], seed: int, seed_in
     )
 
 
+def mission_key(key: GeometryKey) -> GeometryKey:
+    """Random attitudes for the same camera: where a mission looks, whatever its calibration looked at."""
+    return key._replace(pointing="random", n_frames=None, seed=key.seed[:1])
+
+
 def frames_of(cell: Cell) -> tuple[Any, ...]:
     """What differs between cells that cannot share frames, without asking for their cameras."""
     settings = cell.settings
@@ -341,7 +346,7 @@ def _random(key: GeometryKey, window: _Window, n: int) -> Geometry:
 
 @dataclass(frozen=True, eq=False)
 class Statements:
-    """What M frames say of p parameters, and what the parameters do to M attitudes, for a noise of `scale` times one.
+    """What M frames say of p parameters, and what the parameters do to M attitudes.
 
     Attributes
     ----------
@@ -373,6 +378,10 @@ class Statements:
     noise: FloatArray
     star_own: FloatArray | None = None
     star_common: FloatArray | None = None
+
+    def for_mission(self, other: Statements) -> Statements:
+        """The same information, for attitudes of other frames."""
+        return replace(self, common=other.common, rest_forms=other.rest_forms, noise=other.noise)
 
 
 def statements(geometry: Geometry, sigma_px: FloatArray, with_star_errors: bool) -> Statements:

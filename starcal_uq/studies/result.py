@@ -370,7 +370,7 @@ def frames_for(curve: FloatArray, factors: FloatArray, frames: FloatArray, targe
     needed = np.full(len(frames), np.nan)
     for cell in np.flatnonzero(~np.isnan(curve).all(axis=1)):
         known = np.isfinite(curve[cell])
-        step, errors = x[known], np.log(curve[cell][known])
+        step, errors = x[known], np.log(np.maximum(curve[cell][known], np.finfo(float).tiny))
         # Errors fall with every frame; beyond the ends they go on as they did.
         after = int(np.clip(np.sum(errors > wanted), 1, len(errors) - 1))
         slope = (errors[after] - errors[after - 1]) / (step[after] - step[after - 1])

@@ -37,9 +37,11 @@ from starcal_uq.studies.cells import (
 from starcal_uq.studies.definition import Cell, StudyDefinition
 from starcal_uq.studies.geometry import (
     Geometry,
+    GeometryKey,
     Heaven,
     Statements,
     geometry_key,
+    mission_key,
     noise_shape,
     offset_px,
     star_noise,
@@ -96,7 +98,7 @@ class SimulatedCells:
             likelihood="student_t" if likelihood == "student_t" else "marginal",
             star_errors=settings["direction_mas"] > 0.0,
         )
-        stated, found = self._foretold(geometry, noise, cell, camera)
+        stated, found = self._foretold(key, geometry, noise, cell, camera)
         prior = self._prior(cell, camera, cal, obs.sigma_px is not None, rng)
         own = estimated(cal, camera, stated, prior)
         if definition.posterior != "none":
@@ -113,11 +115,16 @@ class SimulatedCells:
         return int(hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:32], 16)
 
     def _foretold(
-        self, geometry: Geometry, noise: FloatArray, cell: Cell, camera: Camera
+        self, key: GeometryKey, geometry: Geometry, noise: FloatArray, cell: Cell, camera: Camera
     ) -> tuple[Statements, Numbers]:
         """What the same frames say by their information."""
         settings, n = cell.settings, geometry.n_frames
         stated = statements(geometry, noise, settings["direction_mas"] > 0.0)
+        if key.pointing != "random":
+            mission = take_frames(mission_key(key), self.heaven, self.definition.geometries)
+            mission = mission.brightest(settings.get("stars"))
+            shape, scale = noise_shape(settings)
+            stated = stated.for_mission(statements(mission, scale * star_noise(mission.mag, shape), False))
         frame = stated.information.sum(axis=0) / n
         prior = prior_precision(self.definition.priors.get(settings["prior"]), camera)
         spread = None

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 FOLDER = "cells"
-_PATTERN, _WHOLE = "*.parquet", "all-{}.parquet"
+_PATTERN, _WHOLE = "[!.]*.parquet", "all-{}.parquet"
 
 
 def _schema() -> pa.Schema:

@@ -528,3 +528,16 @@ def test_one_distortion_less_one_column_less():
     found.plot.forecast()
     tangential = plan(camera("brown_tangential"), sky(), n_geometries=100, n_campaigns=20, sweeps=False)
     assert {"p1_per_px", "p2_per_px", "k2_per_px4"} < set(tangential.forecast.names)
+
+
+def test_coupling_of_a_plan_is_that_of_a_calibration() -> None:
+    """Of as many frames, before and after they were taken."""
+    foretold = sc.coupling(made().expected(60))
+    after = sc.coupling(sc.calibrate(observations(n_frames=60), camera()))
+    np.testing.assert_allclose(foretold.correlation, after.correlation, atol=0.15)
+    np.testing.assert_allclose(foretold.sigma_marginal, after.sigma_marginal, rtol=0.25)
+    strong = np.abs(after.extended_correlation) > 0.5
+    assert strong.sum() > 12
+    np.testing.assert_allclose(foretold.extended_correlation[strong], after.extended_correlation[strong], atol=0.25)
+    # Without a target it is what 1000 frames give.
+    assert sc.coupling(made()).sigma_marginal[2] == pytest.approx(foretold.sigma_marginal[2] * np.sqrt(60 / 1000))
