@@ -91,9 +91,10 @@ def prepare_image(
     mesh = min(_MESH_PX, *data.shape)
     mask = None if whole else ~finite
     background = sep.Background(_smooth(image, filled), mask=mask, bw=mesh, bh=mesh)
-    counts = filled - background.back()
+    counts = np.array(filled)
+    background.subfrom(counts)
     spread = background
-    if background.globalrms > _UNEVEN * 1.4826 * float(np.median(np.abs(counts[::5, ::5]))):
+    if background.globalrms > _UNEVEN * 1.4826 * float(_median(np.abs(counts[::5, ::5]).ravel())):
         # Where the background is steep, its slope inside a mesh is no noise.
         spread = sep.Background(counts, mask=mask, bw=mesh, bh=mesh)
     # Numbers are rounded to whole counts at best; floating-point images without noise get a floor to divide by.
@@ -104,7 +105,9 @@ def prepare_image(
         cut_noise, left = _cut_noise(counts)
         floor = max(floor, cut_noise)
         counts -= np.float32(left)
-    noise = np.maximum(spread.rms() / _CLIPPED, floor)
+    noise = spread.rms()
+    noise /= np.float32(_CLIPPED)
+    np.maximum(noise, np.float32(floor), out=noise)
     if not whole:
         counts[~finite] = 0.0
     counts_per_e = 1.0 / gain if gain else 0.0
@@ -120,12 +123,21 @@ def _smooth(image: Image, filled: Any) -> Any:
     Their median jumps from one to the next, and the mode, 2.5 medians less 1.5 means, jumps further: a fifth of a count
     is a sigma of the filtered image.
     """
-    sample = filled[::5, ::5]
-    scatter = 1.4826 * float(np.median(np.abs(sample - np.median(sample))))
-    if image.data.dtype.kind not in "ui" or scatter > _COARSE:
+    if image.data.dtype.kind not in "ui":
+        return filled
+    sample = filled[::5, ::5].ravel()
+    if 1.4826 * _median(np.abs(sample - np.float32(_median(sample)))) > _COARSE:
         return filled
     blur = np.random.default_rng(0).random(_BLUR_TILE, dtype=np.float32) - np.float32(0.5)
     return filled + np.resize(blur, filled.shape)
+
+
+def _median(values: Any) -> Any:
+    """`np.median` along the last axis, in a third of its time: there is no NaN to look for."""
+    n = values.shape[-1]
+    parted = np.partition(values, n // 2, axis=-1)
+    upper = parted[..., n // 2]
+    return upper if n % 2 else 0.5 * (upper + parted[..., : n // 2].max(axis=-1))
 
 
 def _cut_noise(counts: Any) -> tuple[float, float]:
@@ -153,13 +165,18 @@ def counts_per_electron(data: Any) -> float:
     if height * width < _FEWEST_MESHES:
         return 0.0
     rows = data[: height * _CELL_PX : 2, : width * _CELL_PX]
-    meshes = rows.reshape(height, _CELL_PX // 2, width, _CELL_PX)
-    pixels = meshes.transpose(0, 2, 1, 3).reshape(height * width, -1, 2)
+    first = rows[:, ::2]
+
+    def meshes(pixels: Any) -> Any:
+        cells = pixels.reshape(height, _CELL_PX // 2, width, _CELL_PX // 2)
+        return cells.transpose(0, 2, 1, 3).reshape(height * width, -1)
+
     # Neighbours differ by their noise alone.
-    difference = pixels[:, :, 1] - pixels[:, :, 0]
-    level = np.median(pixels[:, ::5, 0], axis=1)
-    limit = 3.0 * 1.4826 * np.median(np.abs(difference[:, ::3]), axis=1, keepdims=True)
-    inside = np.abs(difference) <= limit
+    difference = meshes(rows[:, 1::2] - first)
+    level = _median(meshes(first)[:, ::5])
+    size = np.abs(difference)
+    limit = 3.0 * 1.4826 * _median(size[:, ::3])[:, None]
+    inside = size <= limit
     n = np.count_nonzero(inside, axis=1)
     difference *= inside
     variance = np.einsum("ij,ij->i", difference, difference) / n / (2.0 * _CLIPPED_VARIANCE)

@@ -11,7 +11,16 @@ from starcal_uq.core.errors import ImageError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.types import AnyDict, BoolArray, IntArray
 from starcal_uq.images.background import PreparedImage, prepare_image
-from starcal_uq.images.fits import Stamps, StarFit, cut_stamps, explained, fit_stars, near_pairs, windowed
+from starcal_uq.images.fits import (
+    Stamps,
+    StarFit,
+    cut_stamps,
+    explained,
+    fit_stars,
+    near_pairs,
+    window_positions,
+    windowed,
+)
 from starcal_uq.images.image import Image
 from starcal_uq.images.psf import FIRST_SIGMA_PX, half_stamp_px, measure_psf, moment_sigma_px, pixel_at
 
@@ -21,6 +30,8 @@ _MAX_DETECTIONS = 5000
 # A width is preferred to that of the PSF if it lowers chi squared by this much.
 _CHI2_MARGIN = 9.0
 _BLOB_SIGMAS = 3.0
+# Windowed centroids good to this are a start for the fit.
+_START_STEP_PX = 0.02
 
 
 @dataclass(frozen=True)
@@ -115,25 +126,55 @@ def _detect(frame: PreparedImage, name: str, sigma: float, options: DetectionOpt
 
     half = int(np.clip(np.ceil(_KERNEL_HALF_SIGMAS * sigma), 1, _KERNEL_HALF_MAX))
     line = np.exp(-0.5 * (np.arange(-half, half + 1) / sigma) ** 2)
-    kernel = np.outer(line, line)
-    # sep divides the kernel by its sum; this is the noise that is left of noise 1.
-    left = np.sqrt(np.sum(kernel**2)) / kernel.sum()
+    # The noise that is left of noise 1.
+    left = np.sum(line**2) / line.sum() ** 2
     try:
-        objects = sep.extract(
-            frame.counts,
+        objects, labels = sep.extract(
+            _filtered(frame.counts, (line / line.sum()).astype(np.float32)),
             options.threshold_sigma * left,
             err=frame.noise,
             minarea=options.min_pixels,
-            filter_kernel=kernel.astype(np.float32),
-            filter_type="conv",
+            filter_kernel=None,
+            segmentation_map=True,
         )
     except Exception as error:  # sep raises bare exceptions when its buffers are full
         raise ImageError(
             f"{name}: there are too many bright pixels to tell stars apart; raise the threshold, or leave the image "
             "out."
         ) from error
+    # sep took the filtered image for the image: the light is that of the pixels themselves.
+    labels = labels.ravel()
+    inside = np.flatnonzero(labels != 0)
+    light = np.bincount(labels[inside], frame.counts.ravel()[inside], minlength=len(objects) + 1)
+    objects["flux"] = light[1 : len(objects) + 1]
     objects = objects[np.isfinite(objects["x"]) & np.isfinite(objects["y"])]
     return objects[np.argsort(-objects["cflux"], kind="stable")][:_MAX_DETECTIONS]
+
+
+# Rows that are filtered together: few enough to stay in the processor's cache.
+_ROWS = 48
+
+
+def _filtered(counts: Any, line: Any) -> Any:
+    """`counts` filtered by a kernel that is the product of a symmetric `line` with itself, with zeros around."""
+    height, width = counts.shape
+    half = len(line) // 2
+    filtered, pair = np.empty((height, width), dtype=np.float32), np.empty((_ROWS, width), dtype=np.float32)
+    # Zeros after each row keep it apart from the next one.
+    padded = np.zeros((_ROWS + 2 * half, width + half), dtype=np.float32)
+    for first in range(0, height, _ROWS):
+        n = min(_ROWS, height - first)
+        low, high = max(first - half, 0), min(first + n + half, height)
+        inside = slice(low - first + half, high - first + half)
+        padded[: inside.start], padded[inside, :width], padded[inside.stop :] = 0.0, counts[low:high], 0.0
+        rows = np.convolve(padded.ravel(), line, mode="same").reshape(padded.shape)[:, :width]
+        out, both = filtered[first : first + n], pair[:n]
+        np.multiply(rows[half : half + n], line[half], out=out)
+        for d in range(1, half + 1):
+            np.add(rows[half - d : half - d + n], rows[half + d : half + d + n], out=both)
+            both *= line[half + d]
+            out += both
+    return filtered
 
 
 def _without_blobs(objects: Any, sigma: float) -> tuple[Any, int]:
@@ -152,17 +193,14 @@ def _without_blobs(objects: Any, sigma: float) -> tuple[Any, int]:
 
 
 def _fit(frame: PreparedImage, objects: Any, sigma: float) -> tuple[Stamps, StarFit]:
-    """Windowed centroids by sep as a start, then the fit of the pixel-integrated star image."""
-    import sep
-
+    """Windowed centroids as a start, then the fit of the pixel-integrated star image."""
     half = half_stamp_px(sigma)
     x, y = objects["x"].astype(np.float64), objects["y"].astype(np.float64)
-    mask = None if frame.usable is None else ~frame.usable
-    if len(objects):
-        xw, yw, flags = sep.winpos(frame.counts, x, y, np.hypot(sigma, 12.0**-0.5), mask=mask)
-        # In a crowd, and where its window is cut, the windowed position runs away.
-        good = (flags == 0) & (np.hypot(xw - x, yw - y) < 1.0)
-        x, y = np.where(good, xw, x), np.where(good, yw, y)
+    width = np.full(len(x), sigma)
+    xw, yw, good = window_positions(frame, x, y, np.hypot(width, 12.0**-0.5), width, frame.usable, _START_STEP_PX)
+    # In a crowd, and where its window is cut, the windowed position runs away.
+    good &= np.hypot(xw - x, yw - y) < 1.0
+    x, y = np.where(good, xw, x), np.where(good, yw, y)
     stamps = cut_stamps(frame.counts, frame.usable, x, y, half, frame.noise, frame.counts_per_e)
     return stamps, fit_stars(stamps, x, y, sigma, pairs=near_pairs(x, y, 2.0 * half))
 

@@ -8,6 +8,8 @@ because the integration over pixels is in the model.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -15,8 +17,9 @@ import numpy as np
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.images.background import PreparedImage
 
-_ITERATIONS = 12
-_TOLERANCE_PX = 1e-4
+_ITERATIONS = 10
+# A star is left alone when its step is this small, in standard deviations, or in px, parts of its flux and log width.
+_TOLERANCE_SIGMAS, _TOLERANCE = 1e-2, 1e-4
 _SQRT_2PI = float(np.sqrt(2.0 * np.pi))
 
 
@@ -85,24 +88,62 @@ def cut_stamps(
 ) -> Stamps:
     """Cut the pixels around positions; what lies outside the image or is not `usable` is marked as not good."""
     height, width = counts.shape
-    steps = np.arange(-half_px, half_px + 1)
+    size = 2 * half_px + 1
     x0, y0 = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
-    columns, rows = x0[:, None] + steps, y0[:, None] + steps
-    inside = ((columns >= 0) & (columns < width))[:, None, :] & ((rows >= 0) & (rows < height))[:, :, None]
-    at = (rows.clip(0, height - 1)[:, :, None], columns.clip(0, width - 1)[:, None, :])
-    good = inside if usable is None else inside & usable[at]
     variance = np.asarray(noise[y0.clip(0, height - 1), x0.clip(0, width - 1)], dtype=np.float64) ** 2
-    stamp = np.where(good, counts[at], 0.0).astype(np.float64)
-    return Stamps(x0 - half_px, y0 - half_px, stamp, good, variance, counts_per_e)
+    x0, y0 = x0 - half_px, y0 - half_px
+    inside = (x0 >= 0) & (x0 <= width - size) & (y0 >= 0) & (y0 <= height - size)
+    stamp, good = np.zeros((len(x0), size, size)), np.ones((len(x0), size, size), dtype=np.bool_)
+
+    if inside.any():
+        # Squares inside the image are copied row by row, which is quicker than pixel by pixel.
+        corner = y0[inside], x0[inside]
+        for target, source in ((stamp, counts), (good, usable)):
+            if source is not None:
+                target[inside] = np.lib.stride_tricks.sliding_window_view(source, (size, size))[corner]
+    if not inside.all():
+        steps = np.arange(size)
+        columns, rows = x0[~inside, None] + steps, y0[~inside, None] + steps
+        at = (rows.clip(0, height - 1)[:, :, None], columns.clip(0, width - 1)[:, None, :])
+        part = ((columns >= 0) & (columns < width))[:, None, :] & ((rows >= 0) & (rows < height))[:, :, None]
+        stamp[~inside], good[~inside] = counts[at], part if usable is None else part & usable[at]
+    if usable is not None or not inside.all():
+        stamp[~good] = 0.0
+    return Stamps(x0, y0, stamp, good, variance, counts_per_e)
 
 
-def profile(centre: FloatArray, sigma: FloatArray, n_pixels: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Fractions of the light in pixels 0, 1, ... along an axis, and derivatives by centre and by log width; (n, m)."""
+def _profiles(
+    stamps: Stamps, u: FloatArray, v: FloatArray, sigma: FloatArray, derivatives: int
+) -> tuple[FloatArray, FloatArray]:
+    """Parts of a star's light in each pixel along x and along y, and as further rows their `derivatives`.
+
+    Shape (n, 1 + derivatives, m) each; the first derivative is by the position, the second by the log width.
+    """
     from scipy.special import ndtr
 
-    z = (np.arange(n_pixels + 1) - 0.5 - centre[:, None]) / sigma[:, None]
-    density = np.exp(-0.5 * z * z) / _SQRT_2PI
-    return np.diff(ndtr(z)), -np.diff(density) / sigma[:, None], -np.diff(z * density)
+    n, m = len(u), stamps.counts.shape[1]
+    inverse = np.concatenate([1.0 / sigma] * 2)[:, None]
+    z = np.arange(-0.5, m) - np.concatenate([u, v])[:, None]
+    z *= inverse
+    rows = np.empty((2 * n, 1 + derivatives, m))
+    density = np.exp(-0.5 * z * z)
+    density /= _SQRT_2PI
+    below = ndtr(z)
+    np.subtract(below[:, 1:], below[:, :-1], out=rows[:, 0])
+    if derivatives:
+        np.subtract(density[:, :-1], density[:, 1:], out=rows[:, 1])
+        rows[:, 1] *= inverse
+    if derivatives > 1:
+        density *= z
+        np.subtract(density[:, :-1], density[:, 1:], out=rows[:, 2])
+    return rows[:n], rows[n:]
+
+
+def _contracted(x: FloatArray, image: FloatArray, y: FloatArray) -> FloatArray:
+    """Sums over pixels of y_a image x_b, (n, a, b), for rows (n, b, m) along x and (n, a, m) along y."""
+    # The star image is a product of two profiles, so that no product with one needs all pixels of all stars at once.
+    total: FloatArray = y @ (image @ x.transpose(0, 2, 1))
+    return total
 
 
 def _gaussian(px: FloatArray, py: FloatArray) -> FloatArray:
@@ -111,101 +152,168 @@ def _gaussian(px: FloatArray, py: FloatArray) -> FloatArray:
 
 
 def fit_stars(
-    stamps: Stamps, x: FloatArray, y: FloatArray, sigma_px: float, *, free_sigma: bool = False, pairs: Any = None
+    stamps: Stamps,
+    x: FloatArray,
+    y: FloatArray,
+    sigma_px: float | FloatArray,
+    *,
+    free_sigma: bool = False,
+    pairs: Any = None,
+    left_moving: float = 0.0,
 ) -> StarFit:
     """Fit position and flux of each star from x, y (n,) in the image, and with `free_sigma` its own width too.
 
-    `pairs` (p, 2) are stars (i, j) of which j reaches into the stamp of i; it is subtracted there.
+    `pairs` (p, 2) are stars (i, j) of which j reaches into the stamp of i; it is subtracted there. A star is left alone
+    once its own steps are small and those of the stars in its stamp; `left_moving` is the part of them that need not
+    get so far, where a median is all that is wanted.
     """
     n, m = stamps.counts.shape[:2]
-    u, v = x - stamps.x0, y - stamps.y0
-    log_sigma = np.full(n, np.log(sigma_px))
-    flux = np.zeros(n)
-    others = np.zeros_like(stamps.counts)
-    n_free = 4 if free_sigma else 3
-    normal = np.zeros((n, n_free, n_free))
-    weight = stamps.good / stamps.variance[:, None, None]
-    for iteration in range(_ITERATIONS + 1):
+    state = np.stack([x - stamps.x0, y - stamps.y0, np.zeros(n), np.zeros(n) + np.log(sigma_px)])
+    has_pairs, derivatives = pairs is not None and len(pairs) > 0, 2 if free_sigma else 1
+    others = np.zeros_like(stamps.counts) if has_pairs else None
+    moving, part, here = np.arange(n), stamps, pairs
+    for iteration in range(_ITERATIONS):
+        if len(moving) <= left_moving * n:
+            break
+        u, v, flux, log_sigma = state if part is stamps else state[:, moving]
         sigma = np.exp(log_sigma)
-        (px, dx, sx), (py, dy, sy) = profile(u, sigma, m), profile(v, sigma, m)
-        shape = _gaussian(px, py)
+        px, py = _profiles(part, u, v, sigma, derivatives)
         if iteration == 0:
             # The flux is linear: start at its best value.
-            flux = _ratio(np.sum(weight * shape * stamps.counts, (1, 2)), np.sum(weight * shape * shape, (1, 2)))
-        if pairs is not None and len(pairs):
-            others = _others(stamps, u, v, flux, sigma, pairs)
-        bright = np.maximum(flux[:, None, None] * shape + others, 0.0)
-        weight = stamps.good / (stamps.variance[:, None, None] + stamps.counts_per_e * bright)
-        f = flux[:, None, None]
-        columns = [f * _gaussian(dx, py), f * _gaussian(px, dy), shape]
+            weight = part.good / part.variance[:, None, None]
+            top = _contracted(px[:, :1], weight * part.counts, py[:, :1])
+            state[2] = flux = _ratio(top, _contracted(px[:, :1] ** 2, weight, py[:, :1] ** 2))[:, 0, 0]
+        light = None
+        if others is not None:
+            others[moving] = 0.0
+            _add_others(others, stamps, state, here)
+            light = others if part is stamps else others[moving]
+        rest, weight = _weighted(part, flux, px[:, 0], py[:, 0], light)
+        normal = _normal(px, py, weight, flux)
+        rest *= weight
+        first = _contracted(px, rest, py)
+        gradient = np.empty((len(moving), 3 + free_sigma))
+        gradient[:, 0], gradient[:, 1], gradient[:, 2] = flux * first[:, 0, 1], flux * first[:, 1, 0], first[:, 0, 0]
         if free_sigma:
-            columns.append(f * (_gaussian(sx, py) + _gaussian(px, sy)))
-        design = np.stack([c.reshape(n, m * m) for c in columns], axis=1)
-        weighted = design * weight.reshape(n, 1, m * m)
-        normal = weighted @ design.transpose(0, 2, 1)
-        if iteration == _ITERATIONS:
-            break
-        rest = (stamps.counts - others - f * shape).reshape(n, m * m, 1)
-        step = _solve(normal, weighted @ rest)
+            gradient[:, 3] = flux * (first[:, 0, 2] + first[:, 2, 0])
+        solution, determined = _solve(normal, gradient[:, :, None])
+        step = np.where(determined, solution[:, 0], 0.0)
+        done = np.einsum("in,ni->n", step, gradient) < _TOLERANCE_SIGMAS**2
         # Far from the solution the linear step overshoots.
-        moved = np.maximum(np.hypot(step[:, 0], step[:, 1]) / (0.5 * sigma), 1.0)
-        u, v, flux = u + step[:, 0] / moved, v + step[:, 1] / moved, flux + step[:, 2]
+        step[:2] /= np.maximum(np.hypot(step[0], step[1]) / (0.5 * sigma), 1.0)
+        state[:3, moving] += step[:3]
         if free_sigma:
-            log_sigma = (log_sigma + np.clip(step[:, 3], -0.3, 0.3)).clip(np.log(0.15), np.log(0.5 * m))
-        if not n or np.abs(step[:, :2]).max() < _TOLERANCE_PX:
-            break
-    covariance = _inverse(normal)[:, :3, :3]
-    residual = stamps.counts - others
-    return StarFit(u + stamps.x0, v + stamps.y0, flux, covariance, np.exp(log_sigma), weight, residual)
+            wider = log_sigma + np.clip(step[3], -0.3, 0.3)
+            state[3, moving] = wider.clip(np.log(0.15), np.log(0.5 * m))
+        step[2] /= np.where(flux == 0.0, 1.0, flux)
+        done |= np.abs(step).max(axis=0) < _TOLERANCE
+        if done.any():
+            still = np.zeros(n, dtype=np.bool_)
+            still[moving] = ~done
+            if has_pairs:
+                still[pairs[still[pairs[:, 1]], 0]] = True
+                here = pairs[still[pairs[:, 0]]]
+            moving = np.flatnonzero(still)
+            part = stamps.subset(moving)
+    u, v, flux, log_sigma = state
+    sigma = np.exp(log_sigma)
+    if others is not None:
+        others[:] = 0.0
+        _add_others(others, stamps, state, pairs)
+    px, py = _profiles(stamps, u, v, sigma, derivatives)
+    _, weight = _weighted(stamps, flux, px[:, 0], py[:, 0], others)
+    covariance = _inverse(_normal(px, py, weight, flux))[:, :3, :3]
+    residual = stamps.counts if others is None else stamps.counts - others
+    return StarFit(u + stamps.x0, v + stamps.y0, flux, covariance, sigma, weight, residual)
+
+
+def _weighted(
+    stamps: Stamps, flux: FloatArray, px: FloatArray, py: FloatArray, others: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    """What the model leaves over, and the weights that it implies, (n, m, m) each."""
+    bright = _gaussian(px, flux[:, None] * py)
+    if others is not None:
+        bright += others
+    rest = stamps.counts - bright
+    np.maximum(bright, 0.0, out=bright)
+    bright *= stamps.counts_per_e
+    bright += stamps.variance[:, None, None]
+    return rest, np.divide(stamps.good, bright, out=bright)
+
+
+# The derivatives by x, y, flux and log width as sums of products of a row along y and a row along x, over the flux.
+_PRODUCTS = (((0, 1),), ((1, 0),), ((0, 0),), ((0, 2), (2, 0)))
+
+
+@lru_cache
+def _products(k: int) -> tuple[IntArray, IntArray, FloatArray]:
+    """Pairs of k rows along an axis, and the matrix from sums over their products to normal matrices, flattened."""
+    first, second = np.triu_indices(k)
+    place = np.zeros((k, k), dtype=np.int64)
+    place[first, second] = place[second, first] = np.arange(len(first))
+    matrix = np.zeros((len(first), len(first), k + 1, k + 1))
+    for i, j in np.ndindex(k + 1, k + 1):
+        for (a, b), (c, d) in product(_PRODUCTS[i], _PRODUCTS[j]):
+            matrix[place[a, c], place[b, d], i, j] += 1.0
+    return first, second, matrix.reshape(len(first) ** 2, -1)
+
+
+def _normal(px: FloatArray, py: FloatArray, weight: FloatArray, flux: FloatArray) -> FloatArray:
+    """Normal matrices (n, p, p) of x, y, flux and perhaps log width."""
+    n, k = px.shape[:2]
+    first, second, matrix = _products(k)
+    sums = _contracted(px[:, first] * px[:, second], weight, py[:, first] * py[:, second])
+    normal: FloatArray = (sums.reshape(n, len(first) ** 2) @ matrix).reshape(n, k + 1, k + 1)
+    factor = np.repeat(flux[:, None], k + 1, axis=1)
+    factor[:, 2] = 1.0
+    normal *= factor[:, :, None]
+    normal *= factor[:, None, :]
+    return normal
 
 
 def explained(stamps: Stamps, fit: StarFit, scale: float) -> FloatArray:
     """Drop of chi squared by a star of `scale` times the width at the fitted place, shape (n,)."""
-    m = stamps.counts.shape[1]
-    sigma = scale * fit.sigma_px
-    shape = _gaussian(profile(fit.x_px - stamps.x0, sigma, m)[0], profile(fit.y_px - stamps.y0, sigma, m)[0])
-    projected = np.sum(fit.weight * shape * fit.residual, (1, 2))
-    return _ratio(projected * np.abs(projected), np.sum(fit.weight * shape * shape, (1, 2)))
+    px, py = _profiles(stamps, fit.x_px - stamps.x0, fit.y_px - stamps.y0, scale * fit.sigma_px, 0)
+    projected = _contracted(px, fit.weight * fit.residual, py)[:, 0, 0]
+    return _ratio(projected * np.abs(projected), _contracted(px**2, fit.weight, py**2)[:, 0, 0])
 
 
-def _others(
-    stamps: Stamps, u: FloatArray, v: FloatArray, flux: FloatArray, sigma: FloatArray, pairs: Any
-) -> FloatArray:
+def _add_others(others: FloatArray, stamps: Stamps, state: FloatArray, pairs: Any) -> None:
+    """Add to each star's stamp the light of the stars that reach into it."""
     here, there = pairs[:, 0], pairs[:, 1]
-    m = stamps.counts.shape[1]
-    px = profile(u[there] + stamps.x0[there] - stamps.x0[here], sigma[there], m)[0]
-    py = profile(v[there] + stamps.y0[there] - stamps.y0[here], sigma[there], m)[0]
-    total = np.zeros_like(stamps.counts)
-    np.add.at(total, here, np.maximum(flux[there], 0.0)[:, None, None] * _gaussian(px, py))
-    return total
+    u, v, flux, log_sigma = state[:, there]
+    du, dv = stamps.x0[there] - stamps.x0[here], stamps.y0[there] - stamps.y0[here]
+    px, py = _profiles(stamps, u + du, v + dv, np.exp(log_sigma), 0)
+    np.add.at(others, here, _gaussian(px[:, 0], np.maximum(flux, 0.0)[:, None] * py[:, 0]))
 
 
 def _ratio(top: FloatArray, bottom: FloatArray) -> FloatArray:
     return np.divide(top, bottom, out=np.zeros_like(top), where=bottom > 0.0)
 
 
-def _determined(normal: FloatArray) -> tuple[BoolArray, FloatArray]:
-    """Which matrices can be inverted, and each scaled to a unit diagonal (the identity where it cannot)."""
-    diagonal = np.einsum("nii->ni", normal)
-    scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    scaled = normal / (scale[:, :, None] * scale[:, None, :])
-    fine = np.isfinite(scaled).all((1, 2)) & (diagonal > 0.0).all(1)
-    scaled = np.where(fine[:, None, None], scaled, np.eye(normal.shape[1]))
-    fine &= np.linalg.det(scaled) > 1e-9
-    return fine, np.where(fine[:, None, None], scaled, np.eye(normal.shape[1]))
+def _solve(normal: FloatArray, right: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Solutions (p, q, n) for normal matrices (n, p, p) and right sides (n, p, q), and which are determined.
+
+    By elimination in all of them at once; normal matrices need no exchange of rows. What the pivots have lost says how
+    nearly singular a matrix is, whatever the units.
+    """
+    p = normal.shape[1]
+    a = np.concatenate([normal, right], axis=2).transpose(1, 2, 0).copy()
+    left = np.ones(len(normal))
+    with np.errstate(all="ignore"):
+        for k in range(p):
+            left *= a[k, k] / normal[:, k, k]
+            a[k, k + 1 :] /= a[k, k]
+            a[k + 1 :, k + 1 :] -= a[k + 1 :, k, None] * a[k, k + 1 :]
+        for k in range(p - 2, -1, -1):
+            a[k, p:] -= np.sum(a[k, k + 1 : p, None] * a[k + 1 :, p:], axis=0)
+    return a[:, p:], (left > 1e-9) & np.isfinite(a).all((0, 1))
 
 
 def _inverse(normal: FloatArray) -> FloatArray:
-    fine, scaled = _determined(normal)
-    scale = np.sqrt(np.where(fine[:, None], np.einsum("nii->ni", normal), 1.0))
-    inverse: FloatArray = np.linalg.inv(scaled) / (scale[:, :, None] * scale[:, None, :])
-    return np.where(fine[:, None, None], inverse, np.inf)
-
-
-def _solve(normal: FloatArray, right: FloatArray) -> FloatArray:
-    inverse = _inverse(normal)
-    steps: FloatArray = (np.where(np.isfinite(inverse), inverse, 0.0) @ right)[:, :, 0]
-    return steps
+    """Inverses (n, p, p), infinite where there is none."""
+    inverse, determined = _solve(normal, np.broadcast_to(np.eye(normal.shape[1]), normal.shape))
+    return np.where(determined, inverse, np.inf).transpose(2, 0, 1)
 
 
 def near_pairs(x: FloatArray, y: FloatArray, reach: float) -> IntArray:
@@ -223,29 +331,90 @@ _WINDOW_SIGMA_PX = 1.5
 # Stars whose second moments can be measured one by one, and how many of them it takes.
 _GRADIENT_SNR, _GRADIENT_STARS = 30.0, 4
 _LEAST_GRADIENT = 0.1
+# A window ends where its weight is 3e-4, as SExtractor's does.
+_WINDOW_SIGMAS = 4.0
+_WINDOW_ITERATIONS, _WINDOW_STEP_PX = 16, 2e-4
+
+
+def window_positions(
+    frame: PreparedImage,
+    x: FloatArray,
+    y: FloatArray,
+    window_px: FloatArray,
+    star_px: FloatArray,
+    usable: BoolArray | None = None,
+    step_px: float = _WINDOW_STEP_PX,
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Windowed centroids from positions (n,), and which are to be believed: whole windows with light in them.
+
+    SExtractor's XWIN and YWIN (Bertin & Arnouts): where the first moment of the light in a Gaussian window (n,) around
+    it is nought. All stars are moved at once, by steps that suit a Gaussian star of width `star_px` (n,): SExtractor's
+    suit a window as wide as the star, and swing in a wider one. The last steps are shorter than `step_px`.
+    """
+    x, y = x.copy(), y.copy()
+    good = np.isfinite(x) & np.isfinite(y)
+    if not len(x):
+        return x, y, good
+    radius = _WINDOW_SIGMAS * window_px
+    half = int(np.ceil(radius.max()))
+    stamps = cut_stamps(frame.counts, usable, x, y, half, frame.noise, frame.counts_per_e)
+    steps, factor = np.arange(2 * half + 1), 1.0 + (star_px**2 + 1.0 / 12.0) / window_px**2
+    moving, counts = np.flatnonzero(good), stamps.counts
+    if len(moving) < len(x):
+        counts = counts[moving]
+    for _ in range(_WINDOW_ITERATIONS):
+        centre = np.concatenate([x[moving] - stamps.x0[moving], y[moving] - stamps.y0[moving]])
+        w = steps - centre[:, None]
+        rows = np.empty((len(w), 2, len(steps)))
+        np.exp(np.tile(-0.5 / window_px[moving] ** 2, 2)[:, None] * w * w, out=rows[:, 0])
+        np.multiply(rows[:, 0], w, out=rows[:, 1])
+        moments = _contracted(rows[: len(moving)], counts, rows[len(moving) :])
+        light = moments[:, 0, 0]
+        lit = light > 0.0
+        scale = factor[moving] / np.where(lit, light, np.inf)
+        dx, dy = scale * moments[:, 0, 1], scale * moments[:, 1, 0]
+        x[moving] += dx
+        y[moving] += dy
+        # A window that has left its square has run away.
+        fine = lit & (np.abs(centre + np.concatenate([dx, dy]) - half).reshape(2, -1).max(axis=0) < 2.0)
+        good[moving[~fine]] = False
+        on = fine & (dx * dx + dy * dy > step_px**2)
+        if not on.any():
+            break
+        moving, counts = moving[on], counts[on]
+    height, width = frame.counts.shape
+    good &= (x - radius >= -0.5) & (x + radius <= width - 0.5) & (y - radius >= -0.5) & (y + radius <= height - 0.5)
+    if usable is not None:
+        cut = np.flatnonzero(good & ~stamps.good.all((1, 2)))
+        u, v = (steps + stamps.x0[cut, None]) - x[cut, None], (steps + stamps.y0[cut, None]) - y[cut, None]
+        far = u[:, None, :] ** 2 + v[:, :, None] ** 2 > radius[cut, None, None] ** 2
+        good[cut] = (stamps.good[cut] | far).all((1, 2))
+    return x, y, good
 
 
 def windowed(frame: PreparedImage, fit: StarFit) -> StarFit:
     """`fit` with windowed centroids and their covariance for the stars that stand alone."""
-    import sep
-
     window = np.maximum(_WINDOW_SIGMA_PX, 1.2 * fit.sigma_px)
-    x, y, flags = sep.winpos(frame.counts, fit.x_px, fit.y_px, window)
-    half = int(np.ceil(4.0 * window.max(initial=_WINDOW_SIGMA_PX)))
+    x, y, whole = window_positions(frame, fit.x_px, fit.y_px, window, fit.sigma_px)
+    half = int(np.ceil(_WINDOW_SIGMAS * window.max(initial=_WINDOW_SIGMA_PX)))
     stamps = cut_stamps(frame.counts, None, x, y, half, frame.noise, frame.counts_per_e)
     steps = np.arange(2 * half + 1)
-    u = (steps + stamps.x0[:, None])[:, None, :] - x[:, None, None]
-    v = (steps + stamps.y0[:, None])[:, :, None] - y[:, None, None]
-    weight = np.exp(-0.5 * (u * u + v * v) / window[:, None, None] ** 2) * stamps.good
-    light = np.sum(weight * stamps.counts, (1, 2))
-    variance = stamps.variance[:, None, None] + stamps.counts_per_e * np.maximum(stamps.counts, 0.0)
+    u, v = (steps + stamps.x0[:, None]) - x[:, None], (steps + stamps.y0[:, None]) - y[:, None]
+    # Moments up to the second along each axis, of the light in the window and of the variance in its square.
+    powers_u, powers_v = (np.stack([np.ones_like(w), w, w * w], axis=1) for w in (u, v))
+    wu, wv = (np.exp(-0.5 * w * w / window[:, None] ** 2)[:, None, :] for w in (u, v))
+    sums = _contracted(powers_u * wu, stamps.counts, powers_v * wv)
+    light = sums[:, 0, 0]
+    variance = np.maximum(stamps.counts, 0.0)
+    variance *= stamps.counts_per_e
+    variance += stamps.variance[:, None, None]
+    variance *= stamps.good
+    spread = _second_moments(_contracted(powers_u * wu**2, variance, powers_v * wv**2))
     near = near_pairs(fit.x_px, fit.y_px, 4.0 * float(window.max(initial=0.0)))
-    use = (flags == 0) & (light > 0.0) & (np.hypot(x - fit.x_px, y - fit.y_px) < 1.0) & stamps.good.all((1, 2))
+    use = whole & (light > 0.0) & (np.hypot(x - fit.x_px, y - fit.y_px) < 1.0) & stamps.good.all((1, 2))
     use[near[fit.flux[near[:, 1]] > 0.01 * fit.flux[near[:, 0]], 0]] = False
-    offsets = np.stack(np.broadcast_arrays(u, v), axis=1)
-    gradient = _window_gradient(weight * stamps.counts, offsets, window, fit, use)
-    scale = weight**2 * variance / np.where(light > 0.0, light, np.inf)[:, None, None] ** 2
-    noise = np.einsum("nhw,nihw,njhw->nij", scale, offsets, offsets)
+    gradient = _window_gradient(sums, window, fit, use)
+    noise = spread / np.where(light > 0.0, light, np.inf)[:, None, None] ** 2
     inverse = np.linalg.inv(gradient)
     covariance = fit.covariance.copy()
     covariance[:, :2, :2] = inverse @ noise @ inverse.transpose(0, 2, 1)
@@ -253,9 +422,13 @@ def windowed(frame: PreparedImage, fit: StarFit) -> StarFit:
     return replace(fit, x_px=x, y_px=y, covariance=np.where(use[:, None, None], covariance, fit.covariance))
 
 
-def _window_gradient(
-    light: FloatArray, offsets: FloatArray, window: FloatArray, fit: StarFit, alone: BoolArray
-) -> FloatArray:
+def _second_moments(sums: FloatArray) -> FloatArray:
+    """Sums of uu, uv and vv as matrices (n, 2, 2), from sums (n, power of v, power of u)."""
+    rows = [sums[:, 0, 2], sums[:, 1, 1], sums[:, 1, 1], sums[:, 2, 0]]
+    return np.stack(rows, axis=1).reshape(-1, 2, 2)
+
+
+def _window_gradient(sums: FloatArray, window: FloatArray, fit: StarFit, alone: BoolArray) -> FloatArray:
     """How far a windowed first moment falls when its window moves on by 1 px, shape (n, 2, 2).
 
     The window follows the star, so that noise in the moment moves the centroid by the inverse of this: by a factor 2
@@ -267,8 +440,7 @@ def _window_gradient(
     star = fit.sigma_px**2 + 1.0 / 12.0
     moments = (star * window**2 / (star + window**2))[:, None, None] * np.eye(2)
     if np.count_nonzero(bright) >= _GRADIENT_STARS:
-        inside, at = light[bright], offsets[bright]
-        second = np.einsum("nhw,nihw,njhw->nij", inside, at, at) / inside.sum((1, 2))[:, None, None]
+        second = _second_moments(sums[bright]) / sums[bright, :1, :1]
         moments = np.broadcast_to(np.median(second, axis=0), moments.shape)
     # Light without a peak does not hold the window; the floor keeps the errors finite.
     values, axes = np.linalg.eigh(np.eye(2) - moments / window[:, None, None] ** 2)

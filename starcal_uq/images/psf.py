@@ -18,6 +18,8 @@ _WIDTHS = (0.25, 15.0)
 # Star images with this part of their light beyond the Gaussian, or so much longer than wide, are no round Gaussians.
 _MISFIT, _ELONGATED = 0.1, 1.2
 _MOMENT_WINDOW_PX = 1.5
+# The fits of this part of the stars need not have converged for a median.
+_LEFT_MOVING = 0.15
 
 
 @dataclass(frozen=True)
@@ -73,24 +75,28 @@ def measure_psf(frame: PreparedImage, objects: Any) -> Psf | None:
     # The brightest of equally faint stars are those whose noise adds light and width: then more are taken.
     clear = np.count_nonzero(snr[bright] > 4.0 * _PSF_SNR) >= _PSF_STARS
     most = _PSF_STARS if clear else 5 * _PSF_STARS
+    x, y, widths = chosen["x"].astype(np.float64), chosen["y"].astype(np.float64), np.full(len(chosen), sigma)
     for _ in range(2):
-        chosen, stamps = _clean_stamps(frame, chosen, sigma, most)
-        if not len(chosen):
+        clean, stamps = _clean_stamps(frame, chosen, sigma, most)
+        if not len(clean):
             return None
-        x, y = chosen["x"].astype(np.float64), chosen["y"].astype(np.float64)
-        fit = fit_stars(stamps, x, y, sigma, free_sigma=True)
-        good = (np.hypot(fit.x_px - x, fit.y_px - y) < 1.0 + sigma) & (fit.flux > 0.0)
+        chosen = chosen[clean]
+        fit = fit_stars(stamps, x[clean], y[clean], widths[clean], free_sigma=True, left_moving=_LEFT_MOVING)
+        good = (np.hypot(fit.x_px - chosen["x"], fit.y_px - chosen["y"]) < 1.0 + sigma) & (fit.flux > 0.0)
         if not good.any():
             return None
         sigma = float(np.clip(np.median(fit.sigma_px[good]), *_WIDTHS))
+        # The second fit, of stamps that suit the width, starts where the first has ended.
+        x, y = np.where(good, fit.x_px, chosen["x"]), np.where(good, fit.y_px, chosen["y"])
+        widths = np.where(good, fit.sigma_px, sigma)
     # All pixels with the same weight, so that what counts as core and wings does not hang on whether the gain is known.
     stamps = cut_stamps(frame.counts, frame.usable, fit.x_px, fit.y_px, half_stamp_px(sigma), frame.noise, 0.0)
     if frame.counts_per_e:
-        fit = fit_stars(stamps, fit.x_px, fit.y_px, sigma, free_sigma=True)
+        fit = fit_stars(stamps, fit.x_px, fit.y_px, fit.sigma_px, free_sigma=True, left_moving=_LEFT_MOVING)
         width = float(np.clip(np.median(fit.sigma_px[good]), *_WIDTHS))
     else:
         width = sigma
-    fit = fit_stars(stamps, fit.x_px, fit.y_px, width)
+    fit = fit_stars(stamps, fit.x_px, fit.y_px, width, left_moving=_LEFT_MOVING)
     # Fainter stars that are found are those whose noise adds light.
     good &= stamps.good.all((1, 2)) & (fit.flux > _MISFIT_SNR * np.sqrt(fit.covariance[:, 2, 2]))
     if np.count_nonzero(good) <= 3:
@@ -128,7 +134,8 @@ def _common_width(frame: PreparedImage, objects: Any, sigma: float) -> Psf | Non
     """The one width that lowers chi squared most over all stars, found by parabolas in its logarithm."""
     chosen = objects[: 5 * _PSF_STARS]
     for _ in range(6):
-        chosen, stamps = _clean_stamps(frame, chosen, sigma, 5 * _PSF_STARS)
+        clean, stamps = _clean_stamps(frame, chosen, sigma, 5 * _PSF_STARS)
+        chosen = chosen[clean]
         if len(chosen) < 3:
             return None
         fit = fit_stars(stamps, chosen["x"].astype(np.float64), chosen["y"].astype(np.float64), sigma)
@@ -141,12 +148,12 @@ def _common_width(frame: PreparedImage, objects: Any, sigma: float) -> Psf | Non
     return Psf(sigma)
 
 
-def _clean_stamps(frame: PreparedImage, objects: Any, sigma: float, most: int) -> tuple[Any, Stamps]:
-    """Detections with all their pixels and no hot pixel, and their stamps."""
+def _clean_stamps(frame: PreparedImage, objects: Any, sigma: float, most: int) -> tuple[IntArray, Stamps]:
+    """Which detections have all their pixels and no hot pixel, and their stamps."""
     x, y = objects["x"].astype(np.float64), objects["y"].astype(np.float64)
     stamps = cut_stamps(frame.counts, frame.usable, x, y, half_stamp_px(sigma), frame.noise, frame.counts_per_e)
     clean = np.flatnonzero(stamps.good.all((1, 2)) & ~_single_pixels(stamps))[:most]
-    return objects[clean], stamps.subset(clean)
+    return clean.astype(np.int64), stamps.subset(clean)
 
 
 def half_stamp_px(sigma: float) -> int:

@@ -104,7 +104,7 @@ def test_the_stated_noise_of_windowed_centroids_is_the_scatter(shape):
 @pytest.mark.parametrize("shape", ["moffat", "wings"])
 def test_a_factor_of_two_for_every_window_states_too_much(shape, monkeypatch):
     """The control: errors by SExtractor's formula, which holds for a window as wide as the star."""
-    half = lambda light, offsets, window, fit, alone: np.tile(0.5 * np.eye(2), (len(window), 1, 1))  # noqa: E731
+    half = lambda sums, window, fit, alone: np.tile(0.5 * np.eye(2), (len(window), 1, 1))  # noqa: E731
     monkeypatch.setattr(windowed_centroids, "_window_gradient", half)
     chi2, n, _ = chi2_by_snr(shape)
     assert np.average(chi2.mean(axis=1), weights=n) < 0.7
