@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starcal_uq.camera.distortion import Parameter
-from starcal_uq.core.formatting import count, decimals_for, fixed, join_words, percent, significant
+from starcal_uq.core.formatting import count, decimals_for, fixed, join_words, percent, plural, significant
 from starcal_uq.core.status import Check, Level, Question, pass_or_fail, pass_or_warn
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.estimation.student import DEFAULT_DOF
@@ -23,6 +23,9 @@ from starcal_uq.inference.ensemble import Chains, autocorrelation
 from starcal_uq.inference.named import LIKELIHOODS
 from starcal_uq.inference.posterior import Diagnostics, Laplace, Posterior
 from starcal_uq.inference.target import ImportanceCheck, LogLikelihood, Target
+
+if TYPE_CHECKING:
+    from starcal_uq.inference.exact import FrameSample
 
 # Vehtari et al. 2021 for R-hat and ESS, Vehtari et al. 2024 for k-hat.
 RHAT_BOUND = 1.01
@@ -40,6 +43,8 @@ _HARMLESS = 0.1
 # A difference on the surface of so many standard deviations at which the likelihoods are the same: a hundredth of what
 # would matter inside of it, and draws outside are a few times further off at most.
 _REACH_SD, _EQUAL = 3.0, 0.005
+# Standard errors, from ten batches, that are counted to a difference which a sample of frames tells.
+_SAMPLE_ERRORS = 5.0
 # Tolerated share of draws that no camera can have, and number of draws tried for distortions that fold.
 _BOUNDS_SHARE = 1e-3
 _FOLD_DRAWS = 40
@@ -68,10 +73,15 @@ class CompressionCheck:
         Largest difference within three standard deviations of the mode, relative to the mode, nat.
     khat : float
         Pareto shape of the weights exact over compressed at the checked draws; 0 where all of them lie within 0.1 nat.
+    n_frames, of_frames : int
+        Frames of the sample that was compared, its uncertainty being part of `max_difference`, and those that it stands
+        for; 0 where all were compared.
     """
 
     max_difference: float = float("nan")
     khat: float = float("nan")
+    n_frames: int = 0
+    of_frames: int = 0
 
     @property
     def good(self) -> bool:
@@ -85,11 +95,16 @@ def check_compression(
     target: Target,
     draws: FloatArray,
     laplace: Laplace,
+    sample: FrameSample | None = None,
 ) -> CompressionCheck:
     """Compare two log likelihoods three standard deviations from the mode, and at posterior draws if they differ there.
 
     What is left out of the expansion grows with the third power of the distance from the mode, so that a few points on
     the surface see as much of it as hundreds of draws. Below `_EQUAL` there, no draw can come near a bound.
+
+    With a sample of frames the expansion is compared on these, and stated is what they tell for all, with
+    `_SAMPLE_ERRORS` standard errors on top. That the compressed likelihood holds all frames, as `exact` does, is then
+    seen at two points on the surface that no direction is missing in.
 
     Parameters
     ----------
@@ -101,30 +116,49 @@ def check_compression(
         Posterior draws.
     laplace : Laplace
         Measure of the distance from the mode.
+    sample : FrameSample, optional
+        Where there are too many frames for `exact`.
     """
     from starcal_uq.inference.arviz import psis
 
     mode = target.natural(np.zeros((1, target.dim)))
+    frames = (0, 0) if sample is None else (sample.n_frames, sample.of_frames)
 
     def differences(points: FloatArray) -> FloatArray:
         arguments = target.arguments(np.concatenate([mode, points]))
         found = exact(*arguments) - compressed(*arguments)
         return np.asarray(found[1:] - found[0])
 
-    on_surface = float(np.max(np.abs(differences(target.natural(_surface(target.dim))))))
-    if on_surface <= _EQUAL:
-        return CompressionCheck(on_surface, 0.0)
+    def known(points: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Differences (n,) and what they may be larger by."""
+        if sample is None:
+            found = differences(points)
+            return found, np.zeros(len(found))
+        by_batch = sample.left_out(*target.arguments(np.concatenate([mode, points])))
+        by_batch = by_batch[:, 1:] - by_batch[:, :1]
+        # A single frame says nothing of others.
+        scatter = by_batch.std(axis=0, ddof=1) if len(by_batch) > 1 else np.full(len(points), np.inf)
+        return by_batch.mean(axis=0), _SAMPLE_ERRORS * scatter / np.sqrt(len(by_batch))
+
+    found, slack = known(target.natural(_surface(target.dim)))
+    on_surface = float(np.max(np.abs(found) + slack))
+    whole = 0.0
+    if sample is not None:
+        diagonal = np.full((1, target.dim), _REACH_SD / np.sqrt(target.dim))
+        whole = float(np.max(np.abs(differences(target.natural(np.concatenate([diagonal, -diagonal]))))))
+    if max(on_surface, whole) <= _EQUAL:
+        return CompressionCheck(max(on_surface, whole), 0.0, *frames)
     theta = target.arguments(draws)[0]
     p = theta.shape[1]
-    difference = differences(draws)
+    difference, slack = known(draws)
     # The factor is lower triangular, so its leading block is the factor of theta's covariance.
     scale = np.diag(laplace.transform)[:p]
     z = np.linalg.solve(laplace.transform[:p, :p] / scale[:, None], ((theta - laplace.mode[:p]) / scale).T)
     near = np.sum(z * z, axis=0) <= _REACH_SD**2
-    size = np.abs(difference)
-    max_difference = float(np.max(size[near])) if np.any(near) else float(np.max(size))
+    size = np.abs(difference) + slack
+    max_difference = max(float(np.max(size[near])) if np.any(near) else float(np.max(size)), whole)
     khat = 0.0 if float(np.max(size)) <= _HARMLESS else float(psis(difference)[1])
-    return CompressionCheck(max_difference, khat)
+    return CompressionCheck(max_difference, khat, *frames)
 
 
 def _surface(dim: int) -> FloatArray:
@@ -193,6 +227,7 @@ def measure(
         compressed_max_difference=compression.max_difference,
         compressed_khat=compression.khat,
         likelihood_used=likelihood_used,
+        compressed_frames=(compression.n_frames, compression.of_frames),
         likelihood=likelihood,
     )
 
@@ -359,6 +394,12 @@ def _evaluation(post: Posterior) -> Check | None:
         remedy = "sc.sample(obs, cal)"
     elif compression.good:
         sentence = "The fast likelihood equals the exact one wherever the posterior is."
+        n_frames, of_frames = d.compressed_frames
+        if n_frames:
+            sentence = (
+                f"The fast likelihood equals the exact one wherever the posterior is, as {count(n_frames)} of "
+                f"{plural(of_frames, 'frame')} tell with {_SAMPLE_ERRORS:g} standard errors counted in."
+            )
     else:
         level, remedy = Level.FAIL, resample(post, evaluation="exact")
         sentence = "The fast likelihood departs from the exact one: sample the exact one."

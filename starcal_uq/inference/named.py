@@ -25,6 +25,7 @@ from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.inference.exact import FrameSample
     from starcal_uq.observations.table import Observations
 
 LikelihoodName = Literal["marginal", "pairs", "pairs_naive", "student_t"]
@@ -32,6 +33,8 @@ Evaluation = Literal["auto", "compressed", "exact"]
 LIKELIHOODS = ("marginal", "pairs", "pairs_naive", "student_t")
 EVALUATIONS = ("auto", "compressed", "exact")
 _MAX_REFINEMENT = 200
+# Times the frames of a sample above which a sample checks the compressed likelihood.
+_MANY = 1.5
 
 
 class NaivePairsWarning(UserWarning):
@@ -64,6 +67,8 @@ class Source:
         Sentences on the likelihood, for the check of its kind.
     checks : tuple of Check
         Checks that need no draws.
+    sample : FrameSample or None
+        What `fast` leaves out, told by some of the frames; None where `exact` itself is compared.
     """
 
     name: str
@@ -76,6 +81,7 @@ class Source:
     extra: Extra | None = None
     notes: tuple[str, ...] = ()
     checks: tuple[Check, ...] = ()
+    sample: FrameSample | None = None
 
 
 def check_names(likelihood: Any, evaluation: Any, dof: Any, has_observations: bool) -> None:
@@ -186,57 +192,26 @@ def resolved_dof(cal: Calibration, dof: float | str | None) -> float | Literal["
     return "free" if nu is None else nu
 
 
-class _ExactMarginal:
-    """The exact Gaussian likelihood, point by point."""
-
-    def __init__(self, obs: Observations, cal: Calibration) -> None:
-        from starcal_uq.estimation.marginal import MarginalLikelihood
-        from starcal_uq.estimation.star_errors import StarLikelihood
-
-        model, theta = cal.camera.distortion, cal.theta
-        self._one = MarginalLikelihood(obs, model)
-        if cal.star_errors is not None:
-            rotations = quaternion_to_rotation(cal.quaternions)
-            self._one = StarLikelihood(obs, model, theta, rotations, cal.star_errors, cal.sigma)
-        self._one.use_rotations(self._one.rotations_at(theta))
-
-    def log_likelihood(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
-        return np.array([self._one.log_likelihood(t, float(s)) for t, s in zip(theta, sigma, strict=True)])
-
-
-class _Extrapolated:
-    """The exact likelihood of all partitions, as far as a sample of their frames knows it.
-
-    To the compressed one, which holds all stars, comes what it leaves out: of the sample, times the frames that each of
-    its own stands for.
-    """
-
-    def __init__(self, obs: Observations, cal: Calibration) -> None:
-        from starcal_uq.estimation.compressed import compress
-        from starcal_uq.estimation.marginal import MarginalLikelihood
-
-        self._whole, likelihood = cal.compressed, MarginalLikelihood(obs, cal.camera.distortion)
-        self._sample = _ExactMarginal(obs, cal)
-        covariance = self._whole.whitening @ self._whole.whitening.T
-        self._compressed = compress(likelihood, self._whole.theta_hat, covariance)
-        self._share = cal.n_frames / obs.n_frames
-
-    def log_likelihood(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
-        left_out = self._sample.log_likelihood(theta, sigma) - self._compressed.log_likelihood(theta, sigma)
-        return self._whole.log_likelihood(theta, sigma) + self._share * left_out
-
-
 def _marginal(obs: Observations | None, cal: Calibration) -> Source:
     if _settings(cal).get("likelihood") == "student_t":
         raise SamplingError(
             "the calibration was made with likelihood='student_t': sample with the same, or calibrate again with "
             "likelihood='marginal'."
         )
-    exact = None if obs is None else _ExactMarginal(obs, cal).log_likelihood
-    if obs is not None and cal.partitions is not None:
-        exact = _Extrapolated(obs, cal).log_likelihood
+    exact, sample = None, None
+    if obs is not None:
+        from starcal_uq.inference.exact import SAMPLED_FRAMES, ExactMarginal, FrameSample
+
+        if cal.partitions is not None:
+            sample = FrameSample(obs, cal, cal.n_frames)
+            exact = sample.log_likelihood
+        else:
+            exact = ExactMarginal(obs, cal).log_likelihood
+            # Stars that bring errors along make frames depend on each other.
+            if obs.n_frames > _MANY * SAMPLED_FRAMES and cal.star_errors is None:
+                sample = FrameSample(obs, cal)
     at = (cal.theta, cal.information, cal.sigma, float(cal.dof))
-    return Source("marginal", *at, exact=exact, fast=cal.compressed.log_likelihood)
+    return Source("marginal", *at, exact=exact, fast=cal.compressed.log_likelihood, sample=sample)
 
 
 def _pairs(obs: Observations, cal: Calibration, adjusted: bool) -> Source:

@@ -121,6 +121,8 @@ class Diagnostics:
     compressed_khat : float
         Pareto shape of the weights exact over compressed at the checked draws; 0 where all differences are below 0.1
         nat, and no tail can matter.
+    compressed_frames : tuple of int
+        Frames that were compared for it and those that they stand for; zeros where all were compared.
     likelihood_used : str
         How it was evaluated: ``compressed``, ``exact``, or the name of the likelihood that was passed.
     likelihood : str
@@ -149,6 +151,7 @@ class Diagnostics:
     likelihood_used: str
     likelihood: str = "marginal"
     checks: tuple[Check, ...] = ()
+    compressed_frames: tuple[int, int] = (0, 0)
 
     @property
     def level(self) -> Level:

@@ -282,7 +282,7 @@ def _compare(run: _Run, outcome: _Outcome, compressed: LogLikelihood, exact: Log
     rng = np.random.default_rng(run.check_seed)
     flat = outcome.draws.reshape(-1, outcome.draws.shape[-1])
     picks = flat[rng.choice(len(flat), min(_N_CHECKED, len(flat)), replace=False)]
-    return check_compression(compressed, exact, outcome.target, picks, outcome.laplace)
+    return check_compression(compressed, exact, outcome.target, picks, outcome.laplace, run.source.sample)
 
 
 def _assemble(run: _Run, outcome: _Outcome, compression: CompressionCheck) -> Posterior:

@@ -86,7 +86,7 @@ EXAMPLES = {
         ).diagnostics.checks[:1]
     ),
     "diagnostics.verdict.draws.same_data": lambda s: [
-        draws.same_data(dataclasses.replace(s.post, provenance={"data_sha256": "0"}), s.obs)
+        draws.same_data(dataclasses.replace(s.post, provenance={"data_sha256": "0"}), s.obs.data_hash)
     ],
     "diagnostics.verdict.draws.propagation": lambda s: [
         draws.propagation(

@@ -292,6 +292,59 @@ def test_compression_check_measures_the_difference() -> None:
         assert not check_compression(cubic, exact, target, draws, laplace).good
 
 
+@pytest.fixture(scope="module")
+def many_frames() -> tuple[Any, Any]:
+    obs = observations(n_frames=100, sigma_px=1.0)
+    return obs, calibrate(obs, nominal(camera()))
+
+
+def test_a_sample_of_frames_bounds_the_error_of_the_expansion(
+    many_frames: tuple[Any, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    obs, cal = many_frames
+    monkeypatch.setattr("starcal_uq.inference.sample._N_CHECKED", 40)
+    every = sample(obs, cal, **QUICKER, evaluation="compressed").diagnostics
+    assert every.compressed_frames == (0, 0)
+    monkeypatch.setattr("starcal_uq.inference.exact.SAMPLED_FRAMES", 40)
+    some = sample(obs, cal, **QUICKER, evaluation="compressed")
+    assert some.diagnostics.compressed_frames == (40, 100)
+    # One px of noise: more than 0.005 nat are left out, and the sample's own uncertainty counts.
+    assert 0.01 < every.compressed_max_difference < some.diagnostics.compressed_max_difference < 2.0
+    # Controls: half of the frames counted twice, which no sample sees by itself, and second derivatives left out.
+    twice = sample(obs, spoilt(cal), **QUICKER, evaluation="compressed").diagnostics
+    assert twice.compressed_max_difference > 1.5
+    gram = cal.compressed.gram.copy()
+    gram[6:] = gram[:, 6:] = 0.0
+    flat = dataclasses.replace(cal, compressed=dataclasses.replace(cal.compressed, gram=gram))
+    linear = sample(obs, flat, **QUICKER, evaluation="compressed").diagnostics
+    assert linear.compressed_max_difference > 2.0 * every.compressed_max_difference
+
+
+def test_a_check_by_a_sample_costs_the_same_at_any_number_of_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    from starcal_uq.estimation.marginal import MarginalLikelihood
+
+    monkeypatch.setattr("starcal_uq.inference.exact.SAMPLED_FRAMES", 20)
+    visited: list[int] = []
+    sums = MarginalLikelihood.sums
+
+    def counted(self: Any, *args: Any, **options: Any) -> Any:
+        visited.append(self.frames.n_frames)
+        return sums(self, *args, **options)
+
+    of_sample = []
+    for n_frames in (40, 160):
+        obs = observations(n_frames=n_frames)
+        cal = calibrate(obs, nominal(camera()))
+        monkeypatch.setattr(MarginalLikelihood, "sums", counted)
+        visited.clear()
+        sample(obs, cal, **QUICKER, evaluation="compressed")
+        monkeypatch.setattr(MarginalLikelihood, "sums", sums)
+        # All frames are visited at the estimate, the mode and two points, the sample at 24 and the mode.
+        assert visited.count(n_frames) == 4
+        of_sample.append(sum(visited) - 4 * n_frames)
+    assert of_sample[0] == of_sample[1]
+
+
 def test_too_short_a_run_fails_its_checks() -> None:
     post = sample(None, gaussian_calibration(), **{**QUICK, "n_steps": 8}, evaluation="compressed")
     assert not post.diagnostics.ok

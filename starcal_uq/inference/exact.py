@@ -1,0 +1,115 @@
+"""The exact Gaussian likelihood of all stars, and what a compressed one leaves out of it on a sample of frames.
+
+What an expansion leaves out adds up over frames. So its sum over all of them is told by some: their mean times the
+number of frames, with the standard error that batches of them show. The cost is then the same for any number of stars.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.attitude.rotations import quaternion_to_rotation
+from starcal_uq.core.types import FloatArray
+from starcal_uq.estimation.compressed import compress
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.star_errors import StarLikelihood
+from starcal_uq.observations.frames import StarFrames
+from starcal_uq.observations.splits import frame_sample
+
+if TYPE_CHECKING:
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.observations.table import Observations
+
+# Frames of a sample, and the batches that tell its standard error.
+SAMPLED_FRAMES, BATCHES = 1000, 10
+# Attitudes that are wrong by this much, rad, cost nothing that is left after their elimination to first order.
+_TURN = 1e-8
+
+
+class ExactMarginal:
+    """The exact Gaussian likelihood around a calibration, point by point.
+
+    Attitudes are those that follow from the ones at the estimate to first order, so that a pass over the stars is
+    enough for a point.
+    """
+
+    def __init__(self, obs: Observations | StarFrames, cal: Calibration, rotations: FloatArray | None = None) -> None:
+        model, theta = cal.camera.distortion, cal.theta
+        self._plain: MarginalLikelihood | None = None
+        if cal.star_errors is not None and not isinstance(obs, StarFrames):
+            start = quaternion_to_rotation(cal.quaternions)
+            self._one: MarginalLikelihood = StarLikelihood(obs, model, theta, start, cal.star_errors, cal.sigma)
+            self._one.use_rotations(self._one.rotations_at(theta))
+            return
+        self._one = self._plain = MarginalLikelihood(obs, model)
+        if rotations is None and len(cal.quaternions) == self._one.frames.n_frames:
+            rotations = quaternion_to_rotation(cal.quaternions)
+        if rotations is not None:
+            self._one.use_rotations(rotations)
+        self._one.use_sums(*self._one.sums(theta))
+
+    def log_likelihood(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Log likelihood (n,) at theta (n, p) and sigma (n,)."""
+        return np.array([self._at(t, float(s)) for t, s in zip(theta, sigma, strict=True)])
+
+    def _at(self, theta: FloatArray, sigma: float) -> float:
+        if self._plain is None:
+            return self._one.log_likelihood(theta, sigma)
+        sums, _ = self._plain.sums(theta, tolerance=_TURN)
+        if not np.isfinite(sums.cost):
+            return -np.inf
+        return float(-0.5 * sums.cost / sigma**2 - self._plain.dof * np.log(sigma) - 0.5 * sums.log_determinant)
+
+
+class FrameSample:
+    """What the compressed likelihood of a calibration leaves out, told by a sample of its frames.
+
+    Parameters
+    ----------
+    obs : Observations
+        The frames, of which a sample is taken where they are many.
+    cal : Calibration
+        Estimate and expansion.
+    of_frames : int, optional
+        Number of frames that they stand for; their own by default.
+
+    Attributes
+    ----------
+    n_frames, of_frames : int
+        Frames of the sample, and those that it stands for.
+    """
+
+    def __init__(self, obs: Observations, cal: Calibration, of_frames: int | None = None) -> None:
+        some, places = frame_sample(obs, SAMPLED_FRAMES)
+        self.n_frames, self.of_frames = some.n_frames, obs.n_frames if of_frames is None else of_frames
+        self._whole = cal.compressed
+        covariance = self._whole.whitening @ self._whole.whitening.T
+        rotations = quaternion_to_rotation(cal.quaternions)[places] if len(cal.quaternions) == obs.n_frames else None
+        frames = StarFrames.from_observations(some)
+        frame = np.repeat(np.arange(some.n_frames), frames.sizes)
+        plain = replace(cal, star_errors=None)
+        self._batches = []
+        for first in range(min(BATCHES, some.n_frames)):
+            batch = frames.select(frame % BATCHES == first)
+            start = None if rotations is None else rotations[first::BATCHES]
+            exact = ExactMarginal(batch, plain, start)
+            likelihood = MarginalLikelihood(batch, cal.camera.distortion)
+            expanded = compress(likelihood, self._whole.theta_hat, covariance, start)
+            self._batches.append((exact, expanded, self.of_frames / batch.n_frames))
+
+    def left_out(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Exact less compressed log likelihood of all frames, as every batch by itself has it, (B, n)."""
+        return np.array(
+            [
+                (exact.log_likelihood(theta, sigma) - expanded.log_likelihood(theta, sigma)) * stands_for
+                for exact, expanded, stands_for in self._batches
+            ]
+        )
+
+    def log_likelihood(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
+        """The compressed log likelihood of all frames, and what it leaves out (n,)."""
+        left_out: FloatArray = self.left_out(theta, sigma).mean(axis=0)
+        return self._whole.log_likelihood(theta, sigma) + left_out
