@@ -18,6 +18,7 @@ from starcal_uq.cli import paper as cli_paper
 from starcal_uq.cli import run as cli_run
 from starcal_uq.cli import statistics as cli_statistics
 from starcal_uq.cli import steps as cli_steps
+from starcal_uq.cli import study as cli_study
 from starcal_uq.core.errors import StarcalError
 
 app = typer.Typer(
@@ -48,7 +49,7 @@ def common(
     """Probabilistic calibration of star sensors: from identified stars to a posterior and its attitude error."""
 
 
-for module in (cli_run, cli_steps, cli_mission, cli_images, cli_filter, cli_statistics, cli_paper):
+for module in (cli_run, cli_steps, cli_mission, cli_study, cli_images, cli_filter, cli_statistics, cli_paper):
     module.register(app)
 
 
@@ -66,7 +67,7 @@ def main() -> None:
     except StarcalError as error:
         _fail(str(error), 2)
     except (typer.Abort, KeyboardInterrupt):
-        _fail("interrupted; what was complete is kept, and `sample` and `filter` go on where they stopped.", 1)
+        _fail("interrupted; what was complete is kept, and `sample`, `filter` and `study` go on where they stopped.", 1)
     except OSError as error:
         place = f"{error.filename}: " if error.filename else ""
         _fail(f"{place}{error.strerror or error}; check the path, its permissions and the space on the disk.", 2)

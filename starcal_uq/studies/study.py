@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
+import secrets
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from starcal_uq.camera.distortion import model_names, parameter_names
+from starcal_uq.core.cluster import Scheduler, cluster
 from starcal_uq.core.constants import AXES as ATTITUDE
 from starcal_uq.core.files import PathLike
 from starcal_uq.core.provenance import provenance
@@ -31,7 +32,8 @@ if TYPE_CHECKING:
     from starcal_uq.sky.catalogue import StarCatalogue
 
 # Guesses of processor time, by which cells are put together: a second's work goes to a process at once.
-_GEOMETRY_S, _CELL_S, _SIMULATED_S, _BATCH_S = 0.01, 0.0007, 0.12, 1.0
+_GEOMETRY_S, _CELL_S, _SIMULATED_S, _BATCH_S = 0.01, 0.0015, 0.1, 1.0
+_FEW_BATCHES = 5
 MISSING = "not computed yet: run the study again, and it goes on."
 
 
@@ -42,6 +44,7 @@ def study(
     seed: int | None = None,
     stars: StarCatalogue | None = None,
     workers: int | None = None,
+    scheduler: Scheduler = None,
     force: bool = False,
     progress: Progress | None = None,
 ) -> Study:
@@ -60,6 +63,8 @@ def study(
         The sky; the embedded catalogue at the epoch of the definition by default.
     workers : int, optional
         Processes; 0 stays in this one, None takes as many as there are processors.
+    scheduler : str or distributed.Client, optional
+        Dask scheduler whose workers compute the cells; processes of this machine otherwise.
     force : bool
         Compute all cells anew.
     progress : callable, optional
@@ -89,8 +94,7 @@ def study(
     if force:
         store.clear()
     known = store.keys()
-    todo = [i for i, key in enumerate(keys) if key not in known]
-    work = Work(wanted, heaven, [cells[i] for i in todo], [keys[i] for i in todo])
+    todo = [(key, cell) for key, cell in zip(keys, cells, strict=True) if key not in known]
     done = len(cells) - len(todo)
 
     def keep(rows: list[AnyDict]) -> None:
@@ -102,7 +106,7 @@ def study(
 
     interrupted = False
     if todo:
-        interrupted = run_batches(work, keep, workers)
+        interrupted = run_batches(Work(wanted, stars), batches_of(wanted, todo), keep, workers, scheduler)
     data = dataset(wanted, cells, keys, store)
     found = Study(data, wanted)
     if out is not None:
@@ -112,73 +116,96 @@ def study(
     return found
 
 
-@dataclass(eq=False)
-class Work:
-    """Cells to compute, in batches of neighbours; called with the number of a batch, in any process.
+Batch = list[tuple[str, Cell]]
 
-    Attributes
+
+def batches_of(definition: StudyDefinition, todo: Batch) -> list[Batch]:
+    """Cells with their hashes, in batches of about a second; those that share frames stand together."""
+    simulated = definition.mode == "simulate"
+    groups: dict[Any, Batch] = {}
+    for key, cell in todo:
+        groups.setdefault(key if simulated else frames_of(cell), []).append((key, cell))
+    batches: list[Batch] = [[]]
+    load = 0.0
+    for members in groups.values():
+        for place, member in enumerate(members):
+            if load >= _BATCH_S:
+                batches.append([])
+                load = 0.0
+            batches[-1].append(member)
+            load += _SIMULATED_S if simulated else _CELL_S + (_GEOMETRY_S if place == 0 else 0.0)
+    return batches
+
+
+class Work:
+    """From a batch of cells to their rows, in any process.
+
+    Parameters
     ----------
     definition : StudyDefinition
         The study.
-    heaven : Heaven
+    stars : StarCatalogue
         Its stars.
-    cells : list of Cell
-        What is to be computed.
-    keys : list of str
-        Their hashes.
     """
 
-    definition: StudyDefinition
-    heaven: Heaven
-    cells: list[Cell]
-    keys: list[str]
+    def __init__(self, definition: StudyDefinition, stars: StarCatalogue) -> None:
+        self.definition, self.stars = definition, stars
+        # A process that is given many batches, each with a copy of this, goes on with what it has.
+        self._token = secrets.token_hex(8)
 
-    @cached_property
-    def batches(self) -> list[list[int]]:
-        """Numbers of the cells of each batch; cells that share frames stand together."""
-        simulated = self.definition.mode == "simulate"
-        groups: dict[Any, list[int]] = {}
-        for number, cell in enumerate(self.cells):
-            groups.setdefault(number if simulated else frames_of(cell), []).append(number)
-        batches: list[list[int]] = [[]]
-        load = 0.0
-        for members in groups.values():
-            for place, number in enumerate(members):
-                if load >= _BATCH_S:
-                    batches.append([])
-                    load = 0.0
-                batches[-1].append(number)
-                load += _SIMULATED_S if simulated else _CELL_S + (_GEOMETRY_S if place == 0 else 0.0)
-        return batches
-
-    @cached_property
-    def computer(self) -> Callable[[Cell], AnyDict]:
-        """From a cell to its numbers."""
-        if self.definition.mode == "fisher":
-            return FisherCells(self.definition, self.heaven).numbers
-        from starcal_uq.studies.simulated import SimulatedCells
-
-        return SimulatedCells(self.definition, self.heaven).numbers
-
-    def __getstate__(self) -> AnyDict:
-        return {name: value for name, value in self.__dict__.items() if name != "computer"}
-
-    def __call__(self, index: int) -> list[AnyDict]:
+    def __call__(self, batch: Batch) -> list[AnyDict]:
+        compute = self._computer()
         rows = []
-        for number in self.batches[index]:
-            cell = self.cells[number]
+        for key, cell in batch:
             start = time.process_time()
-            numbers = self.computer(cell)
+            numbers = compute(cell)
             numbers["seconds"] = time.process_time() - start
-            rows.append(row(self.keys[number], model_of(self.definition, cell), numbers))
+            rows.append(row(key, model_of(self.definition, cell), numbers))
         return rows
 
+    def _computer(self) -> Callable[[Cell], AnyDict]:
+        if self._token not in _computers:
+            from starcal_uq.studies.simulated import SimulatedCells
 
-def run_batches(work: Work, keep: Callable[[list[AnyDict]], None], workers: int | None) -> bool:
+            kind = FisherCells if self.definition.mode == "fisher" else SimulatedCells
+            _computers.clear()
+            _computers[self._token] = kind(self.definition, Heaven(self.stars)).numbers
+        return _computers[self._token]
+
+
+_computers: dict[str, Callable[[Cell], AnyDict]] = {}
+
+
+@dataclass(frozen=True)
+class _Numbered:
+    """Work by the number of a batch."""
+
+    work: Work
+    batches: list[Batch]
+
+    def __call__(self, index: int) -> list[AnyDict]:
+        return self.work(self.batches[index])
+
+
+def run_batches(
+    work: Work,
+    batches: list[Batch],
+    keep: Callable[[list[AnyDict]], None],
+    workers: int | None,
+    scheduler: Scheduler,
+) -> bool:
     """Compute all batches and keep each as it arrives; whether Ctrl-C was pressed before the end."""
+    if scheduler is not None:
+        try:
+            with cluster(scheduler, caller="starcal_uq.study") as processes:
+                processes.map(work, batches, keep=lambda _, rows: keep(rows))
+        except KeyboardInterrupt:
+            return True
+        return False
     # A process takes seconds to start: what is done sooner is done here.
-    workers = 0 if workers is None and len(work.batches) < 4 else workers
-    _, interrupted = run_tasks(work, len(work.batches), caller="starcal_uq.study", chunk=1, workers=workers, each=keep)
+    workers = 0 if workers is None and len(batches) < _FEW_BATCHES else workers
+    task = _Numbered(work, batches)
+    _, interrupted = run_tasks(task, len(batches), caller="starcal_uq.study", chunk=1, workers=workers, each=keep)
     return interrupted
 
 

@@ -1,0 +1,123 @@
+"""Coupling studies: what couples with what, and what would decouple it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import starcal_uq as sc
+from starcal_uq.cli.console import err, print_json, print_table, progress_bar
+from starcal_uq.cli.console import out as console
+from starcal_uq.cli.options import Force, Json, SchedulerAddress
+from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.files import atomic_write_text, check_new_folder, new_folder
+
+# What a folder of a study holds; one of them is enough to go on with it.
+_MARKS = ("cells", "study.nc")
+_COPY = "study.toml"
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the command line."""
+    app.command("study")(study_command)
+
+
+def study_command(
+    file: Annotated[
+        Path, typer.Argument(metavar="STUDY", help="What is varied (TOML); --template writes one to start from.")
+    ],
+    out: Annotated[
+        Path,
+        typer.Option("-o", "--out", metavar="DIR", help="Folder for cells, results and report; a study goes on in it."),
+    ] = Path("study"),
+    template: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Write a commented STUDY and stop: fov-distortion, frames-stars, magnitude-noise, distortion-models.",
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=0, help="Processes; as many as processors by default, 0 for this one.")
+    ] = None,
+    scheduler: SchedulerAddress = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Root seed, instead of that of STUDY.")] = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Vary camera, sky, noise and observation: what couples, what decouples it, and what it does to attitudes.
+
+    Cells that are there already are not computed again; `--force` begins anew. Status 1 when no cell has numbers, or
+    after Ctrl-C, which keeps those that were complete.
+    """
+    if template is not None:
+        sc.studies.write_study_template(template, file, force)
+        print(f"Study to fill in: {file}. Next: starcal-uq study {file} -o {out}")
+        return
+    definition = sc.studies.StudyDefinition.load(file)
+    _check_folder(out, file, force)
+    copy = new_folder(out) / _COPY
+    if copy.resolve() != file.resolve():
+        atomic_write_text(copy, file.read_text("utf-8-sig"))
+    with progress_bar("cells") as progress:
+        found = sc.study(
+            definition, out=out, seed=seed, workers=workers, scheduler=scheduler, force=force, progress=progress
+        )
+    page = None
+    if found.ok.any():
+        from starcal_uq.presentation.pages.write import write_page
+
+        page = write_page(found, out)
+    if json:
+        print_json(_summary(found, out, page))
+    else:
+        _show(found, page)
+    if not found.complete:
+        err.print("interrupted; start the command again, and it goes on.", style="yellow")
+    if not found.complete or not found.ok.any():
+        raise typer.Exit(1)
+
+
+def _check_folder(out: Path, file: Path, force: bool) -> None:
+    """Refuse a folder that holds something other than a study."""
+    if sc.Run(out).has("calibration"):
+        raise RunFolderError(f"{out}: is the folder of a run, whose files would be mixed with these; name another.")
+    if out.is_dir() and (any((out / mark).exists() for mark in _MARKS) or {*out.iterdir()} <= {out / file.name}):
+        return
+    check_new_folder(out, force)
+
+
+def _summary(found: sc.studies.Study, out: Path, page: Path | None) -> dict[str, object]:
+    from starcal_uq.presentation.words.studies import study_advice, study_answer, study_limits
+
+    numbers = found.ok.any()
+    return {
+        "name": found.definition.name,
+        "question": found.definition.question,
+        "cells": found.n_cells,
+        "cells_ok": int(found.ok.sum()),
+        "complete": found.complete,
+        "problems": found.problems,
+        "answer": study_answer(found) if numbers else [],
+        "advice": study_advice(found) if numbers else [],
+        "limits": study_limits(found),
+        "data": str(out / "study.nc"),
+        "table": str(out / "study.parquet"),
+        "page": None if page is None else str(page),
+    }
+
+
+def _show(found: sc.studies.Study, page: Path | None) -> None:
+    from starcal_uq.presentation.words.studies import study_advice, study_answer, study_table
+
+    table = study_table(found)
+    if table is not None:
+        print_table(table)
+    for sentence in (*study_answer(found), *study_advice(found)):
+        console.print(sentence, highlight=False, soft_wrap=True)
+    for problem, n in found.problems.items():
+        err.print(f"{n} of {found.n_cells} cells: {problem}", style="yellow", highlight=False, soft_wrap=True)
+    if page is not None:
+        print(f"Page: {page.resolve()}")

@@ -1,0 +1,60 @@
+"""The command `study`: a template, a folder that goes on, errors in one sentence."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+STUDY = """\
+[study]
+target_arcsec = 0.05
+[camera]
+width_px = 1024
+height_px = 1024
+pixel_um = 12.0
+focal_mm = 70.2
+x0_px = 511.5
+y0_px = 511.5
+[sweep]
+frames = [50, 200]
+"""
+
+
+def test_a_study_from_its_file_to_its_page_and_on(painting_cli, tmp_path: Path, monkeypatch) -> None:
+    # Figures have tests of their own.
+    monkeypatch.setattr("starcal_uq.presentation.pages.studies.study_figures", lambda _study: {})
+    (tmp_path / "my.toml").write_text(STUDY, "utf-8")
+    status, printed, _ = painting_cli("study", "my.toml", "-o", "out", "--json", "--workers", 0)
+    found = json.loads(printed)
+    assert status == 0
+    assert (found["cells"], found["cells_ok"], found["complete"], found["problems"]) == (2, 2, True, {})
+    assert found["answer"] and found["advice"]
+    assert {path.name for path in (tmp_path / "out").iterdir()} >= {"cells", "study.nc", "study.parquet", "study.toml"}
+    assert (tmp_path / "out" / "study.toml").read_text("utf-8") == STUDY
+    assert Path(found["page"]).name == "report.html"
+
+
+def test_cells_without_numbers_alone_are_status_1(painting_cli, tmp_path: Path) -> None:
+    (tmp_path / "my.toml").write_text(STUDY + "fov_deg = [0.5]\n", "utf-8")
+    status, _, said = painting_cli("study", "my.toml", "-o", "out")
+    assert status == 1
+    assert "2 of 2 cells: only 0 of" in said
+
+
+def test_templates_and_errors(painting_cli, tmp_path: Path) -> None:
+    status, printed, _ = painting_cli("study", "new.toml", "--template", "frames-stars")
+    assert (status, printed.split(".")[0]) == (0, "Study to fill in: new")
+    (tmp_path / "bad.toml").write_text(STUDY.replace("frames", "frame"), "utf-8")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "thesis.tex").touch()
+    for arguments, words in (
+        (("new.toml", "--template", "frames-stars"), "new.toml: the file exists already"),
+        (("new.toml", "--template", "stars"), "template 'stars' is unknown: use one of fov-distortion,"),
+        (("none.toml",), "none.toml: the study file does not exist; write one with"),
+        (("bad.toml",), "bad.toml, section [sweep]: key frame is unknown; did you mean frames?"),
+        (("new.toml", "-o", "other"), "other: the folder exists and is not empty"),
+    ):
+        status, _, said = painting_cli("study", *arguments)
+        assert status == 2
+        assert said.startswith("error: ") and words in said and len(said.splitlines()) == 1
+    assert list((tmp_path / "other").iterdir()) == [tmp_path / "other" / "thesis.tex"]
