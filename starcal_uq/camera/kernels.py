@@ -44,7 +44,13 @@ _BINARY = {
 }
 
 
-def emit_source(function: Any, name: str = "kernel") -> str:
+def emit_source(
+    function: Any,
+    name: str = "kernel",
+    arguments: str = "inputs, out",
+    read: Callable[[int, int], str] = "inputs[{}][{}]".format,
+    write: Callable[[int, int], str] = "out[{}][{}]".format,
+) -> str:
     """Write the instruction list of a CasADi SX function as Python source.
 
     Parameters
@@ -53,6 +59,10 @@ def emit_source(function: Any, name: str = "kernel") -> str:
         An SX function with dense inputs and outputs.
     name : str
         Name of the emitted Python function.
+    arguments : str
+        Its arguments.
+    read, write : callable
+        From the number of an input or output and of its element to what stands for it in the source.
 
     Returns
     -------
@@ -68,7 +78,7 @@ def emit_source(function: Any, name: str = "kernel") -> str:
     import casadi as ca
 
     templates = {getattr(ca, key): value for key, value in (_UNARY | _BINARY).items()}
-    lines = [f"def {name}(inputs, out):"]
+    lines = [f"def {name}({arguments}):"]
     for index in range(function.n_instructions()):
         operation = function.instruction_id(index)
         sources = function.instruction_input(index)
@@ -76,9 +86,9 @@ def emit_source(function: Any, name: str = "kernel") -> str:
         if operation == ca.OP_CONST:
             lines.append(f"    w{targets[0]} = {float(function.instruction_constant(index))!r}")
         elif operation == ca.OP_INPUT:
-            lines.append(f"    w{targets[0]} = inputs[{sources[0]}][{sources[1]}]")
+            lines.append(f"    w{targets[0]} = {read(sources[0], sources[1])}")
         elif operation == ca.OP_OUTPUT:
-            lines.append(f"    out[{targets[0]}][{targets[1]}] = w{sources[0]}")
+            lines.append(f"    {write(targets[0], targets[1])} = w{sources[0]}")
         elif operation in templates:
             expression = templates[operation].format(*(f"w{source}" for source in sources))
             lines.append(f"    w{targets[0]} = {expression}")

@@ -198,7 +198,7 @@ def backward_second_kernel(model_name: str) -> Kernel:
 
 
 @lru_cache(maxsize=32)
-def _newton_kernel(model_name: str) -> Kernel:
+def newton_kernel(model_name: str) -> Kernel:
     """Kernel of one Newton step: next point (2,) and Jacobian determinant at the present one (1,)."""
     s = _symbols(model_name)
     point, determinant = _newton_step(model_name, s.root, s.pixel, s.theta)
@@ -227,7 +227,7 @@ def solve_displacement(
     (2, n) array
         Offsets in px; not finite where there is no solution before the distortion folds over.
     """
-    kernel = _newton_kernel(model_name)
+    kernel = newton_kernel(model_name)
     n = target.shape[1]
     point = target if start is None else start
     if not get_model(model_name).coefficients or n == 0 or not np.any(theta[3:]):
@@ -285,7 +285,7 @@ def fold_radius_px(model_name: str, theta: FloatArray, max_radius_px: float) -> 
     radius = np.linspace(0.0, max_radius_px, 501)[1:]
     angle = np.zeros(1) if get_model(model_name).radial else np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
     points = np.stack([np.outer(np.cos(angle), radius).ravel(), np.outer(np.sin(angle), radius).ravel()])
-    _, determinant = _newton_kernel(model_name)(points.shape[1], theta, points, points)
+    _, determinant = newton_kernel(model_name)(points.shape[1], theta, points, points)
     # det <= 0 marks a fold; a second crossing can make it positive again, so the first one counts.
     folded = (determinant[0].reshape(angle.size, radius.size) <= 0.0).any(axis=0)
     return float(radius[np.argmax(folded)]) if folded.any() else float("inf")

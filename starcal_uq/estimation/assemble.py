@@ -104,7 +104,7 @@ def assemble(
         pair_theta=pair_theta,
         pair_covariance=pair_covariance,
         compressed=compressed,
-        provenance=provenance(None, record | (settings or {}), obs.data_hash),
+        provenance=provenance(None, record | (settings or {}), obs.data_hash) | {"kernels": likelihood.kernels},
         fingerprints=Fingerprints.of(obs, residuals, nominal.centre_px),
     )
 

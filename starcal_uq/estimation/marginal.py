@@ -19,6 +19,7 @@ from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.projection import forward_kernel, forward_root, unproject_theta
 from starcal_uq.core.types import FloatArray
+from starcal_uq.estimation.loops import wanted
 from starcal_uq.estimation.solvers import Normal
 from starcal_uq.estimation.sums import (
     ATTITUDE_STEPS,
@@ -84,6 +85,11 @@ class MarginalLikelihood:
     def dof(self) -> int:
         """Independent numbers in the data after the attitudes: ``sum_k (2 m_k - 3)``."""
         return 2 * self.frames.n_stars - 3 * self.frames.n_frames
+
+    @property
+    def kernels(self) -> str:
+        """``numpy`` or ``numba``: what sums over all frames are made with."""
+        return "numba" if wanted(self.model_name, self.frames.n_stars) else "numpy"
 
     def start_rotations(self, theta: FloatArray) -> FloatArray:
         """Attitudes (K, 3, 3) by QUEST at theta."""

@@ -31,6 +31,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.camera.projection import forward_kernel, forward_root
 from starcal_uq.core.types import FloatArray
+from starcal_uq.estimation import loops
 from starcal_uq.estimation.solvers import Normal
 from starcal_uq.maths.linear import inverse_symmetric
 from starcal_uq.observations.frames import StarFrames
@@ -209,52 +210,53 @@ def frame_sums(
         What stays with the part.
     """
     theta = np.asarray(theta, dtype=np.float64)
-    p, k = len(theta), frames.n_frames
-    rows = p + 4
-    blocks = frames.parts(BLOCK_STARS)
-    starts = frames.starts
-    largest = max((int(starts[last] - starts[first]) for first, last in blocks), default=0)
-    buffers = _Buffers(p, largest)
-    kernel = forward_kernel(model_name, "first")
-    gram = np.zeros((p + 1, p + 1))
-    packed, mixed = np.empty((6, k)), np.empty((3, p + 1, k))
-    turn = np.zeros((3, p))
+    path = loops.frame_loop if loops.wanted(model_name, frames.n_stars) else _frame_blocks
     with np.errstate(all="ignore"):
-        for first, last in blocks:
-            part = frames.part(first, last)
-            columns = buffers.columns(part.n_stars)
-            b = part.rotated(rotations[first:last])
-            flat = columns.reshape(2 * rows, -1)
-            kernel.into((theta, b, forward_root(model_name, theta, b)), (flat[6:8], flat[8:], flat[:6]))
-            np.subtract(part.pixel, columns[3], out=columns[3])
-            if part.weight is not None:
-                columns *= part.weight
-            if residuals is not None:
-                residuals[:, int(starts[first]) : int(starts[last])] = columns[3]
-            if first == 0:
-                turn = _common_turn(columns)
-            flat = columns.reshape(rows, -1)
-            flat[4:] -= turn.T @ flat[:3]
-            gram += flat[3:] @ flat[3:].T
-            packed[:, first:last], mixed[:, :, first:last] = _unpacked(part.sum(buffers.products(columns)), rows)
-        inverse, determinant = inverse_symmetric(packed)
-        solved = np.einsum("ijk,jqk->iqk", inverse, mixed)
-        gram -= np.tensordot(mixed, solved, axes=([0, 2], [0, 2]))
-        log_determinant = np.log(determinant)
-        shift = solved[:, 0]
-        response = -solved[:, 1:] - turn[:, :, None]
-        attitudes = Attitudes(theta, rotations, shift, response, inverse, log_determinant)
-        largest_turn = float(np.max(np.abs(shift), initial=0.0))
+        gram, shift, response, inverse, volume = path(frames, model_name, theta, rotations, residuals)
         sums = NormalSums(
             cost=float(gram[0, 0]),
             gradient=-gram[0, 1:],
             matrix=gram[1:, 1:],
-            log_determinant=float(np.sum(log_determinant)),
-            turn=largest_turn,
+            log_determinant=float(np.sum(volume)),
+            turn=float(np.max(np.abs(shift), initial=0.0)),
             n_stars=frames.n_stars,
-            n_frames=k,
+            n_frames=frames.n_frames,
         )
-    return sums, attitudes
+    return sums, Attitudes(theta, rotations, shift, response, inverse, volume)
+
+
+def _frame_blocks(
+    frames: StarFrames, model_name: str, theta: FloatArray, rotations: FloatArray, residuals: FloatArray | None
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """As `starcal_uq.estimation.loops.frame_loop`, with NumPy."""
+    p, k = len(theta), frames.n_frames
+    rows = p + 4
+    blocks, starts = frames.parts(BLOCK_STARS), frames.starts
+    largest = max((int(starts[last] - starts[first]) for first, last in blocks), default=0)
+    buffers, kernel = _Buffers(p, largest), forward_kernel(model_name, "first")
+    gram, turn = np.zeros((p + 1, p + 1)), np.zeros((3, p))
+    packed, mixed = np.empty((6, k)), np.empty((3, p + 1, k))
+    for first, last in blocks:
+        part = frames.part(first, last)
+        columns = buffers.columns(part.n_stars)
+        b = part.rotated(rotations[first:last])
+        flat = columns.reshape(2 * rows, -1)
+        kernel.into((theta, b, forward_root(model_name, theta, b)), (flat[6:8], flat[8:], flat[:6]))
+        np.subtract(part.pixel, columns[3], out=columns[3])
+        if part.weight is not None:
+            columns *= part.weight
+        if residuals is not None:
+            residuals[:, int(starts[first]) : int(starts[last])] = columns[3]
+        if first == 0:
+            turn = _common_turn(columns)
+        flat = columns.reshape(rows, -1)
+        flat[4:] -= turn.T @ flat[:3]
+        gram += flat[3:] @ flat[3:].T
+        packed[:, first:last], mixed[:, :, first:last] = _unpacked(part.sum(buffers.products(columns)), rows)
+    inverse, determinant = inverse_symmetric(packed)
+    solved = np.einsum("ijk,jqk->iqk", inverse, mixed)
+    gram -= np.tensordot(mixed, solved, axes=([0, 2], [0, 2]))
+    return gram, solved[:, 0], -solved[:, 1:] - turn[:, :, None], inverse, np.log(determinant)
 
 
 def settled_sums(

@@ -1,0 +1,144 @@
+"""Sums over parts of the frames, on the NumPy path and compiled."""
+
+from __future__ import annotations
+
+import importlib.util
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from starcal_uq.camera import compiled
+from starcal_uq.core.errors import StarcalError
+from starcal_uq.estimation.compressed import gram_sums
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.sums import Descent, frame_sums, settled_sums, sum_of
+from tests.helpers.scenes import camera, observations, with_sigmas
+
+needs_numba = pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="Numba is not installed")
+
+
+def _scaled(matrix, reference):
+    scale = np.sqrt(np.diag(reference))
+    return matrix / np.outer(scale, scale)
+
+
+def test_parts_add_up_wherever_they_are_cut():
+    likelihood = MarginalLikelihood(with_sigmas(observations(n_frames=60)), "brown")
+    frames, theta = likelihood.frames, camera().theta
+    whole, attitudes = settled_sums(frames, "brown", theta, likelihood.start_rotations(theta))
+    whitening = np.diag(1.0 / np.sqrt(np.diag(whole.matrix)))
+    gram = gram_sums(frames, "brown", theta, whitening, attitudes.rotations)
+    cuts = [(0, 1), (1, 27), (27, 60)]
+    parts = [frame_sums(frames.part(a, b), "brown", theta, attitudes.rotations[a:b])[0] for a, b in cuts]
+    grams = [gram_sums(frames.part(a, b), "brown", theta, whitening, attitudes.rotations[a:b]) for a, b in cuts]
+    total = sum_of(parts)
+    assert total.cost == pytest.approx(whole.cost, rel=1e-12)
+    assert np.allclose(_scaled(total.matrix, whole.matrix), _scaled(whole.matrix, whole.matrix), rtol=0, atol=1e-12)
+    assert (total.n_stars, total.n_frames) == (frames.n_stars, 60)
+    added = grams[0] + grams[1] + grams[2]
+    assert np.allclose(_scaled(added.gram, gram.gram), _scaled(gram.gram, gram.gram), rtol=0, atol=1e-9)
+    size = np.abs(gram.gram).max()
+    assert np.allclose(added.gram, gram.gram, rtol=0, atol=1e-14 * size)
+    assert added.log_determinant == pytest.approx(gram.log_determinant, rel=1e-12)
+
+
+def test_attitudes_follow_the_parameters_in_one_pass():
+    likelihood = MarginalLikelihood(observations(n_frames=40), "brown")
+    frames, theta = likelihood.frames, np.array(camera().theta)
+    descent = Descent(frames, "brown", likelihood.start_rotations(theta))
+    first = descent.evaluate(theta)
+    sigma = np.sqrt(np.diag(np.linalg.inv(_scaled(first.matrix, first.matrix)))) / np.sqrt(np.diag(first.matrix)) * 0.05
+    moved = theta + 3.0 * sigma
+    followed, exact = descent.evaluate(moved), likelihood.evaluate(moved)
+    assert followed.cost == pytest.approx(exact.cost, rel=1e-9)
+    # Attitudes that stay where they were are far from the best: what the sums say is then no evaluation of the model.
+    stayed = likelihood.frames.pixel - _predicted(frames, moved, descent.best[1].rotations)
+    left = likelihood.frames.pixel - _predicted(frames, moved, likelihood.profile(moved)[0].rotations)
+    assert np.sum(stayed**2) > 1.01 * np.sum(left**2)
+
+
+def _predicted(frames, theta, rotations):
+    from starcal_uq.camera.projection import forward_kernel
+
+    return forward_kernel("brown", "value")(frames.n_stars, theta, frames.rotated(rotations), np.zeros(2))[0]
+
+
+def test_switch_of_the_kernels(monkeypatch):
+    monkeypatch.setenv(compiled.SWITCH, "auto")
+    assert compiled.chosen(1000, lambda: "unused") == "numpy"
+    assert compiled.chosen(10**6, lambda: "never compiled") == "numpy"
+    monkeypatch.setenv(compiled.SWITCH, "numpy")
+    assert compiled.chosen(10**9, lambda: "") == "numpy"
+    with pytest.raises(StarcalError, match="auto, numpy, numba"):
+        compiled.use("fortran")
+    monkeypatch.setattr(compiled, "installed", lambda: False)
+    assert compiled.SWITCH == "STARCAL_UQ_KERNELS"
+    with pytest.raises(StarcalError, match=r"starcal-uq\[compiled\]"):
+        compiled.use("numba")
+
+
+@needs_numba
+@pytest.mark.slow
+@pytest.mark.parametrize(("model", "stated"), [("brown", False), ("brown", True), ("inverse", False), ("none", True)])
+def test_compiled_loops_equal_numpy(model, stated, monkeypatch):
+    obs = observations(model, n_frames=60)
+    likelihood = MarginalLikelihood(with_sigmas(obs) if stated else obs, model)
+    theta = camera(model).theta
+    monkeypatch.setenv(compiled.SWITCH, "numpy")
+    rotations = likelihood.start_rotations(theta)
+    plain, where = frame_sums(likelihood.frames, model, theta, rotations)
+    monkeypatch.setenv(compiled.SWITCH, "numba")
+    residuals = np.empty((2, likelihood.frames.n_stars))
+    fused, there = frame_sums(likelihood.frames, model, theta, rotations, residuals)
+    assert fused.cost == pytest.approx(plain.cost, rel=1e-12)
+    difference = _scaled(fused.matrix - plain.matrix, plain.matrix)
+    assert np.max(np.abs(difference)) < 1e-12
+    slope = (fused.gradient - plain.gradient) / np.sqrt(np.diag(plain.matrix) * plain.cost)
+    assert np.max(np.abs(slope)) < 1e-12
+    assert np.allclose(there.shift, where.shift, rtol=0, atol=1e-15)
+    # Rounding of positions of a thousand px, in units of a noise of down to 0.02 px.
+    assert np.allclose(residuals, _residuals(likelihood, model, theta, rotations), rtol=0, atol=1e-10)
+    # A theta at which the model is not finite is not finite on either path.
+    bad = np.array(theta)
+    bad[2] = np.nan
+    assert frame_sums(likelihood.frames, model, bad, rotations)[0].normal.cost == np.inf
+
+
+def _residuals(likelihood, model, theta, rotations):
+    from starcal_uq.camera.projection import forward_kernel, forward_root
+
+    frames = likelihood.frames
+    b = frames.rotated(rotations)
+    (xy,) = forward_kernel(model, "value")(frames.n_stars, theta, b, forward_root(model, theta, b))
+    e = frames.pixel - xy
+    return e if frames.weight is None else e * frames.weight
+
+
+@needs_numba
+@pytest.mark.slow
+def test_machine_code_is_kept_for_other_processes_and_not_needed(tmp_path, monkeypatch):
+    script = (
+        "import time, numpy as np\n"
+        "from starcal_uq.camera import compiled\n"
+        "from starcal_uq.estimation import loops\n"
+        "text = loops.source('none')\n"
+        "loops.compiled.load('none', text)\n"
+        "print(compiled.chosen(10**6, lambda: text), compiled._folder(text).exists())\n"
+    )
+
+    def run(folder):
+        environment = {"XDG_CACHE_HOME": str(folder), "PATH": "", "HOME": str(tmp_path), "PYTHONPATH": sys.path[0]}
+        done = subprocess.run([sys.executable, "-c", script], env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return done.stdout.split()
+
+    assert run(tmp_path / "cache") == ["numba", "True"]
+    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.nbc")}
+    assert len(kept) > 0
+    assert run(tmp_path / "cache") == ["numba", "True"]
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "cache").rglob("*.nbc")} == kept
+    blocked = tmp_path / "file"
+    blocked.write_text("no folder")
+    assert run(blocked) == ["numpy", "False"]
