@@ -363,8 +363,17 @@ class Sweep:
     @cached_property
     def frame_error(self) -> FloatArray:
         """Frame-dependent error of the calibration across the boresight, 1 sigma per axis, of every cell (arcsec)."""
-        cross = self.data["frame_error_arcsec"].sel(axis=["pitch", "yaw"]).values
-        return np.asarray(np.sqrt(np.mean(cross**2, axis=-1)), dtype=np.float64)
+        return self.cross("frame_error_arcsec")
+
+    @cached_property
+    def common_rotation(self) -> FloatArray:
+        """Rotation common to all frames across the boresight, 1 sigma per axis, of every cell (arcsec)."""
+        return self.cross("common_rotation_arcsec")
+
+    def cross(self, variable: str) -> FloatArray:
+        """Root mean square over pitch and yaw of a variable by axis, of every cell."""
+        across = self.data[variable].sel(axis=["pitch", "yaw"]).values
+        return np.asarray(np.sqrt(np.mean(across**2, axis=-1)), dtype=np.float64)
 
     @cached_property
     def pairs(self) -> tuple[Pair, ...]:

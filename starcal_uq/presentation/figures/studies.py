@@ -87,7 +87,7 @@ def numbers_of(
             raise ValueError(f"{variable} needs {name}: one of {', '.join(study.parameter_names)}.")
         found = found.sel({name: wanted})
     if "axis" in found.dims:
-        return _cross(found.values), f"{words} [{unit}]"
+        return study.sweep.cross(variable), f"{words} [{unit}]"
     numbers = np.asarray(found.values, dtype=np.float64)
     if variable == "variance_inflation":
         numbers = np.sqrt(numbers)
@@ -96,11 +96,6 @@ def numbers_of(
         numbers, unit = numbers / spec.scale, pretty_unit(spec.scaled_unit)
     text = words.format(*(symbol(name) for name in (parameter, parameter_2) if name is not None))
     return numbers, f"{text} [{unit}]" if unit else text
-
-
-def _cross(by_axis: Any) -> FloatArray:
-    """Root mean square over pitch and yaw, the last index being the axis."""
-    return np.asarray(np.sqrt(np.mean(np.asarray(by_axis, dtype=np.float64)[..., :2] ** 2, axis=-1)))
 
 
 def plot_study_correlation(
@@ -646,8 +641,8 @@ def _two_axes(
 ) -> tuple[str, str | None]:
     """The axis to draw along, and the one that tells lines apart: as named, or the first that are left.
 
-    Numbers come first, because lines are for them; with `names`, names do. With `lines`, axes of a Latin hypercube tell
-    no lines apart.
+    Lines run along numbers, and names tell them apart; with `names` it is the other way round. With `lines`, axes of a
+    Latin hypercube tell no lines apart.
     """
     if not sweep.axes:
         raise ValueError("nothing was swept: give [sweep] an axis with more than one value.")
@@ -656,11 +651,14 @@ def _two_axes(
         if axis not in sweep.axes:
             raise ValueError(f"{axis!r} was not swept: use one of {', '.join(sweep.axes)}.")
     free = [axis for axis in sweep.axes if axis not in named]
-    free.sort(key=lambda axis: _numeric(sweep.values[axis]) is names)
-    along = along or free.pop(0)
+    if along is None:
+        along = next((axis for axis in free if _numeric(sweep.values[axis]) is not names), free[0])
+        free.remove(along)
     # What was drawn and not laid out makes no lines: the other drawn axes are in the band.
     free = [axis for axis in free if not (axis in sweep.drawn and lines)]
-    return along, by or (free[0] if free else None)
+    if by is None and free:
+        by = next((axis for axis in free if _numeric(sweep.values[axis]) is names), free[0])
+    return along, by
 
 
 def _some(n: int, most: int) -> list[int]:
@@ -795,9 +793,10 @@ def _plain(axis: Any) -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator
 
     low, high = axis.get_view_interval()
-    subs = (1.0, 2.0, 5.0) if high < 150.0 * low else (1.0,)
+    span = high / low
+    subs = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0) if span < 6.0 else (1.0, 2.0, 5.0) if span < 150.0 else (1.0,)
     axis.set_major_locator(LogLocator(subs=subs, numticks=20))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: count(int(value)) if value >= 1.0 else f"{value:.6g}"))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: count(int(value)) if value >= 10.0 else f"{value:.6g}"))
     axis.set_minor_locator(_no_ticks())
 
 

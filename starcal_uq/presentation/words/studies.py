@@ -30,8 +30,12 @@ _TOLD = 4
 _SAME = 0.99
 # An error that changes by less than this factor along an axis hardly depends on it.
 _HARDLY = 1.1
+# What a lens and a catalogue are, and nobody chooses.
+_NATURE = ("distortion", "distortion_px", "direction_mas", "k1", "k2", "k3", "p1", "p2")
 # A price in sigma from which it pays to do something about a coupling.
 _DEAR = 2.0
+# A common rotation that differs by this factor over the sweep is worth a word.
+_MIND = 3.0
 
 
 def study_text(study: Study) -> str:
@@ -63,7 +67,7 @@ def study_answer(study: Study) -> list[str]:
         _weakest(sweep),
         _price(study),
         _gauge(study),
-        _errors(sweep),
+        *_errors(sweep),
         _target(study),
         *_models(study),
         *_simpler(study),
@@ -215,7 +219,7 @@ def _price(study: Study) -> str:
 def _span(values: FloatArray) -> str:
     """Least to most of what is finite."""
     good = values[np.isfinite(values)]
-    ends = [significant(float(v), 3 if abs(v) >= 1.0 else 2) for v in (good.min(), good.max())]
+    ends = [significant(float(v), 3 if abs(v) >= 0.1 else 2) for v in (good.min(), good.max())]
     return ends[0] if ends[0] == ends[1] else f"{ends[0]} to {ends[1]}"
 
 
@@ -257,20 +261,32 @@ def error_effects(sweep: Sweep, numbers: FloatArray) -> list[Effect]:
     return sorted(found, key=lambda effect: -effect.factor)
 
 
-def _errors(sweep: Sweep) -> str:
-    """Sizes of the error that differs from frame to frame, and what each axis does to it."""
-    effects = error_effects(sweep, sweep.frame_error)
-    text = (
-        "The error that differs from frame to frame is "
-        f"{_span(sweep.over(sweep.frame_error))} arcsec (1 sigma per axis across the boresight)"
-    )
+def _errors(sweep: Sweep) -> list[str]:
+    """Sizes of both attitude errors of the calibration, and what each axis does to them."""
+    return [
+        _error("The error that differs from frame to frame is", sweep, sweep.frame_error),
+        _error("The rotation common to all frames is", sweep, sweep.common_rotation),
+    ]
+
+
+def _error(head: str, sweep: Sweep, numbers: FloatArray) -> str:
+    effects = error_effects(sweep, numbers)
+    grid = sweep.over(numbers).ravel()
+    ends = [int(np.nanargmin(grid)), int(np.nanargmax(grid))]
+    text = f"{head} {_span(grid)} arcsec (1 sigma per axis across the boresight)"
+    if len(sweep.axes) > 1 and grid[ends[1]] >= _HARDLY * grid[ends[0]]:
+        text += f", least with {place(sweep.at(ends[0]))}, most with {place(sweep.at(ends[1]))}"
     strong = [_effect(effect) for effect in effects if effect.factor >= _HARDLY]
     weak = [axis_name(effect.curve.axis) for effect in effects if effect.factor < _HARDLY]
     if strong:
-        text += f": {join_words(strong)}"
+        text += f". {_medians(len(sweep.axes))}{', '.join(strong)}"
     if weak:
         text += f"; it hardly depends on {join_words(weak)}" if strong else f", whatever {join_words(weak)} may be"
     return text + "."
+
+
+def _medians(n_axes: int) -> str:
+    return "Medians: " if n_axes > 1 else "It goes from "
 
 
 def _effect(effect: Effect) -> str:
@@ -285,7 +301,7 @@ def _effect(effect: Effect) -> str:
     words = " to ".join(f"{significant(float(curve.median[i]))} with {said(curve.axis, curve.values[i])}" for i in ends)
     law = ""
     if effect.exponent is not None and curve.axis != "max_mag":
-        law = f", as the power {fixed(effect.exponent, 2)}"
+        law = f" (proportional to its power {fixed(effect.exponent, 2)})"
     return f"{words}{law}"
 
 
@@ -360,20 +376,25 @@ def _models(study: Study) -> list[str]:
     sweep = study.sweep
     if "distortion" not in sweep.axes:
         return []
-    names = sorted(sweep.values["distortion"], key=lambda model: len(parameters(model)))
+    known = sweep.values["distortion"]
+    names = sorted(known, key=lambda model: len(parameters(model)))
     position = sweep.axes.index("distortion")
-    sigma_f = np.asarray(study.data["sigma"].sel(parameter="f").values, dtype=np.float64)
+    numbers = {
+        "the sigma of f": np.asarray(study.data["sigma"].sel(parameter="f").values, dtype=np.float64),
+        "the error from frame to frame": sweep.frame_error,
+        "the common rotation": sweep.common_rotation,
+    }
+    grids = {words: sweep.over(array) for words, array in numbers.items()}
     told = []
-    first = names[0]
     for model in names[1:]:
         factors = []
-        for numbers in (sigma_f, sweep.frame_error):
-            grid = sweep.over(numbers)
-            a, b = (np.take(grid, sweep.values["distortion"].index(m), position) for m in (first, model))
-            factors.append(b / a)
-        if all(np.isfinite(f).any() for f in factors):
-            told.append(f"{model} has {_span(factors[0])} times the sigma of f and {_span(factors[1])} times the error")
-    return [f"Beside the model {first}: {'; '.join(told)}."] if told else []
+        for words, grid in grids.items():
+            first, other = (np.take(grid, known.index(name), position) for name in (names[0], model))
+            if np.isfinite(other / first).any():
+                factors.append(f"{_span(other / first)} times {words}")
+        if factors:
+            told.append(f"{model} has {join_words(factors)}")
+    return [f"Beside the model {names[0]}: {'; '.join(told)}."] if told else []
 
 
 def _simpler(study: Study) -> list[str]:
@@ -387,6 +408,11 @@ def _simpler(study: Study) -> list[str]:
         grid, error = sweep.over(bias), sweep.over(np.where(np.isfinite(bias), sweep.frame_error, np.nan))
         known = np.isfinite(grid) & np.isfinite(error)
         if not known.any():
+            continue
+        # Where the coefficients that it leaves out are zero, nothing was tried.
+        known &= grid > 0.0
+        if not known.any():
+            parts.append(f"The model {model} lacks nothing here: the coefficients that it leaves out are zero.")
             continue
         good = known & (grid < error)
         size = f"{_span(grid[known])} arcsec against {_span(error[known])} of the calibration"
@@ -467,17 +493,23 @@ def study_advice(study: Study) -> list[str]:
 def _advice_couplings(study: Study) -> list[str]:
     sweep = study.sweep
     parts = []
-    best: dict[tuple[str, Any], list[str]] = {}
+    best: dict[tuple[str, Any, bool], list[str]] = {}
     stuck = []
     for pair in sweep.coupled:
         found = pair.decoupling()
         if found:
-            size, cost = found[0]
-            best.setdefault((size.axis, size.values[cost.least]), []).append(_dashed(pair))
+            _, cost = found[0]
+            key = cost.axis, cost.values[cost.least], _pays(study, pair, cost)
+            best.setdefault(key, []).append(_dashed(pair))
         elif float(np.exp(max((c.median.min() for c in pair.costs), default=0.0))) >= _DEAR:
             stuck.append(_dashed(pair))
-    for (axis, value), names in best.items():
-        if axis == "distortion":
+    for (axis, value, pays), names in best.items():
+        if not pays:
+            parts.append(
+                f"{join_words(names)} are least coupled with {said(axis, value)}, but their sigmas are no smaller "
+                "there: that alone is no reason to go there."
+            )
+        elif axis == "distortion":
             parts.append(f"To tell {join_words(names)} apart, take the model {value} if its bias allows.")
         else:
             parts.append(f"To tell {join_words(names)} apart, go to {said(axis, value)}.")
@@ -488,6 +520,25 @@ def _advice_couplings(study: Study) -> list[str]:
             "model with fewer coefficients where its bias allows."
         )
     return parts
+
+
+def _pays(study: Study, pair: Pair, cost: Curve) -> bool:
+    """Whether both sigmas are smaller where the pair is least coupled than where it is most."""
+    sweep = study.sweep
+    for name in pair.names:
+        sigma = np.where(
+            np.isfinite(_correlations(study, pair)), study.data["sigma"].sel(parameter=name).values, np.nan
+        )
+        curve = sweep.along(sigma, cost.axis)
+        if curve is None or curve.median[cost.least] >= curve.median[cost.most]:
+            return False
+    return True
+
+
+def _correlations(study: Study, pair: Pair) -> FloatArray:
+    """Correlation of a pair in every cell (C,)."""
+    found = study.data["correlation"].sel(parameter=pair.names[0], parameter_2=pair.names[1])
+    return np.asarray(found.values, dtype=np.float64)
 
 
 def _advice_errors(sweep: Sweep) -> list[str]:
@@ -512,9 +563,22 @@ def _advice_errors(sweep: Sweep) -> list[str]:
             also.append(f"noise {significant(deeper ** (1.0 / laws['sigma_px']))} times smaller")
         same = f", as much as {join_words(also)}" if also else ""
         parts.append(f"One magnitude more in the limit divides the attitude error by {significant(deeper)}{same}.")
-    if laws.get("frames") and laws.get("sigma_px"):
+    worth = []
+    for axis, law in laws.items():
+        if laws.get("frames") and axis != "frames" and abs(law) > 0.2:
+            more = "half" if law > 0.0 else "twice"
+            worth.append(
+                f"{more} the {axis_name(axis)} is worth {significant(2.0 ** (-abs(law) / laws['frames']))} times"
+            )
+    if worth:
+        parts.append(f"{_capital(join_words(worth))} the frames: they do the same to the attitude error.")
+    common = sweep.over(sweep.common_rotation).ravel()
+    least, most = int(np.nanargmin(common)), int(np.nanargmax(common))
+    if sweep.axes and common[most] >= _MIND * common[least]:
         parts.append(
-            f"Half the noise is worth {significant(2.0 ** (-laws['sigma_px'] / laws['frames']))} times the frames."
+            "If alignment is not calibrated with the same parameters, mind the common rotation: "
+            f"{significant(float(common[most]))} arcsec with {place(sweep.at(most))}, "
+            f"{significant(float(common[least]))} with {place(sweep.at(least))}."
         )
     return parts
 
@@ -541,12 +605,20 @@ def _advice_target(study: Study) -> str:
         return f"For {target:g} arcsec take {plural(int(needed[best]), 'frame')}{f' with {at}' if at else ''}."
     if "frames" not in sweep.axes:
         return ""
-    frames = np.array([sweep.at(int(i))["frames"] for i in met], dtype=np.float64)
-    fewest = met[frames == frames.min()]
+    # What the lens is, nobody chooses: the target is to be met whatever it is.
+    given = [i for i, axis in enumerate(sweep.axes) if axis in _NATURE]
+    worst = np.max(sweep.over(sweep.frame_error), axis=tuple(given), keepdims=True)
+    met = np.broadcast_to(worst <= target, sweep.shape).ravel()
+    whatever = f", whatever {join_words([_the(sweep.axes[i]) for i in given])} of this sweep" if given else ""
+    if not met.any():
+        return f"No place of this sweep keeps {target:g} arcsec{whatever}: take more frames." if given else ""
+    frames = np.array([sweep.at(i)["frames"] for i in range(len(met))], dtype=np.float64)
+    fewest = met & (frames == frames[met].min())
     # Of those, the one with most to spare.
-    best = int(fewest[np.argmin(errors[fewest])])
-    left = significant(float(errors[best]))
-    return f"The fewest frames that keep {target:g} arcsec: {place(sweep.at(best))} ({left} arcsec)."
+    errors = np.where(fewest, np.broadcast_to(worst, sweep.shape).ravel(), np.inf)
+    best = int(np.argmin(errors))
+    at = place({axis: value for axis, value in sweep.at(best).items() if axis not in _NATURE})
+    return f"The fewest frames that keep {target:g} arcsec{whatever}: {at} ({significant(float(errors[best]))} arcsec)."
 
 
 def _advice_models(study: Study) -> str:
@@ -559,7 +631,8 @@ def _advice_models(study: Study) -> str:
     for i, model in enumerate(map(str, study.data["simpler"].values)):
         bias = model_bias(study, i)
         known = sweep.ok & np.isfinite(bias)
-        if known.any():
+        # Where what it leaves out is zero, nothing was tried.
+        if known.any() and np.any(bias[known] > 0.0):
             (good if np.all(bias[known] < sweep.frame_error[known]) else bad).append(model)
     order = sorted(good, key=lambda model: len(parameters(model)))
     if order:
@@ -600,8 +673,7 @@ def summary_columns(study: Study) -> list[tuple[str, FloatArray, Any]]:
     sweep = study.sweep
     columns: list[tuple[str, FloatArray, Any]] = []
     for pair in sorted(sweep.coupled or sweep.pairs[:1], key=lambda pair: -pair.mean_size)[:2]:
-        r = study.data["correlation"].sel(parameter=pair.names[0], parameter_2=pair.names[1]).values
-        columns.append((f"Correlation {pair.names[0]}, {pair.names[1]}", np.asarray(r, dtype=np.float64), _correlation))
+        columns.append((f"Correlation {pair.names[0]}, {pair.names[1]}", _correlations(study, pair), _correlation))
     factor = np.sqrt(study.data["variance_inflation"].sel(parameter="f").values)
     spec = parameter_called("f")
     columns.append(
@@ -609,8 +681,7 @@ def summary_columns(study: Study) -> list[tuple[str, FloatArray, Any]]:
     )
     columns.append(("Price of coupling, f", np.asarray(factor, dtype=np.float64), _number))
     columns.append(("Condition number", study.data["condition_number"].values, _number))
-    common = np.sqrt(np.mean(study.data["common_rotation_arcsec"].values[:, :2] ** 2, axis=-1))
-    columns.append(("Common rotation [arcsec]", common, _number))
+    columns.append(("Common rotation [arcsec]", sweep.common_rotation, _number))
     columns.append(("Frame error [arcsec]", sweep.frame_error, _number))
     target = study.definition.target_arcsec
     if target is not None:
