@@ -68,6 +68,8 @@ class Match:
         Centroids that more than one star fits.
     n_unlike_brightness : int
         Centroids left out because they are farther from their star, and less of its brightness, than chance explains.
+    n_possible : int
+        Centroids, or stars of the catalogue in the field if those are fewer: no match has more.
     information : (4, 4) array, gradient : (4,) array
         Information on the shared parameters, attitude eliminated: information times their best value is
         ``gradient``.
@@ -82,6 +84,7 @@ class Match:
     log10_false: float
     n_ambiguous: int
     n_unlike_brightness: int
+    n_possible: int
     information: FloatArray
     gradient: FloatArray
 
@@ -154,7 +157,8 @@ def match_frame(
         state, e = _fit(state, _linearised(state, u, sigma_px, r, centroid, star, g), prior)
     information, gradient = _information(state, _linearised(state, u, sigma_px * noise_scale, r, centroid, star, g))
     on_detector = np.all(np.abs(predicted) < 0.5 * np.array([g.width_px, g.height_px]) + 30.0, axis=1)
-    density = max(int(on_detector.sum()), 4) / (g.width_px * g.height_px)
+    in_field = max(int(on_detector.sum()), 4)
+    density = in_field / (g.width_px * g.height_px)
     expected = log10_false_matches(len(u), len(star), density, depth, typical * noise_scale, g, tolerance)
     return Match(
         state,
@@ -166,6 +170,7 @@ def match_frame(
         expected,
         int(ambiguous),
         int(refused.sum()),
+        min(len(u), in_field),
         information,
         gradient,
     )

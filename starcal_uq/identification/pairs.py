@@ -13,14 +13,18 @@ import os
 import sys
 import zipfile
 from dataclasses import dataclass, fields
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path
 from starcal_uq.core.types import FloatArray, IntArray
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 # Stars a field should hold; a star with this many brighter ones within a field's area around it is no pattern star.
 PATTERN_STARS = 18
@@ -92,6 +96,13 @@ class StarPairs:
         return question[inside], self.neighbour[row[inside]]
 
     @cached_property
+    def tree(self) -> cKDTree:
+        """The pattern stars as a tree of `directions`."""
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self.directions)
+
+    @cached_property
     def _steps(self) -> tuple[IntArray, float]:
         """Where each step of each star's neighbours begins, (n * steps + 1,), and the steps per rad."""
         width = (float(self.angle[-1]) if len(self.angle) else 1.0) / _STEPS * (1.0 + 1e-12)
@@ -134,6 +145,39 @@ def angle_between(a: FloatArray, b: FloatArray) -> FloatArray:
     return angle
 
 
+# What was prepared last, for cameras that are used in turns; the key says for what.
+_RECENT = 4
+_recent: dict[str, StarPairs] = {}
+
+
+def prepared_star_pairs(
+    directions: FloatArray,
+    mag: FloatArray,
+    field_sr: float,
+    max_angle_rad: float,
+    cache: bool,
+    cache_dir: str | os.PathLike[str] | None = None,
+) -> StarPairs:
+    """The pairs that this process has used before, or else those of the file where `cache` is on, or new ones."""
+    key = _digest(directions, mag, field_sr, max_angle_rad, PATTERN_STARS)
+    pairs = _recent.pop(key, None)
+    if pairs is None:
+        make = partial(cached_star_pairs, cache_dir=cache_dir) if cache else find_star_pairs
+        pairs = make(directions, mag, field_sr, max_angle_rad)
+        while len(_recent) >= _RECENT:
+            del _recent[next(iter(_recent))]
+    _recent[key] = pairs
+    return pairs
+
+
+def _digest(directions: FloatArray, mag: FloatArray, *parameters: float) -> str:
+    """What pairs are made of, in 24 letters."""
+    digest = hashlib.sha256(repr((_VERSION, *parameters)).encode())
+    for array in (directions, mag):
+        digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
+    return digest.hexdigest()[:24]
+
+
 def cached_star_pairs(
     directions: FloatArray,
     mag: FloatArray,
@@ -147,11 +191,8 @@ def cached_star_pairs(
     The file's name is a hash of the catalogue and of all parameters. A damaged file is replaced; a folder that cannot
     be written to does no harm.
     """
-    digest = hashlib.sha256(repr((_VERSION, field_sr, max_angle_rad, per_field)).encode())
-    for array in (directions, mag):
-        digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
     folder = default_cache_dir() if cache_dir is None else Path(cache_dir)
-    path = folder / f"star-pairs-{digest.hexdigest()[:24]}.npz"
+    path = folder / f"star-pairs-{_digest(directions, mag, field_sr, max_angle_rad, per_field)}.npz"
     stored = _read(path)
     if stored is not None:
         return stored

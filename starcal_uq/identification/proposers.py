@@ -13,7 +13,7 @@ import numpy as np
 
 from starcal_uq.core.errors import IdentificationError
 from starcal_uq.core.types import FloatArray
-from starcal_uq.identification.pairs import StarPairs, cached_star_pairs, find_star_pairs
+from starcal_uq.identification.pairs import StarPairs, prepared_star_pairs
 from starcal_uq.identification.pyramid import CameraTolerance, FieldGeometry, Hypothesis, hypotheses
 from starcal_uq.sky.catalogue import StarCatalogue
 from starcal_uq.sky.gaia import write_gaia_records
@@ -37,14 +37,11 @@ def prepare_engine(
     cache_dir: str | PathLike[str] | None,
 ) -> Proposer:
     """The catalogue prepared for one of `ENGINES`; `IdentificationError` where its package is not installed."""
-    from scipy.spatial import cKDTree
-
     if engine == "tetra3rs":
         return PlateSolver(stars, geometry, tolerance).hypotheses
     if engine != "pyramid":
         raise IdentificationError(f"there is no engine {engine!r}: choose {' or '.join(ENGINES)}.")
-    pairs = prepare_pairs(stars, geometry, tolerance, cache, cache_dir)
-    return partial(hypotheses, pairs, cKDTree(pairs.directions))
+    return partial(hypotheses, prepare_pairs(stars, geometry, tolerance, cache, cache_dir))
 
 
 def prepare_pairs(
@@ -60,10 +57,7 @@ def prepare_pairs(
     # Rounded, so that cameras of nearly the same field share a file.
     largest = float(np.ceil(largest * 200.0) / 200.0)
     field_sr = float(f"{w * h / f**2:.2g}")
-    directions = stars.directions_icrs
-    if cache:
-        return cached_star_pairs(directions, stars.mag, field_sr, largest, cache_dir)
-    return find_star_pairs(directions, stars.mag, field_sr, largest)
+    return prepared_star_pairs(stars.directions_icrs, stars.mag, field_sr, largest, cache, cache_dir)
 
 
 # The table of patterns is made for fields this much smaller and larger than the tolerance of the focal length asks for.

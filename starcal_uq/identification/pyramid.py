@@ -113,7 +113,6 @@ def remaining_order(n: int, searched: int) -> IntArray:
 
 def hypotheses(
     pairs: StarPairs,
-    tree: object,
     points: FloatArray,
     sigma_px: FloatArray,
     geometry: FieldGeometry,
@@ -124,7 +123,7 @@ def hypotheses(
     """For each triangle, the hypotheses that a fourth star supports, best first.
 
     Triangles are made of the first `max_centroids` of `points` (n, 2), ideal pixels, brightest first; only those that a
-    search of the first `searched` has left (`remaining_order`). `tree` is that of ``pairs.directions``.
+    search of the first `searched` has left (`remaining_order`).
     """
     n = min(len(points), max_centroids)
     if n < 4:
@@ -138,7 +137,7 @@ def hypotheses(
     for triangle in _sorted_triangles(triangles, length, geometry):
         candidates = _look_up(triangle, b, angle, sigma, pairs, geometry, tolerance, bases)
         if len(candidates):
-            yield _supported(triangle, candidates, u, sigma, angle, length, pairs, tree, geometry, tolerance)
+            yield _supported(triangle, candidates, u, sigma, angle, length, pairs, geometry, tolerance)
 
 
 def _sorted_triangles(triangles: IntArray, length: FloatArray, geometry: FieldGeometry) -> list[tuple[int, int, int]]:
@@ -205,7 +204,6 @@ def _supported(
     angle: FloatArray,
     length: FloatArray,
     pairs: StarPairs,
-    tree: object,
     geometry: FieldGeometry,
     tolerance: CameraTolerance,
 ) -> list[Hypothesis]:
@@ -230,7 +228,7 @@ def _supported(
     gate_px = SIGMAS * np.hypot(sigma[others], noise * (1.0 + 1.5 * reach / span))
     gate_px = gate_px + geometry.relative_bias(tolerance) * (reach + span)
     gate = gate_px / geometry.focal_px
-    distance, _ = tree.query(sky.reshape(-1, 3), distance_upper_bound=float(gate.max()))  # type: ignore[attr-defined]
+    distance, _ = pairs.tree.query(sky.reshape(-1, 3), distance_upper_bound=float(gate.max()))
     support = np.sum(distance.reshape(len(candidates), -1) < gate, axis=1)
     best = np.argsort(-support, kind="stable")
     best = best[support[best] > 0][:_HANDED_ON]

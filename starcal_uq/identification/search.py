@@ -35,7 +35,7 @@ _OTHER_ATTITUDE_RAD = 2e-3
 # Triangles are made of so many centroids first, and then of so many.
 _CENTROIDS = (10, 16)
 _MAX_TRIANGLES = 200
-# A match with more than this noise, or with less than half of the centroids, is compared with those of more triangles.
+# A match with more than this noise, or with less than half of what is possible, is compared with those of more triangles.
 _POOR_FIT = 1.3
 _MORE_TRIANGLES = 5
 # Triangles of a frame that is tried once more with a worse lens, whose many hypotheses take long.
@@ -214,8 +214,8 @@ class Search:
                 yield match
                 if match.log10_false < np.log10(_BEYOND_DOUBT):
                     # A triangle with the wrong star of a close pair gives nearly the right attitude: it matches too
-                    # many stars for chance, but few of all, and badly.
-                    if match.noise_scale < _POOR_FIT and len(match) > 0.5 * len(points):
+                    # many stars for chance, but few of all that could be, and badly.
+                    if match.noise_scale < _POOR_FIT and len(match) > 0.5 * match.n_possible:
                         return
                     left = min(left, _MORE_TRIANGLES)
 

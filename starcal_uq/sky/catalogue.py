@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -75,10 +76,12 @@ class StarCatalogue(Shown):
         without = f", {missing} without proper motion" if missing else ""
         return f"<{len(self)} stars, {kind} directions at J{self.epoch:g}, magnitudes in {self.band}{without}>"
 
-    @property
+    @cached_property
     def directions_icrs(self) -> FloatArray:
         """Unit vectors, ICRS axes, shape (n, 3)."""
-        return unit_vectors(self.ra_deg, self.dec_deg)
+        directions = unit_vectors(self.ra_deg, self.dec_deg)
+        directions.setflags(write=False)
+        return directions
 
     def select(self, mask: BoolArray | IntArray) -> StarCatalogue:
         """The stars that a mask of shape (n,), or an array of indices, picks, in that order."""
