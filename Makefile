@@ -4,11 +4,13 @@
 #   ALT_PYTHON=...  the second interpreter for `make test-other`; `none` leaves that run out
 #   WORKERS=...     processes that share the tests (0: one, without sharing)
 #   DEMO_OUT=...    the folder that `make demo` writes
+#   BENCH=...       options of `make bench`, such as "--quick" or "--only calibrate"
 
 PYTHON ?=
 ALT_PYTHON ?=
 WORKERS ?= 2
 DEMO_OUT ?= starcal-demo
+BENCH ?=
 
 BIN := .venv/bin
 ALT_BIN := .venv-alt/bin
@@ -24,7 +26,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-other test-second test-slow lint lint-types lint-style docs bench clean
+.PHONY: help demo test test-other test-second test-slow lint lint-types lint-style docs bench bench-rivals clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -61,11 +63,14 @@ lint-style:
 docs: .venv/.installed-docs ## the documentation, into docs/_build/html; a warning is an error
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --fresh-env docs docs/_build/html
 
-bench: .venv/.installed ## timings and effective draws, beside the straightforward way
-	OPENBLAS_NUM_THREADS=1 OMP_NUM_THREADS=1 MKL_NUM_THREADS=1 $(BIN)/python benchmarks/run.py
+bench: .venv/.installed ## the package beside its rivals, and with BENCH="--large --write" the tables of the documentation
+	$(BIN)/python benchmarks/run.py $(BENCH)
+
+bench-rivals: .bench/.installed ## an environment for the rivals that are not in ours; mrcal comes with the system
+	@/usr/bin/python3 -c "import mrcal" 2>/dev/null || echo "mrcal is not there: apt-get install python3-mrcal (Debian, Ubuntu)"
 
 clean: ## remove everything that the other targets made
-	rm -rf .venv .venv-alt docs/_build docs/notebooks docs/reference/_commands.txt docs/reference/api starcal-demo dist
+	rm -rf .venv .venv-alt .bench docs/_build docs/notebooks docs/reference/_commands.txt docs/reference/api starcal-demo dist
 	rm -rf .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
@@ -103,4 +108,10 @@ clean: ## remove everything that the other targets made
 	@echo "installing starcal_uq and its tests for the second interpreter"
 	@$(ALT_BIN)/python $(PIP_INSTALL) hatchling editables
 	@$(ALT_BIN)/python $(PIP_INSTALL) --no-build-isolation --editable ".[test]"
+	@touch $@
+
+.bench/.installed: .venv/.made benchmarks/rivals.txt
+	@echo "installing the rivals of the benchmarks"
+	@$(BIN)/python -m venv --clear .bench/venv
+	@.bench/venv/bin/python -m pip install --quiet --disable-pip-version-check --requirement benchmarks/rivals.txt
 	@touch $@

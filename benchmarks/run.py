@@ -1,282 +1,657 @@
-"""Timings of the main job beside the straightforward way of doing it, measured in one run.
+"""The package beside its rivals, each at full strength, in turns on one machine, as a page of the documentation.
 
-Run with ``make bench``. Every line is the median of several repeats on one core; ratios compare the two columns of the
-same run, so that they mean something on any machine.
+    python benchmarks/run.py [--only NAME ...] [--quick] [--large] [--repeats N] [--write] [--list]
+
+``--only`` takes parts of names; ``--quick`` takes less data and fewer turns (under two minutes), ``--large`` adds the
+rows that take minutes each. ``--write`` puts what was run into `benchmarks/results.json` and makes the tables of
+`docs/explanation/benchmarks.md` from that file; rows that were not run stay.
+
+A row is a question: contestants, ours first, that take turns on the same data, in processes of their own
+(`harness.take_turns`). First it is shown that the answers are the same; a ratio without that means nothing. A rival
+that cannot run here is named with the reason. `make bench-rivals` makes an environment for those that are not in ours;
+mrcal comes with the system (Debian: ``apt-get install python3-mrcal``).
 """
 
 from __future__ import annotations
 
 import argparse
-import statistics
+import datetime
+import io
+import json
+import os
+import platform
 import subprocess
 import sys
-import tempfile
-from collections.abc import Callable
+import tarfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from time import perf_counter
+from typing import Any
 
 import numpy as np
-from rich.console import Console
-from rich.table import Table
 
-import starcal_uq as sc
-from starcal_uq.camera.projection import forward_kernel, forward_root
-from starcal_uq.estimation.calibrate import calibrate
-from starcal_uq.estimation.marginal import MarginalLikelihood
-from starcal_uq.estimation.pairs import PairObjective
-from starcal_uq.estimation.recursive.innovations import frame_normals
-from starcal_uq.estimation.recursive.start import RecursionOptions
-from starcal_uq.observations.frames import StarFrames
-from starcal_uq.observations.streams import stream_frames
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT)]
+
+from benchmarks.harness import (  # noqa: E402
+    CONTESTANTS,
+    ONE_THREAD,
+    Contestant,
+    Runs,
+    Worker,
+    cost,
+    interpreter,
+    ratio,
+    spread,
+    take_turns,
+)
+
+CACHE = ROOT / ".bench"
+RESULTS = ROOT / "benchmarks" / "results.json"
+PAGE = ROOT / "docs" / "explanation" / "benchmarks.md"
+BEFORE = "0e7b0a1afa4eb04b62df08dc31eeebd4d9d66f9b"
+SEED = 2017
+IMAGES = Path(os.environ.get("STARCAL_IMAGES", ROOT.parent / "shared" / "data" / "esa-tetra3"))
+CLOCKS = ("processor", "wall")
 
 
-def seconds(run: Callable[[], object], repeats: int) -> float:
-    """Median wall time."""
-    times = []
-    for _ in range(repeats):
-        began = perf_counter()
-        run()
-        times.append(perf_counter() - began)
-    return statistics.median(times)
+@dataclass(frozen=True)
+class Agreement:
+    """How far a rival's answer is from ours, in words, and whether they are the same for all that matters."""
+
+    words: str
+    same: bool
 
 
-def explicit_pairs(obs: sc.Observations) -> np.ndarray:
-    """The paper's three stages with SciPy's Levenberg-Marquardt on explicitly formed pairs, analytic Jacobian.
+Same = Callable[[Mapping[str, Any], Mapping[str, Any]], Agreement]
 
-    The rival is given the same generated kernels and derivatives and the same linear stage; only the sums over pairs
-    are formed one by one. Its covariance is the naive inverse of J^T J, which is all that SciPy offers.
+
+@dataclass(frozen=True)
+class Target:
+    """What was asked: the `rival` takes `factor` times as long, or we at most `wall` seconds or `peak_mb`."""
+
+    words: str
+    rival: str | None = None
+    factor: float | None = None
+    wall: float | None = None
+    peak_mb: float | None = None
+
+
+@dataclass(frozen=True)
+class Row:
+    """One question.
+
+    Attributes
+    ----------
+    name : str
+        Word for ``--only``.
+    what : str
+        Heading in the table.
+    contestants : tuple of Contestant
+        Ours first.
+    same : callable
+        Compares (ours, rival's) results.
+    unit : str
+        What the times are for, where a call does not always do as much.
+    amount : callable
+        How many of it a result holds.
+    frames : int
+        Frames of the data; 0 for none.
+    repeats : int
+        Turns.
+    one_core : bool
+        All contestants on one core and one thread; otherwise as a user would start them.
+    large : bool
+        Runs only when it is asked for.
+    targets : tuple of Target
+        What was asked.
     """
-    from scipy.optimize import least_squares
 
-    from starcal_uq.estimation.stages import distortion_stage
-
-    frames, start = StarFrames.from_observations(obs), sc.paper.paper_start()
-    theta = np.array(start.theta)
-    first = PairObjective(frames, "none")
-    joint = PairObjective(frames, "brown")
-    pairs = joint.pair_indices()
-    for objective in (first, joint):
-        # Indices are formed once, as anyone would.
-        objective.pair_indices = lambda: pairs  # type: ignore[method-assign]
-
-    def solve(objective: PairObjective, x: np.ndarray) -> np.ndarray:
-        return least_squares(
-            lambda t: objective.residuals(t)[0],
-            x,
-            jac=lambda t: objective.residuals(t)[1],
-            method="lm",
-            x_scale="jac",
-            xtol=1e-12,
-            ftol=1e-12,
-        ).x
-
-    theta[:3] = solve(first, theta[:3])
-    theta = distortion_stage(frames, start, theta).theta
-    theta = solve(joint, np.array(theta))
-    jacobian = joint.residuals(theta)[1]
-    scale = np.linalg.norm(jacobian, axis=0)
-    np.linalg.inv((jacobian / scale).T @ (jacobian / scale))
-    return theta
+    name: str
+    what: str
+    contestants: tuple[Contestant, ...]
+    same: Same = lambda ours, rival: Agreement("–", True)
+    unit: str = ""
+    amount: Callable[[Any], float] = lambda result: 1.0
+    frames: int = 0
+    repeats: int = 7
+    one_core: bool = True
+    large: bool = False
+    targets: tuple[Target, ...] = ()
 
 
-def explicit_innovations(frames: StarFrames, theta: np.ndarray, count: int) -> np.ndarray:
-    """Information of the first frames on the optics, from explicitly formed pairs and the pseudo-inverse.
-
-    The rival is given the same directions and derivatives; it forms every pair's derivatives with respect to the pixels
-    and the parameters, and the minimum-norm solution by NumPy.
-    """
-    total = np.zeros((3, 3))
-    for k in range(count):
-        frame = frames.part(k, k + 1)
-        objective = PairObjective(frame, "none")
-        b, db = objective.directions(theta, frame)
-        i, j = np.triu_indices(frame.n_stars, 1)
-        rows = np.arange(len(i))
-        by_pixel = np.zeros((len(i), 2, frame.n_stars))
-        for axis in range(2):
-            by_pixel[rows, axis, i] = -np.sum(db[axis][:, i] * b[:, j], axis=0)
-            by_pixel[rows, axis, j] = -np.sum(db[axis][:, j] * b[:, i], axis=0)
-        slopes = np.sum(db[:, :, i] * b[:, j] + db[:, :, j] * b[:, i], axis=1).T
-        reduced = np.linalg.pinv(by_pixel.reshape(len(i), -1), rcond=1e-9) @ slopes
-        total += reduced.T @ reduced
-    return total
+# --- the same answer --------------------------------------------------------------------------------------------------
 
 
-def add_baselines(table: Table, obs: sc.Observations, efficient: float, repeats: int) -> None:
-    """Rows of the methods that the paper compares itself with, per 1000 frames."""
-    start, thousands = sc.paper.paper_start(), obs.n_frames / 1000.0
-    for label, method, options in (
-        ("least squares, distortion ignored", "least_squares", None),
-        ("Samaan: filter and linear distortion", "samaan", None),
-        ("Griffith: recursive least squares", "griffith", None),
-        ("Griffith with the distortion", "griffith", RecursionOptions(parameters="all")),
-        ("Griffith, pairs as if independent", "griffith", RecursionOptions(pair_covariance="diagonal")),
-    ):
-        time = seconds(lambda m=method, o=options: calibrate(obs, start, method=m, recursion=o), repeats)  # type: ignore[misc]
-        table.add_row(
-            f"{label}, 1000 frames",
-            f"{1e3 * time / thousands:.0f} ms",
-            f"{1e3 * efficient / thousands:.0f} ms",
-            f"{efficient / time:.1f}",
-            "method='efficient'",
+def same_estimate(limit: float = 0.03) -> Same:
+    """Largest difference of the optics in our standard deviations, and of the deviations where both have them."""
+
+    def compare(ours: Mapping[str, Any], rival: Mapping[str, Any]) -> Agreement:
+        if "theta" not in rival:
+            return Agreement("–", True)
+        sigma = np.sqrt(np.diag(ours["covariance"]))
+        off = float(np.max(np.abs(np.array(rival["theta"]) - ours["theta"]) / sigma))
+        words, same = f"{off:.2g} σ", off < limit
+        if "covariance" in rival:
+            ratios = np.sqrt(np.diag(rival["covariance"])) / sigma
+            words += f", σ to {100.0 * np.max(np.abs(ratios - 1.0)):.1g} %"
+            same = same and bool(np.all(np.abs(ratios - 1.0) < 0.02))
+        return Agreement(words + (f"; {rival['said']}" if "said" in rival else ""), same)
+
+    return compare
+
+
+def same_draws(ours: Mapping[str, Any], rival: Mapping[str, Any]) -> Agreement:
+    """Means and spreads of two sets of draws, beside their Monte Carlo errors."""
+    mine, theirs = ours["moments"], rival["moments"]
+    (m, s, n), (m2, s2, n2) = (tuple(np.array(moment) for moment in x) for x in (mine, theirs))
+    means, spreads = np.abs(m2 - m) / s, np.abs(s2 / s - 1.0)
+    noise = np.sqrt(1.0 / n + 1.0 / n2)
+    same = bool(np.all(means < 4.0 * noise + 0.03) and np.all(spreads < 4.0 * noise + 0.02))
+    return Agreement(f"means {np.max(means):.2f} σ, spreads {100.0 * np.max(spreads):.0f} %", same)
+
+
+def same_attitudes(ours: Mapping[str, Any], rival: Mapping[str, Any]) -> Agreement:
+    """Largest angle between the attitudes, arc seconds."""
+    a, b = np.array(ours["quaternions"]), np.array(rival["quaternions"])
+    few = min(len(a), len(b))
+    a, b = a[:few], b[:few]
+    b = b * np.sign(np.sum(a * b, axis=1, keepdims=True))
+    angle = float(np.max(2.0 * np.linalg.norm(a - b, axis=1)) * 206264.8)
+    return Agreement(f"{angle:.1g} arcsec", angle < 1e-3)
+
+
+def same_arrays(key: str, scale: float, unit: str, limit: float) -> Same:
+    """Largest difference of two arrays."""
+
+    def compare(ours: Mapping[str, Any], rival: Mapping[str, Any]) -> Agreement:
+        off = float(np.max(np.abs(np.array(ours[key]) - np.array(rival[key])))) * scale
+        return Agreement(f"{off:.1g} {unit}", off < limit)
+
+    return compare
+
+
+# --- the rows ---------------------------------------------------------------------------------------------------------
+
+
+def rows(quick: bool = False) -> list[Row]:
+    """All questions; `quick` has less data."""
+    ours, before = "starcal_uq", "starcal_uq before"
+    turns = 3 if quick else 7
+    few = 100 if quick else 1000
+    draws, chain = ({"draws": 200}, {"steps": 600}) if quick else ({}, {})
+    made = [
+        Row(
+            name=f"calibrate-{frames}",
+            what=f"Estimate of the optics with its covariance, {frames:,} frames",
+            contestants=(
+                Contestant(ours, "ours:calibrate"),
+                Contestant(before, "ours:calibrate", "before"),
+                Contestant("SciPy sparse bundle", "bundles:sparse"),
+                Contestant("SciPy least_squares, sparse", "bundles:least_squares"),
+                Contestant("NumPy bundle, angles eliminated", "bundles:schur"),
+                Contestant("mrcal", "bundle_mrcal:bundle", "system"),
+                Contestant("mrcal, no covariance", "bundle_mrcal:bundle", "system", {"covariance": False}),
+            ),
+            same=same_estimate(),
+            frames=frames,
+            repeats=turns,
+            targets=(
+                Target("a quarter of SciPy's sparse bundle", "SciPy sparse bundle", 4.0),
+                Target("a fifth of mrcal's time", "mrcal", 5.0),
+            ),
         )
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "frames.parquet"
-        obs.save(path)
-        streamed = seconds(lambda: calibrate(stream_frames(path), start, method="griffith"), repeats)
-    table.add_row("Griffith from a file, frame by frame", f"{1e3 * streamed / thousands:.0f} ms", "", "", "")
-    frames, theta, few = StarFrames.from_observations(obs), start.theta[:3], min(100, obs.n_frames)
-    ours = seconds(lambda: frame_normals(frames, "none", theta, np.ones(3)), repeats) / obs.n_frames
-    rival = seconds(lambda: explicit_innovations(frames, theta, few), 3) / few
-    total = np.sum(frame_normals(frames.part(0, few), "none", theta, np.ones(3)).grams, axis=0)[1:, 1:]
-    difference = np.max(np.abs(explicit_innovations(frames, theta, few) / total - 1.0))
-    table.add_row(
-        "a frame's pairs with their full covariance",
-        f"{1e6 * ours:.0f} us",
-        f"{1e6 * rival:.0f} us",
-        f"{rival / ours:.0f}",
-        f"explicit pairs, pseudo-inverse (same to {difference:.0e})",
-    )
+        for frames in ((1000,) if quick else (1000, 10_000))
+    ]
+    made += [
+        Row(
+            name="calibrate-100000",
+            what="Estimate of the optics with its covariance, 100,000 frames",
+            contestants=(
+                Contestant(ours, "ours:calibrate"),
+                Contestant(before, "ours:calibrate", "before", first=False, every=3),
+            ),
+            same=same_estimate(),
+            frames=100_000,
+            repeats=3,
+            large=True,
+            targets=(Target("8 times as fast as before", before, 8.0), Target("less than 1.5 GB", peak_mb=1500.0)),
+        ),
+        Row(
+            name="three-stages",
+            what="The paper's three stages with sandwich covariance, 1,000 frames",
+            contestants=(
+                Contestant(ours, "ours:three_stages"),
+                Contestant(before, "ours:three_stages", "before"),
+                Contestant("SciPy LM on explicit pairs", "pairs:three_stages"),
+            ),
+            same=same_estimate(),
+            frames=1000,
+            repeats=turns,
+        ),
+        Row(
+            name="other-answers",
+            what="Camera calibrations that give another answer, 1,000 frames",
+            contestants=(
+                Contestant(ours, "ours:calibrate"),
+                Contestant("tetra3rs calibrate_camera", "bundle_tetra3rs:calibrate", "rivals"),
+                *(
+                    ()
+                    if quick
+                    else (Contestant("OpenCV calibrateCamera", "points:calibrate", "rivals", first=False, every=3),)
+                ),
+            ),
+            same=same_estimate(),
+            frames=1000,
+            repeats=turns,
+        ),
+        Row(
+            name="sample",
+            what=f"1,000 effective draws from the posterior, {few:,} frames",
+            contestants=(
+                Contestant(ours, "ours:sample"),
+                Contestant(before, "ours:sample", "before"),
+                Contestant("NUTS (NumPyro), exact likelihood", "nuts:numpyro", "rivals", draws),
+                *(
+                    Contestant(label, "samplers:ensemble", options={"move": move, **chain}, first=False)
+                    for label, move in (
+                        ("emcee, stretch, exact likelihood", "StretchMove"),
+                        ("emcee, DE, exact likelihood", "DEMove"),
+                    )
+                ),
+            ),
+            same=same_draws,
+            unit="for 1,000 effective draws",
+            amount=lambda result: float(np.min(result["moments"][2])) / 1000.0,
+            frames=few,
+            repeats=2 if quick else 3,
+        ),
+        Row(
+            name="sample-size",
+            what="Draws with all their checks: 10,000 frames beside 1,000",
+            contestants=(
+                Contestant("starcal_uq, 10,000 frames", "ours:sample"),
+                Contestant("starcal_uq before, 10,000 frames", "ours:sample", "before"),
+                Contestant("starcal_uq, 1,000 frames", "ours:sample", options={"n_frames": 1000}),
+            ),
+            frames=10_000,
+            repeats=3,
+            large=True,
+            targets=(Target("the same whatever the number of stars", "starcal_uq, 1,000 frames", 0.8),),
+        ),
+        *(
+            Row(
+                name=f"{name}-10000",
+                what=f"`{name}`, 10,000 frames",
+                contestants=(
+                    Contestant(ours, f"ours:{name}"),
+                    Contestant(before, f"ours:{name}", "before", first=False),
+                ),
+                frames=10_000,
+                repeats=2,
+                large=True,
+            )
+            for name in ("propagate", "diagnose")
+        ),
+        Row(
+            name="attitudes",
+            what="4,000 attitudes of 12 stars",
+            contestants=tuple(
+                Contestant(label, call, options={"frames": n, "stars": 12})
+                for label, call, n in (
+                    (ours, "ours:quest", 4000),
+                    ("NumPy, singular values of all frames", "attitudes:kabsch", 4000),
+                    ("NumPy, eigenvectors of all frames", "attitudes:davenport", 4000),
+                    ("SciPy align_vectors, frame by frame", "attitudes:align_vectors", 4000),
+                )
+            ),
+            same=same_attitudes,
+            repeats=turns,
+        ),
+        Row(
+            name="project",
+            what="A million directions to pixels",
+            contestants=(
+                Contestant(ours, "ours:project", options={"points": 1_000_000}),
+                Contestant("OpenCV projectPoints", "points:project", "rivals", {"points": 1_000_000}),
+            ),
+            same=same_arrays("xy", 1.0, "px", 1e-6),
+            repeats=turns,
+        ),
+        Row(
+            name="unproject",
+            what="A million pixels to directions",
+            contestants=(
+                Contestant(ours, "ours:unproject", options={"points": 1_000_000}),
+                Contestant("OpenCV undistortPoints", "points:unproject", "rivals", {"points": 1_000_000}),
+            ),
+            same=same_arrays("b", 206264.8, "arcsec", 1e-4),
+            repeats=turns,
+        ),
+        Row(
+            name="import",
+            what="`import starcal_uq` in a fresh process",
+            contestants=(
+                Contestant(ours, "ours:imported", options={"code": "import starcal_uq"}),
+                Contestant(before, "ours:imported", "before", {"code": "import starcal_uq"}),
+                Contestant("import numpy", "ours:imported", options={"code": "import numpy"}),
+            ),
+            repeats=turns,
+        ),
+    ]
+    return made if quick else made + commands(ours, before)
 
 
-def import_seconds() -> float:
-    """Median time of ``import starcal_uq`` in fresh interpreters, beyond starting Python."""
-    code = "import time; t = time.perf_counter(); import starcal_uq; print(time.perf_counter() - t)"
-    times = [float(subprocess.check_output([sys.executable, "-c", code], text=True)) for _ in range(7)]
-    return statistics.median(times)
+def commands(ours: str, before: str) -> list[Row]:
+    """Whole commands, as a user starts them, and work on images."""
+
+    def pair(arguments: Sequence[str], needs: Path | None = None) -> tuple[Contestant, ...]:
+        options = {"arguments": list(arguments), "needs": None if needs is None else str(needs)}
+        return (
+            Contestant(ours, "ours:command", options=options),
+            Contestant(before, "ours:command", "before", options, first=False),
+        )
+
+    stars, camera = "{data}/stars.parquet", "{data}/camera.toml"
+    table, nominal = IMAGES.parent / "esa_tetra3_observations.csv", IMAGES.parent / "esa_tetra3_camera.toml"
+    images = {"images": str(IMAGES)}
+    identified = {**images, "camera": str(nominal)}
+    return [
+        Row(
+            name="demo",
+            what="`starcal-uq demo`",
+            contestants=pair(["demo", "--out", "{out}"]),
+            repeats=3,
+            one_core=False,
+            targets=(Target("4 times as fast as before", before, 4.0),),
+        ),
+        Row(
+            name="run-table",
+            what="`starcal-uq run` on the table of ESA's night-sky frames (567 stars)",
+            contestants=pair(["run", str(table), str(nominal), "--out", "{out}"], table),
+            repeats=3,
+            one_core=False,
+            targets=(Target("4 times as fast as before", before, 4.0),),
+        ),
+        Row(
+            name="run-1000",
+            what="`starcal-uq run`, 1,000 frames",
+            contestants=pair(["run", stars, camera, "--out", "{out}"]),
+            frames=1000,
+            repeats=3,
+            one_core=False,
+        ),
+        Row(
+            name="run-10000",
+            what="`starcal-uq run`, 10,000 frames",
+            contestants=pair(["run", stars, camera, "--out", "{out}"]),
+            frames=10_000,
+            repeats=2,
+            one_core=False,
+            large=True,
+            targets=(Target("8 times as fast as before", before, 8.0),),
+        ),
+        Row(
+            name="centroids",
+            what="Centroids of ESA's night-sky frames, per frame",
+            contestants=(
+                Contestant(ours, "ours:centroids", options=images),
+                Contestant(before, "ours:centroids", "before", images),
+                Contestant("tetra3rs extract_centroids", "images_tetra3rs:centroids", "rivals", images),
+            ),
+            same=counted("stars found"),
+            unit="for a frame",
+            amount=lambda result: float(result["frames"]),
+            repeats=3,
+            targets=(Target("3 times as fast as before", before, 3.0),),
+        ),
+        Row(
+            name="identify",
+            what="Identification of ESA's night-sky frames, per frame",
+            contestants=(
+                Contestant(ours, "ours:identify", options=identified),
+                Contestant(before, "ours:identify", "before", identified),
+                Contestant("tetra3rs solve_from_centroids", "images_tetra3rs:identify", "rivals", identified),
+            ),
+            same=counted("frames identified"),
+            unit="for a frame",
+            amount=lambda result: float(result["frames"]),
+            repeats=3,
+            targets=(Target("3 times as fast as before", before, 3.0),),
+        ),
+    ]
 
 
-def quest_rates(obs: sc.Observations) -> tuple[float, float]:
-    """12-star attitudes per second: batch QUEST, and SciPy's align_vectors called per frame."""
-    from scipy.spatial.transform import Rotation
-
-    from starcal_uq.attitude.rotations import random_rotations
-
-    rng = np.random.default_rng(0)
-    k, m = 4000, 12
-    b = rng.normal(0.0, 0.07, (k, m, 3)) + np.array([0.0, 0.0, 1.0])
-    b /= np.linalg.norm(b, axis=2, keepdims=True)
-    r = np.einsum("kji,kmj->kmi", random_rotations(k, rng), b)
-    starts = np.arange(k + 1) * m
-    flat_b, flat_r = b.reshape(-1, 3), r.reshape(-1, 3)
-    ours = seconds(lambda: sc.attitude.quest(flat_b, flat_r, starts, covariance=False), 7)
-    few = 300
-    theirs = seconds(lambda: [Rotation.align_vectors(b[i], r[i]) for i in range(few)], 3)
-    return k / ours, few / theirs
+def counted(words: str) -> Same:
+    """Ours and theirs, side by side: no two programs find the same."""
+    return lambda ours, rival: Agreement(f"{rival['found']} {words}, ours {ours['found']}", True)
 
 
-def main() -> None:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=1000)
-    parser.add_argument("--repeats", type=int, default=7)
-    options = parser.parse_args()
-    stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
-    obs = sc.simulate(stars, sc.paper.paper_camera(), n_frames=options.frames, sigma_px=0.05, seed=2017)
-    start = sc.paper.paper_start()
-    n_pairs = PairObjective(StarFrames.from_observations(obs), "brown").n_pairs
-    console = Console(width=110)
-    console.print(f"{obs.n_frames} frames, {obs.n_stars} stars, {n_pairs} pairs; medians, one core")
-    table = Table()
-    for heading, justify in (
-        ("what", "left"),
-        ("ours", "right"),
-        ("rival", "right"),
-        ("ratio", "right"),
-        ("rival is", "left"),
-    ):
-        table.add_column(heading, justify=justify)  # type: ignore[arg-type]
-
-    calibrate(obs, start, method="three_stage")
-    three = seconds(lambda: _three_stages(obs), options.repeats)
-    rival = seconds(lambda: explicit_pairs(obs), 3)
-    difference = np.max(np.abs(explicit_pairs(obs) - _three_stages(obs)[0]) / np.sqrt(np.diag(_three_stages(obs)[1])))
-    table.add_row(
-        "three stages with sandwich covariance",
-        f"{1e3 * three:.0f} ms",
-        f"{1e3 * rival:.0f} ms",
-        f"{rival / three:.0f}",
-        f"SciPy LM on explicit pairs (same optimum to {difference:.0e} sigma)",
-    )
-    whole = seconds(lambda: calibrate(obs, start), options.repeats)
-    table.add_row("the same, refined, with compressed likelihood", f"{1e3 * whole:.0f} ms", "", "", "")
-
-    add_baselines(table, obs, whole, options.repeats)
-
-    cal = calibrate(obs, start)
-    sc.sample(obs, cal, seed=0, n_steps=40)
-    began = perf_counter()
-    post = sc.sample(obs, cal, seed=1)
-    sampling = perf_counter() - began
-    mixture = float(np.min(post.diagnostics.ess_bulk)) / post.diagnostics.n_evaluations
-    stretch_post = sc.sample(obs, cal, seed=1, moves="stretch", n_steps=2000)
-    stretch = float(np.min(stretch_post.diagnostics.ess_bulk)) / stretch_post.diagnostics.n_evaluations
-    table.add_row(
-        f"sampling: {np.min(post.diagnostics.ess_bulk):.0f} effective draws in",
-        f"{sampling:.2f} s",
-        "",
-        "",
-        "",
-    )
-    table.add_row(
-        "effective draws per 1000 evaluations",
-        f"{1e3 * mixture:.0f}",
-        f"{1e3 * stretch:.0f}",
-        f"{mixture / stretch:.0f}",
-        "emcee's stretch move",
-    )
-
-    exact = MarginalLikelihood(obs, "brown")
-    exact.use_rotations(exact.rotations_at(cal.theta))
-    thetas, sigmas = np.tile(cal.theta, (128, 1)), np.full(128, cal.sigma)
-    one = seconds(lambda: exact.log_likelihood(cal.theta, cal.sigma), 15)
-    many = seconds(lambda: cal.compressed.log_likelihood(thetas, sigmas), 50) / 128
-    table.add_row(
-        "one likelihood evaluation",
-        f"{1e6 * many:.1f} us",
-        f"{1e6 * one:.0f} us",
-        f"{one / many:.0f}",
-        "exact likelihood",
-    )
-
-    frames = StarFrames.from_observations(obs)
-    b = frames.rotated(exact.rotations_at(cal.theta))
-    root = forward_root("brown", cal.theta, b)
-    kernel = forward_kernel("brown", "first")
-    mapped = kernel.function.map(frames.n_stars)
-    shared = np.zeros((2, frames.n_stars))
-    ours = seconds(lambda: kernel(frames.n_stars, cal.theta, b, root), 30)
-    casadi_time = seconds(lambda: mapped(np.tile(cal.theta[:, None], frames.n_stars), b, shared), 5)
-    table.add_row(
-        "model with both Jacobians, all stars",
-        f"{1e3 * ours:.1f} ms",
-        f"{1e3 * casadi_time:.1f} ms",
-        f"{casadi_time / ours:.0f}",
-        "CasADi's mapped function",
-    )
-    rate, scipy_rate = quest_rates(obs)
-    table.add_row(
-        "12-star attitudes per second",
-        f"{rate:,.0f}",
-        f"{scipy_rate:,.0f}",
-        f"{rate / scipy_rate:.0f}",
-        "SciPy align_vectors",
-    )
-    table.add_row("import starcal_uq", f"{1e3 * import_seconds():.0f} ms", "", "", "")
-    console.print(table)
+# --- running ----------------------------------------------------------------------------------------------------------
 
 
-def _three_stages(obs: sc.Observations) -> tuple[np.ndarray, np.ndarray]:
-    """The paper's three stages and their sandwich covariance, without the refinement."""
-    from starcal_uq.estimation.stages import distortion_stage, joint_stage, optics_stage
+def data_of(frames: int) -> Path:
+    """Folder with the data of so many frames, made when it is not there."""
+    folder = CACHE / "data" / f"{frames}-{SEED}"
+    if frames and not (folder / "stars.npz").exists():
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        command = [sys.executable, str(CONTESTANTS / "data.py"), str(folder), str(frames), str(SEED)]
+        subprocess.run(command, check=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+    return folder
 
-    frames, start = StarFrames.from_observations(obs), sc.paper.paper_start()
-    optics = optics_stage(frames, start, "lm", 200)
-    linear = distortion_stage(frames, start, optics.theta)
-    pairs = PairObjective(frames, "brown")
-    theta = joint_stage(pairs, start, linear.theta, "lm", 200).theta
-    return theta, pairs.godambe(theta)
+
+def fetch_before() -> None:
+    """Put the version before into the cache, where git knows it."""
+    if (CACHE / "before").exists():
+        return
+    found = subprocess.run(["git", "-C", str(ROOT), "archive", BEFORE, "starcal_uq"], capture_output=True)
+    if found.returncode == 0:
+        with tarfile.open(fileobj=io.BytesIO(found.stdout)) as archive:
+            archive.extractall(CACHE / "before", filter="data")
+        # It knew no Numba: ArviZ, which uses it where it is, then gave arrays where it expected numbers.
+        (CACHE / "before" / "numba.py").write_text('raise ImportError("left out")\n', encoding="utf-8")
+
+
+def run_row(row: Row, repeats: int | None = None, tell: Callable[[str], None] = lambda text: None) -> dict[str, Any]:
+    """Time all contestants of a row, and put what came out into a record."""
+    folder = data_of(row.frames)
+
+    def start(contestant: Contestant) -> Worker | str:
+        if contestant.python == "before":
+            fetch_before()
+        found = interpreter(contestant.python, ROOT, CACHE)
+        if isinstance(found, str):
+            return found
+        data = data_of(contestant.options["n_frames"]) if "n_frames" in contestant.options else folder
+        options = {k: v for k, v in contestant.options.items() if k != "n_frames"}
+        command, environment = found
+        fixed = ONE_THREAD if row.one_core else {}
+        return Worker(contestant.call, options, data, command, {**fixed, **environment})
+
+    runs = take_turns(row.contestants, repeats or row.repeats, start, tell)
+    for run in runs:
+        for turn in run.turns.values():
+            if isinstance(turn.result, dict) and "draws" in turn.result:
+                turn.result["moments"] = moments(turn.result["draws"])
+    return record(row, runs)
+
+
+def moments(path: str) -> list[list[float]]:
+    """Means, standard deviations and effective numbers of draws (chains, draws, parameters), by ArviZ for everybody."""
+    from starcal_uq.inference.arviz import ess_bulk
+
+    draws = np.load(path)
+    flat = draws.reshape(-1, draws.shape[2])
+    mean, sd = flat.mean(axis=0), flat.std(axis=0)
+    return [
+        mean.tolist(),
+        sd.tolist(),
+        [ess_bulk(column) for column in np.moveaxis((draws - mean) / sd, 2, 0)],
+    ]
+
+
+def record(row: Row, runs: Sequence[Runs]) -> dict[str, Any]:
+    """All figures of a row, as they are kept."""
+    mine, listed = runs[0], []
+    for run in runs:
+        entry: dict[str, Any] = {"label": run.label, "missing": run.missing, "turns": len(run.turns)}
+        if run.turns:
+            entry["peak_mb"] = run.peak_mb
+            entry["first_s"] = run.first and run.first.wall
+            for clock in CLOCKS:
+                entry[clock] = vars(spread([cost(t, clock, row.amount) for t in run.turns.values()]))
+            if run is not mine and mine.turns:
+                agreement = row.same(mine.turns[0].result, run.turns[0].result)
+                entry["answer"], entry["same"] = agreement.words, agreement.same
+                for clock in CLOCKS:
+                    found = ratio(run, mine, clock, row.amount)
+                    entry[f"{clock}_ratio"] = found and vars(found)
+        listed.append(entry)
+    return {
+        "name": row.name,
+        "what": row.what,
+        "unit": row.unit,
+        "one_core": row.one_core,
+        "made": datetime.datetime.now(datetime.UTC).strftime("%Y-%m-%d"),
+        "machine": machine(),
+        "load": os.getloadavg()[0],
+        "contestants": listed,
+        "targets": [judged(target, listed) for target in row.targets],
+    }
+
+
+def judged(target: Target, listed: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """A target and what came out; one in time is met where both clocks say so."""
+    mine = listed[0]
+    said: dict[str, Any] = {"asked": target.words, "rival": target.rival, "measured": None, "met": None}
+    if target.factor is not None:
+        rival = next(entry for entry in listed if entry["label"] == target.rival)
+        found = [rival.get(f"{clock}_ratio") for clock in CLOCKS]
+        if all(found):
+            factors = [f["median"] for f in found]
+            said["measured"] = f"{factors[0]:.2g} times (wall clock {factors[1]:.2g})"
+            said["met"] = min(factors) >= target.factor
+    elif target.wall is not None and "wall" in mine:
+        said["measured"], said["met"] = f"{mine['wall']['median']:.0f} s", mine["wall"]["median"] <= target.wall
+    elif target.peak_mb is not None and "peak_mb" in mine:
+        said["measured"], said["met"] = f"{mine['peak_mb']:,.0f} MB", mine["peak_mb"] <= target.peak_mb
+    return said
+
+
+def machine() -> str:
+    """Processor, cores and Python."""
+    name = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        name = next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        pass
+    return f"{name}, {os.cpu_count()} cores, Python {platform.python_version()}, NumPy {np.__version__}"
+
+
+# --- tables -----------------------------------------------------------------------------------------------------------
+
+
+def seconds(value: float) -> str:
+    """With a unit that suits its size."""
+    for factor, unit in ((1.0, "s"), (1e3, "ms")):
+        if value * factor >= 1.0:
+            return f"{value * factor:.3g} {unit}"
+    return f"{1e6 * value:.3g} µs"
+
+
+def times(found: Mapping[str, float] | None) -> str:
+    """Median and quartiles of a ratio."""
+    return "–" if not found else f"**{found['median']:.3g}** ({found['low']:.3g} to {found['high']:.3g})"
+
+
+def table(records: Sequence[Mapping[str, Any]]) -> str:
+    """All contestants of all rows."""
+    head = ("", "Processor", "Wall", "Times ours (processor)", "Times ours (wall)", "Peak MB", "Beside our answer")
+    lines = []
+    for record in records:
+        where = "one core" if record["one_core"] else "all cores"
+        unit = f" ({record['unit']})" if record["unit"] else ""
+        lines += [
+            f"\n### {record['what']}{unit}\n",
+            f"`{record['name']}`, {where}, {record['made']}, load of the machine {record.get('load', 0.0):.1f}.\n",
+        ]
+        lines += ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+        for entry in record["contestants"]:
+            if not entry["turns"]:
+                reason = entry["missing"] or "it was not its turn"
+                lines.append(f"| {entry['label']} | not measured: {reason} |" + " |" * (len(head) - 2))
+                continue
+            cells = [entry["label"], seconds(entry["processor"]["median"]), seconds(entry["wall"]["median"])]
+            cells += [times(entry.get("processor_ratio")), times(entry.get("wall_ratio")), f"{entry['peak_mb']:,.0f}"]
+            answer = entry.get("answer", "")
+            cells.append(answer if entry.get("same", True) else f"**another answer**: {answer}")
+            lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines).strip()
+
+
+def targets(records: Sequence[Mapping[str, Any]]) -> str:
+    """What was asked and what came out."""
+    lines = ["| What | Asked | Measured | Beside | Met |", "|---|---|---|---|---|"]
+    for record in records:
+        for target in record["targets"]:
+            met = {True: "yes", False: "**no**", None: "not measured"}[target["met"]]
+            cells = (record["what"], target["asked"], target["measured"] or "–", target["rival"] or "itself", met)
+            lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def write(made: Sequence[dict[str, Any]]) -> None:
+    """Keep the records, and make the page from all that are kept, in the order of the rows."""
+    kept = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() else []
+    merged = {r["name"]: r for r in [*kept, *made]}
+    ordered = [merged[row.name] for row in rows() if row.name in merged]
+    RESULTS.write_text(json.dumps(ordered, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    text = PAGE.read_text(encoding="utf-8")
+    machines = "; ".join(sorted({r["machine"] for r in ordered}))
+    for word, between in (("targets", targets(ordered)), ("benchmarks", f"Machine: {machines}.\n\n{table(ordered)}")):
+        before, found, rest = text.partition(f"<!-- {word} -->")
+        _, end, after = rest.partition(f"<!-- /{word} -->")
+        if not found or not end:
+            raise SystemExit(f"{PAGE} has no markers <!-- {word} --> and <!-- /{word} -->")
+        text = f"{before}{found}\n\n{between}\n\n{end}{after}"
+    PAGE.write_text(text, encoding="utf-8")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="+", default=[], metavar="NAME", help="parts of the names of rows")
+    parser.add_argument("--quick", action="store_true", help="less data, fewer turns")
+    parser.add_argument("--large", action="store_true", help="also the rows that take minutes each")
+    parser.add_argument("--repeats", type=int, help="turns of each row")
+    parser.add_argument("--write", action="store_true", help="put the results into the documentation")
+    parser.add_argument("--list", action="store_true", help="names of the rows")
+    options = parser.parse_args(arguments)
+    if options.quick and options.write:
+        parser.error("--quick is for a look: what is written has all its data; leave one of them out.")
+    chosen = [row for row in rows(options.quick) if not options.only or any(part in row.name for part in options.only)]
+    if options.list:
+        print("\n".join(f"{row.name:20} {row.what}{' (--large)' if row.large else ''}" for row in chosen))
+        return 0
+    if not options.large:
+        chosen = [row for row in chosen if not row.large or row.name in options.only]
+    if not chosen:
+        parser.error(f"no row is called {' or '.join(options.only)}; --list names them.")
+
+    def tell(text: str) -> None:
+        print(text, file=sys.stderr)
+
+    made = []
+    for row in chosen:
+        made.append(run_row(row, options.repeats, tell))
+        print(f"{table(made[-1:])}\n", flush=True)
+        if options.write:
+            write(made)
+    if any(record["targets"] for record in made):
+        print(targets(made))
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

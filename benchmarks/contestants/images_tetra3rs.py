@@ -1,0 +1,54 @@
+"""Centroids and identification by tetra3rs, one thread."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import tetra3rs
+from worker import Missing
+
+Result = dict[str, Any]
+
+
+def _images(folder: Path) -> list[np.ndarray]:
+    paths = sorted(Path(folder).glob("*.tif*"))
+    if not paths:
+        raise Missing(f"{folder} is not on this machine")
+    return [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in paths]
+
+
+def centroids(folder: Path, *, images: str) -> Callable[[], Result]:
+    """`extract_centroids` with its defaults; no covariances, no correction of the pixel phase."""
+    loaded = _images(images)
+
+    def run() -> Result:
+        found = [tetra3rs.extract_centroids(image, threads=1) for image in loaded]
+        return {"frames": len(loaded), "found": sum(len(f.centroids) for f in found)}
+
+    return run
+
+
+def identify(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
+    """`solve_from_centroids`, of its own centroids; the field is known to 3 %."""
+    loaded = _images(images)
+    field = 11.42
+    database = tetra3rs.SolverDatabase.generate_from_gaia(
+        max_fov_deg=1.05 * field, min_fov_deg=0.95 * field, star_max_magnitude=7.0, epoch_proper_motion_year=2019.6
+    )
+    points = [tetra3rs.extract_centroids(image, threads=1).centroids for image in loaded]
+    height, width = loaded[0].shape
+
+    def run() -> Result:
+        found = [
+            database.solve_from_centroids(
+                p, fov_estimate_deg=field, image_width=width, image_height=height, fov_max_error_deg=0.03 * field
+            )
+            for p in points
+        ]
+        return {"frames": len(loaded), "found": sum(bool(f) for f in found)}
+
+    return run

@@ -1,0 +1,176 @@
+"""What the package offers, by its public calls; the version before is timed by the same lines."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from worker import Missing
+
+import starcal_uq as sc
+
+Result = dict[str, Any]
+
+
+def _data(folder: Path) -> tuple[Any, Any]:
+    return sc.load_observations(folder / "stars.parquet"), sc.Camera.load(folder / "camera.toml")
+
+
+def calibrate(folder: Path, **options: Any) -> Callable[[], Result]:
+    """Estimate, covariance, compressed likelihood."""
+    obs, camera = _data(folder)
+
+    def run() -> Result:
+        cal = sc.calibrate(obs, camera, **options)
+        return {"theta": cal.theta, "covariance": cal.covariance, "sigma": cal.sigma}
+
+    return run
+
+
+def three_stages(folder: Path) -> Callable[[], Result]:
+    """The paper's method with its sandwich covariance."""
+    obs, camera = _data(folder)
+
+    def run() -> Result:
+        cal = sc.calibrate(obs, camera, method="three_stage")
+        return {"theta": cal.pair_theta, "covariance": cal.pair_covariance}
+
+    return run
+
+
+def sample(folder: Path, **options: Any) -> Callable[[], Result]:
+    """Draws with all their checks."""
+    obs, camera = _data(folder)
+    cal = sc.calibrate(obs, camera)
+    kept = Path(tempfile.mkdtemp(prefix="starcal-bench-")) / "draws.npy"
+    seeds = iter(range(10_000))
+
+    def run() -> Result:
+        post = sc.sample(obs, cal, seed=next(seeds), **options)
+        # (chains, draws, parameters)
+        np.save(kept, post.draws.reshape(post.n_ensembles, -1, post.draws.shape[-1]))
+        return {"draws": str(kept), "evaluations": post.diagnostics.n_evaluations}
+
+    return run
+
+
+def propagate(folder: Path) -> Callable[[], Result]:
+    """The attitude error that a calibration contributes."""
+    obs, camera = _data(folder)
+    post = sc.sample(obs, sc.calibrate(obs, camera), seed=0)
+
+    def run() -> Result:
+        error = sc.propagate(post, obs, seed=0)
+        return {"text": error.text()}
+
+    return run
+
+
+def diagnose(folder: Path) -> Callable[[], Result]:
+    """Misfit, jackknife, predictive check, other starts, other models."""
+    obs, camera = _data(folder)
+    cal = sc.calibrate(obs, camera)
+    post = sc.sample(obs, cal, seed=0)
+
+    def run() -> Result:
+        return {"text": sc.diagnose(obs, cal, post).text()}
+
+    return run
+
+
+def study(folder: Path, **options: Any) -> Callable[[], Result]:
+    """Cells of a coupling study."""
+    if not hasattr(sc, "study"):
+        raise Missing("this version has no `study`")
+    raise Missing("no benchmark has been written for it")
+
+
+def command(folder: Path, *, arguments: list[str], needs: str | None = None) -> Callable[[], Result]:
+    """A command of the package in a fresh process; ``{data}`` is the folder of the data, ``{out}`` a new one."""
+    if needs is not None and not Path(needs).exists():
+        raise Missing(f"{needs} is not on this machine")
+    program = [sys.executable, "-c", "from starcal_uq.cli.app import main; main()"]
+
+    def run() -> Result:
+        with tempfile.TemporaryDirectory() as out:
+            words = [a.format(data=folder, out=Path(out) / "out") for a in arguments]
+            done = subprocess.run([*program, *words], capture_output=True, text=True)
+        if done.returncode != 0:
+            raise RuntimeError(f"{' '.join(words)}: {done.stderr.strip()[-300:]}")
+        return {}
+
+    return run
+
+
+def imported(folder: Path, *, code: str) -> Callable[[], Result]:
+    """A line of Python in a fresh process."""
+
+    def run() -> Result:
+        subprocess.run([sys.executable, "-c", code], check=True)
+        return {}
+
+    return run
+
+
+def quest(folder: Path, *, frames: int, stars: int) -> Callable[[], Result]:
+    """Attitudes of all frames in one call."""
+    from attitudes import directions
+
+    b, r = directions(frames, stars)
+    starts = np.arange(frames + 1) * stars
+    flat_b, flat_r = b.reshape(-1, 3), r.reshape(-1, 3)
+
+    def run() -> Result:
+        found = sc.attitude.quest(flat_b, flat_r, starts, covariance=False)
+        return {"quaternions": found.quaternions[:1000]}
+
+    return run
+
+
+def project(folder: Path, *, points: int) -> Callable[[], Result]:
+    """Directions to pixels."""
+    from points import directions
+
+    camera, b = sc.paper.paper_camera(), directions(points)
+    return lambda: {"xy": sc.camera.project(camera, b)[:1000]}
+
+
+def unproject(folder: Path, *, points: int) -> Callable[[], Result]:
+    """Pixels to directions."""
+    from points import pixels
+
+    camera, xy = sc.paper.paper_camera(), pixels(points)
+    return lambda: {"b": sc.camera.unproject(camera, xy)[:1000]}
+
+
+def centroids(folder: Path, *, images: str) -> Callable[[], Result]:
+    """Stars of images that are in memory."""
+    if not Path(images).is_dir():
+        raise Missing(f"{images} is not on this machine")
+    loaded = [sc.images.read_image(path) for path in sorted(Path(images).glob("*.tif*"))]
+
+    def run() -> Result:
+        found = sc.images.extract_centroids(loaded)
+        return {"frames": len(loaded), "found": len(found.x_px)}
+
+    return run
+
+
+def identify(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
+    """Stars of images identified from their centroids."""
+    if not Path(images).is_dir():
+        raise Missing(f"{images} is not on this machine")
+    nominal = sc.Camera.load(camera)
+    found = sc.images.extract_centroids(images, camera=nominal)
+    stars = sc.load_catalogue(max_mag=7.0, epoch=2019.6)
+
+    def run() -> Result:
+        done = sc.identification.identify(found, nominal, stars, cache=False)
+        return {"frames": len(done.frames), "found": sum(f.status == "identified" for f in done.frames)}
+
+    return run
