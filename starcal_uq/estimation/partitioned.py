@@ -8,11 +8,12 @@ of frames is kept, for what looks at stars one by one.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, reduce
 from operator import add
 from time import perf_counter
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +28,7 @@ from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, check_camera
 from starcal_uq.estimation.calibration import Calibration
-from starcal_uq.estimation.compressed import GramSums, gram_sums
+from starcal_uq.estimation.compressed import GramSums, gram_sums, optimum, settled
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.residual_map import OUTLIER_SIGMA, PartitionSums, ResidualMap
 from starcal_uq.estimation.solvers import Normal, is_singular, levenberg_marquardt
@@ -38,31 +39,33 @@ from starcal_uq.observations.checks import mixed_bits
 from starcal_uq.observations.partitions import Partition, PartitionedObservations, PartitionReader, joined_hash
 from starcal_uq.observations.table import Observations
 
-# Last step of the refinement, standard deviations of the estimate.
-_LAST_STEP = 1e-8
+T = TypeVar("T")
+# Standard deviations of the estimate: last step of the solver, from where one of Newton's on the expansion finds the
+# optimum, and its length that needs no new expansion.
+_LAST_STEP, _NEAR = 0.5, 1e-5
 
 
 @dataclass(frozen=True)
 class _Seen:
-    """What the first pass has seen: stars, data hashes, and number and content of every frame."""
+    """What the first pass has seen: normal equations, data hashes, and number and content of every frame."""
 
-    n_stars: int
+    sums: NormalSums
     hashes: tuple[str, ...]
     frames: IntArray
     content: NDArray[np.uint64]
 
 
-def _look(reader: PartitionReader, part: Partition) -> _Seen:
+def _look(reader: PartitionReader, model: str, theta: FloatArray, part: Partition) -> _Seen:
     obs = reader.load(part, check=True)
     # Equal pixels in any order of the stars have equal sums.
     with np.errstate(over="ignore"):
         content = np.add.reduceat(mixed_bits(obs.x_px, obs.y_px), obs.frame_starts[:-1])
-    return _Seen(obs.n_stars, (obs.data_hash,), obs.frame_ids, content)
+    return _Seen(_sums(obs, model, theta), (obs.data_hash,), obs.frame_ids, content)
 
 
 def _seen_together(parts: Sequence[_Seen]) -> _Seen:
     return _Seen(
-        sum(part.n_stars for part in parts),
+        sum_of([part.sums for part in parts]),
         tuple(value for part in parts for value in part.hashes),
         np.concatenate([part.frames for part in parts]),
         np.concatenate([part.content for part in parts]),
@@ -70,7 +73,11 @@ def _seen_together(parts: Sequence[_Seen]) -> _Seen:
 
 
 def _normal(reader: PartitionReader, model: str, theta: FloatArray, part: Partition) -> NormalSums:
-    likelihood = MarginalLikelihood(reader.load(part), model)
+    return _sums(reader.load(part), model, theta)
+
+
+def _sums(obs: Observations, model: str, theta: FloatArray) -> NormalSums:
+    likelihood = MarginalLikelihood(obs, model)
     return settled_sums(likelihood.frames, model, theta, likelihood.start_rotations(theta))[0]
 
 
@@ -162,37 +169,44 @@ def calibrate_partitions(
         For bad rows, with the file.
     """
     reader, model, began = obs.reader, start.camera.distortion, perf_counter()
-    seen = cluster.reduce(partial(_look, reader), obs.parts, _seen_together, progress=progress)
+    first = start.stages[-1].theta
+
+    def total(one: Callable[[Partition], T], together: Callable[[Sequence[T]], T]) -> T:
+        return cluster.reduce(one, obs.parts, together, progress=progress)
+
+    seen = total(partial(_look, reader, model, first), _seen_together)
     if duplicates == "refuse":
         _refuse_repeated(seen)
-    n_stars, n_frames, p = seen.n_stars, len(seen.frames), len(start.theta)
-    dof = 2 * n_stars - 3 * n_frames - p
+    n_stars, n_frames = seen.sums.n_stars, seen.sums.n_frames
+    dof = 2 * n_stars - 3 * n_frames - len(first)
 
     def evaluate(theta: FloatArray) -> Normal:
-        return cluster.reduce(partial(_normal, reader, model, theta), obs.parts, sum_of, progress=progress).normal
+        known = np.array_equal(theta, first)
+        return (seen.sums if known else total(partial(_normal, reader, model, theta), sum_of)).normal
 
-    # A last step of 1e-8 sigma, which leaves nothing of where the search began: that depends on the sample.
-    found = levenberg_marquardt(
-        evaluate, start.stages[-1].theta, max_iterations=max_iterations, tolerance=_LAST_STEP**2 / dof
-    )
-    sampled = replace(start.stages[-1], name="sample")
-    stage = Stage("refinement", found.trajectory, found.costs, found.status, found.evaluations, perf_counter() - began)
+    found = levenberg_marquardt(evaluate, first, max_iterations=max_iterations, tolerance=_LAST_STEP**2 / dof)
     theta, normal, status = found.theta, found.normal, found.status
     if not np.isfinite(normal.cost) or is_singular(normal.matrix):
         reason = status if not status.ok else Status.SINGULAR if np.isfinite(normal.cost) else Status.NOT_FINITE
         raise CalibrationError(f"the calibration failed ({reason.name}): {reason.remedy}.", reason)
-    sigma = float(np.sqrt(normal.cost / dof))
-    covariance = scaled_inverse(normal.matrix) * sigma**2
-    whitening = scaled_cholesky(covariance)
-    gram = cluster.reduce(partial(_gram, reader, model, theta, whitening), obs.parts, _gram_together, progress=progress)
-    compressed = gram.likelihood(theta, whitening)
+    whitening = scaled_cholesky(scaled_inverse(normal.matrix) * normal.cost / dof)
+    for _ in range(max_iterations):
+        gram = total(partial(_gram, reader, model, theta, whitening), _gram_together)
+        here = gram.likelihood(theta, whitening)
+        best = optimum(settled(here))
+        theta = best.theta
+        # The expansion is exact to second order: so near, its optimum is that of all stars to rounding.
+        if float(np.max(np.abs(here.whiten(theta)))) < _NEAR:
+            break
+    compressed, sigma = best.compressed, best.sigma
+    sampled = replace(start.stages[-1], name="sample")
+    ways, costs = np.vstack([found.trajectory, theta]), np.append(found.costs, best.sum_of_squares)
+    stage = Stage("refinement", ways, costs, status, found.evaluations + 1, perf_counter() - began)
     # As in `assemble`: the rotation-volume term moves the maximum by about 0.01 sigma of a small table.
     theta = theta - 0.5 * compressed.whitening @ compressed.log_determinant_slope
     camera = start.nominal.with_theta(theta)
     scale = sigma * float(np.sqrt(dof / (2.0 * n_stars)))
-    rest = cluster.reduce(
-        partial(_residuals, reader, camera, theta, scale, n_stars), obs.parts, _added_residuals, progress=progress
-    )
+    rest = total(partial(_residuals, reader, camera, theta, scale, n_stars), _added_residuals)
     likelihood = MarginalLikelihood(sample, model)
     state, _ = likelihood.profile(theta)
     residuals = likelihood.frames.in_pixels(state.e).T
@@ -212,7 +226,7 @@ def calibrate_partitions(
         start,
         camera=camera,
         theta=theta,
-        covariance=covariance,
+        covariance=best.covariance,
         sigma=sigma,
         sigma_std=sigma / float(np.sqrt(2.0 * dof)),
         stages=(*start.stages[:-1], sampled, stage),
@@ -221,7 +235,7 @@ def calibrate_partitions(
         residuals_px=residuals,
         chi2=float(np.sum(rest.sums.chi2)),
         dof=dof,
-        information=normal.matrix / sigma**2,
+        information=best.information,
         rotation_per_theta=rest.response / n_frames,
         attitude_noise=rest.inverse / n_frames * sigma**2,
         compressed=compressed,

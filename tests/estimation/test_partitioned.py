@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
 from itertools import pairwise
 from pathlib import Path
 
@@ -34,9 +38,11 @@ def assert_equal(a: sc.Calibration, b: sc.Calibration, bound: float) -> None:
     assert a.dof == b.dof and a.n_stars == b.n_stars and a.n_frames == b.n_frames
     np.testing.assert_allclose(a.sigma, b.sigma, rtol=bound)
     np.testing.assert_allclose(a.chi2, b.chi2, rtol=bound)
-    for one, other in ((a.covariance, b.covariance), (a.compressed.gram, b.compressed.gram)):
-        unit = np.sqrt(np.outer(np.diag(other), np.diag(other)))
-        assert np.max(np.abs(one - other) / unit) < 10 * bound
+    unit = np.sqrt(np.outer(np.diag(b.covariance), np.diag(b.covariance)))
+    assert np.max(np.abs(a.covariance - b.covariance) / unit) < bound
+    points = b.theta + np.random.default_rng(1).standard_normal((20, len(b.theta))) @ b.compressed.whitening.T
+    likelihoods = [cal.compressed.log_likelihood(points, b.sigma) for cal in (a, b)]
+    assert np.max(np.abs(likelihoods[0] - likelihoods[1])) < 1e-6
     for name in ("rotation_per_theta", "attitude_noise"):
         one, other = getattr(a, name), getattr(b, name)
         assert np.max(np.abs(one - other)) < 10 * bound * np.max(np.abs(other))
@@ -107,3 +113,70 @@ def test_bad_row_names_its_file(small, tmp_path: Path) -> None:
     sc.Observations(**{**bad.columns, "x_px": x}, meta=bad.meta).save(parts.parts[1].path, force=True)
     with pytest.raises(ObservationError, match=r"part1.parquet, row 4, column x_px"):
         sc.calibrate(sc.observations.open_partitions(parts.folder), camera)
+
+
+@pytest.mark.slow
+def test_workers_of_a_scheduler_give_the_bits_of_one_process_even_if_one_is_killed(tmp_path: Path) -> None:
+    from distributed import Client, LocalCluster
+
+    obs, camera = sensor(1200)
+    parts = divided(obs, tmp_path / "frames", list(range(0, 1201, 40)))
+    alone = sc.calibrate(parts, camera, workers=0)
+    assert_equal(alone, sc.calibrate(obs, camera), 1e-10)
+    killed: list[int] = []
+    with LocalCluster(n_workers=3, threads_per_worker=1, dashboard_address=None) as local, Client(local) as client:
+        pids = client.run(os.getpid)
+
+        def kill(done: int, total: int) -> None:
+            if done == 5 and not killed:
+                killed.append(next(iter(pids.values())))
+                os.kill(killed[0], signal.SIGKILL)
+
+        found = sc.calibrate(parts, camera, scheduler=local.scheduler_address, progress=kill)
+        assert killed and set(client.run(os.getpid).values()) != set(pids.values())
+    np.testing.assert_array_equal(found.theta, alone.theta)
+    np.testing.assert_array_equal(found.compressed.gram, alone.compressed.gram)
+    np.testing.assert_array_equal(found.partitions.chi2, alone.partitions.chi2)
+
+
+@pytest.mark.slow
+def test_memory_and_time_grow_with_the_partition_and_the_stars(tmp_path: Path) -> None:
+    """One process whose address space may grow by 300 MB over what its imports take, ten times the frames each time."""
+    code = (
+        "import resource, sys, time\n"
+        "import numpy as np\n"
+        "import starcal_uq as sc\n"
+        "from starcal_uq.estimation.calibrate import calibrate\n"
+        "camera, start, stars = sc.paper.paper_camera(), sc.paper.paper_start(), sc.load_catalogue(max_mag=6.0)\n"
+        "sc.calibrate(sc.simulate(stars, camera, n_frames=300), start)\n"
+        "folder, n = sys.argv[1], int(sys.argv[2])\n"
+        "import pyarrow.parquet, distributed\n"
+        "used = int(open('/proc/self/statm').read().split()[0]) * resource.getpagesize()\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (used + 300_000_000,) * 2)\n"
+        "sc.simulation.simulate_partitions(\n"
+        "    stars, camera, folder, n_frames=n, partition_frames=3000, workers=0)\n"
+        "began = time.process_time()\n"
+        "cal = sc.calibrate(sc.observations.open_partitions(folder), start, workers=0)\n"
+        "print(time.process_time() - began, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
+        "z = (cal.theta - camera.theta) / cal.sigmas\n"
+        "assert np.max(np.abs(z)) < 4.5 and cal.n_frames == n, z\n"
+        # The limit means something: all of the larger table at once does not fit under it.
+        "try:\n"
+        "    whole = [sc.load_observations(part.path) for part in sc.observations.open_partitions(folder).parts]\n"
+        "    columns = {name: np.concatenate([getattr(one, name) for one in whole]) for name in whole[0].columns}\n"
+        "    sc.calibrate(sc.Observations(**columns), start)\n"
+        "except MemoryError:\n"
+        "    print('out of memory')\n"
+    )
+    seconds, memory = [], []
+    for n in (3000, 30_000):
+        done = subprocess.run(
+            [sys.executable, "-c", code, str(tmp_path / str(n)), str(n)], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr[-2000:]
+        words = done.stdout.split()
+        assert (words[2:] == ["out", "of", "memory"]) is (n == 30_000)
+        seconds.append(float(words[0]))
+        memory.append(float(words[1]))
+    assert np.log10(seconds[1] / seconds[0]) < 1.05
+    assert memory[1] < 1.2 * memory[0]
