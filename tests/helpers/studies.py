@@ -55,6 +55,7 @@ def made_study(
         seeds=tuple(range(seeds)),
         mode="fisher" if covered is None else "simulate",
         target_arcsec=target_arcsec,
+        target_sigma={"f": 0.05},
     )
     cells = [dict(zip(sweep, values, strict=True)) for values in product(*sweep.values()) for _ in range(seeds)]
     n, p = len(cells), len(NAMES)
@@ -95,6 +96,8 @@ def made_study(
         "frame_error_arcsec": (("cell", "axis"), scale[:, None] * ones),
         "nea_arcsec": (("cell", "axis"), scale[:, None] * ones),
         "error_curve_arcsec": (("cell", "frames_factor"), scale[:, None] / np.sqrt(factor)),
+        # Sigmas fall as the root of the number of frames.
+        "frames_needed_sigma": (("cell", "parameter"), np.ceil(frames[:, None] * (sigma / 0.05) ** 2)),
         "model_bias_arcsec": (("cell", "simpler"), bias[:, None]),
         "model_bias_attitude_arcsec": (("cell", "simpler", "axis"), bias[:, None, None] * ones[:, None, :]),
     }

@@ -43,6 +43,7 @@ def test_the_axis_that_decouples_is_named_with_its_numbers(decoupled: Study) -> 
         "(proportional to its power −0.50)" in answer and "The target of 0.5 arcsec is met in 3 of 8 places: " in answer
     )
     assert "from 1000 frames on" in answer
+    assert "The target of 0.050 px for f is met in 3 of 8 places: from 1000 frames on" in answer
     advice = " ".join(study_advice(decoupled))
     assert "To tell f–k1 apart, go to a field of 20°." in advice
     assert "The fewest frames that keep 0.5 arcsec: " in advice and "1000 frames" in advice

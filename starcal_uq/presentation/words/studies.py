@@ -69,6 +69,7 @@ def study_answer(study: Study) -> list[str]:
         _gauge(study),
         *_errors(sweep),
         _target(study),
+        *_target_sigmas(study),
         *_models(study),
         *_simpler(study),
         _coverage(study),
@@ -324,9 +325,35 @@ def _target(study: Study) -> str:
     return f"{text}. {_frames_needed(study, target)}".strip()
 
 
-def _frames_needed(study: Study, target: float) -> str:
+def _target_sigmas(study: Study) -> list[str]:
+    """The same for targets of single parameters."""
     sweep = study.sweep
-    needed = sweep.over(study.frames_for(target)).ravel()
+    parts = []
+    for name, target in study.definition.target_sigma.items():
+        spec = parameter_called(name)
+        sigma = sweep.over(np.asarray(study.data["sigma"].sel(parameter=name).values, dtype=np.float64))
+        known = np.isfinite(sigma)
+        if not known.any():
+            continue
+        met = known & (sigma <= target)
+        unit = pretty_unit(spec.scaled_unit)
+        head = f"The target of {significant(target / spec.scale)} {unit} for {name} is met"
+        if met.all() or not met.any():
+            text = f"{head} {'everywhere' if met.any() else 'nowhere'}"
+        else:
+            text = f"{head} in {count(int(met.sum()))} of {count(int(known.sum()))} places{_where(sweep, met, known)}"
+        needed = study.data["frames_needed_sigma"].sel(parameter=name).values
+        parts.append(f"{text}. {_range_of_frames(sweep, np.asarray(needed, dtype=np.float64))}".strip())
+    return parts
+
+
+def _frames_needed(study: Study, target: float) -> str:
+    return _range_of_frames(study.sweep, study.frames_for(target))
+
+
+def _range_of_frames(sweep: Sweep, cells: FloatArray) -> str:
+    """The fewest and the most frames that a target takes over the sweep, and where."""
+    needed = sweep.over(cells).ravel()
     if not np.isfinite(needed).any():
         return "No number of frames meets it." if np.isinf(needed).any() else ""
     others = [axis for axis in sweep.axes if axis != "frames"]
@@ -512,7 +539,8 @@ def _advice_couplings(study: Study) -> list[str]:
         elif axis == "distortion":
             parts.append(f"To tell {join_words(names)} apart, take the model {value} if its bias allows.")
         else:
-            parts.append(f"To tell {join_words(names)} apart, go to {said(axis, value)}.")
+            go = "take" if isinstance(value, str) else "go to"
+            parts.append(f"To tell {join_words(names)} apart, {go} {said(axis, value)}.")
     if stuck:
         parts.append(
             f"Do not expect {join_words(stuck[:_TOLD])} to come apart by what was varied here. Report them with their "
@@ -637,7 +665,7 @@ def _advice_models(study: Study) -> str:
     order = sorted(good, key=lambda model: len(parameters(model)))
     if order:
         return f"The model {order[0]} is rich enough everywhere in this sweep: more coefficients only add sigma."
-    if bad and not good:
+    if len(bad) == study.data.sizes["simpler"]:
         return (
             "No simpler distortion model is safe over the whole sweep: keep the coefficients, and live with their "
             "coupling."
@@ -664,7 +692,7 @@ def study_table(study: Study) -> TextTable | None:
             cells = (form(float(grid[i])) for (_, _, form), grid in zip(columns, grids, strict=True))
             rows.append((axis_label(axis) if i == 0 else "", value_words(value), *cells))
     heads = ("Along", "Value", *(head for head, _, _ in columns))
-    title = "Medians over seeds and all other axes"
+    title = "Medians over seeds and all other axes; pairs: correlation; rest: error that differs from frame to frame"
     return TextTable(heads, tuple(rows), title, "ll" + "r" * len(columns))
 
 
@@ -673,16 +701,15 @@ def summary_columns(study: Study) -> list[tuple[str, FloatArray, Any]]:
     sweep = study.sweep
     columns: list[tuple[str, FloatArray, Any]] = []
     for pair in sorted(sweep.coupled or sweep.pairs[:1], key=lambda pair: -pair.mean_size)[:2]:
-        columns.append((f"Correlation {pair.names[0]}, {pair.names[1]}", _correlations(study, pair), _correlation))
+        columns.append((_dashed(pair), _correlations(study, pair), _correlation))
     factor = np.sqrt(study.data["variance_inflation"].sel(parameter="f").values)
     spec = parameter_called("f")
     columns.append(
         (f"Sigma f [{pretty_unit(spec.scaled_unit)}]", study.data["sigma"].sel(parameter="f").values, _number)
     )
-    columns.append(("Price of coupling, f", np.asarray(factor, dtype=np.float64), _number))
-    columns.append(("Condition number", study.data["condition_number"].values, _number))
-    columns.append(("Common rotation [arcsec]", sweep.common_rotation, _number))
-    columns.append(("Frame error [arcsec]", sweep.frame_error, _number))
+    columns.append(("Price f", np.asarray(factor, dtype=np.float64), _number))
+    columns.append(("Common [arcsec]", sweep.common_rotation, _number))
+    columns.append(("Rest [arcsec]", sweep.frame_error, _number))
     target = study.definition.target_arcsec
     if target is not None:
         columns.append((f"Frames for {target:g} arcsec", study.frames_for(target), _frames))
