@@ -17,7 +17,7 @@ import importlib.util
 import os
 import platform
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -43,6 +43,20 @@ def use(choice: str) -> None:
     """
     _check(choice)
     os.environ[SWITCH] = choice
+
+
+@contextlib.contextmanager
+def using(choice: str) -> Iterator[None]:
+    """As `use`, for a while."""
+    before = os.environ.get(SWITCH)
+    use(choice)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[SWITCH]
+        else:
+            os.environ[SWITCH] = before
 
 
 def _check(choice: str) -> None:

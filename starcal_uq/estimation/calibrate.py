@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation, rotation_to_quaternion
+from starcal_uq.camera import compiled
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model, sigma_parameter
 from starcal_uq.core.cluster import Scheduler, cluster
@@ -25,7 +26,7 @@ from starcal_uq.estimation.fingerprints import Fingerprints
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import NOISES, fit_noise, weighed
 from starcal_uq.estimation.pairs import PairObjective
-from starcal_uq.estimation.partitioned import calibrate_partitions
+from starcal_uq.estimation.partitioned import calibrate_partitions, kernels_for
 from starcal_uq.estimation.recursive.start import RECURSIVE_METHODS, RecursionOptions
 from starcal_uq.estimation.recursive.stream import raise_unless_good
 from starcal_uq.estimation.robust import compress_reweighted, refine, robust_start
@@ -189,7 +190,9 @@ def calibrate(
                 "duplicates='keep'."
             )
         sample = obs.sample()
-        start = calibrate(sample, camera, solver=solver, max_iterations=max_iterations, duplicates=duplicates)
+        # What is compiled is compiled here, before other processes ask for it.
+        with compiled.using(kernels_for(camera.distortion, obs.n_stars)):
+            start = calibrate(sample, camera, solver=solver, max_iterations=max_iterations, duplicates=duplicates)
         with cluster(scheduler, workers=_enough(workers, obs), caller="calibrate") as processes:
             calibration = calibrate_partitions(
                 obs,

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_uq.attitude.rotations import rotation_to_quaternion
+from starcal_uq.camera import compiled
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.cluster import Cluster
 from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
@@ -26,6 +27,7 @@ from starcal_uq.core.provenance import provenance
 from starcal_uq.core.status import Status
 from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.estimation import loops
 from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, check_camera
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.compressed import GramSums, gram_sums, optimum, settled
@@ -53,6 +55,16 @@ class _Seen:
     hashes: tuple[str, ...]
     frames: IntArray
     content: NDArray[np.uint64]
+
+
+def kernels_for(model_name: str, n_stars: int) -> str:
+    """Path of the loops, ``numpy`` or ``numba``, for all partitions together."""
+    return "numba" if loops.wanted(model_name, n_stars) else "numpy"
+
+
+def _with_kernels(kernels: str, one: Callable[[Partition], T], part: Partition) -> T:
+    with compiled.using(kernels):
+        return one(part)
 
 
 def _look(reader: PartitionReader, model: str, theta: FloatArray, part: Partition) -> _Seen:
@@ -169,10 +181,12 @@ def calibrate_partitions(
         For bad rows, with the file.
     """
     reader, model, began = obs.reader, start.camera.distortion, perf_counter()
+    # Chosen here once: what one process has compiled in the meantime must not change the digits of another.
+    kernels = kernels_for(model, obs.n_stars)
     first = start.stages[-1].theta
 
     def total(one: Callable[[Partition], T], together: Callable[[Sequence[T]], T]) -> T:
-        return cluster.reduce(one, obs.parts, together, progress=progress)
+        return cluster.reduce(partial(_with_kernels, kernels, one), obs.parts, together, progress=progress)
 
     seen = total(partial(_look, reader, model, first), _seen_together)
     if duplicates == "refuse":
