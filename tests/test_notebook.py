@@ -12,7 +12,11 @@ NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
 
 
 @pytest.mark.parametrize(
-    "name", ["quickstart", *(pytest.param(name, marks=pytest.mark.slow) for name in ("error_budget", "paper"))]
+    "name",
+    [
+        "quickstart",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("coupling_study", "error_budget", "paper")),
+    ],
 )
 def test_it_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     # Jupyter's own files stay out of the home folder.
