@@ -1,12 +1,12 @@
 """One cell of a study: from its settings to its numbers, by Fisher information.
 
-The covariance after n frames is that of an estimate which weighs stars by their noise,
+The covariance after n frames is that of an estimate which weighs images by their whole variance,
 
-    C = (n F + P)^-1 (n F + P + tau^2 (n A + n (n - 1) B)) (n F + P)^-1,
+    C = (n F + P)^-1 (n F + P + n A + n (n - 1) B) (n F + P)^-1,
 
-with F the mean information of a frame (attitudes eliminated), P the prior's precision, and tau the error that a star's
-direction has in all of its images; A and B are mean products of scores within a frame and between frames. Everything
-else follows from C: it is what `coupling` says of a posterior, before there is any.
+with F the mean information of a frame (attitudes eliminated) and P the prior's precision. A and B are there where stars
+bring errors into all of their images: what these add to the variance of a frame's score, and the covariance of the
+scores of two frames. Everything else follows from C: it is what `coupling` says of a posterior, before there is any.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from starcal_uq.studies.geometry import (
     geometry_key,
     mission_key,
     noise_shape,
-    offset_px,
+    offset_of,
     star_noise,
     statements,
     take_frames,
@@ -101,12 +101,7 @@ class FisherCells:
         counts = self._campaign(cell, n, m)
         frame = np.tensordot(counts, stated.information, 1) / (scale**2 * n)
         prior = prior_precision(self.definition.priors.get(settings["prior"]), camera)
-        spread = None
-        if stated.star_own is not None and stated.star_common is not None:
-            spread = star_spread(
-                stated.star_own, stated.star_common, m, scale, offset_px(camera, settings["direction_mas"])
-            )
-        found = coupling_numbers(frame, prior, spread, n, stated)
+        found = coupling_numbers(frame, prior, n, stated)
         found |= simpler_numbers(frame, n, float(counts @ stated.weights) / scale**2, stated)
         found |= {
             "status": "ok",
@@ -147,19 +142,22 @@ class FisherCells:
         """What the frames of a cell say, and do to attitudes of a mission, and the noise to scale it by."""
         settings = cell.settings
         key = geometry_key(camera, settings, self.definition.seed, cell.seed_index, False)
+        offset = offset_of(camera, settings)
         shape, scale = noise_shape(settings)
-        with_errors = settings["direction_mas"] > 0.0
-        whole = (key, settings.get("stars"), shape, with_errors)
+        if offset > 0.0:
+            # Two sizes of noise have no common factor.
+            shape, scale = (settings["sigma_px"], *shape[1:]), 1.0
+        whole = (key, settings.get("stars"), shape, offset)
         if self._stated is None or self._stated[0] != whole:
-            stated = self._state(key, settings.get("stars"), shape, with_errors)
+            stated = self._state(*whole)
             if key.pointing != "random":
-                stated = stated.for_mission(self._state(mission_key(key), settings.get("stars"), shape, False))
+                stated = stated.for_mission(self._state(mission_key(key), *whole[1:]))
             self._stated = whole, stated
         return self._stated[1], scale
 
-    def _state(self, key: GeometryKey, stars: int | None, shape: NoiseShape, with_errors: bool) -> Statements:
+    def _state(self, key: GeometryKey, stars: int | None, shape: NoiseShape, offset: float) -> Statements:
         chosen = self.geometry(key).brightest(stars)
-        return statements(chosen, star_noise(chosen.mag, shape), with_errors)
+        return statements(chosen, star_noise(chosen.mag, shape), offset)
 
 
 def prior_precision(table: Mapping[str, Any] | None, camera: Camera) -> FloatArray | None:
@@ -172,20 +170,6 @@ def prior_precision(table: Mapping[str, Any] | None, camera: Camera) -> FloatArr
         if entry in table:
             precision[place] = stated[place] ** -2.0
     return precision
-
-
-def star_spread(
-    own: FloatArray, common: FloatArray, m: int, scale: float, offset: float
-) -> tuple[FloatArray, FloatArray]:
-    """tau^2 A and tau^2 B of the module's formula, from sums over m frames."""
-    factor = offset**2 / scale**4
-    a = own / m
-    b = (common - own) / (m * (m - 1)) if m > 1 else np.zeros_like(own)
-    # A difference of sums over stars that hardly repeat may be negative by chance.
-    size = np.sqrt(np.diag(a))
-    values, vectors = np.linalg.eigh(b / np.outer(size, size))
-    b = (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(size, size)
-    return factor * a, factor * b
 
 
 def covariances(
@@ -204,17 +188,16 @@ def covariances(
 def coupling_numbers(
     frame: FloatArray,
     prior: FloatArray | None,
-    spread: tuple[FloatArray, FloatArray] | None,
     n: int,
     stated: Statements,
 ) -> Numbers:
     """What couples after n frames with a mean information of `frame` each."""
     precision = np.zeros(len(frame)) if prior is None else prior
     numbers = np.concatenate([[1.0], FRAME_FACTORS]) * n
-    every = covariances(frame, precision, spread, numbers)
+    every = covariances(frame, precision, stated.star_spread, numbers)
     if not np.isfinite(every[0]).all():
         raise StudyError("the frames do not determine every parameter: use more stars, a simpler model, or a prior.")
-    data = every[0] if prior is None else covariances(frame, np.zeros(len(frame)), spread, numbers[:1])[0]
+    data = every[0] if prior is None else covariances(frame, np.zeros(len(frame)), stated.star_spread, numbers[:1])[0]
     common, forms = stated.common, stated.rest_forms
     cross = 0.5 * (forms[0] + forms[1])
     with np.errstate(invalid="ignore"):

@@ -364,9 +364,8 @@ class Statements:
         Mean square over frames of what an attitude adds to it, rad^2.
     noise : (3,) array
         Mean over frames of the variance of an attitude, rad^2.
-    star_own, star_common : (p, p) array or None
-        Sum over frames of what errors of stars do to the score: within frames, and of all frames together; for
-        errors of one px.
+    star_spread : tuple of (p, p) array, or None
+        By errors of the stars: variance of a frame's score beyond its information, and covariance of two frames'.
     """
 
     camera: Camera
@@ -376,24 +375,31 @@ class Statements:
     common: FloatArray
     rest_forms: FloatArray
     noise: FloatArray
-    star_own: FloatArray | None = None
-    star_common: FloatArray | None = None
+    star_spread: tuple[FloatArray, FloatArray] | None = None
 
     def for_mission(self, other: Statements) -> Statements:
         """The same information, for attitudes of other frames."""
         return replace(self, common=other.common, rest_forms=other.rest_forms, noise=other.noise)
 
 
-def statements(geometry: Geometry, sigma_px: FloatArray, with_star_errors: bool) -> Statements:
-    """What the frames of a geometry say when its stars have this noise (N,), px per axis."""
-    frames = geometry.frames(sigma_px)
+def statements(geometry: Geometry, noise_px: FloatArray, offset_px: float = 0.0) -> Statements:
+    """What the frames of a geometry say.
+
+    Parameters
+    ----------
+    geometry : Geometry
+        The frames.
+    noise_px : (N,) array
+        Centroid noise, px per axis.
+    offset_px : float
+        Error of a star's direction, px at the boresight per axis, the same in all of its images; images are weighed by
+        both together.
+    """
+    frames = geometry.frames(np.hypot(noise_px, offset_px))
     camera = geometry.camera
     information, response, noise = frame_matrices(camera, frames, geometry.rotations)
     common = response.mean(axis=0)
     rest = response - common
-    star: tuple[FloatArray | None, FloatArray | None] = (None, None)
-    if with_star_errors:
-        star = _star_scores(geometry, frames)
     return Statements(
         camera=camera,
         information=information,
@@ -402,25 +408,35 @@ def statements(geometry: Geometry, sigma_px: FloatArray, with_star_errors: bool)
         common=common,
         rest_forms=np.einsum("kap,kaq->apq", rest, rest, optimize=True) / len(rest),
         noise=np.diagonal(noise, axis1=1, axis2=2).mean(axis=0),
-        star_own=star[0],
-        star_common=star[1],
+        star_spread=_star_spread(geometry, frames, noise_px, offset_px) if offset_px > 0.0 else None,
     )
 
 
-def _star_scores(geometry: Geometry, frames: StarFrames) -> tuple[FloatArray, FloatArray]:
-    """Sums over images, and over stars of the sum of their images, of the squared score for one px of star error."""
-    camera = geometry.camera
+def _star_spread(
+    geometry: Geometry, frames: StarFrames, noise_px: FloatArray, offset_px: float
+) -> tuple[FloatArray, FloatArray]:
+    """Variance of a frame's score beyond its information, and covariance of two frames' scores, by errors of stars."""
+    camera, m = geometry.camera, geometry.n_frames
     likelihood = MarginalLikelihood(frames, camera.distortion)
     state, _ = likelihood.profile(camera.theta, geometry.rotations)
     h = likelihood.project_out(state, likelihood.derivatives(camera.theta, state))
     numbers = np.unique(geometry.star, return_inverse=True)[1]
     z = offset_columns(likelihood, state, sky_axes(frames.r, numbers), camera.focal_px)
-    score = np.einsum("pxn,jxn->pjn", h, z)
+    score = offset_px * np.einsum("pxn,jxn->pjn", h, z)
     total = np.zeros((int(numbers.max()) + 1, len(h), 2))
     add_by_star(total, score, numbers)
-    return np.einsum("pjn,qjn->pq", score, score), np.einsum("spj,sqj->pq", total, total)
+    own, every = np.einsum("pjn,qjn->pq", score, score), np.einsum("spj,sqj->pq", total, total)
+    # Of the whole variance by which an image is weighed, centroid noise is this share.
+    share = noise_px**2 / (noise_px**2 + offset_px**2)
+    excess = own - np.einsum("pxn,qxn,n->pq", h, h, 1.0 - share, optimize=True)
+    common = (every - own) / (m * (m - 1)) if m > 1 else np.zeros_like(own)
+    # A difference of sums over stars that hardly repeat may be negative by chance.
+    size = np.sqrt(np.diag(own))
+    values, vectors = np.linalg.eigh(common / np.outer(size, size))
+    common = (vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(size, size)
+    return excess / m, common
 
 
-def offset_px(camera: Camera, direction_mas: float) -> float:
-    """An error of a direction in px at the boresight."""
-    return camera.focal_px * direction_mas / 1000.0 / ARCSEC
+def offset_of(camera: Camera, settings: Mapping[str, Any]) -> float:
+    """Error of a star's direction in px at the boresight, per axis."""
+    return float(camera.focal_px * settings["direction_mas"] / 1000.0 / ARCSEC)

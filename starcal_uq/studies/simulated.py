@@ -32,7 +32,6 @@ from starcal_uq.studies.cells import (
     covariance_numbers,
     prior_precision,
     simpler_numbers,
-    star_spread,
 )
 from starcal_uq.studies.definition import Cell, StudyDefinition
 from starcal_uq.studies.geometry import (
@@ -43,7 +42,7 @@ from starcal_uq.studies.geometry import (
     geometry_key,
     mission_key,
     noise_shape,
-    offset_px,
+    offset_of,
     star_noise,
     statements,
     take_frames,
@@ -119,19 +118,16 @@ class SimulatedCells:
     ) -> tuple[Statements, Numbers]:
         """What the same frames say by their information."""
         settings, n = cell.settings, geometry.n_frames
-        stated = statements(geometry, noise, settings["direction_mas"] > 0.0)
+        offset = offset_of(camera, settings)
+        stated = statements(geometry, noise, offset)
         if key.pointing != "random":
             mission = take_frames(mission_key(key), self.heaven, self.definition.geometries)
             mission = mission.brightest(settings.get("stars"))
             shape, scale = noise_shape(settings)
-            stated = stated.for_mission(statements(mission, scale * star_noise(mission.mag, shape), False))
+            stated = stated.for_mission(statements(mission, scale * star_noise(mission.mag, shape), offset))
         frame = stated.information.sum(axis=0) / n
         prior = prior_precision(self.definition.priors.get(settings["prior"]), camera)
-        spread = None
-        if stated.star_own is not None and stated.star_common is not None:
-            offset = offset_px(camera, settings["direction_mas"])
-            spread = star_spread(stated.star_own, stated.star_common, n, 1.0, offset)
-        found = coupling_numbers(frame, prior, spread, n, stated)
+        found = coupling_numbers(frame, prior, n, stated)
         found |= simpler_numbers(frame, n, float(stated.weights.sum()), stated)
         return stated, found | {
             "sigma_predicted": found["sigma"],
