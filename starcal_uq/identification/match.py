@@ -12,15 +12,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import lgamma, log, pi
-from typing import TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
 
 from starcal_uq.attitude.rotations import exp_rotation
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.identification.brightness import unlike_brightness
 from starcal_uq.identification.nearby import NearbyStars
 from starcal_uq.identification.pyramid import SIGMAS, CameraTolerance, FieldGeometry, Hypothesis
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
 
 # Parameters after the three of the attitude: ln F, d_x, d_y, kappa.
 N_SHARED = 4
@@ -99,20 +102,23 @@ def start_state(hypothesis: Hypothesis) -> CameraState:
 
 def match_frame(
     u: FloatArray,
+    tree: cKDTree,
     sigma_px: FloatArray,
     sky: NearbyStars,
     start: CameraState,
     tolerance: CameraTolerance,
     *,
+    log10_wanted: float,
     mag: FloatArray | None = None,
     radial: bool = True,
     polished: bool = False,
 ) -> Match | None:
-    """Match all centroids of a frame, ideal pixels u (n, 2), and refine, with a gate that shrinks to the noise.
+    """Match all centroids of a frame, ideal pixels u (n, 2) and their `tree`, with a gate that shrinks to the noise.
 
     With instrumental magnitudes (n,), NaN where not known, doubtful matches of unlike brightness are left out. `radial`
     says whether kappa is fitted, and `polished` that `start` is good to the noise already, so that the gate starts
-    small. None where fewer than four stars are matched.
+    small. None where fewer than four stars are matched, or where it shows on the way that there will be too few for
+    less than ten to the `log10_wanted` false matches.
     """
     g = sky.geometry
     focal = g.focal_px * float(np.exp(start.shared[0]))
@@ -128,21 +134,27 @@ def match_frame(
     final = SIGMAS * np.maximum(sigma_px, _LEAST_GATE_SIGMA_PX)
     typical = float(np.median(final))
     wide = 2.0 * typical + 0.5 * bias * g.corner_px
+    predicted = _predict(start, r, g)[0]
+    predicted = predicted[_on_detector(predicted, g)]
+    enough = _enough(len(u), len(predicted), depth, typical, g, tolerance, log10_wanted)
+    # One look at what is near a centroid, where a match takes four fits.
+    if np.isfinite(tree.query(predicted, distance_upper_bound=_WIDER * wide)[0]).sum() < enough:
+        return None
     gates = (1.5 * final, final) if polished else (wide + 0.0 * final, 0.5 * (wide + final), 1.5 * final, final)
     state, noise_scale = start, 1.0
     centroid = star = np.empty(0, dtype=np.int64)
     for number, gate in enumerate(gates):
         predicted, _ = _predict(state, r, g)
         limit = np.maximum(gate, final * noise_scale)
-        centroid, star, _ = _mutual(u, predicted, limit)
-        if len(star) < 4:
+        centroid, star, _ = _mutual(tree, u, predicted, limit)
+        if len(star) < (enough if number else 4):
             return None
         state, e = _fit(state, _linearised(state, u, sigma_px, r, centroid, star, g), prior)
         if number >= len(gates) - 2:
             noise_scale = _noise_scale(e, sigma_px[centroid])
     predicted, _ = _predict(state, r, g)
     limit = final * noise_scale
-    centroid, star, ambiguous = _mutual(u, predicted, limit, (sigma_px * noise_scale) ** 2 * _DISTINCT)
+    centroid, star, ambiguous = _mutual(tree, u, predicted, limit, (sigma_px * noise_scale) ** 2 * _DISTINCT)
     if len(star) < 4:
         return None
     e = u[centroid] - predicted[star]
@@ -156,8 +168,7 @@ def match_frame(
             return None
         state, e = _fit(state, _linearised(state, u, sigma_px, r, centroid, star, g), prior)
     information, gradient = _information(state, _linearised(state, u, sigma_px * noise_scale, r, centroid, star, g))
-    on_detector = np.all(np.abs(predicted) < 0.5 * np.array([g.width_px, g.height_px]) + 30.0, axis=1)
-    in_field = max(int(on_detector.sum()), 4)
+    in_field = max(int(_on_detector(predicted, g).sum()), 4)
     density = in_field / (g.width_px * g.height_px)
     expected = log10_false_matches(len(u), len(star), density, depth, typical * noise_scale, g, tolerance)
     return Match(
@@ -174,6 +185,35 @@ def match_frame(
         information,
         gradient,
     )
+
+
+# At the start stars may lie this many times the first gate away, and this part of those wanted must be seen.
+_WIDER, _SEEN = 1.5, 0.7
+
+
+def _enough(
+    n: int,
+    in_field: int,
+    depth: int,
+    gate_px: float,
+    g: FieldGeometry,
+    tolerance: CameraTolerance,
+    log10_wanted: float,
+) -> int:
+    """Stars of n centroids that are matched on the way to fewer than ten to the `log10_wanted` false matches."""
+    density = max(in_field, 4) / (g.width_px * g.height_px)
+    wanted = 4
+    for wanted in range(4, n + 1):
+        if log10_false_matches(n, wanted, density, depth, gate_px, g, tolerance) < log10_wanted:
+            break
+    # Of few, one may be missing.
+    return max(4, min(wanted - 1, round(_SEEN * wanted)))
+
+
+def _on_detector(predicted: FloatArray, g: FieldGeometry) -> BoolArray:
+    """Which stars are on the detector, or just outside."""
+    inside: BoolArray = np.all(np.abs(predicted) < 0.5 * np.array([g.width_px, g.height_px]) + 30.0, axis=1)
+    return inside
 
 
 def log10_false_matches(
@@ -294,20 +334,25 @@ def _noise_scale(e: FloatArray, sigma_px: FloatArray) -> float:
 
 
 def _mutual(
-    u: FloatArray, predicted: FloatArray, limit_px: FloatArray, distinct_px2: FloatArray | None = None
+    tree: cKDTree, u: FloatArray, predicted: FloatArray, limit_px: FloatArray, distinct_px2: FloatArray | None = None
 ) -> tuple[IntArray, IntArray, int]:
-    """Nearest mutual neighbours within limits (n,): centroids, stars, and how many were left out as ambiguous."""
-    dx = u[:, None, 0] - predicted[None, :, 0]
-    dy = u[:, None, 1] - predicted[None, :, 1]
-    d2 = dx * dx + dy * dy
+    """Nearest mutual neighbours within limits (n,): centroids, stars, and how many were left out as ambiguous.
+
+    `tree` is that of the centroids u (n, 2), of which only those nearest to a star are looked at further.
+    """
+    farthest = float(limit_px.max()) * (1.0 + 1e-9)
+    nearest_centroid = tree.query(predicted, distance_upper_bound=farthest)[1]
+    rows = np.unique(nearest_centroid[nearest_centroid < len(u)])
+    if not len(rows):
+        return rows.astype(np.int64), rows.astype(np.int64), 0
+    d2 = (u[rows, 0, None] - predicted[:, 0]) ** 2 + (u[rows, 1, None] - predicted[:, 1]) ** 2
     star = np.argmin(d2, axis=1)
-    rows = np.arange(len(u))
-    nearest = d2[rows, star]
-    mutual = (np.argmin(d2, axis=0)[star] == rows) & (nearest <= limit_px**2)
-    ambiguous = np.zeros(len(u), dtype=np.bool_)
+    nearest = d2[np.arange(len(rows)), star]
+    mutual = (nearest_centroid[star] == rows) & (nearest <= limit_px[rows] ** 2)
+    ambiguous = np.zeros(len(rows), dtype=np.bool_)
     if distinct_px2 is not None:
-        next_star = np.partition(d2, 1, axis=1)[:, 1] if d2.shape[1] > 1 else np.full(len(u), np.inf)
-        next_centroid = np.partition(d2, 1, axis=0)[1][star] if d2.shape[0] > 1 else np.full(len(u), np.inf)
-        ambiguous = mutual & (np.minimum(next_star, next_centroid) - nearest < distinct_px2)
-    keep = np.flatnonzero(mutual & ~ambiguous)
-    return keep.astype(np.int64), star[keep].astype(np.int64), int(ambiguous.sum())
+        next_star = np.partition(d2, 1, axis=1)[:, 1] if d2.shape[1] > 1 else np.full(len(rows), np.inf)
+        next_centroid = tree.query(predicted[star], k=[2])[0][:, 0] ** 2
+        ambiguous = mutual & (np.minimum(next_star, next_centroid) - nearest < distinct_px2[rows])
+    keep = mutual & ~ambiguous
+    return rows[keep].astype(np.int64), star[keep].astype(np.int64), int(ambiguous.sum())

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -23,8 +23,12 @@ from starcal_uq.identification.result import FrameStatus
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.sky.catalogue import StarCatalogue
 
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
 # A frame is identified when fewer wrong attitudes than this are expected to match as well.
 MAX_EXPECTED_FALSE = 1e-4
+_LOG10_ACCEPTED = float(np.log10(MAX_EXPECTED_FALSE))
 # Fewer stars than this are not identified: three have no redundancy beyond the focal length.
 MIN_STARS = 4
 # Centroids are not believed to be better than this: catalogue positions and the lens have errors of their own.
@@ -35,7 +39,7 @@ _OTHER_ATTITUDE_RAD = 2e-3
 # Triangles are made of so many centroids first, and then of so many.
 _CENTROIDS = (10, 16)
 _MAX_TRIANGLES = 200
-# A match with more than this noise, or with less than half of what is possible, is compared with those of more triangles.
+# A match with more than this noise, or with less than half of what can be, is compared with those of more triangles.
 _POOR_FIT = 1.3
 _MORE_TRIANGLES = 5
 # Triangles of a frame that is tried once more with a worse lens, whose many hypotheses take long.
@@ -93,6 +97,7 @@ class FrameTable:
             flux = np.where(saturated, np.nan, flux)
         self.mag = [instrumental_mag(flux[rows]) for rows in self.rows]
         self.points = self._ideal(self.camera)
+        self._trees: dict[int, cKDTree] = {}
 
     def _ideal(self, camera: Camera) -> list[FloatArray]:
         stacked = np.concatenate(self.xy) if self.xy else np.empty((0, 2))
@@ -104,8 +109,16 @@ class FrameTable:
     def seen_by(self, camera: Camera) -> FrameTable:
         """The same frames in the ideal pixels of another camera."""
         other = copy(self)
-        other.camera, other.points = camera, other._ideal(camera)
+        other.camera, other.points, other._trees = camera, other._ideal(camera), {}
         return other
+
+    def tree(self, k: int) -> cKDTree:
+        """The points of a frame, to be searched by place."""
+        from scipy.spatial import cKDTree
+
+        if k not in self._trees:
+            self._trees[k] = cKDTree(self.points[k])
+        return self._trees[k]
 
 
 class Search:
@@ -166,13 +179,14 @@ class Search:
         match = self._matched(field, k, start, polished=True)
         seconds = first.seconds + perf_counter() - clock
         # A frame that fits by itself but not with the camera of the others is not trusted.
-        if match is None or match.log10_false > np.log10(MAX_EXPECTED_FALSE):
+        if match is None or match.log10_false > _LOG10_ACCEPTED:
             return Found("not identified", None, seconds)
         return Found(first.status, match, seconds)
 
     def _matched(self, field: FrameTable, k: int, start: CameraState, polished: bool = False) -> Match | None:
         return match_frame(
             field.points[k],
+            field.tree(k),
             field.sigma[k],
             self.sky,
             start,
@@ -180,6 +194,7 @@ class Search:
             mag=field.mag[k],
             radial=self.radial,
             polished=polished,
+            log10_wanted=_LOG10_ACCEPTED,
         )
 
     def _look(self, field: FrameTable, k: int) -> tuple[FrameStatus, Match | None]:
@@ -209,7 +224,7 @@ class Search:
             left -= 1
             for hypothesis in batch:
                 match = self._matched(field, k, start_state(hypothesis))
-                if match is None or match.log10_false >= np.log10(MAX_EXPECTED_FALSE):
+                if match is None or match.log10_false >= _LOG10_ACCEPTED:
                     continue
                 yield match
                 if match.log10_false < np.log10(_BEYOND_DOUBT):
