@@ -119,8 +119,6 @@ def _profiles(
 
     Shape (n, 1 + derivatives, m) each; the first derivative is by the position, the second by the log width.
     """
-    from scipy.special import ndtr
-
     n, m = len(u), stamps.counts.shape[1]
     inverse = np.concatenate([1.0 / sigma] * 2)[:, None]
     z = np.arange(-0.5, m) - np.concatenate([u, v])[:, None]
@@ -128,7 +126,7 @@ def _profiles(
     rows = np.empty((2 * n, 1 + derivatives, m))
     density = np.exp(-0.5 * z * z)
     density /= _SQRT_2PI
-    below = ndtr(z)
+    below = _below(z, density)
     np.subtract(below[:, 1:], below[:, :-1], out=rows[:, 0])
     if derivatives:
         np.subtract(density[:, :-1], density[:, 1:], out=rows[:, 1])
@@ -137,6 +135,23 @@ def _profiles(
         density *= z
         np.subtract(density[:, :-1], density[:, 1:], out=rows[:, 2])
     return rows[:n], rows[n:]
+
+
+def _below(z: FloatArray, density: FloatArray) -> FloatArray:
+    """Normal distribution function where its density is known, to 7.5e-8 (Abramowitz & Stegun 26.2.17).
+
+    No pixel is known so well, and SciPy's exact function takes longer to import than an image takes to measure.
+    """
+    t = np.abs(z)
+    t *= 0.2316419
+    t += 1.0
+    np.reciprocal(t, out=t)
+    above = t * 1.330274429
+    for coefficient in (-1.821255978, 1.781477937, -0.356563782, 0.319381530):
+        above += coefficient
+        above *= t
+    above *= density
+    return np.where(z > 0.0, 1.0 - above, above)
 
 
 def _contracted(x: FloatArray, image: FloatArray, y: FloatArray) -> FloatArray:
@@ -318,11 +333,15 @@ def _inverse(normal: FloatArray) -> FloatArray:
 
 def near_pairs(x: FloatArray, y: FloatArray, reach: float) -> IntArray:
     """Pairs (i, j), in both orders, of positions closer than `reach`."""
-    from scipy.spatial import cKDTree
-
-    if len(x) < 2:
-        return np.zeros((0, 2), dtype=np.int64)
-    pairs = cKDTree(np.column_stack([x, y])).query_pairs(reach, output_type="ndarray").astype(np.int64)
+    order = np.argsort(x, kind="stable")
+    along = x[order]
+    # Those behind each one along x that are near enough, and of them those that are near.
+    count = np.searchsorted(along, along + reach, side="right") - np.arange(1, len(x) + 1)
+    first = np.repeat(np.arange(len(x)), count)
+    second = np.arange(1, len(first) + 1) + first - np.repeat(np.cumsum(count) - count, count)
+    i, j = order[first], order[second]
+    near = np.hypot(x[i] - x[j], y[i] - y[j]) <= reach
+    pairs = np.column_stack([i[near], j[near]]).astype(np.int64)
     return np.concatenate([pairs, pairs[:, ::-1]])
 
 

@@ -285,6 +285,9 @@ def _plain(header: Any) -> AnyDict:
 def _read_picture(path: Path, data: bytes) -> Image:
     import PIL.Image
 
+    # Otherwise Pillow loads all that it can read before it knows a TIFF file.
+    import PIL.TiffImagePlugin  # noqa: F401
+
     messages: list[str] = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -309,13 +312,15 @@ def _read_picture(path: Path, data: bytes) -> Image:
             raise _broken(path) from error
     if pixels.ndim == 3:
         # Grey pictures saved as RGB lose nothing.
-        grey = bool(np.all(pixels == pixels[..., :1]))
+        colours = [np.ascontiguousarray(pixels[..., k]) for k in range(3)]
+        grey = all(np.array_equal(colours[0], colour) for colour in colours[1:])
         saturation: float | None = 255.0
-        whole = pixels
-        pixels = whole[..., 0] if grey else (whole @ np.array(_LUMINANCE, np.float32)).astype(np.float32)
+        pixels = colours[0]
         if not grey:
+            parts = [colour * np.float32(part) for colour, part in zip(colours, _LUMINANCE, strict=True)]
+            pixels = parts[0] + parts[1] + parts[2]
             # One saturated colour spoils the sum before the sum reaches its own limit.
-            pixels[(whole == 255).any(axis=-1)] = 255.0
+            pixels[np.maximum(np.maximum(*colours[:2]), colours[2]) == 255] = 255.0
             messages.append(
                 f"{path.name}: the colour image was turned into luminance; colours sampled in a mosaic make centroids "
                 "worse than predicted."
