@@ -201,6 +201,15 @@ class StudyDefinition:
         ):
             if not good:
                 raise StudyError(f"{where}, section [study]: {text}.")
+        for section, name, values in (
+            *(("sweep", name, values) for name, values in self.sweep.items()),
+            *(("observation", name, (value,)) for name, value in self.observation.items()),
+            *(("sweep.latin", name, (span["start"], span["stop"])) for name, span in self.latin.items()),
+        ):
+            axis = _axis(name, f"{where}, section [{section}]")
+            if section != "sweep.latin" or axis.kind != "whole":
+                for value in values:
+                    axis.check(value, f"{where}, section [{section}]")
         every = {**self.observation, **self.sweep, **self.latin}
         self._check_names(every, where)
         for name in self.target_sigma:

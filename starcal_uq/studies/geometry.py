@@ -46,14 +46,15 @@ _DEPTH_STEP = 0.5
 class Attitudes(NamedTuple):
     """Some attitudes (n, 3, 3), and stars in a cone around each boresight.
 
-    Frame number, index and cosine of the angle of every such star, by frame and then by index, for all cosines above
-    `least`.
+    Frame number, index, magnitude and cosine of the angle of every such star, by frame and then by index, for all
+    cosines above `least`.
     """
 
     rotations: FloatArray
     least: float
     frame: IntArray
     star: IntArray
+    mag: FloatArray
     cosine: FloatArray
 
 
@@ -78,7 +79,7 @@ class Depth:
         frame = np.repeat(np.arange(len(rotations)), [len(found) for found in near])
         star = np.concatenate([np.asarray(found, dtype=np.int64) for found in near])
         cosine = np.einsum("nj,nj->n", rotations[frame, 2], self.directions[star])
-        return Attitudes(rotations, least, frame, star, cosine)
+        return Attitudes(rotations, least, frame, star, self.stars.mag[star], cosine)
 
     def random(self, seed: tuple[int, ...], block: int, least: float) -> Attitudes:
         """A block of random attitudes with at least those stars; cells of all fields look at the same attitudes."""
@@ -130,15 +131,19 @@ class _Window(Sky):
         super().__init__(depth.stars.select(slice(0, 0)), camera, margin_px)  # type: ignore[arg-type]
         self.depth, self.max_mag = depth, max_mag
 
-    def seen(self, near: Attitudes) -> Geometry:
+    def seen(self, blocks: Sequence[Attitudes]) -> Geometry:
         """Frames of some attitudes, whatever they show."""
-        chosen = (near.cosine > self.min_cosine) & (self.depth.stars.mag[near.star] <= self.max_mag)
-        frame, star = near.frame[chosen], near.star[chosen]
-        xy = project(self.camera, np.einsum("nij,nj->ni", near.rotations[frame], self.depth.directions[star]))
+        rotations = np.concatenate([near.rotations for near in blocks])
+        first = np.cumsum([0, *(len(near.rotations) for near in blocks)])
+        kept = [(near.cosine > self.min_cosine) & (near.mag <= self.max_mag) for near in blocks]
+        frame = np.concatenate([n + near.frame[k] for n, near, k in zip(first[:-1], blocks, kept, strict=True)])
+        star = np.concatenate([near.star[k] for near, k in zip(blocks, kept, strict=True)])
+        b = np.matmul(rotations[frame], self.depth.directions[star][:, :, None])[:, :, 0]
+        xy = project(self.camera, b)
         inside = np.all((xy > self.low) & (xy < self.high), axis=1)
-        sizes = np.bincount(frame[inside], minlength=len(near.rotations))
+        sizes = np.bincount(frame[inside], minlength=len(rotations))
         starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-        return Geometry(self.camera, self.depth, near.rotations, starts, star[inside], xy[inside])
+        return Geometry(self.camera, self.depth, rotations, starts, star[inside], xy[inside])
 
 
 @dataclass(frozen=True, eq=False)
@@ -317,10 +322,10 @@ def take_frames(key: GeometryKey, heaven: Heaven, most: int) -> Geometry:
     field = key.camera.fov_deg[0]
     for _ in range(_PLACES):
         start = random_rotations(1, rng)
-        if window.seen(depth.around(start, window.min_cosine)).with_stars(key.min_stars).n_frames:
+        if window.seen([depth.around(start, window.min_cosine)]).with_stars(key.min_stars).n_frames:
             break
     rotations = pattern_rotations(key.pointing, key.n_frames, rng, field, start[0])
-    found = window.seen(depth.around(rotations, window.min_cosine)).with_stars(key.min_stars)
+    found = window.seen([depth.around(rotations, window.min_cosine)]).with_stars(key.min_stars)
     if found.n_frames == 0:
         raise StudyError(
             f"no frame of the pattern {key.pointing!r} shows {key.min_stars} stars: raise max_mag, or lower min_stars."
@@ -330,12 +335,15 @@ def take_frames(key: GeometryKey, heaven: Heaven, most: int) -> Geometry:
 
 def _random(key: GeometryKey, window: _Window, n: int) -> Geometry:
     parts: list[Geometry] = []
-    good = 0
+    good = tries = 0
     while good < n:
-        near = window.depth.random(key.seed, len(parts), window.min_cosine)
-        parts.append(window.seen(near).with_stars(key.min_stars))
+        # As many blocks as will do if frames go on to show enough stars as often as so far.
+        wanted = int(np.ceil((n - good) * min(tries / max(good, 1), 4.0) / _BLOCK)) if tries else -(-n // _BLOCK)
+        number = range(tries // _BLOCK, tries // _BLOCK + wanted)
+        blocks = [window.depth.random(key.seed, block, window.min_cosine) for block in number]
+        parts.append(window.seen(blocks).with_stars(key.min_stars))
         good += parts[-1].n_frames
-        tries = _BLOCK * len(parts)
+        tries += _BLOCK * wanted
         if tries >= _LEAST_TRIES and good < _LEAST_SKY * tries:
             raise StudyError(
                 f"only {good} of {count(tries)} random attitudes show {key.min_stars} stars to magnitude "

@@ -344,6 +344,12 @@ def test_a_bad_definition_is_one_sentence(tables: dict[str, object], words: str)
     assert str(caught.value).count("..") == 0
 
 
+def test_a_definition_made_in_python_is_checked_as_well() -> None:
+    for sweep, words in (({"fov": (1,)}, "did you mean fov_deg"), ({"pointing": ("up",)}, "pointing is 'up'")):
+        with pytest.raises(StudyError, match=words):
+            sc.study(definition(sweep=sweep), workers=0)
+
+
 def test_a_definition_comes_back_from_its_tables(tmp_path: Path) -> None:
     (tmp_path / "sub").mkdir()
     paper_camera().save(tmp_path / "sub" / "camera.toml")
