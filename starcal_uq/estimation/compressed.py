@@ -20,9 +20,10 @@ from starcal_uq.camera.projection import bent_index, forward_kernel, forward_roo
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray
+from starcal_uq.estimation.loops import gram_loop, wanted
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.star_errors import StarSums
-from starcal_uq.estimation.sums import ATTITUDE_STEPS, ATTITUDE_TOLERANCE_RAD
+from starcal_uq.estimation.sums import ATTITUDE_STEPS, ATTITUDE_TOLERANCE_RAD, settled_sums
 from starcal_uq.maths.linear import COLUMNS, ROWS, inverse_symmetric, scaled_cholesky, symmetric_inverse
 from starcal_uq.observations.frames import StarFrames
 
@@ -285,6 +286,11 @@ def gram_sums(
         Attitudes to start from.
     """
     theta = np.asarray(theta, dtype=np.float64)
+    if wanted(model_name, frames.n_stars):
+        sums, at = settled_sums(frames, model_name, theta, rotations)
+        moved = (at.shift, at.response, at.inverse)
+        gram, slope = gram_loop(frames, model_name, theta, whitening, at.rotations, moved)
+        return GramSums(gram, sums.log_determinant, slope, frames.n_stars, frames.n_frames)
     expansion, p = _Expansion(model_name, theta, whitening), len(theta)
     gram, slope, log_determinant = np.zeros((expansion.q, expansion.q)), np.zeros(p), 0.0
     with np.errstate(all="ignore"):

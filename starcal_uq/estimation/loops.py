@@ -2,7 +2,7 @@
 
 The source is generated for one distortion model: its kernels come from the instructions of CasADi, and what has a fixed
 number of terms is written out, so that accumulators stay in registers. Stars are visited in chunks whose columns stay
-in the first cache; a column is a row of `CHUNK` numbers in one buffer, at a distance that the compiler knows.
+in the first cache; a column is a row of `STRIDE` numbers in one buffer, at a distance that the compiler knows.
 """
 
 from __future__ import annotations
@@ -16,56 +16,65 @@ import numpy as np
 from starcal_uq.camera import compiled
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.kernels import Kernel, emit_source
-from starcal_uq.camera.projection import forward_kernel, newton_kernel
+from starcal_uq.camera.projection import backward_kernel, bent_index, forward_kernel, newton_kernel
 from starcal_uq.core.types import FloatArray
 from starcal_uq.observations.frames import StarFrames
 
-_CHUNK = 128
+# Columns of a buffer: more than a chunk, and no multiple of what makes rows compete for places in the cache.
+_STRIDE = 136
 _NONE = np.empty(0)
 
 _HEAD = """
 import numpy as np
 from numba import float64, int64, njit, types
 
-P, CHUNK, ROWS, EXPLICIT = {p}, {chunk}, {rows}, {explicit}
-SMALL = {p} + {p} * ({p} + 1) // 2 + 1
+P, STRIDE, CHUNK, GRAM_CHUNK, ROWS, EXPLICIT = {p}, {stride}, 128, 64, {rows}, {explicit}
 # Sums in another order and fused products, nothing that changes what is done with NaN and infinity.
+HELPER = dict(no_cpython_wrapper=True, no_cfunc_wrapper=True)
 ORDERED = dict(nogil=True, cache=True, error_model="numpy", fastmath={{"contract"}})
 FAST = dict(nogil=True, cache=True, error_model="numpy", fastmath={{"contract", "reassoc", "nsz"}})
 INLINE = dict(nogil=True, inline="always", error_model="numpy", fastmath={{"contract", "reassoc", "nsz"}})
+
+ONE, TWO, THREE = float64[::1], float64[:, ::1], float64[:, :, ::1]
+GIVEN, TABLE, BLOCKS = (types.Array(float64, n, "C", readonly=True) for n in (1, 2, 3))
+THETA = types.UniTuple(float64, P)
+STARS = (*[GIVEN] * 6, types.Array(int64, 1, "C", readonly=True), BLOCKS)
+FRAME_SUMS = types.void(THETA, *STARS, TWO, TWO, TWO, THREE, THREE, ONE)
+PAIR_SUMS = types.float64(THETA, *[GIVEN] * 5, types.Array(int64, 1, "C", readonly=True), TWO, TWO)
+GRAM_SUMS = types.void(THETA, types.UniTuple(float64, P * P), *STARS, TABLE, BLOCKS, BLOCKS, TWO, ONE)
 """
 
 _LOOPS = '''
-@njit(**FAST)
+@njit(**FAST, **HELPER)
 def fill_root(theta, buf, row, target, m):
     """Newton's method for the point that a model displaces to the targets; as `solve_displacement` does it."""
     flat = True
     for q in range(3, P):
         flat = flat and theta[q] == 0.0
     for i in range(m):
-        x, y = buf[target * CHUNK + i], buf[(target + 1) * CHUNK + i]
+        x, y = buf[target * STRIDE + i], buf[(target + 1) * STRIDE + i]
         u, v = x, y
         if not flat:
             settled = False
             for _ in range(60):
                 newton(theta, x, y, u, v, buf, row, i)
-                du, dv = buf[row * CHUNK + i] - u, buf[(row + 1) * CHUNK + i] - v
-                u, v = buf[row * CHUNK + i], buf[(row + 1) * CHUNK + i]
-                if not buf[(row + 2) * CHUNK + i] > 0.0:
+                du, dv = buf[row * STRIDE + i] - u, buf[(row + 1) * STRIDE + i] - v
+                u, v = buf[row * STRIDE + i], buf[(row + 1) * STRIDE + i]
+                if not buf[(row + 2) * STRIDE + i] > 0.0:
                     break
                 if max(abs(du), abs(dv)) < 1e-5:
                     settled = True
                     break
             if not settled:
                 u, v = np.nan, np.nan
-        buf[row * CHUNK + i] = u
-        buf[(row + 1) * CHUNK + i] = v
+        buf[row * STRIDE + i] = u
+        buf[(row + 1) * STRIDE + i] = v
 
 
-@njit(**FAST)
+@njit(**FAST, **HELPER)
 def fill_directions(theta, r0, r1, r2, starts, rotations, s0, m, first, work):
     """Directions of a chunk in the camera frame into rows 0 to 2 of `work`, roots into rows 3 and 4."""
-    f, j = first, 0
+    f, j = first, starts[0]
     while j < m:
         while starts[f + 1] <= s0 + j:
             f += 1
@@ -76,43 +85,43 @@ def fill_directions(theta, r0, r1, r2, starts, rotations, s0, m, first, work):
         for i in range(j, end):
             x, y, z = r0[s0 + i], r1[s0 + i], r2[s0 + i]
             work[i] = a00 * x + a01 * y + a02 * z
-            work[CHUNK + i] = a10 * x + a11 * y + a12 * z
-            work[2 * CHUNK + i] = a20 * x + a21 * y + a22 * z
+            work[STRIDE + i] = a10 * x + a11 * y + a12 * z
+            work[2 * STRIDE + i] = a20 * x + a21 * y + a22 * z
         j = end
     if EXPLICIT:
         return
     for i in range(m):
-        scale = theta[2] / work[2 * CHUNK + i]
-        work[6 * CHUNK + i] = scale * work[i]
-        work[7 * CHUNK + i] = scale * work[CHUNK + i]
+        scale = theta[2] / work[2 * STRIDE + i]
+        work[6 * STRIDE + i] = scale * work[i]
+        work[7 * STRIDE + i] = scale * work[STRIDE + i]
     fill_root(theta, work, 3, 6, m)
 
 
-@njit(**FAST)
+@njit(**FAST, **HELPER)
 def fill_columns(theta, turn, x0, y0, r0, r1, r2, weight, starts, rotations, s0, m, first, work, buf):
     """A, e and H' of a chunk."""
     fill_directions(theta, r0, r1, r2, starts, rotations, s0, m, first, work)
     for i in range(m):
-        x, y, z, u, v = work[i], work[CHUNK + i], work[2 * CHUNK + i], work[3 * CHUNK + i], work[4 * CHUNK + i]
+        x, y, z, u, v = work[i], work[STRIDE + i], work[2 * STRIDE + i], work[3 * STRIDE + i], work[4 * STRIDE + i]
         first_kernel(theta, x, y, z, u, v, buf, i)
     for i in range(m):
-        buf[6 * CHUNK + i] = x0[s0 + i] - buf[6 * CHUNK + i]
-        buf[7 * CHUNK + i] = y0[s0 + i] - buf[7 * CHUNK + i]
+        buf[6 * STRIDE + i] = x0[s0 + i] - buf[6 * STRIDE + i]
+        buf[7 * STRIDE + i] = y0[s0 + i] - buf[7 * STRIDE + i]
     if len(weight) > 0:
         for q in range(2 * ROWS):
             for i in range(m):
-                buf[q * CHUNK + i] *= weight[s0 + i]
+                buf[q * STRIDE + i] *= weight[s0 + i]
     for q in range(P):
         t0, t1, t2 = turn[0, q], turn[1, q], turn[2, q]
         for x in range(2):
-            o = (8 + 2 * q + x) * CHUNK
+            o = (8 + 2 * q + x) * STRIDE
             for i in range(m):
                 buf[o + i] -= (
-                    t0 * buf[x * CHUNK + i] + t1 * buf[(2 + x) * CHUNK + i] + t2 * buf[(4 + x) * CHUNK + i]
+                    t0 * buf[x * STRIDE + i] + t1 * buf[(2 + x) * STRIDE + i] + t2 * buf[(4 + x) * STRIDE + i]
                 )
 
 
-@njit(**FAST)
+@njit(**FAST, **HELPER)
 def inverse3(acc, out):
     """Inverse of the symmetric 3 x 3 matrix in the upper corner of `acc`: six entries; its determinant comes back."""
     xx, xy, xz, yy, yz, zz = acc[0, 0], acc[0, 1], acc[0, 2], acc[1, 1], acc[1, 2], acc[2, 2]
@@ -126,12 +135,14 @@ def inverse3(acc, out):
 
 @njit(FRAME_SUMS, **FAST)
 def frame_sums(theta, x0, y0, r0, r1, r2, weight, starts, rotations, residuals, gram, shift, response, inverse, volume):
-    work, buf = np.zeros(8 * CHUNK), np.empty(2 * ROWS * CHUNK)
+    work, buf = np.zeros(8 * STRIDE), np.empty(2 * ROWS * STRIDE)
     acc, inv, turn = np.zeros((3, ROWS)), np.empty(6), np.zeros((3, P))
-    n, first, s0 = starts[len(starts) - 1], 0, 0
-    m = min(CHUNK, n)
-    fill_columns(theta, turn, x0, y0, r0, r1, r2, weight, starts, rotations, 0, m, 0, work, buf)
-    frame_products(buf, 0, m, acc)
+    # Offsets begin at zero; a literal one would have every function compiled for its type.
+    zero = starts[0]
+    n, first, s0 = starts[len(starts) - 1], zero, zero
+    m = min(zero + CHUNK, n)
+    fill_columns(theta, turn, x0, y0, r0, r1, r2, weight, starts, rotations, zero, m, zero, work, buf)
+    frame_products(buf, zero, m, acc)
     inverse3(acc, inv)
     for q in range(P):
         a, b, c = acc[0, 4 + q], acc[1, 4 + q], acc[2, 4 + q]
@@ -142,14 +153,14 @@ def frame_sums(theta, x0, y0, r0, r1, r2, weight, starts, rotations, residuals, 
         turn[:] = 0.0
     acc[:] = 0.0
     while s0 < n:
-        m = min(CHUNK, n - s0)
+        m = min(zero + CHUNK, n - s0)
         fill_columns(theta, turn, x0, y0, r0, r1, r2, weight, starts, rotations, s0, m, first, work, buf)
         if residuals.shape[1] > 0:
             for x in range(2):
                 for i in range(m):
-                    residuals[x, s0 + i] = buf[(6 + x) * CHUNK + i]
+                    residuals[x, s0 + i] = buf[(6 + x) * STRIDE + i]
         chunk_products(buf, m, gram)
-        f, j = first, 0
+        f, j = first, zero
         while j < m:
             while starts[f + 1] <= s0 + j:
                 f += 1
@@ -179,19 +190,166 @@ def frame_sums(theta, x0, y0, r0, r1, r2, weight, starts, rotations, residuals, 
         s0 += m
 '''
 
-_SIGNATURES = """
-ONE, TWO, THREE = float64[::1], float64[:, ::1], float64[:, :, ::1]
-GIVEN, TABLE, BLOCKS = (types.Array(float64, n, "C", readonly=True) for n in (1, 2, 3))
-THETA = types.UniTuple(float64, P)
-STARS = (*[GIVEN] * 6, types.Array(int64, 1, "C", readonly=True), BLOCKS)
-FRAME_SUMS = types.void(THETA, *STARS, TWO, TWO, TWO, THREE, THREE, ONE)
+_PAIRS = """
+@njit(PAIR_SUMS, **FAST)
+def pair_sums(theta, x0, y0, r0, r1, r2, starts, scores, matrix):
+    B, DB, R, E, D, W = 0, 3, 3 + 3 * P, 6 + 3 * P, 9 + 3 * P, 12 + 3 * P
+    work, buf = np.zeros(8 * STRIDE), np.empty((12 + 6 * P) * STRIDE)
+    ee, rr, re = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    eb, bb, cross, score = np.empty((3, 3)), np.empty((3, 3)), np.empty((P, 3, 3)), np.empty(P)
+    n_frames = len(starts) - 1
+    cost, first = 0.0, 0
+    while first < n_frames:
+        s0, last = starts[first], first + 1
+        while last < n_frames and starts[last + 1] - s0 <= CHUNK:
+            last += 1
+        m = starts[last] - s0
+        for i in range(m):
+            work[i], work[STRIDE + i] = x0[s0 + i] - theta[0], y0[s0 + i] - theta[1]
+        if not EXPLICIT:
+            for i in range(m):
+                backward_kernel(theta, x0[s0 + i], y0[s0 + i], 0.0, 0.0, buf, i)
+        else:
+            fill_root(theta, work, 3, 0, m)
+            for i in range(m):
+                backward_kernel(theta, x0[s0 + i], y0[s0 + i], work[3 * STRIDE + i], work[4 * STRIDE + i], buf, i)
+        for i in range(m):
+            x, y, z = r0[s0 + i], r1[s0 + i], r2[s0 + i]
+            buf[R * STRIDE + i], buf[(R + 1) * STRIDE + i], buf[(R + 2) * STRIDE + i] = x, y, z
+            buf[E * STRIDE + i] = buf[i] - x
+            buf[(E + 1) * STRIDE + i] = buf[STRIDE + i] - y
+            buf[(E + 2) * STRIDE + i] = buf[2 * STRIDE + i] - z
+        for f in range(first, last):
+            j, end = starts[f] - s0, starts[f + 1] - s0
+            ee[:], rr[:], re[:], cross[:], score[:] = 0.0, 0.0, 0.0, 0.0, 0.0
+            pair_grams(buf, j, end, ee, rr, re)
+            pair_cross(buf, j, end, cross)
+            for a in range(1, 3):
+                for c in range(a):
+                    ee[a, c], rr[a, c] = ee[c, a], rr[c, a]
+            for a in range(3):
+                for c in range(3):
+                    cost += ee[a, c] * rr[a, c] + re[a, c] * re[c, a] + ee[a, c] * (2.0 * re[a, c] + 0.5 * ee[a, c])
+                    eb[a, c] = re[c, a] + ee[a, c]
+                    bb[a, c] = rr[a, c] + re[a, c] + re[c, a] + ee[a, c]
+            for c in range(3):
+                p0, p1, p2, q0, q1, q2 = eb[0, c], eb[1, c], eb[2, c], bb[0, c], bb[1, c], bb[2, c]
+                for i in range(j, end):
+                    buf[(D + c) * STRIDE + i] = (
+                        p0 * buf[R * STRIDE + i]
+                        + p1 * buf[(R + 1) * STRIDE + i]
+                        + p2 * buf[(R + 2) * STRIDE + i]
+                        + q0 * buf[E * STRIDE + i]
+                        + q1 * buf[(E + 1) * STRIDE + i]
+                        + q2 * buf[(E + 2) * STRIDE + i]
+                    )
+            for a in range(P):
+                o = (DB + 3 * a) * STRIDE
+                for c in range(3):
+                    q0, q1, q2 = bb[0, c], bb[1, c], bb[2, c]
+                    for i in range(j, end):
+                        buf[(W + 3 * a + c) * STRIDE + i] = (
+                            q0 * buf[o + i] + q1 * buf[o + STRIDE + i] + q2 * buf[o + 2 * STRIDE + i]
+                        )
+            pair_scores(buf, j, end, score)
+            for a in range(P):
+                scores[a, f] = score[a]
+                for c in range(a, P):
+                    total = 0.0
+                    for x in range(3):
+                        for y in range(3):
+                            total += cross[a, x, y] * cross[c, y, x]
+                    matrix[a, c] += total
+        pair_matrix(buf, m, matrix)
+        first = last
+    return cost
+"""
+
+
+_GRAM = """
+@njit(GRAM_SUMS, **FAST)
+def gram_sums(theta, l, x0, y0, r0, r1, r2, weight, starts, rotations, shift, path, inverse, gram, slope):
+    work, buf = np.zeros(8 * STRIDE), np.zeros(GRAM_ROWS * STRIDE)
+    acc, solved = np.zeros((3, SECOND)), np.empty(3)
+    zero = starts[0]
+    n, first, s0 = starts[len(starts) - 1], zero, zero
+    while s0 < n:
+        m = min(zero + GRAM_CHUNK, n - s0)
+        fill_directions(theta, r0, r1, r2, starts, rotations, s0, m, first, work)
+        for i in range(m):
+            x, y, z, u, v = work[i], work[STRIDE + i], work[2 * STRIDE + i], work[3 * STRIDE + i], work[4 * STRIDE + i]
+            bent_kernel(theta, x, y, z, u, v, buf, i)
+        for i in range(m):
+            buf[i], buf[STRIDE + i] = x0[s0 + i] - buf[i], y0[s0 + i] - buf[STRIDE + i]
+        if len(weight) > 0:
+            for q in range(PATH):
+                for i in range(m):
+                    buf[q * STRIDE + i] *= weight[s0 + i]
+        f, j = first, zero
+        while j < m:
+            while starts[f + 1] <= s0 + j:
+                f += 1
+            end = min(starts[f + 1] - s0, m)
+            for c in range(3):
+                for a in range(P):
+                    value = path[c, a, f]
+                    for i in range(j, end):
+                        buf[(PATH + P * c + a) * STRIDE + i] = value
+                value = shift[c, f]
+                for i in range(j, end):
+                    buf[(PATH + 3 * P + c) * STRIDE + i] = value
+                for d in range(c, 3):
+                    value = inverse[c, d, f]
+                    o = (PATH + 3 * P + 3 + (3 * c - c * (c - 1) // 2 + d - c)) * STRIDE
+                    for i in range(j, end):
+                        buf[o + i] = value
+            j = end
+        expand_0(l, buf, m, slope)
+        expand_1(l, buf, m, slope)
+        for p in range(Q):
+            for q in range(p, Q, 4):
+                t0, t1, t2, t3 = 0.0, 0.0, 0.0, 0.0
+                for x in range(2):
+                    o, o2 = (COLUMNS + 2 * p + x) * STRIDE, (COLUMNS + 2 * q + x) * STRIDE
+                    for i in range(m):
+                        v = buf[o + i]
+                        t0 += v * buf[o2 + i]
+                        t1 += v * buf[o2 + 2 * STRIDE + i]
+                        t2 += v * buf[o2 + 4 * STRIDE + i]
+                        t3 += v * buf[o2 + 6 * STRIDE + i]
+                gram[p, q] += t0
+                gram[p, q + 1] += t1
+                gram[p, q + 2] += t2
+                gram[p, q + 3] += t3
+        f, j = first, zero
+        while j < m:
+            while starts[f + 1] <= s0 + j:
+                f += 1
+            end = min(starts[f + 1] - s0, m)
+            second_0(buf, j, end, acc)
+            second_1(buf, j, end, acc)
+            second_2(buf, j, end, acc)
+            j = end
+            if s0 + j == starts[f + 1]:
+                for q in range(SECOND):
+                    for c in range(3):
+                        solved[c] = (
+                            inverse[c, 0, f] * acc[0, q] + inverse[c, 1, f] * acc[1, q] + inverse[c, 2, f] * acc[2, q]
+                        )
+                    for p in range(q + 1):
+                        gram[1 + P + p, 1 + P + q] -= (
+                            acc[0, p] * solved[0] + acc[1, p] * solved[1] + acc[2, p] * solved[2]
+                        )
+                acc[:] = 0.0
+        first = f
+        s0 += m
 """
 
 
 def _row(first: Iterable[int]) -> Any:
     """Where the elements of each output stand in the buffer."""
     starts = list(first)
-    return lambda output, element: f"out[{starts[output] + element} * CHUNK + i]"
+    return lambda output, element: f"out[{starts[output] + element} * STRIDE + i]"
 
 
 def _scalar_source(kernel: Kernel, name: str, first: Iterable[int]) -> str:
@@ -212,24 +370,169 @@ def _newton_source(kernel: Kernel) -> str:
         return f"t[{element}]" if source == 0 else names[source][element]
 
     def write(output: int, element: int) -> str:
-        return f"out[(row + {2 * output + element}) * CHUNK + i]"
+        return f"out[(row + {2 * output + element}) * STRIDE + i]"
 
     return emit_source(kernel.function, "newton", "t, x, y, u, v, out, row, i", read, write)
 
 
-def _products_source(name: str, arguments: str, begin: str, end: str, pairs: list[tuple[int, int]], offset: int) -> str:
-    """Sums of products of rows (two axes each) from `begin` to `end`, added to entries of a matrix.
+def _backward_source(kernel: Kernel) -> str:
+    names = ("t", ("x", "y"), ("u", "v"))
 
-    Row and column of the matrix are those of the pairs less `offset`.
-    """
-    needed = sorted({row for pair in pairs for row in pair})
-    lines = [f"def {name}(buf, {arguments}, total):"]
-    lines += [f"    s{a}_{b} = 0.0" for a, b in pairs]
+    def read(source: int, element: int) -> str:
+        return f"t[{element}]" if source == 0 else names[source][element]
+
+    def write(output: int, element: int) -> str:
+        # Derivatives come as rows of (p, 3).
+        return f"out[{3 * output + element} * STRIDE + i]"
+
+    return emit_source(kernel.function, "backward_kernel", "t, x, y, u, v, out, i", read, write)
+
+
+# An entry of an array, and the pairs of rows whose products are summed into it.
+_Sums = list[tuple[str, list[tuple[int, int]]]]
+
+
+def _sums_source(name: str, arguments: str, begin: str, end: str, sums: _Sums) -> str:
+    """Sums of products of rows from column `begin` to `end`, added to entries of arrays."""
+    needed = sorted({row for _, pairs in sums for pair in pairs for row in pair})
+    lines = [f"def {name}({arguments}):"]
+    lines += [f"    s{n} = 0.0" for n in range(len(sums))]
     lines.append(f"    for i in range({begin}, {end}):")
-    lines += [f"        v{row}_{x} = buf[{2 * row + x} * CHUNK + i]" for row in needed for x in range(2)]
-    lines += [f"        s{a}_{b} += v{a}_0 * v{b}_0 + v{a}_1 * v{b}_1" for a, b in pairs]
-    lines += [f"    total[{a - offset}, {b - offset}] += s{a}_{b}" for a, b in pairs]
+    lines += [f"        v{row} = buf[{row} * STRIDE + i]" for row in needed]
+    for n, (_, pairs) in enumerate(sums):
+        lines.append(f"        s{n} += " + " + ".join(f"v{a} * v{b}" for a, b in pairs))
+    lines += [f"    {target} += s{n}" for n, (target, _) in enumerate(sums)]
     return "\n".join(lines) + "\n"
+
+
+def _normal_sources(rows: int) -> list[str]:
+    """Products of A with A, e and H of a frame, and those of e and H among themselves of a chunk."""
+
+    def products(name: str, pairs: list[tuple[int, int]], offset: int) -> _Sums:
+        return [(f"{name}[{a - offset}, {b - offset}]", [(2 * a + x, 2 * b + x) for x in range(2)]) for a, b in pairs]
+
+    with_attitude = [(c, q) for c in range(3) for q in range(c, rows)]
+    among = [(a, b) for a in range(3, rows) for b in range(a, rows)]
+    frame = _sums_source("frame_products", "buf, j, end, acc", "j", "end", products("acc", with_attitude, 0))
+    chunk = _sums_source("chunk_products", "buf, m, gram", "0", "m", products("gram", among, 3))
+    return ["@njit(**ORDERED, **HELPER)\n" + frame, "@njit(**FAST, **HELPER)\n" + chunk]
+
+
+def _pair_sources(p: int) -> list[str]:
+    """Sums over a frame or a chunk for the interstar angles; rows as `pair_sums` fills them."""
+    b, db, r, e, d, w = 0, 3, 3 + 3 * p, 6 + 3 * p, 9 + 3 * p, 12 + 3 * p
+    square = [(i, j) for i in range(3) for j in range(i, 3)]
+    grams: _Sums = [(f"ee[{i}, {j}]", [(e + i, e + j)]) for i, j in square]
+    grams += [(f"rr[{i}, {j}]", [(r + i, r + j)]) for i, j in square]
+    grams += [(f"re[{i}, {j}]", [(r + i, e + j)]) for i in range(3) for j in range(3)]
+    crosses = [
+        _sums_source(
+            f"pair_cross_{a}",
+            "buf, j, end, cross",
+            "j",
+            "end",
+            [(f"cross[{a}, {i}, {k}]", [(b + i, db + 3 * a + k)]) for i in range(3) for k in range(3)],
+        )
+        for a in range(p)
+    ]
+    every = "def pair_cross(buf, j, end, cross):\n" + "".join(
+        f"    pair_cross_{a}(buf, j, end, cross)\n" for a in range(p)
+    )
+    scores: _Sums = [(f"score[{a}]", [(db + 3 * a + i, d + i) for i in range(3)]) for a in range(p)]
+    matrix: _Sums = [
+        (f"matrix[{a}, {c}]", [(w + 3 * a + i, db + 3 * c + i) for i in range(3)])
+        for a in range(p)
+        for c in range(a, p)
+    ]
+    return [
+        "@njit(**ORDERED, **HELPER)\n" + _sums_source("pair_grams", "buf, j, end, ee, rr, re", "j", "end", grams),
+        *("@njit(**ORDERED, **HELPER)\n" + text for text in (*crosses, every)),
+        "@njit(**ORDERED, **HELPER)\n" + _sums_source("pair_scores", "buf, j, end, score", "j", "end", scores),
+        "@njit(**FAST, **HELPER)\n" + _sums_source("pair_matrix", "buf, m, matrix", "0", "m", matrix),
+    ]
+
+
+def _expansion_sources(model_name: str, p: int) -> list[str]:
+    """Columns of the compressed likelihood of a chunk, as `compressed._Expansion` forms them, one axis each.
+
+    Rows of the buffer: e, H, A and the second derivatives that do not vanish, two axes each; of each star's frame the
+    path (3, p), the shift (3) and the inverse (6); then the columns, two axes each.
+    """
+    rows, columns = (index.tolist() for index in bent_index(model_name))
+    h, a, bent = 2, 2 + 2 * p, 8 + 2 * p
+    path = bent + 2 * len(rows)
+    shift, inverse = path + 3 * p, path + 3 * p + 3
+    out = inverse + 6
+    q = (p + 1) * (p + 2) // 2
+    at = {(0, 0): 0, (0, 1): 1, (0, 2): 2, (1, 1): 3, (1, 2): 4, (2, 2): 5}
+    sources = [f"PATH, COLUMNS, Q, SECOND, GRAM_ROWS = {path}, {out}, {q}, {q - p - 1}, {out + 2 * q + 8}"]
+    for x in range(2):
+        body: list[str] = []
+
+        def sum_of(terms: list[str]) -> str:
+            return " + ".join(terms) if terms else "0.0"
+
+        def put(column: int, value: str, body: list[str] = body, x: int = x) -> None:
+            body.append(f"buf[{out + 2 * column + x} * STRIDE + i] = {value}")
+
+        names = {"e": 0} | {f"h{t}": h + 2 * t for t in range(p)} | {f"a{c}": a + 2 * c for c in range(3)}
+        names |= {f"q{n}": bent + 2 * n for n in range(len(rows))}
+        body += [f"{name} = buf[{row + x} * STRIDE + i]" for name, row in names.items()]
+        frame = {f"k{c}_{z}": path + p * c + z for c in range(3) for z in range(p)}
+        frame |= {f"s{c}": shift + c for c in range(3)} | {f"n{c}{d}": inverse + n for (c, d), n in at.items()}
+        body += [f"{name} = buf[{row} * STRIDE + i]" for name, row in frame.items()]
+        put(0, "e - (s0 * a0 + s1 * a1 + s2 * a2)")
+        body += [f"g{c} = " + sum_of([f"n{min(c, d)}{max(c, d)} * a{d}" for d in range(3)]) for c in range(3)]
+        for z in range(p):
+            terms = [f"l[{t * p + z}] * h{t}" for t in range(p)] + [f"k{c}_{z} * a{c}" for c in range(3)]
+            put(1 + z, f"-({sum_of(terms)})")
+            for c in range(3):
+                own = [
+                    f"l[{t * p + z}] * q{n}"
+                    for n, (t, d) in enumerate(zip(rows, columns, strict=True))
+                    if t < p and d == p + c
+                ]
+                turned = [
+                    f"k{d}_{z} * q{n}"
+                    for n, (one, two) in enumerate(zip(rows, columns, strict=True))
+                    for b, d in {(one - p, two - p), (two - p, one - p)}
+                    if one >= p and b == c
+                ]
+                body.append(f"m{z}_{c}, r{z}_{c} = {sum_of(own)}, {sum_of(turned)}")
+                body.append(f"u{z}_{c} = m{z}_{c} + 0.5 * r{z}_{c}")
+        body += [f"t{z} += " + sum_of([f"g{c} * (m{z}_{c} + r{z}_{c})" for c in range(3)]) for z in range(p)]
+        # Second derivatives over theta alone: first with one direction, then with the other.
+        own_entries = [(n, t, d) for n, (t, d) in enumerate(zip(rows, columns, strict=True)) if d < p]
+        used = sorted({t for _, t, d in own_entries} | {d for _, t, d in own_entries})
+        for z in range(p):
+            for t in used:
+                terms = [
+                    f"l[{other * p + z}] * q{n}"
+                    for n, one, two in own_entries
+                    for mine, other in {(one, two), (two, one)}
+                    if mine == t
+                ]
+                body.append(f"w{t}_{z} = {sum_of(terms)}")
+        column = 1 + p
+        for z in range(p):
+            for y in range(z, p):
+                terms = [f"l[{t * p + z}] * w{t}_{y}" for t in used]
+                terms += [f"u{z}_{c} * k{c}_{y} + k{c}_{z} * u{y}_{c}" for c in range(3)]
+                put(column, f"{'-0.5' if z == y else '-1.0'} * ({sum_of(terms)})")
+                column += 1
+        lines = [f"def expand_{x}(l, buf, m, slope):"]
+        lines += [f"    t{z} = 0.0" for z in range(p)]
+        lines += ["    for i in range(m):", *(f"        {line}" for line in body)]
+        lines += [f"    slope[{z}] += 2.0 * t{z}" for z in range(p)]
+        sources.append("@njit(**FAST, **HELPER)\n" + "\n".join(lines) + "\n")
+    for c in range(3):
+        sums: _Sums = [
+            (f"acc[{c}, {n}]", [(a + 2 * c + x, out + 2 * (1 + p + n) + x) for x in range(2)]) for n in range(q - p - 1)
+        ]
+        sources.append(
+            "@njit(**ORDERED, **HELPER)\n" + _sums_source(f"second_{c}", "buf, j, end, acc", "j", "end", sums)
+        )
+    return sources
 
 
 @lru_cache(maxsize=16)
@@ -238,18 +541,17 @@ def source(model_name: str) -> str:
     p = 3 + len(get_model(model_name).coefficients)
     rows = p + 4
     explicit = get_model(model_name).direction == "forward"
-    with_attitude = [(c, q) for c in range(3) for q in range(c, rows)]
-    among = [(a, b) for a in range(3, rows) for b in range(a, rows)]
-    return "\n\n".join(
-        [
-            _HEAD.format(p=p, chunk=_CHUNK, rows=rows, explicit=explicit) + _SIGNATURES,
-            "@njit(**INLINE)\n" + _scalar_source(forward_kernel(model_name, "first"), "first_kernel", (6, 8, 0)),
-            "@njit(**INLINE)\n" + _newton_source(newton_kernel(model_name)),
-            "@njit(**ORDERED)\n" + _products_source("frame_products", "j, end", "j", "end", with_attitude, 0),
-            "@njit(**FAST)\n" + _products_source("chunk_products", "m", "0", "m", among, 3),
-            _LOOPS,
-        ]
-    )
+    kernels = [
+        _scalar_source(forward_kernel(model_name, "first"), "first_kernel", (6, 8, 0)),
+        _newton_source(newton_kernel(model_name)),
+        _backward_source(backward_kernel(model_name, True)),
+        _scalar_source(forward_kernel(model_name, "bent"), "bent_kernel", (0, 2, 2 + 2 * p, 8 + 2 * p)),
+    ]
+    head = _HEAD.format(p=p, stride=_STRIDE, rows=rows, explicit=explicit)
+    inlined = ["@njit(**INLINE)\n" + kernel for kernel in kernels]
+    parts = [head, *inlined, *_normal_sources(rows), *_pair_sources(p), _LOOPS, _PAIRS]
+    parts += [*_expansion_sources(model_name, p), _GRAM]
+    return "\n\n".join(parts)
 
 
 def wanted(model_name: str, n_stars: int) -> bool:
@@ -277,3 +579,42 @@ def frame_loop(
     loops.frame_sums(tuple(theta.tolist()), *_stars(frames, rotations), into, gram, shift, response, inverse, volume)
     upper = np.triu(gram, 1)
     return np.triu(gram) + upper.T, shift, response, inverse, volume
+
+
+def pair_loop(
+    frames: StarFrames, model_name: str, theta: FloatArray, turned: FloatArray
+) -> tuple[float, FloatArray, FloatArray] | None:
+    """Cost, Gauss-Newton matrix (p, p) and gradients (p, K) of frames over interstar angles; `turned` as in `pairs`.
+
+    None where a frame has more stars than the loops take.
+    """
+    if int(frames.sizes.max()) > _STRIDE:
+        return None
+    p = len(theta)
+    scores, matrix = np.empty((p, frames.n_frames)), np.zeros((p, p))
+    loops = compiled.load(model_name, source(model_name))
+    cost = loops.pair_sums(tuple(theta.tolist()), *frames.pixel, *turned, frames.starts, scores, matrix)
+    return cost, np.triu(matrix) + np.triu(matrix, 1).T, scores
+
+
+def gram_loop(
+    frames: StarFrames,
+    model_name: str,
+    theta: FloatArray,
+    whitening: FloatArray,
+    rotations: FloatArray,
+    moved: tuple[FloatArray, FloatArray, FloatArray],
+) -> tuple[FloatArray, FloatArray]:
+    """Gram matrix (q, q) of `compressed.GramSums` and the slope (p,) of the log determinant.
+
+    `moved` are shift, response and inverse of the frames at `rotations`, as `frame_loop` gives them.
+    """
+    p = len(theta)
+    q = (p + 1) * (p + 2) // 2
+    gram, slope = np.zeros((q, q + 3)), np.zeros(p)
+    path = np.ascontiguousarray(np.einsum("ipk,pa->iak", moved[1], whitening))
+    loops = compiled.load(model_name, source(model_name))
+    given = (tuple(theta.tolist()), tuple(whitening.ravel().tolist()), *_stars(frames, rotations))
+    loops.gram_sums(*given, np.ascontiguousarray(moved[0]), path, moved[2], gram, slope)
+    square = gram[:, :q]
+    return np.triu(square) + np.triu(square, 1).T, slope

@@ -9,15 +9,13 @@ small, and every term below is formed from E, so that nothing cancels:
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
-
 import numpy as np
 
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.distortion import get_model
-from starcal_uq.camera.projection import backward_kernel, backward_root
+from starcal_uq.camera.projection import backward_kernel, backward_root, unproject_theta
 from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.estimation.loops import pair_loop, wanted
 from starcal_uq.estimation.solvers import Normal, is_singular
 from starcal_uq.maths.linear import unit_inverse
 from starcal_uq.observations.frames import StarFrames
@@ -41,25 +39,14 @@ def _apply(stars: FloatArray, matrix: FloatArray) -> FloatArray:
     return product
 
 
-@dataclass(frozen=True)
-class _Terms:
-    """One block of frames: cost per frame (K,), D B (3, N), b (3, N), db (p, 3, N)."""
-
-    cost: FloatArray
-    d_b: FloatArray
-    b: FloatArray
-    db: FloatArray
-
-
-def _block_terms(frames: StarFrames, catalogue: FloatArray, b: FloatArray, db: FloatArray) -> _Terms:
-    """Terms of one block; `catalogue` are the catalogue directions (3, N), turned nearly into the camera frame."""
+def _block_terms(frames: StarFrames, catalogue: FloatArray, b: FloatArray) -> tuple[float, FloatArray]:
+    """Cost and D B (3, N) of one block; `catalogue` are the directions (3, N), turned nearly into the camera frame."""
     e = b - catalogue
     ee, rr, re = _gram(frames, e, e), _gram(frames, catalogue, catalogue), _gram(frames, catalogue, e)
     er = re.transpose(1, 0, 2)
-    cost = np.sum(ee * rr + re * er + 2.0 * ee * re + 0.5 * ee * ee, axis=(0, 1))
+    cost = float(np.sum(ee * rr + re * er + 2.0 * ee * re + 0.5 * ee * ee))
     # D B = R' (E^T B) + E (R'^T B) + E (E^T B), with B = R' + E.
-    d_b = _apply(catalogue, frames.spread(er + ee)) + _apply(e, frames.spread(rr + re + er + ee))
-    return _Terms(cost, d_b, b, db)
+    return cost, _apply(catalogue, frames.spread(er + ee)) + _apply(e, frames.spread(rr + re + er + ee))
 
 
 class PairObjective:
@@ -82,6 +69,7 @@ class PairObjective:
         self._turned_at: FloatArray | None = None
         self._turned: list[FloatArray] = []
         self._rotations: list[FloatArray] = []
+        self._compiled = wanted(model_name, frames.n_stars)
         self._last: tuple[FloatArray, Normal, FloatArray] | None = None
 
     @property
@@ -103,21 +91,19 @@ class PairObjective:
         b, db = backward_kernel(self.model_name, True)(frames.n_stars, theta, frames.pixel, root)
         return b, db
 
-    def _terms(self, theta: FloatArray) -> Iterator[tuple[StarFrames, _Terms]]:
-        """Terms of the objective, block by block."""
-        turn = self._turned_at is None or np.max(np.abs(theta[:3] - self._turned_at)) > _TURN_AGAIN_PX
-        if turn:
-            self._turned_at, self._turned, self._rotations = theta[:3].copy(), [], []
-        for index, frames in enumerate(self._blocks):
-            b, db = self.directions(theta, frames)
-            if turn:
-                found = quest(b.T, frames.r.T, frames.starts, covariance=False, on_degenerate="flag")
-                self._turned.append(frames.rotated(found.rotations))
-                self._rotations.append(found.rotations)
-                if not found.ok.all():
-                    # No reference to keep: the model is not finite here.
-                    self._turned_at = None
-            yield frames, _block_terms(frames, self._turned[index], b, db)
+    def _turn(self, theta: FloatArray) -> None:
+        """Turn the catalogue nearly into the camera frame, if the last time is too far away."""
+        if self._turned_at is not None and np.max(np.abs(theta[:3] - self._turned_at)) <= _TURN_AGAIN_PX:
+            return
+        self._turned_at, self._turned, self._rotations = theta[:3].copy(), [], []
+        for frames in self._blocks:
+            b = unproject_theta(self.model_name, theta, frames.pixel.T)
+            found = quest(b, frames.r.T, frames.starts, covariance=False, on_degenerate="flag")
+            self._turned.append(frames.rotated(found.rotations))
+            self._rotations.append(found.rotations)
+            if not found.ok.all():
+                # No reference to keep: the model is not finite here.
+                self._turned_at = None
 
     def cost(self, theta: FloatArray) -> float:
         """The objective S(theta)."""
@@ -141,16 +127,29 @@ class PairObjective:
         p = self.n_parameters
         cost, matrix, scores = 0.0, np.zeros((p, p)), []
         with np.errstate(all="ignore"):
-            for part, terms in self._terms(theta):
-                b, db = terms.b, terms.db
-                cost += float(np.sum(terms.cost))
-                scores.append(part.sum(np.sum(db * terms.d_b, axis=1)))
-                weighted = _apply(db, part.spread(_gram(part, b, b)))
-                matrix += weighted.reshape(p, -1) @ db.reshape(p, -1).T
-                cross = part.sum(b[:, None, None, :] * db.transpose(1, 0, 2)).transpose(2, 0, 1, 3)
-                matrix += cross.reshape(p, -1) @ cross.transpose(0, 2, 1, 3).reshape(p, -1).T
+            self._turn(theta)
+            for frames, turned in zip(self._blocks, self._turned, strict=True):
+                own = pair_loop(frames, self.model_name, theta, turned) if self._compiled else None
+                part = self._block_sums(frames, theta, turned) if own is None else own
+                cost += part[0]
+                matrix += part[1]
+                scores.append(part[2])
             frame_scores = np.concatenate(scores, axis=1)
         return Normal(cost, np.sum(frame_scores, axis=1), 0.5 * (matrix + matrix.T)), frame_scores
+
+    def _block_sums(
+        self, frames: StarFrames, theta: FloatArray, turned: FloatArray
+    ) -> tuple[float, FloatArray, FloatArray]:
+        """Cost, Gauss-Newton matrix (p, p) and gradients (p, K) of one block."""
+        p = self.n_parameters
+        b, db = self.directions(theta, frames)
+        cost, d_b = _block_terms(frames, turned, b)
+        scores = frames.sum(np.sum(db * d_b, axis=1))
+        weighted = _apply(db, frames.spread(_gram(frames, b, b)))
+        matrix = weighted.reshape(p, -1) @ db.reshape(p, -1).T
+        cross = frames.sum(b[:, None, None, :] * db.transpose(1, 0, 2)).transpose(2, 0, 1, 3)
+        matrix += cross.reshape(p, -1) @ cross.transpose(0, 2, 1, 3).reshape(p, -1).T
+        return cost, matrix, scores
 
     def godambe(self, theta: FloatArray) -> FloatArray:
         """Sandwich covariance ``H^-1 V H^-1`` of the estimator that minimises the objective, (p, p).

@@ -13,6 +13,7 @@ from starcal_uq.camera import compiled
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.estimation.compressed import gram_sums
 from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.estimation.sums import Descent, frame_sums, settled_sums, sum_of
 from tests.helpers.scenes import camera, observations, with_sigmas
 
@@ -100,10 +101,43 @@ def test_compiled_loops_equal_numpy(model, stated, monkeypatch):
     assert np.allclose(there.shift, where.shift, rtol=0, atol=1e-15)
     # Rounding of positions of a thousand px, in units of a noise of down to 0.02 px.
     assert np.allclose(residuals, _residuals(likelihood, model, theta, rotations), rtol=0, atol=1e-10)
+    _compare_gram(likelihood, model, theta, rotations, plain.matrix, monkeypatch)
+    _compare_pairs(likelihood.frames, model, theta, monkeypatch)
     # A theta at which the model is not finite is not finite on either path.
     bad = np.array(theta)
     bad[2] = np.nan
     assert frame_sums(likelihood.frames, model, bad, rotations)[0].normal.cost == np.inf
+
+
+def _compare_gram(likelihood, model, theta, rotations, matrix, monkeypatch):
+    whitening = np.linalg.inv(np.linalg.cholesky(matrix)).T
+    both = []
+    for path in ("numba", "numpy"):
+        monkeypatch.setenv(compiled.SWITCH, path)
+        both.append(gram_sums(likelihood.frames, model, theta, whitening, rotations))
+    fused, plain = both
+    p = len(theta)
+    difference = np.abs(_scaled(fused.gram - plain.gram, plain.gram))
+    assert np.max(difference[: p + 1, : p + 1]) < 1e-12
+    # What the attitudes take off the second derivatives is ten digits of them, and nothing of the likelihood.
+    assert np.max(difference) < 1e-8
+    assert np.max(np.abs(fused.gram - plain.gram)) < 1e-12 * np.max(plain.gram)
+    assert np.allclose(fused.log_determinant_slope, plain.log_determinant_slope, rtol=0, atol=1e-12)
+    monkeypatch.setenv(compiled.SWITCH, "numba")
+
+
+def _compare_pairs(frames, model, theta, monkeypatch):
+    both = []
+    for path in ("numba", "numpy"):
+        monkeypatch.setenv(compiled.SWITCH, path)
+        objective = PairObjective(frames, model)
+        both.append((objective.evaluate(theta), objective.godambe(theta)))
+    (fused, fused_covariance), (plain, covariance) = both
+    # The matrix is what a common turn leaves of ten thousand times as much: neither path knows its twelfth digit.
+    assert fused.cost == pytest.approx(plain.cost, rel=1e-11)
+    assert np.max(np.abs(_scaled(fused.matrix - plain.matrix, plain.matrix))) < 1e-10
+    assert np.max(np.abs(_scaled(fused_covariance - covariance, covariance))) < 1e-7
+    monkeypatch.setenv(compiled.SWITCH, "numba")
 
 
 def _residuals(likelihood, model, theta, rotations):
