@@ -55,6 +55,9 @@ def planted(monkeypatch, tmp_path):
             bench.Target("twice as fast", "twice", 1.99),
             bench.Target("three times as fast", "twice", 3.0),
             bench.Target("small", peak_mb=49.0),
+            bench.Target("quick", seconds=0.31, clock="processor"),
+            bench.Target("quick by the clock on the wall", seconds=0.31),
+            bench.Target("the wrong one beside the slow one", "twice", 3.9, "wrong"),
             bench.Target("faster than what is not there", "absent", 1.0),
         ),
     )
@@ -71,7 +74,7 @@ def test_contestants_take_turns_and_the_load_of_the_machine_cancels(planted):
     assert ours["processor"]["median"] == pytest.approx(0.3)  # without the first call
     assert (twice["same"], wrong["same"]) == (True, False)
     assert absent["missing"] == "it is not installed"
-    assert [t["met"] for t in found["targets"]] == [True, False, False, None]
+    assert [t["met"] for t in found["targets"]] == [True, False, False, True, False, True, None]
 
 
 def test_a_row_says_what_differs_and_who_is_missing(planted):
@@ -106,6 +109,15 @@ def test_ratios_count_what_was_done_and_take_common_turns_only():
     assert spread([5.0, 1.0, 3.0]).median == 3.0
 
 
+def test_growth_is_fitted_through_all_sizes():
+    sizes = (10, 100, 1000)
+    row = bench.Row("growth", "Growth", tuple(Contestant(f"{n}", "x:y", options={"n_frames": n}) for n in sizes))
+    for power in (0.9, 1.2):
+        listed = [{"turns": 1, "processor": {"median": 1e-3 * n**power}} for n in sizes]
+        said = bench.judged(row, bench.Target("slowly", exponent=1.05), listed)
+        assert (said["measured"], said["met"]) == (f"{power:.2f}", power < 1.05)
+
+
 def test_every_row_has_a_name_of_its_own_and_rivals_that_its_targets_name():
     for quick in (False, True):
         rows = bench.rows(quick)
@@ -114,6 +126,7 @@ def test_every_row_has_a_name_of_its_own_and_rivals_that_its_targets_name():
             labels = [c.label for c in row.contestants]
             assert len(set(labels)) == len(labels)
             assert {t.rival for t in row.targets} - {None} <= set(labels[1:])
+            assert {t.of for t in row.targets} - {None} <= set(labels[1:])
             for contestant in row.contestants:
                 file, _, function = contestant.call.partition(":")
                 source = (bench.CONTESTANTS / f"{file}.py").read_text(encoding="utf-8")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -83,11 +84,13 @@ def diagnose(folder: Path) -> Callable[[], Result]:
     return run
 
 
-def study(folder: Path, **options: Any) -> Callable[[], Result]:
-    """Cells of a coupling study."""
+def study(folder: Path, *, definition: str) -> Callable[[], Result]:
+    """All cells of a coupling study, on all processors."""
     if not hasattr(sc, "study"):
         raise Missing("this version has no `study`")
-    raise Missing("no benchmark has been written for it")
+    path = Path(tempfile.mkdtemp(prefix="starcal-bench-")) / "study.toml"
+    path.write_text(definition, encoding="utf-8")
+    return lambda: {"cells": int(sc.study(path).data.sizes["cell"])}
 
 
 def command(folder: Path, *, arguments: list[str], needs: str | None = None) -> Callable[[], Result]:
@@ -97,14 +100,37 @@ def command(folder: Path, *, arguments: list[str], needs: str | None = None) -> 
     program = [sys.executable, "-c", "from starcal_uq.cli.app import main; main()"]
 
     def run() -> Result:
-        with tempfile.TemporaryDirectory() as out:
+        peak = 0.0
+        with tempfile.TemporaryDirectory() as out, tempfile.TemporaryFile("w+") as said:
             words = [a.format(data=folder, out=Path(out) / "out") for a in arguments]
-            done = subprocess.run([*program, *words], capture_output=True, text=True)
-        if done.returncode != 0:
-            raise RuntimeError(f"{' '.join(words)}: {done.stderr.strip()[-300:]}")
-        return {}
+            process = subprocess.Popen([*program, *words], stdout=said, stderr=said)
+            while process.poll() is None:
+                peak = max(peak, _tree_mb(process.pid))
+                time.sleep(0.1)
+            said.seek(0)
+            text = said.read()
+            # Status 1 is a verdict on the data, such as those of real frames.
+            if process.returncode > 1 or "Traceback" in text:
+                raise RuntimeError(f"{' '.join(words)}: {text.strip()[-300:]}")
+        return {"peak_mb": peak} if peak > 0.0 else {}
 
     return run
+
+
+def _tree_mb(root: int) -> float:
+    """Memory of a process and all that descend from it, pages that they share counted once; 0 where Linux is not."""
+    total, waiting = 0.0, [root]
+    while waiting:
+        pid = waiting.pop()
+        try:
+            lines = Path(f"/proc/{pid}/smaps_rollup").read_text(encoding="ascii").splitlines()
+            total += sum(float(line.split()[1]) for line in lines if line.startswith("Pss:")) * 1.024e-3
+            for task in Path(f"/proc/{pid}/task").iterdir():
+                waiting += [int(child) for child in (task / "children").read_text(encoding="ascii").split()]
+        except OSError:
+            # It has ended, or there is no such folder.
+            continue
+    return total
 
 
 def imported(folder: Path, *, code: str) -> Callable[[], Result]:
