@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import Parameter, parameters, sigma_parameter
@@ -21,12 +22,15 @@ from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path, ensure_new, reading
 from starcal_uq.core.records import Arrays, from_plain, to_plain
 from starcal_uq.core.status import Check, Level, worst
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.inference.priors import SIGMA_NAMES, Priors
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
+
+# Dimensions, values and attributes by name.
+Variables = dict[str, tuple[tuple[str, ...], NDArray[Any], dict[str, Any]]]
 
 DRAW_ORDER = (
     "chain is one separately seeded ensemble; within a chain, draws are ordered by half of the run, then walker, then "
@@ -282,10 +286,14 @@ class Posterior(Shown):
         """ArviZ's groups ``posterior`` and ``sample_stats`` as xarray datasets (chain, draw)."""
         import xarray as xr
 
+        return {name: xr.Dataset(*group) for name, group in self._groups().items()}
+
+    def _groups(self) -> dict[str, tuple[Variables, dict[str, IntArray], AnyDict]]:
+        """Variables, coordinates and attributes of these groups."""
         shape = (self.n_ensembles, self.n_walkers * self.n_steps)
         coords = {"chain": np.arange(shape[0]), "draw": np.arange(shape[1])}
         shown = self.parameters
-        variables = {
+        variables: Variables = {
             shown[i].name: (
                 ("chain", "draw"),
                 (self.draws[:, i] / shown[i].scale).reshape(shape),
@@ -293,7 +301,7 @@ class Posterior(Shown):
             )
             for i in self.sampled
         }
-        attrs = {
+        attrs: AnyDict = {
             "inference_library": "emcee",
             "inference_library_version": str(self.provenance.get("versions", {}).get("emcee")),
             "draw_order": DRAW_ORDER,
@@ -303,11 +311,8 @@ class Posterior(Shown):
         }
         if not self.sigma_sampled:
             attrs[f"{self.sigma_name}_given"] = float(self.sigma_draws[0])
-        stats = {"lp": (("chain", "draw"), self.log_posterior.reshape(shape), {"units": "nat"})}
-        return {
-            "posterior": xr.Dataset(variables, coords, attrs),
-            "sample_stats": xr.Dataset(stats, coords, attrs),
-        }
+        stats: Variables = {"lp": (("chain", "draw"), self.log_posterior.reshape(shape), {"units": "nat"})}
+        return {"posterior": (variables, coords, attrs), "sample_stats": (stats, coords, attrs)}
 
     def summary(self) -> pd.DataFrame:
         """One row per parameter: prior, posterior and diagnostics, plain and divided by the parameter's scale.
@@ -361,18 +366,18 @@ class Posterior(Shown):
         RunFolderError
             If the file exists and `force` is false, or cannot be written.
         """
-        import xarray as xr
+        import h5netcdf
 
         ensure_new(path, force)
         arrays: Arrays = {}
         record = to_plain(self, arrays, _ARRAYS)
-        root = xr.Dataset(
-            {name: (_ARRAYS[name], value) for name, value in arrays.items()},
-            attrs={"format": _FORMAT, "record": json.dumps({name: record[name] for name in _RECORD})},
-        )
-        tree = xr.DataTree.from_dict({"/": root, **self.datasets()})
-        with atomic_path(path) as temporary:
-            tree.to_netcdf(temporary, engine="h5netcdf")
+        attrs = {"format": _FORMAT, "record": json.dumps({name: record[name] for name in _RECORD})}
+        # xarray would do it, but loads Dask for a lock, which takes longer than sampling.
+        with atomic_path(path) as temporary, h5netcdf.File(temporary, "w") as file:
+            _write(file, {name: (_ARRAYS[name], value, {}) for name, value in arrays.items()}, attrs)
+            for group, (variables, coords, about) in self._groups().items():
+                dimensions: Variables = {name: ((name,), values, {}) for name, values in coords.items()}
+                _write(file.create_group(group), dimensions | variables, about)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Posterior:
@@ -398,6 +403,16 @@ class Posterior(Shown):
                 record = json.loads(str(file.attrs["record"]))
                 arrays = {name: np.asarray(file.variables[name][...]) for name in _ARRAYS if name in file.variables}
             return from_plain(cls, record, arrays)
+
+
+def _write(group: Any, variables: Variables, attrs: AnyDict) -> None:
+    """Put variables with their dimensions, and attributes, into a group of a netCDF file."""
+    for name, (dimensions, values, about) in variables.items():
+        for dimension, size in zip(dimensions, values.shape, strict=True):
+            if dimension not in group.dimensions:
+                group.dimensions[dimension] = size
+        group.create_variable(name, dimensions, data=values).attrs.update(about)
+    group.attrs.update(attrs)
 
 
 _FORMAT = "starcal_uq posterior 2"
