@@ -47,21 +47,24 @@ def plot_correlation(coupling: Coupling, ax: Axes | None = None, *, extended: bo
 def plot_correlations(coupling: Coupling) -> Figure:
     """Both matrices side by side: the camera parameters alone, and with the boresight."""
     p, q = len(coupling.parameter_names), len(coupling.extended_names)
-    figure = style.new_figure(11.0, 11.0 * q / (p + q) * 0.83 + 0.5)
-    left, right = figure.subplots(1, 2, width_ratios=(p, q))
+    width, before, between, after, above = 11.0, 0.45, 0.75, 1.2, 0.62
+    cell = (width - before - between - after) / (p + q)
+    figure = style.new_figure(width, q * cell + above + 0.1)
+    left = style.place(figure, before, 0.1 + (q - p) * cell, p * cell, p * cell)
+    right = style.place(figure, before + p * cell + between, 0.1, q * cell, q * cell)
     _heat_map(left, np.asarray(coupling.correlation), coupling.parameter_names)
     image = _extended(right, coupling)
-    style.label(left, "Camera parameters")
-    style.label(right, "With the constant attitude error they cause")
-    bar = figure.colorbar(image, ax=[left, right], fraction=0.03, pad=0.02, aspect=32)
-    style.dress_bar(bar, "correlation")
+    style.label(left, "Camera parameters", pad=24)
+    style.label(right, "With the constant attitude error they cause", pad=24)
+    bar = style.place(figure, width - after + 0.2, 0.1, 0.2, q * cell)
+    style.label_distance(style.colour_bar(right, image, "correlation", bar).ax, y_in=-0.75)
     return figure
 
 
 def plot_couplings(coupling: Coupling, ax: Axes | None = None) -> Axes:
     """How many times larger each sigma is because the other parameters are unknown too."""
     if ax is None:
-        ax = style.new_axes(4.6, 2.6)
+        ax = style.new_axes(4.6, 2.6, (0.4, 0.12, 0.5, 0.34))
     style.dress(ax, grid=True)
     ratio = np.asarray(coupling.sigma_marginal) / np.asarray(coupling.sigma_conditional)
     rows = np.arange(len(ratio))

@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
 
 _SMALLEST_P = 1e-12
+# Mean width of a letter of a tick label.
+_LETTER_IN = 0.065
 
 
 def plot_misfit(misfit: Misfit, ax: Axes | None = None, *, alpha: float = ALPHA) -> Axes:
@@ -94,16 +96,18 @@ def plot_comparison(models: ModelComparison, ax: Axes | None = None) -> Axes:
 
 def plot_diagnosis(diagnosis: Diagnosis) -> Figure:
     """Tests for misfit, jackknife and comparison of models side by side."""
-    figure = style.new_figure(11.0, 5.4)
-    grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1.0))
-    plot_misfit(diagnosis.misfit, figure.add_subplot(grid[:, 0]))
-    upper, lower = figure.add_subplot(grid[0, 1]), figure.add_subplot(grid[1, 1])
+    width, height, bottom = 11.0, 5.4, 0.5
+    figure = style.new_figure(width, height)
+    names = 0.2 + _LETTER_IN * max((len(test.name) for test in diagnosis.misfit.tests), default=0)
+    plot_misfit(diagnosis.misfit, style.place(figure, names, bottom, 5.7 - names, height - bottom - 0.12))
+    each = 0.5 * (height - bottom - 0.36 - 0.76)
     if diagnosis.jackknife is not None:
-        plot_jackknife(diagnosis.jackknife, upper)
+        upper = style.place(figure, 7.3, bottom + each + 0.76, width - 7.42, each)
+        style.label_distance(plot_jackknife(diagnosis.jackknife, upper), y_in=0.45)
     if diagnosis.comparison is not None:
-        plot_comparison(diagnosis.comparison, lower)
-    for panel, result in ((upper, diagnosis.jackknife), (lower, diagnosis.comparison)):
-        panel.set_visible(result is not None)
+        lower = style.place(figure, 7.3, bottom, width - 7.42, each)
+        style.label_distance(plot_comparison(diagnosis.comparison, lower), x_in=0.27)
+    style.label_distance(figure.axes[0], x_in=0.27)
     return figure
 
 

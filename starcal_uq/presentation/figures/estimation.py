@@ -146,10 +146,13 @@ def plot_residuals(cal: Calibration, obs: Observations) -> Figure:
             "this calibration comes from a stream of frames and kept no residuals: calibrate loaded observations."
         )
     figure = style.new_figure(11.0, 4.1)
-    left, middle, right = figure.subplots(1, 3, width_ratios=(1.12, 1.0, 0.95))
+    grid = style.panels(figure, 1, 3, (0.62, 0.1, 0.72, 0.36), (0.8, 0.0), width_ratios=(1.12, 1.0, 0.95))
+    left, middle, right = (figure.add_subplot(grid[0, column]) for column in range(3))
     plot_residual_map(cal, obs, left)
     plot_residual_radius(cal, obs, middle)
     plot_residual_histogram(cal, obs, right)
+    for ax, aside in ((left, 0.42), (middle, 0.58), (right, 0.42)):
+        style.label_distance(ax, x_in=0.27, y_in=aside)
     return figure
 
 

@@ -29,7 +29,8 @@ def plot_attitude(error: AttitudeError, ax: Axes | None = None) -> Axes:
     Bars and their numbers are with the misfit found, lines across them if the model holds; open bars are not assessed.
     """
     if ax is None:
-        ax = style.new_axes(7.2, 3.4)
+        ax = style.new_axes(7.2, 3.4, (0.66, 0.1, 0.72, 0.36))
+        style.label_distance(ax, x_in=0.24, y_in=0.46)
     style.dress(ax, grid=True)
     series = (
         ("centroid noise (NEA)", style.SKY, ""),
@@ -93,16 +94,22 @@ def plot_field_map(field: FieldMap) -> Figure:
     Colours are the 1-sigma error per axis, root mean square of the two; ellipses are the 1-sigma ellipses, enlarged
     from panel to panel by the factor that the key shows. A map of an earlier version has no ellipses.
     """
-    # As tall as the panels, or the colour bars would outgrow them.
-    figure = style.new_figure(11.0, 0.85 + 4.05 * float(np.ptp(field.y_px) / np.ptp(field.x_px)))
-    left, right = figure.subplots(1, 2)
-    _panel(left, field, field.sigma_absolute_arcsec, field.covariance_absolute_arcsec2, "Absolute")
-    title = "Best constant rotation removed"
-    _panel(right, field, field.sigma_compensated_arcsec, field.covariance_compensated_arcsec2, title)
+    across = 3.76
+    down = across * float(np.ptp(field.y_px) / np.ptp(field.x_px))
+    figure = style.new_figure(11.0, 0.88 + down)
+    maps = (
+        (field.sigma_absolute_arcsec, field.covariance_absolute_arcsec2, "Absolute"),
+        (field.sigma_compensated_arcsec, field.covariance_compensated_arcsec2, "Best constant rotation removed"),
+    )
+    for column, (sigma, covariance, title) in enumerate(maps):
+        left = 0.64 + 5.5 * column
+        ax, bar = (style.place(figure, left + x, 0.5, wide, down) for x, wide in ((0.0, across), (across + 0.14, 0.18)))
+        _panel(ax, bar, field, sigma, covariance, title)
+        style.label_distance(ax, x_in=0.27, y_in=0.42)
     return figure
 
 
-def _panel(ax: Axes, field: FieldMap, values: FloatArray, covariance: FloatArray | None, title: str) -> None:
+def _panel(ax: Axes, own: Axes, field: FieldMap, values: FloatArray, covariance: FloatArray | None, title: str) -> None:
     style.dress(ax)
     x, y = np.asarray(field.x_px), np.asarray(field.y_px)
     levels, norm = round_levels(values)
@@ -115,7 +122,7 @@ def _panel(ax: Axes, field: FieldMap, values: FloatArray, covariance: FloatArray
     ax.set_ylim(y[-1], y[0])
     ax.set_aspect("equal")
     style.label(ax, title, "x [px]", "y [px]")
-    bar = style.colour_bar(ax, image, "1 sigma per axis [arcsec]")
+    bar = style.colour_bar(ax, image, "1 sigma per axis [arcsec]", own)
     ticks_at_levels(bar, levels)
     if covariance is not None:
         _ellipses(ax, x, y, covariance)
@@ -268,7 +275,8 @@ _BAND_COLOURS = (
 def plot_distortion_curve(curve: DistortionCurve) -> Figure:
     """Mean radial displacement (left), and the bands around it in px and arcsec (right)."""
     figure = style.new_figure(10.4, 3.7)
-    left, right = figure.subplots(1, 2)
+    grid = style.panels(figure, 1, 2, (0.72, 0.78, 0.5, 0.34), (1.0, 0.0))
+    left, right = (figure.add_subplot(grid[0, column]) for column in range(2))
     for ax in (left, right):
         style.dress(ax, grid=True)
         ax.set_xlim(0.0, curve.radius_px[-1])
@@ -286,6 +294,8 @@ def plot_distortion_curve(curve: DistortionCurve) -> Figure:
     where = "" if len(curve.azimuth_deg) == 1 else f", azimuth {curve.azimuth_deg[widest]:g}° (the widest)"
     style.label(left, "Distortion", "distance from the principal point [px]", "radial displacement [px]")
     style.label(right, f"Its uncertainty{where}", "distance from the principal point [px]", "minus the mean [px]")
+    style.label_distance(left, x_in=0.27, y_in=0.5)
+    style.label_distance(right, x_in=0.27, y_in=0.66)
     return figure
 
 

@@ -25,7 +25,8 @@ ORANGE, VERMILLION, PURPLE = "#E69F00", "#D55E00", "#CC79A7"
 INK, GREY, LIGHT = "#1b2733", "#66727f", "#dfe4e9"
 
 TITLE_SIZE, LABEL_SIZE, TICK_SIZE = 10.5, 9.5, 8.5
-DPI = 200
+# Half as many again as a page of 1100 px shows.
+DPI = 160
 # Half the time of zlib's default for pictures of the same size, because flat grounds are most of them.
 _COMPRESSION = 3
 # Means with their standard errors.
@@ -44,9 +45,14 @@ def new_figure(width_in: float, height_in: float) -> Figure:
 
 
 def panels(
-    figure: Figure, rows: int, columns: int, margins_in: tuple[float, float, float, float], gaps_in: tuple[float, float]
+    figure: Figure,
+    rows: int,
+    columns: int,
+    margins_in: tuple[float, float, float, float],
+    gaps_in: tuple[float, float],
+    **ratios: Any,
 ) -> GridSpec:
-    """A grid of equal panels with margins (left, right, bottom, top) and gaps (across, down) in inches.
+    """A grid of panels with margins (left, right, bottom, top) and gaps (across, down) in inches; equal by default.
 
     Many small panels of known labels are laid out at once: measuring every label takes longer than drawing all of them.
     """
@@ -63,12 +69,22 @@ def panels(
         top=1.0 - top / height,
         wspace=across * columns / (width - left - right - across * (columns - 1)),
         hspace=down * rows / (height - bottom - top - down * (rows - 1)),
+        **ratios,
     )
+
+
+def place(figure: Figure, left_in: float, bottom_in: float, width_in: float, height_in: float) -> Axes:
+    """A panel of known place in inches, as `panels` are."""
+    figure.set_layout_engine("none")
+    width, height = figure.get_size_inches()
+    return figure.add_axes((left_in / width, bottom_in / height, width_in / width, height_in / height))
 
 
 def label_distance(ax: Axes, *, x_in: float | None = None, y_in: float | None = None) -> None:
     """Begin the axis labels so many inches below and to the left of a panel whose place is fixed."""
     figure = figure_of(ax)
+    # The shape of a panel of equal scales, which is smaller than its place.
+    ax.apply_aspect()
     width, height = figure.get_size_inches() * ax.get_position().size
     if x_in is not None:
         ax.xaxis.set_label_coords(0.5, -x_in / height)
@@ -76,8 +92,8 @@ def label_distance(ax: Axes, *, x_in: float | None = None, y_in: float | None = 
         ax.yaxis.set_label_coords(-y_in / width, 0.5)
 
 
-def new_axes(width_in: float, height_in: float) -> Axes:
-    """One dressed panel on a figure of its own.
+def new_axes(width_in: float, height_in: float, margins_in: tuple[float, float, float, float] | None = None) -> Axes:
+    """One dressed panel on a figure of its own, with margins (left, right, bottom, top) in inches where they are known.
 
     In a notebook the figure is handed to pyplot, because only then does the notebook show it below the cell although
     the caller holds the Axes; elsewhere pyplot is left alone.
@@ -88,7 +104,10 @@ def new_axes(width_in: float, height_in: float) -> Axes:
         figure = pyplot.figure(figsize=(width_in, height_in), layout="constrained", facecolor="white")
     else:
         figure = new_figure(width_in, height_in)
-    return dress(figure.add_subplot())
+    if margins_in is None:
+        return dress(figure.add_subplot())
+    left, right, bottom, top = margins_in
+    return dress(place(figure, left, bottom, width_in - left - right, height_in - bottom - top))
 
 
 def dress(ax: Axes, *, grid: bool = False) -> Axes:
@@ -104,10 +123,11 @@ def dress(ax: Axes, *, grid: bool = False) -> Axes:
     return ax
 
 
-def label(ax: Axes, title: str = "", x: str = "", y: str = "") -> None:
-    """Title and axis labels in the common sizes."""
+def label(ax: Axes, title: str = "", x: str = "", y: str = "", *, pad: float = 7.0) -> None:
+    """Title, `pad` points above the panel, and axis labels in the common sizes."""
     if title:
-        ax.set_title(title, fontsize=TITLE_SIZE, color=INK, loc="left", pad=7)
+        # A height that is given is not searched for among all tick labels.
+        ax.set_title(title, fontsize=TITLE_SIZE, color=INK, loc="left", pad=pad, y=1.0)
     if x:
         ax.set_xlabel(x, fontsize=LABEL_SIZE, color=INK)
     if y:
@@ -141,9 +161,10 @@ def legend_above(figure: Figure, handles: Any, **keywords: Any) -> None:
     figure.legend(handles=handles, **{"loc": "outside upper center", **options, **keywords})
 
 
-def colour_bar(ax: Axes, image: Any, text: str) -> Any:
-    """A colour bar of its own for one panel."""
-    bar = ax.figure.colorbar(image, ax=ax, fraction=0.046, pad=0.03)
+def colour_bar(ax: Axes, image: Any, text: str, own: Axes | None = None) -> Any:
+    """A colour bar of one panel, on a panel of its own where there is one."""
+    where: dict[str, Any] = {"cax": own} if own is not None else {"ax": ax, "fraction": 0.046, "pad": 0.03}
+    bar = ax.figure.colorbar(image, **where)
     dress_bar(bar, text)
     return bar
 
