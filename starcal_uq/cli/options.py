@@ -58,6 +58,12 @@ SchedulerAddress = Annotated[
         help="Dask scheduler whose workers do it; local processes otherwise.",
     ),
 ]
+FileWorkers = Annotated[
+    int | None,
+    typer.Option(
+        "--workers", min=0, help="Local processes for a folder of partitions; one for each processor by default."
+    ),
+]
 Duplicates = Annotated[
     str,
     typer.Option(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 import starcal_uq as sc
-from starcal_uq.cli.options import Columns, Duplicates, SchedulerAddress, Seed, TimeUtc, parse_choice
+from starcal_uq.cli.options import Columns, Duplicates, FileWorkers, SchedulerAddress, Seed, TimeUtc, parse_choice
 from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
@@ -51,6 +51,7 @@ class EstimationSettings:
     ] = "common"
     duplicates: Duplicates = "refuse"
     scheduler: SchedulerAddress = None
+    workers: FileWorkers = None
 
     def options(self) -> AnyDict:
         """Keyword arguments of `Run.calibrate`."""
@@ -62,7 +63,8 @@ class EstimationSettings:
             "duplicates": self.duplicates,
         }
         options |= {"star_errors": True} if self.star_errors else {}
-        options |= {"scheduler": self.scheduler} if self.scheduler is not None else {}
+        spread = {"scheduler": self.scheduler, "workers": self.workers}
+        options |= {name: value for name, value in spread.items() if value is not None}
         return options | {"likelihood": "student_t"} if self.robust else options
 
 

@@ -30,6 +30,7 @@ from starcal_uq.cli.options import (
     AlignmentFrames,
     CameraFile,
     Draws,
+    FileWorkers,
     Force,
     Json,
     NewRun,
@@ -112,14 +113,15 @@ def simulate_command(
         ),
     ] = None,
     scheduler: SchedulerAddress = None,
+    workers: FileWorkers = None,
     seed: Seed = 0,
     force: Force = False,
 ) -> None:
     """Simulate identified stars with the embedded catalogue; directions are written as the sensor saw them."""
     if partition_frames is None:
         ensure_new(out, force)
-        if scheduler is not None:
-            raise typer.BadParameter("--scheduler makes a folder of partitions: give --partition-frames as well.")
+        if not (scheduler is None and workers is None):
+            raise typer.BadParameter("--scheduler and --workers make a folder: give --partition-frames as well.")
     elif images is not None:
         raise typer.BadParameter("--images belongs to one table: leave out --partition-frames.")
     if sensor is not None and images is None:
@@ -138,6 +140,7 @@ def simulate_command(
                 seed=seed,
                 force=force,
                 scheduler=scheduler,
+                workers=workers,
                 progress=progress,
             )
         print(f"{made.n_stars} stars in {frames} frames, {len(made.parts)} files: {out}")

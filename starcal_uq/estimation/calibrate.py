@@ -173,10 +173,10 @@ def calibrate(
         raise CalibrationError("errors of the stars (star_errors) need method='efficient' and likelihood='marginal'.")
     if recursion is not None and method not in RECURSIVE_METHODS:
         raise CalibrationError(f"method {method!r} is not recursive: leave recursion out, or use samaan or griffith.")
-    if scheduler is not None and not isinstance(obs, PartitionedObservations):
+    if not (scheduler is None and workers is None) and not isinstance(obs, PartitionedObservations):
         raise CalibrationError(
-            "a Dask scheduler is of use to partitioned observations (sc.observations.open_partitions, a folder of "
-            "Parquet files): leave it out."
+            "a Dask scheduler, or workers, are of use to partitioned observations (sc.observations.open_partitions, a "
+            "folder of Parquet files): leave them out."
         )
     if isinstance(obs, PartitionedObservations) and method not in RECURSIVE_METHODS:
         if (method, likelihood, noise, star_errors) != ("efficient", "marginal", "common", False):

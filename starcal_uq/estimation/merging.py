@@ -195,6 +195,10 @@ def renumbered(frame_ids: Sequence[IntArray]) -> tuple[IntArray, list[int]]:
     """
     shifts, following = [], None
     for ids in frame_ids:
+        if not len(ids):
+            # Of a run that has kept no frames.
+            shifts.append(0)
+            continue
         shifts.append(0 if following is None else following - int(ids.min()))
         following = int(ids.max()) + shifts[-1] + 1
     return np.concatenate([ids + shift for ids, shift in zip(frame_ids, shifts, strict=True)]), shifts

@@ -49,7 +49,7 @@ _LAST_STEP, _NEAR = 0.5, 1e-5
 
 @dataclass(frozen=True)
 class _Seen:
-    """What the first pass has seen: normal equations, data hashes, and number and content of every frame."""
+    """What the first pass has seen: normal equations, data hashes; number and content of every frame if asked for."""
 
     sums: NormalSums
     hashes: tuple[str, ...]
@@ -67,12 +67,15 @@ def _with_kernels(kernels: str, one: Callable[[Partition], T], part: Partition) 
         return one(part)
 
 
-def _look(reader: PartitionReader, model: str, theta: FloatArray, part: Partition) -> _Seen:
+def _look(reader: PartitionReader, model: str, theta: FloatArray, by_content: bool, part: Partition) -> _Seen:
     obs = reader.load(part, check=True)
+    sums, hashes = _sums(obs, model, theta), (obs.data_hash,)
+    if not by_content:
+        return _Seen(sums, hashes, obs.frame_ids[:0], np.empty(0, dtype=np.uint64))
     # Equal pixels in any order of the stars have equal sums.
     with np.errstate(over="ignore"):
         content = np.add.reduceat(mixed_bits(obs.x_px, obs.y_px), obs.frame_starts[:-1])
-    return _Seen(_sums(obs, model, theta), (obs.data_hash,), obs.frame_ids, content)
+    return _Seen(sums, hashes, obs.frame_ids, content)
 
 
 def _seen_together(parts: Sequence[_Seen]) -> _Seen:
@@ -188,9 +191,8 @@ def calibrate_partitions(
     def total(one: Callable[[Partition], T], together: Callable[[Sequence[T]], T]) -> T:
         return cluster.reduce(partial(_with_kernels, kernels, one), obs.parts, together, progress=progress)
 
-    seen = total(partial(_look, reader, model, first), _seen_together)
-    if duplicates == "refuse":
-        _refuse_repeated(seen)
+    seen = total(partial(_look, reader, model, first, duplicates == "refuse"), _seen_together)
+    _refuse_repeated(seen)
     n_stars, n_frames = seen.sums.n_stars, seen.sums.n_frames
     dof = 2 * n_stars - 3 * n_frames - len(first)
 

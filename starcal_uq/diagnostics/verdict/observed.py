@@ -144,6 +144,31 @@ def noise(cal: Calibration) -> Check:
     return Check(name, Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence)
 
 
+def partitions(cal: Calibration) -> Check | None:
+    """Is the noise of all files of a folder the same?"""
+    from scipy.special import erfc
+
+    if cal.partitions is None:
+        return None
+    found = cal.partitions
+    dof = (2.0 * found.n_stars - 3.0 * found.n_frames) * cal.dof / (cal.dof + len(cal.theta))
+    # Wilson and Hilferty (1931): the cube root of a mean square is normal, in the tails too.
+    spread = 2.0 / (9.0 * dof)
+    z = (np.cbrt(found.chi2 / cal.sigma**2 / dof) - (1.0 - spread)) / np.sqrt(spread)
+    worst = int(np.argmax(np.abs(z)))
+    p_value = min(1.0, len(z) * float(erfc(abs(z[worst]) / np.sqrt(2.0))))
+    good = p_value >= PATTERN_P
+    factor = float(np.sqrt(found.chi2[worst] / dof[worst])) / cal.sigma
+    place = f"file {worst + 1} of {len(z)}, by frame number, has {significant(factor, 3)} times the common noise"
+    sentence = (
+        f"The files scatter as alike as noise of one size lets them ({place})."
+        if good
+        else f"The files scatter unequally ({place}): look for what changed there, or calibrate them apart and compare."
+    )
+    value, bound = f"p = {significant(p_value)}", f"p ≥ {PATTERN_P:g}"
+    return Check("Noise of the files", Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence)
+
+
 def coverage(obs: Observations, cal: Calibration) -> Check:
     """Did the stars cover the field, and how many frames were there?"""
     binned = bin_residuals(cal, obs)
