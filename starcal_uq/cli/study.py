@@ -27,7 +27,7 @@ def register(app: typer.Typer) -> None:
 def study_command(
     file: Annotated[
         Path, typer.Argument(metavar="STUDY", help="What is varied (TOML); --template writes one to start from.")
-    ],
+    ] = Path("study.toml"),
     out: Annotated[
         Path,
         typer.Option("-o", "--out", metavar="DIR", help="Folder for cells, results and report; a study goes on in it."),
