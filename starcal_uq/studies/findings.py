@@ -24,8 +24,8 @@ _BEYOND_SEEDS = 2.0
 _PART = 0.25
 # Up to this variance a direction is that of uncoupled parameters.
 _ALONE = 1.4
-# An axis with more values than these, as of a Latin hypercube, is cut into this many parts of equal number.
-_MOST_VALUES, _PARTS = 16, 6
+# An axis of a Latin hypercube is cut into this many parts of equal number.
+_PARTS = 6
 
 Statistic = Literal["median", "low", "high", "mean", "count"]
 
@@ -128,7 +128,7 @@ class Pair:
     strongest_at, weakest_at : dict
         Where that is, by axis.
     seeds : float
-        Range of the correlation over seeds at a place, the median over all places.
+        Range of the correlation over seeds at a place, the median over all places; 0 for a Latin hypercube.
     mean_size : float
         Size of the correlation, the mean over all places; 0 where a model lacks one of the two.
     sizes : tuple of Curve
@@ -203,14 +203,16 @@ class Sweep:
         Of a study.
     axes : sequence of str
         Names of the swept axes.
+    latin : sequence of str
+        Those that were drawn from a Latin hypercube.
     """
 
-    def __init__(self, data: xr.Dataset, axes: Sequence[str]) -> None:
+    def __init__(self, data: xr.Dataset, axes: Sequence[str], latin: Sequence[str] = ()) -> None:
         self.data = data
         self.axes = tuple(axes)
         self.ok: BoolArray = np.asarray(data["status"].values == "ok")
         self.names: tuple[str, ...] = tuple(map(str, data["parameter"].values))
-        levels = [_levels(data[axis].values) for axis in self.axes]
+        levels = [_levels(data[axis].values, axis in latin) for axis in self.axes]
         self.values = {axis: values for axis, (_, values) in zip(self.axes, levels, strict=True)}
         self.shape = tuple(len(values) for _, values in levels)
         self._codes = [code for code, _ in levels]
@@ -406,7 +408,7 @@ class Sweep:
             float(grid[least]),
             self.at(most),
             self.at(least),
-            self.seeds(r),
+            0.0 if self.drawn else self.seeds(r),
             float(np.nan_to_num(size).mean()),
             sizes,
             costs,
@@ -485,8 +487,8 @@ def _statistic(values: FloatArray, first: IntArray, n: IntArray, statistic: Stat
     return np.asarray(values[first] if statistic == "low" else values[first + n - 1])
 
 
-def _levels(values: Any) -> tuple[IntArray, tuple[Any, ...]]:
-    """Number of the level of every cell, and the levels: values of the axis, or parts of equal number of many."""
+def _levels(values: Any, drawn: bool) -> tuple[IntArray, tuple[Any, ...]]:
+    """Number of the level of every cell, and the levels: values of the axis, or parts of equal number of those drawn."""
     array = np.asarray(values)
     if array.dtype.kind in "OUS":
         # Names keep the order in which they were given.
@@ -494,7 +496,7 @@ def _levels(values: Any) -> tuple[IntArray, tuple[Any, ...]]:
         return np.array([known[str(name)] for name in array], dtype=np.int64), tuple(known)
     numbers = array.astype(np.float64)
     distinct, codes = np.unique(numbers, return_inverse=True)
-    if len(distinct) <= _MOST_VALUES:
+    if not drawn or len(distinct) <= _PARTS:
         return codes.astype(np.int64), tuple(distinct.tolist())
     cuts = np.quantile(numbers, np.linspace(0.0, 1.0, _PARTS + 1)[1:-1])
     parts = np.searchsorted(cuts, numbers, side="right").astype(np.int64)

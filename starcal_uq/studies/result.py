@@ -108,7 +108,7 @@ class Study(Shown):
     @cached_property
     def sweep(self) -> Sweep:
         """The cells by their place in the sweep, and what they say together."""
-        return Sweep(self.data, self.axes)
+        return Sweep(self.data, self.axes, tuple(self.definition.latin))
 
     @property
     def complete(self) -> bool:

@@ -738,14 +738,25 @@ def _draw_lines(ax: Axes, lines: Lines, *, dashed: bool = False) -> None:
 
 
 def _draw_bars(ax: Axes, lines: Lines) -> None:
-    """What the posterior says beside the line: median and range over seeds."""
+    """What the posterior says beside the line: median and range over seeds, those of other lines a little aside."""
+    from matplotlib.transforms import ScaledTranslation
+
     x = _positions(lines.values)
-    for row, colour in _line_colours(lines).items():
+    colours = _line_colours(lines)
+    for number, (row, colour) in enumerate(colours.items()):
         middle = lines.median[row]
         good = np.isfinite(middle)
         bars = np.stack([middle - lines.low[row], lines.high[row] - middle])[:, good]
+        aside = ScaledTranslation(0.09 * (number - 0.5 * (len(colours) - 1)), 0.0, style.figure_of(ax).dpi_scale_trans)
         ax.errorbar(
-            x[good], middle[good], yerr=np.abs(bars), color=colour, fmt="x", markersize=6, elinewidth=1.1, capsize=3
+            *(x[good], middle[good]),
+            yerr=np.abs(bars),
+            color=colour,
+            fmt="x",
+            markersize=6,
+            elinewidth=1.1,
+            capsize=3,
+            transform=ax.transData + aside,
         )
 
 
@@ -810,6 +821,7 @@ def _target(ax: Axes, value: float, words: str) -> None:
         textcoords="offset points",
         fontsize=style.TICK_SIZE,
         color=style.VERMILLION,
+        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.8},
     )
 
 

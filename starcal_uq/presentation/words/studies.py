@@ -72,7 +72,7 @@ def study_answer(study: Study) -> list[str]:
         *_target_sigmas(study),
         *_models(study),
         *_simpler(study),
-        _coverage(study),
+        *_simulated(study),
     ]
     return [part for part in parts if part]
 
@@ -459,30 +459,57 @@ def model_bias(study: Study, simpler: int) -> FloatArray:
     return np.asarray(np.sqrt(np.mean(by_axis**2, axis=-1)), dtype=np.float64)
 
 
-def _coverage(study: Study) -> str:
-    """Whether intervals of simulated cells hold the truth as often as they say."""
+def _simulated(study: Study) -> list[str]:
+    """Whether intervals of simulated cells hold the truth as often as they say, and posteriors are as forecast."""
     if "covered_95" not in study.data:
-        return ""
+        return []
+    sweep = study.sweep
+    covered = np.asarray(study.data["covered_95"].values, dtype=np.float64)
+    covered = np.where(sweep.ok[:, None], covered, np.nan)
+    groups = [("", np.ones(len(sweep.ok), dtype=np.bool_))]
+    for axis in ("method", "likelihood", "prior"):
+        if axis in sweep.axes:
+            names = study.data[axis].values
+            groups += [(f" with {said(axis, value)}", names == value) for value in sweep.values[axis]]
     told, wrong = [], []
-    covered = study.data["covered_95"].values
-    for i, name in enumerate(study.sweep.names):
-        held = covered[study.sweep.ok, i]
-        held = held[np.isfinite(held)]
-        if not len(held):
-            continue
-        n, hits = len(held), int(held.sum())
-        # One false alarm in a hundred studies, however many parameters there are.
-        low, high = binomial_interval(hits, n, 1.0 - 0.01 / len(study.sweep.names))
-        told.append(f"{name} {percent(hits / n, 3)}")
-        if not low <= 0.95 <= high:
-            wrong.append(f"{name} ({percent(low)} to {percent(high)})")
+    # One false alarm in a hundred studies, however many intervals are looked at.
+    level = 1.0 - 0.01 / (len(groups) * len(sweep.names))
+    for words, cells in groups:
+        for i, name in enumerate(sweep.names):
+            held = covered[cells, i]
+            held = held[np.isfinite(held)]
+            if not len(held):
+                continue
+            n, hits = len(held), int(held.sum())
+            low, high = binomial_interval(hits, n, level)
+            if not words:
+                told.append(f"{name} {percent(hits / n, 3)}")
+            if not low <= 0.95 <= high:
+                wrong.append(f"{name}{words} ({percent(hits / n, 3)} of {count(n)})")
     if not told:
-        return ""
-    cells = int(study.sweep.ok.sum())
-    text = f"In {count(cells)} simulated cells the 95 % intervals hold the truth as often as this: {join_words(told)}"
+        return []
+    cells_words = count(int(sweep.ok.sum()))
+    text = f"In {cells_words} simulated cells the 95 % intervals hold the truth as often as this: {join_words(told)}"
     if wrong:
-        return f"{text}. That is not 95 % for {join_words(wrong)}: do not use these intervals as they are."
-    return f"{text}; chance explains what differs from 95 %."
+        text += f". That is not 95 % for {join_words(wrong)}: do not use these intervals as they are."
+    else:
+        text += "; chance explains what differs from 95 %."
+    return [text, *_posteriors(study)]
+
+
+def _posteriors(study: Study) -> list[str]:
+    """Sigmas of the posteriors beside what the information forecast."""
+    if "posterior_sigma" not in study.data:
+        return []
+    ratio = study.data["posterior_sigma"].values / study.data["sigma"].values
+    ratio = np.where(study.sweep.ok[:, None], ratio, np.nan)
+    if not np.isfinite(ratio).any():
+        return []
+    low, middle, high = (fixed(float(q), 2) for q in np.nanquantile(ratio, (0.05, 0.5, 0.95)))
+    return [
+        f"Sigmas of the posteriors are {middle} times what the information forecasts (median; {low} to {high} for 90 % "
+        "of cells and parameters)."
+    ]
 
 
 def study_limits(study: Study) -> list[str]:
@@ -496,8 +523,13 @@ def study_limits(study: Study) -> list[str]:
         rest = f"; {plural(more, 'further reason')}" if more > 0 else ""
         parts.append(f"{count(failed)} of {plural(total, 'cell')} have no numbers ({'; '.join(reasons)}{rest}).")
     seeds = len(np.unique(study.data["seed_index"].values))
-    if seeds == 1:
+    if seeds == 1 and not sweep.drawn:
         parts.append("One seed: what another sky or other frames would change was not assessed.")
+    if sweep.drawn:
+        parts.append(
+            f"Drawn from a Latin hypercube: {join_words([axis_name(axis) for axis in sweep.drawn])}. Each is told in "
+            "parts of equal number, by their middles."
+        )
     if study.definition.mode == "simulate":
         parts.append("Simulated with the noise and the distortion model that the calibration assumes.")
     else:
