@@ -488,7 +488,7 @@ def _statistic(values: FloatArray, first: IntArray, n: IntArray, statistic: Stat
 
 
 def _levels(values: Any, drawn: bool) -> tuple[IntArray, tuple[Any, ...]]:
-    """Number of the level of every cell, and the levels: values of the axis, or parts of equal number of those drawn."""
+    """Number of the level of every cell, and the levels: values of the axis, or parts of those that were drawn."""
     array = np.asarray(values)
     if array.dtype.kind in "OUS":
         # Names keep the order in which they were given.

@@ -35,7 +35,7 @@ def decoupled() -> Study:
 def test_the_axis_that_decouples_is_named_with_its_numbers(decoupled: Study) -> None:
     text = study_text(decoupled)
     assert text.startswith("f and k1 are coupled most (correlation −0.97 to −0.30")
-    assert "The field of view changes how f and k1 are coupled: from 0.97 with a field of 5° to 0.30" in text
+    assert "The field of view changes how f–k1 are coupled: from 0.97 with a field of 5° to 0.30" in text
     answer = " ".join(study_answer(decoupled))
     assert "The number of frames does little to the couplings" in answer
     assert "The weakest direction turns with the field of view: f against k1 from a field of 5° to 10" in answer

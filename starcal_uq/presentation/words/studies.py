@@ -46,14 +46,17 @@ def study_text(study: Study) -> str:
     if not sweep.coupled:
         return _uncoupled(sweep)
     pair = sweep.coupled[0]
-    found = [(other, *other.decoupling()[0]) for other in sweep.coupled if other.decoupling()]
     text = f"{_capital(_names(pair))} are coupled most ({_range(pair)})."
     if not sweep.axes:
         return text
+    if "distortion" in sweep.axes:
+        text = f"{text} {_price_of_models(study)}".strip()
+    found = [(other, *other.decoupling()[0]) for other in sweep.coupled if other.decoupling()]
     if not found:
         return f"{text} {_capital(_nothing_decouples(sweep))}."
-    other, size, cost = max(found, key=lambda entry: entry[2].change)
-    return f"{text} {_capital(_decoupled(other, size, cost))}."
+    # What can be chosen comes before what a lens is.
+    other, size, cost = max(found, key=lambda entry: (entry[1].axis not in _NATURE, entry[2].change))
+    return f"{text} {_capital(_the(size.axis))} changes how {_dashed(other)} are coupled: {_ends(size, cost)}."
 
 
 def study_answer(study: Study) -> list[str]:
@@ -119,10 +122,12 @@ def _what_decouples(sweep: Sweep) -> list[str]:
     """What changes each of the couplings, and which axes do nothing about any."""
     if not sweep.axes or not sweep.coupled:
         return []
-    parts = []
+    # Pairs of which the same is to be said share a sentence.
+    told: dict[tuple[str, str], list[str]] = {}
     for pair in sweep.coupled[:_TOLD]:
         for size, cost in pair.decoupling()[:1]:
-            parts.append(_capital(_decoupled(pair, size, cost)) + ".")
+            told.setdefault((_capital(_the(size.axis)), _ends(size, cost)), []).append(_dashed(pair))
+    parts = [f"{axis} changes how {join_words(pairs)} are coupled: {ends}." for (axis, ends), pairs in told.items()]
     helping = {size.axis for pair in sweep.coupled for size, _ in pair.decoupling()}
     idle = [axis for axis in sweep.axes if axis not in helping]
     if not helping:
@@ -136,15 +141,12 @@ def _what_decouples(sweep: Sweep) -> list[str]:
     return parts
 
 
-def _decoupled(pair: Pair, size: Curve, cost: Curve) -> str:
-    """Which axis tells a pair apart, from what to what."""
+def _ends(size: Curve, cost: Curve) -> str:
+    """From what to what an axis changes a coupling."""
     high, low = cost.most, cost.least
     prices = (fixed(float(np.exp(cost.median[i])), 1) for i in (high, low))
     ends = [f"{correlation_text(float(size.median[i]))} with {said(size.axis, size.values[i])}" for i in (high, low)]
-    return (
-        f"{_the(size.axis)} changes how {_names(pair)} are coupled: from {ends[0]} to {ends[1]} in size, "
-        f"which takes the price in sigma from {' to '.join(prices)}"
-    )
+    return f"from {ends[0]} to {ends[1]} in size, which takes the price in sigma from {' to '.join(prices)}"
 
 
 def _nothing_decouples(sweep: Sweep) -> str:
@@ -265,7 +267,11 @@ def error_effects(sweep: Sweep, numbers: FloatArray) -> list[Effect]:
 def _errors(sweep: Sweep) -> list[str]:
     """Sizes of both attitude errors of the calibration, and what each axis does to them."""
     return [
-        _error("The error that differs from frame to frame is", sweep, sweep.frame_error),
+        _error(
+            "Across the boresight, 1 sigma per axis, the error that differs from frame to frame is",
+            sweep,
+            sweep.frame_error,
+        ),
         _error("The rotation common to all frames is", sweep, sweep.common_rotation),
     ]
 
@@ -274,7 +280,7 @@ def _error(head: str, sweep: Sweep, numbers: FloatArray) -> str:
     effects = error_effects(sweep, numbers)
     grid = sweep.over(numbers).ravel()
     ends = [int(np.nanargmin(grid)), int(np.nanargmax(grid))]
-    text = f"{head} {_span(grid)} arcsec (1 sigma per axis across the boresight)"
+    text = f"{head} {_span(grid)} arcsec"
     if len(sweep.axes) > 1 and grid[ends[1]] >= _HARDLY * grid[ends[0]]:
         text += f", least with {place(sweep.at(ends[0]))}, most with {place(sweep.at(ends[1]))}"
     strong = [_effect(effect) for effect in effects if effect.factor >= _HARDLY]
@@ -396,6 +402,18 @@ def _where(sweep: Sweep, flag: BoolArray, known: BoolArray) -> str:
     if told < max(0.8, base + 0.05):
         return ""
     return f": {words}" if told > 0.999 else f": {words} (so in {percent(told)} of the places)"
+
+
+def _price_of_models(study: Study) -> str:
+    """The sigma of f with richer models beside that with the simplest, medians."""
+    sweep = study.sweep
+    curve = sweep.along(np.asarray(study.data["sigma"].sel(parameter="f").values, dtype=np.float64), "distortion")
+    if curve is None:
+        return ""
+    order = sorted(range(len(curve.values)), key=lambda i: len(parameters(curve.values[i])))
+    first = order[0]
+    told = [f"{significant(float(curve.median[i] / curve.median[first]))} with {curve.values[i]}" for i in order[1:]]
+    return f"Beside the model {curve.values[first]}, the sigma of f is larger by factors of {join_words(told)}."
 
 
 def _models(study: Study) -> list[str]:
@@ -556,11 +574,12 @@ def _advice_couplings(study: Study) -> list[str]:
     stuck = []
     for pair in sweep.coupled:
         found = pair.decoupling()
-        if found:
-            _, cost = found[0]
+        free = [entry for entry in found if entry[0].axis not in _NATURE or entry[0].axis == "distortion"]
+        if free:
+            _, cost = free[0]
             key = cost.axis, cost.values[cost.least], _pays(study, pair, cost)
             best.setdefault(key, []).append(_dashed(pair))
-        elif float(np.exp(max((c.median.min() for c in pair.costs), default=0.0))) >= _DEAR:
+        elif not found and float(np.exp(max((c.median.min() for c in pair.costs), default=0.0))) >= _DEAR:
             stuck.append(_dashed(pair))
     for (axis, value, pays), names in best.items():
         if not pays:
