@@ -41,6 +41,7 @@ from starcal_uq.comparison.significance import (
 )
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import ComparisonError
+from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.observations.splits import split_frames, split_labels
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
 _WIDE_PRIOR = 5.0
 
 
+@one_thread()
 def compare(
     a: Calibration | Posterior,
     b: Calibration | Posterior,

@@ -24,6 +24,8 @@ Numbered = list[tuple[int, T]]
 _WAIT_S = 0.2
 _THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _shared: list[Callable[[int], Any]] = []
+# How many `one_thread` are under way.
+_limited = [0]
 
 
 def run_tasks(
@@ -120,7 +122,7 @@ def _submit(path: Path, chunks: list[range], workers: int, caller: str, keep: Ca
     # Forked processes would inherit the locks of threads that they do not have.
     pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_start, initargs=(path,))
     try:
-        with interrupt_between_steps() as check, _one_thread_each():
+        with interrupt_between_steps() as check, one_thread():
             pending: set[Future[Numbered[T]]] = {pool.submit(_run, numbers) for numbers in chunks}
             try:
                 while pending:
@@ -151,13 +153,26 @@ def _keep_running(
 
 
 @contextmanager
-def _one_thread_each() -> Iterator[None]:
-    """Processes started here use one BLAS thread: many would fight for the cores, and could sum in another order."""
+def one_thread() -> Iterator[None]:
+    """One BLAS thread in this process and in those that it starts; also a decorator, ``@one_thread()``.
+
+    Our matrices are small or thin: more threads take half as much processor time again and save none, fight for the
+    cores with other processes, and sum in another order.
+    """
+    if _limited[0] > 0:
+        # A caller has done it.
+        yield
+        return
+    from threadpoolctl import threadpool_limits
+
     before = {name: os.environ.get(name) for name in _THREAD_COUNTS}
     os.environ.update(dict.fromkeys(_THREAD_COUNTS, "1"))
+    _limited[0] += 1
     try:
-        yield
+        with threadpool_limits(limits=1, user_api="blas"):
+            yield
     finally:
+        _limited[0] -= 1
         for name, value in before.items():
             if value is None:
                 del os.environ[name]

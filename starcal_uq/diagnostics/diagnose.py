@@ -18,7 +18,7 @@ from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.files import PathLike
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import read_json, write_json
-from starcal_uq.core.tasks import Progress
+from starcal_uq.core.tasks import Progress, one_thread
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.diagnostics.jackknife import Jackknife, jackknife_frames
 from starcal_uq.diagnostics.misfit import Misfit, misfit_tests
@@ -129,6 +129,7 @@ class Diagnosis(Shown):
         return read_json(cls, path, "a diagnosis", "run `starcal-uq diagnose` again")
 
 
+@one_thread()
 def diagnose(
     obs: Observations | PartitionedObservations,
     cal: Calibration,

@@ -15,7 +15,7 @@ from starcal_uq.core.cluster import Scheduler, cluster
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.status import Status
-from starcal_uq.core.tasks import Progress, processors
+from starcal_uq.core.tasks import Progress, one_thread, processors
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, assemble, check_camera, noise_px, with_star_errors
 from starcal_uq.estimation.baselines import check_count, least_squares, recursive
@@ -56,6 +56,7 @@ _STARS_WORTH_PROCESSES = 1_000_000
 _SAMPLE_FRAMES, _SAMPLE_STARS = 150, 2500
 
 
+@one_thread()
 def calibrate(
     obs: Observations | PartitionedObservations | Iterable[Observations],
     camera: Camera,
@@ -289,6 +290,7 @@ class Fit:
     rotations: FloatArray
 
 
+@one_thread()
 def fit(obs: Observations, camera: Camera, *, method: str = "efficient") -> Fit:
     """Go through the stages of `calibrate` without covariances, compression and whatever else a result holds.
 
@@ -304,6 +306,7 @@ def fit(obs: Observations, camera: Camera, *, method: str = "efficient") -> Fit:
     return _fitted(likelihood, camera, stages[-1].theta, status)
 
 
+@one_thread()
 def refit(obs: Observations, cal: Calibration, model: str) -> Fit:
     """Another distortion model on the same stars, from the optics and attitudes of a calibration.
 

@@ -23,6 +23,7 @@ from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
 from starcal_uq.core.provenance import data_hashes, provenance
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.status import Status
+from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.compressed import Optimum, combined, optimum, scaled, total
@@ -42,6 +43,7 @@ NOISES = ("auto", "common", "own")
 MAX_DISTANCE = 8.0
 
 
+@one_thread()
 def merge(
     calibrations: Sequence[Calibration],
     observations: Observations | None = None,

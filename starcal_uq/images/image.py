@@ -286,7 +286,7 @@ def _read_picture(path: Path, data: bytes) -> Image:
     import PIL.Image
 
     # Otherwise Pillow loads all that it can read before it knows a TIFF file.
-    import PIL.TiffImagePlugin  # noqa: F401
+    import PIL.TiffImagePlugin
 
     messages: list[str] = []
     with warnings.catch_warnings():

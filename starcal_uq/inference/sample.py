@@ -16,7 +16,7 @@ from starcal_uq.camera.distortion import parameters, sigma_parameter
 from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.provenance import data_hashes, provenance
 from starcal_uq.core.records import to_plain
-from starcal_uq.core.tasks import Progress
+from starcal_uq.core.tasks import Progress, one_thread
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.inference.checks import CompressionCheck, chain_order, check_compression, check_draws, measure
@@ -60,6 +60,7 @@ _N_IMPORTANCE_SLOW = 2_000
 _DEGREES = (3, 4)
 
 
+@one_thread()
 def sample(
     obs: Observations | PartitionedObservations | None,
     cal: Calibration,

@@ -20,6 +20,7 @@ from starcal_uq.core.constants import AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PlanningError
 from starcal_uq.core.provenance import provenance
+from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.planning.forecast import N_CAMPAIGNS, N_FRAMES, SCOPES, Forecast, Forecaster, nea_arcsec
@@ -52,6 +53,7 @@ class HasInformation(Protocol):
         ...
 
 
+@one_thread()
 def plan(
     camera: Camera,
     stars: StarCatalogue,

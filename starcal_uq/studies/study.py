@@ -16,7 +16,7 @@ from starcal_uq.core.cluster import Scheduler, cluster
 from starcal_uq.core.constants import AXES as ATTITUDE
 from starcal_uq.core.files import PathLike
 from starcal_uq.core.provenance import provenance
-from starcal_uq.core.tasks import Progress, run_tasks
+from starcal_uq.core.tasks import Progress, one_thread, run_tasks
 from starcal_uq.core.types import AnyDict
 from starcal_uq.sky.catalogue import load_catalogue
 from starcal_uq.studies.axes import AXES
@@ -37,6 +37,7 @@ _FEW_BATCHES = 5
 MISSING = "not computed yet: run the study again, and it goes on."
 
 
+@one_thread()
 def study(
     definition: StudyDefinition | PathLike,
     *,

@@ -59,3 +59,26 @@ def test_a_script_without_a_guard_ends_with_the_remedy(tmp_path: Path, root: Pat
 def test_a_local_function_cannot_go_to_workers() -> None:
     with pytest.raises(SamplingError, match="top level, or use workers=0"):
         run_tasks(lambda index: index, 20, caller="f", chunk=2, workers=2)
+
+
+def test_long_calls_use_one_blas_thread_and_give_the_others_back() -> None:
+    import numpy as np
+    from threadpoolctl import threadpool_info, threadpool_limits
+
+    from starcal_uq.core.tasks import one_thread
+
+    assert np.linalg.norm(np.eye(2) @ np.eye(2)) > 1.0
+
+    def threads() -> set[int]:
+        return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+    @one_thread()
+    def inside() -> set[int]:
+        with one_thread():
+            return threads()
+
+    with threadpool_limits(limits=2, user_api="blas"):
+        before = threads()
+        assert inside() == {1}
+        assert inside() == {1}
+        assert threads() == before

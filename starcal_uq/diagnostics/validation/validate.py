@@ -25,7 +25,7 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError, PriorError, SamplingError
 from starcal_uq.core.provenance import provenance
-from starcal_uq.core.tasks import Progress, run_tasks
+from starcal_uq.core.tasks import Progress, one_thread, run_tasks
 from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.validation.replicates import (
     MARGINAL,
@@ -52,6 +52,7 @@ _PRIOR_CORNER_PX = 1.0
 _PRIOR_LOG_SIGMA = 0.2
 
 
+@one_thread()
 def validate(
     camera: Camera,
     *,

@@ -18,6 +18,7 @@ import numpy as np
 
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
+from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.duplicates import check_duplicates, repeating_frames
@@ -62,6 +63,7 @@ class _Rates:
     shrinkage: float
 
 
+@one_thread()
 def screen(
     obs: Observations,
     camera: Camera,
