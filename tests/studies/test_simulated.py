@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,9 @@ from scipy.stats import binom
 
 import starcal_uq as sc
 from starcal_uq.paper import paper_camera
+from starcal_uq.sky.positions import ra_dec_deg
 from starcal_uq.studies import Study, StudyDefinition
+from tests.helpers.outside import campaign
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -146,3 +149,39 @@ def test_dasks_workers_compute_the_same_cells(tmp_path: Path) -> None:
     assert here.ok.all()
     same = [name for name in here.data.data_vars if name != "seconds"]
     assert found.data[same].equals(here.data[same])
+
+
+@pytest.mark.slow
+def test_cells_foretell_the_scatter_of_calibrations_of_another_make_of_sensor() -> None:
+    """Stars, frames and noise by NumPy alone; frames of 15 stars that lie anywhere in the field."""
+    n, theta = 100, None
+    estimates = []
+    for seed in range(n):
+        seen = campaign(np.random.default_rng([6, seed]), n_frames=40, stars_per_frame=15, sigma_px=0.08)
+        sheet = sc.Camera(**seen.camera_toml(), coefficients=(0.0, 0.0))
+        estimates.append(sc.calibrate(sc.Observations(**seen.columns), sheet).theta)
+        theta = seen.theta
+    assert theta is not None
+    rng = np.random.default_rng(9)
+    directions = rng.standard_normal((14_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    ra, dec = ra_dec_deg(directions)
+    known = sc.load_catalogue(6.0).select(np.zeros(len(ra), dtype=np.int64))
+    # The fifteen brightest of a frame lie anywhere in it, too.
+    stars = replace(known, ra_deg=ra, dec_deg=dec, mag=rng.uniform(0.0, 6.0, len(ra)))
+    made = definition(
+        camera=sheet.with_theta(theta),
+        mode="fisher",
+        sweep={"frames": (40,)},
+        observation={"sigma_px": 0.08, "stars": 15, "min_stars": 15},
+        seeds=tuple(range(20)),
+    )
+    foretold = sc.study(made, stars=stars, workers=0).data
+    assert np.all(foretold["status"].values == "ok")
+    scatter = np.std(estimates, axis=0, ddof=1)
+    # One standard error of the scatter is 7 %.
+    np.testing.assert_allclose(scatter / foretold["sigma"].mean("cell").values, 1.0, atol=0.25)
+    found, wanted = np.corrcoef(np.array(estimates).T), foretold["correlation"].mean("cell").values
+    # Fisher's transform of a correlation of n has a standard error of 1 / sqrt(n - 3), 0.1.
+    i, j = np.array([2, 2, 3]), np.array([3, 4, 4])
+    np.testing.assert_allclose(np.arctanh(found[i, j]), np.arctanh(wanted[i, j]), atol=0.4)
