@@ -224,7 +224,10 @@ def comparison(rejected: bool) -> Any:
         SimpleNamespace(model="none", rejected=True, common_arcsec=(99.0,) * 3, rest_arcsec=(99.0,) * 3),
     ]
     return SimpleNamespace(
-        scores=tuple(scores), fitted="brown", of=lambda name: next(s for s in scores if s.model == name)
+        scores=tuple(scores),
+        fitted="brown",
+        share=1.0,
+        of=lambda name: next(s for s in scores if s.model == name),
     )
 
 
