@@ -22,7 +22,7 @@ from starcal_uq.presentation.figures.studies import (
     plot_study_maps,
     plot_weakest,
 )
-from starcal_uq.presentation.figures.style import small_png_bytes
+from starcal_uq.presentation.figures.style import png_bytes
 from starcal_uq.presentation.html import embedded_image, template_environment
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.axes import axis_label, value_words
@@ -120,7 +120,7 @@ def study_figures(study: Study) -> dict[str, bytes]:
         drawn["simpler"] = plot_simpler(study)
     if "covered_95" in study.data:
         drawn["coverage"] = plot_coverage(study)
-    return {name: small_png_bytes(figure, _DPI) for name, figure in drawn.items()}
+    return {name: png_bytes(figure, _DPI) for name, figure in drawn.items()}
 
 
 def render_study(study: Study, images: Mapping[str, bytes]) -> str:
