@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -128,27 +130,86 @@ def _detect(frame: PreparedImage, name: str, sigma: float, options: DetectionOpt
     line = np.exp(-0.5 * (np.arange(-half, half + 1) / sigma) ** 2)
     # The noise that is left of noise 1.
     left = np.sum(line**2) / line.sum() ** 2
+    filtered = _filtered(frame.counts, (line / line.sum()).astype(np.float32))
+    filtered = _filtered(frame.counts, (line / line.sum()).astype(np.float32))
+    threshold = np.float32(options.threshold_sigma * left)
+    n_above = np.count_nonzero(filtered > threshold * frame.noise)
+
+    def extract(image: Any, noise: Any, levels: int) -> tuple[Any, Any]:
+        # sep prepares a list for all pixels that it may have to keep, which takes longer than a small image.
+        most = sep.get_extract_pixstack()
+        sep.set_extract_pixstack(min(most, n_above + _PIXELS_MORE, image.size + _PIXELS_MORE))
+        try:
+            found: tuple[Any, Any] = sep.extract(
+                image,
+                threshold,
+                err=noise,
+                minarea=options.min_pixels,
+                filter_kernel=None,
+                segmentation_map=True,
+                deblend_nthresh=levels,
+            )
+        finally:
+            sep.set_extract_pixstack(most)
+        return found
+
     try:
-        objects, labels = sep.extract(
-            _filtered(frame.counts, (line / line.sum()).astype(np.float32)),
-            options.threshold_sigma * left,
-            err=frame.noise,
-            minarea=options.min_pixels,
-            filter_kernel=None,
-            segmentation_map=True,
-        )
+        objects, labels = _taken_apart(filtered, frame.noise, *extract(filtered, frame.noise, 1), extract)
     except Exception as error:  # sep raises bare exceptions when its buffers are full
         raise ImageError(
             f"{name}: there are too many bright pixels to tell stars apart; raise the threshold, or leave the image "
             "out."
         ) from error
-    # sep took the filtered image for the image: the light is that of the pixels themselves.
     labels = labels.ravel()
     inside = np.flatnonzero(labels != 0)
-    light = np.bincount(labels[inside], frame.counts.ravel()[inside], minlength=len(objects) + 1)
-    objects["flux"] = light[1 : len(objects) + 1]
+    objects["flux"] = np.bincount(labels[inside], frame.counts.ravel()[inside], minlength=len(objects) + 1)[1:]
     objects = objects[np.isfinite(objects["x"]) & np.isfinite(objects["y"])]
     return objects[np.argsort(-objects["cflux"], kind="stable")][:_MAX_DETECTIONS]
+
+
+# The list of pixels is longer than those above the threshold by so many.
+_PIXELS_MORE = 100
+# Brightness levels at which SExtractor looks for objects that fall apart.
+_LEVELS = 32
+
+
+def _taken_apart(
+    image: Any, noise: Any, objects: Any, labels: Any, extract: Callable[[Any, Any, int], tuple[Any, Any]]
+) -> tuple[Any, Any]:
+    """Objects and their map of numbers with those taken apart that have several peaks.
+
+    No other can fall apart, and to look for it in all takes as long as all the rest.
+    """
+    height, width = image.shape
+    inside = np.flatnonzero(labels.ravel() != 0)
+    row, column = np.divmod(inside, width)
+    rows = [(row + step).clip(0, height - 1) * width for step in (-1, 0, 1)]
+    columns = [(column + step).clip(0, width - 1) for step in (-1, 0, 1)]
+    flat, highest = image.ravel(), np.ones(len(inside), dtype=np.bool_)
+    for first, second in product(rows, columns):
+        highest &= flat[inside] >= flat[first + second]
+    peaks = np.bincount(labels.ravel()[inside[highest]], minlength=len(objects) + 1)
+    kept = [objects]
+    n = len(objects)
+    for label in np.flatnonzero(peaks > 1):
+        whole = objects[label - 1]
+        box = slice(whole["ymin"], whole["ymax"] + 1), slice(whole["xmin"], whole["xmax"] + 1)
+        own = labels[box] == label
+        # A margin, so that no part is taken for cut off by the border of the image.
+        alone = np.pad(np.where(own, image[box], np.float32(0.0)), 1)
+        parts, numbers = extract(alone, np.pad(noise[box], 1, mode="edge"), _LEVELS)
+        if len(parts) < 2:
+            continue
+        for axis, first in (("x", whole["xmin"] - 1), ("y", whole["ymin"] - 1)):
+            for name in (axis, f"{axis}min", f"{axis}max"):
+                parts[name] += first
+        parts["flag"] |= whole["flag"]
+        numbers = numbers[1:-1, 1:-1]
+        labels[box][own] = np.where(numbers > 0, n + numbers, 0)[own]
+        objects["x"][label - 1] = np.nan
+        kept.append(parts)
+        n += len(parts)
+    return np.concatenate(kept), labels
 
 
 # Rows that are filtered together: few enough to stay in the processor's cache.

@@ -30,6 +30,9 @@ _UNDERSAMPLED_PX = 0.85
 # Fainter stars are more easily found where the light falls into one pixel.
 _PHASE_SNR = 10.0
 
+# Just below the most that glibc keeps.
+_KEPT_BYTES = 31 << 20
+
 Source = Image | str | os.PathLike[str]
 
 
@@ -101,6 +104,9 @@ def extract_centroids(
         psf_sigma_px=psf_sigma_px,
         max_stars=max_stars,
     )
+    # glibc gives memory back to the system when arrays the size of an image are freed, and gets it again page by page,
+    # until a larger one has been freed. This one is never written to.
+    np.empty(_KEPT_BYTES, dtype=np.uint8)
     table = _Table()
     for number, source in enumerate(sources):
         table.add(number, source, camera, options)

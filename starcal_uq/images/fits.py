@@ -180,7 +180,7 @@ def fit_stars(
 
     `pairs` (p, 2) are stars (i, j) of which j reaches into the stamp of i; it is subtracted there. A star is left alone
     once its own steps are small and those of the stars in its stamp; `left_moving` is the part of them that need not
-    get so far, where a median is all that is wanted.
+    get so far, where a median is all that is wanted; with all of them each star is moved once.
     """
     n, m = stamps.counts.shape[:2]
     state = np.stack([x - stamps.x0, y - stamps.y0, np.zeros(n), np.zeros(n) + np.log(sigma_px)])
@@ -188,7 +188,7 @@ def fit_stars(
     others = np.zeros_like(stamps.counts) if has_pairs else None
     moving, part, here = np.arange(n), stamps, pairs
     for iteration in range(_ITERATIONS):
-        if len(moving) <= left_moving * n:
+        if iteration and len(moving) <= left_moving * n:
             break
         u, v, flux, log_sigma = state if part is stamps else state[:, moving]
         sigma = np.exp(log_sigma)

@@ -18,8 +18,8 @@ _WIDTHS = (0.25, 15.0)
 # Star images with this part of their light beyond the Gaussian, or so much longer than wide, are no round Gaussians.
 _MISFIT, _ELONGATED = 0.1, 1.2
 _MOMENT_WINDOW_PX = 1.5
-# The fits of this part of the stars need not have converged for a median.
-_LEFT_MOVING = 0.15
+# The fits of this part of the stars need not have converged: for the size of stamps, and for a median.
+_LEFT_MOVING = (0.5, 0.15)
 
 
 @dataclass(frozen=True)
@@ -76,12 +76,12 @@ def measure_psf(frame: PreparedImage, objects: Any) -> Psf | None:
     clear = np.count_nonzero(snr[bright] > 4.0 * _PSF_SNR) >= _PSF_STARS
     most = _PSF_STARS if clear else 5 * _PSF_STARS
     x, y, widths = chosen["x"].astype(np.float64), chosen["y"].astype(np.float64), np.full(len(chosen), sigma)
-    for _ in range(2):
+    for left_moving in _LEFT_MOVING:
         clean, stamps = _clean_stamps(frame, chosen, sigma, most)
         if not len(clean):
             return None
         chosen = chosen[clean]
-        fit = fit_stars(stamps, x[clean], y[clean], widths[clean], free_sigma=True, left_moving=_LEFT_MOVING)
+        fit = fit_stars(stamps, x[clean], y[clean], widths[clean], free_sigma=True, left_moving=left_moving)
         good = (np.hypot(fit.x_px - chosen["x"], fit.y_px - chosen["y"]) < 1.0 + sigma) & (fit.flux > 0.0)
         if not good.any():
             return None
@@ -92,11 +92,12 @@ def measure_psf(frame: PreparedImage, objects: Any) -> Psf | None:
     # All pixels with the same weight, so that what counts as core and wings does not hang on whether the gain is known.
     stamps = cut_stamps(frame.counts, frame.usable, fit.x_px, fit.y_px, half_stamp_px(sigma), frame.noise, 0.0)
     if frame.counts_per_e:
-        fit = fit_stars(stamps, fit.x_px, fit.y_px, fit.sigma_px, free_sigma=True, left_moving=_LEFT_MOVING)
+        fit = fit_stars(stamps, fit.x_px, fit.y_px, fit.sigma_px, free_sigma=True, left_moving=left_moving)
         width = float(np.clip(np.median(fit.sigma_px[good]), *_WIDTHS))
     else:
         width = sigma
-    fit = fit_stars(stamps, fit.x_px, fit.y_px, width, left_moving=_LEFT_MOVING)
+    # The places are known: one step for the light.
+    fit = fit_stars(stamps, fit.x_px, fit.y_px, width, left_moving=1.0)
     # Fainter stars that are found are those whose noise adds light.
     good &= stamps.good.all((1, 2)) & (fit.flux > _MISFIT_SNR * np.sqrt(fit.covariance[:, 2, 2]))
     if np.count_nonzero(good) <= 3:
