@@ -132,11 +132,15 @@ def cluster(scheduler: Scheduler = None, *, workers: int | None = None, caller: 
         if workers <= 1:
             yield Cluster()
             return
+        import logging
+
         from distributed import Client, LocalCluster
 
-        # No dashboard: it would load another megabyte of libraries and open a port.
+        # What its log warns of, such as a slow end, is Dask's to mend. Its page of numbers takes whatever port is free.
         try:
-            local = LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address=None)
+            local = LocalCluster(
+                n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=logging.ERROR
+            )
         except RuntimeError as error:
             raise ClusterError(
                 f"processes cannot be started ({str(error).splitlines()[0]}): in a script, call {caller or 'this'} "

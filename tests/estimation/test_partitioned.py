@@ -168,7 +168,10 @@ def test_workers_of_a_scheduler_give_the_bits_of_one_process_even_if_one_is_kill
     alone = sc.calibrate(parts, camera, workers=0)
     assert_equal(alone, sc.calibrate(obs, camera), 1e-9)
     killed: list[int] = []
-    with LocalCluster(n_workers=3, threads_per_worker=1, dashboard_address=None) as local, Client(local) as client:
+    with (
+        LocalCluster(n_workers=3, threads_per_worker=1, dashboard_address="127.0.0.1:0") as local,
+        Client(local) as client,
+    ):
         pids = client.run(os.getpid)
 
         def kill(done: int, total: int) -> None:
