@@ -172,8 +172,8 @@ def test_bound_is_that_of_the_marginal_information():
     for i, method in enumerate(PAIRS):
         cal = method.calibrate(obs, sc.paper.paper_start())
         q = len(cal.theta)
-        # Workers may sum in another order than this process.
-        np.testing.assert_allclose(found.estimates[i, 1, :q], cal.theta, rtol=1e-10)
+        # The three stages are taken from the efficient fit, which reached the attitudes on another way.
+        np.testing.assert_array_equal(found.estimates[i, 1, :q], cal.theta)
         np.testing.assert_allclose(found.claimed[i, 1, :q], cal.sigmas, rtol=1e-10)
         assert np.isnan(found.estimates[i, 1, q:]).all()
 
