@@ -82,10 +82,14 @@ def test_coverage_is_judged_with_its_bounds() -> None:
     assert "do not use these intervals" in " ".join(study_answer(wrong))
 
 
-def test_every_figure_draws(decoupled: Study) -> None:
+def test_figures_draw(decoupled: Study) -> None:
     simulated = made_study({"pointing": ("random", "stare")}, lambda cell: {("f", "k1"): -0.9}, covered=0.95)
-    for study in (decoupled, simulated):
-        names = set(view_of(Study).figures) - ({"coverage"} if study is decoupled else {"map", "maps"})
+    # The page draws the others, each once.
+    for study, names in (
+        (decoupled, {"map", "matrices", "inflation"}),
+        (simulated, {"correlation", "coverage", "simpler"}),
+    ):
+        assert names < set(view_of(Study).figures)
         for name in sorted(names):
             drawn = getattr(study.plot, name)()
             figure = drawn if isinstance(drawn, Figure) else figure_of(drawn)
@@ -98,12 +102,15 @@ def test_every_figure_draws(decoupled: Study) -> None:
         decoupled.plot.needed(along="stars")
 
 
-def test_page_holds_answer_advice_and_provenance(decoupled: Study, tmp_path: Path) -> None:
+def test_page_holds_answer_advice_and_provenance(
+    decoupled: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("starcal_uq.presentation.pages.studies._DPI", 40)
     page = write_page(decoupled, tmp_path / "study").read_text("utf-8")
     assert len(page) < 2_000_000 and "A study &lt;made&gt; by hand" in page and "<script" not in page
     for words in (study_text(decoupled), "go to a field of 20°", "too few stars", "study: seeds"):
         assert words in page
-    assert len(list((tmp_path / "study" / "figures").glob("*.png"))) == page.count("data:image/png") >= 6
+    assert len(list((tmp_path / "study" / "figures").glob("*.png"))) == page.count("data:image/png") == 7
     table = study_table(decoupled)
     assert table is not None and len(table.rows) == 6 and "1000" in [row[1] for row in table.rows]
 
