@@ -92,7 +92,8 @@ def write_reference(_app: object) -> None:
         names = [name for name in module.__all__ if not isinstance(getattr(module, name), ModuleType)]
         lines = [f"# {f'sc.{place}' if place else 'sc'}", "", (module.__doc__ or "").strip(), "", "```{eval-rst}"]
         for name in sorted(names, key=lambda name: (not name[0].isupper(), name.lower())):
-            kind = "class" if isinstance(getattr(module, name), type) else "function"
+            public = getattr(module, name)
+            kind = "class" if isinstance(public, type) else "function" if callable(public) else "data"
             lines.append(f".. auto{kind}:: {module.__name__}.{name}")
         if place == "core":
             lines.append(".. automodule:: starcal_uq.core.errors")

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
 
 from starcal_uq.core.display import view_of
@@ -94,6 +95,11 @@ def test_figures_draw(decoupled: Study) -> None:
             drawn = getattr(study.plot, name)()
             figure = drawn if isinstance(drawn, Figure) else figure_of(drawn)
             assert png_bytes(figure, dpi=30).startswith(b"\x89PNG")
+    many = {"fov_deg": tuple(range(5, 15)), "frames": tuple(range(100, 1000, 100))}
+    wide = made_study(many, lambda cell: {}, size=lambda cell: 1.0 / np.sqrt(cell["frames"]), seeds=1)
+    contours = [artist for artist in wide.plot.map().collections if isinstance(artist, ContourSet)]
+    assert len(contours) == 1 and len(contours[0].levels) >= 3
+    assert "0.00" in wide.plot.map("correlation", parameter="f", parameter_2="k1").texts[0].get_text()
     lines = decoupled.plot.correlation([("f", "k1")]).axes[0].get_lines()
     np.testing.assert_allclose(lines[1].get_ydata(), [0.97, 0.8, 0.3], atol=0.003)
     with pytest.raises(ValueError, match='mode = "simulate"'):

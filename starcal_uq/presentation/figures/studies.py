@@ -44,6 +44,7 @@ _PARAMETER_COLOURS = {
 }
 _NAMED = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.VERMILLION)
 _MARKERS = "osD^v"
+_CORRELATION_LEVELS = (-0.99, -0.97, -0.95, -0.9, -0.8, -0.5, 0.0, 0.5, 0.8, 0.9, 0.95, 0.97, 0.99)
 _CORRELATION_TICKS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999, 0.9999, 0.99999)
 # Variables that a map or a line may show: words, unit, and whether a small number is good news.
 _SHOWN = {
@@ -285,18 +286,26 @@ def _contours(ax: Axes, lines: Lines, variable: str) -> None:
     _scale(ax.yaxis, lines.by_values)
     colours, norm, _ = _colours(lines.median, variable)
     levels, _ = round_levels(z.compressed())
-    image = ax.pcolormesh(x, y, z, cmap=colours, norm=norm, shading="gouraud" if not z.mask.any() else "nearest")
-    shown = levels[1:-1][:: max(1, len(levels) // 6)]
-    if len(shown) and np.ptp(z.compressed()) > 0.01 * abs(float(np.median(z.compressed()))):
-        from matplotlib.patheffects import withStroke
-
-        drawn = ax.contour(x, y, z, levels=shown, colors="white", linewidths=1.0)
-        for text in ax.clabel(drawn, fmt=lambda value: f"{value:.3g}", fontsize=style.TICK_SIZE):
-            text.set_path_effects([withStroke(linewidth=2.0, foreground=style.INK)])
+    image = ax.pcolormesh(x, y, z, cmap=colours, norm=norm, shading="nearest" if z.mask.any() else "gouraud")
     bar = style.colour_bar(ax, image, "")
-    if variable != "correlation":
-        low, high = (float(end) for end in np.ravel([image.norm.vmin, image.norm.vmax]))
-        ticks_at_levels(bar, levels[(levels >= low) & (levels <= high)])
+    low, high = float(z.min()), float(z.max())
+    if variable == "correlation":
+        levels = np.array(_CORRELATION_LEVELS)
+        shown = levels[(levels > low) & (levels < high)]
+    else:
+        ends = (float(end) for end in np.ravel([image.norm.vmin, image.norm.vmax]))
+        ticks_at_levels(bar, levels[(levels >= next(ends)) & (levels <= next(ends))])
+        # Contours of little relief would be those of chance.
+        shown = levels[1:-1][:: max(1, len(levels) // 6)] if high > 1.3 * low else levels[:0]
+    if not len(shown):
+        words = " to ".join(correlation_text(v) if variable == "correlation" else _short(v) for v in (low, high))
+        ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", color="white", fontsize=style.LABEL_SIZE)
+        return
+    from matplotlib.patheffects import withStroke
+
+    drawn = ax.contour(x, y, z, levels=shown, colors="white", linewidths=1.0, linestyles="solid")
+    for text in ax.clabel(drawn, fmt=lambda value: f"{value:.3g}", fontsize=style.TICK_SIZE):
+        text.set_path_effects([withStroke(linewidth=2.0, foreground=style.INK)])
 
 
 def _colours(z: FloatArray, variable: str) -> tuple[str, Any, Any]:

@@ -328,7 +328,20 @@ def _target(study: Study) -> str:
         text = f"{head} nowhere"
     else:
         text = f"{head} in {count(int(met.sum()))} of {count(int(known.sum()))} places{_where(sweep, met, known)}"
-    return f"{text}. {_frames_needed(study, target)}".strip()
+    return f"{text}{_crossings(study)}. {_frames_needed(study, target)}".strip()
+
+
+def _crossings(study: Study) -> str:
+    """Where the median error comes to the target along an axis of numbers, between its values."""
+    sweep = study.sweep
+    told = []
+    for axis in sweep.axes:
+        if axis in sweep.drawn or isinstance(sweep.values[axis][0], str):
+            continue
+        places = study.met(axis)
+        if len(places) == 1:
+            told.append(said(axis, places[0]))
+    return f", and the median error comes to it with {join_words(told)}" if told else ""
 
 
 def _target_sigmas(study: Study) -> list[str]:
