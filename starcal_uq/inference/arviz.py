@@ -1,10 +1,8 @@
 """The only importer of ArviZ: one set of functions over ArviZ 0.23 (`InferenceData`) and 1.x (`DataTree`).
 
-What differs between them and is settled here: the container of draws; a default `prob` of the tail ESS that went away;
-and Pareto smoothing, which takes log weights in 0.23 and *negated* log weights in 1.x, without complaint when given the
-wrong ones. Numbers come from the array functions of `arviz_stats`, the package behind 1.x, which Python 3.11 can
-install beside 0.23: they need NumPy and SciPy alone, while 0.23 loads matplotlib, xarray and all of its plots, which
-takes seconds. Without that package, 0.23 computes them.
+The containers differ. Numbers come from the array functions of `arviz_stats`, the package behind 1.x, beside 0.23 too:
+they need NumPy and SciPy alone, while 0.23 loads matplotlib, xarray and all of its plots, which takes seconds. Its
+`psislw` takes *negated* log weights, where 0.23's takes log weights, without complaint when given the wrong ones.
 """
 
 from __future__ import annotations
@@ -40,24 +38,16 @@ def _legacy() -> Any:
     with warnings.catch_warnings():
         # 0.23 announces 1.x once a day; nothing that a user of this package could act on.
         warnings.filterwarnings("ignore", message=r"\s*ArviZ is undergoing a major refactor", category=FutureWarning)
-        module = importlib.import_module("arviz")
-    # Where Numba is installed, 0.23 compiles its functions at first use, which costs more than it saves here, and its
-    # standard error fails with NumPy 2.4.
-    module.Numba.disable_numba()
-    return module
+        return importlib.import_module("arviz")
 
 
 @lru_cache(maxsize=1)
 def _array_stats() -> Any:
-    """The array interface of 1.x, which needs neither matplotlib nor a container; None where it is not installed."""
-    try:
-        return importlib.import_module("arviz_stats.base").array_stats
-    except ModuleNotFoundError:
-        return None
+    return importlib.import_module("arviz_stats.base").array_stats
 
 
 def _diagnostic(name: str, values: FloatArray, **options: Any) -> float:
-    return float(getattr(_array_stats() or _legacy(), name)(values, **options))
+    return float(getattr(_array_stats(), name)(values, **options))
 
 
 def to_arviz(groups: Mapping[str, xr.Dataset]) -> Any:
@@ -111,7 +101,5 @@ def psis(log_weights: FloatArray) -> tuple[FloatArray, FloatArray]:
     if not np.all(flat):
         # Trial shapes of the tail fit that are out of the question get the weight exp(-large), by way of 1 / inf.
         with np.errstate(over="ignore"):
-            stats = _array_stats()
-            found = _legacy().psislw(values[~flat]) if stats is None else stats.psislw(-values[~flat])
-            smoothed[~flat], khat[~flat] = found
+            smoothed[~flat], khat[~flat] = _array_stats().psislw(-values[~flat])
     return smoothed, khat
