@@ -262,6 +262,13 @@ class GeometryKey(NamedTuple):
     seed: tuple[int, ...]
 
 
+def margin_px(settings: Mapping[str, Any]) -> float:
+    """Stars nearer to the edge than this are left out: a power of two, so that many noises share their frames."""
+    shape, scale = noise_shape(settings)
+    faintest = scale * float(star_noise(np.array([settings["max_mag"]]), shape)[0])
+    return float(max(1.0, 2.0 ** np.ceil(np.log2(EDGE_SIGMAS * faintest))))
+
+
 def geometry_key(camera: Camera, settings: Mapping[str, Any], seed: int, seed_index: int, exact: bool) -> GeometryKey:
     """What the frames of a cell depend on; `exact` asks for its own number of frames.
 
@@ -269,16 +276,11 @@ def geometry_key(camera: Camera, settings: Mapping[str, Any], seed: int, seed_in
     each time, and stars that bring their own errors have to be counted over the frames that there are.
     """
     own = exact or settings["pointing"] != "random" or settings["direction_mas"] > 0.0
-    # Powers of two, so that many noises share their frames.
-    faintest = (
-        float(star_noise(np.array([settings["max_mag"]]), noise_shape(settings)[0])[0]) * noise_shape(settings)[1]
-    )
-    margin = max(1.0, 2.0 ** np.ceil(np.log2(EDGE_SIGMAS * faintest)))
     return GeometryKey(
         camera,
         settings["max_mag"],
         settings["min_stars"],
-        float(margin),
+        margin_px(settings),
         settings["pointing"],
         (settings["frames"] if exact else min(settings["frames"], _MOST_FRAMES)) if own else None,
         (seed, seed_index) if own else (seed,),
@@ -295,8 +297,14 @@ def frames_of(cell: Cell) -> tuple[Any, ...]:
     settings = cell.settings
     own = settings["pointing"] != "random" or settings["direction_mas"] > 0.0
     frames = (settings["frames"], cell.seed_index) if own else ()
-    names = (*CAMERA_AXES, "max_mag", "min_stars", "pointing", "sigma_px")
-    return (*(settings.get(name) for name in names), *frames)
+    names = (*CAMERA_AXES, "max_mag", "min_stars", "pointing")
+    return (*(settings.get(name) for name in names), margin_px(settings), *frames)
+
+
+def weights_of(cell: Cell) -> str:
+    """What differs between cells that share frames, but neither their stars nor the weights of these."""
+    settings = cell.settings
+    return repr((settings.get("stars"), noise_shape(settings)[0], settings["direction_mas"]))
 
 
 def take_frames(key: GeometryKey, heaven: Heaven, most: int) -> Geometry:

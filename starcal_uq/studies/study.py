@@ -23,7 +23,7 @@ from starcal_uq.sky.catalogue import load_catalogue
 from starcal_uq.studies.axes import AXES
 from starcal_uq.studies.cells import FRAME_FACTORS, FisherCells, simpler_models
 from starcal_uq.studies.definition import Cell, StudyDefinition
-from starcal_uq.studies.geometry import Heaven, frames_of
+from starcal_uq.studies.geometry import Heaven, frames_of, weights_of
 from starcal_uq.studies.result import TEXTS, VARIABLES, Study, frames_for
 from starcal_uq.studies.store import Store, row
 
@@ -130,7 +130,8 @@ def batches_of(definition: StudyDefinition, todo: Batch) -> list[Batch]:
     batches: list[Batch] = [[]]
     load = 0.0
     for members in groups.values():
-        for place, member in enumerate(members):
+        # Sorting keeps the order of equals.
+        for place, member in enumerate(sorted(members, key=lambda member: weights_of(member[1]))):
             if load >= _BATCH_S:
                 batches.append([])
                 load = 0.0

@@ -298,6 +298,20 @@ def test_an_interrupted_study_goes_on(tmp_path: Path, monkeypatch: pytest.Monkey
         sc.study(definition(), out=tmp_path, workers=0)
 
 
+def test_cells_that_differ_in_noise_frames_or_prior_share_their_frames(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What makes a cell of a grid cost a millisecond."""
+    taken: list[int] = []
+    stated: list[int] = []
+    take, state = cells.take_frames, cells.statements
+    monkeypatch.setattr(cells, "take_frames", lambda *given: taken.append(1) or take(*given))
+    monkeypatch.setattr(cells, "statements", lambda *given: stated.append(1) or state(*given))
+    sweep = {"prior": ("flat", "ground"), "sigma_px": (0.05, 0.1), "fov_deg": (9.0, 12.0), "stars": (5, 8, 10)}
+    priors = {"ground": {"focal_fraction": 1e-5}}
+    found = sc.study(definition(sweep=sweep, priors=priors, seeds=(0, 1), geometries=60), workers=0)
+    assert found.n_cells == 48 and found.ok.all()
+    assert (len(taken), len(stated)) == (2, 6)
+
+
 # --- definitions -----------------------------------------------------------------------------------------------------
 
 CAMERA = paper_camera().to_dict()
