@@ -70,11 +70,8 @@ class Fingerprints:
     def of(cls, obs: Observations, residuals_px: FloatArray, centre_px: tuple[float, float]) -> Fingerprints:
         """Take those of a table with its residuals (N, 2)."""
         sizes = obs.stars_per_frame
-        distance = np.hypot(*(obs.xy - centre_px).T)
-        order = np.lexsort((distance, obs.frame))
-        rank = np.arange(len(order)) - np.repeat(obs.frame_starts[:-1], sizes)
-        rows = order[rank < _MARKS]
-        error = np.linalg.norm(_unsmooth(obs.xy, residuals_px, rows), axis=1)
+        rows = _most_central(np.hypot(*(obs.xy - centre_px).T), obs.frame_starts[:-1], sizes)
+        error = np.hypot(*_unsmooth(obs.xy, residuals_px, rows).T)
         free = np.sqrt(1.0 - 1.5 / np.maximum(sizes, 2))
         error /= np.repeat(free, np.minimum(sizes, _MARKS))
         return cls(sizes.astype(np.int64), obs.xy[rows].astype(np.float32), error.astype(np.float32))
@@ -100,6 +97,19 @@ class Fingerprints:
         return np.minimum(self.sizes, _MARKS)
 
 
+def _most_central(distance: FloatArray, starts: IntArray, sizes: IntArray) -> IntArray:
+    """Rows of at most 12 stars of each frame, nearest first, frame by frame."""
+    kept = np.minimum(sizes, _MARKS)
+    into = np.cumsum(kept) - kept
+    rows = np.empty(int(kept.sum()), dtype=np.int64)
+    for size in np.unique(sizes):
+        frames = np.flatnonzero(sizes == size)
+        stars = starts[frames, None] + np.arange(size)
+        nearest = np.argsort(distance[stars], axis=1, kind="stable")[:, :_MARKS]
+        rows[into[frames, None] + np.arange(nearest.shape[1])] = np.take_along_axis(stars, nearest, axis=1)
+    return rows
+
+
 def _unsmooth(xy: FloatArray, residuals: FloatArray, rows: IntArray) -> FloatArray:
     """Residuals of some rows without a polynomial over the detector: what a model cannot follow is no noise."""
     step = max(1, len(xy) // _MOST_STARS)
@@ -123,12 +133,17 @@ def _unsmooth(xy: FloatArray, residuals: FloatArray, rows: IntArray) -> FloatArr
             value, last = value * x + inner, first
         return value
 
-    length = np.linalg.norm(residuals, axis=1)
+    length = np.hypot(*residuals.T)
     # A few wrong stars would bend the polynomial for all others.
     used = np.flatnonzero(length <= 5.0 * np.median(length))[::step]
     x = terms(place[used])
     solution = np.linalg.lstsq(x.T @ x, x.T @ residuals[used], rcond=None)[0]
-    return residuals[rows] - np.stack([smooth(place[rows], column) for column in solution.T], axis=1)
+    left = residuals[rows]
+    for first in range(0, len(rows), _PART):
+        part = slice(first, first + _PART)
+        for axis in range(2):
+            left[part, axis] -= smooth(place[rows[part]], np.asarray(solution[:, axis], dtype=np.float64))
+    return left
 
 
 def shared(a: Fingerprints, b: Fingerprints) -> IntArray:
@@ -181,7 +196,7 @@ def _near(points: FloatArray) -> IntArray | None:
     strip -= strip.min(initial=0.0)
     along = points[:, 2] - points[:, 2].min(initial=0.0)
     length = along.max(initial=0.0) + 3.0
-    order = np.argsort(strip * length + along, kind="stable")
+    order = np.argsort(strip * length + along)
     points, strip, along = points[order], strip[order], along[order]
     keys = strip * length + along
     found = []

@@ -26,6 +26,8 @@ from starcal_uq.observations.rows import FrameRows, locked
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
 
+# Rows of a column that are hashed at once.
+_ROWS_AT_ONCE = 100_000
 _DTYPES: dict[str, type] = {"whole": np.int64, "number": np.float64, "text": np.str_, "time": np.str_}
 
 
@@ -147,13 +149,13 @@ class Observations(FrameRows, Shown):
             digest.update(f"{name}:{len(values)};".encode())
             if values.dtype.kind == "U":
                 # The length before each text: without it ("ab", "c") and ("a", "bc") would agree.
-                texts = values.tolist()
-                marked = {text: f"{len(text)}:{text}" for text in set(texts)}
-                digest.update("".join(map(marked.__getitem__, texts)).encode())
+                for first in range(0, len(values), _ROWS_AT_ONCE):
+                    digest.update(_marked(values[first : first + _ROWS_AT_ONCE]))
             else:
                 # Adding zero makes -0.0 and 0.0, which compare equal, agree in their bytes.
-                values = values + values.dtype.type(0)
-                digest.update(values.astype(values.dtype.newbyteorder("<")).tobytes())
+                for first in range(0, len(values), _ROWS_AT_ONCE):
+                    part = values[first : first + _ROWS_AT_ONCE] + values.dtype.type(0)
+                    digest.update(part.astype(values.dtype.newbyteorder("<"), copy=False))
         return digest.hexdigest()
 
     def select(self, mask: ArrayLike) -> Observations:
@@ -282,6 +284,24 @@ def _array(name: str, values: Any) -> Any:
             f"observations: column {name} has shape {array.shape}; give one value per row.", column=name
         )
     return array
+
+
+def _marked(texts: StrArray) -> bytes:
+    """Each text behind its length, such as ``3:abc``, one after the other."""
+    n, width = len(texts), texts.dtype.itemsize // 4
+    code = np.ascontiguousarray(texts).view(np.uint32).reshape(n, width)
+    length = np.count_nonzero(code, axis=1)
+    plain = width and width < 1000 and int(code.max(initial=0)) < 128
+    if not plain or not np.array_equal(code != 0, np.arange(width) < length[:, None]):
+        return "".join(f"{len(text)}:{text}" for text in texts.tolist()).encode()
+    # Plain letters without a gap: all at once, as rows of bytes in which a zero stands for nothing.
+    rows = np.zeros((n, 4 + width), dtype=np.uint8)
+    for place, unit in enumerate((100, 10, 1)):
+        digit = length // unit
+        rows[:, place] = np.where((digit > 0) | (unit == 1), 48 + digit % 10, 0)
+    rows[:, 3] = ord(":")
+    rows[:, 4:] = code
+    return bytes(rows[rows != 0])
 
 
 def _all_missing(values: Any) -> bool:
