@@ -8,7 +8,7 @@ from another calibration.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -22,7 +22,7 @@ from starcal_uq.core.tasks import Progress, one_thread
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.diagnostics.jackknife import Jackknife, jackknife_frames
 from starcal_uq.diagnostics.misfit import Misfit, misfit_tests
-from starcal_uq.diagnostics.models import MODELS, ModelComparison, compare_models
+from starcal_uq.diagnostics.models import MODELS, ModelComparison, compare_models, of_all_stars
 from starcal_uq.diagnostics.predictive import PredictiveCheck, predictive_check
 from starcal_uq.diagnostics.stars import StarTest, star_test
 from starcal_uq.estimation.calibrate import METHODS, calibrate, fit
@@ -173,8 +173,8 @@ def diagnose(
     step(4, 5)
     # A single frame cannot be left out.
     comparison = compare_models(obs, cal, models, seed=seed) if models and obs.n_frames > 1 else None
-    if comparison is not None and whole.partitions is not None:
-        comparison = replace(comparison, share=obs.n_frames / whole.n_frames)
+    if comparison is not None:
+        comparison = of_all_stars(comparison, obs, whole)
     step(5, 5)
     settings = {"models": list(models), "n_starts": n_starts}
     return Diagnosis(

@@ -221,6 +221,22 @@ def compare_models(
     )
 
 
+def of_all_stars(found: ModelComparison, obs: Observations, cal: Calibration) -> ModelComparison:
+    """The comparison on a sample of partitioned observations, with the moves by richer models that all stars give."""
+    if cal.partitions is None:
+        return found
+    rotations = quaternion_to_rotation(cal.quaternions)
+    richer = {other.model: other.theta for other in cal.partitions.richer}
+    scores = []
+    for score in found.scores:
+        if score.model in richer:
+            common, rest = _moved(cal, FrameNormals.around(obs, score.model, richer[score.model], rotations))
+            score = replace(score, common_arcsec=common, rest_arcsec=rest)
+        scores.append(score)
+    sampled = any(score.model not in richer and score.model != found.fitted for score in found.accepted)
+    return replace(found, scores=tuple(scores), share=obs.n_frames / cal.n_frames if sampled else 1.0)
+
+
 def _without_star_errors(obs: Observations, cal: Calibration) -> Calibration:
     """The estimate that knows of no errors of the stars, as those of the other models: moves are then the models'."""
     theta = cal.stages[-2].theta

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from starcal_uq.attitude.rotations import rotation_to_quaternion
 from starcal_uq.camera import compiled
 from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import get_model, model_names
 from starcal_uq.core.cluster import Cluster
 from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
 from starcal_uq.core.provenance import provenance
@@ -32,10 +33,10 @@ from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, check_camera
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.compressed import GramSums, gram_sums, optimum, settled
 from starcal_uq.estimation.marginal import MarginalLikelihood
-from starcal_uq.estimation.residual_map import OUTLIER_SIGMA, PartitionSums, ResidualMap
+from starcal_uq.estimation.residual_map import OUTLIER_SIGMA, PartitionSums, ResidualMap, RicherModel
 from starcal_uq.estimation.solvers import Normal, is_singular, levenberg_marquardt
 from starcal_uq.estimation.stages import Stage
-from starcal_uq.estimation.sums import NormalSums, settled_sums, sum_of
+from starcal_uq.estimation.sums import NormalSums, frame_sums, settled_sums, sum_of
 from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse
 from starcal_uq.observations.checks import mixed_bits
 from starcal_uq.observations.partitions import Partition, PartitionedObservations, PartitionReader, joined_hash
@@ -107,11 +108,29 @@ def _gram_together(parts: Sequence[GramSums]) -> GramSums:
 
 @dataclass(frozen=True)
 class _Residuals:
-    """Sums over stars and frames at the estimate: attitude response (3, p) and covariance (3, 3), and the residuals."""
+    """Sums over stars and frames at the estimate: attitude response (3, p) and covariance (3, 3), and the residuals.
+
+    `richer` are the normal equations of the models of which that of the camera is a special case.
+    """
 
     response: FloatArray
     inverse: FloatArray
     sums: PartitionSums
+    richer: tuple[NormalSums, ...]
+
+
+def _richer(camera: Camera) -> list[Camera]:
+    """The same camera by every model with more terms."""
+    own = get_model(camera.distortion)
+    values = dict(zip((c.name for c in own.coefficients), camera.coefficients, strict=True))
+    found = []
+    for name in model_names():
+        model = get_model(name)
+        terms = [c.name for c in model.coefficients]
+        if model.direction == own.direction and values.keys() < set(terms):
+            coefficients = tuple(values.get(term, 0.0) for term in terms)
+            found.append(camera.replace(distortion=name, coefficients=coefficients))
+    return found
 
 
 def _residuals(
@@ -134,7 +153,12 @@ def _residuals(
         largest=float(size[worst]),
         largest_frame=int(obs.frame[worst]),
     )
-    return _Residuals(np.sum(attitudes.response, axis=2), np.sum(attitudes.inverse, axis=2), sums)
+    # Without their further terms these models are the camera's: the attitudes are known, and one pass is enough.
+    with compiled.using("numpy"):
+        richer = tuple(
+            frame_sums(whole, other.distortion, other.theta, attitudes.at(theta))[0] for other in _richer(camera)
+        )
+    return _Residuals(np.sum(attitudes.response, axis=2), np.sum(attitudes.inverse, axis=2), sums, richer)
 
 
 def _added_residuals(parts: Sequence[_Residuals]) -> _Residuals:
@@ -142,7 +166,23 @@ def _added_residuals(parts: Sequence[_Residuals]) -> _Residuals:
         np.sum([part.response for part in parts], axis=0),
         np.sum([part.inverse for part in parts], axis=0),
         PartitionSums.joined([part.sums for part in parts]),
+        tuple(sum_of(some) for some in zip(*(part.richer for part in parts), strict=True)),
     )
+
+
+def _stepped(camera: Camera, sums: Sequence[NormalSums], variance: float) -> tuple[RicherModel, ...]:
+    """The richer models of `_richer` after one step; those that the stars do not determine are left out."""
+    found = []
+    for other, total in zip(_richer(camera), sums, strict=True):
+        normal = total.normal
+        if not np.isfinite(normal.cost) or is_singular(normal.matrix):
+            continue
+        step = -scaled_inverse(normal.matrix) @ normal.gradient
+        n_terms = len(step) - len(camera.theta)
+        found.append(
+            RicherModel(other.distortion, other.theta + step, n_terms, float(-step @ normal.gradient) / variance)
+        )
+    return tuple(found)
 
 
 def calibrate_partitions(
@@ -257,7 +297,7 @@ def calibrate_partitions(
         compressed=compressed,
         provenance=record,
         fingerprints=None,
-        partitions=rest.sums,
+        partitions=replace(rest.sums, richer=_stepped(camera, rest.richer, sigma**2)),
     )
 
 

@@ -77,6 +77,29 @@ class ResidualMap:
 
 
 @dataclass(frozen=True)
+class RicherModel:
+    """A distortion model with more terms, fitted to all stars by one Gauss-Newton step from the calibration.
+
+    Attributes
+    ----------
+    model : str
+        Name of the registry.
+    theta : (q,) array
+        Its estimate, px units.
+    n_terms : int
+        Terms beyond those of the calibration.
+    gain : float
+        Decrease of the sum of squares, in units of the noise variance: chi-square with `n_terms` degrees of freedom
+        where the calibration's model holds.
+    """
+
+    model: str
+    theta: FloatArray
+    n_terms: int
+    gain: float
+
+
+@dataclass(frozen=True)
 class PartitionSums:
     """What is known of all residuals of a calibration that has kept those of a sample of its frames.
 
@@ -96,6 +119,8 @@ class PartitionSums:
         Largest residual along an axis, standard deviations.
     largest_frame : int
         Frame of the largest.
+    richer : tuple of RicherModel
+        Models of which the calibration's is a special case.
     """
 
     n_stars: IntArray
@@ -106,6 +131,7 @@ class PartitionSums:
     n_beyond: int
     largest: float
     largest_frame: int
+    richer: tuple[RicherModel, ...] = ()
 
     @classmethod
     def joined(cls, parts: Sequence[PartitionSums]) -> PartitionSums:

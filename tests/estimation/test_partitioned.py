@@ -14,6 +14,8 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.core.errors import CalibrationError, ObservationError, RepeatedFramesError
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.observations.partitions import PartitionedObservations
 from tests.helpers.outside import campaign
 
@@ -105,6 +107,37 @@ def test_file_with_another_noise_is_found(small, tmp_path: Path) -> None:
     table = sc.Observations(**{**obs.columns, **noisy}, meta=obs.meta)
     found = partitions(sc.calibrate(divided(table, tmp_path / "uneven", [0, 30, 60, 90]), camera))
     assert found is not None and found.level.name == "WARN" and "file 3 of 3" in found.sentence
+
+
+def test_richer_models_are_fitted_to_all_stars(small, tmp_path: Path) -> None:
+    from starcal_uq.diagnostics.verdict.observed import terms
+
+    obs, camera, parts = small
+    many = sc.calibrate(parts, camera)
+    assert [other.model for other in many.partitions.richer] == ["brown3", "brown_tangential"]
+    variance = many.sigma**2
+    for other in many.partitions.richer:
+        full = camera.replace(distortion=other.model, coefficients=(0.0,) * (2 + other.n_terms))
+        one = sc.calibrate(obs, full)
+        best = one.stages[-1].theta
+        # One step of Gauss and Newton over 1.5 sigma; their rate of convergence here is a few per cent a step.
+        normal = MarginalLikelihood(obs, other.model).evaluate(other.theta)
+        second = other.theta - scaled_inverse(normal.matrix) @ normal.gradient
+        first_error, second_error = (np.max(np.abs(at - best) / one.sigmas) for at in (other.theta, second))
+        assert first_error < 0.03 and second_error < 0.05 * max(first_error, 1e-3)
+        assert other.gain == pytest.approx((many.chi2 - one.chi2) / variance, abs=0.01)
+    check = terms(many)
+    assert check is not None and check.level.name == "PASS"
+
+    def decentred(at: np.ndarray, *_: object) -> np.ndarray:
+        """Tangential distortion of 0.1 px at the corner."""
+        x, y = at / 724.0
+        return 0.05 * np.stack([3.0 * x * x + y * y, 2.0 * x * y])
+
+    made = campaign(np.random.default_rng(5), n_frames=90, displaced=decentred)
+    table = sc.Observations(**made.columns, meta=obs.meta)
+    bent = terms(sc.calibrate(divided(table, tmp_path / "bent", [0, 40, 90]), camera))
+    assert bent is not None and bent.level.name == "WARN" and "'brown_tangential'" in bent.sentence
 
 
 def test_partitioned_run_is_sampled_diagnosed_and_reported(small, tmp_path: Path) -> None:

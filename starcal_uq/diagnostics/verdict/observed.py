@@ -169,6 +169,27 @@ def partitions(cal: Calibration) -> Check | None:
     return Check("Noise of the files", Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence)
 
 
+def terms(cal: Calibration) -> Check | None:
+    """Do all stars of partitioned observations ask for terms that the distortion model lacks?"""
+    from scipy.special import gammaincc
+
+    if cal.partitions is None or not cal.partitions.richer:
+        return None
+    richer = cal.partitions.richer
+    single = [float(gammaincc(0.5 * other.n_terms, 0.5 * max(other.gain, 0.0))) for other in richer]
+    best = int(np.argmin(single))
+    name, p_value = richer[best].model, min(1.0, len(single) * single[best])
+    good = p_value >= PATTERN_P
+    sentence = (
+        f"No richer distortion model fits all stars better than chance lets it ({name!r} comes nearest)."
+        if good
+        else f"All stars together ask for the terms of the distortion model {name!r}: calibrate with it."
+    )
+    value, bound = f"p = {significant(p_value)}", f"p ≥ {PATTERN_P:g}"
+    remedy = "" if good else f'{CALIBRATE} with distortion = "{name}" in CAMERA'
+    return Check("Terms of the distortion", Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, remedy)
+
+
 def coverage(obs: Observations, cal: Calibration) -> Check:
     """Did the stars cover the field, and how many frames were there?"""
     binned = bin_residuals(cal, obs)
