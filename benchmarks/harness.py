@@ -100,7 +100,8 @@ class Worker:
             stdout=subprocess.PIPE,
             stderr=self.errors,
             text=True,
-            env={**os.environ, **environment},
+            # Compiled files are kept, as they are for users.
+            env={k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"} | dict(environment),
         )
         self.missing: str | None = self._read().get("missing")
 
