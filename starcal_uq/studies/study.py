@@ -110,6 +110,7 @@ def study(
         work = Work(wanted, stars, deepest, heaven.hash(deepest))
         interrupted = run_batches(work, batches_of(wanted, todo), keep, workers, scheduler)
     data = dataset(wanted, cells, keys, store)
+    data.attrs |= {"stars": heaven.stars.source, "stars_sha256": heaven.hash(deepest)}
     found = Study(data, wanted)
     if out is not None:
         if not interrupted:
