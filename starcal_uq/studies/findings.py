@@ -310,8 +310,8 @@ class Sweep:
         along, by : str
             Axes; without `by` there is one line.
         at : dict, optional
-            Values of other axes; those that are not given are held at the middle one of their values, and what was
-            drawn from a Latin hypercube is not held at all.
+            Values of other axes; those that are not given are held at the middle one of their values (where most
+            cells have numbers), and what was drawn from a Latin hypercube is not held at all.
 
         Raises
         ------
@@ -355,12 +355,19 @@ class Sweep:
         for axis, value in at.items():
             if value not in self.values[axis]:
                 raise ValueError(f"{axis} has no value {value!r}: use one of {', '.join(map(str, self.values[axis]))}.")
-        middle = {
-            axis: self.values[axis][len(self.values[axis]) // 2]
-            for axis in self.axes
-            if axis not in self.drawn and axis not in (along, by)
-        }
-        return middle | {axis: value for axis, value in at.items() if axis not in (along, by)}
+        given = {axis: value for axis, value in at.items() if axis not in (along, by)}
+        free = [i for i, axis in enumerate(self.axes) if axis not in (*self.drawn, along, by, *given)]
+        cells = self.ok.copy()
+        for axis, value in given.items():
+            cells &= self._codes[self.axes.index(axis)] == self.values[axis].index(value)
+        if not free or not cells.any():
+            return given
+        # The middle, unless cells are missing there.
+        places, counts = np.unique(np.stack([self._codes[i][cells] for i in free]), axis=1, return_counts=True)
+        middle = np.array([self.shape[i] // 2 for i in free])[:, None]
+        best = int(np.lexsort((np.abs(places - middle).sum(axis=0), -counts))[0])
+        chosen = {self.axes[i]: self.values[self.axes[i]][int(places[j, best])] for j, i in enumerate(free)}
+        return chosen | given
 
     @cached_property
     def frame_error(self) -> FloatArray:

@@ -655,6 +655,8 @@ def _two_axes(
     """
     if not sweep.axes:
         raise ValueError("nothing was swept: give [sweep] an axis with more than one value.")
+    if not sweep.ok.any():
+        raise ValueError("no cell of the study has numbers: see the status of its cells.")
     named = [axis for axis in (along, by) if axis is not None]
     for axis in named:
         if axis not in sweep.axes:
