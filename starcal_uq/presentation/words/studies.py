@@ -738,8 +738,9 @@ def _advice_models(study: Study) -> str:
 
 
 def study_notes(study: Study) -> list[str]:
-    """Advice and limits, for a notebook."""
-    return [*study_advice(study), *study_limits(study)]
+    """The whole answer, advice and limits, for a notebook."""
+    advice = [f"Advice: {sentence[:1].lower() + sentence[1:]}" for sentence in study_advice(study)]
+    return [*study_answer(study), *advice, *study_limits(study)]
 
 
 def study_table(study: Study) -> TextTable | None:
