@@ -131,7 +131,6 @@ def _detect(frame: PreparedImage, name: str, sigma: float, options: DetectionOpt
     # The noise that is left of noise 1.
     left = np.sum(line**2) / line.sum() ** 2
     filtered = _filtered(frame.counts, (line / line.sum()).astype(np.float32))
-    filtered = _filtered(frame.counts, (line / line.sum()).astype(np.float32))
     threshold = np.float32(options.threshold_sigma * left)
     n_above = np.count_nonzero(filtered > threshold * frame.noise)
 
@@ -180,6 +179,8 @@ def _taken_apart(
 
     No other can fall apart, and to look for it in all takes as long as all the rest.
     """
+    import sep
+
     height, width = image.shape
     inside = np.flatnonzero(labels.ravel() != 0)
     row, column = np.divmod(inside, width)
@@ -203,7 +204,10 @@ def _taken_apart(
         for axis, first in (("x", whole["xmin"] - 1), ("y", whole["ymin"] - 1)):
             for name in (axis, f"{axis}min", f"{axis}max"):
                 parts[name] += first
-        parts["flag"] |= whole["flag"]
+        ends = (
+            (parts["xmin"] == 0) | (parts["ymin"] == 0) | (parts["xmax"] == width - 1) | (parts["ymax"] == height - 1)
+        )
+        parts["flag"][ends] |= sep.OBJ_TRUNC
         numbers = numbers[1:-1, 1:-1]
         labels[box][own] = np.where(numbers > 0, n + numbers, 0)[own]
         objects["x"][label - 1] = np.nan

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import sys
+from collections import Counter
 from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
@@ -18,6 +19,7 @@ from starcal_uq.attitude.rotations import quaternion_to_rotation, random_rotatio
 from starcal_uq.camera.projection import unproject
 from starcal_uq.core.errors import IdentificationError
 from starcal_uq.identification import match as matching
+from starcal_uq.identification import search
 from starcal_uq.identification.brightness import instrumental_mag, unlike_brightness
 from starcal_uq.identification.engine import calibrated_tolerance, identify
 from starcal_uq.identification.pairs import angle_between, cached_star_pairs, default_cache_dir, find_star_pairs
@@ -114,6 +116,34 @@ def test_narrow_and_wide_fields(folder: Path, fov_deg: float, max_mag: float) ->
     found = identify(table, square_camera(fov_deg), stars, cache_dir=folder)
     assert found.n_identified == 15
     assert wrong_rows(found, table, names) == 0
+
+
+def test_stops_at_the_first_good_match_and_looks_before_it_matches(
+    stars: Any, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Counts of work: attitudes matched, and the fits that they took."""
+    calls: Counter[str] = Counter()
+
+    def counted(name: str, original: Any) -> Any:
+        def call(*values: Any, **options: Any) -> Any:
+            calls[name] += 1
+            return original(*values, **options)
+
+        return call
+
+    for module, name in ((search, "match_frame"), (matching, "_fit")):
+        monkeypatch.setattr(module, name, counted(name, getattr(module, name)))
+    # Half of the centroids are too faint for the catalogue, which is no reason to look on.
+    bright = stars.select(stars.mag < 5.2)
+    table, _, _ = random_frames(stars, square_camera(20.0, 0.98, 10.0), 10, 6)
+    assert identify(table, square_camera(20.0), bright, share_camera=False, cache_dir=folder).n_identified == 10
+    assert calls["match_frame"] < 3 * 10
+    calls.clear()
+    table, _, _ = random_frames(stars, square_camera(12.0), 2, 7)
+    table.x_px = np.random.default_rng(8).random(len(table.x_px)) * 1023.0
+    assert identify(table, square_camera(12.0), stars, share_camera=False, cache_dir=folder).n_identified == 0
+    # Four fits each where every one is matched; most are seen to be wrong before the first.
+    assert calls["match_frame"] > 100 and calls["_fit"] < calls["match_frame"]
 
 
 def test_no_stars_at_all(stars: Any, folder: Path) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from functools import cache
 
 import numpy as np
 import pandas as pd
 import PIL.Image
 import pytest
+import sep
 from astropy.io import fits
 from scipy.spatial import cKDTree
 from scipy.special import erf
@@ -15,6 +17,9 @@ from scipy.special import erf
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import ImageError, ObservationError, RunFolderError
 from starcal_uq.identification.result import FrameIdentification, Identification
+from starcal_uq.images import detection
+from starcal_uq.images import fits as star_fits
+from starcal_uq.images.background import prepare_image
 from starcal_uq.images.centroids import COLUMNS, FRAME_COLUMNS, Centroids
 from starcal_uq.images.extract import extract_centroids
 from starcal_uq.images.image import Image, read_image
@@ -176,6 +181,71 @@ def test_a_large_frame_takes_a_moment():
     assert len(matched(extract_centroids(image), xy)[0]) == 15
     # Two thirds of it.
     assert times_as_long(lambda: extract_centroids(image), sort_a_million) < 2.0
+
+
+def test_an_image_is_passed_over_once_and_stars_are_fitted_together(monkeypatch):
+    rng = np.random.default_rng(21)
+    xy = grid(rng)
+    image = Image(noisy(sky(xy, flux_for(30, 1.2), 1.2), rng), "counted")
+    passes, fits = Counter(), []
+
+    def counted(name, original):
+        def call(data, *rest, **options):
+            passes[name] += np.size(data) == image.data.size
+            return original(data, *rest, **options)
+
+        return call
+
+    for module, name in ((sep, "Background"), (sep, "extract"), (detection, "_filtered")):
+        monkeypatch.setattr(module, name, counted(name, getattr(module, name)))
+    solve = star_fits._solve
+    monkeypatch.setattr(star_fits, "_solve", lambda normal, right: (fits.append(len(normal)), solve(normal, right))[1])
+    assert len(matched(extract_centroids(image, gain_e_per_count=1.0), xy)[0]) == len(xy)
+    assert passes == {"Background": 1, "extract": 1, "_filtered": 1}
+    # Width, shape and places: some ten steps for each star, all stars in one call.
+    assert sum(fits) < 12 * len(xy) and len(fits) < 40
+
+
+def test_detections_are_those_of_sextractor():
+    """Filter and taking apart are done in fewer steps than SExtractor's, and find what it finds, in a crowd too."""
+    rng = np.random.default_rng(22)
+    xy = rng.uniform(3, 252, (300, 2))
+    image = Image(noisy(sky(xy, 10.0 ** rng.uniform(3.0, 5.0, 300), 1.2, (256, 256)), rng), "crowd")
+    frame, _, _ = prepare_image(image, 1.0, None, None)
+    ours = detection._detect(frame, "crowd", 1.2, detection.DetectionOptions())
+    line_ = np.exp(-0.5 * (np.arange(-3, 4) / 1.2) ** 2)
+    kernel = np.outer(line_, line_).astype(np.float32)
+    threshold = 5.0 * np.sqrt(np.sum(kernel**2)) / kernel.sum()
+    theirs = sep.extract(frame.counts, threshold, err=frame.noise, minarea=1, filter_kernel=kernel, filter_type="conv")
+    distance, index = cKDTree(np.column_stack([ours["x"], ours["y"]])).query(
+        np.column_stack([theirs["x"], theirs["y"]])
+    )
+    same = distance < 1e-3
+    # Cleaning weighs areas of the filtered image here: a detection at the foot of a bright one may differ.
+    assert len(ours) == pytest.approx(len(theirs), abs=3) and np.count_nonzero(~same) <= 3
+    assert np.count_nonzero(theirs["flag"] & 1) > 50
+    np.testing.assert_array_equal(ours["flag"][index[same]], theirs["flag"][same])
+    # Which part gets a pixel between two is drawn by lot.
+    lone = same & (theirs["flag"] & 1 == 0)
+    np.testing.assert_allclose(ours["flux"][index[lone]], theirs["flux"][lone], rtol=1e-3)
+
+
+def test_windows_settle_where_sextractors_do():
+    xy, image, found = trial(100, 2.0)
+    frame, _, _ = prepare_image(Image(image, "window"), 1.0, None, None)
+    start, width = found.xy[:, 0] + 0.2, np.full(len(found), 2.0)
+    x, y, good = star_fits.window_positions(frame, start, found.xy[:, 1] - 0.2, np.hypot(width, 0.3), width)
+    theirs = sep.winpos(frame.counts, start, found.xy[:, 1] - 0.2, np.hypot(width, 0.3))
+    assert good.all() and len(good) == len(xy)
+    np.testing.assert_allclose(np.hypot(x - theirs[0], y - theirs[1]), 0.0, atol=0.02 * found.sigma_px.max())
+
+
+def test_pairs_of_near_positions_are_all_found():
+    x, y = np.random.default_rng(3).random((2, 300)) * 100.0
+    expected = cKDTree(np.column_stack([x, y])).query_pairs(5.0)
+    pairs = star_fits.near_pairs(x, y, 5.0)
+    assert {tuple(pair) for pair in pairs.tolist()} == expected | {(j, i) for i, j in expected}
+    assert len(pairs) == 2 * len(expected) and not len(star_fits.near_pairs(x[:1], y[:1], 5.0))
 
 
 # ---- flags and rejections ------------------------------------------------------------------------------------------
