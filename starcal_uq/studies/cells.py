@@ -22,7 +22,7 @@ from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import StarcalError, StudyError
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.inference.priors import Priors
-from starcal_uq.maths.linear import correlation_of, inverses, scaled_inverse, unit_inverse
+from starcal_uq.maths.linear import correlation_of, inverses
 from starcal_uq.propagation.coupling import weak_directions
 from starcal_uq.studies.axes import CAMERA_AXES, camera_of
 from starcal_uq.studies.definition import Cell, StudyDefinition
@@ -47,6 +47,7 @@ FRAME_FACTORS = 10.0 ** np.arange(-3.0, 3.01, 0.25)
 _PRIOR_OF = {"principal_point_px": slice(0, 2), "focal_fraction": slice(2, 3), "distortion_corner_px": slice(3, None)}
 # Sets of frames that are kept: the last ones, and those of the mission for the patterns of a camera.
 _KEPT = 8
+UNDETERMINED = "the frames do not determine every parameter: use more stars, a simpler model, or a prior."
 Numbers = AnyDict
 
 
@@ -92,6 +93,8 @@ class FisherCells:
             return self._numbers(cell, self.camera(cell))
         except StarcalError as error:
             return {"status": str(error)}
+        except np.linalg.LinAlgError:
+            return {"status": UNDETERMINED}
 
     def _numbers(self, cell: Cell, camera: Camera) -> Numbers:
         settings = cell.settings
@@ -196,7 +199,7 @@ def coupling_numbers(
     numbers = np.concatenate([[1.0], FRAME_FACTORS]) * n
     every = covariances(frame, precision, stated.star_spread, numbers)
     if not np.isfinite(every[0]).all():
-        raise StudyError("the frames do not determine every parameter: use more stars, a simpler model, or a prior.")
+        raise StudyError(UNDETERMINED)
     data = every[0] if prior is None else covariances(frame, np.zeros(len(frame)), stated.star_spread, numbers[:1])[0]
     common, forms = stated.common, stated.rest_forms
     cross = 0.5 * (forms[0] + forms[1])
@@ -252,14 +255,16 @@ def simpler_numbers(frame: FloatArray, n: int, weight: float, stated: Statements
     for model in simpler_models(camera.distortion):
         kept = np.array([name in parameter_names(model) for name in names])
         inner = frame[np.ix_(kept, kept)]
-        shift: FloatArray = scaled_inverse(inner) @ frame[np.ix_(kept, ~kept)] @ camera.theta[~kept]
+        inverse = inverses(inner[None])[0]
+        # Where a prior alone determines a parameter, a fit without it has no answer.
+        inverse = inverse if np.isfinite(inverse).all() else np.full(inner.shape, np.nan)
+        shift: FloatArray = inverse @ frame[np.ix_(kept, ~kept)] @ camera.theta[~kept]
         error = np.zeros(len(names))
         error[kept], error[~kept] = shift, -camera.theta[~kept]
         # Two coordinates to a star.
-        rms = float(np.sqrt(max(float(n * error @ frame @ error) / (2.0 * weight), 0.0)))
-        inverse, scale = unit_inverse(n * inner)
+        rms = np.sqrt(np.maximum(n * error @ frame @ error / (2.0 * weight), 0.0))
         sigmas = np.full(len(names), np.nan)
-        sigmas[kept] = shift / (np.sqrt(np.diag(inverse)) * scale)
+        sigmas[kept] = shift / np.sqrt(np.diag(inverse) / n)
         found["model_bias_arcsec"][model] = ARCSEC * rms / camera.focal_px
         found["model_bias_attitude_arcsec"][model] = ARCSEC * np.sqrt(
             np.maximum(np.einsum("p,apq,q->a", error, stated.rest_forms, error), 0.0)

@@ -27,6 +27,7 @@ from starcal_uq.observations.table import Observations
 from starcal_uq.sky.positions import ra_dec_deg
 from starcal_uq.studies.axes import camera_of
 from starcal_uq.studies.cells import (
+    UNDETERMINED,
     Numbers,
     coupling_numbers,
     covariance_numbers,
@@ -79,6 +80,8 @@ class SimulatedCells:
             return self._numbers(cell, camera_of(self.definition.camera, cell.settings))
         except StarcalError as error:
             return {"status": str(error)}
+        except np.linalg.LinAlgError:
+            return {"status": UNDETERMINED}
 
     def _numbers(self, cell: Cell, camera: Camera) -> Numbers:
         definition, settings = self.definition, cell.settings

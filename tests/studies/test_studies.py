@@ -145,6 +145,19 @@ def test_a_prior_narrows_what_it_is_about() -> None:
     assert sigma[2, 2] == pytest.approx(data[2, 2], rel=0.01)
 
 
+def test_what_only_a_prior_determines_has_no_sigma_of_the_data() -> None:
+    """One attitude with three stars says three numbers about five parameters."""
+    priors = {"all": {"principal_point_px": 1.0, "focal_fraction": 1e-4, "distortion_corner_px": 1.0}}
+    sweep = {"prior": ("flat", "all")}
+    observation = {"pointing": "stare", "stars": 3}
+    found = sc.study(definition(sweep=sweep, priors=priors, observation=observation), workers=0)
+    assert list(found.ok) == [False, True]
+    assert found.data["status"].values[0].startswith("the frames do not determine every parameter")
+    assert np.isinf(found.data["sigma_data"].values[1]).all()
+    assert np.isfinite(found.data["sigma"].values[1]).all()
+    assert np.isnan(found.data["model_bias_arcsec"].sel(simpler="k1").values[1])
+
+
 def test_frames_that_a_target_takes_give_it() -> None:
     made = definition(target_arcsec=0.02, target_sigma={"f": 0.05}, geometries=100)
     first = sc.study(made, workers=0)
