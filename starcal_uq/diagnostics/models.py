@@ -43,7 +43,7 @@ KHAT_BOUND = 0.7
 REJECT_P, REJECT_ELPD = 0.005, 4.0
 _DRAWS = 1000
 # Frames whose densities are sampled as well; the closed form, which is exact for the same model, costs nothing.
-_SAMPLED_FRAMES = 200
+_SAMPLED_FRAMES = 100
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.star_errors import StarLikelihood
 from starcal_uq.maths.linear import scaled_cholesky
+from starcal_uq.observations.splits import frame_sample
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
 
 _RINGS = 10
-_MAX_STARS = 40_000
+_MAX_STARS = 20_000
 
 
 @dataclass(frozen=True)
@@ -71,11 +72,14 @@ class PredictiveCheck(Shown):
         Draws of the posterior.
     n_frames : int
         Frames that were used: all, unless there are very many stars.
+    of_frames : int
+        Frames that there are; 0 in a check of a version that did not say.
     """
 
     statistics: tuple[PredictiveStatistic, ...]
     n_draws: int
     n_frames: int
+    of_frames: int = 0
 
     def to_dataframe(self) -> pd.DataFrame:
         """One row per statistic."""
@@ -101,18 +105,16 @@ def predictive_check(
         Seed of the draws and the replicates.
     """
     rng = np.random.default_rng(seed)
-    likelihood = MarginalLikelihood(weighed(obs, cal), cal.camera.distortion)
-    frames = likelihood.frames
-    # The statistics settle long before: of very many stars, the first frames do.
-    last = min(frames.n_frames, max(1, int(np.searchsorted(frames.starts, _MAX_STARS, side="right")) - 1))
-    part = MarginalLikelihood(frames.part(0, last), cal.camera.distortion)
+    # The statistics settle long before: of very many stars, those of some frames do.
+    limit = max(1, min(obs.n_frames, _MAX_STARS * obs.n_frames // obs.n_stars))
+    some, places = frame_sample(weighed(obs, cal), limit, seed)
+    part = MarginalLikelihood(some, cal.camera.distortion)
     frames = part.frames
-    state, _ = part.profile(cal.theta, quaternion_to_rotation(cal.quaternions[:last]))
+    state, _ = part.profile(cal.theta, quaternion_to_rotation(cal.quaternions[places]))
     e, h = state.e, part.project_out(state, part.derivatives(cal.theta, state))
     stars = None
     if cal.star_errors is not None:
         # Residuals after each star's offset, as they follow the parameters; replicates go the same way.
-        some = weighed(obs, cal).select_frames(obs.frame_ids[:last])
         stars = StarLikelihood(some, part.model_name, cal.theta, state.rotations, cal.star_errors, cal.sigma)
         columns, _ = stars.conditioned(state, np.concatenate([h, e[None]]))
         h, e = columns[:-1], columns[-1]
@@ -134,7 +136,7 @@ def predictive_check(
     if cal.noise_model is not None and cal.noise_model.frame_dof is not None:
         # Every frame's sum of squares went into the factor of its own noise.
         statistics = tuple(s for s in statistics if not s.name.startswith("worst frame"))
-    return PredictiveCheck(statistics, len(sigma), last)
+    return PredictiveCheck(statistics, len(sigma), some.n_frames, obs.n_frames)
 
 
 def _draws(

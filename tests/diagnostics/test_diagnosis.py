@@ -252,6 +252,14 @@ def test_replicates_look_like_data_of_the_model_and_unlike_others(obs, cal):
     assert ring.statistics[3].name.startswith("radial pattern") and ring.statistics[3].p_value < 0.05
 
 
+def test_replicates_on_some_frames_say_so(obs, cal, monkeypatch):
+    monkeypatch.setattr("starcal_uq.diagnostics.predictive._MAX_STARS", 500)
+    some = predictive_check(obs, cal, n_draws=100)
+    assert some.of_frames == obs.n_frames and some.n_frames == pytest.approx(500 * obs.n_frames / obs.n_stars, abs=1)
+    assert f"on {some.n_frames} of {obs.n_frames} frames" in some.text
+    assert not any(s.extreme for s in some.statistics)
+
+
 def test_replicates_use_the_posterior(obs, cal):
     post = sc.sample(obs, cal, seed=1, n_steps=50)
     assert not any(s.extreme for s in predictive_check(obs, cal, post, n_draws=100).statistics)

@@ -117,3 +117,22 @@ def test_the_size_found_gives_the_right_covariance():
     # The control: the stated covariance is far too small.
     assert np.mean([squared(c, cal, test.formal_covariance) for c, cal, test in found]) > 1.6
     assert 0.5 < np.mean([squared(c, cal, test.model_covariance) for c, cal, test in found]) < 1.5
+
+
+def test_traces_of_a_sparse_matrix_are_those_of_a_dense_one():
+    from scipy import sparse
+
+    from starcal_uq.diagnostics.stars import _sparse_traces
+
+    rng = np.random.default_rng(1)
+    rest = sparse.random_array((800, 800), density=0.01, rng=rng, format="csr")
+    matrix = sparse.csr_array(rest + rest.T + sparse.diags_array(rng.uniform(5.0, 15.0, 800)))
+    dense = matrix.toarray()
+    square = dense @ dense
+    exact = (np.trace(dense), np.trace(square), np.sum(square * dense), np.sum(square**2))
+    found = _sparse_traces(matrix)
+    np.testing.assert_allclose(found[:2], exact[:2], rtol=1e-12)
+    np.testing.assert_allclose(found[2:], exact[2:], rtol=5e-4)
+    # The control: without what random signs find, they would be farther off.
+    rest = dense - np.diag(np.diag(dense))
+    assert np.sum((rest @ rest) ** 2) > 1e-3 * exact[3]

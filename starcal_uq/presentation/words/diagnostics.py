@@ -131,6 +131,8 @@ def predictive_text(found: PredictiveCheck) -> str:
     """How many statistics of the residuals lie outside what the posterior predicts."""
     extreme = [s.name for s in found.statistics if s.extreme]
     asked = f"{len(found.statistics)} statistics of the residuals against {plural(found.n_draws, 'draw')}"
+    if found.n_frames < found.of_frames:
+        asked += f" on {count(found.n_frames)} of {plural(found.of_frames, 'frame')}"
     return f"{asked}: {'nothing extreme' if not extreme else 'extreme are ' + join_words(extreme)}."
 
 
