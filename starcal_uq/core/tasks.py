@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import pickle
 import signal
+import sys
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from functools import lru_cache
 from multiprocessing import get_context
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -23,6 +25,7 @@ T = TypeVar("T")
 Numbered = list[tuple[int, T]]
 _WAIT_S = 0.2
 _THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+_WITH_BLAS = {"numpy", "scipy.linalg", "scipy.sparse.linalg"}
 _shared: list[Callable[[int], Any]] = []
 # How many `one_thread` are under way.
 _limited = [0]
@@ -152,6 +155,14 @@ def _keep_running(
             keep(future.result())
 
 
+@lru_cache(maxsize=1)
+def _pools(_n_loaded: int) -> Any:
+    """The libraries' pools of threads; looked up again when another module has brought one."""
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
+
+
 @contextmanager
 def one_thread() -> Iterator[None]:
     """One BLAS thread in this process and in those that it starts; also a decorator, ``@one_thread()``.
@@ -163,13 +174,11 @@ def one_thread() -> Iterator[None]:
         # A caller has done it.
         yield
         return
-    from threadpoolctl import threadpool_limits
-
     before = {name: os.environ.get(name) for name in _THREAD_COUNTS}
     os.environ.update(dict.fromkeys(_THREAD_COUNTS, "1"))
     _limited[0] += 1
     try:
-        with threadpool_limits(limits=1, user_api="blas"):
+        with _pools(len(sys.modules.keys() & _WITH_BLAS)).limit(limits=1, user_api="blas"):
             yield
     finally:
         _limited[0] -= 1

@@ -118,8 +118,16 @@ def _unsmooth(xy: FloatArray, residuals: FloatArray, rows: IntArray) -> FloatArr
     degree = max(d for d in range(_DEGREE + 1) if d == 0 or (d + 1) * (d + 2) // 2 * _STARS_PER_TERM <= len(xy))
 
     def terms(at: FloatArray) -> FloatArray:
-        x, y = (np.vander(values, degree + 1, increasing=True) for values in at.T)
-        return np.column_stack([x[:, i] * y[:, j] for i in range(degree + 1) for j in range(degree + 1 - i)])
+        x, y = np.ascontiguousarray(at.T)
+        powers = np.ones((degree + 1, len(y)))
+        for j in range(degree):
+            np.multiply(powers[j], y, out=powers[j + 1])
+        rows, first = np.empty(((degree + 1) * (degree + 2) // 2, len(y))), 0
+        for i in range(degree + 1):
+            np.copyto(rows[first : first + degree + 1 - i], powers[: degree + 1 - i])
+            first += degree + 1 - i
+            powers *= x
+        return rows
 
     def smooth(at: FloatArray, coefficients: FloatArray) -> FloatArray:
         # Horner's scheme in both coordinates: no table of all terms.
@@ -137,7 +145,7 @@ def _unsmooth(xy: FloatArray, residuals: FloatArray, rows: IntArray) -> FloatArr
     # A few wrong stars would bend the polynomial for all others.
     used = np.flatnonzero(length <= 5.0 * np.median(length))[::step]
     x = terms(place[used])
-    solution = np.linalg.lstsq(x.T @ x, x.T @ residuals[used], rcond=None)[0]
+    solution = np.linalg.lstsq(x @ x.T, x @ residuals[used], rcond=None)[0]
     left = residuals[rows]
     for first in range(0, len(rows), _PART):
         part = slice(first, first + _PART)

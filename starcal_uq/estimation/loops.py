@@ -564,6 +564,13 @@ def _stars(frames: StarFrames, rotations: FloatArray) -> tuple[Any, ...]:
     return (*frames.pixel, *frames.r, weight, frames.starts, np.ascontiguousarray(rotations))
 
 
+def _both(upper: FloatArray) -> FloatArray:
+    """A symmetric matrix from its upper triangle, zeros below."""
+    whole = upper + upper.T
+    np.fill_diagonal(whole, np.diag(upper))
+    return whole
+
+
 def frame_loop(
     frames: StarFrames, model_name: str, theta: FloatArray, rotations: FloatArray, residuals: FloatArray | None
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
@@ -577,8 +584,7 @@ def frame_loop(
     into = np.empty((2, 0)) if residuals is None else residuals
     loops = compiled.load(model_name, source(model_name))
     loops.frame_sums(tuple(theta.tolist()), *_stars(frames, rotations), into, gram, shift, response, inverse, volume)
-    upper = np.triu(gram, 1)
-    return np.triu(gram) + upper.T, shift, response, inverse, volume
+    return _both(gram), shift, response, inverse, volume
 
 
 def pair_loop(
@@ -594,7 +600,7 @@ def pair_loop(
     scores, matrix = np.empty((p, frames.n_frames)), np.zeros((p, p))
     loops = compiled.load(model_name, source(model_name))
     cost = loops.pair_sums(tuple(theta.tolist()), *frames.pixel, *turned, frames.starts, scores, matrix)
-    return cost, np.triu(matrix) + np.triu(matrix, 1).T, scores
+    return cost, _both(matrix), scores
 
 
 def gram_loop(
@@ -616,5 +622,5 @@ def gram_loop(
     loops = compiled.load(model_name, source(model_name))
     given = (tuple(theta.tolist()), tuple(whitening.ravel().tolist()), *_stars(frames, rotations))
     loops.gram_sums(*given, np.ascontiguousarray(moved[0]), path, moved[2], gram, slope)
-    square = gram[:, :q]
-    return np.triu(square) + np.triu(square, 1).T, slope
+    # Rows are summed by fours: what stands below the diagonal and beyond the last column is of no use.
+    return _both(np.triu(gram[:, :q])), slope
