@@ -17,7 +17,7 @@ from starcal_uq.camera.projection import backward_kernel, backward_root, unproje
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.loops import pair_loop, wanted
 from starcal_uq.estimation.solvers import Normal, is_singular
-from starcal_uq.maths.linear import unit_inverse
+from starcal_uq.maths.linear import COLUMNS, ROWS, unit_inverse
 from starcal_uq.observations.frames import StarFrames
 
 # Stars per block: small enough that its arrays stay in cache, large enough to hide the interpreter.
@@ -25,6 +25,10 @@ _BLOCK_STARS = 4096
 # The objective does not depend on how the catalogue is turned; a turn that is right to within this many pixels keeps E
 # small enough for eleven digits of the cost.
 _TURN_AGAIN_PX = 30.0
+
+
+# Where the entries of a symmetric matrix stand among its six unique ones.
+_SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 
 
 def _gram(frames: StarFrames, a: FloatArray, b: FloatArray) -> FloatArray:
@@ -35,7 +39,17 @@ def _gram(frames: StarFrames, a: FloatArray, b: FloatArray) -> FloatArray:
 def _apply(stars: FloatArray, matrix: FloatArray) -> FloatArray:
     """Every star's vectors (..., 3, N) times its frame's matrix (3, 3, N): the rows of ``A M``."""
     x, y, z = (stars[..., i, None, :] for i in range(3))
-    product: FloatArray = x * matrix[0] + y * matrix[1] + z * matrix[2]
+    product: FloatArray = x * matrix[0]
+    product += y * matrix[1]
+    product += z * matrix[2]
+    return product
+
+
+def _dot(stars: FloatArray, vector: FloatArray) -> FloatArray:
+    """Products of vectors (..., 3, N) with one (3, N)."""
+    product: FloatArray = stars[..., 0, :] * vector[0]
+    product += stars[..., 1, :] * vector[1]
+    product += stars[..., 2, :] * vector[2]
     return product
 
 
@@ -144,10 +158,14 @@ class PairObjective:
         p = self.n_parameters
         b, db = self.directions(theta, frames)
         cost, d_b = _block_terms(frames, turned, b)
-        scores = frames.sum(np.sum(db * d_b, axis=1))
-        weighted = _apply(db, frames.spread(_gram(frames, b, b)))
+        scores = frames.sum(_dot(db, d_b))
+        bb = frames.sum(np.stack([b[i] * b[j] for i, j in zip(ROWS, COLUMNS, strict=True)]))
+        weighted = _apply(db, frames.spread(bb)[_SYMMETRIC])
         matrix = weighted.reshape(p, -1) @ db.reshape(p, -1).T
-        cross = frames.sum(b[:, None, None, :] * db.transpose(1, 0, 2)).transpose(2, 0, 1, 3)
+        cross = np.empty((3, p, 3, frames.n_frames))
+        for i in range(3):
+            cross[i] = frames.sum((b[i] * db).reshape(3 * p, -1)).reshape(p, 3, -1)
+        cross = cross.transpose(1, 0, 2, 3)
         matrix += cross.reshape(p, -1) @ cross.transpose(0, 2, 1, 3).reshape(p, -1).T
         return cost, matrix, scores
 
