@@ -110,8 +110,8 @@ clean: ## remove everything that the other targets made
 	@$(ALT_BIN)/python $(PIP_INSTALL) --no-build-isolation --editable ".[test]"
 	@touch $@
 
-.bench/.installed: .venv/.made benchmarks/rivals.txt
+.bench/.installed: .venv/.made benchmarks/rivals.txt benchmarks/cedar.txt
 	@echo "installing the rivals of the benchmarks"
-	@$(BIN)/python -m venv --clear .bench/venv
-	@.bench/venv/bin/python -m pip install --quiet --disable-pip-version-check --requirement benchmarks/rivals.txt
+	@for name in rivals cedar; do $(BIN)/python -m venv --clear .bench/$$name && .bench/$$name/bin/python -m pip install \
+	--quiet --disable-pip-version-check --requirement benchmarks/$$name.txt || exit 1; done
 	@touch $@

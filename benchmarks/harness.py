@@ -38,8 +38,8 @@ class Contestant:
         Name in the table.
     call : str
         ``file:function`` in the folder of contestants.
-    python : {"own", "before", "rivals", "system"}
-        Interpreter: this one, this one with the package as it was before, the rivals' environment, the system's.
+    python : {"own", "before", "rivals", "cedar", "system"}
+        Interpreter: this one, this one with the package of before, one of the environments of rivals, the system's.
     options : dict
         Keywords of the function.
     first : bool
@@ -205,8 +205,8 @@ def interpreter(python: str, root: Path, cache: Path) -> tuple[list[str], dict[s
         if not (cache / "before" / "starcal_uq").is_dir():
             return "the version before is not in this repository's history"
         return [sys.executable], {"PYTHONPATH": str(cache / "before")}
-    if python == "rivals":
-        path = cache / "venv" / "bin" / "python"
+    if python in ("rivals", "cedar"):
+        path = cache / python / "bin" / "python"
         return ([str(path)], {}) if path.exists() else "`make bench-rivals` has not been run"
     path = Path("/usr/bin/python3")
     # mrcal keeps arrays on the stack: 10,000 frames need more of it than the usual 8 MB.

@@ -449,7 +449,7 @@ def commands(ours: str, before: str) -> list[Row]:
             what="Calibration, by number of frames",
             contestants=tuple(
                 Contestant(f"{ours}, {n:,} frames", "ours:calibrate", options={"n_frames": n})
-                for n in (1000, 3000, 10_000, 30_000, 100_000)
+                for n in (1000, 10_000, 100_000, 1_000_000)
             ),
             repeats=3,
             large=True,
@@ -516,6 +516,7 @@ def commands(ours: str, before: str) -> list[Row]:
             contestants=(
                 Contestant(ours, "ours:centroids", options=images),
                 Contestant(before, "ours:centroids", "before", images),
+                Contestant("cedar-solve get_centroids", "images_cedar:centroids", "cedar", images),
                 Contestant("tetra3rs extract_centroids", "images_tetra3rs:centroids", "rivals", images),
             ),
             same=counted("stars found"),
@@ -530,6 +531,7 @@ def commands(ours: str, before: str) -> list[Row]:
             contestants=(
                 Contestant(ours, "ours:identify", options=identified),
                 Contestant(before, "ours:identify", "before", identified),
+                Contestant("cedar-solve solve_from_centroids", "images_cedar:identify", "cedar", identified),
                 Contestant("tetra3rs solve_from_centroids", "images_tetra3rs:identify", "rivals", identified),
             ),
             same=counted("frames identified"),

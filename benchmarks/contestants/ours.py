@@ -19,7 +19,10 @@ Result = dict[str, Any]
 
 
 def _data(folder: Path) -> tuple[Any, Any]:
-    return sc.load_observations(folder / "stars.parquet"), sc.Camera.load(folder / "camera.toml")
+    camera = sc.Camera.load(folder / "camera.toml")
+    if (folder / "frames").is_dir():
+        return sc.observations.open_partitions(folder / "frames"), camera
+    return sc.load_observations(folder / "stars.parquet"), camera
 
 
 def calibrate(folder: Path, **options: Any) -> Callable[[], Result]:
@@ -66,8 +69,8 @@ def propagate(folder: Path) -> Callable[[], Result]:
     post = sc.sample(obs, sc.calibrate(obs, camera), seed=0)
 
     def run() -> Result:
-        error = sc.propagate(post, obs, seed=0)
-        return {"text": error.text()}
+        sc.propagate(post, obs, seed=0)
+        return {}
 
     return run
 
@@ -79,7 +82,8 @@ def diagnose(folder: Path) -> Callable[[], Result]:
     post = sc.sample(obs, cal, seed=0)
 
     def run() -> Result:
-        return {"text": sc.diagnose(obs, cal, post).text()}
+        sc.diagnose(obs, cal, post)
+        return {}
 
     return run
 
