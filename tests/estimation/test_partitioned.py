@@ -17,6 +17,7 @@ from starcal_uq.core.errors import CalibrationError, ObservationError, RepeatedF
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.observations.partitions import PartitionedObservations
+from starcal_uq.presentation.report.words import data_sentence
 from tests.helpers.outside import campaign
 
 
@@ -140,7 +141,7 @@ def test_richer_models_are_fitted_to_all_stars(small, tmp_path: Path) -> None:
     assert bent is not None and bent.level.name == "WARN" and "'brown_tangential'" in bent.sentence
 
 
-def test_partitioned_run_is_sampled_diagnosed_and_reported(small, tmp_path: Path) -> None:
+def test_partitioned_run_is_sampled_and_judged(small, tmp_path: Path) -> None:
     _, camera, parts = small
     run = sc.Run(tmp_path / "run")
     cal = run.calibrate(parts, camera)
@@ -149,6 +150,8 @@ def test_partitioned_run_is_sampled_diagnosed_and_reported(small, tmp_path: Path
     np.testing.assert_array_equal(again.calibration.partitions.chi2, cal.partitions.chi2)
     assert again.observations.n_frames == 90
     sc.sample(parts, cal, seed=1, n_steps=60)
+    words = data_sentence(again.results).replace("\u202f", " ").replace("\u00a0", " ")
+    assert "1 350 stars in 90 frames of 4 files, of which a sample of 90 frames" in words
     checks = {check.name: check for check in again.verdict.checks}
     assert checks["Coverage of the field"].value.endswith("90 frames")
     with pytest.raises(CalibrationError, match="other observations"):
