@@ -17,9 +17,12 @@ if TYPE_CHECKING:
 
 # From this correlation on a pair counts as coupled, as in `Coupling.pairs`.
 COUPLED = 0.5
-# An axis matters where it changes what a pair's coupling costs in sigma by this factor, and by more than seeds do.
+# An axis matters where it changes what a pair's coupling costs in sigma by this factor, and by more than chance does.
 MATTERS = 1.25
-_BEYOND_SEEDS = 2.0
+# Probability with which chance alone passes for a change.
+_FALSE_ALARM = 1e-3
+# A median's standard error over a mean's: of normal numbers, and of the evenly spread ones of a hypercube.
+_MEDIAN, _EVEN = 1.25, 1.75
 # A parameter takes part in a direction when its share of the direction's length exceeds this (as in `Coupling`).
 _PART = 0.25
 # Up to this variance a direction is that of uncoupled parameters.
@@ -44,9 +47,9 @@ class Curve:
         Median over the other axes, least and most over them.
     change : float
         Largest less smallest value along the axis, the median of it over the other axes.
-    seeds : float
-        Range over seeds at a place, the median over all places, 0 with one seed; for a Latin hypercube, two standard
-        errors of a median.
+    chance : float
+        Change that other seeds (in a Latin hypercube, the other drawn axes) make less than once in a thousand times; 0
+        with one seed.
     """
 
     axis: str
@@ -55,12 +58,7 @@ class Curve:
     low: FloatArray
     high: FloatArray
     change: float
-    seeds: float
-
-    @property
-    def beyond_seeds(self) -> bool:
-        """Whether the change is more than what other seeds make of it."""
-        return self.change > _BEYOND_SEEDS * self.seeds
+    chance: float
 
     @property
     def most(self) -> int:
@@ -154,8 +152,8 @@ class Pair:
 
 
 def matters(cost: Curve) -> bool:
-    """Whether an axis changes the logarithm of a sigma by enough, and by more than seeds do."""
-    return cost.change > np.log(MATTERS) and cost.beyond_seeds
+    """Whether an axis changes the logarithm of a sigma by enough, and by more than chance does."""
+    return cost.change > max(float(np.log(MATTERS)), cost.chance)
 
 
 @dataclass(frozen=True)
@@ -276,7 +274,7 @@ class Sweep:
             np.nanmin(lines, axis=1),
             np.nanmax(lines, axis=1),
             float(np.median(np.nanmax(lines, axis=0) - np.nanmin(lines, axis=0))),
-            self._chance(numbers, pooled) if self.drawn else self.seeds(numbers),
+            self._chance(numbers, pooled, len(lines)),
         )
 
     def seeds(self, numbers: FloatArray) -> float:
@@ -284,14 +282,20 @@ class Sweep:
         spread = self.over(numbers, "high") - self.over(numbers, "low")
         return float(np.nanmedian(spread)) if np.isfinite(spread).any() else 0.0
 
-    def _chance(self, numbers: FloatArray, pooled: Sequence[str]) -> float:
-        """Two standard errors of a part's median: what the other drawn axes make of it."""
+    def _chance(self, numbers: FloatArray, pooled: Sequence[str], n_values: int) -> float:
+        """Range of medians at so many places that chance exceeds once in a thousand times; Bonferroni over pairs."""
+        from scipy.special import stdtrit
 
         n = self.over(numbers, "count", pooled)
-        variance = self.over(numbers**2, "mean", pooled) - self.over(numbers, "mean", pooled) ** 2
-        # A median has 1.25 times the standard error of a mean.
-        error = 2.5 * np.sqrt(np.maximum(variance, 0.0) / n)
-        return float(np.nanmedian(error)) if np.isfinite(error).any() else 0.0
+        scatter = self.over(numbers**2, "mean", pooled) - self.over(numbers, "mean", pooled) ** 2
+        repeated = n >= 2.0
+        if not repeated.any():
+            return 0.0
+        variance = np.maximum(scatter, 0.0)[repeated] / (n[repeated] - 1.0)
+        factor = _EVEN if pooled or self.drawn else np.where(n[repeated] > 2.0, _MEDIAN, 1.0)
+        dof = float(np.sum(n[repeated] - 1.0))
+        quantile = float(stdtrit(dof, 1.0 - _FALSE_ALARM / (n_values * (n_values - 1))))
+        return float(np.sqrt(2.0 * np.mean(factor**2 * variance))) * quantile
 
     def curves(self, numbers: FloatArray) -> tuple[Curve, ...]:
         """`along` every axis that has it."""
