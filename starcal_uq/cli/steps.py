@@ -119,9 +119,9 @@ def simulate_command(
 ) -> None:
     """Simulate identified stars with the embedded catalogue; directions are written as the sensor saw them."""
     if partition_frames is None:
-        ensure_new(out, force)
         if not (scheduler is None and workers is None):
             raise typer.BadParameter("--scheduler and --workers make a folder: give --partition-frames as well.")
+        ensure_new(out, force)
     elif images is not None:
         raise typer.BadParameter("--images belongs to one table: leave out --partition-frames.")
     if sensor is not None and images is None:

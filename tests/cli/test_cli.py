@@ -276,3 +276,20 @@ def test_declared_directions_and_renamed_columns(cli, inputs):
     )
     assert status == 0
     assert "warning" not in err
+
+
+def test_folder_of_partitions_from_simulation_to_posterior(cli, inputs):
+    made = ("simulate", inputs / "camera.toml", "-o", "frames", "--frames", "50", "--min-stars", "5", "--max-mag", "7")
+    status, out, err = cli(*made, "--partition-frames", "20", "--workers", "0")
+    assert (status, out.split(" stars ")[1]) == (0, "in 50 frames, 3 files: frames\n"), err
+    status, out, err = cli("calibrate", "frames", inputs / "camera.toml", "-o", "run", "--workers", "0")
+    assert status == 0 and "in 50 frames" in out, err
+    assert cli("sample", "run", *SMALL)[0] in (0, 1)
+    for words, arguments in (
+        ("give --partition-frames", (*made, "--workers", "2", "--force")),
+        ("leave them out", ("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "no", "--workers", "2")),
+        ("cannot be screened", ("calibrate", "frames", inputs / "camera.toml", "-o", "no", "--screen")),
+        ("other settings", (*made, "--partition-frames", "20", "--seed", "9")),
+    ):
+        status, _, err = cli(*arguments)
+        assert status == 2 and words in err, err
