@@ -46,7 +46,7 @@ def plot_convergence(cal: Calibration, truth: Camera | None = None) -> Figure:
             _mark_stages(ax, starts, len(values))
         upper.plot(iteration, values[:, i] * factor, color=style.BLUE, marker="o", markersize=3.2, linewidth=1.2)
         upper.axhline(reference[i] * factor, color=style.VERMILLION, linewidth=1.0, dashes=(4, 2))
-        upper.set_title(f"{parameter.latex} [{unit}]", fontsize=style.TITLE_SIZE, color=style.INK, pad=16)
+        upper.set_title(f"{parameter.latex} [{unit}]", fontsize=style.TITLE_SIZE, color=style.INK, pad=16, y=1.0)
         upper.ticklabel_format(axis="y", useOffset=False, style="plain")
         error = (values[:, i] - reference[i]) / cal.sigmas[i]
         lower.axhspan(-1.0, 1.0, color=style.GREEN, alpha=0.2, linewidth=0)

@@ -57,7 +57,7 @@ def plot_corner(post: Posterior, cal: Calibration | None = None, truth: Camera |
             ax = style.dress(figure.add_subplot(grid[row, column]))
             if row == column:
                 histogram(ax, columns[row], ends[row], gaussian, row, marks[row])
-                ax.set_title(scales[row].title, fontsize=style.TICK_SIZE, color=style.INK, pad=5)
+                ax.set_title(scales[row].title, fontsize=style.TICK_SIZE, color=style.INK, pad=5, y=1.0)
             else:
                 _density(ax, columns[column], columns[row])
                 if gaussian is not None:
@@ -193,7 +193,7 @@ def plot_prior_posterior(post: Posterior, truth: Camera | None = None) -> Figure
             color=style.BLUE,
             linewidth=1.5,
         )
-        upper.set_title(parameter.latex, fontsize=style.TITLE_SIZE, color=style.INK, pad=5)
+        upper.set_title(parameter.latex, fontsize=style.TITLE_SIZE, color=style.INK, pad=5, y=1.0)
         upper.set_xlabel(_unit(parameter.scaled_unit), fontsize=style.TICK_SIZE, color=style.INK)
         sparse(upper, y=False)
         lower = style.dress(figure.add_subplot(grid[1, i]))

@@ -111,6 +111,8 @@ def new_axes(width_in: float, height_in: float, margins_in: tuple[float, float, 
 
 def dress(ax: Axes, *, grid: bool = False) -> Axes:
     """Quiet spines, small ticks, no offsets on the tick labels."""
+    # A title whose height is given is not put above all tick labels, each of them measured, when the figure is drawn.
+    ax.set_title("", y=1.0)
     ax.tick_params(labelsize=TICK_SIZE, colors=INK, color=GREY, length=3.0, width=0.7)
     for side, spine in ax.spines.items():
         spine.set_color(GREY)
@@ -125,7 +127,6 @@ def dress(ax: Axes, *, grid: bool = False) -> Axes:
 def label(ax: Axes, title: str = "", x: str = "", y: str = "", *, pad: float = 7.0) -> None:
     """Title, `pad` points above the panel, and axis labels in the common sizes."""
     if title:
-        # A height that is given is not searched for among all tick labels.
         ax.set_title(title, fontsize=TITLE_SIZE, color=INK, loc="left", pad=pad, y=1.0)
     if x:
         ax.set_xlabel(x, fontsize=LABEL_SIZE, color=INK)
