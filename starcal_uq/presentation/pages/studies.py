@@ -63,7 +63,11 @@ _CAPTIONS = {
         "Sigmas and the price of coupling",
         "Full lines: all parameters unknown. Dashed: all others known. The gap is the price of coupling. {band}",
     ),
-    "needed": ("What a target takes", "{band}"),
+    "needed": (
+        "What a target takes",
+        "The error that differs from frame to frame, 1 sigma per axis across the boresight, and, where there is a target, "
+        "the frames that it takes. {band}",
+    ),
     "simpler": (
         "Would a simpler model do?",
         "Frame-dependent attitude error across the boresight that a simpler distortion model would leave, beside that "
@@ -116,7 +120,7 @@ def study_figures(study: Study) -> dict[str, bytes]:
         "inflation": plot_inflation(study),
         "needed": plot_needed(study),
     }
-    if "simpler" in study.data.dims and np.isfinite(study.data["model_bias_arcsec"].values).any():
+    if "simpler" in study.data.dims and np.any(np.nan_to_num(study.data["model_bias_arcsec"].values) > 0.0):
         drawn["simpler"] = plot_simpler(study)
     if "covered_95" in study.data:
         drawn["coverage"] = plot_coverage(study)
