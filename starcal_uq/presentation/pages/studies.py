@@ -65,8 +65,8 @@ _CAPTIONS = {
     ),
     "needed": (
         "What a target takes",
-        "The error that differs from frame to frame, 1 sigma per axis across the boresight, and, where there is a target, "
-        "the frames that it takes. {band}",
+        "The error that differs from frame to frame, 1 sigma per axis across the boresight, and, where there is a "
+        "target, the frames that it takes. {band}",
     ),
     "simpler": (
         "Would a simpler model do?",
