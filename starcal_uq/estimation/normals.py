@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.attitude.rotations import quaternion_to_rotation
+from starcal_uq.attitude.rotations import exp_rotation, quaternion_to_rotation
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.star_errors import StarSums, add_by_star
+from starcal_uq.estimation.sums import ATTITUDE_STEPS, ATTITUDE_TOLERANCE_RAD, frame_normals
+from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
@@ -76,28 +78,23 @@ class FrameNormals:
     @classmethod
     def around(cls, obs: Observations, model: str, theta: FloatArray, start: FloatArray) -> FrameNormals:
         """Normal equations of a distortion model at theta (p,), attitudes searched from `start` (K, 3, 3)."""
-        likelihood = MarginalLikelihood(obs, model)
-        matrices, slopes, squares, volumes, rotations = [], [], [], [], []
-        for first, last in likelihood.frames.parts(_STARS_AT_ONCE):
-            part = MarginalLikelihood(likelihood.frames.part(first, last), likelihood.model_name)
-            state, _ = part.profile(theta, start[first:last])
-            h = part.project_out(state, part.derivatives(theta, state))
-            matrices.append(np.moveaxis(part.frames.sum(np.einsum("axn,bxn->abn", h, h)), 2, 0))
-            slopes.append(part.frames.sum(np.sum(h * state.e, axis=1)).T)
-            squares.append(part.frames.sum(np.sum(state.e**2, axis=0)))
-            volumes.append(state.log_determinant)
-            rotations.append(state.rotations)
-        matrix = np.concatenate(matrices)
+        frames = StarFrames.from_observations(obs)
+        for _ in range(ATTITUDE_STEPS):
+            gram, shift, log_determinant = frame_normals(frames, model, theta, start)
+            if not np.max(np.abs(shift)) >= ATTITUDE_TOLERANCE_RAD:
+                break
+            start = exp_rotation(shift.T) @ start
+        matrix = gram[:, 1:, 1:]
         scale = 1.0 / np.sqrt(np.einsum("kaa->a", matrix))
         return cls(
             theta=theta,
             scale=scale,
             matrices=matrix * np.outer(scale, scale),
-            slopes=np.concatenate(slopes) * scale,
-            squares=np.concatenate(squares),
-            log_determinant=np.concatenate(volumes),
-            rotations=np.concatenate(rotations),
-            dof=2 * likelihood.frames.sizes - 3,
+            slopes=gram[:, 0, 1:] * scale,
+            squares=gram[:, 0, 0],
+            log_determinant=log_determinant,
+            rotations=start,
+            dof=2 * frames.sizes - 3,
         )
 
     def clustered(self) -> tuple[FloatArray, FloatArray, FloatArray]:

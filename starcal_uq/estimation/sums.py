@@ -29,6 +29,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starcal_uq.attitude.rotations import exp_rotation
+from starcal_uq.camera.kernels import Kernel
 from starcal_uq.camera.projection import forward_kernel, forward_root
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation import loops
@@ -137,7 +138,7 @@ class _Buffers:
 
     def __init__(self, p: int, n: int) -> None:
         self._columns = np.empty((4 + p) * 2 * n)
-        self._products = np.empty((3 * (p + 3)) * n)
+        self._products = np.empty((4 + p) * (5 + p) // 2 * n)
         self._one, self._two = np.empty((4 + p) * n), np.empty((4 + p) * n)
         self.p = p
 
@@ -145,12 +146,13 @@ class _Buffers:
         """A, e and H: (3 + 1 + p, 2, n)."""
         return self._columns[: (4 + self.p) * 2 * n].reshape(4 + self.p, 2, n)
 
-    def products(self, columns: FloatArray) -> FloatArray:
-        """Products of the rows of A with themselves, e and H, over both axes: (6 + 3 (p + 1), n)."""
+    def products(self, columns: FloatArray, depth: int = 3) -> FloatArray:
+        """Products of the first rows (those of A) with themselves and the ones that follow, over both axes: (.., n)."""
         rows, _, n = columns.shape
-        out = self._products[: 3 * (rows - 1) * n].reshape(3 * (rows - 1), n)
+        total = depth * rows - depth * (depth - 1) // 2
+        out = self._products[: total * n].reshape(total, n)
         first = 0
-        for i in range(3):
+        for i in range(depth):
             count = rows - i
             one, two = (buffer[: count * n].reshape(count, n) for buffer in (self._one, self._two))
             np.multiply(columns[i:, 0], columns[i, 0], out=one)
@@ -238,13 +240,7 @@ def _frame_blocks(
     packed, mixed = np.empty((6, k)), np.empty((3, p + 1, k))
     for first, last in blocks:
         part = frames.part(first, last)
-        columns = buffers.columns(part.n_stars)
-        b = part.rotated(rotations[first:last])
-        flat = columns.reshape(2 * rows, -1)
-        kernel.into((theta, b, forward_root(model_name, theta, b)), (flat[6:8], flat[8:], flat[:6]))
-        np.subtract(part.pixel, columns[3], out=columns[3])
-        if part.weight is not None:
-            columns *= part.weight
+        columns = _filled(part, model_name, theta, rotations[first:last], buffers, kernel)
         if residuals is not None:
             residuals[:, int(starts[first]) : int(starts[last])] = columns[3]
         if first == 0:
@@ -257,6 +253,58 @@ def _frame_blocks(
     solved = np.einsum("ijk,jqk->iqk", inverse, mixed)
     gram -= np.tensordot(mixed, solved, axes=([0, 2], [0, 2]))
     return gram, solved[:, 0], -solved[:, 1:] - turn[:, :, None], inverse, np.log(determinant)
+
+
+def _filled(
+    part: StarFrames, model_name: str, theta: FloatArray, rotations: FloatArray, buffers: _Buffers, kernel: Kernel
+) -> FloatArray:
+    """A, e and H of one block (4 + p, 2, n), whitened, in its buffer."""
+    columns = buffers.columns(part.n_stars)
+    b = part.rotated(rotations)
+    flat = columns.reshape(2 * len(columns), -1)
+    kernel.into((theta, b, forward_root(model_name, theta, b)), (flat[6:8], flat[8:], flat[:6]))
+    np.subtract(part.pixel, columns[3], out=columns[3])
+    if part.weight is not None:
+        columns *= part.weight
+    return columns
+
+
+def frame_normals(
+    frames: StarFrames, model_name: str, theta: FloatArray, rotations: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Normal equations of every single frame, attitudes eliminated, in one pass.
+
+    Returns
+    -------
+    gram : (K, p + 1, p + 1) array
+        Products of e and H without what the frame's attitude can reproduce.
+    shift : (3, K) array
+        Rotation vectors to the best attitudes, rad.
+    log_determinant : (K,) array
+        log |A^T A|.
+    """
+    p, k = len(theta), frames.n_frames
+    rows = p + 4
+    blocks, starts = frames.parts(BLOCK_STARS), frames.starts
+    buffers = _Buffers(p, max(int(starts[last] - starts[first]) for first, last in blocks))
+    kernel = forward_kernel(model_name, "first")
+    sums, turn = np.empty((rows * (rows + 1) // 2, k)), np.zeros((3, p))
+    with np.errstate(all="ignore"):
+        for first, last in blocks:
+            part = frames.part(first, last)
+            columns = _filled(part, model_name, theta, rotations[first:last], buffers, kernel)
+            if first == 0:
+                turn = _common_turn(columns)
+            flat = columns.reshape(rows, -1)
+            flat[4:] -= turn.T @ flat[:3]
+            sums[:, first:last] = part.sum(buffers.products(columns, rows))
+        packed, mixed = _unpacked(sums[: 3 * (rows - 1)], rows)
+        inverse, determinant = inverse_symmetric(packed)
+        solved = np.einsum("ijk,jqk->iqk", inverse, mixed)
+        gram = np.empty((k, p + 1, p + 1))
+        i, j = np.triu_indices(p + 1)
+        gram[:, i, j] = gram[:, j, i] = (sums[3 * (rows - 1) :] - np.einsum("cqk,cqk->qk", mixed[:, i], solved[:, j])).T
+        return gram, solved[:, 0], np.log(determinant)
 
 
 def settled_sums(
