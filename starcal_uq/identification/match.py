@@ -11,6 +11,7 @@ parameters (phi, ln F, d, kappa) follow from damped least squares, the damping b
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from math import lgamma, log, pi
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -191,6 +192,7 @@ def match_frame(
 _WIDER, _SEEN = 1.5, 0.7
 
 
+@lru_cache(maxsize=1024)
 def _enough(
     n: int,
     in_field: int,

@@ -189,10 +189,9 @@ def _look_up(
     row, second, third = row[keep], second[keep], third[keep]
     candidates = np.column_stack([a[row], second, third])
     # A flat triangle has no handedness beyond the noise.
-    height = abs(float(np.linalg.det(b[[i, j, k]]))) / max(base, near, far)
-    if height > 2.0 * noise:
-        sign = np.sign(np.linalg.det(b[[i, j, k]]))
-        candidates = candidates[np.sign(_triple(pairs.directions, candidates)) == sign]
+    volume = float(np.linalg.det(b[[i, j, k]]))
+    if abs(volume) > 2.0 * noise * max(base, near, far):
+        candidates = candidates[np.sign(_triple(pairs.directions, candidates)) == np.sign(volume)]
     return candidates
 
 
