@@ -95,6 +95,11 @@ class StarPairs:
         inside = np.flatnonzero(np.abs(self.neighbour_angle[row] - angle_rad[question]) <= tolerance_rad)
         return question[inside], self.neighbour[row[inside]]
 
+    def ready(self) -> StarPairs:
+        """The same, with what is derived made now, so that no frame waits for it."""
+        _ = self.tree, self._steps
+        return self
+
     @cached_property
     def tree(self) -> cKDTree:
         """The pattern stars as a tree of `directions`."""

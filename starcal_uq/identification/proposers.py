@@ -41,7 +41,7 @@ def prepare_engine(
         return PlateSolver(stars, geometry, tolerance).hypotheses
     if engine != "pyramid":
         raise IdentificationError(f"there is no engine {engine!r}: choose {' or '.join(ENGINES)}.")
-    return partial(hypotheses, prepare_pairs(stars, geometry, tolerance, cache, cache_dir))
+    return partial(hypotheses, prepare_pairs(stars, geometry, tolerance, cache, cache_dir).ready())
 
 
 def prepare_pairs(
