@@ -247,6 +247,7 @@ def rows(quick: bool = False) -> list[Row]:
                     Target(f"{asked}{suffix}", rival, factor, of)
                     for asked, rival, factor in (
                         ("a quarter of SciPy's sparse bundle", "SciPy sparse bundle", 4.0),
+                        ("a quarter of SciPy's sparse bundle", "SciPy least_squares, sparse", 4.0),
                         ("a fifth of mrcal's time", "mrcal", 5.0),
                     )
                     for suffix, of in (("", None), (" (compiled path)", f"{ours}, compiled path"))
