@@ -21,6 +21,7 @@ import io
 import json
 import os
 import platform
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -593,9 +594,11 @@ def run_row(row: Row, repeats: int | None = None, tell: Callable[[str], None] = 
 
     runs = take_turns(row.contestants, repeats or row.repeats, start, tell)
     for run in runs:
-        for turn in run.turns.values():
-            if isinstance(turn.result, dict) and "draws" in turn.result:
-                turn.result["moments"] = moments(turn.result["draws"])
+        drawn = [turn.result for turn in run.turns.values() if "draws" in turn.result]
+        for result in drawn:
+            result["moments"] = moments(result["draws"])
+        for result in drawn[:1]:
+            shutil.rmtree(Path(result["draws"]).parent)
     return record(row, runs)
 
 

@@ -70,14 +70,15 @@ def numpyro(folder: Path, *, chains: int = 4, warmup: int = 200, draws: int = 50
         chain_method="sequential",
         progress_bar=False,
     )
-    kept = Path(tempfile.mkdtemp(prefix="starcal-bench-")) / "draws.npy"
+    kept = Path(tempfile.mkdtemp(prefix="starcal-bench-"))
     seeds = iter(range(10_000))
 
     def run() -> Result:
         seed = next(seeds)
+        path = kept / f"{seed}.npy"
         start = jnp.asarray(np.random.default_rng(seed).standard_normal((chains, 6)))
         sampler.run(jax.random.PRNGKey(seed), init_params=start, extra_fields=("num_steps",))
-        np.save(kept, exact.parameters(np.asarray(sampler.get_samples(group_by_chain=True))))
-        return {"draws": str(kept), "evaluations": int(np.sum(sampler.get_extra_fields()["num_steps"]))}
+        np.save(path, exact.parameters(np.asarray(sampler.get_samples(group_by_chain=True))))
+        return {"draws": str(path), "evaluations": int(np.sum(sampler.get_extra_fields()["num_steps"]))}
 
     return run

@@ -51,14 +51,16 @@ def sample(folder: Path, **options: Any) -> Callable[[], Result]:
     """Draws with all their checks."""
     obs, camera = _data(folder)
     cal = sc.calibrate(obs, camera)
-    kept = Path(tempfile.mkdtemp(prefix="starcal-bench-")) / "draws.npy"
+    kept = Path(tempfile.mkdtemp(prefix="starcal-bench-"))
     seeds = iter(range(10_000))
 
     def run() -> Result:
-        post = sc.sample(obs, cal, seed=next(seeds), **options)
+        seed = next(seeds)
+        post = sc.sample(obs, cal, seed=seed, **options)
         # (chains, draws, parameters)
-        np.save(kept, post.draws.reshape(post.n_ensembles, -1, post.draws.shape[-1]))
-        return {"draws": str(kept), "evaluations": post.diagnostics.n_evaluations}
+        path = kept / f"{seed}.npy"
+        np.save(path, post.draws.reshape(post.n_ensembles, -1, post.draws.shape[-1]))
+        return {"draws": str(path), "evaluations": post.diagnostics.n_evaluations}
 
     return run
 
@@ -92,7 +94,8 @@ def study(folder: Path, *, definition: str) -> Callable[[], Result]:
     """All cells of a coupling study, on all processors."""
     if not hasattr(sc, "study"):
         raise Missing("this version has no `study`")
-    path = Path(tempfile.mkdtemp(prefix="starcal-bench-")) / "study.toml"
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / "study.toml"
     path.write_text(definition, encoding="utf-8")
     return lambda: {"cells": int(sc.study(path).data.sizes["cell"])}
 

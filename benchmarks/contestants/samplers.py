@@ -18,16 +18,17 @@ def ensemble(folder: Path, *, move: str, walkers: int = 32, steps: int = 1500, b
     import emcee
 
     density = Likelihood(folder)
-    kept = Path(tempfile.mkdtemp(prefix="starcal-bench-")) / "draws.npy"
+    kept = Path(tempfile.mkdtemp(prefix="starcal-bench-"))
     seeds = iter(range(10_000))
 
     def run() -> Result:
-        rng = np.random.RandomState(next(seeds))
+        seed = next(seeds)
+        rng, path = np.random.RandomState(seed), kept / f"{seed}.npy"
         sampler = emcee.EnsembleSampler(walkers, 6, density, moves=getattr(emcee.moves, move)())
         start = emcee.State(rng.standard_normal((walkers, 6)), random_state=rng.get_state())
         sampler.run_mcmc(start, burn + steps, skip_initial_state_check=True)
         draws = density.parameters(sampler.get_chain(discard=burn))
-        np.save(kept, np.swapaxes(draws, 0, 1))
-        return {"draws": str(kept), "evaluations": walkers * (burn + steps)}
+        np.save(path, np.swapaxes(draws, 0, 1))
+        return {"draws": str(path), "evaluations": walkers * (burn + steps)}
 
     return run
