@@ -25,7 +25,6 @@ T = TypeVar("T")
 Numbered = list[tuple[int, T]]
 _WAIT_S = 0.2
 _THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
-_WITH_BLAS = {"numpy", "scipy.linalg", "scipy.sparse.linalg"}
 _shared: list[Callable[[int], Any]] = []
 # How many `one_thread` are under way.
 _limited = [0]
@@ -157,7 +156,7 @@ def _keep_running(
 
 @lru_cache(maxsize=1)
 def _pools(_n_loaded: int) -> Any:
-    """The libraries' pools of threads; looked up again when another module has brought one."""
+    """The libraries' pools of threads; looked up again when other modules were loaded, which may have brought one."""
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()
@@ -178,7 +177,7 @@ def one_thread() -> Iterator[None]:
     os.environ.update(dict.fromkeys(_THREAD_COUNTS, "1"))
     _limited[0] += 1
     try:
-        with _pools(len(sys.modules.keys() & _WITH_BLAS)).limit(limits=1, user_api="blas"):
+        with _pools(len(sys.modules)).limit(limits=1, user_api="blas"):
             yield
     finally:
         _limited[0] -= 1

@@ -113,6 +113,13 @@ EXAMPLES = {
         observed.directions(dataclasses.replace(s.obs, meta=meta), s.cal)
         for meta in ({"directions": "undeclared"}, {"directions": "apparent", "observer": "unknown"})
     ],
+    "diagnostics.verdict.observed.terms": lambda s: [
+        observed.terms(
+            dataclasses.replace(
+                s.cal, partitions=SimpleNamespace(richer=[SimpleNamespace(model="brown3", n_terms=1, gain=99.0)])
+            )
+        )
+    ],
     "diagnostics.verdict.observed.outliers": lambda s: [
         observed.outliers(s.obs, dataclasses.replace(s.cal, residuals_px=s.cal.residuals_px * 9.0))
     ],

@@ -183,10 +183,10 @@ def terms(cal: Calibration) -> Check | None:
     sentence = (
         f"No richer distortion model fits all stars better than chance lets it ({name!r} comes nearest)."
         if good
-        else f"All stars together ask for the terms of the distortion model {name!r}: calibrate with it."
+        else f"All stars together ask for the terms of the distortion model {name!r}: name it in CAMERA."
     )
     value, bound = f"p = {significant(p_value)}", f"p ≥ {PATTERN_P:g}"
-    remedy = "" if good else f'{CALIBRATE} with distortion = "{name}" in CAMERA'
+    remedy = "" if good else CALIBRATE
     return Check("Terms of the distortion", Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, remedy)
 
 
