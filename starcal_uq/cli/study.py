@@ -90,7 +90,8 @@ def _check_folder(out: Path, file: Path, force: bool) -> None:
 
 
 def _summary(found: sc.studies.Study, out: Path, page: Path | None) -> dict[str, object]:
-    from starcal_uq.presentation.words.studies import study_advice, study_answer, study_limits
+    from starcal_uq.presentation.words.studies import study_answer, study_limits
+    from starcal_uq.presentation.words.study_advice import study_advice
 
     numbers = found.ok.any()
     return {
@@ -110,7 +111,8 @@ def _summary(found: sc.studies.Study, out: Path, page: Path | None) -> dict[str,
 
 
 def _show(found: sc.studies.Study, page: Path | None) -> None:
-    from starcal_uq.presentation.words.studies import study_advice, study_answer, study_table
+    from starcal_uq.presentation.words.studies import study_answer, study_table
+    from starcal_uq.presentation.words.study_advice import study_advice
 
     table = study_table(found)
     if table is not None:

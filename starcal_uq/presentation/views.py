@@ -84,6 +84,7 @@ from starcal_uq.presentation.words import (
     planning,
     propagation,
     studies,
+    study_advice,
 )
 from starcal_uq.propagation.attitude_error import Agreement, AttitudeError
 from starcal_uq.propagation.coupling import Coupling
@@ -205,7 +206,7 @@ VIEWS: Mapping[type, View] = {
         "Study",
         studies.study_text,
         studies.study_table,
-        studies.study_notes,
+        study_advice.study_notes,
         correlation=plot_study_correlation,
         map=plot_study_map,
         maps=plot_study_maps,

@@ -13,7 +13,8 @@ from starcal_uq.core.display import view_of
 from starcal_uq.presentation.figures.style import figure_of, png_bytes
 from starcal_uq.presentation.pages.studies import render_study
 from starcal_uq.presentation.pages.write import write_page
-from starcal_uq.presentation.words.studies import study_advice, study_answer, study_limits, study_table, study_text
+from starcal_uq.presentation.words.studies import study_answer, study_limits, study_table, study_text
+from starcal_uq.presentation.words.study_advice import study_advice
 from starcal_uq.studies.result import Study
 from tests.helpers.studies import NAMES, made_study
 

@@ -9,41 +9,48 @@ import numpy as np
 
 from starcal_uq.camera.distortion import parameter_called
 from starcal_uq.core.constants import AXES
-from starcal_uq.core.formatting import count, fixed, percent, pretty_unit, significant
+from starcal_uq.core.formatting import percent, pretty_unit, significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.maths.intervals import binomial_interval
 from starcal_uq.presentation.figures import style
 from starcal_uq.presentation.figures.coupling import correlation_text, symbol
 from starcal_uq.presentation.figures.scales import round_levels, ticks_at_levels
-from starcal_uq.presentation.words.axes import axis_label, place, said, value_words
+from starcal_uq.presentation.figures.sweeps import (
+    MARKERS,
+    NAMED,
+    capital,
+    colour_of,
+    draw_bars,
+    draw_lines,
+    held_title,
+    legend,
+    logarithmic,
+    nothing,
+    numeric,
+    plain,
+    positions,
+    scale,
+    short,
+    some,
+    target_line,
+    ticks,
+    two_axes,
+)
+from starcal_uq.presentation.words.axes import axis_label, said, value_words
 from starcal_uq.presentation.words.studies import model_bias
 from starcal_uq.studies.findings import Lines, Sweep
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from numpy.typing import NDArray
 
     from starcal_uq.studies.result import Study
 
-_MOST_LINES = 5
 _MOST_PANELS = 3
 # A map of so many cells still shows their numbers.
 _MOST_CELLS = 80
 # Colours span at least this factor.
 _RELIEF = 2.0
-_PARAMETER_COLOURS = {
-    "x0": style.BLUE,
-    "y0": style.SKY,
-    "f": style.ORANGE,
-    "k1": style.PURPLE,
-    "k2": style.VERMILLION,
-    "k3": style.INK,
-    "p1": style.GREEN,
-    "p2": "#F0E442",
-}
-_NAMED = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.VERMILLION)
-_MARKERS = "osD^v"
 _CORRELATION_LEVELS = (-0.99, -0.97, -0.95, -0.9, -0.8, -0.5, 0.0, 0.5, 0.8, 0.9, 0.95, 0.97, 0.99)
 _CORRELATION_TICKS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99, 0.995, 0.999, 0.9999, 0.99999)
 # Variables that a map or a line may show: words, unit, and whether a small number is good news.
@@ -125,7 +132,7 @@ def plot_study_correlation(
         Values at which other axes are held, their middle ones by default.
     """
     sweep = study.sweep
-    along, by = _two_axes(sweep, along, by)
+    along, by = two_axes(sweep, along, by)
     chosen = [tuple(pair) for pair in pairs] if pairs is not None else _main_pairs(sweep)
     figure = style.new_figure(2.4 + 2.9 * len(chosen), 3.9)
     panels = figure.subplots(1, len(chosen), sharey=True, squeeze=False)[0]
@@ -134,16 +141,16 @@ def plot_study_correlation(
         r = _correlation(study, first, second)
         lines = sweep.lines(r, along, by, at)
         style.dress(ax, grid=True)
-        _draw_lines(ax, _sizes(lines))
+        draw_lines(ax, _sizes(lines))
         if "posterior_correlation" in study.data and second not in AXES:
             sampled = study.data["posterior_correlation"].sel(parameter=first, parameter_2=second).values
-            _draw_bars(ax, _sizes(sweep.lines(sampled, along, by, at)))
+            draw_bars(ax, _sizes(sweep.lines(sampled, along, by, at)))
         known = np.abs(np.stack([lines.median, lines.low, lines.high]))
         top = max(top, float(np.nanmax(known, initial=0.0)))
         style.label(ax, f"{symbol(first)} and {symbol(second)}{_sign_words(lines.median)}", axis_label(along))
     style.label(panels[0], "", "", "size of the correlation")
     _correlation_axis(panels[0], top)
-    _legend(figure, lines, sampled="posterior_correlation" in study.data)
+    legend(figure, lines, sampled="posterior_correlation" in study.data)
     return figure
 
 
@@ -229,21 +236,21 @@ def plot_study_map(
     ValueError
         For a study of fewer than two axes, or a name that it does not have.
     """
-    x, y = _two_axes(study.sweep, x, y, lines=False)
+    x, y = two_axes(study.sweep, x, y, lines=False)
     if y is None:
         raise ValueError("a map needs two swept axes.")
     numbers, text = numbers_of(study, variable, parameter, parameter_2)
     if ax is None:
         ax = style.new_axes(5.6, 4.2)
     lines = study.sweep.lines(numbers, x, y, at)
-    style.label(ax, _capital(text), axis_label(x), axis_label(y))
+    style.label(ax, capital(text), axis_label(x), axis_label(y))
     style.dress(ax)
     if not np.isfinite(lines.median).any():
-        _nothing(ax)
+        nothing(ax)
         return ax
     if (
-        _numeric(lines.values)
-        and _numeric(lines.by_values)
+        numeric(lines.values)
+        and numeric(lines.by_values)
         and min(lines.median.shape) >= 6
         and lines.median.size > _MOST_CELLS
     ):
@@ -262,8 +269,8 @@ def _cells(ax: Axes, lines: Lines, variable: str) -> None:
     for spine in ax.spines.values():
         spine.set_visible(False)
     ax.tick_params(length=0.0)
-    _ticks(ax.xaxis, lines.values, np.arange(n_x))
-    _ticks(ax.yaxis, lines.by_values, np.arange(n_y))
+    ticks(ax.xaxis, lines.values, np.arange(n_x))
+    ticks(ax.yaxis, lines.by_values, np.arange(n_y))
     ax.set_xticks(np.arange(1, n_x) - 0.5, minor=True)
     ax.set_yticks(np.arange(1, n_y) - 0.5, minor=True)
     ax.tick_params(which="minor", length=0.0)
@@ -273,7 +280,7 @@ def _cells(ax: Axes, lines: Lines, variable: str) -> None:
         if np.isnan(value):
             text, colour = "–", style.GREY
         else:
-            text = correlation_text(float(value)) if variable == "correlation" else _short(float(value))
+            text = correlation_text(float(value)) if variable == "correlation" else short(float(value))
             colour = "white" if np.isfinite(value) and dark(value) else style.INK
         ax.text(column, row, text, ha="center", va="center", fontsize=size, color=colour)
 
@@ -282,8 +289,8 @@ def _contours(ax: Axes, lines: Lines, variable: str) -> None:
     """Colours on true scales, with contours that carry their numbers."""
     x, y = (np.asarray(values, dtype=np.float64) for values in (lines.values, lines.by_values))
     z = np.ma.masked_invalid(lines.median)
-    _scale(ax.xaxis, lines.values)
-    _scale(ax.yaxis, lines.by_values)
+    scale(ax.xaxis, lines.values)
+    scale(ax.yaxis, lines.by_values)
     colours, norm, _ = _colours(lines.median, variable)
     levels, _ = round_levels(z.compressed())
     image = ax.pcolormesh(x, y, z, cmap=colours, norm=norm, shading="nearest" if z.mask.any() else "gouraud")
@@ -298,7 +305,7 @@ def _contours(ax: Axes, lines: Lines, variable: str) -> None:
         # Contours of little relief would be those of chance.
         shown = levels[1:-1][:: max(1, len(levels) // 6)] if high > 1.3 * low else levels[:0]
     if not len(shown):
-        words = " to ".join(correlation_text(v) if variable == "correlation" else _short(v) for v in (low, high))
+        words = " to ".join(correlation_text(v) if variable == "correlation" else short(v) for v in (low, high))
         ax.text(0.5, 0.5, words, transform=ax.transAxes, ha="center", color="white", fontsize=style.LABEL_SIZE)
         return
     from matplotlib.patheffects import withStroke
@@ -327,7 +334,7 @@ def _colours(z: FloatArray, variable: str) -> tuple[str, Any, Any]:
 def plot_study_maps(study: Study, x: str | None = None, y: str | None = None) -> Figure:
     """Four maps over two axes: the coupling that changes most, the largest inflation, and both attitude errors."""
     sweep = study.sweep
-    x, y = _two_axes(sweep, x, y, lines=False)
+    x, y = two_axes(sweep, x, y, lines=False)
     if y is None:
         raise ValueError("maps need two swept axes.")
     changing = max(sweep.coupled or sweep.pairs[:1], key=lambda pair: max((c.change for c in pair.costs), default=0.0))
@@ -338,7 +345,7 @@ def plot_study_maps(study: Study, x: str | None = None, y: str | None = None) ->
     plot_study_map(study, "variance_inflation", parameter=_most_inflated(study), x=x, y=y, ax=panels[1])
     plot_study_map(study, "frame_error_arcsec", x=x, y=y, ax=panels[2])
     plot_study_map(study, "common_rotation_arcsec", x=x, y=y, ax=panels[3])
-    _held_title(figure, sweep.held(x, y))
+    held_title(figure, sweep.held(x, y))
     return figure
 
 
@@ -366,10 +373,10 @@ def plot_weakest(
         Values at which other axes are held, their middle ones by default.
     """
     sweep = study.sweep
-    along, by = _two_axes(sweep, along, by, names=True)
+    along, by = two_axes(sweep, along, by, names=True)
     shares = np.asarray(study.data["weak_direction"].values, dtype=np.float64) ** 2
     variance = sweep.lines(study.data["weak_variance"].values, along, by, at)
-    rows = _some(len(variance.median), _MOST_PANELS)
+    rows = some(len(variance.median), _MOST_PANELS)
     figure = style.new_figure(2.2 + 2.9 * len(rows), 3.8)
     panels = figure.subplots(1, len(rows), sharey=True, squeeze=False)[0]
     places = np.arange(len(variance.values))
@@ -380,18 +387,18 @@ def plot_weakest(
         below = np.zeros(len(places))
         for name, share in stack.items():
             height = np.nan_to_num(share[row] / np.where(total[row] > 0.0, total[row], np.nan))
-            ax.bar(places, height, 0.78, bottom=below, color=_colour_of(name), edgecolor="white", linewidth=0.8)
+            ax.bar(places, height, 0.78, bottom=below, color=colour_of(name), edgecolor="white", linewidth=0.8)
             below = below + height
         for at_x, value in zip(places, variance.median[row], strict=True):
             words = "–" if np.isnan(value) else f"×{significant(float(value))}"
             ax.annotate(words, (at_x, 1.02), ha="center", va="bottom", fontsize=style.TICK_SIZE - 0.5, color=style.INK)
         ax.set_ylim(0.0, 1.12)
         ax.set_yticks([0.0, 0.25, 0.5, 0.75, 1.0], ["0", "25 %", "50 %", "75 %", "100 %"])
-        _ticks(ax.xaxis, variance.values, places)
-        title = _capital(said(by, variance.by_values[row])) if by is not None else ""
+        ticks(ax.xaxis, variance.values, places)
+        title = capital(said(by, variance.by_values[row])) if by is not None else ""
         style.label(ax, title, axis_label(along))
     style.label(panels[0], "", "", "share of the weakest direction")
-    handles = [style.key(symbol(name), _colour_of(name), linewidth=7.0) for name in stack]
+    handles = [style.key(symbol(name), colour_of(name), linewidth=7.0) for name in stack]
     style.legend_above(figure, handles)
     return figure
 
@@ -411,13 +418,13 @@ def plot_matrices(
         Values at which other axes are held, their middle ones by default.
     """
     sweep = study.sweep
-    along, by = _two_axes(sweep, along, by, names=True)
+    along, by = two_axes(sweep, along, by, names=True)
     names = study.parameter_names
     r = np.asarray(study.data["correlation"].values, dtype=np.float64)
     p = len(names)
     lines = [[sweep.lines(r[:, i, j], along, by, at) for j in range(p)] for i in range(p)]
     grid = np.array([[entry.median for entry in row] for row in lines])
-    columns, rows = _some(grid.shape[3], 5), _some(grid.shape[2], _MOST_PANELS)
+    columns, rows = some(grid.shape[3], 5), some(grid.shape[2], _MOST_PANELS)
     figure = style.new_figure(11.0, 0.9 + 1.9 * len(rows))
     panels = style.panels(figure, len(rows), len(columns), (0.95, 0.8, 0.58, 0.32), (0.12, 0.12))
     for row, at_row in enumerate(rows):
@@ -482,28 +489,28 @@ def plot_needed(
         Values at which other axes are held, their middle ones by default.
     """
     sweep = study.sweep
-    along, by = _two_axes(sweep, along, by)
+    along, by = two_axes(sweep, along, by)
     target = study.definition.target_arcsec if target_arcsec is None else target_arcsec
     n = 1 if target is None else 2
     figure = style.new_figure(5.8 * n, 4.0)
     panels = figure.subplots(1, n, squeeze=False)[0]
     lines = sweep.lines(sweep.frame_error, along, by, at)
     style.dress(panels[0], grid=True)
-    _draw_lines(panels[0], lines)
-    _logarithmic(panels[0], lines)
+    draw_lines(panels[0], lines)
+    logarithmic(panels[0], lines)
     if target is not None:
         low, high = panels[0].get_ylim()
         panels[0].set_ylim(min(low, float(target) / 1.5), max(high, float(target) * 1.5))
-        _plain(panels[0].yaxis)
+        plain(panels[0].yaxis)
     style.label(panels[0], "Error that differs from frame to frame", axis_label(along), "1 sigma per axis [arcsec]")
     if target is not None:
-        _target(panels[0], float(target), f"target {target:g} arcsec")
+        target_line(panels[0], float(target), f"target {target:g} arcsec")
         needed = sweep.lines(study.frames_for(float(target)), along, by, at)
         style.dress(panels[1], grid=True)
-        _draw_lines(panels[1], needed)
-        _logarithmic(panels[1], needed)
+        draw_lines(panels[1], needed)
+        logarithmic(panels[1], needed)
         style.label(panels[1], f"Frames for {target:g} arcsec", axis_label(along), "frames")
-    _legend(figure, lines)
+    legend(figure, lines)
     return figure
 
 
@@ -524,7 +531,7 @@ def plot_inflation(
         Values at which other axes are held, their middle ones by default.
     """
     sweep = study.sweep
-    along, by = _two_axes(sweep, along, by)
+    along, by = two_axes(sweep, along, by)
     names = study.parameter_names
     columns = len(names) if len(names) <= 3 else -(-len(names) // 2)
     rows = -(-len(names) // columns)
@@ -535,14 +542,14 @@ def plot_inflation(
         numbers, text = numbers_of(study, "sigma", name)
         known, _ = numbers_of(study, "sigma_conditional", name)
         lines = sweep.lines(numbers, along, by, at)
-        _draw_lines(ax, lines)
+        draw_lines(ax, lines)
         conditional = sweep.lines(known, along, by, at)
-        _draw_lines(ax, conditional, dashed=True)
-        _logarithmic(ax, lines, conditional)
-        style.label(ax, _capital(text), axis_label(along))
+        draw_lines(ax, conditional, dashed=True)
+        logarithmic(ax, lines, conditional)
+        style.label(ax, capital(text), axis_label(along))
     for ax in panels[len(names) :]:
         ax.set_visible(False)
-    _legend(figure, lines, dashed="all others known")
+    legend(figure, lines, dashed="all others known")
     return figure
 
 
@@ -574,25 +581,25 @@ def plot_simpler(
     if not shown:
         raise ValueError("no simpler distortion model was tried in this study.")
     sweep = study.sweep
-    along, by = _two_axes(sweep, along, by)
+    along, by = two_axes(sweep, along, by)
     error = sweep.lines(sweep.frame_error, along, by, at)
     curves = [sweep.lines(bias[:, i], along, by, at) for i in shown]
-    rows = _some(len(error.median), _MOST_PANELS)
+    rows = some(len(error.median), _MOST_PANELS)
     figure = style.new_figure(2.2 + 2.9 * len(rows), 3.9)
     panels = figure.subplots(1, len(rows), sharey=True, squeeze=False)[0]
-    x = _positions(error.values)
+    x = positions(error.values)
     for ax, row in zip(panels, rows, strict=True):
         style.dress(ax, grid=True)
         ax.fill_between(x, error.low[row], error.high[row], color=style.GREY, alpha=0.25, linewidth=0)
         ax.plot(x, error.median[row], color=style.GREY, linewidth=2.2)
         for number, curve in enumerate(curves):
-            ax.plot(x, curve.median[row], color=_NAMED[number % 5], marker=_MARKERS[number % 5], markersize=4.5)
-        _scale(ax.xaxis, error.values)
-        style.label(ax, _capital(said(by, error.by_values[row])) if by is not None else "", axis_label(along))
-    _logarithmic(panels[0], error, *curves)
+            ax.plot(x, curve.median[row], color=NAMED[number % 5], marker=MARKERS[number % 5], markersize=4.5)
+        scale(ax.xaxis, error.values)
+        style.label(ax, capital(said(by, error.by_values[row])) if by is not None else "", axis_label(along))
+    logarithmic(panels[0], error, *curves)
     style.label(panels[0], "", "", "arcsec")
     keys = [
-        style.key(f"left by the model {models[i]}", _NAMED[n % 5], marker=_MARKERS[n % 5], markersize=4.5)
+        style.key(f"left by the model {models[i]}", NAMED[n % 5], marker=MARKERS[n % 5], markersize=4.5)
         for n, i in enumerate(shown)
     ]
     style.legend_above(figure, [style.key("error of the calibration", style.GREY, linewidth=2.2), *keys])
@@ -617,7 +624,7 @@ def plot_coverage(study: Study, *, along: str | None = None) -> Figure:
     if "covered_95" not in study.data:
         raise ValueError('coverage needs simulated cells: set mode = "simulate" in [study].')
     sweep = study.sweep
-    along, _ = _two_axes(sweep, along, None)
+    along, _ = two_axes(sweep, along, None)
     covered = np.asarray(study.data["covered_95"].values, dtype=np.float64)
     others = [axis for axis in sweep.axes if axis != along]
     figure = style.new_figure(8.6, 4.0)
@@ -631,232 +638,16 @@ def plot_coverage(study: Study, *, along: str | None = None) -> Figure:
         for at_x, part, size in zip(places + shift, rate, n, strict=True):
             if np.isfinite(part):
                 low, high = binomial_interval(round(part * size), int(size))
-                ax.vlines(at_x, low, high, color=_colour_of(name), linewidth=1.4)
-                ax.plot(at_x, part, marker="o", markersize=6, color=_colour_of(name))
+                ax.vlines(at_x, low, high, color=colour_of(name), linewidth=1.4)
+                ax.plot(at_x, part, marker="o", markersize=6, color=colour_of(name))
                 lowest = min(lowest, low)
     ax.axhline(0.95, color=style.INK, linewidth=0.9)
-    _ticks(ax.xaxis, sweep.values[along], places)
+    ticks(ax.xaxis, sweep.values[along], places)
     ax.set_ylim(max(0.0, lowest - 0.06), 1.015)
     ax.yaxis.set_major_formatter(lambda value, _: percent(value))
     style.label(ax, "", axis_label(along), "95 % intervals that hold the truth")
     style.legend_above(
         figure,
-        [style.key(symbol(name), _colour_of(name), marker="o", markersize=6) for name in study.parameter_names],
+        [style.key(symbol(name), colour_of(name), marker="o", markersize=6) for name in study.parameter_names],
     )
     return figure
-
-
-def _two_axes(
-    sweep: Sweep, along: str | None, by: str | None, *, names: bool = False, lines: bool = True
-) -> tuple[str, str | None]:
-    """The axis to draw along, and the one that tells lines apart: as named, or the first that are left.
-
-    Lines run along numbers, and names tell them apart; with `names` it is the other way round. With `lines`, axes of a
-    Latin hypercube tell no lines apart.
-    """
-    if not sweep.axes:
-        raise ValueError("nothing was swept: give [sweep] an axis with more than one value.")
-    if not sweep.ok.any():
-        raise ValueError("no cell of the study has numbers: see the status of its cells.")
-    named = [axis for axis in (along, by) if axis is not None]
-    for axis in named:
-        if axis not in sweep.axes:
-            raise ValueError(f"{axis!r} was not swept: use one of {', '.join(sweep.axes)}.")
-    free = [axis for axis in sweep.axes if axis not in named]
-    if along is None:
-        along = next((axis for axis in free if _numeric(sweep.values[axis]) is not names), free[0])
-        free.remove(along)
-    # What was drawn and not laid out makes no lines: the other drawn axes are in the band.
-    free = [axis for axis in free if not (axis in sweep.drawn and lines)]
-    if by is None and free:
-        by = next((axis for axis in free if _numeric(sweep.values[axis]) is names), free[0])
-    return along, by
-
-
-def _some(n: int, most: int) -> list[int]:
-    """Up to `most` of n indices, both ends among them."""
-    return sorted({round(i) for i in np.linspace(0, n - 1, min(n, most))})
-
-
-def _numeric(values: Sequence[Any]) -> bool:
-    return not any(isinstance(value, str) for value in values)
-
-
-def _geometric(values: Sequence[Any]) -> bool:
-    """Whether values are spaced by ratios rather than by differences."""
-    if not _numeric(values) or len(values) < 3:
-        return False
-    x = np.asarray(values, dtype=np.float64)
-    if np.any(x <= 0.0) or x[-1] < 4.0 * x[0]:
-        return False
-    steps, ratios = np.diff(x), np.diff(np.log(x))
-    return bool(np.std(ratios) / np.mean(ratios) < np.std(steps) / np.mean(steps))
-
-
-def _positions(values: Sequence[Any]) -> FloatArray:
-    """Where values stand on an axis: names side by side, numbers where they are."""
-    return np.asarray(values, dtype=np.float64) if _numeric(values) else np.arange(len(values), dtype=np.float64)
-
-
-def _scale(axis: Any, values: Sequence[Any]) -> None:
-    """Scale and ticks of an axis of the sweep."""
-    if _geometric(values):
-        axis._set_axes_scale("log")
-    _ticks(axis, values, _positions(values))
-    axis.set_minor_locator(_no_ticks())
-
-
-def _no_ticks() -> Any:
-    from matplotlib.ticker import NullLocator
-
-    return NullLocator()
-
-
-def _ticks(axis: Any, values: Sequence[Any], places: NDArray[Any]) -> None:
-    """Ticks at the swept values, every second or third where they are many; long names stand aslant."""
-    shown = _some(len(values), 8)
-    words = [value_words(values[i]) for i in shown]
-    axis.set_ticks(np.asarray(places)[shown], words)
-    if axis.axis_name == "x" and not _numeric(values) and max(map(len, words)) * len(words) > 26:
-        for tick in axis.get_ticklabels():
-            tick.set(rotation=28, ha="right", rotation_mode="anchor")
-
-
-def _line_colours(lines: Lines) -> dict[int, Any]:
-    """The lines to draw, by their number, each with its colour: in order of the second axis' values."""
-    rows = _some(len(lines.median), _MOST_LINES)
-    if lines.by is None:
-        return {rows[0]: style.BLUE}
-    if not _numeric(lines.by_values):
-        return {row: _NAMED[i % len(_NAMED)] for i, row in enumerate(rows)}
-    import matplotlib
-
-    ramp = matplotlib.colormaps["viridis"]
-    return {row: ramp(0.86 * i / max(1, len(rows) - 1)) for i, row in enumerate(rows)}
-
-
-def _draw_lines(ax: Axes, lines: Lines, *, dashed: bool = False) -> None:
-    """A line with its band over seeds for some values of the second axis."""
-    x = _positions(lines.values)
-    for number, (row, colour) in enumerate(_line_colours(lines).items()):
-        good = np.isfinite(lines.median[row])
-        if dashed:
-            ax.plot(x[good], lines.median[row][good], color=colour, linewidth=1.2, dashes=(4, 2))
-            continue
-        ax.fill_between(x[good], lines.low[row][good], lines.high[row][good], color=colour, alpha=0.2, linewidth=0)
-        marker = _MARKERS[number % len(_MARKERS)]
-        ax.plot(x[good], lines.median[row][good], color=colour, marker=marker, markersize=4.5, linewidth=1.5)
-    _scale(ax.xaxis, lines.values)
-
-
-def _draw_bars(ax: Axes, lines: Lines) -> None:
-    """What the posterior says beside the line: median and range over seeds, those of other lines a little aside."""
-    from matplotlib.transforms import ScaledTranslation
-
-    x = _positions(lines.values)
-    colours = _line_colours(lines)
-    for number, (row, colour) in enumerate(colours.items()):
-        middle = lines.median[row]
-        good = np.isfinite(middle)
-        bars = np.stack([middle - lines.low[row], lines.high[row] - middle])[:, good]
-        aside = ScaledTranslation(0.09 * (number - 0.5 * (len(colours) - 1)), 0.0, style.figure_of(ax).dpi_scale_trans)
-        ax.errorbar(
-            *(x[good], middle[good]),
-            yerr=np.abs(bars),
-            color=colour,
-            fmt="x",
-            markersize=6,
-            elinewidth=1.1,
-            capsize=3,
-            transform=ax.transData + aside,
-        )
-
-
-def _legend(figure: Figure, lines: Lines, *, sampled: bool = False, dashed: str = "") -> None:
-    """One legend above all panels: the values of the second axis, and what is not a plain line."""
-    keys = []
-    if lines.by is not None:
-        for number, (row, colour) in enumerate(_line_colours(lines).items()):
-            words = (
-                value_words(lines.by_values[row])
-                if number
-                else _capital(f"{axis_label(lines.by)}: {value_words(lines.by_values[row])}")
-            )
-            keys.append(style.key(words, colour, marker=_MARKERS[number % len(_MARKERS)], markersize=4.5))
-    if sampled:
-        keys.append(style.key("posterior, range over seeds", style.GREY, marker="x", linestyle="none"))
-    if dashed:
-        keys.append(style.key(dashed, style.GREY, dashes=(4, 2)))
-    if keys:
-        style.legend_above(figure, keys, columnspacing=1.4)
-    _held_title(figure, lines.held)
-
-
-def _held_title(figure: Figure, held: Mapping[str, Any]) -> None:
-    if held:
-        figure.suptitle(f"For {place(held)}", fontsize=style.LABEL_SIZE, color=style.GREY, x=0.01, ha="left")
-
-
-def _logarithmic(ax: Axes, *lines: Lines) -> None:
-    """A logarithmic axis in plain numbers over what is drawn, of at least a factor of two."""
-    values = np.concatenate([array.ravel() for entry in lines for array in (entry.median, entry.low, entry.high)])
-    values = values[np.isfinite(values) & (values > 0.0)]
-    if not len(values):
-        _nothing(ax)
-        return
-    low, high = float(values.min()) / 1.15, float(values.max()) * 1.15
-    wider = max(1.0, np.sqrt(2.25 * low / high))
-    ax.set_ylim(low / wider, high * wider)
-    ax.set_yscale("log")
-    _plain(ax.yaxis)
-
-
-def _plain(axis: Any) -> None:
-    """Plain numbers on a logarithmic axis, at 1, 2 and 5 where it spans little."""
-    from matplotlib.ticker import FuncFormatter, LogLocator
-
-    low, high = axis.get_view_interval()
-    span = high / low
-    subs = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0) if span < 6.0 else (1.0, 2.0, 5.0) if span < 150.0 else (1.0,)
-    axis.set_major_locator(LogLocator(subs=subs, numticks=20))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: count(int(value)) if value >= 10.0 else f"{value:.6g}"))
-    axis.set_minor_locator(_no_ticks())
-
-
-def _target(ax: Axes, value: float, words: str) -> None:
-    ax.axhline(value, color=style.VERMILLION, linewidth=1.2, dashes=(5, 2))
-    ax.annotate(
-        words,
-        (0.02, value),
-        xycoords=("axes fraction", "data"),
-        xytext=(0, 4),
-        textcoords="offset points",
-        fontsize=style.TICK_SIZE,
-        color=style.VERMILLION,
-        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.8},
-    )
-
-
-def _nothing(ax: Axes) -> None:
-    ax.text(
-        0.5, 0.5, "no cell has this", transform=ax.transAxes, ha="center", color=style.GREY, fontsize=style.LABEL_SIZE
-    )
-
-
-def _short(value: float) -> str:
-    """At most three digits, no power of ten where plain zeros are few."""
-    return (
-        significant(value, 3)
-        if abs(value) < 100.0
-        else fixed(float(f"{value:.3g}"), 0)
-        if abs(value) < 1e6
-        else significant(value, 2)
-    )
-
-
-def _colour_of(name: str) -> str:
-    return _PARAMETER_COLOURS.get(name, style.GREY)
-
-
-def _capital(text: str) -> str:
-    return text[:1].upper() + text[1:]

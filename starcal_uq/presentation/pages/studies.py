@@ -27,13 +27,13 @@ from starcal_uq.presentation.html import embedded_image, template_environment
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.axes import axis_label, value_words
 from starcal_uq.presentation.words.studies import (
-    study_advice,
     study_answer,
     study_limits,
     study_table,
     study_text,
     summary_columns,
 )
+from starcal_uq.presentation.words.study_advice import study_advice
 from starcal_uq.studies.result import Study
 
 PAGE = "report.html"

@@ -25,17 +25,13 @@ if TYPE_CHECKING:
     from starcal_uq.studies.result import Study
 
 # Pairs that are told one by one.
-_TOLD = 4
+TOLD = 4
 # A parameter and the common rotation cannot be told apart from this correlation on.
 _SAME = 0.99
 # An error that changes by less than this factor along an axis hardly depends on it.
-_HARDLY = 1.1
+HARDLY = 1.1
 # What a lens and a catalogue are, and nobody chooses.
-_NATURE = ("distortion", "distortion_px", "direction_mas", "k1", "k2", "k3", "p1", "p2")
-# A price in sigma from which it pays to do something about a coupling.
-_DEAR = 2.0
-# A common rotation that differs by this factor over the sweep is worth a word.
-_MIND = 3.0
+NATURE = ("distortion", "distortion_px", "direction_mas", "k1", "k2", "k3", "p1", "p2")
 
 
 def study_text(study: Study) -> str:
@@ -46,17 +42,17 @@ def study_text(study: Study) -> str:
     if not sweep.coupled:
         return _uncoupled(sweep)
     pair = sweep.coupled[0]
-    text = f"{_capital(_names(pair))} are coupled most ({_range(pair)})."
+    text = f"{capital(_names(pair))} are coupled most ({_range(pair)})."
     if not sweep.axes:
         return text
     if "distortion" in sweep.axes:
         text = f"{text} {_price_of_models(study)}".strip()
     found = [(other, *other.decoupling()[0]) for other in sweep.coupled if other.decoupling()]
     if not found:
-        return f"{text} {_capital(_nothing_decouples(sweep))}."
+        return f"{text} {capital(_nothing_decouples(sweep))}."
     # What can be chosen comes before what a lens is.
-    other, size, cost = max(found, key=lambda entry: (entry[1].axis not in _NATURE, entry[2].change))
-    return f"{text} {_capital(_the(size.axis))} changes how {_dashed(other)} are coupled: {_ends(size, cost)}."
+    other, size, cost = max(found, key=lambda entry: (entry[1].axis not in NATURE, entry[2].change))
+    return f"{text} {capital(the(size.axis))} changes how {dashed(other)} are coupled: {_ends(size, cost)}."
 
 
 def study_answer(study: Study) -> list[str]:
@@ -84,7 +80,7 @@ def _names(pair: Pair) -> str:
     return f"{pair.names[0]} and {pair.names[1]}"
 
 
-def _dashed(pair: Pair) -> str:
+def dashed(pair: Pair) -> str:
     return f"{pair.names[0]}\N{EN DASH}{pair.names[1]}"
 
 
@@ -110,7 +106,7 @@ def _uncoupled(sweep: Sweep) -> str:
 def _couplings(sweep: Sweep) -> str:
     if not sweep.coupled:
         return _uncoupled(sweep)
-    told = [f"{_dashed(pair)} ({_range(pair).removeprefix('correlation ')})" for pair in sweep.coupled[:_TOLD]]
+    told = [f"{dashed(pair)} ({_range(pair).removeprefix('correlation ')})" for pair in sweep.coupled[:TOLD]]
     more = len(sweep.coupled) - len(told)
     rest = f"; {plural(more, 'more pair')} above {COUPLED:g} in size somewhere" if more > 0 else ""
     others = len(sweep.pairs) - len(sweep.coupled)
@@ -124,20 +120,20 @@ def _what_decouples(sweep: Sweep) -> list[str]:
         return []
     # Pairs of which the same is to be said share a sentence.
     told: dict[tuple[str, str], list[str]] = {}
-    for pair in sweep.coupled[:_TOLD]:
+    for pair in sweep.coupled[:TOLD]:
         for size, cost in pair.decoupling()[:1]:
-            told.setdefault((_capital(_the(size.axis)), _ends(size, cost)), []).append(_dashed(pair))
+            told.setdefault((capital(the(size.axis)), _ends(size, cost)), []).append(dashed(pair))
     parts = [f"{axis} changes how {join_words(pairs)} are coupled: {ends}." for (axis, ends), pairs in told.items()]
     helping = {size.axis for pair in sweep.coupled for size, _ in pair.decoupling()}
     idle = [axis for axis in sweep.axes if axis not in helping]
     if not helping:
-        parts.append(_capital(_nothing_decouples(sweep)) + ".")
+        parts.append(capital(_nothing_decouples(sweep)) + ".")
     elif idle:
         changes = [c for pair in sweep.coupled for c in pair.sizes if c.axis in idle]
-        names = join_words([_the(axis) for axis in idle])
+        names = join_words([the(axis) for axis in idle])
         do, them = ("does", "it") if len(idle) == 1 else ("do", "them")
         most = f": along {them} no correlation changes by more than {_change(changes)}" if changes else ""
-        parts.append(f"{_capital(names)} {do} little to the couplings{most}.")
+        parts.append(f"{capital(names)} {do} little to the couplings{most}.")
     return parts
 
 
@@ -163,7 +159,7 @@ def _change(curves: Sequence[Curve]) -> str:
     return significant(max(largest, 0.001), 1)
 
 
-def _the(axis: str) -> str:
+def the(axis: str) -> str:
     return f"the {axis_name(axis)}"
 
 
@@ -187,7 +183,7 @@ def _weakest(sweep: Sweep) -> str:
         return f"The weakest direction is {join_words(told)} of the places, and no one axis tells which."
     runs = [f"{_direction(kinds[kind])} {_run(turn.axis, values)}" for values, kind in turn.runs[:6]]
     right = "" if turn.told > 0.999 else f" (so in {percent(turn.told)} of the places)"
-    return f"The weakest direction turns with {_the(turn.axis)}: {'; '.join(runs)}{right}."
+    return f"The weakest direction turns with {the(turn.axis)}: {'; '.join(runs)}{right}."
 
 
 def _direction(kind: Direction) -> str:
@@ -212,10 +208,10 @@ def _price(study: Study) -> str:
         factor = sweep.over(np.sqrt(study.data["variance_inflation"].values[:, i]))
         if np.isfinite(factor).any():
             found.append((float(np.nanmedian(factor)), name, _span(factor)))
-    dear = [entry for entry in sorted(found, reverse=True) if entry[0] >= _HARDLY]
+    dear = [entry for entry in sorted(found, reverse=True) if entry[0] >= HARDLY]
     if not dear:
         return "Coupling costs nothing: every sigma is what it would be if the other parameters were known."
-    told = [f"{name} {words} times" for _, name, words in dear[:_TOLD]]
+    told = [f"{name} {words} times" for _, name, words in dear[:TOLD]]
     return f"The price, as sigma over what it would be if the other parameters were known: {join_words(told)}."
 
 
@@ -281,10 +277,10 @@ def _error(head: str, sweep: Sweep, numbers: FloatArray) -> str:
     grid = sweep.over(numbers).ravel()
     ends = [int(np.nanargmin(grid)), int(np.nanargmax(grid))]
     text = f"{head} {_span(grid)} arcsec"
-    if len(sweep.axes) > 1 and grid[ends[1]] >= _HARDLY * grid[ends[0]]:
+    if len(sweep.axes) > 1 and grid[ends[1]] >= HARDLY * grid[ends[0]]:
         text += f", least with {place(sweep.at(ends[0]))}, most with {place(sweep.at(ends[1]))}"
-    strong = [_effect(effect) for effect in effects if effect.factor >= _HARDLY]
-    weak = [axis_name(effect.curve.axis) for effect in effects if effect.factor < _HARDLY]
+    strong = [_effect(effect) for effect in effects if effect.factor >= HARDLY]
+    weak = [axis_name(effect.curve.axis) for effect in effects if effect.factor < HARDLY]
     if strong:
         text += f". {_medians(len(sweep.axes))}{', '.join(strong)}"
     if weak:
@@ -571,176 +567,10 @@ def study_limits(study: Study) -> list[str]:
     return parts
 
 
-def study_advice(study: Study) -> list[str]:
-    """What a designer can do with the answer."""
-    sweep = study.sweep
-    if not sweep.ok.any():
-        return ["Nothing can be advised: see why the cells failed."]
-    parts = [*_advice_couplings(study), *_advice_errors(sweep), _advice_target(study), _advice_models(study)]
-    return [part for part in parts if part]
-
-
-def _advice_couplings(study: Study) -> list[str]:
-    sweep = study.sweep
-    parts = []
-    best: dict[tuple[str, Any, bool], list[str]] = {}
-    stuck = []
-    for pair in sweep.coupled:
-        found = pair.decoupling()
-        free = [entry for entry in found if entry[0].axis not in _NATURE or entry[0].axis == "distortion"]
-        if free:
-            _, cost = free[0]
-            key = cost.axis, cost.values[cost.least], _pays(study, pair, cost)
-            best.setdefault(key, []).append(_dashed(pair))
-        elif not found and float(np.exp(max((c.median.min() for c in pair.costs), default=0.0))) >= _DEAR:
-            stuck.append(_dashed(pair))
-    for (axis, value, pays), names in best.items():
-        if not pays:
-            parts.append(
-                f"{join_words(names)} are least coupled with {said(axis, value)}, but their sigmas are no smaller "
-                "there: that alone is no reason to go there."
-            )
-        elif axis == "distortion":
-            parts.append(f"To tell {join_words(names)} apart, take the model {value} if its bias allows.")
-        else:
-            go = "take" if isinstance(value, str) else "go to"
-            parts.append(f"To tell {join_words(names)} apart, {go} {said(axis, value)}.")
-    if stuck:
-        parts.append(
-            f"Do not expect {join_words(stuck[:_TOLD])} to come apart by what was varied here. Report them with their "
-            "covariance, never one alone; to know one of them, measure it otherwise and give it as a prior, or take a "
-            "model with fewer coefficients where its bias allows."
-        )
-    return parts
-
-
-def _pays(study: Study, pair: Pair, cost: Curve) -> bool:
-    """Whether both sigmas are smaller where the pair is least coupled than where it is most."""
-    sweep = study.sweep
-    for name in pair.names:
-        sigma = np.where(
-            np.isfinite(_correlations(study, pair)), study.data["sigma"].sel(parameter=name).values, np.nan
-        )
-        curve = sweep.along(sigma, cost.axis)
-        if curve is None or curve.median[cost.least] >= curve.median[cost.most]:
-            return False
-    return True
-
-
-def _correlations(study: Study, pair: Pair) -> FloatArray:
+def correlations(study: Study, pair: Pair) -> FloatArray:
     """Correlation of a pair in every cell (C,)."""
     found = study.data["correlation"].sel(parameter=pair.names[0], parameter_2=pair.names[1])
     return np.asarray(found.values, dtype=np.float64)
-
-
-def _advice_errors(sweep: Sweep) -> list[str]:
-    """What is worth most for the attitude error, and what trades against what."""
-    effects = [e for e in error_effects(sweep, sweep.frame_error) if e.factor >= _HARDLY]
-    parts = []
-    numeric = [e for e in effects if not isinstance(e.curve.values[0], str)]
-    if numeric:
-        top = numeric[0]
-        parts.append(
-            f"For the attitude error, {_the(top.curve.axis)} is worth most within this sweep: a factor of "
-            f"{significant(top.factor)} between {said(top.curve.axis, top.curve.values[top.curve.most])} and "
-            f"{value_words(top.curve.values[top.curve.least])}."
-        )
-    laws = {e.curve.axis: e.exponent for e in effects if e.exponent is not None and e.curve.axis != "max_mag"}
-    deeper = next((_per_magnitude(e.curve) for e in effects if e.curve.axis == "max_mag"), None)
-    if deeper is not None and deeper > _HARDLY:
-        also = []
-        if laws.get("frames"):
-            also.append(f"{significant(deeper ** (-1.0 / laws['frames']))} times the frames")
-        if laws.get("sigma_px"):
-            also.append(f"noise {significant(deeper ** (1.0 / laws['sigma_px']))} times smaller")
-        same = f", as much as {join_words(also)}" if also else ""
-        parts.append(f"One magnitude more in the limit divides the attitude error by {significant(deeper)}{same}.")
-    worth = []
-    for axis, law in laws.items():
-        if laws.get("frames") and axis != "frames" and abs(law) > 0.2:
-            more = "half" if law > 0.0 else "twice"
-            worth.append(
-                f"{more} the {axis_name(axis)} is worth {significant(2.0 ** (-abs(law) / laws['frames']))} times"
-            )
-    if worth:
-        parts.append(f"{_capital(join_words(worth))} the frames: they do the same to the attitude error.")
-    common = sweep.over(sweep.common_rotation).ravel()
-    least, most = int(np.nanargmin(common)), int(np.nanargmax(common))
-    if sweep.axes and common[most] >= _MIND * common[least]:
-        parts.append(
-            "If alignment is not calibrated with the same parameters, mind the common rotation: "
-            f"{significant(float(common[most]))} arcsec with {place(sweep.at(most))}, "
-            f"{significant(float(common[least]))} with {place(sweep.at(least))}."
-        )
-    return parts
-
-
-def _per_magnitude(curve: Curve) -> float | None:
-    """By how much a magnitude divides an error, on average over the axis."""
-    x = np.asarray(curve.values, dtype=np.float64)
-    return float(np.exp(-np.polyfit(x, np.log(curve.median), 1)[0])) if len(x) > 1 else None
-
-
-def _advice_target(study: Study) -> str:
-    """The place that meets the target with the fewest frames, if frames can be chosen."""
-    target, sweep = study.definition.target_arcsec, study.sweep
-    if target is None:
-        return ""
-    errors = sweep.over(sweep.frame_error).ravel()
-    met = np.flatnonzero(errors <= target)
-    if not len(met):
-        needed = sweep.over(study.frames_for(target)).ravel()
-        if not np.isfinite(needed).any():
-            return f"{target:g} arcsec is out of reach here: lower the noise, or relax the target."
-        best = int(np.argmin(np.where(np.isfinite(needed), needed, np.inf)))
-        at = place({axis: v for axis, v in sweep.at(best).items() if axis != "frames"})
-        return f"For {target:g} arcsec take {plural(int(needed[best]), 'frame')}{f' with {at}' if at else ''}."
-    if "frames" not in sweep.axes:
-        return ""
-    # What the lens is, nobody chooses: the target is to be met whatever it is.
-    given = [i for i, axis in enumerate(sweep.axes) if axis in _NATURE]
-    worst = np.max(sweep.over(sweep.frame_error), axis=tuple(given), keepdims=True)
-    met = np.broadcast_to(worst <= target, sweep.shape).ravel()
-    whatever = f", whatever {join_words([_the(sweep.axes[i]) for i in given])} of this sweep" if given else ""
-    if not met.any():
-        return f"No place of this sweep keeps {target:g} arcsec{whatever}: take more frames." if given else ""
-    frames = np.array([sweep.at(i)["frames"] for i in range(len(met))], dtype=np.float64)
-    fewest = met & (frames == frames[met].min())
-    # Of those, the one with most to spare.
-    errors = np.where(fewest, np.broadcast_to(worst, sweep.shape).ravel(), np.inf)
-    best = int(np.argmin(errors))
-    at = place({axis: value for axis, value in sweep.at(best).items() if axis not in _NATURE})
-    return f"The fewest frames that keep {target:g} arcsec{whatever}: {at} ({significant(float(errors[best]))} arcsec)."
-
-
-def _advice_models(study: Study) -> str:
-    """The simplest model that is rich enough."""
-    if "simpler" not in study.data.dims:
-        return ""
-    sweep = study.sweep
-    good: list[str] = []
-    bad: list[str] = []
-    for i, model in enumerate(map(str, study.data["simpler"].values)):
-        bias = model_bias(study, i)
-        known = sweep.ok & np.isfinite(bias)
-        # Where what it leaves out is zero, nothing was tried.
-        if known.any() and np.any(bias[known] > 0.0):
-            (good if np.all(bias[known] < sweep.frame_error[known]) else bad).append(model)
-    order = sorted(good, key=lambda model: len(parameters(model)))
-    if order:
-        return f"The model {order[0]} is rich enough everywhere in this sweep: more coefficients only add sigma."
-    if len(bad) == study.data.sizes["simpler"]:
-        return (
-            "No simpler distortion model is safe over the whole sweep: keep the coefficients, and live with their "
-            "coupling."
-        )
-    return ""
-
-
-def study_notes(study: Study) -> list[str]:
-    """The whole answer, advice and limits, for a notebook."""
-    advice = [f"Advice: {sentence[:1].lower() + sentence[1:]}" for sentence in study_advice(study)]
-    return [*study_answer(study), *advice, *study_limits(study)]
 
 
 def study_table(study: Study) -> TextTable | None:
@@ -766,7 +596,7 @@ def summary_columns(study: Study) -> list[tuple[str, FloatArray, Any]]:
     sweep = study.sweep
     columns: list[tuple[str, FloatArray, Any]] = []
     for pair in sorted(sweep.coupled or sweep.pairs[:1], key=lambda pair: -pair.mean_size)[:2]:
-        columns.append((_dashed(pair), _correlations(study, pair), _correlation))
+        columns.append((dashed(pair), correlations(study, pair), _correlation))
     factor = np.sqrt(study.data["variance_inflation"].sel(parameter="f").values)
     spec = parameter_called("f")
     columns.append(
@@ -793,7 +623,7 @@ def _frames(value: float) -> str:
     return "–" if np.isnan(value) else "never" if np.isinf(value) else count(int(np.ceil(value)))
 
 
-def _capital(text: str) -> str:
+def capital(text: str) -> str:
     """First letter of a sentence; the name of a parameter stays as it is written."""
     return text if text.split(" ")[0] in _PARAMETERS else text[:1].upper() + text[1:]
 
