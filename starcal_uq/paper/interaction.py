@@ -440,10 +440,11 @@ def run_one(plan: Plan, index: int) -> Outcome:
 def estimates(obs: Observations, start: Camera, sigma_px: float) -> FloatArray:
     """Optics (M, 3) by every method of the study; NaN where one fails."""
     found = np.full((len(HANDLING), 3), np.nan)
-    # The stages of one calibration are methods of their own: least squares without distortion, then the paper's.
+    with suppress(StarcalError):
+        found[0] = calibrate(obs, start, method="least_squares").theta[:3]
     with suppress(StarcalError):
         cal = calibrate(obs, start, method="efficient")
-        found[0], found[2], found[3] = cal.stages[0].theta[:3], cal.pair_theta[:3], cal.theta[:3]
+        found[2], found[3] = cal.pair_theta[:3], cal.theta[:3]
     with suppress(StarcalError):
         options = RecursionOptions(sigma_px=sigma_px)
         found[1] = calibrate([obs], start, method="samaan", recursion=options).theta[:3]

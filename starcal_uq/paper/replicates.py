@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 
 # A replicate takes about half a second at a thousand frames.
 _CHUNK = 2
-# Methods that are stages of the efficient one.
-_STAGES = ("least_squares", "three_stage")
+# Methods whose textbook claim takes pairs as independent.
+_OF_PAIRS = ("least_squares", "three_stage")
 # A slow option of a method, which is there to show what it claims, takes part in one of so many replicates.
 SHARE = 4
 _LEAST = 8
@@ -465,8 +465,8 @@ def solve_all(
 ) -> list[Solved | StarcalError]:
     """Every method's result, or why it has none; `frames` are those of `obs`.
 
-    The first stage of the efficient method is least squares, and its third is the paper's method: where it is among the
-    methods and converges, they are taken from it.
+    The stages of the efficient method on interstar angles end in the paper's estimate: where it is among the methods
+    and converges, that is taken from it.
     """
     found: dict[Method, Solved | StarcalError] = {}
     efficient = [method for method in methods if method.method == "efficient"]
@@ -474,8 +474,8 @@ def solve_all(
     whole: Calibration | None = None
     for method in (*efficient, *others):
         try:
-            if whole is not None and method.method in _STAGES:
-                found[method] = _stage(whole, method.method, frames)
+            if whole is not None and method.method == "three_stage":
+                found[method] = _three_stages(whole, frames)
                 continue
             cal = method.calibrate(obs, start)
             found[method] = _solved(cal, frames)
@@ -487,7 +487,7 @@ def solve_all(
 
 def _solved(cal: Calibration, frames: StarFrames) -> Solved:
     classical = np.full(len(cal.theta), np.nan)
-    if cal.method in _STAGES:
+    if cal.method in _OF_PAIRS:
         classical = textbook_sigmas(PairObjective(frames, cal.camera.distortion), cal.theta)
     for stage in cal.stages:
         if stage.sigmas is not None:
@@ -495,15 +495,10 @@ def _solved(cal: Calibration, frames: StarFrames) -> Solved:
     return Solved(cal.camera, cal.theta, cal.sigmas, classical)
 
 
-def _stage(whole: Calibration, method: str, frames: StarFrames) -> Solved:
-    if method == "three_stage":
-        theta, camera = whole.pair_theta, whole.nominal.with_theta(whole.pair_theta)
-    else:
-        theta = whole.stages[0].theta[:3]
-        camera = pinhole(whole.nominal, theta)
-    pairs = PairObjective(frames, camera.distortion)
-    covariance = whole.pair_covariance if method == "three_stage" else pairs.godambe(theta)
-    return Solved(camera, theta, np.sqrt(np.diag(covariance)), textbook_sigmas(pairs, theta))
+def _three_stages(whole: Calibration, frames: StarFrames) -> Solved:
+    camera = whole.nominal.with_theta(whole.pair_theta)
+    classical = textbook_sigmas(PairObjective(frames, camera.distortion), whole.pair_theta)
+    return Solved(camera, whole.pair_theta, np.sqrt(np.diag(whole.pair_covariance)), classical)
 
 
 def pinhole(camera: Camera, theta: FloatArray) -> Camera:
