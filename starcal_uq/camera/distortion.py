@@ -168,6 +168,11 @@ def parameter_names(model_name: str) -> tuple[str, ...]:
     return tuple(p.name for p in parameters(model_name))
 
 
+# Coefficients and parameters of all models, by name.
+COEFFICIENTS = {spec.name: spec for model in _MODELS.values() for spec in model.coefficients}
+PARAMETERS: dict[str, Parameter] = {spec.name: spec for spec in _OPTICS} | COEFFICIENTS
+
+
 def parameter_called(name: str) -> Parameter:
     """The parameter of this name, of whatever model has it.
 
@@ -176,11 +181,10 @@ def parameter_called(name: str) -> Parameter:
     DistortionError
         For a name that no model has.
     """
-    known = {spec.name: spec for model in _MODELS.values() for spec in (*_OPTICS, *model.coefficients)}
     try:
-        return known[name]
+        return PARAMETERS[name]
     except KeyError:
-        raise DistortionError(f"parameter {name!r} is unknown: use one of {', '.join(known)}.") from None
+        raise DistortionError(f"parameter {name!r} is unknown: use one of {', '.join(PARAMETERS)}.") from None
 
 
 def sigma_parameter(per_star: bool) -> Parameter:

@@ -17,10 +17,12 @@ if TYPE_CHECKING:
 
     from starcal_uq.camera.camera import Camera
 
+# From this correlation on a pair counts as coupled.
+COUPLED = 0.5
 # A parameter takes part in a direction when its share of the direction's length exceeds this.
-_PART = 0.25
+PART = 0.25
 # Directions whose variance lies within these bounds are those of uncoupled parameters.
-_ALONE = (0.7, 1.4)
+ALONE = (0.7, 1.4)
 
 
 class HasCovariance(Protocol):
@@ -128,7 +130,7 @@ class Coupling(Shown):
     common_rotation_arcsec: FloatArray
     single_frame_correlation: FloatArray
 
-    def pairs(self, at_least: float = 0.5) -> list[tuple[str, str, float]]:
+    def pairs(self, at_least: float = COUPLED) -> list[tuple[str, str, float]]:
         """Pairs of parameters with a correlation of at least this size, the strongest first."""
         i, j = np.triu_indices(len(self.parameter_names), 1)
         strong = [
@@ -230,10 +232,10 @@ def weak_directions(correlation: FloatArray, names: tuple[str, ...]) -> tuple[We
 
 def _words(weights: FloatArray, variance: float, names: tuple[str, ...]) -> str:
     """Say which parameters trade against each other along a direction."""
-    order = [i for i in np.argsort(-np.abs(weights)) if abs(weights[i]) >= _PART]
+    order = [i for i in np.argsort(-np.abs(weights)) if abs(weights[i]) >= PART]
     up = [names[i] for i in order if weights[i] > 0.0]
     down = [names[i] for i in order if weights[i] < 0.0]
-    if len(order) == 1 or _ALONE[0] < variance < _ALONE[1]:
+    if len(order) == 1 or ALONE[0] < variance < ALONE[1]:
         return f"{' and '.join(names[i] for i in order)}: not coupled to the others"
     trade = f"{' and '.join(up)} against {' and '.join(down)}" if down else f"{' and '.join(up)} together"
     if variance > 1.0:

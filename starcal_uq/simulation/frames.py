@@ -13,7 +13,7 @@ from starcal_uq.attitude.rotations import random_rotations
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import fold_radius_px, project, unproject
 from starcal_uq.core.errors import CatalogueError, StarcalError
-from starcal_uq.core.types import AnyDict, FloatArray, IntArray
+from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
 from starcal_uq.observations.table import Observations
 
 if TYPE_CHECKING:
@@ -205,22 +205,24 @@ def choose_attitudes(
     return np.concatenate(chosen)[:n_frames], frames[:n_frames]
 
 
-class Sky:
-    """Finds the stars of a catalogue on the detector.
+class Window:
+    """The detector on the sky.
 
     Parameters
     ----------
-    stars : StarCatalogue
-        Catalogue.
     camera : Camera
         Optics and detector.
     margin_px : float
         Stars nearer to the edge than this are left out; a negative margin lets in stars outside the detector.
+
+    Attributes
+    ----------
+    min_cosine : float
+        Cosine of the cone around the optical axis that holds everything on the detector.
     """
 
-    def __init__(self, stars: StarCatalogue, camera: Camera, margin_px: float) -> None:
+    def __init__(self, camera: Camera, margin_px: float) -> None:
         self.camera = camera
-        self.directions = stars.directions_icrs
         self.low = -0.5 + margin_px
         self.high = np.array([camera.width_px, camera.height_px]) - 0.5 - margin_px
         low, high = min(-0.5, self.low), np.maximum(np.array([camera.width_px, camera.height_px]) - 0.5, self.high)
@@ -232,12 +234,32 @@ class Sky:
             if fold_radius_px(camera.distortion, camera.theta, ideal_px) <= ideal_px:
                 self.min_cosine = float(np.min(b[:, 2]))
 
+    def seen(self, b: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Pixels (N, 2) of directions (N, 3) in the camera, and which of them are on the detector (N,)."""
+        xy = project(self.camera, b)
+        return xy, np.all((xy > self.low) & (xy < self.high), axis=1)
+
+
+class Sky(Window):
+    """Finds the stars of a catalogue on the detector.
+
+    Parameters
+    ----------
+    stars : StarCatalogue
+        Catalogue.
+    camera, margin_px
+        As for `Window`.
+    """
+
+    def __init__(self, stars: StarCatalogue, camera: Camera, margin_px: float) -> None:
+        super().__init__(camera, margin_px)
+        self.directions = stars.directions_icrs
+
     def views(self, rotations: FloatArray) -> list[tuple[IntArray, FloatArray]]:
         """Catalogue indices (m,) and noise-free pixels (m, 2) of the stars on the detector, for each rotation."""
         frame, star = self._near(rotations[:, 2])
         b = np.einsum("nij,nj->ni", rotations[frame], self.directions[star])
-        xy = project(self.camera, b)
-        inside = np.all((xy > self.low) & (xy < self.high), axis=1)
+        xy, inside = self.seen(b)
         edges = np.searchsorted(frame[inside], np.arange(len(rotations) + 1))
         star, xy = star[inside], xy[inside]
         return [(star[i:j], xy[i:j]) for i, j in pairwise(edges)]

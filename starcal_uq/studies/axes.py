@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import get_model, model_names
+from starcal_uq.camera.distortion import COEFFICIENTS, get_model, model_names
 from starcal_uq.camera.projection import fold_radius_px
 from starcal_uq.core.errors import StudyError
 from starcal_uq.core.types import AnyDict
@@ -19,8 +19,6 @@ from starcal_uq.simulation.pointing import POINTINGS
 FLAT = "flat"
 # Terms of a distortion that cancel to less than this share of their sum have no size that could be scaled.
 _CANCELLED = 0.02
-
-
 # Stands for zero where that itself makes no sense.
 _TINY = 1e-6
 
@@ -80,7 +78,6 @@ class Axis:
         return f"write {noun} {bounds}"
 
 
-_COEFFICIENTS = {c.name: c for name in model_names() for c in get_model(name).coefficients}
 AXES = {
     axis.name: axis
     for axis in (
@@ -92,7 +89,7 @@ AXES = {
         Axis("y0_offset_px", "offset of the principal point along y", "px"),
         Axis("distortion", "distortion model", "", "name", choices=model_names()),
         Axis("distortion_px", "displacement of the corner by the distortion", "px"),
-        *(Axis(name, c.description, c.unit) for name, c in _COEFFICIENTS.items()),
+        *(Axis(name, c.description, c.unit) for name, c in COEFFICIENTS.items()),
         Axis("max_mag", "magnitude limit", "mag", high=10.0, low=-1.0, base=6.0),
         Axis("stars", "brightest stars of a frame that are used", "", "whole", 3, 100_000),
         Axis("frames", "frames", "", "whole", 1, 10_000_000, base=200),
@@ -112,7 +109,7 @@ AXES = {
 # Axes that make another camera.
 CAMERA_AXES = tuple(AXES)[: tuple(AXES).index("max_mag")]
 # Both set the focal length; the coefficients and the size of the distortion both set the distortion.
-EXCLUSIVE = (("fov_deg", "focal_mm"), *((name, "distortion_px") for name in _COEFFICIENTS))
+EXCLUSIVE = (("fov_deg", "focal_mm"), *((name, "distortion_px") for name in COEFFICIENTS))
 
 
 def base_settings(given: Mapping[str, Any]) -> AnyDict:

@@ -100,21 +100,9 @@ class FisherCells:
         settings = cell.settings
         stated, scale = self.stated(cell, camera)
         n = settings["frames"]
-        m = len(stated.information)
-        counts = self._campaign(cell, n, m)
-        frame = np.tensordot(counts, stated.information, 1) / (scale**2 * n)
+        counts = self._campaign(cell, n, len(stated.information)) / scale**2
         prior = prior_precision(self.definition.priors.get(settings["prior"]), camera)
-        found = coupling_numbers(frame, prior, n, stated)
-        found |= simpler_numbers(frame, n, float(counts @ stated.weights) / scale**2, stated)
-        found |= {
-            "status": "ok",
-            "n_frames": n,
-            "mean_stars": stated.mean_stars,
-            "field_deg": camera.fov_deg[0],
-            "truth": camera.theta,
-            "nea_arcsec": ARCSEC * scale * np.sqrt(stated.noise),
-        }
-        return found
+        return campaign_numbers(stated, counts, prior, n, scale) | {"status": "ok"}
 
     def _campaign(self, cell: Cell, n: int, m: int) -> FloatArray:
         """How often each of m frames is in a campaign of n."""
@@ -173,6 +161,23 @@ def prior_precision(table: Mapping[str, Any] | None, camera: Camera) -> FloatArr
         if entry in table:
             precision[place] = stated[place] ** -2.0
     return precision
+
+
+def campaign_numbers(
+    stated: Statements, counts: FloatArray, prior: FloatArray | None, n: int, scale: float = 1.0
+) -> Numbers:
+    """What a campaign of n frames says, frame k counted `counts[k]` times; noise `scale` times that stated."""
+    camera = stated.camera
+    frame = np.tensordot(counts, stated.information, 1) / n
+    found = coupling_numbers(frame, prior, n, stated)
+    found |= simpler_numbers(frame, n, float(counts @ stated.weights), stated)
+    return found | {
+        "n_frames": n,
+        "mean_stars": stated.mean_stars,
+        "field_deg": camera.fov_deg[0],
+        "truth": camera.theta,
+        "nea_arcsec": ARCSEC * scale * np.sqrt(stated.noise),
+    }
 
 
 def covariances(

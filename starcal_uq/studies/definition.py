@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.distortion import COEFFICIENTS, PARAMETERS, parameter_names
 from starcal_uq.core.errors import CameraError, PriorError, StudyError
 from starcal_uq.core.files import PathLike, atomic_write_text, ensure_new
 from starcal_uq.core.toml import Key, Section, read_toml, unknown_key
@@ -234,10 +234,8 @@ class StudyDefinition:
         for one, other in EXCLUSIVE:
             if one in every and other in every:
                 raise StudyError(f"{where}: {one} and {other} set the same thing; leave one of them out.")
-        coefficients = {c.name for model in self.models for c in get_model(model).coefficients}
-        known = {c.name for model in AXES["distortion"].choices for c in get_model(model).coefficients}
         for name in every:
-            if name in known and name not in coefficients:
+            if name in COEFFICIENTS and name not in self.parameter_names:
                 raise StudyError(
                     f"{where}: {name} is no coefficient of distortion {' or '.join(map(repr, self.models))}; remove "
                     "it, or use another model."
@@ -259,9 +257,8 @@ class StudyDefinition:
     @property
     def parameter_names(self) -> tuple[str, ...]:
         """Parameters of all models, in the order of the registry."""
-        used = {c.name for model in self.models for c in get_model(model).coefficients}
-        names = {c.name: None for model in AXES["distortion"].choices for c in get_model(model).coefficients}
-        return ("x0", "y0", "f", *(name for name in names if name in used))
+        used = {name for model in self.models for name in parameter_names(model)}
+        return tuple(name for name in PARAMETERS if name in used)
 
     @property
     def n_cells(self) -> int:

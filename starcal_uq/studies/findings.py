@@ -10,23 +10,19 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from starcal_uq.core.constants import AXES as ATTITUDE
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+from starcal_uq.propagation.coupling import ALONE, COUPLED, PART
 
 if TYPE_CHECKING:
     import xarray as xr
 
-# From this correlation on a pair counts as coupled, as in `Coupling.pairs`.
-COUPLED = 0.5
 # An axis matters where it changes what a pair's coupling costs in sigma by this factor, and by more than chance does.
 MATTERS = 1.25
 # Probability with which chance alone passes for a change.
 _FALSE_ALARM = 1e-3
 # A median's standard error over a mean's: of normal numbers, and of the evenly spread ones of a hypercube.
 _MEDIAN, _EVEN = 1.25, 1.75
-# A parameter takes part in a direction when its share of the direction's length exceeds this (as in `Coupling`).
-_PART = 0.25
-# Up to this variance a direction is that of uncoupled parameters.
-_ALONE = 1.4
 # An axis of a Latin hypercube is cut into this many parts of equal number.
 _PARTS = 6
 
@@ -323,9 +319,7 @@ class Sweep:
             For a name that is no axis, or a value that an axis does not have.
         """
         held = self.held(along, by, at)
-        cells = np.ones(len(self.ok), dtype=np.bool_)
-        for axis, value in held.items():
-            cells &= self._codes[self.axes.index(axis)] == self.values[axis].index(value)
+        cells = self._cells(held)
         pooled = [axis for axis in self.axes if axis not in (along, by)]
         order = [self.axes.index(axis) for axis in (by, along) if axis is not None]
         rest = [i for i in range(len(self.axes)) if i not in order]
@@ -352,18 +346,11 @@ class Sweep:
 
     def held(self, along: str, by: str | None = None, at: Mapping[str, Any] | None = None) -> dict[str, Any]:
         """Where the other axes are held."""
-        at = dict(at or {})
-        for axis in filter(None, (along, by, *at)):
-            if axis not in self.axes:
-                raise ValueError(f"{axis!r} was not swept: use one of {', '.join(self.axes) or 'none'}.")
-        for axis, value in at.items():
-            if value not in self.values[axis]:
-                raise ValueError(f"{axis} has no value {value!r}: use one of {', '.join(map(str, self.values[axis]))}.")
-        given = {axis: value for axis, value in at.items() if axis not in (along, by)}
+        for axis in filter(None, (along, by)):
+            self._check(axis)
+        given = {axis: value for axis, value in (at or {}).items() if axis not in (along, by)}
+        cells = self.ok & self._cells(given)
         free = [i for i, axis in enumerate(self.axes) if axis not in (*self.drawn, along, by, *given)]
-        cells = self.ok.copy()
-        for axis, value in given.items():
-            cells &= self._codes[self.axes.index(axis)] == self.values[axis].index(value)
         if not free or not cells.any():
             return given
         # The middle, unless cells are missing there.
@@ -372,6 +359,33 @@ class Sweep:
         best = int(np.lexsort((np.abs(places - middle).sum(axis=0), -counts))[0])
         chosen = {self.axes[i]: self.values[self.axes[i]][int(places[j, best])] for j, i in enumerate(free)}
         return chosen | given
+
+    def pooled(self, numbers: FloatArray, along: str, at: Mapping[str, Any] | None = None) -> FloatArray:
+        """Median of a number at every value of an axis, over seeds and all axes that `at` does not hold.
+
+        Raises
+        ------
+        ValueError
+            As `lines` does.
+        """
+        self._check(along)
+        others = [axis for axis in self.axes if axis != along]
+        return self.over(numbers, "median", others, self._cells(at or {})).ravel()
+
+    def _cells(self, at: Mapping[str, Any]) -> BoolArray:
+        """Cells (C,) at values of axes."""
+        cells = np.ones(len(self.ok), dtype=np.bool_)
+        for axis, value in at.items():
+            self._check(axis)
+            known = self.values[axis]
+            if value not in known:
+                raise ValueError(f"{axis} has no value {value!r}: use one of {', '.join(map(str, known))}.")
+            cells &= self._codes[self.axes.index(axis)] == known.index(value)
+        return cells
+
+    def _check(self, axis: str) -> None:
+        if axis not in self.axes:
+            raise ValueError(f"{axis!r} was not swept: use one of {', '.join(self.axes) or 'none'}.")
 
     @cached_property
     def frame_error(self) -> FloatArray:
@@ -385,8 +399,7 @@ class Sweep:
 
     def cross(self, variable: str) -> FloatArray:
         """Root mean square over pitch and yaw of a variable by axis, of every cell."""
-        across = self.data[variable].sel(axis=["pitch", "yaw"]).values
-        return np.asarray(np.sqrt(np.mean(across**2, axis=-1)), dtype=np.float64)
+        return np.asarray(cross(self.data[variable]).values, dtype=np.float64)
 
     @cached_property
     def pairs(self) -> tuple[Pair, ...]:
@@ -430,7 +443,7 @@ class Sweep:
         """The kinds of weakest direction, the most common first, and the kind of every place (-1 where unknown)."""
         weights = np.nan_to_num(self.data["weak_direction"].values)
         # Nothing takes part in a direction that is hardly worse than the parameters themselves.
-        part = (np.abs(weights) >= _PART) & (self.data["weak_variance"].values >= _ALONE)[:, None]
+        part = (np.abs(weights) >= PART) & (self.data["weak_variance"].values >= ALONE[1])[:, None]
         part &= part.sum(axis=1)[:, None] >= 2
         first = weights[np.arange(len(weights)), np.argmax(part, axis=1)]
         signs = np.where(part, np.sign(weights * first[:, None]), 0.0)[self.ok]
@@ -485,6 +498,12 @@ class Sweep:
     def failures(self) -> tuple[tuple[str, int], ...]:
         """Why cells failed, and how many, the most frequent first."""
         return tuple(Counter(map(str, self.data["status"].values[~self.ok])).most_common())
+
+
+def cross(errors: xr.DataArray) -> xr.DataArray:
+    """Root mean square over pitch and yaw of errors by axis."""
+    across: xr.DataArray = (errors.sel(axis=list(ATTITUDE[:2])) ** 2).mean("axis", skipna=False) ** 0.5
+    return across
 
 
 def _statistic(values: FloatArray, first: IntArray, n: IntArray, statistic: Statistic) -> FloatArray:

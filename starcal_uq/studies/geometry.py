@@ -16,7 +16,6 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import random_rotations
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.projection import project
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import StudyError
 from starcal_uq.core.formatting import count
@@ -25,7 +24,7 @@ from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.star_errors import add_by_star, offset_columns, sky_axes
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.planning.information import frame_matrices
-from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky
+from starcal_uq.simulation.frames import EDGE_SIGMAS, Window
 from starcal_uq.simulation.pointing import pattern_rotations
 from starcal_uq.studies.axes import CAMERA_AXES
 from starcal_uq.studies.definition import Cell
@@ -124,14 +123,14 @@ class Heaven:
         return self._hashes[max_mag]
 
 
-class _Window(Sky):
+class _Views(Window):
     """The detector on the sky, for stars that a tree has found."""
 
     def __init__(self, depth: Depth, camera: Camera, max_mag: float, margin_px: float) -> None:
-        super().__init__(depth.stars.select(slice(0, 0)), camera, margin_px)  # type: ignore[arg-type]
+        super().__init__(camera, margin_px)
         self.depth, self.max_mag = depth, max_mag
 
-    def seen(self, blocks: Sequence[Attitudes]) -> Geometry:
+    def frames(self, blocks: Sequence[Attitudes]) -> Geometry:
         """Frames of some attitudes, whatever they show."""
         rotations = np.concatenate([near.rotations for near in blocks])
         first = np.cumsum([0, *(len(near.rotations) for near in blocks)])
@@ -139,8 +138,7 @@ class _Window(Sky):
         frame = np.concatenate([n + near.frame[k] for n, near, k in zip(first[:-1], blocks, kept, strict=True)])
         star = np.concatenate([near.star[k] for near, k in zip(blocks, kept, strict=True)])
         b = np.matmul(rotations[frame], self.depth.directions[star][:, :, None])[:, :, 0]
-        xy = project(self.camera, b)
-        inside = np.all((xy > self.low) & (xy < self.high), axis=1)
+        xy, inside = self.seen(b)
         sizes = np.bincount(frame[inside], minlength=len(rotations))
         starts = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
         return Geometry(self.camera, self.depth, rotations, starts, star[inside], xy[inside])
@@ -316,7 +314,7 @@ def take_frames(key: GeometryKey, heaven: Heaven, most: int) -> Geometry:
         When the catalogue cannot fill them.
     """
     depth = heaven.depth(key.max_mag)
-    window = _Window(depth, key.camera, key.max_mag, key.margin_px)
+    window = _Views(depth, key.camera, key.max_mag, key.margin_px)
     if key.pointing == "random":
         n = key.n_frames
         if n is None:
@@ -330,10 +328,10 @@ def take_frames(key: GeometryKey, heaven: Heaven, most: int) -> Geometry:
     field = key.camera.fov_deg[0]
     for _ in range(_PLACES):
         start = random_rotations(1, rng)
-        if window.seen([depth.around(start, window.min_cosine)]).with_stars(key.min_stars).n_frames:
+        if window.frames([depth.around(start, window.min_cosine)]).with_stars(key.min_stars).n_frames:
             break
     rotations = pattern_rotations(key.pointing, key.n_frames, rng, field, start[0])
-    found = window.seen([depth.around(rotations, window.min_cosine)]).with_stars(key.min_stars)
+    found = window.frames([depth.around(rotations, window.min_cosine)]).with_stars(key.min_stars)
     if found.n_frames == 0:
         raise StudyError(
             f"no frame of the pattern {key.pointing!r} shows {key.min_stars} stars: raise max_mag, or lower min_stars."
@@ -341,7 +339,7 @@ def take_frames(key: GeometryKey, heaven: Heaven, most: int) -> Geometry:
     return found
 
 
-def _random(key: GeometryKey, window: _Window, n: int) -> Geometry:
+def _random(key: GeometryKey, window: _Views, n: int) -> Geometry:
     parts: list[Geometry] = []
     good = tries = 0
     while good < n:
@@ -349,7 +347,7 @@ def _random(key: GeometryKey, window: _Window, n: int) -> Geometry:
         wanted = int(np.ceil((n - good) * min(tries / max(good, 1), 4.0) / _BLOCK)) if tries else -(-n // _BLOCK)
         number = range(tries // _BLOCK, tries // _BLOCK + wanted)
         blocks = [window.depth.random(key.seed, block, window.min_cosine) for block in number]
-        parts.append(window.seen(blocks).with_stars(key.min_stars))
+        parts.append(window.frames(blocks).with_stars(key.min_stars))
         good += parts[-1].n_frames
         tries += _BLOCK * wanted
         if tries >= _LEAST_TRIES and good < _LEAST_SKY * tries:

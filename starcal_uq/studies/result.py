@@ -18,16 +18,13 @@ from starcal_uq.core.files import PathLike, atomic_path, new_folder, reading
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.studies.axes import AXES
 from starcal_uq.studies.definition import StudyDefinition
-from starcal_uq.studies.findings import Sweep
+from starcal_uq.studies.findings import Sweep, cross
 
 if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
 NETCDF, PARQUET = "study.nc", "study.parquet"
-BAND = (0.05, 0.95)
-# More values than this along an axis of a hypercube are drawn in so many groups.
-_GROUPS = 12
 # An error that falls more slowly than this power of the frames, a thousand times more of them, is at its floor.
 _NO_GAIN = -0.05
 _PARAMETER, _OTHER, _AXIS, _FACTOR, _SIMPLER = "parameter", "parameter_2", "axis", "frames_factor", "simpler"
@@ -99,11 +96,10 @@ class Study(Shown):
         """Number of cells."""
         return int(self.data.sizes["cell"])
 
-    @cached_property
+    @property
     def ok(self) -> BoolArray:
         """Cells that have numbers, (C,)."""
-        good: BoolArray = np.asarray(self.data["status"].values == "ok")
-        return good
+        return self.sweep.ok
 
     @cached_property
     def sweep(self) -> Sweep:
@@ -117,9 +113,8 @@ class Study(Shown):
 
     @property
     def problems(self) -> dict[str, int]:
-        """Reasons why cells have no numbers, with how many have each."""
-        texts, counts = np.unique(self.data["status"].values[~self.ok].astype(str), return_counts=True)
-        return {str(text): int(n) for text, n in zip(texts, counts, strict=True)}
+        """Reasons why cells have no numbers, with how many have each, the most frequent first."""
+        return dict(self.sweep.failures)
 
     def values(
         self,
@@ -141,129 +136,25 @@ class Study(Shown):
         """
         labels = {_PARAMETER: parameter, _OTHER: parameter_2, _AXIS: axis, _SIMPLER: simpler}
         if variable == "frames_needed" and variable not in self.data:
-            raise StudyError("the study has no target: use needed(along, target_arcsec).")
+            raise StudyError("the study has no target: use frames_for(target_arcsec).")
         if variable not in self.data:
             raise StudyError(f"the study has no variable {variable!r}: use one of {', '.join(map(str, self.data))}.")
         array = self.data[variable]
-        cross = axis == "cross" and _AXIS in array.dims
+        if axis == "cross" and _AXIS in array.dims:
+            array = cross(array)
         for name, label in labels.items():
-            if name not in array.dims or (cross and name == _AXIS):
+            if name not in array.dims:
                 continue
             known = [str(v) for v in array[name].values]
             if label not in known:
                 raise StudyError(f"{variable} needs {name}=: give one of {', '.join(known)}.")
             array = array.sel({name: label})
-        if cross:
-            array = (0.5 * (array**2).sel({_AXIS: list(ATTITUDE[:2])}).sum(_AXIS, skipna=False)) ** 0.5
         numbers: FloatArray = np.asarray(array.values, dtype=np.float64)
         if numbers.ndim != 1:
             raise StudyError(
                 f"{variable} has more than one number per cell along {', '.join(map(str, array.dims[1:]))}."
             )
         return numbers
-
-    def at(self, at: Mapping[str, Any] | None = None) -> BoolArray:
-        """Cells (C,) with numbers, at given values of some axes; the nearest value of an axis of numbers.
-
-        Raises
-        ------
-        StudyError
-            For an axis that is not swept, or a name that does not occur.
-        """
-        mask = self.ok.copy()
-        for name, wanted in (at or {}).items():
-            found = self._coordinate(name)
-            if found.dtype.kind in "OU":
-                if wanted not in found:
-                    raise StudyError(f"{name} is never {wanted!r}: use one of {', '.join(sorted(set(found)))}.")
-                mask &= found == wanted
-            else:
-                mask &= found == found[np.argmin(np.abs(found - wanted))]
-        return mask
-
-    def _coordinate(self, name: str) -> Any:
-        if name not in self.definition.axes:
-            raise StudyError(f"{name} is not varied in this study: use one of {', '.join(self.definition.axes)}.")
-        return self.data[name].values
-
-    def _grouped(self, name: str) -> tuple[Any, list[Any]]:
-        """Group (C,) of every cell along an axis, and the value of each group; a hypercube's values share groups."""
-        found = self._coordinate(name)
-        values, group = np.unique(found, return_inverse=True)
-        if found.dtype.kind in "OU":
-            order = [str(v) for v in self.definition.axes[name] if v in values]
-            place = {value: order.index(str(value)) for value in values}
-            return np.array([place[v] for v in values])[group], order
-        if name not in self.definition.latin or len(values) <= _GROUPS:
-            return group, values.tolist()
-        part = np.minimum(np.arange(len(values)) * _GROUPS // len(values), _GROUPS - 1)
-        return part[group], [float(np.median(values[part == k])) for k in range(_GROUPS)]
-
-    def band(
-        self,
-        variable: str,
-        along: str,
-        *,
-        parameter: str | None = None,
-        parameter_2: str | None = None,
-        axis: str | None = None,
-        simpler: str | None = None,
-        at: Mapping[str, Any] | None = None,
-    ) -> pd.DataFrame:
-        """A variable along an axis: median and the middle 90 % over seeds and all axes that `at` does not fix.
-
-        Returns
-        -------
-        pandas.DataFrame
-            Columns ``value`` (of the axis), ``median``, ``low``, ``high`` and ``n``, the number of cells.
-        """
-        numbers = self.values(variable, parameter=parameter, parameter_2=parameter_2, axis=axis, simpler=simpler)
-        return self._band(numbers, along, at)
-
-    def _band(self, numbers: FloatArray, along: str, at: Mapping[str, Any] | None) -> pd.DataFrame:
-        import pandas as pd
-
-        mask = self.at(at) & ~np.isnan(numbers)
-        group, values = self._grouped(along)
-        rows = []
-        for place, value in enumerate(values):
-            some = numbers[mask & (group == place)]
-            # Observations, not interpolated between: some may be infinite.
-            low, middle, high = (
-                np.quantile(some, (BAND[0], 0.5, BAND[1]), method="closest_observation") if len(some) else (np.nan,) * 3
-            )
-            if len(some) and np.isfinite(some).all():
-                middle = np.median(some)
-            rows.append({"value": value, "median": middle, "low": low, "high": high, "n": len(some)})
-        return pd.DataFrame(rows)
-
-    def image(
-        self,
-        variable: str,
-        x: str,
-        y: str,
-        *,
-        parameter: str | None = None,
-        parameter_2: str | None = None,
-        axis: str | None = None,
-        simpler: str | None = None,
-        at: Mapping[str, Any] | None = None,
-    ) -> xr.DataArray:
-        """A variable over two axes, (y, x): median over seeds and all axes that `at` does not fix."""
-        import xarray as xr
-
-        if x == y:
-            raise StudyError(f"an image needs two axes, not {x} twice.")
-        numbers = self.values(variable, parameter=parameter, parameter_2=parameter_2, axis=axis, simpler=simpler)
-        mask = self.at(at) & ~np.isnan(numbers)
-        (column, columns), (row, rows) = self._grouped(x), self._grouped(y)
-        pixels = np.full((len(rows), len(columns)), np.nan)
-        for i in range(len(rows)):
-            for j in range(len(columns)):
-                some = numbers[mask & (row == i) & (column == j)]
-                if len(some):
-                    pixels[i, j] = np.median(some)
-        return xr.DataArray(pixels, coords={y: rows, x: columns}, dims=(y, x), name=variable)
 
     def frames_for(self, target_arcsec: float) -> FloatArray:
         """Frames (C,) that bring the frame-dependent error, 1 sigma per axis across the boresight, to a target.
@@ -273,31 +164,35 @@ class Study(Shown):
         curve, factors, frames = (self.data[name].values for name in ("error_curve_arcsec", _FACTOR, "n_frames"))
         return frames_for(curve, factors, frames, target_arcsec)
 
-    def needed(
+    def met(
         self, along: str, target_arcsec: float | None = None, *, at: Mapping[str, Any] | None = None
-    ) -> pd.DataFrame:
-        """Frames that a target takes, along an axis: as `band` gives a variable; by default the study's own target.
+    ) -> list[float]:
+        """Values of an axis of numbers at which the median frame-dependent error crosses the target, interpolated.
+
+        Parameters
+        ----------
+        along : str
+            The axis.
+        target_arcsec : float, optional
+            Error across the boresight per axis, 1 sigma, arcsec; the study's own target by default.
+        at : dict, optional
+            Values at which other axes are held; the median is over all of theirs by default.
 
         Raises
         ------
         StudyError
-            Without any target.
+            Without a target, along names, or for an axis or a value that is not in the sweep.
         """
         target = self.definition.target_arcsec if target_arcsec is None else target_arcsec
-        if target is None or not target > 0.0:
-            raise StudyError("no target is set: give target_arcsec above zero, here or in [study].")
-        return self._band(self.frames_for(target), along, at)
-
-    def met(
-        self, along: str, target_arcsec: float | None = None, *, at: Mapping[str, Any] | None = None
-    ) -> list[float]:
-        """Values of an axis of numbers at which the median frame-dependent error crosses the target, interpolated."""
-        target = self.definition.target_arcsec if target_arcsec is None else target_arcsec
-        if target is None or AXES[along].kind == "name":
+        if target is None or not target > 0.0 or AXES[along].kind == "name":
             raise StudyError("give target_arcsec above zero, and an axis of numbers.")
-        table = self.band("frame_error_arcsec", along, axis="cross", at=at).dropna()
-        value = table["value"].to_numpy(dtype=np.float64)
-        excess = np.log(table["median"].to_numpy(dtype=np.float64) / target)
+        try:
+            median = self.sweep.pooled(self.sweep.frame_error, along, at)
+        except ValueError as error:
+            raise StudyError(str(error)) from None
+        known = np.isfinite(median)
+        value = np.asarray(self.sweep.values[along], dtype=np.float64)[known]
+        excess = np.log(median[known] / target)
         changes = np.flatnonzero(np.sign(excess[:-1]) * np.sign(excess[1:]) < 0)
         return [float(value[i] + (value[i + 1] - value[i]) * excess[i] / (excess[i] - excess[i + 1])) for i in changes]
 

@@ -29,10 +29,9 @@ from starcal_uq.studies.axes import camera_of
 from starcal_uq.studies.cells import (
     UNDETERMINED,
     Numbers,
-    coupling_numbers,
+    campaign_numbers,
     covariance_numbers,
     prior_precision,
-    simpler_numbers,
 )
 from starcal_uq.studies.definition import Cell, StudyDefinition
 from starcal_uq.studies.geometry import (
@@ -120,7 +119,7 @@ class SimulatedCells:
         self, key: GeometryKey, geometry: Geometry, noise: FloatArray, cell: Cell, camera: Camera
     ) -> tuple[Statements, Numbers]:
         """What the same frames say by their information."""
-        settings, n = cell.settings, geometry.n_frames
+        settings = cell.settings
         offset = offset_of(camera, settings)
         stated = statements(geometry, noise, offset)
         if key.pointing != "random":
@@ -128,18 +127,9 @@ class SimulatedCells:
             mission = mission.brightest(settings.get("stars"))
             shape, scale = noise_shape(settings)
             stated = stated.for_mission(statements(mission, scale * star_noise(mission.mag, shape), offset))
-        frame = stated.information.sum(axis=0) / n
         prior = prior_precision(self.definition.priors.get(settings["prior"]), camera)
-        found = coupling_numbers(frame, prior, n, stated)
-        found |= simpler_numbers(frame, n, float(stated.weights.sum()), stated)
-        return stated, found | {
-            "sigma_predicted": found["sigma"],
-            "n_frames": n,
-            "mean_stars": stated.mean_stars,
-            "field_deg": camera.fov_deg[0],
-            "truth": camera.theta,
-            "nea_arcsec": ARCSEC * np.sqrt(stated.noise),
-        }
+        found = campaign_numbers(stated, np.ones(len(stated.information)), prior, geometry.n_frames)
+        return stated, found | {"sigma_predicted": found["sigma"]}
 
     def _prior(
         self, cell: Cell, camera: Camera, cal: Calibration, per_star: bool, rng: np.random.Generator

@@ -109,10 +109,7 @@ def test_figures_draw(decoupled: Study) -> None:
         decoupled.plot.needed(along="stars")
 
 
-def test_page_holds_answer_advice_and_provenance(
-    decoupled: Study, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("starcal_uq.presentation.pages.studies._DPI", 40)
+def test_page_holds_answer_advice_and_provenance(decoupled: Study, tmp_path: Path) -> None:
     page = write_page(decoupled, tmp_path / "study").read_text("utf-8")
     assert len(page) < 2_000_000 and "A study &lt;made&gt; by hand" in page and "<script" not in page
     for words in (study_text(decoupled), "go to a field of 20°", "too few stars", "study: seeds"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +19,6 @@ from starcal_uq.presentation.figures.scales import round_levels, ticks_at_levels
 from starcal_uq.presentation.figures.sweeps import (
     MARKERS,
     NAMED,
-    capital,
     colour_of,
     draw_bars,
     draw_lines,
@@ -36,7 +36,7 @@ from starcal_uq.presentation.figures.sweeps import (
     ticks,
     two_axes,
 )
-from starcal_uq.presentation.words.axes import axis_label, said, value_words
+from starcal_uq.presentation.words.axes import axis_label, capital, said, value_words
 from starcal_uq.presentation.words.studies import model_bias
 from starcal_uq.studies.findings import Lines, Sweep
 
@@ -85,18 +85,11 @@ def numbers_of(
     if variable not in _SHOWN or variable not in study.data:
         known = ", ".join(name for name in _SHOWN if name in study.data)
         raise ValueError(f"variable {variable!r} cannot be drawn: use one of {known}.")
-    found = study.data[variable]
     words, unit = _SHOWN[variable]
-    for name in ("parameter", "parameter_2"):
-        if name not in found.dims:
-            continue
-        wanted = parameter if name == "parameter" else parameter_2
-        if wanted not in study.parameter_names:
+    for name, wanted in (("parameter", parameter), ("parameter_2", parameter_2)):
+        if name in study.data[variable].dims and wanted not in study.parameter_names:
             raise ValueError(f"{variable} needs {name}: one of {', '.join(study.parameter_names)}.")
-        found = found.sel({name: wanted})
-    if "axis" in found.dims:
-        return study.sweep.cross(variable), f"{words} [{unit}]"
-    numbers = np.asarray(found.values, dtype=np.float64)
+    numbers = study.values(variable, parameter=parameter, parameter_2=parameter_2, axis="cross")
     if variable == "variance_inflation":
         numbers = np.sqrt(numbers)
     if variable.startswith("sigma") and parameter is not None:
@@ -143,7 +136,7 @@ def plot_study_correlation(
         style.dress(ax, grid=True)
         draw_lines(ax, _sizes(lines))
         if "posterior_correlation" in study.data and second not in AXES:
-            sampled = study.data["posterior_correlation"].sel(parameter=first, parameter_2=second).values
+            sampled = study.values("posterior_correlation", parameter=first, parameter_2=second)
             draw_bars(ax, _sizes(sweep.lines(sampled, along, by, at)))
         known = np.abs(np.stack([lines.median, lines.low, lines.high]))
         top = max(top, float(np.nanmax(known, initial=0.0)))
@@ -160,10 +153,8 @@ def _correlation(study: Study, first: str, second: str) -> FloatArray:
     if first not in names or second not in (*names, *AXES):
         raise ValueError(f"no pair {first}, {second}: name two of {', '.join((*names, *AXES))}, a parameter first.")
     if second in AXES:
-        found = study.data["attitude_correlation"].sel(parameter=first, axis=second)
-    else:
-        found = study.data["correlation"].sel(parameter=first, parameter_2=second)
-    return np.asarray(found.values, dtype=np.float64)
+        return study.values("attitude_correlation", parameter=first, axis=second)
+    return study.values("correlation", parameter=first, parameter_2=second)
 
 
 def _main_pairs(sweep: Sweep) -> list[tuple[str, str]]:
@@ -179,8 +170,6 @@ def _sign_words(r: FloatArray) -> str:
 
 def _sizes(lines: Lines) -> Lines:
     """Absolute values, the range over seeds with them."""
-    from dataclasses import replace
-
     ends = np.sort(np.abs(np.stack([lines.low, lines.high])), axis=0)
     crosses = lines.low * lines.high < 0.0
     return replace(lines, median=np.abs(lines.median), low=np.where(crosses, 0.0, ends[0]), high=ends[1])
@@ -575,7 +564,7 @@ def plot_simpler(
         For a study in which no simpler model was tried.
     """
     models = [str(model) for model in study.data["simpler"].values] if "simpler" in study.data else []
-    bias = np.stack([model_bias(study, i) for i in range(len(models))], axis=1) if models else np.empty((0, 0))
+    bias = np.stack([model_bias(study, model) for model in models], axis=1) if models else np.empty((0, 0))
     # A model that leaves out zeros alone was not tried.
     shown = [i for i in range(len(models)) if np.any(np.nan_to_num(bias[:, i]) > 0.0)]
     if not shown:

@@ -10,7 +10,7 @@ import numpy as np
 from starcal_uq.core.formatting import count, fixed, significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.figures import style
-from starcal_uq.presentation.words.axes import axis_label, place, value_words
+from starcal_uq.presentation.words.axes import axis_label, capital, place, value_words
 from starcal_uq.studies.findings import Lines, Sweep
 
 if TYPE_CHECKING:
@@ -244,7 +244,3 @@ def short(value: float) -> str:
 
 def colour_of(name: str) -> str:
     return _PARAMETER_COLOURS.get(name, style.GREY)
-
-
-def capital(text: str) -> str:
-    return text[:1].upper() + text[1:]

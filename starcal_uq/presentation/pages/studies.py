@@ -39,8 +39,6 @@ from starcal_uq.studies.result import Study
 PAGE = "report.html"
 _TEMPLATE = "study.html.j2"
 _CELLS_SHOWN = 60
-# Sharp on a page of this width, and small enough for all of them in one file.
-_DPI = 180
 
 _CAPTIONS = {
     "correlation": (
@@ -124,7 +122,7 @@ def study_figures(study: Study) -> dict[str, bytes]:
         drawn["simpler"] = plot_simpler(study)
     if "covered_95" in study.data:
         drawn["coverage"] = plot_coverage(study)
-    return {name: png_bytes(figure, _DPI) for name, figure in drawn.items()}
+    return {name: png_bytes(figure) for name, figure in drawn.items()}
 
 
 def render_study(study: Study, images: Mapping[str, bytes]) -> str:
@@ -152,14 +150,9 @@ def render_study(study: Study, images: Mapping[str, bytes]) -> str:
         "cells": cells_table(study, _CELLS_SHOWN),
         "cells_words": f"{plural(min(_CELLS_SHOWN, len(study.sweep.ok)), 'cell')} of {count(len(study.sweep.ok))}",
         "provenance": _provenance(study),
-        "images": {name: embedded_image(png) | {"width": _width(png)} for name, png in images.items()},
+        "images": {name: embedded_image(png) for name, png in images.items()},
     }
     return template_environment().get_template(_TEMPLATE).render(context) + "\n"
-
-
-def _width(png: bytes) -> int:
-    """Width on the page: 100 to an inch."""
-    return int.from_bytes(png[16:20], "big") * 100 // _DPI
 
 
 def cells_table(study: Study, n: int) -> TextTable:

@@ -6,32 +6,36 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from starcal_uq.core.formatting import count, fixed, join_words
+from starcal_uq.camera.distortion import PARAMETERS
+from starcal_uq.core.formatting import count, fixed, join_words, pretty_unit
+from starcal_uq.studies.axes import AXES
 
-# Name, unit, and how a value is said; the name of an axis that is missing here is said as it is.
+# Name, and how a value is said; the name of an axis that is missing here is said as it is.
 _AXES = {
-    "fov_deg": ("field of view", "°", "a field of {}°"),
-    "focal_mm": ("focal length", "mm", "a focal length of {} mm"),
-    "pixels": ("detector's width", "px", "{} px of detector"),
-    "pixel_um": ("pixel pitch", "µm", "pixels of {} µm"),
-    "x0_offset_px": ("offset of the principal point in x", "px", "a principal point {} px off in x"),
-    "y0_offset_px": ("offset of the principal point in y", "px", "a principal point {} px off in y"),
-    "distortion": ("distortion model", "", "the model {}"),
-    "distortion_px": ("distortion at the corner", "px", "{} px of distortion"),
-    "max_mag": ("magnitude limit", "mag", "stars to magnitude {}"),
-    "stars": ("number of stars per frame", "", "{} stars a frame"),
-    "frames": ("number of frames", "", "{} frames"),
-    "min_stars": ("fewest stars of a frame", "", "at least {} stars a frame"),
-    "pointing": ("pointing", "", "{} pointing"),
-    "sigma_px": ("centroid noise", "px", "{} px of noise"),
-    "noise_per_mag": ("growth of the noise per magnitude", "dex", "noise growing by {} dex per magnitude"),
-    "noise_mag": ("magnitude of the stated noise", "mag", "noise as stated at magnitude {}"),
-    "noise_floor_px": ("noise of bright stars", "px", "a floor of {} px under the noise"),
-    "direction_mas": ("errors of the stars' directions", "mas", "star errors of {} mas"),
-    "prior": ("prior", "", "the prior {}"),
-    "method": ("method", "", "the method {}"),
-    "likelihood": ("likelihood", "", "the likelihood {}"),
+    "fov_deg": ("field of view", "a field of {}°"),
+    "focal_mm": ("focal length", "a focal length of {} mm"),
+    "pixels": ("detector's width", "{} px of detector"),
+    "pixel_um": ("pixel pitch", "pixels of {} µm"),
+    "x0_offset_px": ("offset of the principal point in x", "a principal point {} px off in x"),
+    "y0_offset_px": ("offset of the principal point in y", "a principal point {} px off in y"),
+    "distortion": ("distortion model", "the model {}"),
+    "distortion_px": ("distortion at the corner", "{} px of distortion"),
+    "max_mag": ("magnitude limit", "stars to magnitude {}"),
+    "stars": ("number of stars per frame", "{} stars a frame"),
+    "frames": ("number of frames", "{} frames"),
+    "min_stars": ("fewest stars of a frame", "at least {} stars a frame"),
+    "pointing": ("pointing", "{} pointing"),
+    "sigma_px": ("centroid noise", "{} px of noise"),
+    "noise_per_mag": ("growth of the noise per magnitude", "noise growing by {} dex per magnitude"),
+    "noise_mag": ("magnitude of the stated noise", "noise as stated at magnitude {}"),
+    "noise_floor_px": ("noise of bright stars", "a floor of {} px under the noise"),
+    "direction_mas": ("errors of the stars' directions", "star errors of {} mas"),
+    "prior": ("prior", "the prior {}"),
+    "method": ("method", "the method {}"),
+    "likelihood": ("likelihood", "the likelihood {}"),
 }
+# Units as they are printed, where that is not how they are written.
+_PRINTED = {"deg": "°", "um": "µm"}
 
 
 def axis_name(axis: str) -> str:
@@ -41,7 +45,8 @@ def axis_name(axis: str) -> str:
 
 def axis_label(axis: str) -> str:
     """The axis with its unit, for an axis of a figure or the head of a column."""
-    unit = _AXES[axis][1] if axis in _AXES else ""
+    unit = AXES[axis].unit if axis in AXES else ""
+    unit = _PRINTED.get(unit, pretty_unit(unit))
     return f"{axis_name(axis)} [{unit}]" if unit else axis_name(axis)
 
 
@@ -60,8 +65,13 @@ def value_words(value: Any) -> str:
 
 def said(axis: str, value: Any) -> str:
     """A value with its axis: ``a field of 10°``."""
-    form = _AXES[axis][2] if axis in _AXES else axis + " {}"
+    form = _AXES[axis][1] if axis in _AXES else axis + " {}"
     return form.format(value_words(value))
+
+
+def capital(text: str) -> str:
+    """First letter of a sentence; the name of a parameter stays as it is written."""
+    return text if text.split(" ")[0].rstrip(":") in PARAMETERS else text[:1].upper() + text[1:]
 
 
 def place(values: Mapping[str, Any]) -> str:

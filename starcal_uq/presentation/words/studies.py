@@ -11,15 +11,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.camera.distortion import parameter_called, parameters
+from starcal_uq.camera.distortion import COEFFICIENTS, parameter_called, parameters
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import count, fixed, join_words, percent, plural, pretty_unit, significant
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.maths.intervals import binomial_interval
 from starcal_uq.presentation.figures.coupling import correlation_text
 from starcal_uq.presentation.tables import TextTable
-from starcal_uq.presentation.words.axes import axis_label, axis_name, place, said, value_words
-from starcal_uq.studies.findings import COUPLED, Curve, Direction, Pair, Sweep
+from starcal_uq.presentation.words.axes import axis_label, axis_name, capital, place, said, value_words
+from starcal_uq.propagation.coupling import COUPLED
+from starcal_uq.studies.findings import Curve, Direction, Pair, Sweep
 
 if TYPE_CHECKING:
     from starcal_uq.studies.result import Study
@@ -31,7 +32,7 @@ _SAME = 0.99
 # An error that changes by less than this factor along an axis hardly depends on it.
 HARDLY = 1.1
 # What a lens and a catalogue are, and nobody chooses.
-NATURE = ("distortion", "distortion_px", "direction_mas", "k1", "k2", "k3", "p1", "p2")
+NATURE = ("distortion", "distortion_px", "direction_mas", *COEFFICIENTS)
 
 
 def study_text(study: Study) -> str:
@@ -346,7 +347,7 @@ def _target_sigmas(study: Study) -> list[str]:
     parts = []
     for name, target in study.definition.target_sigma.items():
         spec = parameter_called(name)
-        sigma = sweep.over(np.asarray(study.data["sigma"].sel(parameter=name).values, dtype=np.float64))
+        sigma = sweep.over(study.values("sigma", parameter=name))
         known = np.isfinite(sigma)
         if not known.any():
             continue
@@ -357,8 +358,8 @@ def _target_sigmas(study: Study) -> list[str]:
             text = f"{head} {'everywhere' if met.any() else 'nowhere'}"
         else:
             text = f"{head} in {count(int(met.sum()))} of {count(int(known.sum()))} places{_where(sweep, met, known)}"
-        needed = study.data["frames_needed_sigma"].sel(parameter=name).values
-        parts.append(f"{text}. {_range_of_frames(sweep, np.asarray(needed, dtype=np.float64))}".strip())
+        needed = study.values("frames_needed_sigma", parameter=name)
+        parts.append(f"{text}. {_range_of_frames(sweep, needed)}".strip())
     return parts
 
 
@@ -416,7 +417,7 @@ def _where(sweep: Sweep, flag: BoolArray, known: BoolArray) -> str:
 def _price_of_models(study: Study) -> str:
     """The sigma of f with richer models beside that with the simplest, medians."""
     sweep = study.sweep
-    curve = sweep.along(np.asarray(study.data["sigma"].sel(parameter="f").values, dtype=np.float64), "distortion")
+    curve = sweep.along(study.values("sigma", parameter="f"), "distortion")
     if curve is None:
         return ""
     order = sorted(range(len(curve.values)), key=lambda i: len(parameters(curve.values[i])))
@@ -434,7 +435,7 @@ def _models(study: Study) -> list[str]:
     names = sorted(known, key=lambda model: len(parameters(model)))
     position = sweep.axes.index("distortion")
     numbers = {
-        "the sigma of f": np.asarray(study.data["sigma"].sel(parameter="f").values, dtype=np.float64),
+        "the sigma of f": study.values("sigma", parameter="f"),
         "the error from frame to frame": sweep.frame_error,
         "the common rotation": sweep.common_rotation,
     }
@@ -457,8 +458,8 @@ def _simpler(study: Study) -> list[str]:
         return []
     sweep = study.sweep
     parts = []
-    for i, model in enumerate(map(str, study.data["simpler"].values)):
-        bias = model_bias(study, i)
+    for model in map(str, study.data["simpler"].values):
+        bias = model_bias(study, model)
         grid, error = sweep.over(bias), sweep.over(np.where(np.isfinite(bias), sweep.frame_error, np.nan))
         known = np.isfinite(grid) & np.isfinite(error)
         if not known.any():
@@ -480,10 +481,9 @@ def _simpler(study: Study) -> list[str]:
     return parts
 
 
-def model_bias(study: Study, simpler: int) -> FloatArray:
+def model_bias(study: Study, simpler: str) -> FloatArray:
     """Frame-dependent attitude error across the boresight (C,) that a simpler model would leave, arcsec."""
-    by_axis = study.data["model_bias_attitude_arcsec"].values[:, simpler, :2]
-    return np.asarray(np.sqrt(np.mean(by_axis**2, axis=-1)), dtype=np.float64)
+    return study.values("model_bias_attitude_arcsec", axis="cross", simpler=simpler)
 
 
 def _simulated(study: Study) -> list[str]:
@@ -569,8 +569,7 @@ def study_limits(study: Study) -> list[str]:
 
 def correlations(study: Study, pair: Pair) -> FloatArray:
     """Correlation of a pair in every cell (C,)."""
-    found = study.data["correlation"].sel(parameter=pair.names[0], parameter_2=pair.names[1])
-    return np.asarray(found.values, dtype=np.float64)
+    return study.values("correlation", parameter=pair.names[0], parameter_2=pair.names[1])
 
 
 def study_table(study: Study) -> TextTable | None:
@@ -597,12 +596,10 @@ def summary_columns(study: Study) -> list[tuple[str, FloatArray, Any]]:
     columns: list[tuple[str, FloatArray, Any]] = []
     for pair in sorted(sweep.coupled or sweep.pairs[:1], key=lambda pair: -pair.mean_size)[:2]:
         columns.append((dashed(pair), correlations(study, pair), _correlation))
-    factor = np.sqrt(study.data["variance_inflation"].sel(parameter="f").values)
+    factor = np.sqrt(study.values("variance_inflation", parameter="f"))
     spec = parameter_called("f")
-    columns.append(
-        (f"Sigma f [{pretty_unit(spec.scaled_unit)}]", study.data["sigma"].sel(parameter="f").values, _number)
-    )
-    columns.append(("Price f", np.asarray(factor, dtype=np.float64), _number))
+    columns.append((f"Sigma f [{pretty_unit(spec.scaled_unit)}]", study.values("sigma", parameter="f"), _number))
+    columns.append(("Price f", factor, _number))
     columns.append(("Common [arcsec]", sweep.common_rotation, _number))
     columns.append(("Rest [arcsec]", sweep.frame_error, _number))
     target = study.definition.target_arcsec
@@ -621,11 +618,3 @@ def _number(value: float) -> str:
 
 def _frames(value: float) -> str:
     return "–" if np.isnan(value) else "never" if np.isinf(value) else count(int(np.ceil(value)))
-
-
-def capital(text: str) -> str:
-    """First letter of a sentence; the name of a parameter stays as it is written."""
-    return text if text.split(" ")[0] in _PARAMETERS else text[:1].upper() + text[1:]
-
-
-_PARAMETERS = {"x0", "y0", "f", "k1", "k2", "k3", "p1", "p2"}

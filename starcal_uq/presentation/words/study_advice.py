@@ -8,12 +8,11 @@ import numpy as np
 
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.formatting import join_words, plural, significant
-from starcal_uq.presentation.words.axes import axis_name, place, said, value_words
+from starcal_uq.presentation.words.axes import axis_name, capital, place, said, value_words
 from starcal_uq.presentation.words.studies import (
     HARDLY,
     NATURE,
     TOLD,
-    capital,
     correlations,
     dashed,
     error_effects,
@@ -80,7 +79,7 @@ def _pays(study: Study, pair: Pair, cost: Curve) -> bool:
     """Whether both sigmas are smaller where the pair is least coupled than where it is most."""
     sweep = study.sweep
     for name in pair.names:
-        sigma = np.where(np.isfinite(correlations(study, pair)), study.data["sigma"].sel(parameter=name).values, np.nan)
+        sigma = np.where(np.isfinite(correlations(study, pair)), study.values("sigma", parameter=name), np.nan)
         curve = sweep.along(sigma, cost.axis)
         if curve is None or curve.median[cost.least] >= curve.median[cost.most]:
             return False
@@ -174,8 +173,8 @@ def _advice_models(study: Study) -> str:
     sweep = study.sweep
     good: list[str] = []
     bad: list[str] = []
-    for i, model in enumerate(map(str, study.data["simpler"].values)):
-        bias = model_bias(study, i)
+    for model in map(str, study.data["simpler"].values):
+        bias = model_bias(study, model)
         known = sweep.ok & np.isfinite(bias)
         # Where what it leaves out is zero, nothing was tried.
         if known.any() and np.any(bias[known] > 0.0):
