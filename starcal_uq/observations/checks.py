@@ -49,6 +49,15 @@ class Problem:
     other: int | None = None
 
 
+def check_mapping(names: Iterable[str]) -> None:
+    """Refuse a name of the package that is to be read from another column, and is no column of observations."""
+    for name in names:
+        if name not in COLUMNS:
+            raise ObservationError(
+                f"columns: {name!r} is no column of observations; use {', '.join(COLUMNS)}.", column=name
+            )
+
+
 def _number(text: str) -> float:
     # Python reads 1_000 as a number; in a table the underscore is a slip.
     if "_" in text:

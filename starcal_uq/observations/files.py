@@ -23,6 +23,7 @@ from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, StrA
 from starcal_uq.observations.checks import (
     Problem,
     check_columns,
+    check_mapping,
     parse_numbers,
     parse_times,
     parse_whole,
@@ -93,11 +94,7 @@ def read_table(
     The columns are those of `only`; without `check`, rows are taken to have been checked before. Of a Parquet file,
     the rows can be those of some `frames` alone.
     """
-    if unknown := [name for name in mapping if name not in COLUMNS]:
-        raise ObservationError(
-            f"columns: {unknown[0]!r} is no column of observations; use {', '.join(COLUMNS)}.",
-            column=unknown[0],
-        )
+    check_mapping(mapping)
     path = Path(path)
     if os.path.isdir(path):
         raise ObservationError(

@@ -18,6 +18,7 @@ import numpy as np
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.files import PathLike
 from starcal_uq.core.types import AnyDict, IntArray
+from starcal_uq.observations.checks import check_mapping
 from starcal_uq.observations.columns import COLUMNS
 from starcal_uq.observations.files import ParquetSummary, parquet_column, parquet_summary, read_table
 from starcal_uq.observations.table import Observations
@@ -193,10 +194,7 @@ def open_partitions(
         If a file is damaged, does not fit to the others, or repeats a frame number of another. Rows are checked when
         they are first worked on.
     """
-    if unknown := [name for name in columns or {} if name not in COLUMNS]:
-        raise ObservationError(
-            f"columns: {unknown[0]!r} is no column of observations; use {', '.join(COLUMNS)}.", column=unknown[0]
-        )
+    check_mapping(columns or {})
     folder = Path(folder)
     if not folder.is_dir():
         raise ObservationError(f"{folder}: is no directory; name one that holds .parquet files.")

@@ -15,7 +15,7 @@ import numpy as np
 
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.types import AnyDict, IntArray
-from starcal_uq.observations.checks import check_columns, raise_problems
+from starcal_uq.observations.checks import check_columns, check_mapping, raise_problems
 from starcal_uq.observations.columns import COLUMNS
 from starcal_uq.observations.files import RawTable, arrow_values, check_names, convert_columns, table_meta
 from starcal_uq.observations.table import Observations
@@ -89,10 +89,7 @@ def stream_frames(
         Here, if there is no such file or its ending cannot be streamed; during iteration, as `load_observations`, and
         when the rows of a frame do not follow each other. The frames before have been given out by then.
     """
-    if unknown := [name for name in columns or {} if name not in COLUMNS]:
-        raise ObservationError(
-            f"columns: {unknown[0]!r} is no column of observations; use {', '.join(COLUMNS)}.", column=unknown[0]
-        )
+    check_mapping(columns or {})
     if batch_rows < 1:
         raise ObservationError(f"batch_rows is {batch_rows}; use 1 or more.")
     path = Path(path)

@@ -11,6 +11,7 @@ scores of two frames. Everything else follows from C: it is what `coupling` says
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
@@ -63,7 +64,7 @@ def simpler_models(model: str) -> tuple[str, ...]:
     )
 
 
-class FisherCells:
+class Cells(ABC):
     """Numbers of cells, one after the other; what neighbours share is kept from one to the next.
 
     Parameters
@@ -76,8 +77,6 @@ class FisherCells:
 
     def __init__(self, definition: StudyDefinition, heaven: Heaven) -> None:
         self.definition, self.heaven = definition, heaven
-        self._geometries: dict[GeometryKey, Geometry | StudyError] = {}
-        self._stated: tuple[Any, Statements] | None = None
         self._camera: tuple[Any, Camera] | None = None
 
     def camera(self, cell: Cell) -> Camera:
@@ -90,11 +89,24 @@ class FisherCells:
     def numbers(self, cell: Cell) -> Numbers:
         """All numbers of a cell; `status` is a sentence where there are none."""
         try:
-            return self._numbers(cell, self.camera(cell))
+            return self._numbers(cell, self.camera(cell)) | {"status": "ok"}
         except StarcalError as error:
             return {"status": str(error)}
         except np.linalg.LinAlgError:
             return {"status": UNDETERMINED}
+
+    @abstractmethod
+    def _numbers(self, cell: Cell, camera: Camera) -> Numbers:
+        """Numbers of a cell by name."""
+
+
+class FisherCells(Cells):
+    """Cells by Fisher information."""
+
+    def __init__(self, definition: StudyDefinition, heaven: Heaven) -> None:
+        super().__init__(definition, heaven)
+        self._geometries: dict[GeometryKey, Geometry | StudyError] = {}
+        self._stated: tuple[Any, Statements] | None = None
 
     def _numbers(self, cell: Cell, camera: Camera) -> Numbers:
         settings = cell.settings
@@ -102,7 +114,7 @@ class FisherCells:
         n = settings["frames"]
         counts = self._campaign(cell, n, len(stated.information)) / scale**2
         prior = prior_precision(self.definition.priors.get(settings["prior"]), camera)
-        return campaign_numbers(stated, counts, prior, n, scale) | {"status": "ok"}
+        return campaign_numbers(stated, counts, prior, n, scale)
 
     def _campaign(self, cell: Cell, n: int, m: int) -> FloatArray:
         """How often each of m frames is in a campaign of n."""

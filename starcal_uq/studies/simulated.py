@@ -13,7 +13,7 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.constants import ARCSEC
-from starcal_uq.core.errors import SamplingError, StarcalError
+from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.inference.ensemble import PROPOSAL_DF, EnsembleSettings, run_ensembles
@@ -25,19 +25,17 @@ from starcal_uq.maths.intervals import student_quantile
 from starcal_uq.maths.linear import correlation_of, scaled_inverse
 from starcal_uq.observations.table import Observations
 from starcal_uq.sky.positions import ra_dec_deg
-from starcal_uq.studies.axes import camera_of
 from starcal_uq.studies.cells import (
-    UNDETERMINED,
+    Cells,
     Numbers,
     campaign_numbers,
     covariance_numbers,
     prior_precision,
 )
-from starcal_uq.studies.definition import Cell, StudyDefinition
+from starcal_uq.studies.definition import Cell
 from starcal_uq.studies.geometry import (
     Geometry,
     GeometryKey,
-    Heaven,
     Statements,
     geometry_key,
     mission_key,
@@ -59,28 +57,8 @@ _PROBABILITY = 0.95
 _CUBIC = 3
 
 
-class SimulatedCells:
-    """Numbers of simulated cells.
-
-    Parameters
-    ----------
-    definition : StudyDefinition
-        The study.
-    heaven : Heaven
-        Its stars.
-    """
-
-    def __init__(self, definition: StudyDefinition, heaven: Heaven) -> None:
-        self.definition, self.heaven = definition, heaven
-
-    def numbers(self, cell: Cell) -> Numbers:
-        """All numbers of a cell; `status` is a sentence where there are none."""
-        try:
-            return self._numbers(cell, camera_of(self.definition.camera, cell.settings))
-        except StarcalError as error:
-            return {"status": str(error)}
-        except np.linalg.LinAlgError:
-            return {"status": UNDETERMINED}
+class SimulatedCells(Cells):
+    """Cells by simulation."""
 
     def _numbers(self, cell: Cell, camera: Camera) -> Numbers:
         definition, settings = self.definition, cell.settings
@@ -107,7 +85,7 @@ class SimulatedCells:
         found |= {
             name: embedded(name, value, cal.parameter_names, camera.parameter_names) for name, value in own.items()
         }
-        return found | {"status": "ok", "noise_estimate": cal.sigma}
+        return found | {"noise_estimate": cal.sigma}
 
     def _seed(self, cell: Cell) -> int:
         """Seed of the noise: another one for all other settings, so that cells are independent of each other."""
