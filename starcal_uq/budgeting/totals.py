@@ -43,6 +43,8 @@ N_SAMPLES = 200_000
 _SPREAD = 2.0
 # Samples beyond a quantile with fewer say little about it: its standard error is unknown, or the samples end before it.
 _RESOLVED = 20.0
+# A bound that is surely below a quantile: of every so manyth sample, at a share so much smaller.
+_EVERY, _BELOW = 20, 0.01
 # Cases on either side of a quantile that stand for it where they point in different directions.
 _NEIGHBOURS = 4
 _DOMINANT = 0.5
@@ -130,9 +132,13 @@ class Total:
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Sums of sampled rows per scope and kind of randomness, arcsec: ``sums[scope, interpretation]`` is (n, 3)."""
+    """Sums of sampled rows per scope and kind of randomness, arcsec: ``sums[scope, interpretation]`` is (3, n)."""
 
     sums: dict[tuple[str, str], FloatArray]
+
+    def along(self, axes: FloatArray, scope: str, kinds: Sequence[str]) -> FloatArray:
+        """What rows of these kinds add up to along axes (k, 3): (k, n), or (k, 1) zeros without kinds."""
+        return axes @ sum((self.sums[scope, kind] for kind in kinds), start=np.zeros((3, 1)))
 
 
 def draw(rows: Sequence[Contributor], n_samples: int = N_SAMPLES, seed: int = 0) -> Samples:
@@ -144,7 +150,7 @@ def draw(rows: Sequence[Contributor], n_samples: int = N_SAMPLES, seed: int = 0)
     from scipy.special import ndtr
 
     scopes = (*SCOPES, AFTER_AT_LEAST) if any(row.absorbed_by_alignment == "in part" for row in rows) else SCOPES
-    sums = {(scope, kind): np.zeros((n_samples, 3)) for scope in scopes for kind in INTERPRETATIONS}
+    sums = {(scope, kind): np.zeros((3, n_samples)) for scope in scopes for kind in INTERPRETATIONS}
     shared: dict[str, FloatArray] = {}
     scales: dict[str, FloatArray] = {}
     joint = {name: _joint(rows, name, n_samples, seed) for name in {row.name for row in rows if row.axis_correlation}}
@@ -155,7 +161,7 @@ def draw(rows: Sequence[Contributor], n_samples: int = N_SAMPLES, seed: int = 0)
         if group and group in shared:
             uniform = shared[group]
         elif row.axis_correlation:
-            uniform = ndtr(joint[row.name][:, AXES.index(row.axis)])
+            uniform = ndtr(joint[row.name][AXES.index(row.axis)])
         else:
             uniform = np.random.default_rng((seed, 1, index)).random(n_samples)
         if group:
@@ -166,12 +172,12 @@ def draw(rows: Sequence[Contributor], n_samples: int = N_SAMPLES, seed: int = 0)
         errors = sign * row.sigma_arcsec * deviates(row.distribution, uniform, log_scale, row.tail_997)
         for scope in scopes:
             if row.counts(scope):
-                sums[scope, row.interpretation][:, AXES.index(row.axis)] += errors
+                sums[scope, row.interpretation][AXES.index(row.axis)] += errors
     return Samples(sums)
 
 
 def _joint(rows: Sequence[Contributor], name: str, n_samples: int, seed: int) -> FloatArray:
-    """Standard normal deviates (n, 3) with the correlations of a contributor's axes."""
+    """Standard normal deviates (3, n) with the correlations of a contributor's axes."""
     own = {row.axis: row for row in rows if row.name == name and row.axis_correlation}
     matrix = np.eye(3)
     for axis, row in own.items():
@@ -180,7 +186,7 @@ def _joint(rows: Sequence[Contributor], name: str, n_samples: int, seed: int) ->
     index = next(place for place, row in enumerate(rows) if row.name == name)
     plain = np.random.default_rng((seed, 1, index)).standard_normal((n_samples, 3))
     deviate: FloatArray = plain @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
-    return deviate
+    return np.ascontiguousarray(deviate.T)
 
 
 def covariance(rows: Sequence[Contributor]) -> FloatArray:
@@ -254,7 +260,7 @@ def total(
         dominant_share=share,
     )
     if result.unresolved:
-        n = len(next(iter(samples.sums.values())))
+        n = next(iter(samples.sums.values())).shape[1]
         text = f"{n} samples do not resolve a confidence of {confidence_text(confidence)}: there is no sampled bound."
         return replace(result, explanation=text)
     return replace(result, explanation=explain(result, counted, _spread(counted, interpretation), dominant))
@@ -290,12 +296,12 @@ def _bounds(
     radius = _radius(confidence, spread)
     together, apart = _worst(worst, along, confidence, by_shape=False)
     by_shape, _ = _worst(worst, along, confidence, by_shape=True)
-    chance, rest = (
-        sum((samples.sums[scope, kind] for kind in kinds), start=np.zeros((1, 3))) @ along.T
-        for kinds in (_random(interpretation), _worst_kinds(interpretation))
-    )
-    sampled, error = _quantile(_meeting(mean, by_shape, chance) + chance, confidence)
-    least = min(_one_of_many(mean + rest, chance, confidence), sampled) if by_shape > 0.0 else sampled
+    chance = samples.along(along, scope, _random(interpretation))
+    sampled, error = _quantile(_meeting(mean, by_shape, chance)[:, None] + chance, confidence)
+    least = sampled
+    if by_shape > 0.0:
+        rest = mean[:, None] + samples.along(along, scope, _worst_kinds(interpretation))
+        least = min(_one_of_many(rest, chance, confidence), sampled)
     length = float(np.linalg.norm(mean))
     return _Bounds(
         mean=length if len(mean) > 1 else float(mean[0]),
@@ -470,7 +476,7 @@ def _meeting(mean: FloatArray, worst: float, chance: FloatArray) -> FloatArray:
         towards = np.column_stack((np.cos(angle), np.sin(angle)))
     reached = mean + worst * towards
     size = np.linalg.norm(reached, axis=1)
-    spread = np.atleast_2d(np.cov(chance, rowvar=False)) if len(chance) > 1 else np.zeros((len(mean), len(mean)))
+    spread = np.atleast_2d(np.cov(chance)) if chance.shape[1] > 1 else np.zeros((len(mean), len(mean)))
     along = np.sqrt(np.einsum("ni,ij,nj->n", reached, spread, reached)) / np.maximum(size, 1e-300)
     furthest: FloatArray = reached[int(np.argmax(size + 2.0 * along))]
     return furthest
@@ -478,16 +484,21 @@ def _meeting(mean: FloatArray, worst: float, chance: FloatArray) -> FloatArray:
 
 def _one_of_many(rest: FloatArray, chance: FloatArray, confidence: float) -> float:
     """What chance reaches at the confidence where the rest is as large as it is in one case of 1 / (1 - confidence)."""
-    size = np.linalg.norm(rest, axis=1)
+    size = _size(rest)
     at = math.ceil(confidence * len(size)) - 1
-    near = range(max(at - _NEIGHBOURS, 0), min(at + _NEIGHBOURS + 1, len(size))) if rest.shape[1] > 1 else (at,)
+    near = range(max(at - _NEIGHBOURS, 0), min(at + _NEIGHBOURS + 1, len(size))) if len(rest) > 1 else (at,)
     order = np.argpartition(size, list(near))
-    return float(np.mean([_quantile(rest[order[place]] + chance, confidence)[0] for place in near]))
+    return float(np.mean([_quantile(rest[:, order[place], None] + chance, confidence)[0] for place in near]))
+
+
+def _size(errors: FloatArray) -> FloatArray:
+    """Size (n,) of errors (axes, n)."""
+    return np.abs(errors[0]) if len(errors) == 1 else np.sqrt(np.square(errors[0]) + np.square(errors[1]))
 
 
 def _quantile(errors: FloatArray, confidence: float) -> tuple[float, float]:
-    """Quantile of the size of errors (n, axes), and its standard error; NaN if unresolved."""
-    size = np.abs(errors[:, 0]) if errors.shape[1] == 1 else np.hypot(errors[:, 0], errors[:, 1])
+    """Quantile of the size of errors (axes, n), and its standard error; NaN if unresolved."""
+    size = _size(errors)
     n = len(size)
     if size.min() == size.max():
         return float(size[0]), 0.0
@@ -495,8 +506,21 @@ def _quantile(errors: FloatArray, confidence: float) -> tuple[float, float]:
         return math.nan, math.nan
     step = _SPREAD * math.sqrt(n * confidence * (1.0 - confidence))
     places = [min(max(math.ceil(confidence * n + shift) - 1, 0), n - 1) for shift in (-step, 0.0, step)]
-    low, here, high = np.partition(size, places)[places].tolist()
+    low, here, high = _ranked(size, places)
     return here, (high - low) / (2.0 * _SPREAD)
+
+
+def _ranked(values: FloatArray, places: Sequence[int]) -> list[float]:
+    """The values at these places of their order; what is surely below the first place is not put into order."""
+    some = values[::_EVERY]
+    first = int((places[0] / len(values) - _BELOW) * len(some))
+    if first > 0:
+        upper = values[values >= np.partition(some, first)[first]]
+        if len(values) - len(upper) <= places[0]:
+            places = [place - len(values) + len(upper) for place in places]
+            values = upper
+    ranked: list[float] = np.partition(values, places)[places].tolist()
+    return ranked
 
 
 def _dominant(rows: Sequence[Contributor], along: FloatArray, confidence: float) -> tuple[Contributor, float]:

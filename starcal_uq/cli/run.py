@@ -32,6 +32,7 @@ from starcal_uq.cli.settings import (
 )
 from starcal_uq.cli.steps import load_table, sample_run
 from starcal_uq.core.files import check_new_folder
+from starcal_uq.core.tasks import one_thread
 
 if TYPE_CHECKING:
     from starcal_uq.observations.partitions import PartitionedObservations
@@ -119,6 +120,7 @@ def run_command(
     _after_calibration(run, sampling, draws, budget, show=True, **aligning)
 
 
+@one_thread()
 def _after_calibration(
     run: Run,
     sampling: SamplingSettings,
