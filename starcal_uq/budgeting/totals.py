@@ -493,7 +493,8 @@ def _one_of_many(rest: FloatArray, chance: FloatArray, confidence: float) -> flo
 
 def _size(errors: FloatArray) -> FloatArray:
     """Size (n,) of errors (axes, n)."""
-    return np.abs(errors[0]) if len(errors) == 1 else np.sqrt(np.square(errors[0]) + np.square(errors[1]))
+    size: FloatArray = np.abs(errors[0]) if len(errors) == 1 else np.sqrt(np.square(errors[0]) + np.square(errors[1]))
+    return size
 
 
 def _quantile(errors: FloatArray, confidence: float) -> tuple[float, float]:
