@@ -5,12 +5,14 @@
 #   WORKERS=...     processes that share the tests (0: one, without sharing)
 #   DEMO_OUT=...    the folder that `make demo` writes
 #   BENCH=...       options of `make bench`, such as "--quick" or "--only calibrate"
+#   SUPPLY=...      options of `make supply`, such as "--all" or "--python 3.12"
 
 PYTHON ?=
 ALT_PYTHON ?=
 WORKERS ?= 2
 DEMO_OUT ?= starcal-demo
 BENCH ?=
+SUPPLY ?=
 
 BIN := .venv/bin
 ALT_BIN := .venv-alt/bin
@@ -26,7 +28,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help demo test test-other test-second test-slow lint lint-types lint-style docs bench bench-rivals clean
+.PHONY: help demo test test-other test-second test-slow supply lint lint-types lint-style docs bench bench-rivals clean
 
 help: ## show this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "make %-10s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -49,6 +51,9 @@ test-second: .venv-alt/.installed
 test-slow: .venv/.installed-test ## the Monte Carlo tests
 	$(BIN)/python $(PYTEST) -m slow
 
+supply: .supply/.installed ## what users install: wheel, source distribution, lowest versions and licences, from empty environments
+	.supply/bin/python scripts/supply.py $(SUPPLY)
+
 lint: .venv/.installed-test ## style, types and layers
 	@$(MAKE) --no-print-directory --jobs=2 lint-types lint-style
 
@@ -70,7 +75,7 @@ bench-rivals: .bench/.installed ## an environment for the rivals that are not in
 	@/usr/bin/python3 -c "import mrcal" 2>/dev/null || echo "mrcal is not there: apt-get install python3-mrcal (Debian, Ubuntu)"
 
 clean: ## remove everything that the other targets made
-	rm -rf .venv .venv-alt .bench docs/_build docs/notebooks docs/reference/_commands.txt docs/reference/api starcal-demo dist
+	rm -rf .venv .venv-alt .supply .bench docs/_build docs/notebooks docs/reference/_commands.txt docs/reference/api starcal-demo dist
 	rm -rf .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
@@ -108,6 +113,11 @@ clean: ## remove everything that the other targets made
 	@echo "installing starcal_uq and its tests for the second interpreter"
 	@$(ALT_BIN)/python $(PIP_INSTALL) hatchling editables
 	@$(ALT_BIN)/python $(PIP_INSTALL) --no-build-isolation --editable ".[test]"
+	@touch $@
+
+.supply/.installed: .venv/.made constraints.txt
+	@.venv/bin/python -m venv --clear .supply
+	@.supply/bin/python $(PIP_INSTALL) build packaging uv
 	@touch $@
 
 .bench/.installed: .venv/.made benchmarks/rivals.txt benchmarks/cedar.txt

@@ -134,6 +134,17 @@ def test_every_import_is_a_declared_dependency() -> None:
     assert undeclared == set()
 
 
+def test_licences_of_all_that_is_installed_are_listed() -> None:
+    """By name: a licence that changes with a version is seen when `make supply` makes the table anew."""
+    from scripts.licences import PAGE, licences
+
+    listed = set(re.findall(r"^\| ([\w-]+) \| \S", PAGE.read_text("utf-8"), re.MULTILINE))
+    found = licences()
+    assert {"numpy", "kiwisolver", "llvmlite"} <= set(found)  # direct, indirect, of an extra
+    assert set(found) <= listed
+    assert "not stated" not in found.values()
+
+
 def find_python(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     environment = {"PATH": str(folder), "HOME": str(folder)}
     command = [shutil.which("sh") or "/bin/sh", str(FIND_PYTHON), *arguments]

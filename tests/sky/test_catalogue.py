@@ -10,6 +10,7 @@ import erfa
 import numpy as np
 import pytest
 
+import starcal_uq
 from starcal_uq.core.errors import CatalogueError
 from starcal_uq.sky.catalogue import StarCatalogue, load_catalogue
 from starcal_uq.sky.gaia import completed_proper_motion, holds_proper_motion, read_gaia_records
@@ -18,7 +19,7 @@ from tests.helpers.speed import sort_a_million, times_as_long
 
 REFERENCE = Path(__file__).resolve().parents[3] / "shared" / "data" / "bright_star_pm.csv"
 OBSERVED = REFERENCE.with_name("esa_tetra3_observations.csv")
-TABLE = Path(__file__).resolve().parents[2] / "starcal_uq" / "sky" / "data" / "bright_star_pm.csv"
+TABLE = Path(starcal_uq.__file__).parent / "sky" / "data" / "bright_star_pm.csv"
 MAS = np.pi / (180.0 * 3600.0 * 1000.0)
 
 

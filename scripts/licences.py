@@ -1,0 +1,73 @@
+"""Licences of what the package brings along, from the packages' own metadata.
+
+    licences.py PYTHON ...     the table of docs/reference/licences.md, from these environments together
+
+Listed is what `pip install starcal-uq` installs, directly or not, and what its extras for users add.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from importlib.metadata import Distribution, PackageNotFoundError, distribution
+from pathlib import Path
+
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "licences.md"
+EXTRAS = ("compiled", "tetra3rs")
+HEAD = """# Licences
+
+`starcal_uq` is under the MIT licence. This is what comes with it, as a dependency or a dependency's dependency, in any
+of the supported versions of Python, and what the extras *compiled* and *tetra3rs* add, as the packages' own metadata
+say it (`make supply` makes this table). None of it is part of our files: each is installed as its authors publish it,
+and those under the LGPL (*casadi*, *sep*) can be replaced by the user.
+
+| Package | Licence |
+|---|---|
+"""
+
+
+def licence(package: Distribution) -> str:
+    """What a package says of itself: expression, classifiers or the first line of its text."""
+    said = [line.rpartition(" :: ")[2] for line in package.metadata.get_all("Classifier", []) if "License ::" in line]
+    names = ", ".join(name for name in said if name != "OSI Approved")
+    text = (package.metadata.get("License") or "").strip().partition("\n")[0]
+    return package.metadata.get("License-Expression") or names or text or "not stated"
+
+
+def licences() -> dict[str, str]:
+    """Licence by package, for all that this environment has because of the package."""
+    found: dict[str, str] = {}
+    wanted = {("starcal-uq", extra) for extra in ("", *EXTRAS)}
+    seen: set[tuple[str, str]] = set()
+    while wanted:
+        seen.add(at := wanted.pop())
+        try:
+            package = distribution(at[0])
+        except PackageNotFoundError:  # for another system or version of Python
+            continue
+        if at[0] != "starcal-uq":
+            found[at[0]] = licence(package)
+        for line in package.requires or ():
+            needed = Requirement(line)
+            if needed.marker is None or needed.marker.evaluate({"extra": at[1]}):
+                wanted |= {(canonicalize_name(needed.name), extra) for extra in ("", *needed.extras)} - seen
+    return found
+
+
+def main() -> None:
+    if len(sys.argv) == 1:
+        print(json.dumps(licences()))
+        return
+    table: dict[str, str] = {}
+    for python in sys.argv[1:]:
+        made = subprocess.run([python, __file__], capture_output=True, text=True, check=True).stdout
+        table |= json.loads(made)
+    PAGE.write_text(HEAD + "".join(f"| {name} | {table[name]} |\n" for name in sorted(table)), "utf-8")
+
+
+if __name__ == "__main__":
+    main()
