@@ -30,8 +30,6 @@ class Parameter:
         Stored and printed values are ``value / scale``: diagnostics lose tiny numbers otherwise.
     scaled_unit : str
         Unit of the scaled value.
-    latex : str
-        Symbol for axis labels.
     description : str
         Meaning, in words.
     """
@@ -40,7 +38,6 @@ class Parameter:
     unit: str
     scale: float
     scaled_unit: str
-    latex: str
     description: str
 
 
@@ -103,11 +100,11 @@ def _brown_tangential(u: Any, v: Any, k: Sequence[Any]) -> tuple[Any, Any]:
     )
 
 
-_K1 = Coefficient("k1", "px^-2", 1e-10, "1e-10 px^-2", "$k_1$", "radial distortion, cubic term", 3)
-_K2 = Coefficient("k2", "px^-4", 1e-15, "1e-15 px^-4", "$k_2$", "radial distortion, quintic term", 5)
-_K3 = Coefficient("k3", "px^-6", 1e-20, "1e-20 px^-6", "$k_3$", "radial distortion, seventh-order term", 7)
-_P1 = Coefficient("p1", "px^-1", 1e-7, "1e-7 px^-1", "$p_1$", "decentring distortion along y", 2)
-_P2 = Coefficient("p2", "px^-1", 1e-7, "1e-7 px^-1", "$p_2$", "decentring distortion along x", 2)
+_K1 = Coefficient("k1", "px^-2", 1e-10, "1e-10 px^-2", "radial distortion, cubic term", 3)
+_K2 = Coefficient("k2", "px^-4", 1e-15, "1e-15 px^-4", "radial distortion, quintic term", 5)
+_K3 = Coefficient("k3", "px^-6", 1e-20, "1e-20 px^-6", "radial distortion, seventh-order term", 7)
+_P1 = Coefficient("p1", "px^-1", 1e-7, "1e-7 px^-1", "decentring distortion along y", 2)
+_P2 = Coefficient("p2", "px^-1", 1e-7, "1e-7 px^-1", "decentring distortion along x", 2)
 
 _EQ14 = "Ye & Yang 2017, eq. 14 (ideal to distorted), in pixels"
 _MODELS = {
@@ -131,12 +128,12 @@ _MODELS = {
 }
 
 _OPTICS = (
-    Parameter("x0", "px", 1.0, "px", "$x_0$", "principal point, along x"),
-    Parameter("y0", "px", 1.0, "px", "$y_0$", "principal point, along y"),
-    Parameter("f", "px", 1.0, "px", "$f$", "focal length"),
+    Parameter("x0", "px", 1.0, "px", "principal point, along x"),
+    Parameter("y0", "px", 1.0, "px", "principal point, along y"),
+    Parameter("f", "px", 1.0, "px", "focal length"),
 )
-_SIGMA = Parameter("sigma", "px", 1.0, "px", r"$\sigma$", "centroid noise per axis")
-_SIGMA_SCALE = Parameter("sigma_scale", "1", 1.0, "1", r"$s_\sigma$", "common factor on the stated noise of the stars")
+_SIGMA = Parameter("sigma", "px", 1.0, "px", "centroid noise per axis")
+_SIGMA_SCALE = Parameter("sigma_scale", "1", 1.0, "1", "common factor on the stated noise of the stars")
 
 
 def model_names() -> tuple[str, ...]:

@@ -26,10 +26,16 @@ from starcal_uq.presentation.figures.estimation import (
     plot_residual_radius,
     plot_residuals,
 )
-from starcal_uq.presentation.figures.inference import CONTOUR_MASSES, mass_levels, plot_corner, plot_prior_posterior
+from starcal_uq.presentation.figures.inference import (
+    CONTOUR_MASSES,
+    mass_levels,
+    plot_corner,
+    plot_prior_posterior,
+    sparse,
+)
 from starcal_uq.presentation.figures.propagation import plot_attitude, plot_field_map
-from starcal_uq.presentation.figures.scales import axis_scale
-from starcal_uq.presentation.figures.style import figure_of, png_bytes
+from starcal_uq.presentation.figures.scales import axis_scale, symbol
+from starcal_uq.presentation.figures.style import figure_of, new_figure, panels, png_bytes
 from starcal_uq.propagation.attitude_error import AttitudeError, MisfitFound
 from tests.helpers.scenes import camera, nominal, observations
 
@@ -98,8 +104,23 @@ def test_corner_shows_every_sampled_parameter(run):
     n = len(run.post.sampled)
     assert len(figure.axes) == n * (n + 1) // 2
     titles = [ax.get_title() for ax in figure.axes if ax.get_title()]
-    assert [title.split(" ")[0] for title in titles] == [run.post.parameters[i].latex for i in run.post.sampled]
+    assert [title.split(" ")[0] for title in titles] == [symbol(run.post.parameters[i].name) for i in run.post.sampled]
     assert overlapping(figure) == []
+
+
+@pytest.mark.parametrize("half", [0.152, 0.157, 3.1, 10.4, 0.0203])
+def test_labels_of_neighbouring_panels_do_not_touch(half):
+    figure = new_figure(11.5, 2.0)
+    grid = panels(figure, 1, 6, (0.46, 0.14, 0.5, 0.6), (0.22, 0.0))
+    for i in range(6):
+        ax = figure.add_subplot(grid[0, i])
+        ax.set_xlim(-half, half)
+        sparse(ax, y=False)
+    figure.draw_without_rendering()
+    labels = [label for ax in figure.axes for label in ax.get_xticklabels() if abs(label.get_position()[0]) <= half]
+    assert len(labels) >= 12
+    boxes = [label.get_window_extent() for label in labels]
+    assert not any(a.overlaps(b) for a, b in itertools.combinations(boxes, 2))
 
 
 def test_prior_and_posterior(run):
@@ -120,11 +141,11 @@ def test_contours_hold_the_stated_mass():
 def test_axis_is_value_minus_the_printed_number():
     k1 = parameters("brown")[3]
     scale = axis_scale(k1, 1.9634e-10, 0.39e-10)
-    assert scale.label == "$k_1$ − 1.96 [10⁻¹⁰ px⁻²]"
-    assert scale.title == "$k_1$ = (1.96 ± 0.39) × 10⁻¹⁰ px⁻²"
+    assert scale.label == "k₁ − 1.96 [10⁻¹⁰ px⁻²]"
+    assert scale.title == "k₁ = (1.96 ± 0.39) × 10⁻¹⁰ px⁻²"
     assert scale(2.35e-10) == pytest.approx(0.39)
     fine = axis_scale(parameters("brown")[2], -5000.0, 0.0002)
-    assert fine.label == "$f$ + 5000.00000 [10⁻³ px]"
+    assert fine.label == "f + 5000.00000 [10⁻³ px]"
     assert fine(np.array([-4999.999])) == pytest.approx([1.0])
 
 

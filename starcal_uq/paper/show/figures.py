@@ -19,6 +19,7 @@ from starcal_uq.paper.result import QUANTITIES, per_px
 from starcal_uq.paper.show.field import CAMERA_NAMES
 from starcal_uq.paper.show.tables import METHOD_NAMES, NAMES
 from starcal_uq.presentation.figures import style
+from starcal_uq.presentation.figures.scales import symbol
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -79,8 +80,8 @@ def plot_trajectories(found: Reproduction) -> Figure:
         for ax in (by_iteration, by_frame):
             ax.axhline(0.0, color=style.INK, linewidth=1.0, dashes=(4, 2))
         _distance_axis((by_iteration, by_frame), threshold)
-        latex = parameters("none")[index].latex
-        style.label(by_iteration, y=f"{latex} − {true * to_unit:g} [{unit}]")
+        name = symbol(parameters("none")[index].name)
+        style.label(by_iteration, y=f"{name} − {true * to_unit:g} [{unit}]")
     by_frame.set_xscale("log")
     style.label(panels[0, 0], "Batch methods: by iteration")
     style.label(panels[0, 1], "Filter: by frame, with its claimed standard deviation")
@@ -219,8 +220,7 @@ def plot_printed_numbers(found: Reproduction) -> Figure:
 
 def _axis_name(one: Judged) -> str:
     place, quantity = one.printed.place.partition(";")[0], one.printed.quantity
-    latex = {p.name: p.latex for p in parameters("brown")}
-    words = NAMES[quantity] if one.printed.is_error_size else latex[quantity.partition("_")[0]]
+    words = NAMES[quantity] if one.printed.is_error_size else symbol(quantity.partition("_")[0])
     return f"{place} ({METHOD_NAMES[one.printed.method]}): {words}"
 
 
@@ -359,7 +359,7 @@ def _errors(ax: Axes, rows: list[AnyDict], places: list[int], parameter: Paramet
             ax.annotate(fixed(bias, 0), end, xytext=(side * 5.0, 0.0), ha=anchor, va="center", **small)
         reach = max(reach, abs(bias) + max(spread, claimed))
     _signed_axis(ax, reach)
-    style.label(ax, parameter.latex)
+    style.label(ax, symbol(parameter.name))
 
 
 def _signed_axis(ax: Axes, reach: float) -> None:
@@ -468,7 +468,8 @@ def plot_interaction(study: InteractionStudy) -> Figure:
             ax.set_yscale("log")
             ax.set_ylim(low, high)
             last = i == len(optics) - 1
-            style.label(ax, title if i == 0 else "", words if last else "", f"{parameter.latex} [px]" if j == 0 else "")
+            name = f"{symbol(parameter.name)} [px]" if j == 0 else ""
+            style.label(ax, title if i == 0 else "", words if last else "", name)
     for j, axis in enumerate(_AXES):
         _scale(panels[0, j], table[table["axis"] == axis][STUDY_AXES[axis]].to_numpy())
     _interaction_legend(figure, methods)

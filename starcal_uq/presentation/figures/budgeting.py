@@ -55,7 +55,7 @@ def _panel(ax: Axes, budget: Budget, names: list[str], axis: str) -> None:
     left = 10.0 ** np.floor(np.log10(low * 0.7))
     # Room on the right for the numbers.
     ax.set_xlim(left, high * (high / left) ** 0.22)
-    ax.set_xscale("log")
+    style.log_scale(ax.xaxis)
     for place, name in enumerate(names):
         row = by_name[name][0]
         value = reaches[name]

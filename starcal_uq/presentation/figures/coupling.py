@@ -10,6 +10,7 @@ import numpy as np
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.figures import style
+from starcal_uq.presentation.figures.scales import symbol
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,9 +18,6 @@ if TYPE_CHECKING:
     from matplotlib.image import AxesImage
 
     from starcal_uq.propagation.coupling import Coupling
-
-_SYMBOLS = {"x0": "$x_0$", "y0": "$y_0$", "f": "$f$", "sigma": r"$\sigma$", "sigma_scale": r"$s_\sigma$"}
-_SYMBOLS |= {name: f"${name[0]}_{name[1]}$" for name in ("k1", "k2", "k3", "p1", "p2")}
 
 
 def plot_correlation(coupling: Coupling, ax: Axes | None = None, *, extended: bool = False) -> Axes:
@@ -86,11 +84,6 @@ def plot_couplings(coupling: Coupling, ax: Axes | None = None) -> Axes:
     ax.grid(False, axis="y")
     style.label(ax, "Price of coupling", "sigma / sigma if all other parameters were known")
     return ax
-
-
-def symbol(name: str) -> str:
-    """The name as a mathematical symbol for labels, or itself."""
-    return _SYMBOLS.get(name, name)
 
 
 def _extended(ax: Axes, coupling: Coupling) -> AxesImage:

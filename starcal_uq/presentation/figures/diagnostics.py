@@ -13,6 +13,7 @@ from starcal_uq.diagnostics.misfit import ALPHA
 from starcal_uq.diagnostics.residuals import Profile1D, residual_profiles
 from starcal_uq.maths.ranks import counts_below, uniformity_band
 from starcal_uq.presentation.figures import style
+from starcal_uq.presentation.figures.scales import symbol
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -42,7 +43,7 @@ def plot_misfit(misfit: Misfit, ax: Axes | None = None, *, alpha: float = ALPHA)
     for chosen, colour, marker in ((p >= alpha, style.BLUE, "o"), (p < alpha, style.VERMILLION, "D")):
         ax.scatter(p[chosen], rows[chosen], color=colour, marker=marker, s=30, zorder=3)
     ax.axvline(alpha, color=style.INK, linewidth=1.0, dashes=(4, 2))
-    ax.set_xscale("log")
+    style.log_scale(ax.xaxis)
     ax.set_xlim(2.5, min(float(p.min()), alpha / 30.0) / 2.5)
     ax.set_ylim(-0.7, len(tests) - 0.3)
     ax.set_yticks(rows, [test.name for test in tests], fontsize=style.TICK_SIZE)
@@ -87,7 +88,7 @@ def plot_comparison(models: ModelComparison, ax: Axes | None = None) -> Axes:
     ax.set_ylim(-0.6, len(scores) - 0.4)
     ax.axvline(0.0, color=style.INK, linewidth=0.9)
     # Rejected models can be thousands of nat away and the others tenths of one.
-    ax.set_xscale("symlog", linthresh=10.0)
+    style.log_scale(ax.xaxis, 10.0)
     reach = max(10.0, *(-s.difference + 2.0 * s.difference_se for s in scores))
     ax.set_xlim(-10.0, 2.0 * reach)
     style.label(ax, "Distortion models", "loss of predictive density [nat], ± 2 s.e.")
@@ -164,7 +165,7 @@ def plot_validation(validation: Validation) -> Figure:
 
 
 def _symbols(validation: Validation) -> list[str]:
-    known = {p.name: p.latex for p in (*parameters(validation.camera.distortion), sigma_parameter(False))}
+    known = {p.name: symbol(p.name) for p in (*parameters(validation.camera.distortion), sigma_parameter(False))}
     return [known.get(q, q.replace("_", " ")) for q in validation.quantities]
 
 

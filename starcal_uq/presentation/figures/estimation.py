@@ -12,6 +12,7 @@ from starcal_uq.core.formatting import pretty_unit, significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals, residual_scale
 from starcal_uq.presentation.figures import style
+from starcal_uq.presentation.figures.scales import symbol
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -46,7 +47,7 @@ def plot_convergence(cal: Calibration, truth: Camera | None = None) -> Figure:
             _mark_stages(ax, starts, len(values))
         upper.plot(iteration, values[:, i] * factor, color=style.BLUE, marker="o", markersize=3.2, linewidth=1.2)
         upper.axhline(reference[i] * factor, color=style.VERMILLION, linewidth=1.0, dashes=(4, 2))
-        upper.set_title(f"{parameter.latex} [{unit}]", fontsize=style.TITLE_SIZE, color=style.INK, pad=16, y=1.0)
+        upper.set_title(f"{symbol(parameter.name)} [{unit}]", fontsize=style.TITLE_SIZE, color=style.INK, pad=16, y=1.0)
         upper.ticklabel_format(axis="y", useOffset=False, style="plain")
         error = (values[:, i] - reference[i]) / cal.sigmas[i]
         lower.axhspan(-1.0, 1.0, color=style.GREEN, alpha=0.2, linewidth=0)
@@ -109,24 +110,14 @@ def _mark_stages(ax: Axes, starts: list[int], total: int) -> None:
 
 
 def _error_axis(ax: Axes, largest: float) -> None:
-    from matplotlib.ticker import FixedLocator, FuncFormatter
+    from matplotlib.ticker import FixedLocator
 
     decades = max(1, int(np.ceil(np.log10(max(largest, 2.0)))))
-    ax.set_yscale("symlog", linthresh=1.0, linscale=0.6)
+    style.log_scale(ax.yaxis, 1.0, linscale=0.6)
     ax.set_ylim(-(10.0 ** (decades + 0.15)), 10.0 ** (decades + 0.15))
     step = 1 if decades <= 2 else int(np.ceil(decades / 2))
     powers = [10.0**d for d in range(decades, 0, -step)]
     ax.yaxis.set_major_locator(FixedLocator([-p for p in powers] + [0.0, *sorted(powers)]))
-    ax.yaxis.set_minor_locator(FixedLocator([-1.0, 1.0]))
-    ax.yaxis.set_major_formatter(FuncFormatter(_power_text))
-
-
-def _power_text(value: float, _: object) -> str:
-    if value == 0.0:
-        return "0"
-    exponent = round(np.log10(abs(value)))
-    body = f"{abs(value):.0f}" if exponent < 3 else f"10^{{{exponent}}}"
-    return f"${'-' if value < 0 else ''}{body}$"
 
 
 # chi-square with 2 degrees of freedom at 99 %: a mean vector beyond it is drawn as significant.
@@ -259,7 +250,7 @@ def plot_residual_histogram(cal: Calibration, obs: Observations, ax: Axes | None
     x = np.linspace(-reach, reach, 300)
     expected = z.size * (edges[1] - edges[0]) * np.exp(-0.5 * x * x) / np.sqrt(2.0 * np.pi)
     ax.plot(x, expected, color=style.INK, linewidth=1.2, dashes=(4, 2), label="Gaussian")
-    ax.set_yscale("log")
+    style.log_scale(ax.yaxis)
     ax.set_ylim(0.5, 6.0 * max(float(counts.max()), 1.0))
     style.legend(ax, loc="upper left", ncols=2, columnspacing=1.0)
     style.label(ax, "Against a Gaussian", "residual / expected sigma", "number per bin")

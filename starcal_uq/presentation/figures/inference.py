@@ -9,7 +9,7 @@ import numpy as np
 from starcal_uq.core.formatting import pretty_unit
 from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.figures import style
-from starcal_uq.presentation.figures.scales import AxisScale, axis_scale
+from starcal_uq.presentation.figures.scales import AxisScale, axis_scale, symbol
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -87,15 +87,18 @@ def _density(ax: Axes, x: FloatArray, y: FloatArray) -> None:
     axes = vectors * np.sqrt(np.maximum(values, 1e-300))
     u, v = np.linalg.solve(axes, np.stack([x, y]) - mean[:, None])
     reach = max(HALF_WIDTH_SD, float(np.quantile(np.abs(np.stack([u, v])), 0.9995)))
-    counts, edges, _ = np.histogram2d(u, v, bins=BINS, range=((-reach, reach), (-reach, reach)))
-    smooth = _smooth(counts)
+    cells = np.floor((np.stack([u, v]) + reach) * (0.5 * BINS / reach)).astype(np.intp)
+    inside = np.all((cells >= 0) & (cells < BINS), axis=0)
+    counts = np.bincount(BINS * cells[0][inside] + cells[1][inside], minlength=BINS**2)
+    smooth = _smooth(counts.astype(np.float64).reshape(BINS, BINS))
     levels = mass_levels(smooth, CONTOUR_MASSES)
     if not np.all(np.diff(levels) > 0):
         return
-    centre = 0.5 * (edges[1:] + edges[:-1])
+    centre = reach * ((2.0 * np.arange(BINS) + 1.0) / BINS - 1.0)
     grid = np.einsum("ij,jab->iab", axes, np.stack(np.meshgrid(centre, centre, indexing="ij"))) + mean[:, None, None]
-    ax.contourf(grid[0], grid[1], smooth, levels=[*levels, smooth.max() * 1.001], colors=["#cfe3f1", "#6fb0d9"])
-    ax.contour(grid[0], grid[1], smooth, levels=levels, colors=[style.BLUE], linewidths=0.9)
+    filled = ax.contourf(grid[0], grid[1], smooth, levels=[*levels, smooth.max() * 1.001], colors=_FILLS)
+    # Edges of the fill are the contours.
+    filled.set(edgecolor=style.BLUE, linewidth=0.9)
 
 
 def mass_levels(density: FloatArray, masses: tuple[float, ...]) -> list[float]:
@@ -107,12 +110,11 @@ def mass_levels(density: FloatArray, masses: tuple[float, ...]) -> list[float]:
 
 def _smooth(counts: FloatArray) -> FloatArray:
     """Blur by one bin: takes the counting noise off the contours and widens them by about 2 %."""
-    offsets = np.arange(-3, 4)
-    kernel = np.exp(-0.5 * offsets**2)
-    kernel /= kernel.sum()
-    for axis in (0, 1):
-        counts = np.apply_along_axis(np.convolve, axis, counts, kernel, "same")
-    return counts
+    offset = np.subtract.outer(np.arange(BINS), np.arange(BINS))
+    kernel = np.where(np.abs(offset) <= _BLUR, np.exp(-0.5 * offset**2), 0.0)
+    # The middle has neighbours on all sides.
+    kernel /= kernel[BINS // 2].sum()
+    return np.asarray(kernel @ counts @ kernel)
 
 
 def _ellipses(ax: Axes, gaussian: tuple[FloatArray, FloatArray], i: int, j: int) -> None:
@@ -133,10 +135,10 @@ def _mark(ax: Axes, x: float | None, y: float | None) -> None:
 def _ticks(
     ax: Axes, row: int, column: int, size: int, scales: list[AxisScale], ends: list[tuple[float, float]]
 ) -> None:
-    sparse(ax, y=row != column)
     ax.set_xlim(*ends[column])
     if row != column:
         ax.set_ylim(*ends[row])
+    sparse(ax, y=row != column)
     if row == size - 1:
         ax.set_xlabel(scales[column].label, fontsize=style.TICK_SIZE, color=style.INK)
         style.label_distance(ax, x_in=0.25)
@@ -153,8 +155,8 @@ def _corner_key(figure: Figure, gaussian: bool, truth: bool, n_draws: int) -> No
     from matplotlib.patches import Patch
 
     handles: list[Patch | Line2D] = [
-        Patch(facecolor="#6fb0d9", edgecolor=style.BLUE, label="39 % of the draws (1 sigma)"),
-        Patch(facecolor="#cfe3f1", edgecolor=style.BLUE, label="86 % of the draws (2 sigma)"),
+        Patch(facecolor=_FILLS[1], edgecolor=style.BLUE, label="39 % of the draws (1 sigma)"),
+        Patch(facecolor=_FILLS[0], edgecolor=style.BLUE, label="86 % of the draws (2 sigma)"),
     ]
     if gaussian:
         handles.append(style.key("Gaussian approximation", style.INK, dashes=(4, 2), linewidth=1.0))
@@ -193,7 +195,7 @@ def plot_prior_posterior(post: Posterior, truth: Camera | None = None) -> Figure
             color=style.BLUE,
             linewidth=1.5,
         )
-        upper.set_title(parameter.latex, fontsize=style.TITLE_SIZE, color=style.INK, pad=5, y=1.0)
+        upper.set_title(symbol(name), fontsize=style.TITLE_SIZE, color=style.INK, pad=5, y=1.0)
         upper.set_xlabel(_unit(parameter.scaled_unit), fontsize=style.TICK_SIZE, color=style.INK)
         sparse(upper, y=False)
         lower = style.dress(figure.add_subplot(grid[1, i]))
@@ -246,6 +248,11 @@ def _unit(text: str) -> str:
 
 BINS = 44
 HALF_WIDTH_SD = 3.6
+# Share of an axis at either end without ticks: about half a label.
+_MARGIN = 0.12
+# Bins on either side over which counts are blurred, and the colours within two sigma and within one.
+_BLUR = 3
+_FILLS = ("#cfe3f1", "#6fb0d9")
 
 
 def scaled_draws(post: Posterior) -> tuple[list[AxisScale], list[FloatArray]]:
@@ -301,14 +308,26 @@ def histogram(
 
 
 def sparse(ax: Axes, *, y: bool) -> None:
-    """Three ticks at most, without offsets; no vertical axis unless `y`."""
-    from matplotlib.ticker import MaxNLocator
-
-    ax.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
+    """A few ticks between the present limits, without offsets; no vertical axis unless `y`."""
+    ax.set_xticks(inner_ticks(*ax.get_xlim()))
     if y:
-        ax.yaxis.set_major_locator(MaxNLocator(3, prune="both"))
+        ax.set_yticks(inner_ticks(*ax.get_ylim()))
     else:
         ax.set_yticks([])
         ax.spines["left"].set_visible(False)
     for axis in (ax.xaxis, ax.yaxis):
         axis.get_major_formatter().set_useOffset(False)  # type: ignore[attr-defined]
+
+
+def inner_ticks(low: float, high: float) -> FloatArray:
+    """Round values, two to five, so far from both ends that their labels do not touch those of the next panel."""
+    from matplotlib.ticker import MaxNLocator
+
+    margin = _MARGIN * (high - low)
+    inside = np.empty(0)
+    for intervals in range(3, 8):
+        ticks = np.asarray(MaxNLocator(intervals).tick_values(low, high), dtype=np.float64)
+        inside = ticks[(ticks >= low + margin) & (ticks <= high - margin)]
+        if len(inside) > 1:
+            break
+    return inside

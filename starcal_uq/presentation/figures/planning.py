@@ -36,8 +36,8 @@ _SWEEPS = (
 )
 # What is drawn of a check, by column.
 _CHECKED = (
-    ("x0_px", "$x_0$", style.BLUE, "o"),
-    ("f_px", "$f$", style.ORANGE, "s"),
+    ("x0_px", "x₀", style.BLUE, "o"),
+    ("f_px", "f", style.ORANGE, "s"),
     ("distortion_corner_px", "distortion", style.PURPLE, "^"),
     ("common_pitch_arcsec", "common rotation, pitch", style.VERMILLION, "D"),
     ("rest_pitch_arcsec", "rest, pitch", style.GREEN, "v"),

@@ -60,7 +60,7 @@ def plot_attitude(error: AttitudeError, ax: Axes | None = None) -> Axes:
                 fontsize=style.TICK_SIZE,
                 color=style.INK,
             )
-    ax.set_yscale("log")
+    style.log_scale(ax.yaxis)
     ax.set_ylim(floor, max(float(positive.max()) if positive.size else 1.0, floor) * 3.0)
     ax.set_xticks(place, error.axes, fontsize=style.LABEL_SIZE)
     ax.tick_params(axis="x", length=0)
@@ -220,8 +220,8 @@ def plot_spectrum(spectrum: ErrorSpectrum, ax: Axes | None = None) -> Axes:
             color=style.INK,
         )
         top = max(top, level)
-    ax.set_xscale("log")
-    ax.set_yscale("log")
+    style.log_scale(ax.xaxis)
+    style.log_scale(ax.yaxis)
     ax.set_xlim(f[0], f[-1])
     ax.set_ylim(max(bottom * 0.5, top * 10.0**-_DECADES), top * 8.0)
     style.legend(ax, loc="lower left", bbox_to_anchor=(0.0, 1.0), borderaxespad=0.2, ncols=3, columnspacing=1.4)
@@ -242,7 +242,7 @@ def plot_error_series(spectrum: ErrorSpectrum, ax: Axes | None = None) -> Axes:
             lw=0.9,
             label=axis,
         )
-    ax.set_yscale("log")
+    style.log_scale(ax.yaxis)
     shown = spectrum.sigma_arcsec[spectrum.sigma_arcsec > 0.0]
     if shown.size:
         ax.set_ylim(0.7 * float(np.quantile(shown, 0.002)), 1.5 * float(shown.max()))

@@ -16,6 +16,12 @@ if TYPE_CHECKING:
     from matplotlib.colors import Normalize
 
 
+_WIDE = 5.0
+_LEVELS_NAMED = 8
+# Letters of a symbol with its number.
+_LONGEST = 2
+
+
 @dataclass(frozen=True)
 class AxisScale:
     """The axis of one parameter.
@@ -40,13 +46,27 @@ class AxisScale:
         return np.asarray((np.asarray(values, dtype=np.float64) - self.reference) / self.factor)
 
 
+_SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
+_GREEK = {"sigma": "σ", "sigma_scale": r"$s_\sigma$"}
+
+
+def symbol(name: str) -> str:
+    """A parameter's name as a symbol for labels, such as k₁; other names as they are.
+
+    Typesetting the mathematics of all labels would take a tenth of the time of all figures.
+    """
+    if name in _GREEK:
+        return _GREEK[name]
+    return name.translate(_SUBSCRIPTS) if len(name) <= _LONGEST else name
+
+
 def axis_scale(parameter: Parameter, estimate: float, sigma: float) -> AxisScale:
     """Choose the reference and the unit from the estimate and its standard deviation (computation units)."""
     value, spread = estimate / parameter.scale, sigma / parameter.scale
     decimals = decimals_for(spread)
     text = fixed(value, decimals)
     rounded = round(value, decimals)
-    title = f"{parameter.latex} = {_with_unit(f'{text} ± {fixed(spread, decimals)}', parameter)}"
+    title = f"{symbol(parameter.name)} = {_with_unit(f'{text} ± {fixed(spread, decimals)}', parameter)}"
     exponent = 3 * round(math.log10(spread) / 3.0) if 0.0 < spread < 0.01 else 0
     power = 10.0**exponent
     unit = pretty_unit(parameter.scaled_unit)
@@ -55,16 +75,13 @@ def axis_scale(parameter: Parameter, estimate: float, sigma: float) -> AxisScale
         unit = f"10{superscript(total)} {pretty_unit(parameter.unit)}".strip()
     sign = "+" if rounded < 0 else "−"
     suffix = f" [{unit}]" if unit else ""
-    label = f"{parameter.latex} {sign} {text.lstrip('−')}{suffix}"
+    label = f"{symbol(parameter.name)} {sign} {text.lstrip('−')}{suffix}"
     return AxisScale(rounded * parameter.scale, parameter.scale * power, label, title)
 
 
 def _with_unit(text: str, parameter: Parameter) -> str:
     unit = pretty_unit(parameter.scaled_unit)
     return f"({text}) × {unit}" if parameter.scale != 1.0 else f"{text} {unit}".strip()
-
-
-_WIDE = 5.0
 
 
 def round_levels(values: FloatArray) -> tuple[FloatArray, Normalize | None]:
@@ -91,7 +108,7 @@ def ticks_at_levels(bar: Any, levels: FloatArray) -> None:
     """Ticks of a colour bar at its levels, all of them or every second, third..., in plain numbers."""
     from matplotlib.ticker import FuncFormatter
 
-    bar.set_ticks(levels[:: max(1, len(levels) // 8)])
+    bar.set_ticks(levels[:: -(-len(levels) // _LEVELS_NAMED)])
     bar.formatter = FuncFormatter(lambda value, _: f"{value:.6g}")
     bar.update_ticks()
     bar.ax.minorticks_off()

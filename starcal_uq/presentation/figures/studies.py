@@ -14,8 +14,8 @@ from starcal_uq.core.formatting import percent, pretty_unit, significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.maths.intervals import binomial_interval
 from starcal_uq.presentation.figures import style
-from starcal_uq.presentation.figures.coupling import correlation_text, symbol
-from starcal_uq.presentation.figures.scales import round_levels, ticks_at_levels
+from starcal_uq.presentation.figures.coupling import correlation_text
+from starcal_uq.presentation.figures.scales import round_levels, symbol, ticks_at_levels
 from starcal_uq.presentation.figures.sweeps import (
     MARKERS,
     NAMED,

@@ -12,8 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.core.formatting import MINUS, superscript
+
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
     from matplotlib.gridspec import GridSpec
     from matplotlib.lines import Line2D
@@ -28,6 +31,8 @@ TITLE_SIZE, LABEL_SIZE, TICK_SIZE = 10.5, 9.5, 8.5
 # Half as many again as a page of 1100 px shows.
 DPI = 160
 _WHITE = 251
+# Intervals between the ticks of an axis, at most.
+_TICKS = 5
 # Means with their standard errors.
 BARS: dict[str, Any] = {"markersize": 4.0, "linestyle": "none", "elinewidth": 1.1}
 
@@ -110,9 +115,16 @@ def new_axes(width_in: float, height_in: float, margins_in: tuple[float, float, 
 
 
 def dress(ax: Axes, *, grid: bool = False) -> Axes:
-    """Quiet spines, small ticks, no offsets on the tick labels."""
+    """Quiet spines, small ticks, and not many of them."""
+    from matplotlib.ticker import AutoLocator
+
     # A title whose height is given is not put above all tick labels, each of them measured, when the figure is drawn.
     ax.set_title("", y=1.0)
+    for axis in (ax.xaxis, ax.yaxis):
+        locator = axis.get_major_locator()
+        # Ticks are most of what it costs to draw a panel.
+        if isinstance(locator, AutoLocator):
+            locator.set_params(nbins=_TICKS)
     ax.tick_params(labelsize=TICK_SIZE, colors=INK, color=GREY, length=3.0, width=0.7)
     for side, spine in ax.spines.items():
         spine.set_color(GREY)
@@ -122,6 +134,29 @@ def dress(ax: Axes, *, grid: bool = False) -> Axes:
         ax.grid(True, color=LIGHT, linewidth=0.7)
         ax.set_axisbelow(True)
     return ax
+
+
+def log_scale(axis: Axis, linear: float | None = None, **options: Any) -> None:
+    """A logarithmic axis with ticks at powers of ten; linear between -`linear` and `linear` where that is given."""
+    from matplotlib.ticker import FuncFormatter, NullLocator
+
+    ax = axis.axes
+    scaled: Any = ax.set_xscale if axis is ax.xaxis else ax.set_yscale
+    if linear is None:
+        scaled("log", **options)
+    else:
+        scaled("symlog", linthresh=linear, **options)
+    axis.set_minor_locator(NullLocator())
+    axis.set_major_formatter(FuncFormatter(lambda value, _: power_text(value)))
+
+
+def power_text(value: float) -> str:
+    """A power of ten as a tick label, without the mathematical typesetting that takes as long as a panel."""
+    if value == 0.0:
+        return "0"
+    exponent = round(float(np.log10(abs(value))))
+    text = f"{abs(value):g}" if abs(exponent) < 3 else f"10{superscript(exponent)}"
+    return f"{MINUS}{text}" if value < 0 else text
 
 
 def label(ax: Axes, title: str = "", x: str = "", y: str = "", *, pad: float = 7.0) -> None:
