@@ -13,7 +13,7 @@ import os
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import AttitudeProfileError, CatalogueError, ObservationError
 from starcal_uq.core.files import table_ending
 from starcal_uq.core.formatting import plural, significant
+from starcal_uq.core.settings import Scalar, Sense, bounded
 from starcal_uq.core.times import julian_days
 from starcal_uq.core.types import FloatArray, IntArray
 
@@ -32,8 +33,6 @@ _FAR_DEG = 30.0
 # A step so many times the usual one is told.
 _GAP = 10.0
 _MAX_FRAMES = 1_000_000
-Sense = Literal["icrs_to_camera", "camera_to_icrs"]
-Scalar = Literal["first", "last"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +123,7 @@ class AttitudeProfile(Shown):
         q: FloatArray = Slerp(self.time_s, Rotation.from_quat(self.quaternions))(wanted).as_quat()
         return q
 
+    @bounded
     def at_rate(self, rate_hz: float) -> AttitudeProfile:
         """The profile with `rate_hz` attitudes per second from its first instant on.
 

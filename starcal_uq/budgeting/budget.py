@@ -27,6 +27,7 @@ from starcal_uq.core.constants import AXES
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.provenance import provenance
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict
 
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
 _CONFIDENCE = 0.997
 
 
+@bounded
 @one_thread()
 def budget(
     post: Posterior,

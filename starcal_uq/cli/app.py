@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import gc
 import sys
-from typing import Annotated
+from typing import Annotated, Any, get_args
 
 import typer
 
@@ -21,6 +21,8 @@ from starcal_uq.cli import statistics as cli_statistics
 from starcal_uq.cli import steps as cli_steps
 from starcal_uq.cli import study as cli_study
 from starcal_uq.core.errors import StarcalError
+from starcal_uq.core.settings import clipped, wanted
+from starcal_uq.core.types import AnyDict
 
 app = typer.Typer(
     name="starcal-uq",
@@ -79,11 +81,27 @@ def main() -> None:
 
 def _usage_sentence(error: Exception) -> str:
     """What is wrong with a call, and where to look."""
+    parameter, cause = getattr(error, "param", None), error.__cause__
+    if isinstance(error, typer.BadParameter) and parameter is not None:
+        name = max(parameter.opts, key=len) if parameter.opts[0].startswith("-") else parameter.display_name_raw
+        problems: list[AnyDict] = getattr(cause, "errors", list)()
+        return f"{name} {_problem(parameter, problems[0]['input']) if problems else error.message}"
     words = getattr(error, "format_message", None)
     message = words() if callable(words) else str(error)
     return f"{message.strip().rstrip('.')}; see `starcal-uq --help`."
 
 
+def _problem(parameter: Any, value: object) -> str:
+    """What is wrong with a value that does not fit the declaration of its parameter."""
+    kind = parameter.type_descriptor
+    if kind.choices is not None:
+        return f"{clipped(value)} is unknown: use one of {', '.join(kind.choices)}."
+    kinds = {kind.annotation, *get_args(kind.annotation)}
+    return f"{clipped(value)}: {wanted(parameter.min, parameter.max, int in kinds)}."
+
+
 def _fail(message: str, status: int) -> None:
-    print(f"error: {message}", file=sys.stderr)
+    # Names of files may hold anything, and a message is one line.
+    line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in message.strip())
+    print(f"error: {line}", file=sys.stderr)
     sys.exit(status)

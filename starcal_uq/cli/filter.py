@@ -9,7 +9,22 @@ import typer
 
 import starcal_uq as sc
 from starcal_uq.cli.console import print_json, records, show_calibration
-from starcal_uq.cli.options import CameraFile, Columns, Force, Json, NewRun, parse_columns
+from starcal_uq.cli.options import (
+    LEAST_SIGMA_PX,
+    CameraFile,
+    Columns,
+    Force,
+    Json,
+    NewRun,
+    number,
+    parse_columns,
+    read_path,
+)
+from starcal_uq.core import settings
+from starcal_uq.core.settings import Limit
+
+_FORGETTING = Limit(1e-9, 1.0, whole=False)
+_WALK_PX = Limit(0.0, 1e6, whole=False)
 
 
 def register(app: typer.Typer) -> None:
@@ -20,39 +35,42 @@ def register(app: typer.Typer) -> None:
 def filter_command(
     observations: Annotated[
         Path,
-        typer.Argument(metavar="OBS", help="Stars in pixels, the frames in order: CSV, Parquet, or a folder of them."),
+        typer.Argument(
+            metavar="OBS",
+            help="Stars in pixels, the frames in order: CSV, Parquet, or a folder of them.",
+            parser=read_path,
+        ),
     ],
     camera: CameraFile,
     out: NewRun,
     method: Annotated[
-        str, typer.Option(help="griffith (recursive least squares) or samaan (Kalman filter, distortion afterwards).")
+        settings.RecursiveMethod,
+        typer.Option(help="griffith (recursive least squares) or samaan (Kalman filter, distortion afterwards)."),
     ] = "griffith",
     parameters: Annotated[
-        str,
+        settings.Filtered,
         typer.Option(help="optics (x0, y0, f; the distortion is ignored, as in the source) or all (griffith only)."),
     ] = "all",
     pair_covariance: Annotated[
-        str, typer.Option(help="full, or diagonal: pairs that share a star taken as independent, as filters used to.")
+        settings.PairCovariance,
+        typer.Option(help="full, or diagonal: pairs that share a star taken as independent, as filters used to."),
     ] = "full",
     forgetting: Annotated[
-        float, typer.Option(help="Weight of all earlier frames against the next, above 0 and up to 1 (griffith).")
+        float, number(_FORGETTING, "Weight of all earlier frames against the next, above 0 and up to 1 (griffith).")
     ] = 1.0,
     process_noise: Annotated[
-        float | None, typer.Option(help="Random walk of the optics, px per frame; needs --sigma (samaan).")
+        float | None, number(_WALK_PX, "Random walk of the optics, px per frame; needs --sigma (samaan).")
     ] = None,
-    sigma: Annotated[float | None, typer.Option(help="Stated centroid noise, px per axis.")] = None,
+    sigma: Annotated[
+        float | None, number("sigma_px", "Stated centroid noise, px per axis.", least=LEAST_SIGMA_PX)
+    ] = None,
     column: Columns = None,
     force: Force = False,
     json: Json = False,
 ) -> None:
     """Calibrate frame by frame, with an estimate after each; stars may exceed memory, an interrupted call goes on."""
-    from starcal_uq.estimation.recursive.innovations import PAIR_COVARIANCES
     from starcal_uq.runs.streams import HISTORY, filter_run
 
-    if pair_covariance not in PAIR_COVARIANCES:
-        raise typer.BadParameter(
-            f"--pair-covariance {pair_covariance!r} is unknown: use one of {', '.join(PAIR_COVARIANCES)}."
-        )
     options = sc.estimation.RecursionOptions(
         pair_covariance=pair_covariance,
         parameters="optics" if method == "samaan" else parameters,

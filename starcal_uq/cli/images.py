@@ -10,9 +10,22 @@ import typer
 
 import starcal_uq as sc
 from starcal_uq.cli.console import err, print_json, print_table, progress_bar, records, warn_undeclared
-from starcal_uq.cli.options import CameraFile, Engine, Force, Json, TimeUtc, check_same_sensor, parse_engine
+from starcal_uq.cli.options import (
+    CameraFile,
+    Engine,
+    Force,
+    Json,
+    MaxMag,
+    TimeUtc,
+    check_same_sensor,
+    number,
+    read_file,
+    read_path,
+    write_file,
+)
 from starcal_uq.cli.settings import ImageSettings, SkySettings
-from starcal_uq.core.files import ensure_new
+from starcal_uq.core.files import ensure_new, table_ending
+from starcal_uq.core.settings import EPOCH
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -29,20 +42,33 @@ def register(app: typer.Typer) -> None:
 
 def centroid_command(
     images: Annotated[
-        list[Path], typer.Argument(metavar="IMAGES...", help="FITS, TIFF, PNG or JPEG files, or folders of them.")
+        list[Path],
+        typer.Argument(
+            metavar="IMAGES...", help="FITS, TIFF, PNG or JPEG files, or folders of them.", parser=read_path
+        ),
     ],
     out: Annotated[
-        Path, typer.Option("-o", "--out", metavar="CENTROIDS", help="Table to write (.csv, .ecsv, .parquet).")
+        Path,
+        typer.Option(
+            "-o", "--out", metavar="CENTROIDS", help="Table to write (.csv, .ecsv, .parquet).", parser=write_file
+        ),
     ],
     camera: Annotated[
-        Path | None, typer.Option("--camera", help="Camera (TOML): images of another size are left out.")
+        Path | None,
+        typer.Option("--camera", help="Camera (TOML): images of another size are left out.", parser=read_file),
     ] = None,
-    gain: Annotated[float | None, typer.Option(help="Electrons per count, where the files do not say it.")] = None,
-    read_noise: Annotated[float | None, typer.Option(help="Read noise, electrons per pixel (needs the gain).")] = None,
-    saturation: Annotated[float | None, typer.Option(help="Counts at which a pixel is saturated.")] = None,
-    threshold: Annotated[float, typer.Option(help="Detection threshold, standard deviations.")] = 5.0,
-    psf_sigma: Annotated[float | None, typer.Option(help="Width of the star images, px; measured by default.")] = None,
-    max_stars: Annotated[int | None, typer.Option(min=1, help="Keep the brightest so many per frame.")] = None,
+    gain: Annotated[
+        float | None, number("gain_e_per_count", "Electrons per count, where the files do not say it.")
+    ] = None,
+    read_noise: Annotated[
+        float | None, number("read_noise_e", "Read noise, electrons per pixel (needs the gain).")
+    ] = None,
+    saturation: Annotated[float | None, number("saturation", "Counts at which a pixel is saturated.")] = None,
+    threshold: Annotated[float, number("threshold_sigma", "Detection threshold, standard deviations.")] = 5.0,
+    psf_sigma: Annotated[
+        float | None, number("psf_sigma_px", "Width of the star images, px; measured by default.")
+    ] = None,
+    max_stars: Annotated[int | None, number("max_stars", "Keep the brightest so many per frame.")] = None,
     pixel_phase: Annotated[
         bool, typer.Option(help="Take out errors that repeat with the place within a pixel, where images show them.")
     ] = True,
@@ -54,6 +80,7 @@ def centroid_command(
     from starcal_uq.core.times import utc_text
     from starcal_uq.pipeline.images import counted, with_time
 
+    table_ending(out)
     ensure_new(out, force)
     if time is not None:
         time = utc_text(time)
@@ -83,18 +110,26 @@ def centroid_command(
 
 
 def identify_command(
-    centroids: Annotated[Path, typer.Argument(metavar="CENTROIDS", help="Table made by `starcal-uq centroid`.")],
+    centroids: Annotated[
+        Path, typer.Argument(metavar="CENTROIDS", help="Table made by `starcal-uq centroid`.", parser=read_file)
+    ],
     camera: CameraFile,
-    out: Annotated[Path, typer.Option("-o", "--out", metavar="OBS", help="Table to write (.csv, .ecsv, .parquet).")],
-    max_mag: Annotated[float, typer.Option(help="Magnitude limit of the catalogue, Gaia G.")] = 7.0,
+    out: Annotated[
+        Path,
+        typer.Option("-o", "--out", metavar="OBS", help="Table to write (.csv, .ecsv, .parquet).", parser=write_file),
+    ],
+    max_mag: MaxMag = 7.0,
     epoch: Annotated[
-        float | None, typer.Option(help="Julian year of the star positions; the images' own by default.")
+        float | None, number(EPOCH, "Julian year of the star positions; the images' own by default.")
     ] = None,
     calibration: Annotated[
-        Path | None, typer.Option(help="Run folder of this camera: its uncertainty takes the tolerances' place.")
+        Path | None,
+        typer.Option(help="Run folder of this camera: its uncertainty takes the tolerances' place.", parser=read_path),
     ] = None,
-    focal_tolerance: Annotated[float, typer.Option(help="Relative error of the nominal focal length.")] = 0.03,
-    centre_tolerance: Annotated[float, typer.Option(help="Error of the nominal principal point, px.")] = 20.0,
+    focal_tolerance: Annotated[float, number("focal_tolerance", "Relative error of the nominal focal length.")] = 0.03,
+    centre_tolerance: Annotated[
+        float, number("centre_tolerance_px", "Error of the nominal principal point, px.")
+    ] = 20.0,
     engine: Engine = "pyramid",
     force: Force = False,
     json: Json = False,
@@ -103,6 +138,7 @@ def identify_command(
     from starcal_uq.pipeline.images import epoch_of
     from starcal_uq.presentation.words.images import MOST_FRAMES, identification_table
 
+    table_ending(out)
     ensure_new(out, force)
     table = sc.images.Centroids.load(centroids)
     nominal = sc.Camera.load(camera)
@@ -119,7 +155,7 @@ def identify_command(
             calibration=known,
             focal_tolerance=focal_tolerance,
             centre_tolerance_px=centre_tolerance,
-            engine=parse_engine(engine),
+            engine=engine,
             progress=progress,
         )
     if found.n_identified:
@@ -149,7 +185,7 @@ def load_images(
             epoch=settings.epoch,
             gain_e_per_count=settings.gain,
             time_utc=settings.time,
-            engine=parse_engine(settings.engine),
+            engine=settings.engine or "pyramid",
             tell=lambda message: err.print(message, style=_style(message), highlight=False, soft_wrap=True),
             progress=progress,
             **known,

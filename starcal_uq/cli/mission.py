@@ -10,8 +10,29 @@ import typer
 import starcal_uq as sc
 from starcal_uq.cli.console import err, print_json, print_table, progress_bar, records
 from starcal_uq.cli.console import out as console
-from starcal_uq.cli.options import FAINTEST, CameraFile, Force, Json, RunPath, Seed, check_same_sensor
+from starcal_uq.cli.options import (
+    LEAST_SIGMA_PX,
+    MAGNITUDES,
+    PROBABILITY,
+    CameraFile,
+    Epoch,
+    Force,
+    Json,
+    MaxMag,
+    RunPath,
+    Seed,
+    check_same_sensor,
+    checked,
+    number,
+    parse_labels,
+    read_file,
+    read_path,
+    write_file,
+    write_path,
+)
+from starcal_uq.core import settings
 from starcal_uq.core.files import check_new_folder, ensure_new
+from starcal_uq.core.settings import Limit
 
 if TYPE_CHECKING:
     from starcal_uq.budgeting.result import Budget
@@ -21,6 +42,12 @@ if TYPE_CHECKING:
     from starcal_uq.planning.check import ForecastCheck
     from starcal_uq.planning.design import FrameChoice
     from starcal_uq.planning.plan import Plan
+
+
+_CHOSEN = Limit(1, 10**6)
+_ARCSEC = Limit(1e-6, 1e6, whole=False)
+# The displacement of the corner by a distortion that still folds nowhere stays far within.
+_PERCENT = Limit(-100.0, 100.0, whole=False)
 
 
 def register(app: typer.Typer) -> None:
@@ -46,18 +73,33 @@ def budget_command(
     run: RunPath,
     file: Annotated[
         Path | None,
-        typer.Option("--file", metavar="TOML", help="Contributors that the data cannot know, and requirements."),
+        typer.Option(
+            "--file",
+            metavar="TOML",
+            help="Contributors that the data cannot know, and requirements.",
+            parser=read_file,
+        ),
     ] = None,
     out: Annotated[
         list[Path] | None,
-        typer.Option("-o", "--out", metavar="FILE", help="Also write .csv, .xlsx, .tex or .html; repeatable."),
+        typer.Option(
+            "-o",
+            "--out",
+            metavar="FILE",
+            help="Also write .csv, .xlsx, .tex or .html; repeatable.",
+            parser=write_file,
+        ),
     ] = None,
     template: Annotated[
         Path | None,
-        typer.Option(metavar="TOML", help="Write a starter file that lists what is not assessed, and stop."),
+        typer.Option(
+            metavar="TOML",
+            help="Write a starter file that lists what is not assessed, and stop.",
+            parser=write_file,
+        ),
     ] = None,
     confidence: Annotated[
-        float | None, typer.Option(help="Confidence of the totals; that of the file, or 0.997.")
+        float | None, number(PROBABILITY, "Confidence of the totals; that of the file, or 0.997.")
     ] = None,
     seed: Seed = 0,
     force: Force = False,
@@ -114,23 +156,29 @@ def fail_if_violated(found: Budget) -> None:
 def compare_command(
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN_A RUN_B", help="Two run folders; one, with --split."),
+        typer.Argument(metavar="RUN_A RUN_B", help="Two run folders; one, with --split.", parser=read_path),
     ],
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Folder for the page, tables and figure.")
+        Path | None,
+        typer.Option("-o", "--out", metavar="DIR", help="Folder for the page, tables and figure.", parser=write_path),
     ] = None,
     split: Annotated[
-        str | None,
+        settings.Split | None,
         typer.Option(help="Compare two parts of one run's frames: odd-even, halves, or random."),
     ] = None,
     labels: Annotated[
-        str | None, typer.Option(metavar="A,B", help="What to call them; the names of the folders by default.")
+        str | None,
+        typer.Option(
+            metavar="A,B",
+            help="What to call them; the names of the folders by default.",
+            callback=checked(parse_labels),
+        ),
     ] = None,
     same_data: Annotated[
         bool | None,
         typer.Option("--same-data/--other-data", help="Whether both rest on the same frames, if files cannot tell."),
     ] = None,
-    level: Annotated[float, typer.Option(help="Probability of a verdict 'differ' when nothing does.")] = 0.01,
+    level: Annotated[float, number(PROBABILITY, "Probability of a verdict 'differ' when nothing does.")] = 0.01,
     seed: Seed = 0,
     force: Force = False,
     json: Json = False,
@@ -147,7 +195,7 @@ def compare_command(
         )
     check_output(out, force)
     options: dict[str, Any] = {"level": level, "seed": seed}
-    names = _two_labels(labels)
+    names = parse_labels(labels)
     if split is None:
         found = sc.runs.compare_runs(*runs, labels=names, same_data=same_data, **options)
     else:
@@ -162,56 +210,60 @@ def compare_command(
         print(f"Page: {page.resolve()}")
 
 
-def _two_labels(text: str | None) -> tuple[str, str] | None:
-    if text is None:
-        return None
-    first, comma, second = (part.strip() for part in text.partition(","))
-    if not (first and comma and second) or first == second:
-        raise typer.BadParameter(f"--labels {text!r} is not two different names such as cold,hot.")
-    return first, second
-
-
 def plan_command(
     camera: CameraFile,
     target: Annotated[
-        float | None, typer.Option("--target-arcsec", metavar="T", help="Two-axis error across the boresight to keep.")
+        float | None,
+        number(_ARCSEC, "Two-axis error across the boresight to keep.", "--target-arcsec", metavar="T"),
     ] = None,
-    confidence: Annotated[float, typer.Option(help="Probability of keeping it (0.997, not 99.7).")] = 0.997,
+    confidence: Annotated[float, number(PROBABILITY, "Probability of keeping it (0.997, not 99.7).")] = 0.997,
     scope: Annotated[
-        str, typer.Option(help="Part of the error the target is for: common, rest, calibration, or total.")
+        settings.Scope, typer.Option(help="Part of the error the target is for: common, rest, calibration, or total.")
     ] = "common",
     sigma: Annotated[
-        float | None, typer.Option(help="Centroid noise, px per axis; 0.05, or that of the run of --after, by default.")
+        float | None,
+        number(
+            "sigma_px",
+            "Centroid noise, px per axis; 0.05, or that of the run of --after, by default.",
+            least=LEAST_SIGMA_PX,
+        ),
     ] = None,
-    max_mag: Annotated[float, typer.Option(help="Magnitude limit of the sensor, Gaia G.")] = 6.0,
-    min_stars: Annotated[int, typer.Option(min=3, help="Frames with fewer stars are not used.")] = 10,
+    max_mag: MaxMag = 6.0,
+    min_stars: Annotated[int, number("min_stars", "Frames with fewer stars are not used.", least=3)] = 10,
     frames: Annotated[
         list[int] | None,
-        typer.Option(help="Size of a campaign to forecast; repeatable (10, 30, 100, 300, 1000 and 3000 by default)."),
+        number("n_frames", "Size of a campaign to forecast; repeatable (10, 30, 100, 300, 1000 and 3000 by default)."),
     ] = None,
-    choose: Annotated[
-        int | None, typer.Option(min=1, metavar="N", help="Also choose the N frames that help most.")
-    ] = None,
-    criterion: Annotated[str, typer.Option(help="What the choice is for: A (attitude error) or D (parameters).")] = "A",
+    choose: Annotated[int | None, number(_CHOSEN, "Also choose the N frames that help most.", metavar="N")] = None,
+    criterion: Annotated[
+        settings.Criterion, typer.Option(help="What the choice is for: A (attitude error) or D (parameters).")
+    ] = "A",
     after: Annotated[
         Path | None,
-        typer.Option(metavar="RUN", help="Count the data of this run first, and take its calibrated camera."),
+        typer.Option(
+            metavar="RUN",
+            help="Count the data of this run first, and take its calibrated camera.",
+            parser=read_path,
+        ),
     ] = None,
     distortion_percent: Annotated[
         tuple[float, float] | None,
-        typer.Option(
-            metavar="LOW HIGH",
-            help="Distortion that a sheet with zero coefficients leaves open: displacement of the corner, per cent, "
+        number(
+            _PERCENT,
+            "Distortion that a sheet with zero coefficients leaves open: displacement of the corner, per cent, "
             "barrel negative; from an f-theta lens to as much pincushion by default.",
+            metavar="LOW HIGH",
         ),
     ] = None,
     check: Annotated[
-        int | None, typer.Option(min=10, metavar="N", help="Also simulate N campaigns of each size and compare.")
+        int | None,
+        number("n_campaigns", "Also simulate N campaigns of each size and compare.", least=10, metavar="N"),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="DIR", help="Folder for the page, tables and figures.")
+        Path | None,
+        typer.Option("-o", "--out", metavar="DIR", help="Folder for the page, tables and figures.", parser=write_path),
     ] = None,
-    epoch: Annotated[float, typer.Option(help="Julian year of the star positions.")] = 2026.9,
+    epoch: Epoch = 2026.9,
     seed: Seed = 0,
     force: Force = False,
     json: Json = False,
@@ -230,10 +282,8 @@ def plan_command(
         known, noise = _known(after, sheet, camera)
         sheet = known.camera
     used = noise if sigma is None else sigma
-    if max_mag > FAINTEST:
-        raise typer.BadParameter(f"--max-mag {max_mag:g}: the embedded catalogue ends at G = {FAINTEST:g}.")
     # Deeper than the sensor, so that the sweep over the magnitude limit has somewhere to go.
-    deep = sc.load_catalogue(max_mag=min(max_mag + 1.0, FAINTEST), epoch=epoch)
+    deep = sc.load_catalogue(max_mag=min(max_mag + 1.0, MAGNITUDES.high), epoch=epoch)
     stars = deep.select(deep.mag <= max_mag)
     sizes = tuple(frames or N_FRAMES)
     found = sc.plan(

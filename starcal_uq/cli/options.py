@@ -2,103 +2,97 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+import stat
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from starcal_uq.core import settings
+from starcal_uq.core.errors import StarcalError
+from starcal_uq.core.settings import EPOCH, LIMITS, Limit, clipped
+
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
-    from starcal_uq.identification.proposers import Engine as EngineName
 
-# Gaia G; where the embedded catalogue ends.
-FAINTEST = 10.0
-
-ChoiceT = TypeVar("ChoiceT", bound=str)
-
-ObsFile = Annotated[
-    Path,
-    typer.Argument(
-        metavar="OBS",
-        help="Stars in pixels: CSV, ECSV or Parquet with columns frame, x_px, y_px, ra_deg, dec_deg and optionally "
-        "sigma_px, star_id, mag, direction_mas, time_utc, temperature_c; or a folder of Parquet files of whole frames, "
-        "which may exceed memory.",
-    ),
-]
-CameraFile = Annotated[
-    Path,
-    typer.Argument(
-        metavar="CAMERA", help="Nominal camera (TOML with a [camera] table): the start, and the prior's centre."
-    ),
-]
-RunPath = Annotated[Path, typer.Argument(metavar="RUN", help="Run folder made by `starcal-uq calibrate`.")]
-NewRun = Annotated[Path, typer.Option("-o", "--out", metavar="RUN", help="Folder for the results.")]
-Force = Annotated[bool, typer.Option("--force", help="Replace results that exist.")]
-Json = Annotated[bool, typer.Option("--json", help="Print the table as JSON.")]
-Seed = Annotated[int, typer.Option(help="Seed; the same seed repeats the result bit for bit.")]
-Columns = Annotated[
-    list[str] | None,
-    typer.Option("--column", metavar="NAME=IN_FILE", help="A column that is called otherwise in the file; repeatable."),
-]
-TimeUtc = Annotated[
-    str | None,
-    typer.Option(
-        "--time",
-        metavar="UTC",
-        help="Images: middle of the exposure of files that do not say it; goes before a time in the file's name.",
-    ),
-]
-Engine = Annotated[str, typer.Option(help="What finds attitudes: pyramid, or tetra3rs (extra of that name).")]
-SchedulerAddress = Annotated[
-    str | None,
-    typer.Option(
-        "--scheduler",
-        metavar="ADDRESS",
-        help="Dask scheduler whose workers do it; local processes otherwise.",
-    ),
-]
-FileWorkers = Annotated[
-    int | None,
-    typer.Option(
-        "--workers", min=0, help="Local processes for a folder of partitions; one for each processor by default."
-    ),
-]
-Duplicates = Annotated[
-    str,
-    typer.Option(
-        help="Frames that hold the same measurement as an earlier one: refuse, drop (leave them out), or keep (they "
-        "are exposures of their own)."
-    ),
-]
-Alignment = Annotated[
-    str,
-    typer.Option(
-        metavar="random|observed|FILE",
-        help="Frames on which alignment is calibrated in flight: random sky, those of the calibration, or a table.",
-    ),
-]
-AlignmentFrames = Annotated[
-    int | None, typer.Option(min=1, metavar="N", help="Number of alignment frames of random sky; 100 by default.")
-]
-Draws = Annotated[int, typer.Option(min=50, help="Posterior draws that go through QUEST.")]
+# Gaia G; no star is brighter than the first, and the embedded catalogue ends at the last.
+MAGNITUDES = Limit(-2.0, 10.0, whole=False)
+PROBABILITY = Limit(1e-9, 1.0 - 1e-9, whole=False)
+# A noise that is given, and not simulated, is above zero.
+LEAST_SIGMA_PX = 1e-6
+_VELOCITY = Limit(-1e5, 1e5, whole=False)
+_LONGEST_LABELS, _LONGEST_ADDRESS = 200, 500
 
 
-def parse_choice(option: str, given: str | None, choices: Sequence[ChoiceT]) -> ChoiceT | None:
-    """The choice of that name; None where none was made."""
-    if given is None:
+def number(limit: str | Limit, text: str, *names: str, least: float | None = None, metavar: str | None = None) -> Any:
+    """Option of a number within limits, of a parameter of Python or of its own; a command may ask for more."""
+    limit = LIMITS[limit] if isinstance(limit, str) else limit
+    low = limit.low if least is None else least
+    return typer.Option(*names, min=low, max=limit.high, help=text, metavar=metavar)
+
+
+def _refuse(value: object, problem: str) -> typer.BadParameter:
+    return typer.BadParameter(f"{clipped(str(value))}: {problem}.")
+
+
+def _mode(path: Path) -> int | None:
+    """What stands at a path; None if nothing does."""
+    try:
+        mode = os.stat(path).st_mode
+    except (FileNotFoundError, NotADirectoryError):
         return None
-    for choice in choices:
-        if choice == given:
-            return choice
-    raise typer.BadParameter(f"{option} {given!r} is unknown: use one of {', '.join(choices)}.")
+    except (OSError, ValueError) as error:
+        raise _refuse(path, f"cannot be looked at ({getattr(error, 'strerror', None) or error}); check it") from None
+    if stat.S_ISCHR(mode) or stat.S_ISBLK(mode) or stat.S_ISSOCK(mode):
+        raise _refuse(path, "is a device; name a file or a folder")
+    return mode
 
 
-def parse_engine(name: str | None) -> EngineName:
-    """The engine of that name, or the usual one."""
-    from starcal_uq.identification.proposers import ENGINES
+def _path(value: str | Path) -> Path:
+    if not str(value):
+        raise typer.BadParameter("'': is empty; name a file or a folder.")
+    return Path(value)
 
-    return parse_choice("--engine", name, ENGINES) or "pyramid"
+
+def read_path(value: str | Path) -> Path:
+    """Path of a file or a folder that can be read."""
+    path = _path(value)
+    if _mode(path) is None:
+        raise _refuse(path, "does not exist; check the path")
+    if not os.access(path, os.R_OK):
+        raise _refuse(path, "cannot be read; check its permissions")
+    return path
+
+
+def read_file(value: str | Path) -> Path:
+    """Path of a file that can be read."""
+    path = read_path(value)
+    if path.is_dir():
+        raise _refuse(path, "is a directory; name a file")
+    return path
+
+
+def write_path(value: str | Path) -> Path:
+    """Path that is neither a device nor below a file."""
+    path = _path(value)
+    if _mode(path) is None:
+        for parent in path.parents:
+            mode = _mode(parent)
+            if mode is not None:
+                if not stat.S_ISDIR(mode):
+                    raise _refuse(path, f"cannot be made, because {clipped(str(parent))} is a file")
+                break
+    return path
+
+
+def write_file(value: str | Path) -> Path:
+    """Path that is not a directory either."""
+    path = write_path(value)
+    if path.is_dir():
+        raise _refuse(path, "is a directory; name a file to write to")
+    return path
 
 
 def parse_columns(pairs: list[str] | None) -> dict[str, str]:
@@ -107,7 +101,7 @@ def parse_columns(pairs: list[str] | None) -> dict[str, str]:
     for pair in pairs or []:
         name, separator, in_file = pair.partition("=")
         if not (name and separator and in_file):
-            raise typer.BadParameter(f"{pair!r} is not NAME=IN_FILE, such as ra_deg=ra_apparent_deg.")
+            raise typer.BadParameter(f"{clipped(pair)} is not NAME=IN_FILE, such as ra_deg=ra_apparent_deg.")
         found[name] = in_file
     return found
 
@@ -119,8 +113,133 @@ def parse_velocity(text: str | None) -> tuple[float, float, float] | None:
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
-        raise typer.BadParameter(f"{text!r} is not three numbers in km/s, such as 7.5,0.0,0.0.") from None
+        raise typer.BadParameter(f"{clipped(text)} is not three numbers in km/s, such as 7.5,0.0,0.0.") from None
+    if not _VELOCITY.holds([x, y, z]):
+        raise typer.BadParameter(f"{clipped(text)} is no velocity in km/s: {_VELOCITY.wanted()}.")
     return x, y, z
+
+
+def parse_labels(text: str | None) -> tuple[str, str] | None:
+    """``A,B`` as two different names."""
+    if text is None:
+        return None
+    first, comma, second = (part.strip() for part in text.partition(","))
+    if not (first and comma and second) or first == second or not text.isprintable() or len(text) > _LONGEST_LABELS:
+        raise typer.BadParameter(f"{clipped(text)} is not two different short names such as cold,hot.")
+    return first, second
+
+
+def _check_time(text: str) -> None:
+    from starcal_uq.core.times import utc_text
+
+    try:
+        utc_text(text)
+    except StarcalError as error:
+        raise typer.BadParameter(str(error).removeprefix("The time ")) from None
+
+
+def _check_text(text: str) -> None:
+    if not text.strip() or not text.isprintable() or len(text) > _LONGEST_ADDRESS:
+        raise typer.BadParameter(f"{clipped(text)} is no address, such as tcp://10.0.0.1:8786.")
+
+
+def check_word_or_file(text: str) -> None:
+    if text not in ("random", "observed"):
+        read_file(Path(text))
+
+
+def checked(parse: Callable[[Any], object]) -> Callable[[Any], Any]:
+    """Callback that lets a value pass which can be parsed; the command parses it."""
+
+    def check(value: Any) -> Any:
+        if value is not None:
+            parse(value)
+        return value
+
+    return check
+
+
+ObsFile = Annotated[
+    Path,
+    typer.Argument(
+        metavar="OBS",
+        help="Stars in pixels: CSV, ECSV or Parquet with columns frame, x_px, y_px, ra_deg, dec_deg and optionally "
+        "sigma_px, star_id, mag, direction_mas, time_utc, temperature_c; or a folder of Parquet files of whole frames, "
+        "which may exceed memory.",
+        parser=read_path,
+    ),
+]
+CameraFile = Annotated[
+    Path,
+    typer.Argument(
+        metavar="CAMERA",
+        help="Nominal camera (TOML with a [camera] table): the start, and the prior's centre.",
+        parser=read_file,
+    ),
+]
+RunPath = Annotated[
+    Path, typer.Argument(metavar="RUN", help="Run folder made by `starcal-uq calibrate`.", parser=read_path)
+]
+NewRun = Annotated[Path, typer.Option("-o", "--out", metavar="RUN", help="Folder for the results.", parser=write_path)]
+Force = Annotated[bool, typer.Option("--force", help="Replace results that exist.")]
+Json = Annotated[bool, typer.Option("--json", help="Print the table as JSON.")]
+Seed = Annotated[int, number("seed", "Seed; the same seed repeats the result bit for bit.")]
+Columns = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--column",
+        metavar="NAME=IN_FILE",
+        help="A column that is called otherwise in the file; repeatable.",
+        callback=checked(parse_columns),
+    ),
+]
+TimeUtc = Annotated[
+    str | None,
+    typer.Option(
+        "--time",
+        metavar="UTC",
+        help="Images: middle of the exposure of files that do not say it; goes before a time in the file's name.",
+        callback=checked(_check_time),
+    ),
+]
+Engine = Annotated[
+    settings.Engine, typer.Option(help="What finds attitudes: pyramid, or tetra3rs (extra of that name).")
+]
+SchedulerAddress = Annotated[
+    str | None,
+    typer.Option(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Dask scheduler whose workers do it; local processes otherwise.",
+        callback=checked(_check_text),
+    ),
+]
+FileWorkers = Annotated[
+    int | None,
+    number("workers", "Local processes for a folder of partitions; one for each processor by default.", "--workers"),
+]
+Workers = Annotated[int | None, number("workers", "Processes; as many as processors by default.", least=1)]
+Duplicates = Annotated[
+    settings.Duplicates,
+    typer.Option(
+        help="Frames that hold the same measurement as an earlier one: refuse, drop (leave them out), or keep (they "
+        "are exposures of their own)."
+    ),
+]
+Alignment = Annotated[
+    str,
+    typer.Option(
+        metavar="random|observed|FILE",
+        help="Frames on which alignment is calibrated in flight: random sky, those of the calibration, or a table.",
+        callback=checked(check_word_or_file),
+    ),
+]
+AlignmentFrames = Annotated[
+    int | None, number("alignment_frames", "Number of alignment frames of random sky; 100 by default.", metavar="N")
+]
+Draws = Annotated[int, number("n_draws", "Posterior draws that go through QUEST.", least=50)]
+Epoch = Annotated[float, number(EPOCH, "Julian year of the star positions.")]
+MaxMag = Annotated[float, number(MAGNITUDES, "Magnitude limit, Gaia G.")]
 
 
 def check_same_sensor(calibrated: Camera, run: Path, sheet: Camera, path: Path) -> None:

@@ -8,10 +8,17 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from starcal_uq.cli.console import progress_bar
-from starcal_uq.cli.options import Force, Json, Seed
+from starcal_uq.cli.options import Force, Json, Seed, Workers, number, write_path
+from starcal_uq.core import settings
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+Out = Annotated[
+    Path,
+    typer.Option("-o", "--out", metavar="DIR", help="Folder for report, tables and figures.", parser=write_path),
+]
 
 
 def register(app: typer.Typer) -> None:
@@ -21,16 +28,17 @@ def register(app: typer.Typer) -> None:
 
 
 def reproduce_command(
-    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for report, tables and figures.")],
+    out: Out,
     replicates: Annotated[
-        int, typer.Option(min=8, help="Repetitions of the experiment, each with its own seed.")
+        int, number("n_replicates", "Repetitions of the experiment, each with its own seed.", least=8)
     ] = 200,
-    frames: Annotated[int, typer.Option(min=20, help="Frames in each.")] = 1000,
+    frames: Annotated[int, number("n_frames", "Frames in each.", least=20)] = 1000,
     convention: Annotated[
-        str, typer.Option(help="eq14 (ideal to distorted, as everybody's models) or eq6 (distorted to ideal).")
+        settings.Convention,
+        typer.Option(help="eq14 (ideal to distorted, as everybody's models) or eq6 (distorted to ideal)."),
     ] = "eq14",
     study: Annotated[bool, typer.Option(help="Also study the interaction of optics and distortion.")] = True,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as processors by default.")] = None,
+    workers: Workers = None,
     seed: Seed = 2017,
     force: Force = False,
     json: Json = False,
@@ -38,11 +46,8 @@ def reproduce_command(
     """Run Ye & Yang 2017 again: each of its numbers beside ours, with the uncertainty that they lack."""
     from starcal_uq.cli.console import out as console
     from starcal_uq.cli.console import print_json, records, show_table
-    from starcal_uq.paper.camera import CONVENTIONS
     from starcal_uq.paper.reproduction import reproduce
 
-    if convention not in CONVENTIONS:
-        raise typer.BadParameter(f"--convention {convention!r} is unknown: use one of {', '.join(CONVENTIONS)}.")
     with progress_bar("reproduction") as progress:
         found = reproduce(
             out,
@@ -65,13 +70,14 @@ def reproduce_command(
 
 
 def field_command(
-    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for report, tables and figures.")],
-    frames: Annotated[int, typer.Option(min=20, help="Frames identified and solved; as many calibrate.")] = 200,
+    out: Out,
+    frames: Annotated[int, number("n_frames", "Frames identified and solved; as many calibrate.", least=20)] = 200,
     reading: Annotated[
-        str, typer.Option(help="window (the middle of a larger detector, 10.8 degrees) or full (all of it).")
+        settings.FieldReading,
+        typer.Option(help="window (the middle of a larger detector, 10.8 degrees) or full (all of it)."),
     ] = "window",
-    replicates: Annotated[int, typer.Option(min=20, help="Repetitions behind the ranges of the errors.")] = 100,
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as processors by default.")] = None,
+    replicates: Annotated[int, number("n_replicates", "Repetitions behind the ranges of the errors.", least=20)] = 100,
+    workers: Workers = None,
     seed: Seed = 2017,
     force: Force = False,
     json: Json = False,
@@ -80,10 +86,7 @@ def field_command(
     from starcal_uq.cli.console import out as console
     from starcal_uq.cli.console import print_json, records, show_table
     from starcal_uq.paper.field.experiment import field_experiment
-    from starcal_uq.paper.field.published import READINGS
 
-    if reading not in READINGS:
-        raise typer.BadParameter(f"--reading {reading!r} is unknown: use one of {', '.join(READINGS)}.")
     with progress_bar("field experiment") as progress:
         found = field_experiment(
             out,

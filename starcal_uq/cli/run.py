@@ -21,7 +21,19 @@ from starcal_uq.cli.console import (
 )
 from starcal_uq.cli.images import load_images
 from starcal_uq.cli.mission import fail_if_violated, show_budget
-from starcal_uq.cli.options import Alignment, AlignmentFrames, CameraFile, Draws, Force, NewRun, Seed
+from starcal_uq.cli.options import (
+    Alignment,
+    AlignmentFrames,
+    CameraFile,
+    Draws,
+    Force,
+    NewRun,
+    Seed,
+    number,
+    read_file,
+    read_path,
+    write_path,
+)
 from starcal_uq.cli.settings import (
     EstimationSettings,
     ImageSettings,
@@ -47,10 +59,10 @@ def register(app: typer.Typer) -> None:
 
 
 def demo(
-    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the results.")] = Path(
-        "starcal-demo"
-    ),
-    frames: Annotated[int, typer.Option(min=20, help="Number of frames.")] = 1000,
+    out: Annotated[
+        Path, typer.Option("--out", "-o", metavar="DIR", help="Folder for the results.", parser=write_path)
+    ] = Path("starcal-demo"),
+    frames: Annotated[int, number("n_frames", "Number of frames.", least=20)] = 1000,
     seed: Seed = 2017,
     force: Force = False,
 ) -> None:
@@ -73,6 +85,7 @@ def run_command(
             metavar="OBS|IMAGES...",
             help="A table of identified stars or a folder of partitions (see `calibrate`), or images (FITS, TIFF, PNG, "
             "JPEG) or folders of them, whose stars are then found and identified.",
+            parser=read_path,
         ),
     ],
     camera: CameraFile,
@@ -86,7 +99,11 @@ def run_command(
     alignment_frames: AlignmentFrames = None,
     budget: Annotated[
         Path | None,
-        typer.Option(metavar="TOML", help="Contributors that the data cannot know, and requirements: see `budget`."),
+        typer.Option(
+            metavar="TOML",
+            help="Contributors that the data cannot know, and requirements: see `budget`.",
+            parser=read_file,
+        ),
     ] = None,
     force: Force = False,
 ) -> None:

@@ -12,7 +12,22 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 import starcal_uq as sc
-from starcal_uq.cli.options import Columns, Duplicates, FileWorkers, SchedulerAddress, Seed, TimeUtc, parse_choice
+from starcal_uq.cli.options import (
+    LEAST_SIGMA_PX,
+    MAGNITUDES,
+    Columns,
+    Duplicates,
+    FileWorkers,
+    SchedulerAddress,
+    Seed,
+    TimeUtc,
+    checked,
+    number,
+    parse_velocity,
+    read_file,
+)
+from starcal_uq.core import settings
+from starcal_uq.core.settings import EPOCH
 from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
@@ -24,13 +39,15 @@ class EstimationSettings:
     """How a camera is estimated."""
 
     method: Annotated[
-        str,
+        settings.Method,
         typer.Option(
             help="efficient (three stages, then the attitude-marginalised likelihood), three_stage (Ye & Yang 2017), "
             "or a baseline: least_squares, samaan (Kalman filter), griffith (recursive least squares)."
         ),
     ] = "efficient"
-    solver: Annotated[str, typer.Option(help="lm, minpack, or ipopt (keeps the optics within physical bounds).")] = "lm"
+    solver: Annotated[
+        settings.Solver, typer.Option(help="lm, minpack, or ipopt (keeps the optics within physical bounds).")
+    ] = "lm"
     screen: Annotated[
         bool, typer.Option("--screen", help="Leave out wrong identifications first; they are listed.")
     ] = False
@@ -43,7 +60,7 @@ class EstimationSettings:
         typer.Option("--star-errors", help="Estimate and marginalise errors that a star brings into every frame."),
     ] = False
     noise: Annotated[
-        str,
+        settings.NoiseKind,
         typer.Option(
             help="common (one noise for all stars), or model (fitted against radius, magnitude and frame, as far as "
             "the residuals ask for it)."
@@ -74,7 +91,7 @@ class SkySettings:
 
     column: Columns = None
     directions: Annotated[
-        str | None,
+        settings.Directions | None,
         typer.Option(
             help="What ra_deg and dec_deg are: apparent (as seen by the moving sensor), catalogue (aberration is then "
             "applied at time_utc), or undeclared.",
@@ -83,7 +100,10 @@ class SkySettings:
     observer_velocity: Annotated[
         str | None,
         typer.Option(
-            "--observer-velocity", metavar="VX,VY,VZ", help="Velocity relative to the Earth's centre, km/s, ICRS axes."
+            "--observer-velocity",
+            metavar="VX,VY,VZ",
+            help="Velocity relative to the Earth's centre, km/s, ICRS axes.",
+            callback=checked(parse_velocity),
         ),
     ] = None
     site: Annotated[
@@ -93,6 +113,7 @@ class SkySettings:
             metavar="SITE",
             help="Where on the ground the camera stood (TOML with a [site] table): refraction and daily aberration are "
             "applied.",
+            parser=read_file,
         ),
     ] = None
     in_space: Annotated[
@@ -101,10 +122,8 @@ class SkySettings:
 
     def options(self) -> AnyDict:
         """Keyword arguments that tables and images share: `observations_from_table`, `observations_from_images`."""
-        from starcal_uq.pipeline.tables import DIRECTIONS
-
         return {
-            "directions": parse_choice("--directions", self.directions, DIRECTIONS),
+            "directions": self.directions,
             "site": None if self.site is None else sc.sky.Site.load(self.site),
             "in_space": self.in_space,
         }
@@ -115,15 +134,18 @@ class ImageSettings:
     """What belongs to images alone; None where nothing was said."""
 
     max_mag: Annotated[
-        float | None, typer.Option(help="Images: magnitude limit of the catalogue, Gaia G; 7 by default.")
+        float | None, number(MAGNITUDES, "Images: magnitude limit of the catalogue, Gaia G; 7 by default.")
     ] = None
     epoch: Annotated[
-        float | None, typer.Option(help="Images: Julian year of the star positions; the images' own by default.")
+        float | None, number(EPOCH, "Images: Julian year of the star positions; the images' own by default.")
     ] = None
-    gain: Annotated[float | None, typer.Option(help="Images: electrons per count, where they do not say it.")] = None
+    gain: Annotated[
+        float | None, number("gain_e_per_count", "Images: electrons per count, where they do not say it.")
+    ] = None
     time: TimeUtc = None
     engine: Annotated[
-        str | None, typer.Option(help="Images: what finds attitudes: pyramid, or tetra3rs (extra of that name).")
+        settings.Engine | None,
+        typer.Option(help="Images: what finds attitudes: pyramid, or tetra3rs (extra of that name)."),
     ] = None
 
 
@@ -133,25 +155,27 @@ class SamplingSettings:
 
     seed: Seed = 0
     sigma: Annotated[
-        float | None, typer.Option(help="Centroid noise in px per axis, if it is known; sampled otherwise.")
+        float | None,
+        number("sigma_px", "Centroid noise in px per axis, if it is known; sampled otherwise.", least=LEAST_SIGMA_PX),
     ] = None
     priors: Annotated[
-        Path | None, typer.Option("--priors", help="TOML file with a [priors] table; wide defaults otherwise.")
+        Path | None,
+        typer.Option("--priors", help="TOML file with a [priors] table; wide defaults otherwise.", parser=read_file),
     ] = None
-    ensembles: Annotated[int, typer.Option(min=2, help="Separately seeded ensembles of walkers.")] = 4
-    walkers: Annotated[int, typer.Option(min=14, help="Walkers in each ensemble.")] = 64
-    steps: Annotated[int, typer.Option(min=20, help="Steps kept of each walker.")] = 200
+    ensembles: Annotated[int, number("n_ensembles", "Separately seeded ensembles of walkers.", least=2)] = 4
+    walkers: Annotated[int, number("n_walkers", "Walkers in each ensemble.", least=14)] = 64
+    steps: Annotated[int, number("n_steps", "Steps kept of each walker.", least=20)] = 200
     likelihood: Annotated[
-        str | None,
+        settings.LikelihoodName | None,
         typer.Option(
             help="marginal (Gaussian, attitudes marginalised), pairs (interstar angles, Godambe's curvature), "
             "student_t (heavy tails, for wrong identifications), or pairs_naive (to see what goes wrong); by default "
             "that of the calibration."
         ),
     ] = None
-    evaluation: Annotated[str, typer.Option(help="auto (compressed, checked against exact), compressed, or exact.")] = (
-        "auto"
-    )
+    evaluation: Annotated[
+        settings.Evaluation, typer.Option(help="auto (compressed, checked against exact), compressed, or exact.")
+    ] = "auto"
 
     def options(self, run: Run) -> AnyDict:
         """Keyword arguments of `Run.sample`."""

@@ -10,7 +10,22 @@ import typer
 import starcal_uq as sc
 from starcal_uq.cli.console import out as console
 from starcal_uq.cli.console import print_json, print_table, progress_bar, records, show_calibration
-from starcal_uq.cli.options import CameraFile, Duplicates, Force, Json, NewRun, RunPath, Seed
+from starcal_uq.cli.options import (
+    LEAST_SIGMA_PX,
+    CameraFile,
+    Duplicates,
+    Force,
+    Json,
+    MaxMag,
+    NewRun,
+    RunPath,
+    Seed,
+    Workers,
+    number,
+    read_path,
+    write_path,
+)
+from starcal_uq.core import settings
 from starcal_uq.core.files import atomic_write_bytes, check_new_folder, new_folder, write_csv
 
 
@@ -23,27 +38,24 @@ def register(app: typer.Typer) -> None:
 
 def validate_command(
     camera: CameraFile,
-    out: Annotated[Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for figure and table.")] = Path(
-        "validation"
-    ),
-    replicates: Annotated[int, typer.Option(min=20, help="Data sets to simulate, calibrate and sample.")] = 1000,
-    frames: Annotated[int, typer.Option(min=2, help="Frames in each.")] = 50,
-    min_stars: Annotated[int, typer.Option(min=3, help="Least stars in a frame.")] = 10,
-    sigma: Annotated[float, typer.Option(help="Centroid noise, px per axis.")] = 0.05,
-    max_mag: Annotated[float, typer.Option(help="Magnitude limit, Gaia G.")] = 6.0,
+    out: Annotated[
+        Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for figure and table.", parser=write_path)
+    ] = Path("validation"),
+    replicates: Annotated[int, number("n_replicates", "Data sets to simulate, calibrate and sample.", least=20)] = 1000,
+    frames: Annotated[int, number("n_frames", "Frames in each.", least=2)] = 50,
+    min_stars: Annotated[int, number("min_stars", "Least stars in a frame.", least=3)] = 10,
+    sigma: Annotated[float, number("sigma_px", "Centroid noise, px per axis.", least=LEAST_SIGMA_PX)] = 0.05,
+    max_mag: MaxMag = 6.0,
     truth: Annotated[
-        str, typer.Option(help="fixed (this camera every time) or prior (drawn from narrow priors around it).")
+        settings.Truth,
+        typer.Option(help="fixed (this camera every time) or prior (drawn from narrow priors around it)."),
     ] = "fixed",
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; as many as processors by default.")] = None,
+    workers: Workers = None,
     seed: Seed = 0,
     force: Force = False,
     json: Json = False,
 ) -> None:
     """Show that the intervals are right for this sensor and this volume of data, by simulation-based calibration."""
-    from starcal_uq.diagnostics.validation.validate import TRUTHS
-
-    if truth not in TRUTHS:
-        raise typer.BadParameter(f"--truth {truth!r} is unknown: use one of {', '.join(TRUTHS)}.")
     sensor = sc.Camera.load(camera)
     check_new_folder(out, force)
     with progress_bar("replicates") as progress:
@@ -56,7 +68,7 @@ def validate_command(
             max_mag=max_mag,
             seed=seed,
             workers=workers,
-            truth=truth,  # type: ignore[arg-type]
+            truth=truth,
             progress=progress,
         )
     from starcal_uq.presentation.figures.style import png_bytes
@@ -79,7 +91,7 @@ def validate_command(
 
 def diagnose_command(
     run: RunPath,
-    starts: Annotated[int, typer.Option(min=0, help="Fits from other starts.")] = 5,
+    starts: Annotated[int, number("n_starts", "Fits from other starts.")] = 5,
     seed: Seed = 0,
     json: Json = False,
 ) -> None:
@@ -120,10 +132,12 @@ def diagnose_command(
 
 
 def merge_command(
-    runs: Annotated[list[Path], typer.Argument(metavar="RUN...", help="Run folders of the same camera.")],
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN...", help="Run folders of the same camera.", parser=read_path)
+    ],
     out: NewRun,
     noise: Annotated[
-        str,
+        settings.MergedNoise,
         typer.Option(
             help="common (one noise for all runs), own (each run keeps its estimated noise), or auto (own where the "
             "runs' noises differ)."

@@ -25,25 +25,33 @@ from starcal_uq.cli.console import (
 )
 from starcal_uq.cli.console import out as console
 from starcal_uq.cli.options import (
-    FAINTEST,
+    MAGNITUDES,
     Alignment,
     AlignmentFrames,
     CameraFile,
     Draws,
+    Epoch,
     FileWorkers,
     Force,
     Json,
+    MaxMag,
     NewRun,
     ObsFile,
     RunPath,
     SchedulerAddress,
     Seed,
-    parse_choice,
+    check_word_or_file,
+    checked,
+    number,
     parse_columns,
     parse_velocity,
+    read_file,
+    write_path,
 )
 from starcal_uq.cli.settings import EstimationSettings, SamplingSettings, SkySettings, unfolded
-from starcal_uq.core.files import check_new_folder, ensure_new
+from starcal_uq.core import settings
+from starcal_uq.core.files import check_new_folder, ensure_new, table_ending
+from starcal_uq.core.settings import EPOCH
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -88,28 +96,36 @@ def simulate_command(
     out: Annotated[
         Path,
         typer.Option(
-            "-o", "--out", metavar="OBS", help="Table to write (.csv, .ecsv, .parquet), or folder of partitions."
+            "-o",
+            "--out",
+            metavar="OBS",
+            help="Table to write (.csv, .ecsv, .parquet), or folder of partitions.",
+            parser=write_path,
         ),
     ],
-    frames: Annotated[int, typer.Option(min=1, help="Number of frames, at random attitudes.")] = 1000,
-    sigma: Annotated[float, typer.Option(min=0.0, help="Centroid noise, px per axis.")] = 0.05,
-    max_mag: Annotated[float, typer.Option(help="Magnitude limit, Gaia G.")] = 6.0,
-    min_stars: Annotated[int, typer.Option(min=3, help="Attitudes with fewer stars are drawn again.")] = 10,
-    epoch: Annotated[float, typer.Option(help="Julian year of the star positions.")] = 2026.9,
+    frames: Annotated[int, number("n_frames", "Number of frames, at random attitudes.")] = 1000,
+    sigma: Annotated[float, number("sigma_px", "Centroid noise, px per axis.")] = 0.05,
+    max_mag: MaxMag = 6.0,
+    min_stars: Annotated[int, number("min_stars", "Attitudes with fewer stars are drawn again.", least=3)] = 10,
+    epoch: Epoch = 2026.9,
     images: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Also render the frames as FITS images into this folder.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Also render the frames as FITS images into this folder.", parser=write_path),
     ] = None,
     sensor: Annotated[
         Path | None,
-        typer.Option(help="Detector of the images (TOML with a [sensor] table); a small tracker's by default."),
+        typer.Option(
+            help="Detector of the images (TOML with a [sensor] table); a small tracker's by default.",
+            parser=read_file,
+        ),
     ] = None,
     partition_frames: Annotated[
         int | None,
-        typer.Option(
-            min=1,
-            metavar="N",
-            help="Write OBS as a folder of Parquet files of N frames each (10000 is a good size), which may exceed "
+        number(
+            "partition_frames",
+            "Write OBS as a folder of Parquet files of N frames each (10000 is a good size), which may exceed "
             "memory; an interrupted command goes on.",
+            metavar="N",
         ),
     ] = None,
     scheduler: SchedulerAddress = None,
@@ -121,6 +137,7 @@ def simulate_command(
     if partition_frames is None:
         if not (scheduler is None and workers is None):
             raise typer.BadParameter("--scheduler and --workers make a folder: give --partition-frames as well.")
+        table_ending(out)
         ensure_new(out, force)
     elif images is not None:
         raise typer.BadParameter("--images belongs to one table: leave out --partition-frames.")
@@ -231,20 +248,22 @@ def propagate_command(
             metavar="observed|random|FILE",
             help="Frames: those of the calibration, random ones of the mission, or an attitude profile "
             "(time_s or time_utc, and qx, qy, qz, qw).",
+            callback=checked(check_word_or_file),
         ),
     ] = "observed",
-    max_mag: Annotated[float, typer.Option(help="Mission: magnitude limit in flight, Gaia G.")] = 6.0,
-    epoch: Annotated[float, typer.Option(help="Mission: Julian year of the star positions.")] = 2026.9,
-    frames: Annotated[int, typer.Option(min=10, help="Mission: number of random attitudes.")] = 1000,
+    max_mag: Annotated[float, number(MAGNITUDES, "Mission: magnitude limit in flight, Gaia G.")] = 6.0,
+    epoch: Annotated[float, number(EPOCH, "Mission: Julian year of the star positions.")] = 2026.9,
+    frames: Annotated[int, number("n_frames", "Mission: number of random attitudes.", least=10)] = 1000,
     min_stars: Annotated[
-        int | None,
-        typer.Option(min=2, help="Mission: frames with fewer stars give no attitude (5; profile: 3)."),
+        int | None, number("min_stars", "Mission: frames with fewer stars give no attitude (5; profile: 3).")
     ] = None,
-    rate: Annotated[float | None, typer.Option(help="Profile: frames per second; its own instants by default.")] = None,
+    rate: Annotated[float | None, number("rate_hz", "Profile: frames per second; its own instants by default.")] = None,
     scalar: Annotated[
-        str | None, typer.Option(help="Profile: first or last, where its columns are numbered (q0 to q3).")
+        settings.Scalar | None, typer.Option(help="Profile: first or last, where its columns are numbered (q0 to q3).")
     ] = None,
-    sense: Annotated[str, typer.Option(help="Profile: icrs_to_camera (b = R r) or camera_to_icrs.")] = "icrs_to_camera",
+    sense: Annotated[
+        settings.Sense, typer.Option(help="Profile: icrs_to_camera (b = R r) or camera_to_icrs.")
+    ] = "icrs_to_camera",
     alignment: Alignment = "random",
     alignment_frames: AlignmentFrames = None,
     draws: Draws = 300,
@@ -261,11 +280,9 @@ def propagate_command(
             n_frames=frames,
             min_stars=min_stars,
             rate_hz=rate,
-            scalar=parse_choice("--scalar", scalar, ("first", "last")),
-            sense=parse_choice("--sense", sense, ("icrs_to_camera", "camera_to_icrs")) or "icrs_to_camera",
+            scalar=scalar,
+            sense=sense,
         )
-    if sky is not None and max_mag > FAINTEST:
-        raise typer.BadParameter(f"--max-mag {max_mag:g}: the embedded catalogue ends at G = {FAINTEST:g}.")
     if sky is None and (rate is not None or scalar is not None):
         raise typer.BadParameter("--rate and --scalar belong to an attitude profile: give --attitudes FILE.")
 

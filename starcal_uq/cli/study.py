@@ -10,7 +10,8 @@ import typer
 import starcal_uq as sc
 from starcal_uq.cli.console import err, print_json, print_table, progress_bar
 from starcal_uq.cli.console import out as console
-from starcal_uq.cli.options import Force, Json, SchedulerAddress
+from starcal_uq.cli.options import Force, Json, SchedulerAddress, number, write_file, write_path
+from starcal_uq.core import settings
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_write_text, check_new_folder, new_folder
 
@@ -26,24 +27,33 @@ def register(app: typer.Typer) -> None:
 
 def study_command(
     file: Annotated[
-        Path, typer.Argument(metavar="STUDY", help="What is varied (TOML); --template writes one to start from.")
+        Path,
+        typer.Argument(
+            metavar="STUDY", help="What is varied (TOML); --template writes one to start from.", parser=write_file
+        ),
     ] = Path("study.toml"),
     out: Annotated[
         Path,
-        typer.Option("-o", "--out", metavar="DIR", help="Folder for cells, results and report; a study goes on in it."),
+        typer.Option(
+            "-o",
+            "--out",
+            metavar="DIR",
+            help="Folder for cells, results and report; a study goes on in it.",
+            parser=write_path,
+        ),
     ] = Path("study"),
     template: Annotated[
-        str | None,
+        settings.StudyTemplate | None,
         typer.Option(
             metavar="NAME",
             help="Write a commented STUDY and stop: fov-distortion, frames-stars, magnitude-noise, distortion-models.",
         ),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(min=0, help="Processes; as many as processors by default, 0 for this one.")
+        int | None, number("workers", "Processes; as many as processors by default, 0 for this one.")
     ] = None,
     scheduler: SchedulerAddress = None,
-    seed: Annotated[int | None, typer.Option(min=0, help="Root seed, instead of that of STUDY.")] = None,
+    seed: Annotated[int | None, number("seed", "Root seed, instead of that of STUDY.")] = None,
     force: Force = False,
     json: Json = False,
 ) -> None:

@@ -41,6 +41,7 @@ from starcal_uq.comparison.significance import (
 )
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import ComparisonError
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibrate import calibrate
@@ -57,6 +58,7 @@ if TYPE_CHECKING:
 _WIDE_PRIOR = 5.0
 
 
+@bounded
 @one_thread()
 def compare(
     a: Calibration | Posterior,
@@ -158,6 +160,7 @@ def compare(
     )
 
 
+@bounded
 def compare_halves(
     obs: Observations,
     camera: Camera,

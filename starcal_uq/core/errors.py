@@ -17,6 +17,10 @@ class StarcalError(Exception):
     """Base of all errors that this package raises on purpose."""
 
 
+class SettingError(StarcalError, ValueError):
+    """A setting lies outside its limits."""
+
+
 class CameraError(StarcalError):
     """A camera description is incomplete, inconsistent or unreadable."""
 

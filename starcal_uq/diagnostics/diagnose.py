@@ -18,6 +18,7 @@ from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.files import PathLike
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import read_json, write_json
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import Progress, one_thread
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.diagnostics.jackknife import Jackknife, jackknife_frames
@@ -129,6 +130,7 @@ class Diagnosis(Shown):
         return read_json(cls, path, "a diagnosis", "run `starcal-uq diagnose` again")
 
 
+@bounded
 @one_thread()
 def diagnose(
     obs: Observations | PartitionedObservations,

@@ -21,6 +21,7 @@ from starcal_uq.attitude.rotations import left_error, quaternion_to_rotation, ro
 from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StarcalError
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibrate import refit
 from starcal_uq.estimation.marginal import MarginalLikelihood
@@ -147,6 +148,7 @@ class ModelComparison(Shown):
         return pd.DataFrame(rows)
 
 
+@bounded
 def compare_models(
     obs: Observations,
     cal: Calibration,

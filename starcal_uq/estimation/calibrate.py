@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from starcal_uq.camera.distortion import get_model, sigma_parameter
 from starcal_uq.core.cluster import Scheduler, cluster
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.provenance import provenance
+from starcal_uq.core.settings import Method, Solver, bounded
 from starcal_uq.core.status import Status
 from starcal_uq.core.tasks import Progress, one_thread, processors
 from starcal_uq.core.types import FloatArray
@@ -44,9 +46,9 @@ from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.partitions import PartitionedObservations
 from starcal_uq.observations.table import Observations
 
-METHODS = ("efficient", "three_stage", "least_squares", "samaan", "griffith")
+METHODS = get_args(Method)
 LIKELIHOODS = ("marginal", "student_t")
-SOLVERS = ("lm", "minpack", "ipopt")
+SOLVERS = get_args(Solver)
 # Stage 1 that moves the principal point by more than this fraction of the width has met strong distortion.
 _FAR = 0.05
 _ITERATIONS = 200
@@ -56,6 +58,7 @@ _STARS_WORTH_PROCESSES = 1_000_000
 _SAMPLE_FRAMES, _SAMPLE_STARS = 150, 2500
 
 
+@bounded
 @one_thread()
 def calibrate(
     obs: Observations | PartitionedObservations | Iterable[Observations],

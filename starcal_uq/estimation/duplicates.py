@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
 from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
+from starcal_uq.core.settings import Duplicates
 from starcal_uq.core.types import IntArray
 from starcal_uq.estimation.fingerprints import Fingerprints, repeats, shared
 
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.observations.table import Observations
 
-DUPLICATES = ("refuse", "drop", "keep")
+DUPLICATES = get_args(Duplicates)
 
 
 def fingerprints_of(calibration: Calibration, obs: Observations | None = None) -> Fingerprints | None:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
 from starcal_uq.core.provenance import data_hashes, provenance
 from starcal_uq.core.records import from_plain, to_plain
+from starcal_uq.core.settings import MergedNoise
 from starcal_uq.core.status import Status
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
@@ -37,7 +38,7 @@ from starcal_uq.observations.table import Observations
 if TYPE_CHECKING:
     import pandas as pd
 
-NOISES = ("auto", "common", "own")
+NOISES = get_args(MergedNoise)
 # Up to this many sigmas of a run, its quadratic expansion was never wrong by more than 0.15 nat, even with five frames.
 # Runs of one camera stay within five.
 MAX_DISTANCE = 8.0

@@ -16,13 +16,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 
 import numpy as np
 
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.formatting import fixed, join_words, significant
 from starcal_uq.core.records import from_plain, to_plain
+from starcal_uq.core.settings import NoiseKind
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.stages import refinement_stage
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.observations.table import Observations
 
-NOISES = ("common", "model")
+NOISES = get_args(NoiseKind)
 _QUANTITIES = ("radius", "magnitude")
 _HIGHEST_POWER = 2
 _ROUNDS, _CHOOSING_ROUNDS, _SETTLED = 10, 2, 1e-3

@@ -19,8 +19,9 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import unproject
 from starcal_uq.core.errors import IdentificationError
+from starcal_uq.core.settings import Engine, bounded
 from starcal_uq.core.types import FloatArray
-from starcal_uq.identification.proposers import Engine, prepare_engine
+from starcal_uq.identification.proposers import prepare_engine
 from starcal_uq.identification.pyramid import CameraTolerance
 from starcal_uq.identification.result import FrameIdentification, Identification, Parity
 from starcal_uq.identification.search import (
@@ -53,6 +54,7 @@ class CalibratedCamera(Protocol):
     def covariance(self) -> FloatArray: ...
 
 
+@bounded
 def identify(
     centroids: CentroidTable,
     camera: Camera,

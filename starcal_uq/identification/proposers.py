@@ -7,19 +7,19 @@ from functools import partial
 from os import PathLike
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal, TypeAlias
+from typing import Any, TypeAlias, get_args
 
 import numpy as np
 
 from starcal_uq.core.errors import IdentificationError
+from starcal_uq.core.settings import Engine
 from starcal_uq.core.types import FloatArray
 from starcal_uq.identification.pairs import StarPairs, prepared_star_pairs
 from starcal_uq.identification.pyramid import CameraTolerance, FieldGeometry, Hypothesis, hypotheses
 from starcal_uq.sky.catalogue import StarCatalogue
 from starcal_uq.sky.gaia import write_gaia_records
 
-Engine: TypeAlias = Literal["pyramid", "tetra3rs"]
-ENGINES: tuple[Engine, ...] = ("pyramid", "tetra3rs")
+ENGINES: tuple[Engine, ...] = get_args(Engine)
 
 # Batches of hypotheses from points, their noise, the camera, its tolerances, the number of centroids to look at, and
 # the number of those that were searched before: `pyramid.hypotheses` with its catalogue, or another solver's.

@@ -16,6 +16,7 @@ import numpy as np
 
 from starcal_uq.core.errors import ImageError
 from starcal_uq.core.formatting import plural
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import AnyDict
 from starcal_uq.images.centroids import COLUMNS, FRAME_COLUMNS, Centroids
 from starcal_uq.images.detection import DetectionOptions, FrameStars, find_stars
@@ -36,6 +37,7 @@ _KEPT_BYTES = 31 << 20
 Source = Image | str | os.PathLike[str]
 
 
+@bounded
 def extract_centroids(
     images: Source | Iterable[Source],
     *,

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.errors import SamplingError
+from starcal_uq.core.settings import Evaluation, LikelihoodName
 from starcal_uq.core.status import Check, Level, Question
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.student import DOF_RANGE, log_excess_prior, parse_dof
@@ -28,10 +29,8 @@ if TYPE_CHECKING:
     from starcal_uq.inference.exact import FrameSample
     from starcal_uq.observations.table import Observations
 
-LikelihoodName = Literal["marginal", "pairs", "pairs_naive", "student_t"]
-Evaluation = Literal["auto", "compressed", "exact"]
-LIKELIHOODS = ("marginal", "pairs", "pairs_naive", "student_t")
-EVALUATIONS = ("auto", "compressed", "exact")
+LIKELIHOODS = get_args(LikelihoodName)
+EVALUATIONS = get_args(Evaluation)
 _MAX_REFINEMENT = 200
 # Times the frames of a sample above which a sample checks the compressed likelihood.
 _MANY = 1.5

@@ -21,6 +21,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path, ensure_new, reading
 from starcal_uq.core.records import Arrays, from_plain, to_plain
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.status import Check, Level, worst
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.inference.priors import SIGMA_NAMES, Priors
@@ -353,6 +354,7 @@ class Posterior(Shown):
         draws = dict(zip(self.parameter_names, self.draws.T, strict=True))
         return pd.DataFrame({**place, **draws})
 
+    @bounded
     def thin(self, n: int, seed: int | np.random.SeedSequence | None = None) -> FloatArray:
         """A random subset (n, p+1) of the draws without replacement; all of them if there are fewer than n."""
         rng = np.random.default_rng(seed)

@@ -18,6 +18,7 @@ from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import fold_radius_px, forward_kernel, forward_root, unproject_theta
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PriorError
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.observations.frames import StarFrames
@@ -92,6 +93,7 @@ class PriorPredictive(Shown):
         return pd.DataFrame({**columns, "observed": self.observed, "tail_probability": self.tail})
 
 
+@bounded
 def prior_predictive(
     priors: Priors, camera: Camera, obs: Observations | None = None, *, n_draws: int = 200, seed: int = 0
 ) -> PriorPredictive:

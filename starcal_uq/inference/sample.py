@@ -16,20 +16,13 @@ from starcal_uq.camera.distortion import parameters, sigma_parameter
 from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.provenance import data_hashes, provenance
 from starcal_uq.core.records import to_plain
+from starcal_uq.core.settings import Evaluation, LikelihoodName, bounded
 from starcal_uq.core.tasks import Progress, one_thread
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.inference.checks import CompressionCheck, chain_order, check_compression, check_draws, measure
 from starcal_uq.inference.ensemble import PROPOSAL_DF, Chains, EnsembleSettings, Moves, run_ensembles
-from starcal_uq.inference.named import (
-    Evaluation,
-    LikelihoodName,
-    Source,
-    check_names,
-    find_source,
-    label_of,
-    resolved_dof,
-)
+from starcal_uq.inference.named import Source, check_names, find_source, label_of, resolved_dof
 from starcal_uq.inference.posterior import Laplace, Posterior
 from starcal_uq.inference.priors import SIGMA_NAMES, Priors
 from starcal_uq.inference.surrogate import fit_polynomial
@@ -60,6 +53,7 @@ _N_IMPORTANCE_SLOW = 2_000
 _DEGREES = (3, 4)
 
 
+@bounded
 @one_thread()
 def sample(
     obs: Observations | PartitionedObservations | None,

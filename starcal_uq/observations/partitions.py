@@ -17,6 +17,7 @@ import numpy as np
 
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.files import PathLike
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import AnyDict, IntArray
 from starcal_uq.observations.checks import check_mapping
 from starcal_uq.observations.columns import COLUMNS
@@ -156,6 +157,7 @@ class PartitionedObservations:
         reader = replace(self.reader, meta={**self.reader.meta, **entries})
         return replace(self, reader=reader, meta={**self.meta, **entries})
 
+    @bounded
     def sample(self, n_frames: int = SAMPLE_FRAMES) -> Observations:
         """About `n_frames` frames with all of their columns: evenly spaced ones of at most 16 files, evenly spaced too.
 

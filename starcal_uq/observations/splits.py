@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
 from starcal_uq.core.errors import ComparisonError
+from starcal_uq.core.settings import Split, bounded
 from starcal_uq.core.types import IntArray
 
 if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
 
-SPLITS = ("odd-even", "halves", "random")
+SPLITS = get_args(Split)
 _LABELS = {
     "odd-even": ("odd frames", "even frames"),
     "halves": ("first half", "second half"),
@@ -20,6 +21,7 @@ _LABELS = {
 }
 
 
+@bounded
 def split_frames(obs: Observations, how: str = "odd-even", *, seed: int = 0) -> tuple[Observations, Observations]:
     """Two tables that share no frame and together are the whole.
 

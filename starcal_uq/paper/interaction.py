@@ -29,6 +29,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import RunFolderError, SamplingError, StarcalError
 from starcal_uq.core.files import write_csv
 from starcal_uq.core.provenance import provenance
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.calibrate import calibrate
@@ -326,6 +327,7 @@ class Outcome(NamedTuple):
     stars_per_frame: float
 
 
+@bounded
 def interaction_study(
     *,
     truth: Camera | None = None,

@@ -20,6 +20,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError, DistortionError, SamplingError, StarcalError
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import read, write
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.estimation.calibrate import calibrate
@@ -276,6 +277,7 @@ def is_slow(method: Method) -> bool:
     return method.recursion is not None and method.recursion.pair_covariance == "diagonal"
 
 
+@bounded
 def replicate(
     *,
     methods: Sequence[Method] = METHODS,

@@ -7,6 +7,7 @@ from pathlib import Path
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.files import PathLike, atomic_write_text, check_new_folder
 from starcal_uq.core.provenance import provenance
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import AnyDict
 from starcal_uq.paper.camera import paper_camera, paper_start
@@ -26,6 +27,7 @@ N_STUDY_REPLICATES = 8
 _SHARES = {"run": 10, "readings": 150, "replicates": 640, "study": 150, "report": 50}
 
 
+@bounded
 def reproduce(
     out: PathLike,
     *,

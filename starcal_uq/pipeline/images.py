@@ -19,9 +19,9 @@ from starcal_uq.sky.site import check_sky
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
+    from starcal_uq.core.settings import Engine
     from starcal_uq.core.tasks import Progress
     from starcal_uq.core.types import FloatArray, StrArray
-    from starcal_uq.identification.proposers import Engine
     from starcal_uq.images.centroids import Centroids
     from starcal_uq.observations.table import Observations
     from starcal_uq.pipeline.refine import ImageCalibration

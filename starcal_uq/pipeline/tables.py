@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 from starcal_uq.core.errors import ObservationError
+from starcal_uq.core.settings import Directions
 from starcal_uq.observations.partitions import open_partitions
 from starcal_uq.observations.table import load_observations
 from starcal_uq.sky.site import check_sky
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
     from starcal_uq.sky.site import Site
 
-DIRECTIONS = ("undeclared", "catalogue", "apparent")
+DIRECTIONS = get_args(Directions)
 
 
 def observations_from_table(

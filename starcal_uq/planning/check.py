@@ -11,6 +11,7 @@ import numpy as np
 
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError, CatalogueError, PlanningError, StarcalError
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.estimation.calibrate import calibrate
@@ -144,6 +145,7 @@ class ForecastCheck(Shown):
         )
 
 
+@bounded
 def check_forecast(
     camera: Camera,
     stars: StarCatalogue,

@@ -13,7 +13,7 @@ evaluated exactly.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PlanningError
 from starcal_uq.core.provenance import provenance
+from starcal_uq.core.settings import Criterion, bounded
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.maths.linear import inverses
 from starcal_uq.planning.forecast import quantities, spreads
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.sky.catalogue import StarCatalogue
 
-CRITERIA = ("D", "A")
+CRITERIA = get_args(Criterion)
 CHOICE_SCOPES = ("common", "rest", "calibration")
 # Without data, a thousandth of a mean frame makes the first steps defined.
 _FAINT = 1e-3
@@ -43,6 +44,7 @@ _EXACT, _SWAPS_PER_FRAME, _RANDOM_SETS, _RANDOM_PATHS = 48, 3, 200, 20
 _GAIN = 1e-9
 
 
+@bounded
 def choose_frames(
     camera: Camera,
     stars: StarCatalogue,

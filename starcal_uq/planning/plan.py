@@ -20,6 +20,7 @@ from starcal_uq.core.constants import AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PlanningError
 from starcal_uq.core.provenance import provenance
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.maths.linear import scaled_inverse
@@ -53,6 +54,7 @@ class HasInformation(Protocol):
         ...
 
 
+@bounded
 @one_thread()
 def plan(
     camera: Camera,
@@ -439,6 +441,7 @@ class Plan(Shown):
     rotation_per_theta: FloatArray
     attitude_noise: FloatArray
 
+    @bounded
     def expected(self, n_frames: int) -> Expected:
         """What n frames will give; their information is that of so many average frames."""
         total = n_frames * self.frame_information

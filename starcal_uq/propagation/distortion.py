@@ -23,6 +23,7 @@ from starcal_uq.camera.projection import unproject, unproject_theta
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import DistortionError
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import FloatArray
 
 if TYPE_CHECKING:
@@ -101,6 +102,7 @@ class DistortionCurve(Shown):
         )
 
 
+@bounded
 def distortion_curve(
     post: Posterior,
     obs: Observations | None = None,

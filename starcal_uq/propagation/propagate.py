@@ -33,6 +33,7 @@ from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.projection import unproject_jacobian, unproject_theta
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import DistortionError, ObservationError, SamplingError
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.noise_model import weighed
@@ -57,6 +58,7 @@ _SAMPLED_FRAMES = 300
 _STEP_PX = 0.5
 
 
+@bounded
 @one_thread()
 def propagate(
     post: Posterior,

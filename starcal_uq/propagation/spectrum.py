@@ -23,6 +23,7 @@ from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import AttitudeProfileError, SamplingError
 from starcal_uq.core.records import read, write
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.propagation.attitude_error import OBSERVED
 from starcal_uq.propagation.propagate import FrameGeometry
@@ -40,6 +41,7 @@ _MAX_GAPS = 0.2
 _UNEVEN = 0.05
 
 
+@bounded
 def error_spectrum(
     post: Posterior,
     obs: Observations,

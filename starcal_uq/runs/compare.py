@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from starcal_uq.comparison.compare import compare, compare_halves
 from starcal_uq.core.errors import ComparisonError, RunFolderError
+from starcal_uq.core.settings import bounded
 from starcal_uq.estimation.duplicates import fingerprints_of
 from starcal_uq.runs.run import Run
 
@@ -59,6 +60,7 @@ def compare_runs(
     )
 
 
+@bounded
 def compare_split(run: PathLike, how: str = "odd-even", *, seed: int = 0, **options: Any) -> CameraComparison:
     """Calibrate two halves of a run's frames by themselves and compare them.
 

@@ -24,6 +24,7 @@ from starcal_uq.core.files import (
     reading,
     write_csv,
 )
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import Progress
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.noise_model import weighed
@@ -33,9 +34,9 @@ from starcal_uq.presentation.report.results import Missing, Results
 from starcal_uq.runs.folder import DERIVED, DIAGNOSIS_TABLES, RESULTS, RunFolder
 
 if TYPE_CHECKING:
-    from starcal_uq.attitude.profile import Scalar, Sense
     from starcal_uq.budgeting.file import BudgetFile
     from starcal_uq.budgeting.result import Budget
+    from starcal_uq.core.settings import Scalar, Sense
     from starcal_uq.diagnostics.diagnose import Diagnosis
     from starcal_uq.diagnostics.verdict.judge import Verdict
     from starcal_uq.estimation.screening.result import Screening
@@ -80,6 +81,7 @@ class MissionSky:
     scalar: Scalar | None = None
     sense: Sense = "icrs_to_camera"
 
+    @bounded
     def frames(self, posterior: Posterior, obs: Observations, seed: int) -> Observations:
         """Noise-free frames, with the noise of the observed ones by magnitude where it is stated."""
         from starcal_uq.attitude.profile import load_attitude_profile
@@ -412,6 +414,7 @@ class Run:
         write_csv(self.coupling.to_dataframe(), self.folder.coupling)
         return self.coupling
 
+    @bounded
     def propagate(
         self,
         *,
@@ -532,6 +535,7 @@ class Run:
             error = replace(error, seen=mission, aligned=aligned)
         return with_misfit(error, diagnosis, self.posterior, self.observations)
 
+    @bounded
     def budget(
         self, *, file: BudgetFile | PathLike | None = None, confidence: float | None = None, seed: int = 0
     ) -> Budget:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import RunFolderError, SensorError
 from starcal_uq.core.files import ensure_new
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import FloatArray
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky, choose_attitudes
 from starcal_uq.simulation.rendering import Scene
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 _PATTERN = "frame_*.fits"
 
 
+@bounded
 def render_frames(
     stars: StarCatalogue,
     camera: Camera,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.core.errors import CatalogueError
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import AnyDict, BoolArray, IntArray
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ class Contaminated:
     wrong: BoolArray
 
 
+@bounded
 def contaminate(
     obs: Observations,
     stars: StarCatalogue,

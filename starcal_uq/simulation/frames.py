@@ -13,6 +13,7 @@ from starcal_uq.attitude.rotations import random_rotations
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import fold_radius_px, project, unproject
 from starcal_uq.core.errors import CatalogueError, StarcalError
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
 from starcal_uq.observations.table import Observations
 
@@ -77,6 +78,7 @@ class Campaign:
         return {**asdict(self), "stars": "embedded" if stars is None else stars.source}
 
 
+@bounded
 def simulate(
     stars: StarCatalogue,
     camera: Camera,

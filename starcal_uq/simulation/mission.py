@@ -13,6 +13,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.errors import CatalogueError, ObservationError
 from starcal_uq.core.formatting import count, plural, significant
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.observations.table import Observations
 from starcal_uq.simulation.frames import Sky, simulate
@@ -28,6 +29,7 @@ _MAG_GROUPS = 12
 _PHOTON_DEX_PER_MAG = 0.2
 
 
+@bounded
 def mission_frames(
     stars: StarCatalogue,
     camera: Camera,
@@ -71,6 +73,7 @@ def mission_frames(
     return frames if noise_like is None else _with_noise(frames, noise_like)
 
 
+@bounded
 def profile_frames(
     stars: StarCatalogue,
     camera: Camera,

@@ -13,6 +13,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.core.cluster import Scheduler, cluster
 from starcal_uq.core.errors import ObservationError, RunFolderError
 from starcal_uq.core.files import PathLike
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import AnyDict
 from starcal_uq.observations.files import parquet_summary, write_partition
 from starcal_uq.observations.partitions import PartitionedObservations, open_partitions
@@ -27,6 +28,7 @@ _FRAMES_WORTH_PROCESSES = 100_000
 _NAME = "part-{:06d}.parquet"
 
 
+@bounded
 def simulate_partitions(
     stars: StarCatalogue,
     camera: Camera,

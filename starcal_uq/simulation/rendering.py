@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import SensorError
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.simulation.frames import Sky
 from starcal_uq.simulation.psf import half_width_px, profiles
@@ -162,6 +163,7 @@ class Scene:
         return electrons.astype(np.uint16)
 
 
+@bounded
 def render(
     stars: StarCatalogue,
     camera: Camera,

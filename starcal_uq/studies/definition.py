@@ -11,7 +11,7 @@ from functools import cached_property
 from importlib.resources import files
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import COEFFICIENTS, PARAMETERS, parameter_names
 from starcal_uq.core.errors import CameraError, PriorError, StudyError
 from starcal_uq.core.files import PathLike, atomic_write_text, ensure_new
+from starcal_uq.core.settings import StudyTemplate
 from starcal_uq.core.toml import Key, Section, read_toml, unknown_key
 from starcal_uq.core.types import AnyDict
 from starcal_uq.inference.priors import PRIORS
@@ -27,7 +28,7 @@ from starcal_uq.studies.axes import AXES, EXCLUSIVE, FLAT, base_settings, camera
 MODES = ("fisher", "simulate")
 POSTERIORS = ("importance", "ensemble", "none")
 # One of each, in the order in which a reader would try them.
-TEMPLATES = ("fov-distortion", "frames-stars", "magnitude-noise", "distortion-models")
+TEMPLATES = get_args(StudyTemplate)
 MAX_CELLS = 1_000_000
 # Changes whenever the same settings would give other numbers: results from before are then computed anew.
 VERSION = 1

@@ -17,6 +17,7 @@ from starcal_uq.core.constants import AXES as ATTITUDE
 from starcal_uq.core.errors import StudyError
 from starcal_uq.core.files import PathLike
 from starcal_uq.core.provenance import provenance
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import Progress, one_thread, run_tasks
 from starcal_uq.core.types import AnyDict
 from starcal_uq.sky.catalogue import load_catalogue
@@ -38,6 +39,7 @@ _FEW_BATCHES = 5
 MISSING = "not computed yet: run the study again, and it goes on."
 
 
+@bounded
 @one_thread()
 def study(
     definition: StudyDefinition | PathLike,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from starcal_uq.camera.distortion import parameters, sigma_parameter
 from starcal_uq.camera.projection import fold_radius_px
 from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.errors import CatalogueError, PriorError, SamplingError, StarcalError
+from starcal_uq.core.settings import Truth
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.marginal import MarginalLikelihood
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
     from starcal_uq.sky.catalogue import StarCatalogue
 
-Truth = Literal["fixed", "prior"]
 LikelihoodMaker = Callable[["Observations", "Calibration"], Likelihood]
 
 MARGINAL = "marginal"

@@ -18,23 +18,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError, PriorError, SamplingError
 from starcal_uq.core.provenance import provenance
+from starcal_uq.core.settings import Truth, bounded
 from starcal_uq.core.tasks import Progress, one_thread, run_tasks
 from starcal_uq.core.types import AnyDict
-from starcal_uq.diagnostics.validation.replicates import (
-    MARGINAL,
-    LikelihoodMaker,
-    Study,
-    TrialOutcome,
-    Truth,
-    run_replicate,
-)
+from starcal_uq.diagnostics.validation.replicates import MARGINAL, LikelihoodMaker, Study, TrialOutcome, run_replicate
 from starcal_uq.diagnostics.validation.result import Validation
 from starcal_uq.inference.priors import Priors
 from starcal_uq.simulation.frames import Campaign
@@ -42,7 +36,7 @@ from starcal_uq.simulation.frames import Campaign
 if TYPE_CHECKING:
     from starcal_uq.sky.catalogue import StarCatalogue
 
-TRUTHS = ("fixed", "prior")
+TRUTHS = get_args(Truth)
 # Student t is for stars that are not where they should be; its sigma is not the noise that is simulated here.
 LIKELIHOODS = (MARGINAL, "pairs", "pairs_naive")
 # What truth="prior" draws from by default: narrow enough that every draw is a camera that sees the same sky.
@@ -52,6 +46,7 @@ _PRIOR_CORNER_PX = 1.0
 _PRIOR_LOG_SIGMA = 0.2
 
 
+@bounded
 @one_thread()
 def validate(
     camera: Camera,

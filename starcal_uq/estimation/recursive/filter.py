@@ -28,9 +28,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.settings import PairCovariance
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray
-from starcal_uq.estimation.recursive.innovations import PairCovariance, PairNormals, frame_normals
+from starcal_uq.estimation.recursive.innovations import PairNormals, frame_normals
 from starcal_uq.observations.frames import StarFrames
 
 # Estimates that are kept of a long stream: when they are this many, every second one is dropped.

@@ -20,16 +20,16 @@ The historical filters took pairs as independent, with the diagonal of ``sigma^2
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import get_args
 
 import numpy as np
 
 from starcal_uq.camera.projection import backward_kernel, backward_root
+from starcal_uq.core.settings import PairCovariance
 from starcal_uq.core.types import FloatArray
 from starcal_uq.observations.frames import StarFrames
 
-PairCovariance = Literal["full", "diagonal"]
-PAIR_COVARIANCES: tuple[PairCovariance, ...] = ("full", "diagonal")
+PAIR_COVARIANCES: tuple[PairCovariance, ...] = get_args(PairCovariance)
 
 # Share of the mean eigenvalue that is added to all: displacements that no angle sees to first order, such as that of
 # the middle one of three stars in line, then count for nothing instead of raising an error.

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.settings import PairCovariance, RecursiveMethod
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.recursive.filter import REACH_SIGMAS, FrameSums, Recursion
-from starcal_uq.estimation.recursive.innovations import PAIR_COVARIANCES, PairCovariance
+from starcal_uq.estimation.recursive.innovations import PAIR_COVARIANCES
 from starcal_uq.estimation.stages import Stage, optics_stage
 from starcal_uq.observations.frames import StarFrames
 
@@ -110,7 +112,7 @@ def begin(
     return recursion, stage
 
 
-RECURSIVE_METHODS = ("samaan", "griffith")
+RECURSIVE_METHODS = get_args(RecursiveMethod)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,139 @@
+"""What settings may be, numbers within limits or words of a list: said once, for Python and the command line.
+
+A limit belongs to the name of a parameter, which has it wherever it occurs; `bounded` makes a function refuse what lies
+outside, before it does anything.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import wraps
+from numbers import Integral, Real
+from typing import Any, Literal, ParamSpec, TypeVar
+
+from starcal_uq.core.errors import SettingError
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+Method = Literal["efficient", "three_stage", "least_squares", "samaan", "griffith"]
+RecursiveMethod = Literal["samaan", "griffith"]
+Solver = Literal["lm", "minpack", "ipopt"]
+NoiseKind = Literal["common", "model"]
+MergedNoise = Literal["auto", "common", "own"]
+Duplicates = Literal["refuse", "drop", "keep"]
+Directions = Literal["undeclared", "catalogue", "apparent"]
+Engine = Literal["pyramid", "tetra3rs"]
+LikelihoodName = Literal["marginal", "pairs", "pairs_naive", "student_t"]
+Evaluation = Literal["auto", "compressed", "exact"]
+Sense = Literal["icrs_to_camera", "camera_to_icrs"]
+Scalar = Literal["first", "last"]
+Split = Literal["odd-even", "halves", "random"]
+Scope = Literal["common", "rest", "calibration", "total"]
+Criterion = Literal["D", "A"]
+PairCovariance = Literal["full", "diagonal"]
+Filtered = Literal["optics", "all"]
+Truth = Literal["fixed", "prior"]
+StudyTemplate = Literal["fov-distortion", "frames-stars", "magnitude-noise", "distortion-models"]
+Convention = Literal["eq14", "eq6"]
+FieldReading = Literal["window", "full"]
+
+
+@dataclass(frozen=True)
+class Limit:
+    """Numbers that a setting may be.
+
+    Attributes
+    ----------
+    low, high : int or float
+        Least and greatest.
+    whole : bool
+        Whether it is a whole number.
+    """
+
+    low: float
+    high: float
+    whole: bool = True
+
+    def wanted(self, low: float | None = None) -> str:
+        """What to give, in words; a command may ask for more than the least."""
+        return wanted(self.low if low is None else low, self.high, self.whole)
+
+    def holds(self, value: Any) -> bool:
+        """Whether a number is one of these; what is neither number nor text is not judged."""
+        if isinstance(value, str | float if self.whole else str):
+            return False
+        if isinstance(value, tuple | list):
+            return all(map(self.holds, value))
+        return not isinstance(value, Integral if self.whole else Real) or bool(self.low <= value <= self.high)  # type: ignore[operator]
+
+
+def wanted(low: float, high: float, whole: bool) -> str:
+    """What to give for a number within limits."""
+    return f"give a {'whole ' if whole else ''}number from {_written(low)} to {_written(high)}"
+
+
+def _written(number: float) -> str:
+    return str(number) if isinstance(number, int) else f"{number:.15g}"
+
+
+# A whole number that TOML, JSON and NumPy can hold, and of which NumPy can make a generator.
+SEED = Limit(0, 2**63 - 1)
+SIGMA_PX = Limit(0.0, 1e4, whole=False)
+EPOCH = Limit(1800.0, 2200.0, whole=False)
+LIMITS = {
+    "seed": SEED,
+    "n_frames": Limit(1, 10**9),
+    "partition_frames": Limit(1, 10**7),
+    "alignment_frames": Limit(1, 10**6),
+    "min_stars": Limit(2, 10**4),
+    "max_stars": Limit(1, 10**6),
+    "n_replicates": Limit(1, 10**6),
+    "n_campaigns": Limit(1, 10**6),
+    "n_geometries": Limit(1, 10**6),
+    "n_starts": Limit(0, 10**4),
+    "n_draws": Limit(1, 10**7),
+    "n_samples": Limit(1, 10**9),
+    "n_ensembles": Limit(1, 10**4),
+    "n_walkers": Limit(1, 10**6),
+    "n_steps": Limit(1, 10**8),
+    "n_burn": Limit(0, 10**8),
+    "workers": Limit(0, 10**4),
+    "sigma_px": SIGMA_PX,
+    "rate_hz": Limit(1e-6, 1e6, whole=False),
+    "gain_e_per_count": Limit(1e-6, 1e6, whole=False),
+    "read_noise_e": Limit(0.0, 1e6, whole=False),
+    "saturation": Limit(1.0, 1e12, whole=False),
+    "threshold_sigma": Limit(0.1, 1e6, whole=False),
+    "psf_sigma_px": Limit(0.05, 1e3, whole=False),
+    "focal_tolerance": Limit(1e-9, 0.5, whole=False),
+    "centre_tolerance_px": Limit(1e-6, 1e5, whole=False),
+}
+
+
+def bounded(function: Callable[P, R]) -> Callable[P, R]:
+    """A function that refuses, with `SettingError`, settings outside the limits of their names."""
+    names = tuple(inspect.signature(function).parameters)
+    limits = {name: LIMITS[name] for name in names if name in LIMITS}
+
+    @wraps(function)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> R:
+        given: Iterable[tuple[str, Any]] = (*zip(names, args, strict=False), *kwargs.items())
+        for name, value in given:
+            if name in limits and not limits[name].holds(value):
+                raise SettingError(f"{name} is {clipped(value)}: {limits[name].wanted()}.")
+        return function(*args, **kwargs)
+
+    return checked
+
+
+def clipped(value: object, most: int = 60) -> str:
+    """A value as it would be typed, not longer than is needed to know it."""
+    try:
+        text = repr(value)
+    except ValueError:
+        # Python writes no whole number of more than 4300 digits.
+        text = "a number of thousands of digits"
+    return text if len(text) <= most else f"{text[: most // 2]}...{text[-most // 4 :]}"

@@ -1,0 +1,175 @@
+"""Every option of every command with every odd value: one sentence that names it, before any work.
+
+Options and their kinds come from the command line's own declaration: a new one is covered by itself.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from pathlib import Path
+
+import pytest
+import typer
+
+from starcal_uq.cli import app as cli_app
+
+# Arguments with which each command would work.
+VALID = {
+    "demo": "-o NEW",
+    "run": "OBS CAMERA -o NEW",
+    "simulate": "CAMERA -o NEW.csv",
+    "calibrate": "OBS CAMERA -o NEW",
+    "sample": "RUN",
+    "coupling": "RUN",
+    "propagate": "RUN",
+    "report": "RUN",
+    "budget": "RUN",
+    "compare": "RUN RUN",
+    "plan": "CAMERA",
+    "study": "NEW.toml",
+    "centroid": "IMAGES -o NEW.csv",
+    "identify": "OBS CAMERA -o NEW.csv",
+    "filter": "OBS CAMERA -o NEW",
+    "validate": "CAMERA",
+    "diagnose": "RUN",
+    "merge": "RUN RUN -o NEW",
+    "reproduce": "-o NEW",
+    "reproduce-field": "-o NEW",
+}
+LONG = 100_000 * "x"
+CONTROLS = "\x1b[31mred\x07\nline"
+WHOLE = ("-1", "0", "1.5", str(10**30), "-" + str(10**30), 5000 * "9", "nan", "", "three", CONTROLS)
+FLOATS = ("nan", "inf", "-inf", "-1", "0", "1e-300", "1e300", "1e999", "", "three", CONTROLS)
+TEXTS = ("", LONG, CONTROLS, "nonsense")
+PATHS = ("", LONG, CONTROLS, "/dev/zero", "missing", "folder", "OBS/below")
+# Paths to which something is written; what is missing there is what is wanted.
+WRITTEN = {"out", "template", "images", "file"}
+
+
+class BeginsError(Exception):
+    """The work of a command would begin here."""
+
+
+@pytest.fixture(scope="module")
+def commands():
+    return typer.main.get_command(cli_app.app).commands
+
+
+@pytest.fixture
+def parse(commands, monkeypatch, capsys, tmp_path):
+    """Whether a command accepts its arguments; the sentence with which it refuses them otherwise."""
+    monkeypatch.chdir(tmp_path)
+    group = typer.main.get_command(cli_app.app)
+    for folder in ("folder", "RUN", "IMAGES"):
+        Path(folder).mkdir()
+    for file in ("OBS", "CAMERA"):
+        Path(file).write_text("")
+
+    def begin(**_):
+        raise BeginsError
+
+    for command in group.commands.values():
+        monkeypatch.setattr(command, "callback", begin)
+    monkeypatch.setattr(cli_app, "app", group)
+
+    def call(*arguments):
+        monkeypatch.setattr(sys, "argv", ["starcal-uq", *arguments])
+        try:
+            cli_app.main()
+        except BeginsError:
+            return None
+        except SystemExit as stop:
+            err = capsys.readouterr().err
+            line = err.removesuffix("\n")
+            good = line.startswith("error: ") and line.isprintable() and line.endswith(".") and len(line) < 400
+            return err if stop.code == 2 and good else f"{stop.code}: {err}"
+        raise AssertionError(f"{arguments}: the command neither began nor ended.")
+
+    return call
+
+
+def named(parameter):
+    return {*parameter.opts, *parameter.secondary_opts, parameter.name, parameter.metavar} - {None}
+
+
+def kind_of(parameter):
+    """Type of one value: int, float, bool, Path, "choice" or str."""
+    declared = parameter.type_descriptor
+    inner = typer._typing.get_args(declared.annotation) if declared.choices is None else ()
+    return "choice" if declared.choices is not None else inner[0] if inner else declared.annotation
+
+
+def call_with(command, parameter, value):
+    """Arguments of a valid call in which one parameter has a value."""
+    words = VALID[command.name].split()
+    if parameter.opts[0].startswith("-"):
+        given = [f"{max(parameter.opts, key=len)}={value}"]
+        if parameter.nargs == 2:
+            given = [parameter.opts[0], value, value]
+        for option in parameter.opts:
+            if option in words:
+                at = words.index(option)
+                del words[at : at + 2]
+        return [command.name, *words, *given]
+    places = [p for p in command.params if not p.opts[0].startswith("-")]
+    words[places.index(parameter)] = value
+    options, arguments = [], []
+    rest = iter(words)
+    for word in rest:
+        if word.startswith("-") and word != value:
+            options += [word, next(rest)]
+        else:
+            arguments.append(word)
+    return [command.name, *options, "--", *arguments]
+
+
+def legitimate(parameter, kind, value):
+    """Whether a value that is accepted may be."""
+    if kind in (int, float):
+        number = float(value)
+        assert math.isfinite(parameter.min) and math.isfinite(parameter.max), parameter.name
+        return parameter.min <= number <= parameter.max
+    if kind is Path:
+        return (value in ("missing", CONTROLS) and parameter.name in WRITTEN) or (
+            value == "folder" and parameter.metavar not in ("CAMERA", "SITE", "CENTROIDS", "TOML", "STUDY")
+        )
+    return kind is str and parameter.name in {"scheduler"} and value == "nonsense"
+
+
+ODD = {int: WHOLE, float: FLOATS, str: TEXTS, "choice": TEXTS, Path: PATHS, bool: ("perhaps",)}
+
+
+def test_every_option_refuses_odd_values_in_one_sentence(commands, parse):
+    assert set(VALID) == set(commands)
+    refused, accepted, problems = 0, 0, []
+    for command in commands.values():
+        assert parse(command.name, *VALID[command.name].split()) is None
+        for parameter in command.params:
+            kind = kind_of(parameter)
+            if kind is bool and parameter.name == "help":
+                continue
+            for value in ODD[kind]:
+                sentence = parse(*call_with(command, parameter, value))
+                good = (
+                    legitimate(parameter, kind, value)
+                    if sentence is None
+                    else sentence.startswith("error: ") and any(name in sentence for name in named(parameter))
+                )
+                refused, accepted = refused + (sentence is not None), accepted + (sentence is None)
+                if not good:
+                    problems.append((command.name, parameter.name, value[:40], sentence))
+    assert not problems, "\n".join(map(str, problems))
+    assert refused > 1000 and accepted < 0.2 * refused
+
+
+def test_control_sentences_and_the_judge_of_accepted_values(commands, parse):
+    seed = next(p for p in commands["demo"].params if p.name == "seed")
+    assert not legitimate(seed, int, "-1")
+    assert parse("demo", "-o", "NEW", "--seed", "3") is None
+    assert parse("demo", "-o", "NEW", "--seed", "-1") == (
+        "error: --seed '-1': give a whole number from 0 to 9223372036854775807.\n"
+    )
+    assert parse("sample", "RUN", "--likelihood", "magic") == (
+        "error: --likelihood 'magic' is unknown: use one of marginal, pairs, pairs_naive, student_t.\n"
+    )
