@@ -79,8 +79,8 @@ def _written(number: float) -> str:
     return str(number) if isinstance(number, int) else f"{number:.15g}"
 
 
-# A whole number that TOML, JSON and NumPy can hold, and of which NumPy can make a generator.
-SEED = Limit(0, 2**63 - 1)
+# What `numpy.random.SeedSequence` makes of one seed for others.
+SEED = Limit(0, 2**64 - 1)
 SIGMA_PX = Limit(0.0, 1e4, whole=False)
 EPOCH = Limit(1800.0, 2200.0, whole=False)
 LIMITS = {
@@ -105,11 +105,13 @@ LIMITS = {
     "rate_hz": Limit(1e-6, 1e6, whole=False),
     "gain_e_per_count": Limit(1e-6, 1e6, whole=False),
     "read_noise_e": Limit(0.0, 1e6, whole=False),
-    "saturation": Limit(1.0, 1e12, whole=False),
-    "threshold_sigma": Limit(0.1, 1e6, whole=False),
-    "psf_sigma_px": Limit(0.05, 1e3, whole=False),
-    "focal_tolerance": Limit(1e-9, 0.5, whole=False),
-    "centre_tolerance_px": Limit(1e-6, 1e5, whole=False),
+    "saturation": Limit(0.0, 1e12, whole=False),
+    "threshold_sigma": Limit(2.0, 1e6, whole=False),
+    "psf_sigma_px": Limit(0.2, 20.0, whole=False),
+    "min_pixels": Limit(1, 10**6),
+    "focal_tolerance": Limit(1e-9, 0.3, whole=False),
+    "centre_tolerance_px": Limit(0.0, 1e5, whole=False),
+    "distortion_tolerance_px": Limit(0.0, 1e5, whole=False),
 }
 
 

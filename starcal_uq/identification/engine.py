@@ -114,10 +114,10 @@ def identify(
     Raises
     ------
     IdentificationError
-        A centroid is not finite or off the detector, a tolerance makes no sense, the catalogue is too small, or the
+        A centroid is not finite or off the detector, the catalogue is too small, or the
         engine is not installed.
     """
-    _check(centroids, camera, stars, focal_tolerance, centre_tolerance_px, distortion_tolerance_px)
+    _check(centroids, camera, stars)
     tolerance = CameraTolerance(focal_tolerance, centre_tolerance_px, distortion_tolerance_px)
     if calibration is not None:
         camera, tolerance = calibration.camera, calibrated_tolerance(calibration, tolerance)
@@ -275,14 +275,7 @@ def _result(
     return Identification(observations, tuple(records), camera, field.camera, parity, n_left_out)
 
 
-def _check(
-    table: CentroidTable, camera: Camera, stars: StarCatalogue, focal: float, centre_px: float, distortion_px: float
-) -> None:
-    if not (0.0 < focal <= 0.3 and centre_px >= 0.0 and distortion_px >= 0.0):
-        raise IdentificationError(
-            f"tolerances of {focal:g} of the focal length, {centre_px:g} px and {distortion_px:g} px cannot be used: "
-            "give a share above 0 and up to 0.3, and pixels that are not negative."
-        )
+def _check(table: CentroidTable, camera: Camera, stars: StarCatalogue) -> None:
     if len(stars) < 100:
         raise IdentificationError(
             f"the catalogue has {len(stars)} stars, too few to find patterns in: raise its magnitude limit."

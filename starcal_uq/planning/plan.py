@@ -311,7 +311,7 @@ def _check(
     n_frames: Sequence[int], min_stars: int, target_arcsec: float | None, n_geometries: int, n_campaigns: int
 ) -> None:
     for good, text in (
-        (len(n_frames) > 0 and all(n >= 1 for n in n_frames), "n_frames holds a number below 1, or none: give some."),
+        (len(n_frames) > 0, "n_frames is empty: give some numbers of frames."),
         (min_stars >= 3, f"min_stars is {min_stars}: an attitude needs at least 3."),
         (
             target_arcsec is None or 0.0 < target_arcsec < np.inf,

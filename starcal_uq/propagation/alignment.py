@@ -58,8 +58,6 @@ def alignment_frames(
     if alignment not in (None, RANDOM):
         raise ObservationError(f"alignment is {alignment!r}; give 'random', 'observed' or a table of observations.")
     n_frames = N_ALIGNMENT_FRAMES if n_frames is None else n_frames
-    if n_frames < 1:
-        raise ObservationError(f"{n_frames} alignment frames align nothing; give at least 1.")
     return random_sky(post, obs, n_frames, seed), f"{plural(n_frames, 'frame')} of random sky"
 
 

@@ -216,6 +216,7 @@ def test_a_runs_own_files_are_not_mixed_with_others(cli, run, tmp_path, small_pl
         assert status == 2
         assert "is the folder of a run" in err
     assert {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
+    (tmp_path / "b.toml").touch()
     status, _, err = cli("budget", "run", "--file", "b.toml", "--template", "./b.toml", "--force")
     assert status == 2
     assert "write over" in err
@@ -243,7 +244,7 @@ def test_plan_refuses_what_it_cannot_mean(cli, run, tmp_path, small_plans):
     sc.paper.paper_start().save(tmp_path / "camera.toml")
     for wrong, word in (
         (("--after", "run", "--check", 10), "--check"),
-        (("--max-mag", 30), "ends at G = 10"),
+        (("--max-mag", 30), "--max-mag '30': give a number from -2 to 10"),
         (("--sigma", 300), "px per axis"),
     ):
         status, _, err = cli("plan", "camera.toml", "--frames", 30, *wrong)
@@ -251,7 +252,7 @@ def test_plan_refuses_what_it_cannot_mean(cli, run, tmp_path, small_plans):
         assert word in err
     status, _, err = cli("propagate", "run", "--attitudes", "random", "--max-mag", 99)
     assert status == 2
-    assert "ends at G = 10" in err
+    assert "--max-mag '99': give a number from -2 to 10" in err
     # What was asked for is in the document.
     options = ("--frames", 30, "--target-arcsec", 1e-9, "--choose", 3, "--check", 10, "--json")
     status, out, _ = cli("plan", "camera.toml", *options)

@@ -168,7 +168,7 @@ def test_control_sentences_and_the_judge_of_accepted_values(commands, parse):
     assert not legitimate(seed, int, "-1")
     assert parse("demo", "-o", "NEW", "--seed", "3") is None
     assert parse("demo", "-o", "NEW", "--seed", "-1") == (
-        "error: --seed '-1': give a whole number from 0 to 9223372036854775807.\n"
+        "error: --seed '-1': give a whole number from 0 to 18446744073709551615.\n"
     )
     assert parse("sample", "RUN", "--likelihood", "magic") == (
         "error: --likelihood 'magic' is unknown: use one of marginal, pairs, pairs_naive, student_t.\n"

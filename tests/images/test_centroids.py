@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from scipy.special import erf
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.core.errors import ImageError, ObservationError, RunFolderError
+from starcal_uq.core.errors import ImageError, ObservationError, RunFolderError, SettingError
 from starcal_uq.identification.result import FrameIdentification, Identification
 from starcal_uq.images import detection
 from starcal_uq.images import fits as star_fits
@@ -401,7 +401,7 @@ def test_frames_that_cannot_be_used_are_left_out_and_the_others_go_on(stars, tmp
 def test_options_out_of_range_are_named():
     image = Image(np.zeros((8, 8)), "a")
     for name, value in (("threshold_sigma", 0.5), ("gain_e_per_count", 0.0), ("max_stars", 0), ("psf_sigma_px", 99.0)):
-        with pytest.raises(ImageError, match=name):
+        with pytest.raises(SettingError, match=f"{name} is {value}: give a"):
             extract_centroids(image, **{name: value})
     with pytest.raises(ImageError, match="there is none"):
         extract_centroids([])

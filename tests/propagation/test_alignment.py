@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.core.errors import ObservationError
+from starcal_uq.core.errors import ObservationError, SettingError
 from starcal_uq.observations.table import Observations
 from starcal_uq.propagation.attitude_error import AttitudeError
 from starcal_uq.propagation.propagate import propagate
@@ -197,11 +197,12 @@ def test_an_alignment_that_is_none_is_refused() -> None:
     frames = table(scenes()["random"][1])
     for options, words in (
         ({"alignment": "sky"}, "give 'random', 'observed' or a table"),
-        ({"alignment_frames": 0}, "at least 1"),
         ({"alignment": "observed", "alignment_frames": 5}, "belongs to a random sky"),
     ):
         with pytest.raises(ObservationError, match=words):
             propagate(POST, frames, **options)  # type: ignore[arg-type]
+    with pytest.raises(SettingError, match="alignment_frames is 0: give a whole number from 1"):
+        propagate(POST, frames, alignment_frames=0)  # type: ignore[arg-type]
 
 
 def test_the_file_keeps_alignment_and_covariances(tmp_path) -> None:  # type: ignore[no-untyped-def]
