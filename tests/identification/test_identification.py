@@ -426,7 +426,7 @@ def test_engine_that_is_not_there(stars: Any, monkeypatch: pytest.MonkeyPatch) -
 
 def test_bad_input(stars: Any, folder: Path) -> None:
     table, *_ = random_frames(stars, square_camera(12.0), 1, 12)
-    with pytest.raises(SettingError, match="focal_tolerance is .*: give a number from 1e-09 to 0.3"):
+    with pytest.raises(SettingError, match=r"focal_tolerance is .*: give a number from 1e-09 to 0.3"):
         identify(table, square_camera(12.0), stars, focal_tolerance=0.0)
     with pytest.raises(IdentificationError, match="too few"):
         identify(table, square_camera(12.0), stars.select(np.arange(10)))
