@@ -2,12 +2,11 @@
 
     python benchmarks/mutation.py [--subject NAME ...] [--number 80] [--seed 1] [--again] [--show] [--write]
 
-A mutant is one small change of the source: a sign, a comparison, a constant, a transpose. Of all mutants of a subject,
-listed in the order of the source, every so many-th is tried (start: the seed), so that each function has its share.
-Each is given to the tests that reach its line, in a process of its own; it is killed when one of them fails. What was
-tried is kept in `.bench/mutation` and not tried again; ``--again`` tries those that survived, after tests were
-strengthened. ``--show`` prints survivors as differences, ``--write`` puts the table into the documentation
-(`docs/explanation/reliability.md`).
+A mutant is one small change of the source: a sign, a comparison, a constant, a transpose. Of all mutants of a subject
+some are drawn by the seed; a larger number holds a smaller one. Each is given to the tests that reach its line, in a
+process of its own; it is killed when one of them fails. What was tried is kept in `.bench/mutation`;
+``--again`` tries those that survived, after tests were strengthened. ``--show`` prints survivors as differences,
+``--write`` puts the table into the documentation (`docs/explanation/reliability.md`).
 
 Ready-made tools were tried first. mutmut leaves out whatever is decorated and cannot leave out sentences; cosmic-ray
 edits the tree in place and starts a new interpreter for each mutant, which takes 20 times as long here; both know
@@ -211,7 +210,7 @@ class Places(ast.NodeVisitor):
         self.add(node, "...", "statement dropped")
 
     def visit_Return(self, node: ast.Return) -> None:
-        if node.value is not None and not isinstance(node.value, ast.Constant):
+        if node.value is not None and not isinstance(node.value, ast.Constant | ast.JoinedStr):
             self.add(node.value, "None", "nothing returned")
             self.visit(node.value)
 
@@ -220,7 +219,8 @@ class Places(ast.NodeVisitor):
         for left, operator, right in zip(operands, node.ops, operands[1:], strict=False):
             self.swap(left, right, COMPARISONS[type(operator)], "comparison")
             # Between numbers that are not counted, equality does not happen.
-            if type(operator) in BORDERS and re.search(r"\b[1-9]\d*(?![.\de])|\blen\(|\bn_|\.size", self.code(node)):
+            counted = re.compile(r"[1-9]\d*|len\(.*|n_\w+|.*\.(size|n_\w+)")
+            if type(operator) in BORDERS and any(counted.fullmatch(self.code(side)) for side in (left, right)):
                 self.swap(left, right, BORDERS[type(operator)], "border")
         self.generic_visit(node)
 
@@ -290,12 +290,11 @@ def files_of(subject: str) -> list[str]:
 
 
 def sampled(subject: str, number: int, seed: int) -> tuple[list[Mutant], int]:
-    """Every so many-th mutant of a subject, and how many there are."""
-    everything = [mutant for file in files_of(subject) for mutant in mutants(file)]
-    step = max(1.0, len(everything) / number)
-    start = (seed * 0.6180339887498949 % 1.0) * step
-    chosen = [everything[int(start + i * step)] for i in range(min(number, len(everything)))]
-    return chosen, len(everything)
+    """Some mutants of a subject in the order of the source, and how many there are."""
+    texts = {file: (ROOT / file).read_text("utf-8") for file in files_of(subject)}
+    everything = [mutant for file in texts for mutant in mutants(file)]
+    drawn = sorted(everything, key=lambda m: hashlib.sha256(f"{seed} {key(m, texts[m.file])}".encode()).digest())
+    return sorted(drawn[:number], key=lambda m: (m.file, m.start)), len(everything)
 
 
 class Changed(importlib.abc.MetaPathFinder, importlib.machinery.SourceFileLoader):

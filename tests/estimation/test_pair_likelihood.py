@@ -15,7 +15,7 @@ from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.status import Level
 from starcal_uq.estimation import composite as module
 from starcal_uq.estimation.calibrate import calibrate
-from starcal_uq.estimation.composite import PairLikelihood, expected_godambe, pair_likelihood
+from starcal_uq.estimation.composite import PairLikelihood, expected_godambe, pair_covariance, pair_likelihood
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.inference.named import NaivePairsWarning
@@ -150,6 +150,15 @@ def test_curvature_is_godambes_information(variability: str) -> None:
         # The naive one is scaled by the expected noise of a pair; the observed noise differs by a few percent.
         assert relative(laplace.covariance, expected) < (0.01 if likelihood.adjusted else 0.1)
     assert found.narrowness > 2.5
+    # One takes V from the model and sigma, and loses the parameters' degrees of freedom when these are integrated.
+    theta, objective = cal.pair_theta, found.objective
+    expected, more = expected_godambe(objective, theta, np.sqrt(cal.chi2 / cal.dof)), 5
+    if variability == "empirical":
+        expected, more = objective.godambe(theta), 0
+    assert relative(found.covariance, expected) < 1e-12
+    assert found.dof == cal.dof + more
+    narrow = np.diag(found.covariance) / np.diag(build(observations(), adjusted=False)[0].covariance)
+    assert found.narrowness == pytest.approx(np.sqrt(np.mean(narrow)), rel=1e-12)
 
 
 def test_both_variabilities_agree_where_there_are_many_frames() -> None:
@@ -171,6 +180,8 @@ def test_fewer_frames_than_parameters_have_the_covariance_of_gaussian_noise() ->
     unit = np.outer(cal.sigmas, cal.sigmas)
     assert np.linalg.eigvalsh(cal.covariance / unit)[0] > 1e-4
     assert np.linalg.eigvalsh(objective.godambe(cal.pair_theta) / unit)[0] < 1e-12
+    unknown = pair_covariance(objective, cal.pair_theta, np.inf, cal.dof)
+    assert unknown.shape == (5, 5) and np.isnan(unknown).all()
 
 
 @pytest.mark.slow
@@ -198,10 +209,11 @@ def test_noise_of_a_pair_is_predicted() -> None:
 def test_stars_other_than_those_of_the_estimate_are_refused() -> None:
     frames = StarFrames.from_observations(observations())
     _, cal = build(observations())
-    with pytest.raises(SamplingError, match="from the minimum of the pair objective"):
-        pair_likelihood(
-            frames, "brown", cal.pair_theta + 2.0 * np.sqrt(np.diag(cal.pair_covariance)), chi2=1.0, residual_dof=100
-        )
+    naive = pair_likelihood(frames, "brown", cal.pair_theta, chi2=cal.chi2, residual_dof=cal.dof)
+    # One parameter after the other: none is told by the size of its unit.
+    for shift in 2.0 * np.diag(np.sqrt(np.diag(naive.covariance))):
+        with pytest.raises(SamplingError, match=r"lies (1\.9|2\.0) standard deviations from the minimum of the pair"):
+            pair_likelihood(frames, "brown", cal.pair_theta + shift, chi2=cal.chi2, residual_dof=cal.dof)
 
 
 @pytest.mark.usefixtures("few_importance_draws")

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from starcal_uq.camera.distortion import model_names
+from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.observations.frames import StarFrames
 from tests.helpers.scenes import camera, observations
@@ -62,6 +63,28 @@ def test_the_turn_of_the_catalogue_does_not_matter():
     used.cost(theta + np.array([20.0, -20.0, 25.0, 0.0, 0.0]))
     assert used.cost(theta) == pytest.approx(fresh.cost(theta), rel=1e-9)
     assert np.allclose(used.evaluate(theta).gradient, fresh.evaluate(theta).gradient, rtol=1e-6)
+
+
+def test_attitudes_are_those_of_the_last_finite_point():
+    frames = StarFrames.from_observations(observations())
+    objective, theta = PairObjective(frames, "brown"), camera().theta
+    assert objective.rotations is None
+    objective.cost(theta)
+    best = MarginalLikelihood(frames, "brown").profile(theta)[0].rotations
+    assert np.max(np.abs(objective.rotations - best)) < 1e-4
+    # The distortion folds over 620 px from the centre, beyond which some frames have stars and some have none.
+    folded = np.array([*theta[:2], theta[2] + 100.0, -1.0 / (3.0 * 930.0**2), 0.0])
+    assert np.isnan(objective.cost(folded)) and objective.rotations is None
+    assert 0.2 < np.mean(objective.frames.sum(np.isnan(objective.directions(folded, frames)[0][0]) * 1.0) > 0) < 0.8
+    assert objective.cost(theta) == pytest.approx(PairObjective(frames, "brown").cost(theta), rel=1e-12)
+
+
+def test_parameters_that_are_not_finite_have_no_cost():
+    objective = PairObjective(StarFrames.from_observations(observations()), "brown")
+    normal = objective.evaluate(np.array([np.nan, *camera().theta[1:]]))
+    assert normal.cost == np.inf
+    assert normal.gradient.shape == (5,) and normal.matrix.shape == (5, 5)
+    assert np.isnan(normal.gradient).all() and np.isnan(normal.matrix).all()
 
 
 def test_time_grows_with_stars_and_not_with_pairs():
