@@ -9,6 +9,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
+from benchmarks import mutation
 from benchmarks import run as bench
 from benchmarks.harness import Contestant, Runs, Turn, ratio, spread
 
@@ -131,3 +132,44 @@ def test_every_row_has_a_name_of_its_own_and_rivals_that_its_targets_name():
                 file, _, function = contestant.call.partition(":")
                 source = (bench.CONTESTANTS / f"{file}.py").read_text(encoding="utf-8")
                 assert f"\ndef {function}(" in source
+
+
+MUTATED = """
+'''A sentence - and its sign.'''
+_BLOCK = 5
+
+def f(x: int, n=3):
+    if x < n and not n:
+        raise ValueError("a" + f"{x - 1}")
+    # A comment - here.
+    return g(x.T[: x + 1], axis=-1, strict=True)
+"""
+
+
+def test_mutants_change_mathematics_and_leave_sentences(tmp_path, monkeypatch):
+    monkeypatch.setattr(mutation, "ROOT", tmp_path)
+    (tmp_path / "made.py").write_text(MUTATED, "utf-8")
+    found = {mutant.source(MUTATED): mutant.what for mutant in mutation.mutants("made.py")}
+    changed = {
+        (old, new): what
+        for text, what in found.items()
+        for old, new in zip(MUTATED.splitlines(), text.splitlines(), strict=True)
+        if old != new
+    }
+    for text in found:
+        compile(text, "made.py", "exec")
+    condition, returned = MUTATED.splitlines()[5], MUTATED.splitlines()[8]
+    assert {new.strip(): what for (old, new), what in changed.items() if old == condition} == {
+        "if not (x < n and not n):": "condition negated",
+        "if x < n or not n:": "logic",
+        "if x >= n and not n:": "comparison",
+        "if x < n and (n):": "sign",
+    }
+    assert {new.partition("return ")[2]: what for (old, new), what in changed.items() if old == returned} == {
+        "None": "nothing returned",
+        "g(x[: x + 1], axis=-1, strict=True)": "transpose dropped",
+        "g(x.T[: (x + 1) - 1], axis=-1, strict=True)": "slice",
+        "g(x.T[: x - 1], axis=-1, strict=True)": "arithmetic",
+        "g(x.T[: x + 2], axis=-1, strict=True)": "constant",
+    }
+    assert {old for old, _ in changed} == {condition, returned, "def f(x: int, n=3):"}
