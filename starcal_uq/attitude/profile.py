@@ -19,8 +19,8 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import left_error
 from starcal_uq.core.display import Shown
-from starcal_uq.core.errors import AttitudeProfileError, CatalogueError, ObservationError
-from starcal_uq.core.files import table_ending
+from starcal_uq.core.errors import AttitudeProfileError, CatalogueError
+from starcal_uq.core.files import read_parquet, reading, shown, table_ending
 from starcal_uq.core.formatting import plural, significant
 from starcal_uq.core.settings import Scalar, Sense, bounded
 from starcal_uq.core.times import julian_days
@@ -235,21 +235,19 @@ class ProfileTable:
 def read_profile(path: str | os.PathLike[str], scalar: str | None) -> ProfileTable:
     """Read times and quaternions; see `starcal_uq.attitude.profile.load_attitude_profile`."""
     path = Path(path)
-    try:
+    with reading(path, "a readable table", "check the path, or write it again", AttitudeProfileError):
         ending = table_ending(path)
         if ending == ".parquet":
             columns, numbers, word = _parquet(path)
         else:
             columns, numbers, word = _text(path, ecsv=ending == ".ecsv")
-    except ObservationError as error:
-        raise AttitudeProfileError(str(error)) from None
-    except OSError as error:
-        raise AttitudeProfileError(f"{path}: cannot be read ({error.strerror or error}); check the path.") from error
-    if not len(numbers):
-        raise AttitudeProfileError(f"{path}: holds no attitudes; give a table with a time and a quaternion per row.")
-    names = _components(path, columns, scalar)
-    q = np.column_stack([_numbers(path, word, numbers, name, columns[name]) for name in names])
-    return ProfileTable(_times(path, word, numbers, columns), q, numbers, word)
+        if not len(numbers):
+            raise AttitudeProfileError(
+                f"{path}: holds no attitudes; give a table with a time and a quaternion per row."
+            )
+        names = _components(path, columns, scalar)
+        q = np.column_stack([_numbers(path, word, numbers, name, columns[name]) for name in names])
+        return ProfileTable(_times(path, word, numbers, columns), q, numbers, word)
 
 
 def _components(path: Path, columns: dict[str, Any], scalar: str | None) -> tuple[str, ...]:
@@ -295,7 +293,7 @@ def _numbers(path: Path, word: str, numbers: IntArray, name: str, cells: Iterabl
             values.append(float(cell))
         except (TypeError, ValueError):
             raise AttitudeProfileError(
-                f"{path}, {word} {number}: {name} is {cell!r}, not a number; repair it."
+                f"{path}, {word} {number}: {name} is {shown(cell)}, not a number; repair it."
             ) from None
     return np.array(values, dtype=float)
 
@@ -324,14 +322,8 @@ def _text(path: Path, *, ecsv: bool) -> tuple[dict[str, Any], IntArray, str]:
 
 def _parquet(path: Path) -> tuple[dict[str, Any], IntArray, str]:
     import pyarrow as pa
-    from pyarrow import parquet
 
-    try:
-        with path.open("rb") as file:
-            table = parquet.read_table(file)
-    except pa.ArrowException as error:
-        reason = str(error).splitlines()[0]
-        raise AttitudeProfileError(f"{path}: is no readable Parquet file ({reason}); write it again.") from None
+    table = read_parquet(path)
     columns: dict[str, Any] = {}
     for name in table.column_names:
         column = table.column(name)

@@ -6,6 +6,7 @@ stands and exits with status 2.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -14,7 +15,26 @@ if TYPE_CHECKING:
 
 
 class StarcalError(Exception):
-    """Base of all errors that this package raises on purpose."""
+    """Base of all errors that this package raises on purpose.
+
+    The message is one line that prints: what a file holds may stand in it, however long or odd.
+    """
+
+    def __init__(self, message: str = "") -> None:
+        super().__init__(_one_line(message))
+
+
+# A word that is longer is cut, and so is a message, whose remedy stands at its end.
+_LONGEST_WORD, _LONGEST = 250, 700
+
+
+def _one_line(message: str) -> str:
+    if message.isprintable() and len(message) <= _LONGEST_WORD:
+        return message
+    line = " ".join(message.splitlines())
+    line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+    line = re.sub(rf"\S{{{_LONGEST_WORD},}}", lambda word: f"{word[0][:40]}...{word[0][-20:]}", line)
+    return line if len(line) <= _LONGEST else f"{line[:480]} ... {line[-200:]}"
 
 
 class SettingError(StarcalError, ValueError):

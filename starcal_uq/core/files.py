@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import csv
+import gzip
+import json
 import os
+import re
+import reprlib
 import secrets
+import struct
+import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +24,8 @@ from starcal_uq.core.errors import ObservationError, RunFolderError, StarcalErro
 
 if TYPE_CHECKING:
     import pandas as pd
+    import pyarrow as pa
+    from pyarrow.parquet import ParquetFile
 
 PathLike = str | os.PathLike[str]
 
@@ -108,25 +116,132 @@ def write_csv(table: pd.DataFrame, path: PathLike) -> None:
         table.to_csv(temporary, index=False, lineterminator="\n")
 
 
+# What a file unpacks to or declares may take this much memory, or this many times its own size.
+_MODEST_BYTES, _MODEST_RATIO = 2**28, 100
+
+
+def check_size(declared: int, stored: int) -> None:
+    """Refuse, with ValueError, content of `declared` bytes that no file of ours with `stored` bytes unpacks to."""
+    if declared > max(_MODEST_BYTES, _MODEST_RATIO * stored):
+        raise ValueError(f"it declares {float(declared):.3g} bytes of content, far more than it can hold")
+
+
+def check_packed(path: PathLike) -> None:
+    """Refuse a file of gzip that unpacks to far more than tables do; it is unpacked piece by piece and not kept."""
+    with open(path, "rb") as file:
+        if file.read(2) != b"\x1f\x8b":
+            return
+        file.seek(0)
+        stored, size = os.path.getsize(path), 0
+        with gzip.open(file) as content:
+            while piece := content.read(2**20):
+                size += len(piece)
+                check_size(size, stored)
+
+
+def read_parquet(source: Path | bytes, wanted: Collection[str] | None = None) -> pa.Table:
+    """A Parquet file, or those of its columns that are wanted; one that cannot be what it declares is refused.
+
+    Raises
+    ------
+    ValueError, OSError, pyarrow.ArrowException
+        For a damaged file; the caller's `reading` makes a sentence of it.
+    """
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    with parquet.ParquetFile(source if isinstance(source, Path) else pa.BufferReader(source)) as file:
+        check_parquet(file, source.stat().st_size if isinstance(source, Path) else len(source))
+        names = file.schema_arrow.names
+        return file.read([name for name in names if wanted is None or name in wanted], use_threads=False)
+
+
+def check_parquet(file: ParquetFile, stored: int) -> None:
+    """Refuse, with ValueError, two columns of one name, and more rows than a file of `stored` bytes can hold."""
+    names = file.schema_arrow.names
+    if twice := {name for name in names if names.count(name) > 1}:
+        raise ValueError(f"column {min(twice)} occurs twice")
+    check_size(file.metadata.num_rows * len(names) * 8, stored)
+
+
+def check_hdf5(path: PathLike) -> None:
+    """Refuse a file that is no HDF5, or declares more than it can hold; readers of netCDF would stumble over it."""
+    import h5py
+
+    stored = os.path.getsize(path)
+
+    def check(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset):
+            check_size(item.nbytes if item.shape is not None else 0, stored)
+
+    with h5py.File(path, "r") as file:
+        file.visititems(check)
+
+
+def shown(value: Any) -> str:
+    """What stands in a file, for a message: as Python writes it, cut where it is long or deep."""
+    return _SHORT.repr(value)
+
+
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 60
+_SHORT.maxlevel = 3
+_LONGEST_REASON = 160
+# Words that only make sense to whoever wrote the program.
+_INTERNAL = re.compile(r"<class |<\w+\.\w|NoneType|0x[0-9a-f]{6}|\b[A-Z]\w*(Error|Exception)\b|_\w+\(|\(\)")
 # A file that was cut off, or is something else, shows itself by any of these, depending on where it was cut.
-_UNREADABLE = (
-    KeyError, ValueError, TypeError, EOFError, AttributeError, zipfile.BadZipFile, zlib.error, csv.Error, StarcalError,
-)  # fmt: skip
+_REASONS: tuple[tuple[type[Exception] | tuple[type[Exception], ...], str], ...] = (
+    (MemoryError, "it declares more than fits into memory"),
+    (RecursionError, "its values are nested too deeply"),
+    (UnicodeError, "its text is not UTF-8"),
+    ((EOFError, struct.error), "it ends too early"),
+    ((zipfile.BadZipFile, zlib.error, tokenize.TokenError), "it is damaged or cut off"),
+    (OverflowError, "a number in it is too large"),
+    ((TypeError, AttributeError, IndexError), "its content has another form"),
+)
+
+
+def reason_of(error: Exception) -> str:
+    """Why a file cannot be what it should be, in a few plain words without an end."""
+    for kinds, words in _REASONS:
+        if isinstance(error, kinds):
+            return words
+    if isinstance(error, json.JSONDecodeError):
+        return f"line {error.lineno} is no JSON"
+    if isinstance(error, KeyError):
+        keys = error.args[0] if error.args and isinstance(error.args[0], tuple) else error.args
+        name = " ".join(map(str, keys))
+        return f"{name} is missing" if 0 < len(name) <= 60 and name.isprintable() else "a part of it is missing"
+    if not isinstance(error, ValueError | StarcalError | csv.Error):
+        return "it is damaged or cut off"
+    text = " ".join(str(error).split()).removesuffix(".")
+    if not text or _INTERNAL.search(text):
+        return "its content has another form"
+    text = "".join(c if c.isprintable() else "?" for c in text)
+    return text if len(text) <= _LONGEST_REASON else f"{text[: _LONGEST_REASON - 3]}..."
 
 
 @contextmanager
-def reading(path: PathLike, what: str, remedy: str) -> Iterator[None]:
-    """For a block that makes a result of a file: what goes wrong there becomes one `RunFolderError`.
+def reading(path: PathLike, what: str, remedy: str, error: type[StarcalError] = RunFolderError) -> Iterator[None]:
+    """For a block that makes a result of a file: whatever goes wrong there becomes one error, of one sentence.
 
-    It says what the file should hold, such as "a field map", and by the remedy, an order, how to get such a file.
+    It says what the file should hold, such as "a field map", and by the remedy, an order, how to get such a file. An
+    error of this package that names the file already is let through.
     """
     try:
         yield
-    except OSError as error:
-        raise RunFolderError(f"{path}: cannot be read ({error.strerror or error}); {remedy}.") from error
-    except _UNREADABLE as error:
-        reason = f"{type(error).__name__}: {error}".removesuffix(".")
-        raise RunFolderError(f"{path}: is not {what} ({reason}); {remedy}.") from error
+    except Exception as problem:
+        if isinstance(problem, StarcalError) and str(problem).startswith(os.fspath(path)):
+            if isinstance(problem, error):
+                raise
+            raise error(str(problem)) from problem
+        if isinstance(problem, OSError) and problem.errno is not None:
+            # The path that failed, which may be that of a file beside this one.
+            place = path if problem.filename is None else os.fsdecode(problem.filename)
+            raise error(f"{place}: cannot be read ({os.strerror(problem.errno)}); {remedy}.") from problem
+        empty = os.path.isfile(path) and not os.path.getsize(path)
+        reason = "the file is empty" if empty else reason_of(problem)
+        raise error(f"{path}: is not {what} ({reason}); {remedy}.") from problem
 
 
 ENDINGS = (".csv", ".ecsv", ".parquet")

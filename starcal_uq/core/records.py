@@ -7,22 +7,28 @@ every bit. A class that has its own form in files (a camera, a prior) says so by
 from __future__ import annotations
 
 import json
+import math
+import os
+import zipfile
 from collections.abc import Collection, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from functools import cache
 from types import NoneType, UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import IO, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from starcal_uq.core.files import PathLike, atomic_path, atomic_write_text, reading
+from starcal_uq.core.files import PathLike, atomic_path, atomic_write_text, check_size, reading, shown
 from starcal_uq.core.types import AnyDict
 
 Record = TypeVar("Record")
 Arrays = dict[str, Any]
 
 _FORMAT, _DOCUMENT = "format", "document"
+_WORDS: dict[Any, str] = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+# Kinds of arrays that each kind may be made of.
+_FROM = {"f": "fiu", "i": "iu", "u": "iu"}
 _SCALARS: dict[Any, tuple[type, ...]] = {bool: (bool,), int: (int,), float: (int, float), str: (str,)}
 
 
@@ -121,23 +127,27 @@ def _value(hint: Any, data: Any, arrays: Arrays, name: str) -> Any:
         if hint is float and data is None:
             return float("nan")
         if not isinstance(data, _SCALARS[hint]) or (isinstance(data, bool) and hint is not bool):
-            raise ValueError(f"{name} is {data!r}, not {hint.__name__}")
+            raise ValueError(f"{name} is {shown(data)}, not {_WORDS[hint]}")
+        if hint is float and isinstance(data, int):
+            float(data)  # it may be too large for one
         return data
     if origin is Literal:
         if data not in args:
-            raise ValueError(f"{name} is {data!r}, not one of {', '.join(map(str, args))}")
+            raise ValueError(f"{name} is {shown(data)}, not one of {', '.join(map(str, args))}")
         return data
     if origin in (Union, UnionType):
         return _one_of(args, data, arrays, name)
     if origin is np.ndarray:
         if data is None:
             raise ValueError(f"{name} is missing")
-        return np.asarray(data, dtype=get_args(args[1])[0])
+        return _as_array(data, np.dtype(get_args(args[1])[0]), name)
     if origin in (tuple, list):
         return _sequence(origin, args, data, arrays, name)
     if origin is dict:
         return {key: _value(args[1], item, arrays, f"{name}_{key}") for key, item in _mapping(data, name).items()}
     if isinstance(hint, type) and issubclass(hint, Enum):
+        if data not in hint.__members__:
+            raise ValueError(f"{name} is {shown(data)}, not one of {', '.join(hint.__members__)}")
         return hint[data]
     if hasattr(hint, "from_dict"):
         start = f"{name}_"
@@ -148,9 +158,19 @@ def _value(hint: Any, data: Any, arrays: Arrays, name: str) -> Any:
     raise TypeError(f"no file holds {name}: {hint}")
 
 
+def _as_array(data: Any, kind: np.dtype[Any], name: str) -> Any:
+    array = np.asarray(data)
+    if array.dtype.kind not in _FROM.get(kind.kind, kind.kind):
+        # Lists of JSON, in which None stands for NaN, and an empty list for no value of any type.
+        listed = isinstance(data, list) and (array.dtype.kind == "O" or not array.size)
+        if not listed or (kind.kind != "f" and array.size):
+            raise ValueError(f"{name} does not hold what it should")
+    return array.astype(kind) if array.dtype != kind else array
+
+
 def _mapping(data: Any, name: str) -> Mapping[str, Any]:
     if not isinstance(data, Mapping):
-        raise ValueError(f"{name or 'the document'} is {type(data).__name__}, not a table")
+        raise ValueError(f"{name or 'the document'} is {shown(data)}, not a table")
     return data
 
 
@@ -168,7 +188,7 @@ def _one_of(kinds: tuple[Any, ...], data: Any, arrays: Arrays, name: str) -> Any
 
 def _sequence(kind: Any, items: tuple[Any, ...], data: Any, arrays: Arrays, name: str) -> Any:
     if not isinstance(data, list | tuple):
-        raise ValueError(f"{name} is {data!r}, not a list")
+        raise ValueError(f"{name} is {shown(data)}, not a list")
     kinds = [items[0]] * len(data) if kind is list or items[-1] is ... else items
     if len(kinds) != len(data):
         raise ValueError(f"{name} has {len(data)} entries, not {len(kinds)}")
@@ -197,7 +217,35 @@ def _record(cls: Any, data: Mapping[str, Any], arrays: Arrays, name: str) -> Any
             values[field.name] = _value(hints[field.name], data[field.name], arrays, place)
         elif field.default is MISSING and field.default_factory is MISSING:
             raise ValueError(f"{place} is missing")
-    return cls(**values)
+    made = cls(**values)
+    _check_sizes(made, name)
+    return made
+
+
+def _check_sizes(record: Any, name: str) -> None:
+    """Arrays must have the sizes that the class states, and where it says so no gap.
+
+    ``SHAPES`` of a class are sizes by field (or property): numbers, or names of sizes that are the same wherever they
+    stand, such as ``{"theta": ("p",), "draws": ("n", "p+1")}``; a tuple has its length. Fields in ``FINITE`` hold
+    neither NaN nor infinities.
+    """
+    sizes: dict[str, int] = {}
+    for field, wanted in getattr(record, "SHAPES", {}).items():
+        value = getattr(record, field)
+        if value is None:
+            continue
+        shape = value.shape if isinstance(value, np.ndarray) else (len(value),)
+        place = f"{name}_{field}" if name else field
+        if len(shape) != len(wanted):
+            raise ValueError(f"{place} has {len(shape)} dimensions, not {len(wanted)}")
+        for size, want in zip(shape, wanted, strict=True):
+            letter, _, more = str(want).partition("+")
+            known = sizes.setdefault(letter, int(letter) if letter.isdigit() else size - int(more or 0))
+            if size != known + int(more or 0):
+                raise ValueError(f"{place} has {size} entries where there should be {known + int(more or 0)}")
+    for field in getattr(record, "FINITE", ()):
+        if not np.isfinite(getattr(record, field)).all():
+            raise ValueError(f"{f'{name}_{field}' if name else field} holds a value that is not finite")
 
 
 def write_json(record: Any, path: PathLike) -> None:
@@ -234,7 +282,34 @@ def read(cls: type[Record], path: PathLike, kind: str, what: str, remedy: str) -
 
 
 def read_arrays(path: PathLike) -> Arrays:
-    """All arrays of an ``.npz`` file; one that holds Python objects is refused."""
-    # Opened here: NumPy leaves a file open that turns out not to be what it seems.
-    with open(path, "rb") as file, np.load(file, allow_pickle=False) as content:
-        return {name: content[name] for name in content.files}
+    """All arrays of an ``.npz`` file.
+
+    One that holds Python objects is refused, as is an array that declares more than its file has, before memory is
+    taken for it.
+    """
+    with zipfile.ZipFile(path) as archive:
+        members = archive.infolist()
+        check_size(sum(info.file_size for info in members), os.path.getsize(path))
+        arrays = {}
+        for info in members:
+            name = info.filename.removesuffix(".npy")
+            if name in arrays:
+                raise ValueError(f"it holds {name} twice")
+            with archive.open(info) as member:
+                arrays[name] = _array(member, info.file_size, name)
+        return arrays
+
+
+def _array(member: IO[bytes], size: int, name: str) -> Any:
+    """The array of a member of `size` bytes, whose header is believed only where it fits to them."""
+    version = np.lib.format.read_magic(member)
+    if version not in ((1, 0), (2, 0), (3, 0)):
+        raise ValueError(f"{name} is no array")
+    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = header(member)
+    if dtype.hasobject:
+        raise ValueError(f"{name} holds Python objects")
+    if math.prod(shape) * dtype.itemsize != size - member.tell():
+        raise ValueError(f"{name} declares another size than it has")
+    member.seek(0)
+    return np.lib.format.read_array(member, allow_pickle=False)

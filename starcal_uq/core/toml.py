@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.core.errors import StarcalError
-from starcal_uq.core.files import PathLike, atomic_write_text, ensure_new
+from starcal_uq.core.files import PathLike, atomic_write_text, ensure_new, shown
 from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
@@ -40,6 +40,8 @@ def read_toml(path: PathLike, name: str, error: type[StarcalError], missing: str
         raise error(f"{where} is not valid TOML: {problem}; correct that line.") from None
     except ValueError:
         raise error(f"{where} holds a number with too many digits; correct it.") from None
+    except RecursionError:
+        raise error(f"{where} nests its values too deeply; write plain tables and lists.") from None
 
 
 def read_section(path: PathLike, name: str, error: type[StarcalError], *, alone: bool = True) -> AnyDict:
@@ -136,7 +138,7 @@ class Section:
             return f"key {key} is missing; add {self.keys[key].wanted}"
         if kind == "extra_forbidden":
             return self.unknown(key)
-        return f"key {key} is {table[key]!r}; write {self.keys[key].wanted}"
+        return f"key {key} is {shown(table[key])}; write {self.keys[key].wanted}"
 
     def unknown(self, key: str) -> str:
         """What is said of a key that the section does not have."""

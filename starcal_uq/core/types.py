@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -12,3 +13,5 @@ IntArray: TypeAlias = NDArray[np.int64]
 BoolArray: TypeAlias = NDArray[np.bool_]
 StrArray: TypeAlias = NDArray[np.str_]
 AnyDict: TypeAlias = dict[str, Any]
+# Sizes of the arrays of a record, by field; see `starcal_uq.core.records`.
+Shapes: TypeAlias = Mapping[str, tuple[int | str, ...]]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.files import atomic_path, reading
 from starcal_uq.core.records import Arrays, from_plain, read_arrays, to_plain, write_json
 from starcal_uq.core.status import Status
-from starcal_uq.core.types import AnyDict, FloatArray, IntArray
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray, Shapes
 from starcal_uq.estimation.compressed import CompressedLikelihood
 from starcal_uq.estimation.fingerprints import Fingerprints
 from starcal_uq.estimation.residual_map import PartitionSums
@@ -136,6 +136,14 @@ class Calibration(Shown):
     fingerprints: Fingerprints | None = None
     star_errors: StarErrors | None = None
     partitions: PartitionSums | None = None
+
+    SHAPES: ClassVar[Shapes] = {
+        **{"parameter_names": ("p",), "theta": ("p",), "covariance": ("p", "p"), "information": ("p", "p")},
+        **{"frame_ids": ("k",), "quaternions": ("k", 4), "residuals_px": ("n", 2)},
+        **{"rotation_per_theta": (3, "p"), "attitude_noise": (3, 3)},
+        **{"pair_theta": ("p",), "pair_covariance": ("p", "p")},
+    }
+    FINITE: ClassVar[tuple[str, ...]] = ("theta", "covariance", "sigma", "sigma_std", "information")
 
     @property
     def parameter_names(self) -> tuple[str, ...]:

@@ -12,6 +12,7 @@ import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
+from typing import ClassVar
 
 import numpy as np
 
@@ -19,7 +20,7 @@ from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.camera.projection import bent_index, forward_kernel, forward_root
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, Shapes
 from starcal_uq.estimation.loops import gram_loop, wanted
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.star_errors import StarSums
@@ -62,6 +63,11 @@ class CompressedLikelihood:
     dof: int
     n_stars: int
     n_frames: int
+
+    SHAPES: ClassVar[Shapes] = {
+        **{"theta_hat": ("p",), "whitening": ("p", "p"), "gram": ("q", "q"), "log_determinant_slope": ("p",)}
+    }
+    FINITE: ClassVar[tuple[str, ...]] = ("theta_hat", "whitening", "gram", "log_determinant_slope")
 
     def whiten(self, theta: FloatArray) -> FloatArray:
         """Whitened parameters z (n, p) of theta (n, p)."""

@@ -16,12 +16,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -65,6 +65,8 @@ class Fingerprints:
     sizes: IntArray
     xy_px: NDArray[np.float32]
     error_px: NDArray[np.float32]
+
+    SHAPES: ClassVar[Shapes] = {"sizes": ("k",), "xy_px": ("m", 2), "error_px": ("m",)}
 
     @classmethod
     def of(cls, obs: Observations, residuals_px: FloatArray, centre_px: tuple[float, float]) -> Fingerprints:

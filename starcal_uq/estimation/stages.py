@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
+from typing import ClassVar
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import monotonic_expression
 from starcal_uq.core.status import Status
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, Shapes
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.estimation.solvers import Constraints, Solution, levenberg_marquardt, minpack
@@ -61,6 +62,8 @@ class Stage:
     evaluations: int
     seconds: float
     sigmas: FloatArray | None = None
+
+    SHAPES: ClassVar[Shapes] = {"trajectory": ("n", "p"), "cost": ("n",), "sigmas": ("n", "p")}
 
     @property
     def iterations(self) -> int:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import os
 import sys
-import zipfile
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
 from pathlib import Path
@@ -21,6 +20,7 @@ import numpy as np
 
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path
+from starcal_uq.core.records import read_arrays
 from starcal_uq.core.types import FloatArray, IntArray
 
 if TYPE_CHECKING:
@@ -227,14 +227,13 @@ def _read(path: Path) -> StarPairs | None:
     """The pairs in a file; None where it is missing, damaged or does not fit together."""
     names = [field.name for field in fields(StarPairs)]
     try:
-        # Opened here, because NumPy leaves a damaged archive open.
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-            pairs = StarPairs(**{name: archive[name] for name in names})
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        archive = read_arrays(path)
+        pairs = StarPairs(**{name: archive[name] for name in names})
+        n, p = len(pairs.star), len(pairs.angle)
+        sizes = (len(pairs.first), len(pairs.second), len(pairs.neighbour) / 2, len(pairs.neighbour_angle) / 2)
+        fits = pairs.directions.shape == (n, 3) and len(pairs.neighbour_start) == n + 1 and all(s == p for s in sizes)
+    except Exception:  # whatever is wrong with a file of the cache, the pairs are made again
         return None
-    n, p = len(pairs.star), len(pairs.angle)
-    sizes = (len(pairs.first), len(pairs.second), len(pairs.neighbour) / 2, len(pairs.neighbour_angle) / 2)
-    fits = pairs.directions.shape == (n, 3) and len(pairs.neighbour_start) == n + 1 and all(s == p for s in sizes)
     return pairs if fits else None
 
 

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import ObservationError
-from starcal_uq.core.files import as_plain, atomic_path, ensure_new, table_ending
+from starcal_uq.core.files import as_plain, atomic_path, ensure_new, read_parquet, reading, table_ending
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, StrArray
 from starcal_uq.observations.rows import FrameRows, locked
 
@@ -248,27 +248,22 @@ class Centroids(FrameRows, Shown):
         if not os.path.isfile(path):
             raise ObservationError(f"{path}: the file does not exist; check the path.")
         read = {".csv": _read_csv, ".ecsv": _read_ecsv, ".parquet": _read_parquet}[ending]
-        try:
+        with reading(path, "a readable table", "write it again", ObservationError):
             columns, text = read(path)
-        except Exception as error:  # each format's reader raises errors of its own
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise ObservationError(f"{path}: is no readable table ({reason}); write it again.") from error
-        if text is None:
-            raise ObservationError(
-                f"{path}: the list of frames is missing; give a table that `starcal-uq centroid` or Centroids.save "
-                "wrote."
-            )
-        if missing := [name for name in COLUMNS if name not in columns]:
-            raise ObservationError(f"{path}: column {missing[0]} is missing; write the table again.", column=missing[0])
-        try:
-            document: AnyDict = json.loads(text)
-            frames: AnyDict = {name: document["frames"][name] for name in FRAME_COLUMNS}
-            messages, meta = tuple(document["messages"]), dict(document["meta"])
-        except (ValueError, KeyError, TypeError) as error:
-            raise ObservationError(
-                f"{path}: the list of frames is damaged ({error!r}); write the table again."
-            ) from None
-        return cls(**{name: columns[name] for name in COLUMNS}, **frames, messages=messages, meta=meta)
+            if text is None:
+                raise ObservationError(
+                    f"{path}: the list of frames is missing; give a table that `starcal-uq centroid` or "
+                    "Centroids.save wrote."
+                )
+            if missing := [name for name in COLUMNS if name not in columns]:
+                raise ObservationError(
+                    f"{path}: column {missing[0]} is missing; write the table again.", column=missing[0]
+                )
+            with reading(path, "a table of centroids with its list of frames", "write it again", ObservationError):
+                document: AnyDict = json.loads(text)
+                frames: AnyDict = {name: document["frames"][name] for name in FRAME_COLUMNS}
+                messages, meta = tuple(map(str, document["messages"])), dict(document["meta"])
+            return cls(**{name: columns[name] for name in COLUMNS}, **frames, messages=messages, meta=meta)
 
     def __repr__(self) -> str:
         return f"Centroids({self.n_stars} stars, {self.n_frames} frames, {self.n_left_out} left out)"
@@ -312,9 +307,7 @@ def _read_ecsv(path: Path) -> tuple[Mapping[str, Any], str | None]:
 
 
 def _read_parquet(path: Path) -> tuple[Mapping[str, Any], str | None]:
-    from pyarrow import parquet
-
-    table = parquet.read_table(path)
+    table = read_parquet(path)
     text = (table.schema.metadata or {}).get(_KEY.encode())
     columns = {name: table.column(name).to_numpy() for name in table.column_names}
     return columns, None if text is None else text.decode()

@@ -11,7 +11,8 @@ from typing import Any, Literal
 import numpy as np
 
 from starcal_uq.core.errors import SamplingError
-from starcal_uq.core.files import atomic_path
+from starcal_uq.core.files import atomic_path, reading
+from starcal_uq.core.records import read_arrays
 from starcal_uq.core.tasks import Progress, interrupt_between_steps
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.inference.target import Density, student_t_log_density
@@ -221,23 +222,24 @@ class _Store:
             )
 
     def _read(self, path: str | os.PathLike[str]) -> None:
-        import zipfile
-
         import emcee
 
-        try:
-            with np.load(path, allow_pickle=False) as saved:
-                content = {name: saved[name] for name in saved.files}
-            same = str(content["fingerprint"]) == self._fingerprint
-        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-            raise SamplingError(f"{path}: cannot be read as a checkpoint ({error}); delete it.") from error
-        if not same:
-            raise SamplingError(
-                f"{path}: the checkpoint was made with other data or settings; delete it, or repeat its settings."
-            )
-        self._u, self._log_density = content["u"], content["log_density"]
-        self._accepted = content["accepted"]
-        self.ensemble, self.step = (int(v) for v in content["place"])
-        position, has_gauss = (int(v) for v in content["rest"])
-        random_state = ("MT19937", content["key"], position, has_gauss, float(content["gauss"]))
-        self.state = emcee.State(content["coords"], log_prob=content["log_prob"], random_state=random_state)
+        with reading(path, "a checkpoint of sampling", "delete it", SamplingError):
+            content = read_arrays(path)
+            if str(content["fingerprint"]) != self._fingerprint:
+                raise SamplingError(
+                    f"{path}: the checkpoint was made with other data or settings; delete it, or repeat its settings."
+                )
+            shapes = {"u": self._u.shape, "log_density": self._log_density.shape, "accepted": self._accepted.shape}
+            n_walkers, dim = self._u.shape[2:]
+            shapes |= {"coords": (n_walkers, dim), "log_prob": (n_walkers,), "place": (2,), "rest": (2,), "gauss": ()}
+            for name, shape in shapes.items():
+                if content[name].shape != shape or not np.isfinite(content[name]).all():
+                    raise ValueError(f"{name} does not hold what it should")
+            position, has_gauss = (int(v) for v in content["rest"])
+            random_state = ("MT19937", content["key"], position, has_gauss, float(content["gauss"]))
+            np.random.RandomState(0).set_state(random_state)
+            self.state = emcee.State(content["coords"], log_prob=content["log_prob"], random_state=random_state)
+            self._u, self._log_density = content["u"], content["log_density"]
+            self._accepted = content["accepted"]
+            self.ensemble, self.step = (int(v) for v in content["place"])

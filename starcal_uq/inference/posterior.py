@@ -5,12 +5,13 @@ Opening a saved posterior needs neither the sampler nor the symbolic model nor a
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +20,11 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import Parameter, parameters, sigma_parameter
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import atomic_path, ensure_new, reading
+from starcal_uq.core.files import atomic_path, check_hdf5, ensure_new, reading
 from starcal_uq.core.records import Arrays, from_plain, to_plain
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.status import Check, Level, worst
-from starcal_uq.core.types import AnyDict, FloatArray, IntArray
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray, Shapes
 from starcal_uq.inference.priors import SIGMA_NAMES, Priors
 
 if TYPE_CHECKING:
@@ -68,6 +69,8 @@ class Laplace:
     transform: FloatArray
     iterations: int
     converged: bool
+
+    SHAPES: ClassVar[Shapes] = {"names": ("d",), "mode": ("d",), "covariance": ("d", "d"), "transform": ("d", "d")}
 
     @property
     def mean(self) -> FloatArray:
@@ -158,6 +161,11 @@ class Diagnostics:
     checks: tuple[Check, ...] = ()
     compressed_frames: tuple[int, int] = (0, 0)
 
+    SHAPES: ClassVar[Shapes] = {
+        **dict.fromkeys(("rhat", "ess_bulk", "ess_tail", "mcse", "autocorrelation", "psis_mean", "psis_sd"), ("p",)),
+        **dict.fromkeys(("laplace_mean", "laplace_sd"), ("p",)),
+    }
+
     @property
     def level(self) -> Level:
         """The worst outcome of the checks."""
@@ -224,6 +232,12 @@ class Posterior(Shown):
     provenance: AnyDict
     dof_draws: FloatArray | None = None
     star_error_px: float = 0.0
+
+    SHAPES: ClassVar[Shapes] = {
+        **{"parameter_names": ("p+1",), "draws": ("n", "p+1"), "log_posterior": ("n",), "dof_draws": ("n",)},
+        **{"information": ("p", "p"), "rotation_per_theta": (3, "p"), "attitude_noise": (3, 3)},
+    }
+    FINITE: ClassVar[tuple[str, ...]] = ("draws", "log_posterior", "information", "rotation_per_theta")
 
     @property
     def camera_names(self) -> tuple[str, ...]:
@@ -373,7 +387,8 @@ class Posterior(Shown):
         ensure_new(path, force)
         arrays: Arrays = {}
         record = to_plain(self, arrays, _ARRAYS)
-        attrs = {"format": _FORMAT, "record": json.dumps({name: record[name] for name in _RECORD})}
+        text = json.dumps({name: record[name] for name in _RECORD})
+        attrs = {"format": _FORMAT, "record": text, "sha256": _sha256(text, arrays)}
         # xarray would do it, but loads Dask for a lock, which takes longer than sampling.
         with atomic_path(path) as temporary, h5netcdf.File(temporary, "w") as file:
             _write(file, {name: (_ARRAYS[name], value, {}) for name, value in arrays.items()}, attrs)
@@ -391,20 +406,34 @@ class Posterior(Shown):
             If the file is missing or is not a posterior.
         """
         import h5netcdf
-        import h5py
 
         remedy = "run `starcal-uq sample RUN --force` again"
         if not Path(path).is_file():
             raise RunFolderError(f"{path}: there is no such file; run `starcal-uq sample RUN` first.")
         with reading(path, "a posterior of this version", remedy):
-            if not h5py.is_hdf5(path):
-                raise ValueError("not netCDF")
+            check_hdf5(path)
             with h5netcdf.File(path, "r") as file:
                 if file.attrs.get("format") != _FORMAT:
                     raise ValueError("another format")
-                record = json.loads(str(file.attrs["record"]))
+                text, known = str(file.attrs["record"]), file.attrs.get("sha256")
                 arrays = {name: np.asarray(file.variables[name][...]) for name in _ARRAYS if name in file.variables}
-            return from_plain(cls, record, arrays)
+            # Versions before wrote none.
+            if known is not None and known != _sha256(text, arrays):
+                raise ValueError("its content was changed after it was written")
+            made = from_plain(cls, json.loads(text), arrays)
+            if made.n_ensembles * made.n_walkers * made.n_steps != len(made.draws):
+                raise ValueError("it holds another number of draws than it says")
+            return made
+
+
+def _sha256(text: str, arrays: Arrays) -> str:
+    """Hash (hex) of all that is read again: netCDF itself has none for what it holds."""
+    sha = hashlib.sha256(text.encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        sha.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        sha.update(array.tobytes())
+    return sha.hexdigest()
 
 
 def _write(group: Any, variables: Variables, attrs: AnyDict) -> None:

@@ -18,7 +18,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.errors import ObservationError
-from starcal_uq.core.files import as_plain, atomic_path, atomic_write_text, ensure_new, table_ending
+from starcal_uq.core.files import (
+    as_plain,
+    atomic_path,
+    atomic_write_text,
+    check_parquet,
+    check_size,
+    ensure_new,
+    reading,
+    table_ending,
+)
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, StrArray
 from starcal_uq.observations.checks import (
     Problem,
@@ -32,6 +41,8 @@ from starcal_uq.observations.checks import (
 from starcal_uq.observations.columns import COLUMNS
 
 if TYPE_CHECKING:
+    from pyarrow.parquet import ParquetFile
+
     from starcal_uq.camera.camera import Camera
 
 _META_KEY = b"starcal_uq"
@@ -66,6 +77,9 @@ class RawTable:
     meta: AnyDict = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
+
+
+WHAT, REMEDY = "a readable table", "write it again"
 
 
 def _read_bytes(path: Path) -> bytes:
@@ -104,17 +118,18 @@ def read_table(
     ending = table_ending(path)
     names = {name: mapping.get(name, name) for name in COLUMNS}
     wanted, data = {names[name] for name in only}, _read_bytes(path)
-    raw = _read(path, data, ending, wanted) if frames is None else _read_frames(path, data, wanted, names, frames)
-    check_names(path, raw, names, mapping)
-    if not len(raw.numbers):
-        raise ObservationError(f"{path}: the table has a header but no rows; give a table with observations.")
-    columns, problems, unknown_frame = convert_columns(path, raw, {name: names[name] for name in only})
-    if check:
-        problems += check_columns(columns, camera, unknown_frame)
-    # A message names the column as it is called in this file.
-    named = [replace(p, column=names[p.column] if p.column else None) for p in problems]
-    raise_problems(str(path), raw.word, raw.numbers, named)
-    return columns, table_meta(path, raw, names, mapping)
+    with reading(path, WHAT, REMEDY, ObservationError):
+        raw = _read(path, data, ending, wanted) if frames is None else _read_frames(path, data, wanted, names, frames)
+        check_names(path, raw, names, mapping)
+        if not len(raw.numbers):
+            raise ObservationError(f"{path}: the table has a header but no rows; give a table with observations.")
+        columns, problems, unknown_frame = convert_columns(path, raw, {name: names[name] for name in only})
+        if check:
+            problems += check_columns(columns, camera, unknown_frame)
+        # A message names the column as it is called in this file.
+        named = [replace(p, column=names[p.column] if p.column else None) for p in problems]
+        raise_problems(str(path), raw.word, raw.numbers, named)
+        return columns, table_meta(path, raw, names, mapping)
 
 
 def _read(path: Path, data: bytes, ending: str, wanted: set[str]) -> RawTable:
@@ -274,16 +289,25 @@ def _ecsv_header(path: Path, text: str) -> AnyDict:
         if not line.startswith("##"):
             lines.append(line[2:])
     try:
-        header: AnyDict = dict(meta.get_header_from_yaml(lines))
+        header: Any = meta.get_header_from_yaml(lines)
     except meta.YamlParseError:
+        header = None
+    columns = header.get("datatype") if isinstance(header, dict) else None
+    if not isinstance(columns, list) or not all(isinstance(column, dict) and "name" in column for column in columns):
         raise ObservationError(f"{path}: the ECSV header is not valid YAML; write the file with astropy.") from None
-    return header
+    return dict(header)
 
 
 def _ecsv_meta(header: AnyDict) -> AnyDict:
     stored = dict(header.get("meta") or {})
     values = {key: value for key, value in stored.items() if not str(key).startswith("__")}
-    plain: AnyDict = json.loads(json.dumps(values, default=as_plain))
+    # Piece by piece: a few lines of YAML that name each other can stand for gigabytes.
+    pieces, size = [], 0
+    for piece in json.JSONEncoder(default=as_plain).iterencode(values):
+        size += len(piece)
+        check_size(16 * size, 0)
+        pieces.append(piece)
+    plain: AnyDict = json.loads("".join(pieces))
     return plain
 
 
@@ -304,32 +328,32 @@ def _read_frames(path: Path, data: bytes, wanted: set[str], own: Mapping[str, st
 
 def _arrow_table(path: Path, data: bytes, wanted: set[str]) -> tuple[Any, list[str], AnyDict]:
     """The wanted columns of a Parquet file, the names of all, and our metadata."""
-    import pyarrow as pa
-    from pyarrow import parquet
-
-    with _readable(path):
-        file = parquet.ParquetFile(pa.BufferReader(data))
+    with open_parquet(path, data) as file:
         names = list(file.schema_arrow.names)
         table = file.read(columns=[name for name in names if name in wanted], use_threads=False)
-    return table, names, _own_meta(file.schema_arrow)
+        return table, names, own_meta(file.schema_arrow)
 
 
 @contextmanager
-def _readable(path: Path) -> Iterator[None]:
+def open_parquet(path: Path, data: bytes | None = None) -> Iterator[ParquetFile]:
+    """A Parquet file that holds no more than it can; whatever is wrong with it is said in an `ObservationError`."""
     import pyarrow as pa
+    from pyarrow import parquet
 
-    try:
-        yield
-    except FileNotFoundError:
-        raise ObservationError(f"{path}: the file does not exist; check the path.") from None
-    except (pa.ArrowException, OSError) as error:
-        reason = str(error).splitlines()[0]
-        raise ObservationError(f"{path}: is no readable Parquet file ({reason}); write it again.") from None
+    with (
+        reading(path, WHAT, REMEDY, ObservationError),
+        parquet.ParquetFile(path if data is None else pa.BufferReader(data), pre_buffer=False) as file,
+    ):
+        check_parquet(file, path.stat().st_size if data is None else len(data))
+        yield file
 
 
-def _own_meta(schema: Any) -> AnyDict:
+def own_meta(schema: Any) -> AnyDict:
+    """Our metadata of a Parquet file."""
     stored = (schema.metadata or {}).get(_META_KEY)
-    meta: AnyDict = json.loads(stored) if stored else {}
+    meta = json.loads(stored) if stored else {}
+    if not isinstance(meta, dict):
+        raise ValueError("its metadata are no table")
     return meta
 
 
@@ -364,9 +388,7 @@ def parquet_summary(path: Path, column: str) -> ParquetSummary:
     ObservationError
         If it is no Parquet file.
     """
-    from pyarrow import parquet
-
-    with _readable(path), parquet.ParquetFile(path) as file:
+    with open_parquet(path) as file:
         schema, rows = file.schema_arrow, file.metadata
         names = tuple(schema.names)
         ranges = []
@@ -376,14 +398,12 @@ def parquet_summary(path: Path, column: str) -> ParquetSummary:
             ranges = [(s.min, s.max) for s in groups if s is not None and s.has_min_max]
         whole = len(ranges) == rows.num_row_groups > 0 and all(isinstance(value, int) for r in ranges for value in r)
         ends = (min(r[0] for r in ranges), max(r[1] for r in ranges)) if whole else (None, None)
-        return ParquetSummary(rows.num_rows, names, _own_meta(schema), *ends)
+        return ParquetSummary(rows.num_rows, names, own_meta(schema), *ends)
 
 
 def parquet_column(path: Path, column: str) -> IntArray:
     """One column of whole numbers of a Parquet file, (N,)."""
-    from pyarrow import parquet
-
-    with _readable(path), parquet.ParquetFile(path) as file:
+    with open_parquet(path) as file:
         values = file.read(columns=[column], use_threads=False).column(column).to_numpy()
     if values.dtype.kind not in "iu":
         raise ObservationError(f"{path}: column {column} holds no whole numbers; write it again.", column=column)

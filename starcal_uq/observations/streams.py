@@ -14,10 +14,21 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.errors import ObservationError
+from starcal_uq.core.files import reading
 from starcal_uq.core.types import AnyDict, IntArray
 from starcal_uq.observations.checks import check_columns, check_mapping, raise_problems
 from starcal_uq.observations.columns import COLUMNS
-from starcal_uq.observations.files import RawTable, arrow_values, check_names, convert_columns, table_meta
+from starcal_uq.observations.files import (
+    REMEDY,
+    WHAT,
+    RawTable,
+    arrow_values,
+    check_names,
+    convert_columns,
+    open_parquet,
+    own_meta,
+    table_meta,
+)
 from starcal_uq.observations.table import Observations
 
 if TYPE_CHECKING:
@@ -26,7 +37,6 @@ if TYPE_CHECKING:
 _BATCH_ROWS = 16_384
 # What estimates are made of; the other columns of a table are for diagnoses, which need all stars at once.
 _STREAMED = ("frame", "x_px", "y_px", "ra_deg", "dec_deg", "sigma_px")
-_META_KEY = b"starcal_uq"
 
 
 @dataclass(frozen=True)
@@ -53,7 +63,8 @@ class FrameStream:
     def __iter__(self) -> Iterator[Observations]:
         seen = _Seen()
         for path in self.paths:
-            yield from _frames_of(path, self, seen)
+            with reading(path, WHAT, REMEDY, ObservationError):
+                yield from _frames_of(path, self, seen)
 
 
 def stream_frames(
@@ -210,27 +221,19 @@ def _given_out(
 
 
 def _parquet_batches(path: Path, wanted: set[str], batch_rows: int) -> Iterator[RawTable]:
-    import json
-
     import pyarrow as pa
-    from pyarrow import parquet
 
-    try:
-        with parquet.ParquetFile(path, pre_buffer=False) as file:
-            names = list(file.schema_arrow.names)
-            stored = (file.schema_arrow.metadata or {}).get(_META_KEY)
-            meta = json.loads(stored) if stored else {}
-            columns = [name for name in names if name in wanted]
-            first = 1
-            for batch in file.iter_batches(batch_rows, columns=columns, use_threads=False):
-                numbers = np.arange(first, first + batch.num_rows)
-                first += batch.num_rows
-                if batch.num_rows:
-                    arrays = {name: arrow_values(pa.chunked_array([batch.column(name)])) for name in columns}
-                    yield RawTable(arrays, names, numbers, "row", meta)
-    except (pa.ArrowException, OSError) as error:
-        reason = str(error).splitlines()[0]
-        raise ObservationError(f"{path}: is no readable Parquet file ({reason}); write it again.") from None
+    with open_parquet(path) as file:
+        names = list(file.schema_arrow.names)
+        meta = own_meta(file.schema_arrow)
+        columns = [name for name in names if name in wanted]
+        first = 1
+        for batch in file.iter_batches(batch_rows, columns=columns, use_threads=False):
+            numbers = np.arange(first, first + batch.num_rows)
+            first += batch.num_rows
+            if batch.num_rows:
+                arrays = {name: arrow_values(pa.chunked_array([batch.column(name)])) for name in columns}
+                yield RawTable(arrays, names, numbers, "row", meta)
 
 
 def _csv_batches(path: Path, wanted: set[str], batch_rows: int) -> Iterator[RawTable]:
@@ -261,5 +264,3 @@ def _csv_batches(path: Path, wanted: set[str], batch_rows: int) -> Iterator[RawT
             f"{path}, line {reader.line_num}: the row cannot be read ({error}); check its quotation marks.",
             row=reader.line_num,
         ) from None
-    except OSError as error:
-        raise ObservationError(f"{path}: cannot be read ({error.strerror}); check its permissions.") from error

@@ -26,8 +26,8 @@ import numpy as np
 
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.display import Shown
-from starcal_uq.core.errors import RunFolderError, SamplingError, StarcalError
-from starcal_uq.core.files import write_csv
+from starcal_uq.core.errors import SamplingError, StarcalError
+from starcal_uq.core.files import reading, write_csv
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import Progress, run_tasks
@@ -168,18 +168,13 @@ class InteractionStudy(Shown):
         """
         import pandas as pd
 
-        try:
+        with reading(path, "an interaction study", "run `starcal-uq reproduce` to write it again"):
             # As text first: the fast parser of numbers loses the last digit.
             text = pd.read_csv(path, dtype=str, keep_default_na=False)
             missing = sorted({*_TEXT, "bias", "spread"} - set(text.columns))
             if missing:
                 raise ValueError(f"it lacks the column {missing[0]!r}")
             return cls(pd.DataFrame({name: _column(name, text[name].tolist()) for name in text.columns}))
-        except OSError as error:
-            reason = f"cannot be read ({error.strerror or error})"
-        except ValueError as error:
-            reason = f"is not an interaction study ({error})"
-        raise RunFolderError(f"{path}: {reason}; run `starcal-uq reproduce` to write it again.")
 
 
 def _column(name: str, values: list[str]) -> list[str] | list[int] | list[float]:

@@ -10,7 +10,7 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import read, write
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import Progress, run_tasks
-from starcal_uq.core.types import AnyDict, FloatArray, IntArray
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray, Shapes
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
@@ -162,6 +162,12 @@ class Replicates(Shown):
     n_requested: int
     interrupted: bool
     provenance: AnyDict
+
+    SHAPES: ClassVar[Shapes] = {
+        **{"methods": ("m",), "failures": ("m",), "replicate": ("n",), "crlb": ("n", "p")},
+        **dict.fromkeys(("estimates", "claimed", "classical"), ("m", "n", "p")),
+        **dict.fromkeys(("map_px", "map_arcsec", "reprojection_px"), ("m", "n")),
+    }
 
     @property
     def n_replicates(self) -> int:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -27,7 +27,7 @@ from starcal_uq.camera.projection import unproject, unproject_jacobian
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
 from starcal_uq.core.records import read, write
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, Shapes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -75,6 +75,14 @@ class FieldMap(Shown):
     covariance_compensated_arcsec2: FloatArray | None = None
     rotation_covariance_arcsec2: FloatArray | None = None
     equivalent_covariance_px2: FloatArray | None = None
+
+    SHAPES: ClassVar[Shapes] = {
+        **{"x_px": ("x",), "y_px": ("y",), "star_x_px": ("n",), "star_y_px": ("n",)},
+        **dict.fromkeys(("sigma_absolute_arcsec", "sigma_compensated_arcsec"), ("y", "x")),
+        **dict.fromkeys(("worst_absolute_arcsec", "worst_compensated_arcsec"), ("y", "x")),
+        **dict.fromkeys(("covariance_absolute_arcsec2", "covariance_compensated_arcsec2"), ("y", "x", 2, 2)),
+        **{"rotation_covariance_arcsec2": (3, 3), "equivalent_covariance_px2": (2, 2)},
+    }
 
     @property
     def equivalent_principal_point_px(self) -> FloatArray | None:

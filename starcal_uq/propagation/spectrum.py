@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import AttitudeProfileError, SamplingError
 from starcal_uq.core.records import read, write
 from starcal_uq.core.settings import bounded
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes
 from starcal_uq.propagation.attitude_error import OBSERVED
 from starcal_uq.propagation.propagate import FrameGeometry
 
@@ -253,6 +253,12 @@ class ErrorSpectrum(Shown):
     gap_share: float
     n_draws: int
     frames: str = OBSERVED
+
+    SHAPES: ClassVar[Shapes] = {
+        **{"frequency_hz": ("f",), "psd_arcsec2_hz": ("f", 3), "lag_s": ("l",), "autocorrelation": ("l", 3)},
+        **dict.fromkeys(("nea_psd_arcsec2_hz", "variance_arcsec2", "nea_arcsec"), (3,)),
+        **{"time_s": ("k",), "sigma_arcsec": ("k", 3)},
+    }
 
     @property
     def axes(self) -> tuple[str, ...]:

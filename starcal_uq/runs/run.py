@@ -21,6 +21,7 @@ from starcal_uq.core.files import (
     atomic_write_text,
     check_new_folder,
     ensure_new,
+    read_parquet,
     reading,
     write_csv,
 )
@@ -28,6 +29,7 @@ from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import Progress
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.noise_model import weighed
+from starcal_uq.observations.files import arrow_values
 from starcal_uq.observations.partitions import PartitionedObservations
 from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.presentation.report.results import Missing, Results
@@ -616,8 +618,6 @@ class Run:
 
 def _frames_of(path: Path) -> Observations:
     """Frames that a run keeps for itself; random places of a drawn sky may coincide, which no measured table may."""
-    import pandas as pd
-
     with reading(path, "a table of frames", "run `starcal-uq propagate RUN` again"):
-        table = pd.read_parquet(path)
-        return Observations(**{str(name): table[name].to_numpy() for name in table.columns})
+        table = read_parquet(path)
+        return Observations(**{name: arrow_values(table.column(name)) for name in table.column_names})

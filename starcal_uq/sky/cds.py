@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import gzip
 import re
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -17,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from starcal_uq.core.errors import CatalogueError
+from starcal_uq.core.files import check_packed, reading
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.sky.catalogue import StarCatalogue
 
@@ -236,7 +236,7 @@ def _parse(rows: _Rows, description: list[str], lines: list[str]) -> dict[str, A
     reader = ascii.get_reader(ascii.Cds)
     try:
         table = reader.read([*description, *lines])
-    except (ValueError, KeyError, IndexError) as error:
+    except Exception as error:  # of whatever kind: the cell is looked for
         raise _locate(rows, reader, error) from error
     columns = {label: _plain(table[label]) for label in rows.layout.labels}
     magnitudes = columns[rows.layout.mag]
@@ -305,12 +305,11 @@ def _needed(section: str, layout: _Layout) -> list[str] | None:
 
 def _text(path: Path) -> str:
     """A text file, unpacked if it is compressed; every byte is one character."""
-    try:
+    with reading(path, "a readable text", "check the path and its permissions", CatalogueError):
+        check_packed(path)
         data = path.read_bytes()
         if data[:2] == b"\x1f\x8b":
             data = gzip.decompress(data)
-    except (OSError, EOFError, zlib.error) as error:
-        raise CatalogueError(f"{path}: cannot be read ({error}); check the path and its permissions.") from error
     return data.decode("latin-1").replace("\r\n", "\n")
 
 

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from starcal_uq.core.errors import CatalogueError
+from starcal_uq.core.files import check_packed, reading
 from starcal_uq.core.types import FloatArray, IntArray, StrArray
 from starcal_uq.sky.catalogue import StarCatalogue, check_epoch, prepare
 from starcal_uq.sky.cds import CdsFormat, read_cds
@@ -126,14 +127,16 @@ def read_catalogue(
     if not path.exists():
         raise CatalogueError(f"{path}: does not exist; check the path.")
     kind = _format_of(path) if format is None else format
-    if kind in ("hipparcos", "sao", "bsc"):
-        if columns is not None or file_epoch is not None:
-            raise CatalogueError(f"{path}: the columns and the epoch of format {kind!r} are fixed; leave them out.")
-        stars = _checked_cds(path, kind, None if readme is None else Path(readme), band)
-    elif kind in ("csv", "ecsv", "fits"):
-        stars = _read_table(path, kind, dict(columns or {}), file_epoch, epoch, band)
-    else:
-        raise CatalogueError(f"{path}: unknown format {kind!r}; use csv, ecsv, fits, hipparcos, sao or bsc.")
+    with reading(path, f"readable as {kind.upper()}", "check the file", CatalogueError):
+        check_packed(path)
+        if kind in ("hipparcos", "sao", "bsc"):
+            if columns is not None or file_epoch is not None:
+                raise CatalogueError(f"{path}: the columns and the epoch of format {kind!r} are fixed; leave them out.")
+            stars = _checked_cds(path, kind, None if readme is None else Path(readme), band)
+        elif kind in ("csv", "ecsv", "fits"):
+            stars = _read_table(path, kind, dict(columns or {}), file_epoch, epoch, band)
+        else:
+            raise CatalogueError(f"{path}: unknown format {kind!r}; use csv, ecsv, fits, hipparcos, sao or bsc.")
     if max_mag is not None and not np.isfinite(stars.mag).any():
         raise CatalogueError(f"{path}: has no magnitudes to cut at {max_mag:g}; leave out max_mag or name the column.")
     return prepare(stars, max_mag, epoch, observer_velocity_km_s, require_proper_motion)
@@ -216,21 +219,19 @@ def _checked_cds(path: Path, kind: CdsFormat, readme: Path | None, band: str | N
 
 def _load_table(path: Path, kind: Format) -> Any:
     from astropy.table import Table
-    from astropy.units import UnitsWarning
+    from astropy.utils.exceptions import AstropyWarning
 
     options: dict[str, Any] = {
         "csv": {"format": "ascii.csv", "comment": "#"},
         "ecsv": {"format": "ascii.ecsv"},
         "fits": {"format": "fits"},
     }[kind]
-    try:
-        with warnings.catch_warnings():
-            # An odd unit matters only in a column that is used; the conversion complains about it there.
-            warnings.simplefilter("ignore", UnitsWarning)
-            return Table.read(path, **options)
-    except (OSError, ValueError, TypeError, KeyError, IndexError) as error:
-        reason = " ".join(str(error).split()).rstrip(".")
-        raise CatalogueError(f"{path}: not readable as {kind.upper()} ({reason}); check the file.") from error
+    with warnings.catch_warnings():
+        # What is odd matters only in a column that is used, whose conversion complains about it; but a cut-off file is
+        # no catalogue.
+        warnings.simplefilter("ignore", AstropyWarning)
+        warnings.filterwarnings("error", "File may have been truncated", AstropyWarning)
+        return Table.read(path, **options)
 
 
 def _find_columns(path: Path, present: list[str], given: dict[str, str]) -> dict[str, str]:

@@ -14,7 +14,7 @@ import numpy as np
 from starcal_uq.core.constants import AXES as ATTITUDE
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StudyError
-from starcal_uq.core.files import PathLike, atomic_path, new_folder, reading
+from starcal_uq.core.files import PathLike, atomic_path, check_hdf5, new_folder, reading
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.studies.axes import AXES
 from starcal_uq.studies.definition import StudyDefinition
@@ -250,7 +250,8 @@ class Study(Shown):
         file = Path(path)
         file = file / NETCDF if file.is_dir() else file
         with reading(file, "a study", "run `starcal-uq study` again"):
-            with xr.open_dataset(file, engine="h5netcdf") as opened:
+            check_hdf5(file)
+            with xr.open_dataset(file, engine="h5netcdf", phony_dims="access") as opened:
                 data = opened.load()
             return cls(data, StudyDefinition.from_dict(json.loads(data.attrs["definition"])))
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import secrets
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from starcal_uq.core.errors import StudyError
-from starcal_uq.core.files import PathLike, atomic_path, new_folder, reading
+from starcal_uq.core.files import PathLike, atomic_path, new_folder, read_parquet, reading
 from starcal_uq.core.types import AnyDict
 from starcal_uq.studies.result import TEXTS, VARIABLES
 
@@ -100,14 +100,8 @@ def _write(table: pa.Table, path: Path) -> None:
 
 
 def _read(path: Path) -> pa.Table:
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
     with reading(path, "a part of a study", "delete it, and its cells are computed again"):
-        try:
-            table: Any = pq.read_table(path)
-        except pa.ArrowInvalid as error:
-            raise ValueError(str(error)) from None
+        table = read_parquet(path)
         if table.schema != _schema():
             raise StudyError("it has other columns")
         return table

@@ -172,7 +172,7 @@ def test_unreadable_files_are_named(tmp_path: Path) -> None:
     for name, content, message in (
         ("none.csv", None, "cannot be read"),
         ("list.txt", b"", "ending .txt is unknown"),
-        ("bad.parquet", b"PAR1 no", "is no readable Parquet file"),
+        ("bad.parquet", b"PAR1 no", "is not a readable table"),
         ("latin.csv", "time_s,qx\n1,é\n".encode("latin-1"), "not UTF-8"),
         ("ragged.csv", b"time_s,qx,qy,qz,qw\n1,0,0,0,1\n2,0,0,1\n", "line 3: holds 4 values under a header of 5"),
     ):

@@ -107,14 +107,14 @@ def test_what_no_file_holds_is_refused(value: Any) -> None:
     [
         ({"colour": 1}, "Whole has no field 'colour'"),
         ({"pair": [3]}, "pair has 1 entries, not 2"),
-        ({"pair": ["3", "x"]}, "pair0 is '3', not int"),
-        ({"pair": [True, "x"]}, "pair0 is True, not int"),
+        ({"pair": ["3", "x"]}, "pair0 is '3', not a whole number"),
+        ({"pair": [True, "x"]}, "pair0 is True, not a whole number"),
         ({"kind": "c"}, "kind is 'c', not one of a, b"),
-        ({"largest": "1"}, "largest is '1', not float"),
+        ({"largest": "1"}, "largest is '1', not a number"),
         ({"parts": 3}, "parts is 3, not a list"),
-        ({"part": 3}, "part is int, not a table"),
+        ({"part": 3}, "part is 3, not a table"),
         ({"numbers": None}, "numbers is missing"),
-        ({"numbers": ["x"]}, "invalid literal"),
+        ({"numbers": ["x"]}, "numbers does not hold what it should"),
         ({"table": {"x": [1.0]}}, "table_x has 1 entries, not 2"),
     ],
 )
@@ -125,7 +125,7 @@ def test_what_is_wrong_in_a_document_is_named(change: AnyDict, words: str) -> No
         from_plain(Whole, plain | change)
     with pytest.raises(ValueError, match="kind is missing"):
         from_plain(Whole, {name: value for name, value in plain.items() if name != "kind"})
-    with pytest.raises(KeyError):
+    with pytest.raises(ValueError, match="LOST"):
         from_plain(Whole, plain | {"part": {"name": "p", "values": [], "status": "LOST"}})
 
 

@@ -503,7 +503,7 @@ def test_files_that_are_no_centroids(tmp_path):
     with pytest.raises(ObservationError, match="list of frames is missing"):
         Centroids.load(tmp_path / "a.csv")
     (tmp_path / "b.parquet").write_text("nothing")
-    with pytest.raises(ObservationError, match="no readable table"):
+    with pytest.raises(ObservationError, match="not a readable table"):
         Centroids.load(tmp_path / "b.parquet")
     with pytest.raises(ObservationError, match="does not exist"):
         Centroids.load(tmp_path / "c.csv")

@@ -157,7 +157,7 @@ def test_other_complaints_are_those_of_the_loader(tmp_path):
         list(stream_frames(path))
     path = tmp_path / "broken.parquet"
     path.write_bytes(b"PAR1 and then nothing")
-    with pytest.raises(ObservationError, match="is no readable Parquet file"):
+    with pytest.raises(ObservationError, match="is not a readable table"):
         list(stream_frames(path))
     sigma = np.full(obs.n_stars, 0.1)
     text = [f"{s}" if k < 400 else "" for k, s in enumerate(sigma)]

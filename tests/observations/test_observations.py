@@ -557,7 +557,7 @@ def test_missing_columns(tmp_path):
         ("header.csv", b"frame,x_px,y_px,ra_deg,dec_deg\n", "a header but no rows"),
         ("latin.csv", b"frame,x_px,y_px,ra_deg,dec_deg\n1,2,3,4,\xe9\n", "line 2: the text is not UTF-8"),
         ("quote.csv", b'frame,x_px,y_px,ra_deg,dec_deg\n1,2,3,4,"5\n', "check its quotation marks"),
-        ("binary.parquet", b"frame,x_px\n1,2\n", "is no readable Parquet file"),
+        ("binary.parquet", b"frame,x_px\n1,2\n", "is not a readable table"),
         ("plain.ecsv", b"frame,x_px\n1,2\n", "line 1: '# %ECSV 1.0' is missing"),
         ("yaml.ecsv", b"# %ECSV 1.0\n# ---\n# a: [\nframe\n1\n", "the ECSV header is not valid YAML"),
         ("obs.xlsx", b"PK", "the ending .xlsx is unknown; use .csv, .ecsv, .parquet."),

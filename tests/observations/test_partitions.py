@@ -71,7 +71,7 @@ def test_damaged_or_mismatched_file_is_named(tmp_path: Path) -> None:
         sc.load_observations(tmp_path)
     path = tmp_path / "b.parquet"
     path.write_bytes(b"PAR1 no more")
-    with pytest.raises(ObservationError, match=r"b.parquet: is no readable Parquet file"):
+    with pytest.raises(ObservationError, match=r"b.parquet: is not a readable table"):
         open_partitions(tmp_path)
     table([2], sigma_px=np.full(4, 0.1)).save(path, force=True)
     with pytest.raises(ObservationError, match=r"a.parquet: column sigma_px is missing, and .*b.parquet has it"):

@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.display import Shown
 from starcal_uq.core.records import read, write
-from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
+from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, Shapes
 from starcal_uq.diagnostics.validation.replicates import INTERVAL
 from starcal_uq.inference.priors import Priors
 from starcal_uq.maths.intervals import binomial_interval, holm
@@ -110,6 +110,12 @@ class Validation(Shown):
     n_requested: int
     interrupted: bool
     provenance: AnyDict
+
+    SHAPES: ClassVar[Shapes] = {
+        **{"quantities": ("q",), "units": ("q",), "truth": ("n", "p+1")},
+        **dict.fromkeys(("replicate", "nees", "nees_calibration", "compression_error", "dof"), ("n",)),
+        **dict.fromkeys(("ranks", "covered", "error", "sd"), ("n", "q")),
+    }
 
     @property
     def n_replicates(self) -> int:

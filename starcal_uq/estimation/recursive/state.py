@@ -17,6 +17,8 @@ from starcal_uq.estimation.recursive.start import RecursionOptions
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.observations.frames import StarFrames
 
+WHAT = "a saved recursive calibration, or is incomplete"
+REMEDY = "give a file written by RecursiveCalibration.save"
 _KIND = "starcal_uq recursive calibration"
 _VERSION = 2
 
@@ -48,8 +50,7 @@ def write_state(state: State, path: str | os.PathLike[str]) -> None:
 
 def read_state(path: str | os.PathLike[str]) -> State:
     """Inverse of `write_state`; `RunFolderError` for a file that is missing, truncated, or no such state."""
-    what = "a saved recursive calibration, or is incomplete"
-    with reading(path, what, "give a file written by RecursiveCalibration.save"):
+    with reading(path, WHAT, REMEDY):
         arrays = read_arrays(path)
         header = json.loads(str(arrays.pop("header")))
         kind, version = header.pop("kind"), header.pop("version")

@@ -12,6 +12,7 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.files import reading
 from starcal_uq.core.records import to_plain
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray
@@ -26,7 +27,7 @@ from starcal_uq.estimation.recursive.result import (
     stream_calibration,
 )
 from starcal_uq.estimation.recursive.start import RECURSIVE_METHODS, RecursionOptions, begin, prior_of
-from starcal_uq.estimation.recursive.state import State, read_state, write_state
+from starcal_uq.estimation.recursive.state import REMEDY, WHAT, State, read_state, write_state
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.observations.frames import StarFrames
 
@@ -326,7 +327,8 @@ class RecursiveCalibration:
             When the file is missing, truncated, or something else.
         """
         state = read_state(path)
-        loaded = cls(state.nominal, state.method, state.options)
+        with reading(path, WHAT, REMEDY):
+            loaded = cls(state.nominal, state.method, state.options)
         loaded._given_distortion, loaded._per_star = state.given_distortion, state.per_star
         loaded._digest, loaded._seconds = state.digest, state.seconds
         loaded._waiting, loaded._richest = state.waiting, state.richest
