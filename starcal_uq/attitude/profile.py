@@ -189,11 +189,13 @@ def check_samples(where: str, word: str, numbers: IntArray, time_s: FloatArray, 
             f"{where}{word} {numbers[i]}: the time {time_s[i]:.9g} s does not come after {time_s[i - 1]:.9g} s; "
             "sort the rows by time and remove repeated ones."
         )
-    off = np.abs(np.linalg.norm(q, axis=1) - 1.0)
+    with np.errstate(over="ignore"):
+        length = np.linalg.norm(q, axis=1)
+    off = np.abs(length - 1.0)
     if np.any(off > _NEARLY_UNIT):
         i = int(np.argmax(off > _NEARLY_UNIT))
         raise AttitudeProfileError(
-            f"{where}{word} {numbers[i]}: the quaternion has the length {np.linalg.norm(q[i]):.6g}, not 1; "
+            f"{where}{word} {numbers[i]}: the quaternion has the length {length[i]:.6g}, not 1; "
             "check its columns."
         )
     uneven = int(np.sum(off > _UNIT))

@@ -5,14 +5,14 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.records import read_json, to_plain, write_json
-from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.core.types import AnyDict, FloatArray, Shapes
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -116,6 +116,14 @@ class CameraComparison(Shown):
     sd_difference: FloatArray
     messages: tuple[str, ...] = ()
     provenance: AnyDict = field(default_factory=dict)
+
+    SHAPES: ClassVar[Shapes] = {
+        **{"x_px": ("x",), "y_px": ("y",), "sigma_arcsec": ("y", "x"), "ratio": ("y", "x")},
+        **{"difference_arcsec": ("y", "x", 2), "difference_px": ("y", "x", 2)},
+        **{"rotation_arcsec": (3,), "rotation_covariance_arcsec2": (3, 3)},
+        **dict.fromkeys(("parameter_names", "parameter_units"), ("q",)),
+        **dict.fromkeys(("theta_a", "theta_b", "sd_a", "sd_b", "sd_difference"), ("q",)),
+    }
 
     @property
     def tested(self) -> bool:

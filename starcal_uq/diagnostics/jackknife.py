@@ -9,14 +9,14 @@ for any number of frames.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.formatting import plural
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, Shapes
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import FrameNormals
 
@@ -66,6 +66,11 @@ class Jackknife(Shown):
     n_frames: int
     residual_dof: int = 0
     tail_dof: FloatArray | None = None
+
+    SHAPES: ClassVar[Shapes] = {
+        **{"parameter_names": ("p",), "left_out": ("k", "p"), "effective_frames": ("p",), "tail_dof": ("p",)},
+        **dict.fromkeys(("formal_covariance", "jackknife_covariance", "sandwich_covariance"), ("p", "p")),
+    }
 
     @property
     def ratio(self) -> FloatArray:

@@ -15,13 +15,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.constants import ARCSEC
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, Shapes
 from starcal_uq.diagnostics.shapes import FRAME_BY_FRAME, MAX_CELLS, View, frame_shapes, shapes
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_inverse
@@ -80,6 +80,11 @@ class Pattern:
     n_frames: int = 0
     max_cells: int = MAX_CELLS
 
+    SHAPES: ClassVar[Shapes] = {
+        **{"directions": ("q", "j"), "amplitudes": ("j",), "covariance": ("j", "j"), "parameters": ("j", "p")},
+        "frame_covariance": (3, 3),
+    }
+
 
 @dataclass(frozen=True, eq=False)
 class Response:
@@ -98,6 +103,10 @@ class Response:
     rest_arcsec: FloatArray
     common_upper_arcsec: FloatArray
     rest_upper_arcsec: FloatArray
+
+    SHAPES: ClassVar[Shapes] = {
+        **dict.fromkeys(("common_arcsec", "rest_arcsec", "common_upper_arcsec", "rest_upper_arcsec"), (3,))
+    }
 
 
 def response(

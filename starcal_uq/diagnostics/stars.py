@@ -14,14 +14,14 @@ three.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import StarNormals
@@ -89,6 +89,12 @@ class StarTest(Shown):
     jackknife_covariance: FloatArray
     included_px: float = 0.0
     included_px_std: float = 0.0
+
+    SHAPES: ClassVar[Shapes] = {
+        "parameter_names": ("p",),
+        **dict.fromkeys(("formal_covariance", "model_covariance"), ("p", "p")),
+        **dict.fromkeys(("sandwich_covariance", "jackknife_covariance"), ("p", "p")),
+    }
 
     @property
     def applicable(self) -> bool:

@@ -6,11 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from starcal_uq.core.types import BoolArray, FloatArray, IntArray
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes
 
 if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
@@ -36,6 +36,8 @@ class StarFrames:
     r: FloatArray
     weight: FloatArray | None
     starts: IntArray
+
+    SHAPES: ClassVar[Shapes] = {"pixel": (2, "n"), "r": (3, "n"), "weight": ("n",), "starts": ("k+1",)}
 
     @classmethod
     def from_observations(cls, obs: Observations) -> StarFrames:

@@ -161,7 +161,7 @@ def test_checkpoint_of_other_settings_is_refused(tmp_path: Path) -> None:
     with pytest.raises(SamplingError, match="other data or settings"):
         sample(None, cal, **{**QUICK, "seed": 4}, evaluation="compressed", checkpoint=checkpoint)
     checkpoint.write_bytes(b"not a checkpoint")
-    with pytest.raises(SamplingError, match="cannot be read as a checkpoint"):
+    with pytest.raises(SamplingError, match="is not a checkpoint of sampling"):
         sample(None, cal, **QUICK, evaluation="compressed", checkpoint=checkpoint)
 
 
