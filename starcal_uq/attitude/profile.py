@@ -195,8 +195,7 @@ def check_samples(where: str, word: str, numbers: IntArray, time_s: FloatArray, 
     if np.any(off > _NEARLY_UNIT):
         i = int(np.argmax(off > _NEARLY_UNIT))
         raise AttitudeProfileError(
-            f"{where}{word} {numbers[i]}: the quaternion has the length {length[i]:.6g}, not 1; "
-            "check its columns."
+            f"{where}{word} {numbers[i]}: the quaternion has the length {length[i]:.6g}, not 1; check its columns."
         )
     uneven = int(np.sum(off > _UNIT))
     if not uneven:
