@@ -20,6 +20,8 @@ from starcal_uq.images.background import PreparedImage
 _ITERATIONS = 10
 # A star is left alone when its step is this small, in standard deviations, or in px, parts of its flux and log width.
 _TOLERANCE_SIGMAS, _TOLERANCE = 1e-2, 1e-4
+# So many may be left that have not settled: they swing at the limit of detection, by less than they are known.
+_LEFT_MOVING = 0.02
 _SQRT_2PI = float(np.sqrt(2.0 * np.pi))
 
 
@@ -167,6 +169,38 @@ def _gaussian(px: FloatArray, py: FloatArray) -> FloatArray:
 
 
 def fit_stars(
+    stamps: Stamps, x: FloatArray, y: FloatArray, sigma_px: float | FloatArray, *, pairs: Any = None, once: bool = False
+) -> StarFit:
+    """Fit position and flux of each star from x, y (n,) in the image.
+
+    `pairs` (p, 2) are stars (i, j) of which j reaches into the stamp of i; it is subtracted there. With `once` each
+    star is moved once only, where the places are known.
+    """
+    state = _settled(stamps, x, y, sigma_px, pairs=pairs, left_moving=1.0 if once else _LEFT_MOVING)
+    u, v, flux, log_sigma = state
+    sigma, others = np.exp(log_sigma), None
+    if pairs is not None and len(pairs):
+        others = np.zeros_like(stamps.counts)
+        _add_others(others, stamps, state, pairs)
+    px, py = _profiles(stamps, u, v, sigma, 1)
+    _, weight = _weighted(stamps, flux, px[:, 0], py[:, 0], others)
+    covariance = _inverse(_normal(px, py, weight, flux))
+    residual = stamps.counts if others is None else stamps.counts - others
+    return StarFit(u + stamps.x0, v + stamps.y0, flux, covariance, sigma, weight, residual)
+
+
+def fit_widths(
+    stamps: Stamps, x: FloatArray, y: FloatArray, sigma_px: FloatArray, left_moving: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Fit the width of each star as well: its position, flux and width, (n,) each.
+
+    `left_moving` is the part of the stars that need not have settled, where a median is all that is wanted.
+    """
+    u, v, flux, log_sigma = _settled(stamps, x, y, sigma_px, free_sigma=True, left_moving=left_moving)
+    return u + stamps.x0, v + stamps.y0, flux, np.exp(log_sigma)
+
+
+def _settled(
     stamps: Stamps,
     x: FloatArray,
     y: FloatArray,
@@ -175,18 +209,18 @@ def fit_stars(
     free_sigma: bool = False,
     pairs: Any = None,
     left_moving: float = 0.0,
-) -> StarFit:
-    """Fit position and flux of each star from x, y (n,) in the image, and with `free_sigma` its own width too.
+) -> FloatArray:
+    """Places in the stamps, fluxes and logarithms of the widths, (4, n).
 
-    `pairs` (p, 2) are stars (i, j) of which j reaches into the stamp of i; it is subtracted there. A star is left alone
-    once its own steps are small and those of the stars in its stamp; `left_moving` is the part of them that need not
-    get so far, where a median is all that is wanted; with all of them each star is moved once.
+    A star is left alone once its own steps are small and those of the stars in its stamp.
     """
     n, m = stamps.counts.shape[:2]
     state = np.stack([x - stamps.x0, y - stamps.y0, np.zeros(n), np.zeros(n) + np.log(sigma_px)])
     has_pairs, derivatives = pairs is not None and len(pairs) > 0, 2 if free_sigma else 1
     others = np.zeros_like(stamps.counts) if has_pairs else None
-    moving, part, here = np.arange(n), stamps, pairs
+    moving, part, here, last = np.arange(n), stamps, pairs, np.zeros((2 + free_sigma, n))
+    # Rows of the steps in position and width.
+    shape = [0, 1, 3][: 2 + free_sigma]
     for iteration in range(_ITERATIONS):
         if iteration and len(moving) <= left_moving * n:
             break
@@ -216,6 +250,7 @@ def fit_stars(
         done = np.einsum("in,ni->n", step, gradient) < _TOLERANCE_SIGMAS**2
         # Far from the solution the linear step overshoots.
         step[:2] /= np.maximum(np.hypot(step[0], step[1]) / (0.5 * sigma), 1.0)
+        step[shape] = _to_their_end(step[shape], last, moving)
         state[:3, moving] += step[:3]
         if free_sigma:
             wider = log_sigma + np.clip(step[3], -0.3, 0.3)
@@ -230,16 +265,18 @@ def fit_stars(
                 here = pairs[still[pairs[:, 0]]]
             moving = np.flatnonzero(still)
             part = stamps.subset(moving)
-    u, v, flux, log_sigma = state
-    sigma = np.exp(log_sigma)
-    if others is not None:
-        others[:] = 0.0
-        _add_others(others, stamps, state, pairs)
-    px, py = _profiles(stamps, u, v, sigma, derivatives)
-    _, weight = _weighted(stamps, flux, px[:, 0], py[:, 0], others)
-    covariance = _inverse(_normal(px, py, weight, flux))[:, :3, :3]
-    residual = stamps.counts if others is None else stamps.counts - others
-    return StarFit(u + stamps.x0, v + stamps.y0, flux, covariance, sigma, weight, residual)
+    return state
+
+
+def _to_their_end(step: FloatArray, last: FloatArray, moving: IntArray) -> FloatArray:
+    """Steps (q, k) of the stars that move, which swing, as about a hot pixel, or creep, to where their sum will end.
+
+    `last` (q, n) are the steps before, and become these.
+    """
+    before = last[:, moving]
+    ratio = _ratio(np.einsum("qk,qk->k", step, before), np.einsum("qk,qk->k", before, before))
+    last[:, moving] = longer = step / (1.0 - ratio.clip(-1.0, 0.5))
+    return longer
 
 
 def _weighted(
@@ -352,33 +389,32 @@ _GRADIENT_SNR, _GRADIENT_STARS = 30.0, 4
 _LEAST_GRADIENT = 0.1
 # A window ends where its weight is 3e-4, as SExtractor's does.
 _WINDOW_SIGMAS = 4.0
-_WINDOW_ITERATIONS, _WINDOW_STEP_PX = 16, 2e-4
+_WINDOW_ITERATIONS, _WINDOW_STEP_PX, _WINDOW_STEP_SIGMAS = 16, 2e-4, 1e-2
 
 
 def window_positions(
-    frame: PreparedImage,
+    stamps: Stamps,
+    shape: tuple[int, int],
     x: FloatArray,
     y: FloatArray,
     window_px: FloatArray,
     star_px: FloatArray,
-    usable: BoolArray | None = None,
-    step_px: float = _WINDOW_STEP_PX,
+    step_px: float | FloatArray,
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Windowed centroids from positions (n,), and which are to be believed: whole windows with light in them.
 
     SExtractor's XWIN and YWIN (Bertin & Arnouts): where the first moment of the light in a Gaussian window (n,) around
     it is nought. All stars are moved at once, by steps that suit a Gaussian star of width `star_px` (n,): SExtractor's
-    suit a window as wide as the star, and swing in a wider one. The last steps are shorter than `step_px`.
+    suit a window as wide as the star, and swing in a wider one. The last steps are shorter than `step_px` (n,).
+    `stamps` of an image of this shape reach to where the windows end.
     """
     x, y = x.copy(), y.copy()
     good = np.isfinite(x) & np.isfinite(y)
     if not len(x):
         return x, y, good
-    radius = _WINDOW_SIGMAS * window_px
-    half = int(np.ceil(radius.max()))
-    stamps = cut_stamps(frame.counts, usable, x, y, half, frame.noise, frame.counts_per_e)
+    half, moving, counts = stamps.counts.shape[1] // 2, np.flatnonzero(good), stamps.counts
     steps, factor = np.arange(2 * half + 1), 1.0 + (star_px**2 + 1.0 / 12.0) / window_px**2
-    moving, counts = np.flatnonzero(good), stamps.counts
+    small, last = np.zeros(len(x)) + step_px**2, np.zeros((2, len(x)))
     if len(moving) < len(x):
         counts = counts[moving]
     for _ in range(_WINDOW_ITERATIONS):
@@ -391,32 +427,33 @@ def window_positions(
         light = moments[:, 0, 0]
         lit = light > 0.0
         scale = factor[moving] / np.where(lit, light, np.inf)
-        dx, dy = scale * moments[:, 0, 1], scale * moments[:, 1, 0]
+        dx, dy = _to_their_end(np.stack([scale * moments[:, 0, 1], scale * moments[:, 1, 0]]), last, moving)
         x[moving] += dx
         y[moving] += dy
         # A window that has left its square has run away.
         fine = lit & (np.abs(centre + np.concatenate([dx, dy]) - half).reshape(2, -1).max(axis=0) < 2.0)
         good[moving[~fine]] = False
-        on = fine & (dx * dx + dy * dy > step_px**2)
+        on = fine & (dx * dx + dy * dy > small[moving])
         if not on.any():
             break
         moving, counts = moving[on], counts[on]
-    height, width = frame.counts.shape
+    height, width = shape
+    radius = _WINDOW_SIGMAS * window_px
     good &= (x - radius >= -0.5) & (x + radius <= width - 0.5) & (y - radius >= -0.5) & (y + radius <= height - 0.5)
-    if usable is not None:
-        cut = np.flatnonzero(good & ~stamps.good.all((1, 2)))
-        u, v = (steps + stamps.x0[cut, None]) - x[cut, None], (steps + stamps.y0[cut, None]) - y[cut, None]
-        far = u[:, None, :] ** 2 + v[:, :, None] ** 2 > radius[cut, None, None] ** 2
-        good[cut] = (stamps.good[cut] | far).all((1, 2))
+    cut = np.flatnonzero(good & ~stamps.good.all((1, 2)))
+    u, v = (steps + stamps.x0[cut, None]) - x[cut, None], (steps + stamps.y0[cut, None]) - y[cut, None]
+    far = u[:, None, :] ** 2 + v[:, :, None] ** 2 > radius[cut, None, None] ** 2
+    good[cut] = (stamps.good[cut] | far).all((1, 2))
     return x, y, good
 
 
 def windowed(frame: PreparedImage, fit: StarFit) -> StarFit:
     """`fit` with windowed centroids and their covariance for the stars that stand alone."""
     window = np.maximum(_WINDOW_SIGMA_PX, 1.2 * fit.sigma_px)
-    x, y, whole = window_positions(frame, fit.x_px, fit.y_px, window, fit.sigma_px)
     half = int(np.ceil(_WINDOW_SIGMAS * window.max(initial=_WINDOW_SIGMA_PX)))
-    stamps = cut_stamps(frame.counts, None, x, y, half, frame.noise, frame.counts_per_e)
+    stamps = cut_stamps(frame.counts, None, fit.x_px, fit.y_px, half, frame.noise, frame.counts_per_e)
+    steps_px = np.maximum(_WINDOW_STEP_PX, _WINDOW_STEP_SIGMAS * np.sqrt(fit.covariance[:, 0, 0]))
+    x, y, whole = window_positions(stamps, frame.counts.shape, fit.x_px, fit.y_px, window, fit.sigma_px, steps_px)
     steps = np.arange(2 * half + 1)
     u, v = (steps + stamps.x0[:, None]) - x[:, None], (steps + stamps.y0[:, None]) - y[:, None]
     # Moments up to the second along each axis, of the light in the window and of the variance in its square.

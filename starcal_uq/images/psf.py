@@ -9,7 +9,7 @@ import numpy as np
 
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.images.background import PreparedImage
-from starcal_uq.images.fits import Stamps, StarFit, cut_stamps, explained, fit_stars
+from starcal_uq.images.fits import Stamps, StarFit, cut_stamps, explained, fit_stars, fit_widths
 
 FIRST_SIGMA_PX = 1.2
 _STAMP_HALF_SIGMAS = 4.0
@@ -19,7 +19,7 @@ _WIDTHS = (0.25, 15.0)
 _MISFIT, _ELONGATED = 0.1, 1.2
 _MOMENT_WINDOW_PX = 1.5
 # The fits of this part of the stars need not have converged: for the size of stamps, and for a median.
-_LEFT_MOVING = (0.5, 0.15)
+_LEFT_MOVING = (0.8, 0.15)
 
 
 @dataclass(frozen=True)
@@ -81,23 +81,21 @@ def measure_psf(frame: PreparedImage, objects: Any) -> Psf | None:
         if not len(clean):
             return None
         chosen = chosen[clean]
-        fit = fit_stars(stamps, x[clean], y[clean], widths[clean], free_sigma=True, left_moving=left_moving)
-        good = (np.hypot(fit.x_px - chosen["x"], fit.y_px - chosen["y"]) < 1.0 + sigma) & (fit.flux > 0.0)
+        x, y, flux, widths = fit_widths(stamps, x[clean], y[clean], widths[clean], left_moving)
+        good = (np.hypot(x - chosen["x"], y - chosen["y"]) < 1.0 + sigma) & (flux > 0.0)
         if not good.any():
             return None
-        sigma = float(np.clip(np.median(fit.sigma_px[good]), *_WIDTHS))
+        sigma = float(np.clip(np.median(widths[good]), *_WIDTHS))
         # The second fit, of stamps that suit the width, starts where the first has ended.
-        x, y = np.where(good, fit.x_px, chosen["x"]), np.where(good, fit.y_px, chosen["y"])
-        widths = np.where(good, fit.sigma_px, sigma)
+        x, y = np.where(good, x, chosen["x"]), np.where(good, y, chosen["y"])
+        widths = np.where(good, widths, sigma)
     # All pixels with the same weight, so that what counts as core and wings does not hang on whether the gain is known.
-    stamps = cut_stamps(frame.counts, frame.usable, fit.x_px, fit.y_px, half_stamp_px(sigma), frame.noise, 0.0)
+    stamps = cut_stamps(frame.counts, frame.usable, x, y, half_stamp_px(sigma), frame.noise, 0.0)
+    width = sigma
     if frame.counts_per_e:
-        fit = fit_stars(stamps, fit.x_px, fit.y_px, fit.sigma_px, free_sigma=True, left_moving=left_moving)
-        width = float(np.clip(np.median(fit.sigma_px[good]), *_WIDTHS))
-    else:
-        width = sigma
-    # The places are known: one step for the light.
-    fit = fit_stars(stamps, fit.x_px, fit.y_px, width, left_moving=1.0)
+        x, y, _, widths = fit_widths(stamps, x, y, widths, left_moving)
+        width = float(np.clip(np.median(widths[good]), *_WIDTHS))
+    fit = fit_stars(stamps, x, y, width, once=True)
     # Fainter stars that are found are those whose noise adds light.
     good &= stamps.good.all((1, 2)) & (fit.flux > _MISFIT_SNR * np.sqrt(fit.covariance[:, 2, 2]))
     if np.count_nonzero(good) <= 3:

@@ -234,7 +234,10 @@ def test_windows_settle_where_sextractors_do():
     xy, image, found = trial(100, 2.0)
     frame, _, _ = prepare_image(Image(image, "window"), 1.0, None, None)
     start, width = found.xy[:, 0] + 0.2, np.full(len(found), 2.0)
-    x, y, good = star_fits.window_positions(frame, start, found.xy[:, 1] - 0.2, np.hypot(width, 0.3), width)
+    stamps = star_fits.cut_stamps(frame.counts, None, start, found.xy[:, 1] - 0.2, 9, frame.noise, 1.0)
+    x, y, good = star_fits.window_positions(
+        stamps, image.shape, start, found.xy[:, 1] - 0.2, np.hypot(width, 0.3), width, 2e-4
+    )
     theirs = sep.winpos(frame.counts, start, found.xy[:, 1] - 0.2, np.hypot(width, 0.3))
     assert good.all() and len(good) == len(xy)
     np.testing.assert_allclose(np.hypot(x - theirs[0], y - theirs[1]), 0.0, atol=0.02 * found.sigma_px.max())
