@@ -176,16 +176,17 @@ def with_star_errors(obs: Observations, cal: Calibration) -> Calibration:
 
 
 def noise_px(likelihood: MarginalLikelihood, theta: FloatArray) -> float:
-    """Root mean square of the residuals per axis, px; infinite when the model is not finite.
+    """Root mean square of the residuals per axis, px, stars weighted by what they state; infinite without a model.
 
     `likelihood` starts its later attitude searches from those found here.
     """
-    e = np.empty((2, likelihood.frames.n_stars))
-    found = likelihood.sums(theta, e, _NEARLY_RAD)
-    if not np.isfinite(found[0].normal.cost):
+    found = likelihood.sums(theta, tolerance=_NEARLY_RAD)
+    cost = found[0].normal.cost
+    if not np.isfinite(cost):
         return float("inf")
     likelihood.use_sums(*found)
-    return float(np.sqrt(np.mean(likelihood.frames.in_pixels(e) ** 2)))
+    weight = likelihood.frames.weight
+    return float(np.sqrt(cost / (2.0 * (likelihood.frames.n_stars if weight is None else np.sum(weight**2)))))
 
 
 def check_camera(camera: Camera, status: Status) -> Status:

@@ -36,6 +36,7 @@ from starcal_uq.estimation.solvers import is_singular
 from starcal_uq.estimation.stages import (
     Stage,
     begun_on_sample,
+    direct_stage,
     distortion_stage,
     joint_stage,
     optics_stage,
@@ -52,6 +53,8 @@ SOLVERS = get_args(Solver)
 # Stage 1 that moves the principal point by more than this fraction of the width has met strong distortion.
 _FAR = 0.05
 _ITERATIONS = 200
+# From the nominal optics positions take some fifteen.
+_DIRECT_ITERATIONS = 60
 # Starting processes takes two seconds.
 _STARS_WORTH_PROCESSES = 1_000_000
 # Frames and stars of a sample that is near enough to the minimum of all.
@@ -335,9 +338,8 @@ def refit(obs: Observations, cal: Calibration, model: str) -> Fit:
 
 def _fitted(likelihood: MarginalLikelihood, camera: Camera, theta: FloatArray, status: Status) -> Fit:
     raise_unless_good(check_camera(camera.with_theta(theta), status))
-    e = np.empty((2, likelihood.frames.n_stars))
-    sums, attitudes = likelihood.sums(theta, e)
-    if float(np.sqrt(np.mean(likelihood.frames.in_pixels(e) ** 2))) > IMPLAUSIBLE_NOISE * camera.width_px:
+    sums, attitudes = likelihood.sums(theta)
+    if noise_px(likelihood, theta) > IMPLAUSIBLE_NOISE * camera.width_px:
         raise_unless_good(Status.INCONSISTENT)
     return Fit(theta, sums.normal.cost, attitudes.rotations)
 
@@ -348,16 +350,39 @@ def _stages(
     """All stages of a Gaussian fit, and how they ended."""
     stages = _sampled_stages(pairs, camera, max_iterations) if method == "efficient" and solver == "lm" else []
     stages = stages or _pair_stages(pairs, camera, solver, max_iterations)
+    most = IMPLAUSIBLE_NOISE * camera.width_px
+    noise = _noise_at(pairs, likelihood, stages[-1].theta)
+    if _strayed(stages[-1], camera) or noise > most:
+        # In a field of few degrees interstar angles hardly see the principal point, and where stars state very unequal
+        # noise they go by the worst ones; positions lead to the estimate from the nominal optics in a few steps.
+        own = MarginalLikelihood(likelihood.frames, camera.distortion)
+        direct = direct_stage(own, camera, min(max_iterations, _DIRECT_ITERATIONS))
+        if direct.status.ok:
+            again = joint_stage(pairs, camera, direct.theta, solver, max_iterations)
+            stages[-1] = min(stages[-1], again, key=_badness)
+            noise = _noise_at(pairs, likelihood, stages[-1].theta)
+            if method == "efficient" and noise_px(own, direct.theta) <= min(noise, most):
+                likelihood.use_sums(*own.sums(direct.theta))
+                return [*stages, direct], direct.status
     pair_theta, status = stages[-1].theta, stages[-1].status
     if status.ok:
-        likelihood.use_rotations(likelihood.start_rotations(pair_theta) if pairs.rotations is None else pairs.rotations)
-        if noise_px(likelihood, pair_theta) > IMPLAUSIBLE_NOISE * camera.width_px:
+        if noise > most:
             # Interstar angles do not see a mirror, nor does their noise show a few wrong stars; positions do.
             status = Status.INCONSISTENT
         elif method == "efficient":
             stages.append(refinement_stage(likelihood, pair_theta, max_iterations))
             status = stages[-1].status
     return stages, status
+
+
+def _noise_at(pairs: PairObjective, likelihood: MarginalLikelihood, theta: FloatArray) -> float:
+    likelihood.use_rotations(likelihood.start_rotations(theta) if pairs.rotations is None else pairs.rotations)
+    return noise_px(likelihood, theta)
+
+
+def _strayed(stage: Stage, camera: Camera) -> bool:
+    """Whether a stage did not converge, or ended far from the nominal principal point."""
+    return not stage.status.ok or float(np.max(np.abs(stage.theta[:2] - camera.theta[:2]))) > _FAR * camera.width_px
 
 
 def _with_noise_model(obs: Observations, camera: Camera, method: str, solver: str, max_iterations: int) -> Calibration:

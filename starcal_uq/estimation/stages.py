@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import ClassVar
 
@@ -17,7 +17,7 @@ from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray, Shapes
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
-from starcal_uq.estimation.solvers import Constraints, Solution, levenberg_marquardt, minpack
+from starcal_uq.estimation.solvers import Constraints, Normal, Solution, levenberg_marquardt, minpack
 from starcal_uq.estimation.sums import Descent
 from starcal_uq.observations.frames import StarFrames
 
@@ -25,6 +25,10 @@ from starcal_uq.observations.frames import StarFrames
 _PAIR_TOLERANCE = 1e-13
 # The estimate itself is taken to rounding, so that every start ends in the same digits.
 _REFINEMENT_TOLERANCE = 1e-18
+# What a start value for the principal point needs: places to try in widths and heights, on so many stars.
+_HELD_TOLERANCE = 1e-6
+_GRID = 0.25 * np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j])
+_GRID_STARS, _GRID_ITERATIONS = 20_000, 12
 # Explicit pairs need about 100 bytes each and parameter; beyond this the normal equations serve.
 MAX_EXPLICIT_PAIRS = 500_000
 
@@ -173,15 +177,63 @@ def refinement_stage(likelihood: MarginalLikelihood, theta: FloatArray, max_iter
 
     The attitudes move along; `likelihood` starts its later searches from where they end.
     """
+    return _timed("refinement", lambda: _descended(likelihood, theta, max_iterations), np.zeros(0))
+
+
+def direct_stage(likelihood: MarginalLikelihood, camera: Camera, max_iterations: int) -> Stage:
+    """As `refinement_stage`, from a data sheet: focal length and coefficients first, then all parameters.
+
+    In a narrow field the principal point hardly matters until the others fit. Moved together with a focal length that
+    is per cent off it leaves along a valley, where the tilt of the field and the coma of the distortion make up for
+    each other. The others are fitted with the principal point held where the data sheet has it and at eight places
+    around; where they fit best, all are set free.
+    """
+
+    def run() -> Solution:
+        theta = camera.theta
+        first = _held(likelihood, theta, max_iterations)
+        best = first
+        few = likelihood.frames.part(0, max(1, int(np.searchsorted(likelihood.frames.starts, _GRID_STARS)) - 1))
+        trial = MarginalLikelihood(few, likelihood.model_name)
+        costs = [_held(trial, first.theta, _GRID_ITERATIONS).normal.cost]
+        for shift in _GRID:
+            moved = np.concatenate([theta[:2] + shift * (camera.width_px, camera.height_px), first.theta[2:]])
+            there = _held(trial, moved, _GRID_ITERATIONS)
+            costs.append(there.normal.cost)
+            if costs[-1] == min(costs):
+                best = there
+        likelihood.use_rotations(likelihood.start_rotations(best.theta))
+        last = _descended(likelihood, best.theta, max_iterations)
+        return replace(
+            last,
+            trajectory=np.concatenate([first.trajectory, last.trajectory]),
+            costs=np.concatenate([first.costs, last.costs]),
+            evaluations=first.evaluations + last.evaluations,
+        )
+
+    return _timed("refinement", run, np.zeros(0))
+
+
+def _held(likelihood: MarginalLikelihood, theta: FloatArray, max_iterations: int) -> Solution:
+    """The best focal length and coefficients for the principal point of theta (p,), from QUEST's attitudes."""
+    descent = Descent(likelihood.frames, likelihood.model_name, likelihood.start_rotations(theta))
+
+    def evaluate(rest: FloatArray) -> Normal:
+        normal = descent.evaluate(np.concatenate([theta[:2], rest]))
+        return Normal(normal.cost, normal.gradient[2:], normal.matrix[2:, 2:])
+
+    found = levenberg_marquardt(evaluate, theta[2:], max_iterations=max_iterations, tolerance=_HELD_TOLERANCE)
+    trajectory = np.hstack([np.tile(theta[:2], (len(found.costs), 1)), found.trajectory])
+    return replace(found, theta=trajectory[-1], trajectory=trajectory)
+
+
+def _descended(likelihood: MarginalLikelihood, theta: FloatArray, max_iterations: int) -> Solution:
+    """The minimum of the likelihood's sum of squares, near whose attitudes its later searches start."""
     start = likelihood.start_rotations(theta) if likelihood.rotations is None else likelihood.rotations
     descent = Descent(likelihood.frames, likelihood.model_name, start, likelihood.last_sums)
-    stage = _timed(
-        "refinement",
-        lambda: levenberg_marquardt(
-            descent.evaluate, theta, max_iterations=max_iterations, tolerance=_REFINEMENT_TOLERANCE
-        ),
-        np.zeros(0),
+    solution = levenberg_marquardt(
+        descent.evaluate, theta, max_iterations=max_iterations, tolerance=_REFINEMENT_TOLERANCE
     )
     if descent.best is not None:
         likelihood.use_sums(*descent.best)
-    return stage
+    return solution

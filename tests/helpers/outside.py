@@ -53,6 +53,7 @@ def campaign(
     drift_px: float = 0.0,
     displaced: Displacement | None = None,
     path: np.ndarray | None = None,
+    offset_px: tuple[float, float] = (-12.0, 18.0),
 ) -> Campaign:
     """Observe.
 
@@ -64,10 +65,10 @@ def campaign(
     `pointings` the camera stares: frames take turns at so many attitudes, each with the same stars whenever it comes
     round, and `drift_px` further along the rows from one turn to the next. `displaced` moves what is seen, after the
     distortion. Along a `path` (n_frames, 3, 3) of attitudes all frames see one sky, whose stars stay while they are in
-    the field.
+    the field. The principal point is `offset_px` off the centre.
     """
     focal = 0.5 * size_px / np.tan(np.radians(0.5 * field_deg))
-    x0, y0 = 0.5 * size_px - 12.0, 0.5 * size_px + 18.0
+    x0, y0 = 0.5 * size_px + offset_px[0], 0.5 * size_px + offset_px[1]
     corner = 0.5 * size_px * np.sqrt(2.0)
     k1, k2 = corner_px[0] / corner**3, corner_px[1] / corner**5
     patch = None if patch_stars is None else cap(rng, np.array([0.3, -0.5, 0.8]), 0.85 * field_deg, patch_stars)

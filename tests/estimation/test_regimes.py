@@ -1,0 +1,83 @@
+"""From narrow to wide fields, from 64 to 20,000 px: a right answer with an honest sigma, or what is left open."""
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from tests.helpers.outside import Campaign, campaign
+
+# Field (deg), side (px), focal length (mm), stars a frame, frames, noise (px), focal length of the data sheet (relative
+# error), displacements at the corner over the half diagonal. In the first six the paper's stages alone go astray.
+SENSORS = {
+    "half a degree, 64 px": (0.5, 64, 150.0, 60, 40, 0.002, 0.03, (-3e-4, 2e-4)),
+    "half a degree, 200 px": (0.54, 199, 159.0, 400, 8, 0.0027, -0.038, (-3e-4, -1e-3)),
+    "half a degree, 20,000 px": (0.5, 20_000, 10_000.0, 60, 25, 0.05, -0.03, (1e-3, -5e-4)),
+    "one degree, few frames": (1.04, 2660, 6.2, 495, 4, 0.0022, -0.016, (-1.7e-3, -1.4e-3)),
+    "one degree, two frames": (1.48, 18_568, 15.4, 37, 2, 0.016, -0.029, (4e-3, 2e-4)),
+    "two degrees, one frame": (2.0, 4096, 900.0, 2000, 1, 0.1, -0.025, (2e-3, 2e-3)),
+    "four degrees, 6 mm": (3.72, 13_075, 6.0, 431, 40, 0.0032, 0.039, (0.018, -0.003)),
+    "ten degrees": (10.0, 1024, 70.0, 15, 100, 0.05, 0.03, (0.01, -0.005)),
+    "thirty degrees, 64 px": (30.0, 64, 8.0, 400, 10, 0.02, 0.02, (0.03, -0.01)),
+    "sixty degrees, 10,000 stars": (60.0, 8000, 35.0, 10_000, 1, 0.2, -0.03, (-0.03, 0.01)),
+    "ninety degrees, 5 mm": (90.0, 3000, 5.0, 40, 100, 0.1, -0.03, (0.05, -0.02)),
+    "ninety degrees, 10 m": (90.0, 20_000, 10_000.0, 3, 300, 1.0, 0.01, (-0.03, 0.01)),
+}
+
+
+def observed(name: str, seed: int, **options) -> Campaign:
+    """A campaign of one of the sensors."""
+    field, size, _, stars, frames, noise, _, (first, second) = SENSORS[name]
+    half = size / np.sqrt(2.0)
+    own = {"corner_px": (first * half, second * half), "sigma_px": noise, "offset_px": (0.04 * size, -0.03 * size)}
+    rng = np.random.default_rng([seed, *name.encode()])
+    own |= {"n_frames": frames, "stars_per_frame": stars, "field_deg": field, "size_px": size}
+    return campaign(rng, **own | options)
+
+
+def sheet(c: Campaign, name: str) -> sc.Camera:
+    """Its data sheet."""
+    _, _, focal_mm, _, _, _, error, _ = SENSORS[name]
+    plain = sc.Camera(**c.camera_toml(focal_error=error), coefficients=(0.0, 0.0))
+    return plain.replace(focal_mm=focal_mm * (1.0 + error), pixel_um=1000.0 * focal_mm / c.theta[2])
+
+
+def squared_error(cal: sc.Calibration, theta: np.ndarray, claim: float = 1.0) -> float:
+    """Squared error in units of `claim` times the stated covariance, chi-square with as many degrees as parameters."""
+    z = (cal.theta - theta) / (claim * cal.sigmas)
+    return float(z @ np.linalg.solve(cal.correlation, z))
+
+
+# Exceeded by chi-square with five degrees of freedom in 3e-6 of draws.
+UNLIKELY = 34.0
+
+
+@pytest.mark.parametrize("name", SENSORS)
+def test_every_sensor_is_calibrated_with_an_honest_sigma(name):
+    c = observed(name, 0)
+    cal = sc.calibrate(sc.Observations(**c.columns), sheet(c, name))
+    assert squared_error(cal, c.theta) < UNLIKELY
+    # Known to a fifth from the fewest stars.
+    assert cal.sigma == pytest.approx(SENSORS[name][5], rel=0.2)
+
+
+@pytest.mark.parametrize("name", ["half a degree, 200 px", "ten degrees", "ninety degrees, 5 mm"])
+def test_stars_whose_noises_differ_by_a_million(name):
+    size = SENSORS[name][1]
+
+    def noise(magnitude):
+        return 1e-7 * size * 10.0 ** (1.5 * (magnitude - 2.0))
+
+    c = observed(name, 0, sigma_px=lambda radius, magnitude, frame: noise(magnitude))
+    cal = sc.calibrate(sc.Observations(**c.columns, sigma_px=noise(c.columns["mag"])), sheet(c, name))
+    assert squared_error(cal, c.theta) < UNLIKELY
+    assert cal.sigma == pytest.approx(1.0, rel=0.2)
+
+
+def test_a_sigma_that_claims_too_much_is_seen():
+    found = []
+    for seed in range(3):
+        c = observed("ten degrees", seed)
+        cal = sc.calibrate(sc.Observations(**c.columns), sheet(c, "ten degrees"))
+        assert squared_error(cal, c.theta) < UNLIKELY
+        found.append(squared_error(cal, c.theta, claim=0.2))
+    assert max(found) > UNLIKELY
