@@ -16,7 +16,7 @@ from starcal_uq.attitude.rotations import (
     rotation_to_quaternion,
     rotation_vector,
 )
-from starcal_uq.attitude.wahba import DegenerateFrameError, quest
+from starcal_uq.attitude.wahba import DegenerateFrameError, _adjugate_quaternion, quest
 from tests.helpers.speed import times_as_long
 
 stats = pytest.importorskip("scipy.stats")
@@ -111,6 +111,18 @@ def test_agrees_with_scipy_also_at_half_turns(sigma_rad: float) -> None:
         np.testing.assert_allclose(result.rotations, rotations, atol=1e-12)
 
 
+def test_eigenvector_before_it_is_polished() -> None:
+    """One step of Newton would mend a wrong entry of the adjugate; whichever row is largest, it needs none."""
+    rotations = np.concatenate((half_turns(), random_rotations(200, np.random.default_rng(5))))
+    b, r, starts, _ = frames([8] * len(rotations), 90.0, 1e-3, 6, rotations)
+    quaternions, values = davenport(b, r, starts, np.ones(len(b)))
+    B = [[np.add.reduceat(b[:, i] * r[:, j], starts[:-1])[None] / 8.0 for j in range(3)] for i in range(3)]
+    found = _adjugate_quaternion(B, values[None])[:, 0].T
+    # Half turns reach the rows of x, y and z, small ones that of w.
+    assert set(np.argmax(np.abs(quaternions), axis=1)) == {0, 1, 2, 3}
+    np.testing.assert_allclose(np.abs(np.sum(found * quaternions, axis=1)), 1.0, rtol=0, atol=1e-12)
+
+
 def test_draws_give_the_same_as_one_call_each(monkeypatch: pytest.MonkeyPatch) -> None:
     counts = list(np.random.default_rng(1).integers(2, 30, 60))
     b, r, starts, _ = frames(counts, 10.0, 1e-5, seed=7)
@@ -140,6 +152,11 @@ def test_weights_and_sigmas_are_two_names_of_one_thing() -> None:
     information = np.sum((np.eye(3) - b[i:j, :, None] * b[i:j, None, :]) * sigma[i:j, None, None] ** -2.0, axis=0)
     np.testing.assert_allclose(by_sigma.covariance[3] @ information, np.eye(3), atol=1e-10)
     np.testing.assert_allclose(plain.loss, 0.5e-10 * quest(b, r, starts, sigma_rad=1e-5).taste / 9, rtol=1e-4)
+    # Where 1 - lambda is rounding, the residuals still tell.
+    b, r, starts, _ = frames([9] * 20, 10.0, 1e-9, seed=9)
+    fine = quest(b, r, starts, sigma_rad=1e-9)
+    residuals = b - np.einsum("nij,nj->ni", np.repeat(fine.rotations, 9, axis=0), r)
+    np.testing.assert_allclose(fine.loss, 0.5 * np.sum(residuals.reshape(20, -1) ** 2, axis=1) / 9, rtol=1e-5)
 
 
 def whitened_excess(errors: np.ndarray, covariance: np.ndarray) -> float:
@@ -274,7 +291,7 @@ def test_wrong_arguments_are_named() -> None:
         ((b, r[:4], starts), {}, "r has shape"),
         ((b, r, [0, 5]), {}, "starts must be"),
         ((b, r, [0, 5, 5, 10]), {}, "frame number 1 has no stars"),
-        ((b * 2.0, r, starts), {}, "unit vectors"),
+        ((b * (1.0 + 0.7e-6), r, starts), {}, "unit vectors"),
         ((b, r, starts, np.ones(3)), {}, "weights has shape"),
         ((b, r, starts, np.zeros(10)), {}, "weights must be finite and positive"),
         ((b, r, starts), {"sigma_rad": -1.0}, "sigma_rad must be finite and positive"),
