@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from copy import copy
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.core.errors import ObservationError, SettingError
+from starcal_uq.core.errors import DistortionError, ObservationError, SettingError
 from starcal_uq.observations.table import Observations
+from starcal_uq.propagation.alignment import alignment_frames, random_sky
 from starcal_uq.propagation.attitude_error import AttitudeError
 from starcal_uq.propagation.propagate import propagate
 
@@ -191,6 +194,48 @@ def test_a_random_sky_is_the_default_and_is_said() -> None:
     own = propagate(POST, frames, n_draws=20, alignment="observed")  # type: ignore[arg-type]
     assert own.rest_arcsec.max() < 1e-6 < 1e-3 < found.rest_arcsec.min()
     np.testing.assert_allclose(found.calibration_total_arcsec, own.common_arcsec, rtol=1e-3)
+
+
+def test_a_random_sky_is_uniform_on_the_sphere_and_off_folded_places() -> None:
+    wide = copy(POST)
+    wide.mean = np.array([511.5, 511.5, 600.0, 0.0, 0.0])
+    wide.draws = np.tile(np.append(wide.mean, NOISE_PX), (20, 1))
+    like = replace(table([np.full((n, 2), 500.0) for n in (5, 11)]), sigma_px=np.arange(1.0, 17.0), mag=np.arange(16.0))
+    sky = random_sky(wide, like, 600, seed=1)  # type: ignore[arg-type]
+    b = np.column_stack((sky.xy - 511.5, np.full(len(sky), 600.0)))
+    np.testing.assert_allclose(sky.directions_icrs, b / np.linalg.norm(b, axis=1)[:, None], rtol=0, atol=1e-12)
+    # A pixel of a pinhole camera covers a solid angle in proportion to cos^3.
+    x, y = np.meshgrid(*[np.arange(1023.0) - 511.0] * 2)
+    r2 = x**2 + y**2
+    weight = (1.0 + r2 / 600.0**2) ** -1.5
+    seen = np.sum((sky.xy - 511.5) ** 2, axis=1)
+    assert abs(seen.mean() - np.average(r2, weights=weight)) < 4.0 * seen.std() / np.sqrt(len(sky))
+    assert np.average(r2) - seen.mean() > 20.0 * seen.std() / np.sqrt(len(sky))  # the control: uniform in pixels
+    assert sky.xy.min() < 1.0 and 1022.0 < sky.xy.max() <= 1023.0
+    counts = np.diff(sky.frame_starts)
+    assert len(counts) == 600 and set(counts) == {5, 11} and abs(np.mean(counts == 5) - 0.5) < 0.08
+    assert set(sky.sigma_px) == set(like.sigma_px) and set(sky.mag) == set(like.mag)
+    # A draw that folds beyond 267 px keeps stars away from there; one that is defined nowhere leaves no place.
+    wide.draws[7, 3] = -1.0 / (3.0 * 400.0**2)
+    within = random_sky(wide, like, 100, seed=1)  # type: ignore[arg-type]
+    assert 250.0 < np.sqrt(np.max(np.sum((within.xy - 511.5) ** 2, axis=1))) < 267.0
+    wide.draws[7, 3] = np.nan
+    with pytest.raises(DistortionError, match="folds over everywhere"):
+        random_sky(wide, like, 100, seed=1)  # type: ignore[arg-type]
+
+
+def test_an_alignment_on_a_table_says_what_that_is() -> None:
+    rng = np.random.default_rng(4)
+    frames, other = table(skies(rng, 3)), table(skies(rng, 1))
+    named = replace(other, meta={**other.meta, "frames": "a night in May"})
+    for given, told in (
+        (frames, "3 frames (the same)"),
+        (other, "1 frame (given)"),
+        (named, "1 frame (a night in May)"),
+    ):
+        found, words = alignment_frames(POST, frames, given, None, 0)  # type: ignore[arg-type]
+        assert found is given and words == told
+    assert alignment_frames(POST, frames, "observed", None, 0)[0] is frames  # type: ignore[arg-type]
 
 
 def test_an_alignment_that_is_none_is_refused() -> None:
