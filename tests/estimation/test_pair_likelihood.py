@@ -15,7 +15,13 @@ from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.status import Level
 from starcal_uq.estimation import composite as module
 from starcal_uq.estimation.calibrate import calibrate
-from starcal_uq.estimation.composite import PairLikelihood, expected_godambe, pair_covariance, pair_likelihood
+from starcal_uq.estimation.composite import (
+    PairLikelihood,
+    enough_frames,
+    expected_godambe,
+    pair_covariance,
+    pair_likelihood,
+)
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.inference.named import NaivePairsWarning
@@ -159,6 +165,33 @@ def test_curvature_is_godambes_information(variability: str) -> None:
     assert found.dof == cal.dof + more
     narrow = np.diag(found.covariance) / np.diag(build(observations(), adjusted=False)[0].covariance)
     assert found.narrowness == pytest.approx(np.sqrt(np.mean(narrow)), rel=1e-12)
+
+
+def test_expected_variability_is_what_the_stated_noise_of_each_star_does_to_the_score() -> None:
+    """By moving one pixel after the other, where the model fits exactly."""
+    exact = observations(n_frames=3, sigma_px=0.0)
+    obs = dataclasses.replace(exact, sigma_px=np.random.default_rng(1).uniform(0.02, 0.1, len(exact)))
+    frames, theta, step = StarFrames.from_observations(obs), camera().theta, 1e-3
+    objective = PairObjective(frames, "brown")
+    v = np.zeros((5, 5))
+    for axis in range(2):
+        for star in range(frames.n_stars):
+            scores = []
+            for sign in (-1.0, 1.0):
+                pixel = frames.pixel.copy()
+                pixel[axis, star] += sign * step
+                scores.append(PairObjective(dataclasses.replace(frames, pixel=pixel), "brown").evaluate(theta).gradient)
+            change = (scores[1] - scores[0]) / (2.0 * step) * obs.sigma_px[star]
+            v += np.outer(change, change)
+    inverse = symmetric_inverse(objective.evaluate(theta).matrix)
+    for factor in (1.0, 1.3):
+        assert relative(expected_godambe(objective, theta, factor), factor**2 * inverse @ v @ inverse) < 1e-4
+
+
+def test_scatter_counts_from_fifty_frames_per_parameter_on() -> None:
+    frames = StarFrames.from_observations(observations(n_frames=250))
+    assert enough_frames(PairObjective(frames, "brown"))
+    assert not enough_frames(PairObjective(frames.part(0, 249), "brown"))
 
 
 def test_both_variabilities_agree_where_there_are_many_frames() -> None:
