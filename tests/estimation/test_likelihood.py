@@ -10,8 +10,9 @@ from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.camera.distortion import model_names
 from starcal_uq.camera.projection import project
 from starcal_uq.core.records import from_plain, to_plain
-from starcal_uq.estimation.compressed import CompressedLikelihood, compress
+from starcal_uq.estimation.compressed import CompressedLikelihood, compress, gram_sums
 from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
 from tests.helpers.scenes import camera, observations, with_sigmas
 
 
@@ -98,6 +99,24 @@ def _compare(obs, model, bound):
         linear = dataclasses.replace(compressed, gram=gram)
         worse = linear.log_likelihood(theta, cal.sigma) - [exact.log_likelihood(t, cal.sigma) for t in theta]
         assert np.max(np.abs(worse)) > 3 * np.max(np.abs(difference))
+
+
+@pytest.mark.parametrize("model", model_names())
+def test_slope_of_the_determinant_is_that_along_the_parameters(model):
+    """The attitude columns change with the camera and with the attitudes that follow it."""
+    import dataclasses
+
+    plain = observations(model, n_frames=8, sigma_px=0.0)
+    obs = dataclasses.replace(plain, sigma_px=np.random.default_rng(1).uniform(0.02, 0.1, len(plain)))
+    exact, theta = MarginalLikelihood(obs, model), camera(model).theta
+    whitening = 3.0 * scaled_cholesky(symmetric_inverse(exact.evaluate(theta).matrix))
+    rotations = exact.start_rotations(theta)
+    slope = gram_sums(exact.frames, model, theta, whitening, rotations).log_determinant_slope
+    ahead, behind = (
+        [np.sum(exact.profile(theta + sign * column, rotations)[0].log_determinant) for column in whitening.T]
+        for sign in (0.5, -0.5)
+    )
+    assert np.allclose(slope, np.subtract(ahead, behind), rtol=0, atol=5e-4 * np.max(np.abs(slope)))
 
 
 def test_compressed_adds_over_frames_and_survives_a_round_trip():
