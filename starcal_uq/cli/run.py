@@ -45,6 +45,7 @@ from starcal_uq.cli.settings import (
 from starcal_uq.cli.steps import load_table, sample_run
 from starcal_uq.core.files import check_new_folder
 from starcal_uq.core.tasks import one_thread
+from starcal_uq.presentation.report.drawing import AFTER_CALIBRATION, AFTER_DIAGNOSIS, AFTER_SAMPLING, Ahead
 
 if TYPE_CHECKING:
     from starcal_uq.observations.partitions import PartitionedObservations
@@ -73,9 +74,10 @@ def demo(
     stars, truth = sc.load_catalogue(max_mag=6.0, epoch=2026.9), sc.paper.paper_camera()
     obs = sc.simulate(stars, truth, n_frames=frames, min_stars=10, sigma_px=0.05, seed=seed)
     err.print("Calibrating from f = 72 mm and the detector's centre ...")
-    show_calibration(run.calibrate(obs, sc.paper.paper_start(), force=force), truth)
-    err.print("Sampling the posterior, couplings, attitude error, then questioning the model ...")
-    _after_calibration(run, SamplingSettings(seed=seed))
+    with Ahead() as ahead:
+        show_calibration(run.calibrate(obs, sc.paper.paper_start(), force=force), truth)
+        err.print("Sampling the posterior, couplings, attitude error, then questioning the model ...")
+        _after_calibration(run, ahead, SamplingSettings(seed=seed))
 
 
 def run_command(
@@ -125,21 +127,23 @@ def run_command(
         obs, nominal = load_table(inputs[0], camera, sky)
     else:
         raise typer.BadParameter(f"{inputs[1]} is no image: give one table of observations, or images only.")
-    with progress_bar("passes over the files") as progress:
-        calibration = run.calibrate(obs, nominal, force=force, progress=progress, **estimation.options())
-    if from_images:
-        run.keep_images(centroids, identified)
-    if run.screening is not None:
-        show_screening(run.screening)
-    show_calibration(calibration, run.truth)
-    warn_air(obs, calibration)
-    aligning = {"alignment": alignment, "alignment_frames": alignment_frames}
-    _after_calibration(run, sampling, draws, budget, show=True, **aligning)
+    with Ahead() as ahead:
+        with progress_bar("passes over the files") as progress:
+            calibration = run.calibrate(obs, nominal, force=force, progress=progress, **estimation.options())
+        if from_images:
+            run.keep_images(centroids, identified)
+        if run.screening is not None:
+            show_screening(run.screening)
+        show_calibration(calibration, run.truth)
+        warn_air(obs, calibration)
+        aligning = {"alignment": alignment, "alignment_frames": alignment_frames}
+        _after_calibration(run, ahead, sampling, draws, budget, show=True, **aligning)
 
 
 @one_thread()
 def _after_calibration(
     run: Run,
+    ahead: Ahead,
     sampling: SamplingSettings,
     draws: int = 300,
     budget: Path | None = None,
@@ -148,19 +152,22 @@ def _after_calibration(
     **aligning: Any,
 ) -> None:
     """Sample, couple, propagate, question the model, budget, report; status 1 when a check or a requirement failed."""
+    ahead.draw(run.calibrated, AFTER_CALIBRATION)
     posterior = sample_run(run, sampling, force=True)
+    ahead.draw(run.results, AFTER_SAMPLING)
     run.couple()
     run.propagate(n_draws=draws, seed=sampling.seed, **aligning)
     if show:
         show_posterior(posterior)
     with progress_bar("diagnosis") as progress:
         run.diagnose(seed=sampling.seed, progress=progress)
+    ahead.draw(run.results, AFTER_DIAGNOSIS)
     if show:
         show_attitude(run.attitude)
     made = run.budget(file=budget, seed=sampling.seed)
     if show:
         show_budget(made)
-    report = run.report()
+    report = run.report(ahead.figures())
     show_verdict(run.verdict)
     print(f"Report: {report.resolve()}")
     fail_if_violated(made)

@@ -6,7 +6,7 @@ is removed when a step is done again, so that a folder never mixes two runs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -268,6 +268,14 @@ class Run:
         )
         return tuple(Missing(what, f"starcal-uq {command} {self.path}") for command, what, there in parts if not there)
 
+    @property
+    def calibrated(self) -> Results:
+        """Data and estimate alone, for what is shown while the rest is not there yet."""
+        truth, calibration = self.truth, self.calibration
+        if truth is not None and truth.parameter_names != calibration.parameter_names:
+            truth = None
+        return Results(self.name, self.observations, calibration, truth=truth)
+
     @cached_property
     def results(self) -> Results:
         """Everything that the run holds, for the report.
@@ -277,17 +285,13 @@ class Run:
         RunFolderError
             If there is no calibration, or its data are not those of the run.
         """
-        truth = self.truth
-        return Results(
-            name=self.name,
-            observations=self.observations,
-            calibration=self.calibration,
+        return replace(
+            self.calibrated,
             posterior=self.posterior if self.has("posterior") else None,
             coupling=self.coupling,
             attitude=self.attitude if self.has("attitude") else None,
             field_map=self.field_map if self.has("field_map") else None,
             diagnosis=self.diagnosis,
-            truth=truth if truth is not None and truth.parameter_names == self.calibration.parameter_names else None,
             images=self.images,
             budget=self.error_budget if self.has("budget") else None,
             missing=self.missing,
@@ -575,17 +579,24 @@ class Run:
         self.error_budget = made
         return made
 
-    def report(self) -> Path:
+    def report(self, drawn: Mapping[str, bytes] | None = None) -> Path:
         """Write ``RUN/report.html`` of whatever the run holds, and the figures in ``RUN/figures``.
+
+        Parameters
+        ----------
+        drawn : mapping, optional
+            Figures of these results that were drawn before, as PNG by name; the others are drawn now.
 
         Raises
         ------
         RunFolderError
             If there is no calibration, a file cannot be read, or files of different runs are mixed.
         """
-        from starcal_uq.presentation.report.page import draw_figures, render
+        from starcal_uq.presentation.report.drawing import FIGURES, draw_figures
+        from starcal_uq.presentation.report.page import render
 
-        figures = draw_figures(self.results)
+        figures = dict(drawn or {})
+        figures |= draw_figures(self.results, [name for name in FIGURES if name not in figures])
         page = render(self.results, figures)
         self.folder.figures.mkdir(exist_ok=True)
         for name, png in figures.items():

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+from starcal_uq.core import beside
 from starcal_uq.presentation.figures import style
 
 
@@ -20,4 +21,6 @@ def without_painting() -> Iterator[None]:
     """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(style, "painted", lambda _figure, _dpi: np.full((1, 1, 3), 255, dtype=np.uint8))
+        # Another process would paint.
+        patch.setattr(beside, "processors", lambda: 1)
         yield

@@ -11,8 +11,10 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.core.formatting import significant
+from starcal_uq.core.tasks import processors
 from starcal_uq.inference.checks import check_draws
 from starcal_uq.presentation.html import symbol
+from starcal_uq.presentation.report.drawing import FIGURES, Ahead, draw_figures
 from starcal_uq.presentation.report.page import render
 from starcal_uq.presentation.report.tables import attitude_rows, parameter_rows, weak_directions
 from starcal_uq.propagation.attitude_error import AttitudeError, MisfitFound
@@ -276,12 +278,35 @@ def test_mixed_runs_are_refused_and_nothing_is_touched(run):
 def test_a_report_that_fails_leaves_the_old_one(run, monkeypatch):
     before = run.report.read_bytes()
     figures = {path: path.stat().st_mtime_ns for path in run.figures.iterdir()}
-    monkeypatch.setattr("starcal_uq.presentation.report.page.draw_figures", lambda _: {"corner": b"new"})
+    monkeypatch.setattr("starcal_uq.presentation.report.drawing.draw_figures", lambda *_: {"corner": b"new"})
     monkeypatch.setattr("starcal_uq.presentation.report.page.render", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         sc.report(run.path)
     assert run.report.read_bytes() == before
     assert {path: path.stat().st_mtime_ns for path in run.figures.iterdir()} == figures
+
+
+def test_figures_drawn_ahead_by_another_process_are_the_same(full):
+    results = sc.Run(full.path).results
+    names = ("convergence", "price_of_coupling")
+    with Ahead() as ahead:
+        ahead.draw(dataclasses.replace(results, coupling=None), names)
+        ahead.draw(results, names[1:])
+        drawn = ahead.figures()
+    if processors() > 1:
+        assert drawn == draw_figures(results, names)
+    assert {path.stem for path in full.figures.iterdir()} <= set(FIGURES)
+
+
+def test_a_report_takes_figures_that_are_drawn(run, monkeypatch):
+    asked = []
+    ahead = (run.figures / "convergence.png").read_bytes()
+    monkeypatch.setattr(
+        "starcal_uq.presentation.report.drawing.draw_figures", lambda _, names: asked.extend(names) or {}
+    )
+    sc.Run(run.path).report({"corner": ahead})
+    assert sorted([*asked, "corner"]) == sorted(FIGURES)
+    assert (run.figures / "corner.png").read_bytes() == ahead
 
 
 def test_no_calibration_no_report(tmp_path):

@@ -9,12 +9,6 @@ from starcal_uq.camera.distortion import get_model, parameters
 from starcal_uq.core.formatting import count, join_words
 from starcal_uq.core.status import Check, Level, Question, worst
 from starcal_uq.diagnostics.verdict.limits import limits
-from starcal_uq.presentation.figures.coupling import plot_correlations, plot_couplings
-from starcal_uq.presentation.figures.diagnostics import plot_diagnosis, plot_residual_profiles
-from starcal_uq.presentation.figures.estimation import plot_convergence, plot_residuals
-from starcal_uq.presentation.figures.inference import plot_corner, plot_prior_posterior
-from starcal_uq.presentation.figures.propagation import plot_attitude, plot_distortion_curve, plot_field_map
-from starcal_uq.presentation.figures.style import figure_of, png_bytes
 from starcal_uq.presentation.html import embedded_image, template_environment
 from starcal_uq.presentation.pages import budgeting as budget_tables
 from starcal_uq.presentation.report import diagnostics as model_tables
@@ -41,7 +35,7 @@ def render(results: Results, figures: Mapping[str, bytes]) -> str:
     results
         What to report.
     figures
-        PNG images by the names of `starcal_uq.presentation.report.page.draw_figures`; a missing one is left out.
+        PNG images by the names of `starcal_uq.presentation.report.drawing.draw_figures`; a missing one is left out.
     """
     return template_environment().get_template("report.html.j2").render(context(results, figures)) + "\n"
 
@@ -132,28 +126,3 @@ def _answer(checks: tuple[Check, ...]) -> str:
 
 def _listed(checks: tuple[Check, ...]) -> str:
     return join_words([check.phrase for check in checks])
-
-
-def draw_figures(results: Results) -> dict[str, bytes]:
-    """Every figure that the results allow, as PNG, by name."""
-    cal, obs, truth = results.calibration, results.observations, results.truth
-    drawn = {
-        "residuals": plot_residuals(cal, obs),
-        "residual_profiles": plot_residual_profiles(cal, obs),
-        "convergence": plot_convergence(cal, truth),
-    }
-    if results.diagnosis is not None:
-        drawn["misfit"] = plot_diagnosis(results.diagnosis)
-    if results.posterior is not None:
-        drawn["corner"] = plot_corner(results.posterior, cal, truth)
-        drawn["prior_posterior"] = plot_prior_posterior(results.posterior, truth)
-    if results.coupling is not None:
-        drawn["correlation"] = plot_correlations(results.coupling)
-        drawn["price_of_coupling"] = figure_of(plot_couplings(results.coupling))
-    if results.attitude is not None:
-        drawn["attitude"] = figure_of(plot_attitude(results.attitude))
-    if results.field_map is not None:
-        drawn["field_map"] = plot_field_map(results.field_map)
-    if results.distortion_curve is not None:
-        drawn["distortion_curve"] = plot_distortion_curve(results.distortion_curve)
-    return {name: png_bytes(figure) for name, figure in drawn.items()}

@@ -1,0 +1,95 @@
+"""One more process, which does what is handed to it while this one goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import IO, Any
+
+from starcal_uq.core.tasks import processors
+
+_PROGRAM = "import sys; sys.path[:] = {path!r}; from starcal_uq.core.beside import serve; serve({folder!r})"
+
+
+class Beside:
+    """Calls of functions in another process, one after the other; a context, at whose end the process is gone.
+
+    It never is the only way to a result: where it could not be started, failed or was killed, `results` has None, and
+    the caller does the work itself. With a single processor nothing is started.
+
+    Calls and results go through files, because a pipe that is full would make this process wait. The other one is a
+    program of its own: those of multiprocessing begin with the caller's main module, which may not expect it.
+    """
+
+    def __init__(self) -> None:
+        self._folder = TemporaryDirectory(prefix="starcal-uq-", ignore_cleanup_errors=True)
+        self._process: subprocess.Popen[bytes] | None = None
+        self._n_calls = 0
+
+    def __enter__(self) -> Beside:
+        if processors() > 1:
+            program = _PROGRAM.format(path=sys.path, folder=self._folder.name)
+            with contextlib.suppress(OSError):
+                self._process = subprocess.Popen(
+                    [sys.executable, "-c", program],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,
+                    # Ctrl-C reaches every process of a terminal; the first one decides what to do about it.
+                    start_new_session=True,
+                )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.communicate()
+        self._folder.cleanup()
+
+    def call(self, function: Callable[..., Any], *arguments: Any) -> int:
+        """Hand a call over, to a function that a module defines at its top level; its number."""
+        number, self._n_calls = self._n_calls, self._n_calls + 1
+        if self._process is not None:
+            _path(self._folder.name, number, "call").write_bytes(pickle.dumps((function, arguments)))
+            # The process may have died.
+            with contextlib.suppress(OSError):
+                _pipe(self._process).write(f"{number}\n".encode())
+                _pipe(self._process).flush()
+        return number
+
+    def results(self) -> list[Any]:
+        """Wait for all calls; their results, None for those that failed. Nothing can be handed over afterwards."""
+        if self._process is not None:
+            with contextlib.suppress(OSError):
+                _pipe(self._process).close()
+            self._process.wait()
+        found = (_path(self._folder.name, number, "result") for number in range(self._n_calls))
+        return [pickle.loads(path.read_bytes()) if path.exists() else None for path in found]
+
+
+def serve(folder: str) -> None:
+    """Do the calls of a `Beside`, until it closes the pipe or is gone."""
+    for line in sys.stdin:
+        function, arguments = pickle.loads(_path(folder, int(line), "call").read_bytes())
+        try:
+            result = pickle.dumps(function(*arguments))
+        except Exception:
+            # Whoever asked tries again, where the error is seen.
+            continue
+        part = _path(folder, int(line), "part")
+        part.write_bytes(result)
+        part.replace(_path(folder, int(line), "result"))
+
+
+def _path(folder: str, number: int, kind: str) -> Path:
+    return Path(folder) / f"{number}.{kind}"
+
+
+def _pipe(process: subprocess.Popen[bytes]) -> IO[bytes]:
+    assert process.stdin is not None
+    return process.stdin

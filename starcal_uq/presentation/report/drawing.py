@@ -1,0 +1,89 @@
+"""The figures of a report, and another process that draws them ahead of it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from typing import Any
+
+from starcal_uq.core.beside import Beside
+from starcal_uq.presentation.figures.coupling import plot_correlations, plot_couplings
+from starcal_uq.presentation.figures.diagnostics import plot_diagnosis, plot_residual_profiles
+from starcal_uq.presentation.figures.estimation import plot_convergence, plot_residuals
+from starcal_uq.presentation.figures.inference import plot_corner, plot_prior_posterior
+from starcal_uq.presentation.figures.propagation import plot_attitude, plot_distortion_curve, plot_field_map
+from starcal_uq.presentation.figures.style import figure_of, label, new_axes, png_bytes
+from starcal_uq.presentation.report.results import Results
+
+# Figures by the step after which they can be drawn.
+AFTER_CALIBRATION = ("residuals", "residual_profiles", "convergence")
+AFTER_SAMPLING = ("corner", "prior_posterior", "correlation", "price_of_coupling", "distortion_curve")
+AFTER_DIAGNOSIS = ("misfit", "attitude", "field_map")
+FIGURES = (*AFTER_CALIBRATION, *AFTER_SAMPLING, *AFTER_DIAGNOSIS)
+
+
+def draw_figures(results: Results, names: Collection[str] = FIGURES) -> dict[str, bytes]:
+    """The figures of these names that the results allow, as PNG."""
+    figures = ((name, _figure(results, name)) for name in names)
+    return {name: png_bytes(figure) for name, figure in figures if figure is not None}
+
+
+def _figure(results: Results, name: str) -> Any:
+    """One figure; None where the results lack what it shows."""
+    cal, obs, truth = results.calibration, results.observations, results.truth
+    if name == "residuals":
+        return plot_residuals(cal, obs)
+    if name == "residual_profiles":
+        return plot_residual_profiles(cal, obs)
+    if name == "convergence":
+        return plot_convergence(cal, truth)
+    if name == "misfit" and results.diagnosis is not None:
+        return plot_diagnosis(results.diagnosis)
+    if name == "corner" and results.posterior is not None:
+        return plot_corner(results.posterior, cal, truth)
+    if name == "prior_posterior" and results.posterior is not None:
+        return plot_prior_posterior(results.posterior, truth)
+    if name == "correlation" and results.coupling is not None:
+        return plot_correlations(results.coupling)
+    if name == "price_of_coupling" and results.coupling is not None:
+        return figure_of(plot_couplings(results.coupling))
+    if name == "attitude" and results.attitude is not None:
+        return figure_of(plot_attitude(results.attitude))
+    if name == "field_map" and results.field_map is not None:
+        return plot_field_map(results.field_map)
+    if name == "distortion_curve" and results.distortion_curve is not None:
+        return plot_distortion_curve(results.distortion_curve)
+    return None
+
+
+class Ahead:
+    """Figures of a report, drawn by another process while what comes after them is computed; a context."""
+
+    def __init__(self) -> None:
+        self._beside = Beside()
+
+    def __enter__(self) -> Ahead:
+        self._beside.__enter__()
+        # What drawing needs takes a second to load.
+        self._beside.call(_load)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._beside.__exit__(*error)
+
+    def draw(self, results: Results, names: Collection[str]) -> None:
+        """Begin to draw the figures of these names, as far as the results allow them."""
+        self._beside.call(draw_figures, results, names)
+
+    def figures(self) -> dict[str, bytes]:
+        """What was drawn, by name; a figure that was drawn twice as it was drawn last."""
+        drawn: dict[str, bytes] = {}
+        for some in self._beside.results():
+            drawn |= some or {}
+        return drawn
+
+
+def _load() -> None:
+    """Load what drawing needs."""
+    ax = new_axes(1.0, 1.0)
+    label(ax, "", "x")
+    png_bytes(figure_of(ax))
