@@ -19,7 +19,7 @@ from starcal_uq.budgeting.totals import Samples, Total, grouped_sigma, total
 from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import BudgetError
-from starcal_uq.core.files import atomic_path, reading
+from starcal_uq.core.files import atomic_path, cell_content, cell_text, reading
 from starcal_uq.core.types import AnyDict, FloatArray
 
 if TYPE_CHECKING:
@@ -291,7 +291,7 @@ class Budget(Shown):
         with atomic_path(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, _COLUMNS, lineterminator="\n")
             writer.writeheader()
-            writer.writerows(records)
+            writer.writerows({name: cell_text(value) for name, value in record.items()} for record in records)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Budget:
@@ -304,7 +304,9 @@ class Budget(Shown):
         """
         with reading(path, "an error budget", "run `starcal-uq budget RUN` to write it"):
             with open(path, newline="", encoding="utf-8") as file:
-                records = list(csv.DictReader(file))
+                records = [
+                    {name: cell_content(cell) for name, cell in record.items()} for record in csv.DictReader(file)
+                ]
             by_kind: dict[str, list[dict[str, str]]] = {}
             for record in records:
                 before = record.pop("raw_sigma_arcsec", "nan")

@@ -111,9 +111,39 @@ def atomic_write_text(path: PathLike, text: str) -> None:
 
 
 def write_csv(table: pd.DataFrame, path: PathLike) -> None:
-    """Write a table as CSV without its index, to the last digit, all or nothing."""
+    """Write a table as CSV without its index, to the last digit, all or nothing; texts as `cell_text` has them."""
+    texts = {
+        name: [cell_text(value) if isinstance(value, str) else value for value in column]
+        for name, column in table.items()
+        if column.dtype.kind not in "biufcmM"
+    }
     with atomic_path(path) as temporary:
-        table.to_csv(temporary, index=False, lineterminator="\n")
+        table.assign(**texts).to_csv(temporary, index=False, lineterminator="\n")
+
+
+# What spreadsheets take for a formula, whoever wrote the file; the apostrophe is their own mark of a text.
+_FORMULA = re.compile(r"'*[=+\-@\t\n].", re.DOTALL)
+
+
+def cell_text(text: str) -> str:
+    """A text for a cell of a table that may be opened as a spreadsheet.
+
+    One that would be run as a formula gets an apostrophe before it, which `cell_content` takes away again; numbers stay
+    as they are. A carriage return, which would end the row unless it is quoted, becomes a line feed, which is.
+    """
+    text = text.replace("\r\n", "\n").replace("\r", "\n")
+    if not _FORMULA.match(text):
+        return text
+    try:
+        float(text)
+    except ValueError:
+        return f"'{text}"
+    return text
+
+
+def cell_content(cell: str) -> str:
+    """Inverse of `cell_text`."""
+    return cell[1:] if cell[:1] == "'" and _FORMULA.match(cell) else cell
 
 
 # What a file unpacks to or declares may take this much memory, or this many times its own size.
@@ -238,10 +268,11 @@ def reading(path: PathLike, what: str, remedy: str, error: type[StarcalError] = 
         if isinstance(problem, OSError) and problem.errno is not None:
             # The path that failed, which may be that of a file beside this one.
             place = path if problem.filename is None else os.fsdecode(problem.filename)
-            raise error(f"{place}: cannot be read ({os.strerror(problem.errno)}); {remedy}.") from problem
-        empty = os.path.isfile(path) and not os.path.getsize(path)
-        reason = "the file is empty" if empty else reason_of(problem)
-        raise error(f"{path}: is not {what} ({reason}); {remedy}.") from problem
+            sentence = f"{place}: cannot be read ({os.strerror(problem.errno)}); {remedy}."
+        else:
+            empty = os.path.isfile(path) and not os.path.getsize(path)
+            sentence = f"{path}: is not {what} ({'the file is empty' if empty else reason_of(problem)}); {remedy}."
+        raise error(sentence) from problem
 
 
 ENDINGS = (".csv", ".ecsv", ".parquet")

@@ -271,7 +271,8 @@ class Calibration(Shown):
         RunFolderError
             When a file is missing or not a calibration.
         """
-        path = Path(path)
-        with reading(path, "a calibration", "run `starcal-uq calibrate` again"):
-            document = json.loads(path.read_text(encoding="utf-8"))
-            return from_plain(cls, document, read_arrays(path.with_suffix(".npz")))
+        path, remedy = Path(path), "run `starcal-uq calibrate` again"
+        with reading(path.with_suffix(".npz"), "the arrays of a calibration", remedy):
+            arrays = read_arrays(path.with_suffix(".npz"))
+        with reading(path, "a calibration", remedy):
+            return from_plain(cls, json.loads(path.read_text(encoding="utf-8")), arrays)

@@ -22,6 +22,8 @@ from starcal_uq.core.files import (
     as_plain,
     atomic_path,
     atomic_write_text,
+    cell_content,
+    cell_text,
     check_parquet,
     check_size,
     ensure_new,
@@ -68,6 +70,8 @@ class RawTable:
         Name in the file to unit, where one is stated.
     problems : list of Problem
         Rows that do not fit the header.
+    spreadsheet : bool
+        Whether texts are those of `starcal_uq.core.files.cell_text`.
     """
 
     columns: dict[str, Any]
@@ -77,6 +81,7 @@ class RawTable:
     meta: AnyDict = field(default_factory=dict)
     units: dict[str, str] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
+    spreadsheet: bool = False
 
 
 WHAT, REMEDY = "a readable table", "write it again"
@@ -184,7 +189,8 @@ def convert_columns(
         elif kind == "time":
             columns[name], bad = parse_times(name, cells)
         else:
-            columns[name] = np.array([cell.strip() for cell in cells], dtype=np.str_)
+            texts = [cell.strip() for cell in cells]
+            columns[name] = np.array(list(map(cell_content, texts)) if raw.spreadsheet else texts, dtype=np.str_)
         problems += bad
     return columns, problems, unknown_frame
 
@@ -250,6 +256,7 @@ def _read_text(path: Path, data: bytes, ecsv: bool) -> RawTable:
         meta=_ecsv_meta(header),
         units={column["name"]: column["unit"] for column in header.get("datatype", []) if column.get("unit")},
         problems=problems,
+        spreadsheet=not ecsv,
     )
 
 
@@ -453,6 +460,8 @@ def _csv_text(columns: Mapping[str, Any]) -> str:
     texts = []
     for name, values in columns.items():
         cells = values.tolist()
+        if COLUMNS[name].kind == "text":
+            cells = list(map(cell_text, cells))
         # An empty cell is how every spreadsheet writes a gap.
         texts.append(["" if v != v else v for v in cells] if COLUMNS[name].gaps else cells)
     text = io.StringIO(newline="")

@@ -27,7 +27,7 @@ import numpy as np
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import SamplingError, StarcalError
-from starcal_uq.core.files import reading, write_csv
+from starcal_uq.core.files import cell_content, reading, write_csv
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import Progress, run_tasks
@@ -179,7 +179,7 @@ class InteractionStudy(Shown):
 
 def _column(name: str, values: list[str]) -> list[str] | list[int] | list[float]:
     if name in _TEXT:
-        return values
+        return list(map(cell_content, values))
     return [int(v) for v in values] if name in _WHOLE else [float(v) if v else np.nan for v in values]
 
 

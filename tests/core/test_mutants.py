@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
+import gzip
 import inspect
+import io
 import random
+import re
+import zipfile
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import starcal_uq as sc
-from tests.helpers.mutants import SAMPLES, Bench
+from starcal_uq.core import files
+from starcal_uq.core.errors import StarcalError
+from tests.helpers.mutants import SAMPLES, Bench, Sample
 
 BY_FILE = {sample.file: sample for sample in SAMPLES}
 # What reads files and is tested elsewhere: images, and folders of runs.
@@ -76,3 +84,220 @@ def test_every_public_reader_is_in_the_table() -> None:
     found = set(readers())
     assert found - known == set()
     assert len(found) > 20 and "Posterior.load" in found
+
+
+def _members(data: bytes, **changed: bytes | None) -> bytes:
+    """An archive with other members; those that are None are left out."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        content = {info.filename: archive.read(info) for info in archive.infolist()}
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, member in (content | {f"{name}.npy": member for name, member in changed.items()}).items():
+            if member is not None:
+                archive.writestr(name, member)
+    return stream.getvalue()
+
+
+def _npy(array: Any) -> bytes:
+    stream = io.BytesIO()
+    np.save(stream, array, allow_pickle=True)
+    return stream.getvalue()
+
+
+def _declared(shape: tuple[int, ...]) -> bytes:
+    """The header of an array, without its content."""
+    stream = io.BytesIO()
+    np.lib.format.write_array_header_1_0(stream, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    return stream.getvalue()
+
+
+def _flipped(data: bytes) -> bytes:
+    return data[:2000] + bytes([data[2000] ^ 4]) + data[2001:]
+
+
+def _parquet(change: Callable[[Any], Any]) -> Callable[[bytes], bytes]:
+    def made(data: bytes) -> bytes:
+        from pyarrow import parquet
+
+        stream = io.BytesIO()
+        parquet.write_table(change(parquet.read_table(io.BytesIO(data))), stream)
+        return stream.getvalue()
+
+    return made
+
+
+def _null(table: Any) -> Any:
+    import pyarrow as pa
+
+    frames = table.column("frame").to_pylist()
+    return table.set_column(0, "frame", pa.array([None, *frames[1:]], pa.int64()))
+
+
+def _meta(key: bytes, text: bytes | None) -> Callable[[bytes], bytes]:
+    return _parquet(lambda table: table.replace_schema_metadata({} if text is None else {key: text}))
+
+
+def _hdf5(change: Callable[[Any], None]) -> Callable[[bytes], bytes]:
+    def made(data: bytes) -> bytes:
+        import h5py
+
+        stream = io.BytesIO(data)
+        with h5py.File(stream, "r+") as file:
+            change(file)
+        return stream.getvalue()
+
+    return made
+
+
+def _nan_draw(file: Any) -> None:
+    draws = file["draws"][()]
+    draws[5, 2] = np.nan
+    file["draws"][...] = draws
+    del file.attrs["sha256"]
+
+
+def _other_draw(file: Any) -> None:
+    draws = file["draws"][()]
+    draws[5, 2] += 1e-6
+    file["draws"][...] = draws
+
+
+def _huge_draws(file: Any) -> None:
+    del file["draws"]
+    file.create_dataset("draws", shape=(10**12,), dtype="f8", chunks=(1000,))
+
+
+def _header_only(data: bytes) -> bytes:
+    lines = data.decode().splitlines(keepends=True)
+    first = next(i for i, line in enumerate(lines) if not line.startswith("#"))
+    return "".join(lines[: first + 1]).encode()
+
+
+def _many_names(data: bytes) -> bytes:
+    """Nine lines of YAML that name each other: a billion entries."""
+    lines = ["# - {a0: &a0 [x, x, x, x, x, x, x, x, x, x]}"]
+    for i in range(8):
+        lines.append(f"# - {{a{i + 1}: &a{i + 1} [{', '.join([f'*a{i}'] * 10)}]}}")
+    head, meta, rest = data.decode().partition("# meta: !!omap\n")
+    return (head + meta + "\n".join(lines) + "\n" + rest).encode()
+
+
+_CAMERA = b"[camera]\nwidth_px = 1024\nheight_px = 1024\npixel_um = 12.0\nx0_px = 1\ny0_px = 1\nfocal_mm = %s\n"
+_DEEP = "[" * 100_000 + "]" * 100_000
+CALIBRATE = r"; run `starcal-uq calibrate` again\.$"
+SAMPLE = r"; run `starcal-uq sample RUN --force` again\.$"
+# What once ended in a traceback, in a wrong reason, or in numbers: the file, what was done to it, and the sentence.
+ONCE = [
+    ("camera.toml", lambda d: _CAMERA % (b"[" * 3000 + b"]" * 3000), "nests its values too deeply; write plain tables"),
+    ("camera.toml", lambda d: _CAMERA % (b"{a=" * 3000 + b"1" + b"}" * 3000), "nests its values too deeply"),
+    ("camera.toml", lambda d: _CAMERA % (b"1" * 5000), "holds a number with too many digits; correct it"),
+    ("camera.toml", lambda d: _CAMERA % (b"1" * 4000), r"focal_mm is 1{1,60}\.\.\.1+; write"),
+    ("camera.toml", lambda d: _CAMERA % b'"\\u0007"', "focal_mm is '\\\\x07'; write"),
+    ("sensor.toml", lambda d: b"[sensor]\n" + b"1" * 5000 + b" = 2\n", r"key 1+\.\.\.1+"),
+    ("calibration.npz", lambda d: b"", r"\(the file is empty\)" + CALIBRATE),
+    ("calibration.npz", lambda d: d[:3000], r"\(it is damaged or cut off\)" + CALIBRATE),
+    ("calibration.npz", _flipped, CALIBRATE),
+    ("calibration.npz", lambda d: b"not an archive", r"\(it is damaged or cut off\)" + CALIBRATE),
+    ("calibration.npz", lambda d: _members(d, quaternions=None), r"\(quaternions is missing\)" + CALIBRATE),
+    (
+        "calibration.npz",
+        lambda d: _members(d, theta=_declared((10**12,))),
+        r"\(theta declares another size than it has\)",
+    ),
+    (
+        "calibration.npz",
+        lambda d: _members(d, theta=_declared((2**62, 4))),
+        r"\(theta declares another size than it has\)",
+    ),
+    ("calibration.npz", lambda d: _members(d, theta=_npy(np.array([{}]))), r"\(theta holds Python objects\)"),
+    ("calibration.npz", lambda d: _members(d, theta=_npy(np.ones(5) + 1j)), r"\(theta does not hold what it should\)"),
+    (
+        "calibration.npz",
+        lambda d: _members(d, theta=_npy(np.full(5, np.nan))),
+        r"\(theta holds a value that is not finite\)",
+    ),
+    (
+        "calibration.npz",
+        lambda d: _members(d, theta=_npy(np.ones(4))),
+        r"\(theta has 4 entries where there should be 5\)",
+    ),
+    ("calibration.json", lambda d: b"", r"\(the file is empty\)" + CALIBRATE),
+    ("calibration.json", lambda d: d[: len(d) // 2], r"\(line \d+ is no JSON\)" + CALIBRATE),
+    ("calibration.json", lambda d: _DEEP.encode(), r"\(its values are nested too deeply\)" + CALIBRATE),
+    ("diagnosis.json", lambda d: _DEEP.encode(), "nested too deeply"),
+    ("images.json", lambda d: b"[1, 2]", r"\(the document is \[1, 2\], not a table\)"),
+    ("posterior.nc", lambda d: b"", r"\(the file is empty\)" + SAMPLE),
+    ("posterior.nc", lambda d: d[:-1000], r"\(it is damaged or cut off\)" + SAMPLE),
+    ("posterior.nc", _hdf5(_nan_draw), r"\(draws holds a value that is not finite\)" + SAMPLE),
+    ("posterior.nc", _hdf5(_other_draw), r"\(its content was changed after it was written\)" + SAMPLE),
+    (
+        "posterior.nc",
+        _hdf5(_huge_draws),
+        r"\(it declares 8e\+12 bytes of content, far more",
+    ),
+    (
+        "checkpoint.npz",
+        lambda d: _members(d, key=None),
+        r"of sampling \(key is missing\); delete it\.$",
+    ),
+    ("checkpoint.npz", lambda d: d[:200], r"is not a checkpoint of sampling \(it is damaged or cut off\); delete it"),
+    (
+        "observations.parquet",
+        _parquet(_null),
+        "row 1, column frame: the value is missing; fill it in or remove the row",
+    ),
+    ("observations.parquet", _parquet(lambda t: t.append_column("frame", t.column(0))), "column frame occurs twice"),
+    ("observations.parquet", _meta(b"starcal_uq", b"{"), r"\(line 1 is no JSON\); write it again\.$"),
+    ("observations.parquet", _meta(b"starcal_uq", b"\xff"), r"\(its text is not UTF-8\)"),
+    ("observations.parquet", _meta(b"starcal_uq", b"[1]"), r"\(its metadata are no table\)"),
+    ("observations.parquet", _meta(b"starcal_uq", _DEEP.encode()), "nested too deeply"),
+    ("observations.parquet", _meta(b"other", b"{"), None),
+    ("stream.parquet", _parquet(lambda t: t.append_column("x_px", t.column(1))), "column x_px occurs twice"),
+    ("part.parquet", _meta(b"starcal_uq", b"1.5"), r"\(its metadata are no table\)"),
+    ("centroids.parquet", _meta(b"starcal_uq_centroids", None), "the list of frames is missing; give a table"),
+    ("centroids.parquet", _meta(b"starcal_uq_centroids", b"{}"), r"\(frames is missing\)"),
+    ("profile.parquet", lambda d: b"", r"\(the file is empty\)"),
+    ("observations.ecsv", _header_only, "the table has a header but no rows; give a table with observations"),
+    ("observations.ecsv", lambda d: d.replace(b"datatype:", b"datatipe:"), "the ECSV header is not valid YAML"),
+    ("catalogue.ecsv", _header_only, "holds no stars"),
+    ("centroids.ecsv", lambda d: d.split(b"\n")[0] + b"\n", "is not a readable table"),
+    ("observations.csv", lambda d: b"\x07,x\n1,2\n", r"one of the file's columns \(\\x07, x\)"),
+    ("catalogue.csv.gz", lambda d: d[:100], "is not readable as CSV"),
+    ("state.npz", lambda d: _members(d, header=None), r"\(header is missing\); give a file written by"),
+]
+
+
+@pytest.mark.parametrize(("name", "damage", "words"), ONCE)
+def test_what_once_went_wrong_is_one_sentence(
+    bench: Bench, name: str, damage: Callable[[bytes], bytes], words: str | None
+) -> None:
+    sample = BY_FILE[name]
+    outcome = bench.judged(sample, damage(bench.valid(sample)[0]))
+    if words is None:
+        assert outcome.kind in ("same", "other")
+        return
+    assert outcome.kind == "refused", outcome
+    assert re.search(words, outcome.detail), outcome.detail
+
+
+def test_what_is_packed_is_bounded_before_it_is_unpacked(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "_MODEST_BYTES", 2**16)
+    outcome = bench.judged(BY_FILE["catalogue.csv.gz"], gzip.compress(bytes(2**20)))
+    assert outcome.kind == "refused" and "far more than it can hold" in outcome.detail
+    sample = BY_FILE["calibration.npz"]
+    outcome = bench.judged(sample, _members(bench.valid(sample)[0], extra=bytes(2**20)))
+    assert outcome.kind == "refused" and "far more than it can hold" in outcome.detail
+    outcome = bench.judged(BY_FILE["observations.ecsv"], _many_names(bench.valid(BY_FILE["observations.ecsv"])[0]))
+    assert outcome.kind == "refused" and "far more than it can hold" in outcome.detail
+
+
+def test_a_bad_sentence_and_what_escapes_are_seen(bench: Bench) -> None:
+    def broken(path: Path) -> None:
+        raise KeyError("row")
+
+    def wordy(path: Path) -> None:
+        raise StarcalError("ValueError: no file\n is named")
+
+    for load, kind in ((broken, "escaped"), (wordy, "words")):
+        sample = Sample("camera.toml", load, ())
+        assert bench.judged(sample, b"", "", bench.folder / "camera.toml").kind == kind

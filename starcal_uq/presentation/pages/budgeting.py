@@ -12,7 +12,7 @@ from starcal_uq.budgeting.result import Budget
 from starcal_uq.budgeting.rows import AXIS_LABELS, Contributor, confidence_text
 from starcal_uq.budgeting.totals import Total
 from starcal_uq.core.errors import BudgetError
-from starcal_uq.core.files import atomic_path, atomic_write_text
+from starcal_uq.core.files import atomic_path, atomic_write_text, cell_text
 from starcal_uq.presentation.figures.budgeting import plot_budget
 from starcal_uq.presentation.figures.style import png_bytes
 from starcal_uq.presentation.html import embedded_image, template_environment
@@ -215,8 +215,10 @@ def _table(
 
 
 def _cell(value: Any) -> Any:
-    # A name that begins like a formula is text, not a formula.
-    return f"'{value}" if isinstance(value, str) and value[:1] in "=+@" and value else value
+    from openpyxl.cell.cell import ILLEGAL_CHARACTERS_RE
+
+    # No workbook holds control characters; a name that begins like a formula is text, not a formula.
+    return cell_text(ILLEGAL_CHARACTERS_RE.sub("\N{REPLACEMENT CHARACTER}", value)) if isinstance(value, str) else value
 
 
 def _share_format(value: float) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.comparison.result import CameraComparison
-from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, new_folder
+from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, new_folder, write_csv
 from starcal_uq.core.formatting import fixed, percent, pretty_unit, significant, with_sigma
 from starcal_uq.presentation.figures.comparison import plot_camera_comparison
 from starcal_uq.presentation.figures.style import png_bytes
@@ -42,8 +42,8 @@ def write_comparison(comparison: CameraComparison, folder: str | os.PathLike[str
     path = new_folder(folder)
     image = png_bytes(plot_camera_comparison(comparison))
     comparison.save(path / "comparison.json")
-    atomic_write_text(path / "difference.csv", comparison.to_dataframe().to_csv(index=False))
-    atomic_write_text(path / "difference_map.csv", comparison.field_dataframe().to_csv(index=False))
+    write_csv(comparison.to_dataframe(), path / "difference.csv")
+    write_csv(comparison.field_dataframe(), path / "difference_map.csv")
     atomic_write_bytes(path / "difference_map.png", image)
     page = path / "comparison.html"
     atomic_write_text(page, render_comparison(comparison, image))
