@@ -86,6 +86,11 @@ def show_posterior(posterior: Posterior) -> None:
         out.print(f"- {check}", style=_STYLES[check.level], highlight=False, soft_wrap=True)
 
 
+def note(message: str) -> None:
+    """Tell what a user should know, on standard error."""
+    err.print(f"note: {message}", style="yellow", highlight=False, soft_wrap=True)
+
+
 def print_table(table: TextTable) -> None:
     """Draw a table; its marks become colours."""
     drawn = Table(title=table.title or None, title_justify="left")

@@ -69,7 +69,8 @@ def filter_command(
     json: Json = False,
 ) -> None:
     """Calibrate frame by frame, with an estimate after each; stars may exceed memory, an interrupted call goes on."""
-    from starcal_uq.runs.streams import HISTORY, filter_run
+    from starcal_uq.runs.folder import HISTORY
+    from starcal_uq.runs.streams import filter_run
 
     options = sc.estimation.RecursionOptions(
         pair_covariance=pair_covariance,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import starcal_uq as sc
-from starcal_uq.cli.console import err, print_json, print_table, progress_bar, records, warn_undeclared
+from starcal_uq.cli.console import err, note, print_json, print_table, progress_bar, records, warn_undeclared
 from starcal_uq.cli.options import (
     CameraFile,
     Engine,
@@ -212,4 +212,4 @@ def _style(message: str) -> str | None:
 
 def _say(messages: Sequence[str]) -> None:
     for message in messages:
-        err.print(f"note: {message}", style="yellow", highlight=False, soft_wrap=True)
+        note(message)

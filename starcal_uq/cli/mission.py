@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import starcal_uq as sc
-from starcal_uq.cli.console import err, print_json, print_table, progress_bar, records
+from starcal_uq.cli.console import err, note, print_json, print_table, progress_bar, records
 from starcal_uq.cli.console import out as console
 from starcal_uq.cli.options import (
     LEAST_SIGMA_PX,
@@ -115,11 +115,17 @@ def budget_command(
         if path.suffix.lower() not in FORMATS:
             raise typer.BadParameter(f"{path}: the ending names the format; use one of {', '.join(FORMATS)}.")
         ensure_new(path, force)
-    found = sc.Run(run).budget(file=file, confidence=confidence, seed=seed)
+    opened = sc.Run(run, tell=note)
     if template is not None:
-        sc.budgeting.write_budget_template(template, found.rows, force=force)
+        rows = sc.budget(opened.posterior, opened.observations, opened.attitude, seed=seed).rows
+        sc.budgeting.write_budget_template(template, rows, force=force)
         print(f"Budget file to fill in: {template}. Next: starcal-uq budget {run} --file {template}")
         return
+    # Without a question of its own, the call shows what is there.
+    if opened.has("budget") and file is None and confidence is None and not force:
+        found = opened.error_budget
+    else:
+        found = opened.budget(file=file, confidence=confidence, seed=seed, force=force)
     for path in out or []:
         write_page(found, path)
     if json:

@@ -11,6 +11,7 @@ import starcal_uq as sc
 from starcal_uq.cli.console import (
     end_with,
     err,
+    note,
     progress_bar,
     show_attitude,
     show_calibration,
@@ -39,11 +40,11 @@ from starcal_uq.cli.settings import (
     ImageSettings,
     SamplingSettings,
     SkySettings,
+    command_of,
     refuse_others,
     unfolded,
 )
 from starcal_uq.cli.steps import load_table, sample_run
-from starcal_uq.core.files import check_new_folder
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.presentation.report.drawing import AFTER_CALIBRATION, AFTER_DIAGNOSIS, AFTER_SAMPLING, Ahead
 
@@ -68,16 +69,19 @@ def demo(
     force: Force = False,
 ) -> None:
     """The experiment of Ye & Yang 2017, end to end, ending in DIR/report.html."""
-    run = sc.Run(out)
-    check_new_folder(out, force)
-    err.print(f"Simulating {frames} frames of the paper's sensor (Gaia G <= 6, 0.05 px noise, seed {seed}) ...")
-    stars, truth = sc.load_catalogue(max_mag=6.0, epoch=2026.9), sc.paper.paper_camera()
-    obs = sc.simulate(stars, truth, n_frames=frames, min_stars=10, sigma_px=0.05, seed=seed)
-    err.print("Calibrating from f = 72 mm and the detector's centre ...")
-    with Ahead() as ahead:
-        show_calibration(run.calibrate(obs, sc.paper.paper_start(), force=force), truth)
+    run = sc.Run(out, tell=note)
+    with run.making({"command": "demo", "frames": frames, "seed": seed}, force=force), Ahead() as ahead:
+        truth = sc.paper.paper_camera()
+        if not run.did("calibrate"):
+            err.print(f"Simulating {frames} frames of the paper's sensor (Gaia G <= 6, 0.05 px noise, seed {seed}) ...")
+            stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
+            obs = sc.simulate(stars, truth, n_frames=frames, min_stars=10, sigma_px=0.05, seed=seed)
+            err.print("Calibrating from f = 72 mm and the detector's centre ...")
+            run.calibrate(obs, sc.paper.paper_start())
+        show_calibration(run.calibration, truth)
         err.print("Sampling the posterior, couplings, attitude error, then questioning the model ...")
         _after_calibration(run, ahead, SamplingSettings(seed=seed))
+    _conclude(run)
 
 
 def run_command(
@@ -112,32 +116,49 @@ def run_command(
     """Calibrate, sample, couple, propagate, budget and report: all from stars or images to RUN/report.html."""
     from starcal_uq.pipeline.images import are_images
 
-    run = sc.Run(out)
-    check_new_folder(out, force)
+    run = sc.Run(out, tell=note)
     if budget is not None:
         # A mistake in it should not show after the work.
         sc.budgeting.load_budget_file(budget)
     folder = len(inputs) == 1 and inputs[0].is_dir() and any(inputs[0].glob("*.parquet"))
     from_images = not folder and are_images(inputs)
     refuse_others(from_images, sky, images)
+    if len(inputs) > 1 and not from_images:
+        raise typer.BadParameter(f"{inputs[1]} is no image: give one table of observations, or images only.")
+    aligning = {"alignment": alignment, "alignment_frames": alignment_frames}
+    settings = {"estimation": estimation, "sky": sky, "images": images, "sampling": sampling, "draws": draws}
+    files = {f"input {number}": path for number, path in enumerate(inputs)} | {"camera": camera}
+    command = command_of("run", settings | aligning | {"budget": budget}, files)
+    with run.making(command, force=force), Ahead() as ahead:
+        if not (run.did("calibrate") and (run.did("images") or not from_images)):
+            _calibrate(run, inputs, camera, from_images, estimation, sky, images)
+        show_calibration(run.calibration, run.truth)
+        warn_air(run.observations, run.calibration)
+        _after_calibration(run, ahead, sampling, draws, budget, show=True, **aligning)
+    _conclude(run)
+
+
+def _calibrate(
+    run: Run,
+    inputs: list[Path],
+    camera: Path,
+    from_images: bool,
+    estimation: EstimationSettings,
+    sky: SkySettings,
+    images: ImageSettings,
+) -> None:
+    """From the inputs to a calibration, with a bar."""
     obs: Observations | PartitionedObservations
     if from_images:
         obs, nominal, centroids, identified = load_images(inputs, camera, images, sky)
-    elif len(inputs) == 1:
-        obs, nominal = load_table(inputs[0], camera, sky)
     else:
-        raise typer.BadParameter(f"{inputs[1]} is no image: give one table of observations, or images only.")
-    with Ahead() as ahead:
-        with progress_bar("passes over the files") as progress:
-            calibration = run.calibrate(obs, nominal, force=force, progress=progress, **estimation.options())
-        if from_images:
-            run.keep_images(centroids, identified)
-        if run.screening is not None:
-            show_screening(run.screening)
-        show_calibration(calibration, run.truth)
-        warn_air(obs, calibration)
-        aligning = {"alignment": alignment, "alignment_frames": alignment_frames}
-        _after_calibration(run, ahead, sampling, draws, budget, show=True, **aligning)
+        obs, nominal = load_table(inputs[0], camera, sky)
+    with progress_bar("passes over the files") as progress:
+        run.calibrate(obs, nominal, progress=progress, **estimation.options())
+    if from_images:
+        run.keep_images(centroids, identified)
+    if run.screening is not None:
+        show_screening(run.screening)
 
 
 @one_thread()
@@ -151,24 +172,33 @@ def _after_calibration(
     show: bool = False,
     **aligning: Any,
 ) -> None:
-    """Sample, couple, propagate, question the model, budget, report; status 1 when a check or a requirement failed."""
+    """Sample, couple, propagate, question the model, budget, report: what is not done yet."""
     ahead.draw(run.calibrated, AFTER_CALIBRATION)
-    posterior = sample_run(run, sampling, force=True)
+    if not run.did("sample"):
+        sample_run(run, sampling, force=False)
     ahead.draw(run.results, AFTER_SAMPLING)
-    run.couple()
-    run.propagate(n_draws=draws, seed=sampling.seed, **aligning)
+    if not run.did("coupling"):
+        run.couple()
+    if not run.did("propagate"):
+        run.propagate(n_draws=draws, seed=sampling.seed, **aligning)
     if show:
-        show_posterior(posterior)
-    with progress_bar("diagnosis") as progress:
-        run.diagnose(seed=sampling.seed, progress=progress)
+        show_posterior(run.posterior)
+    if not run.did("diagnose"):
+        with progress_bar("diagnosis") as progress:
+            run.diagnose(seed=sampling.seed, progress=progress)
     ahead.draw(run.results, AFTER_DIAGNOSIS)
     if show:
         show_attitude(run.attitude)
-    made = run.budget(file=budget, seed=sampling.seed)
+    if not run.did("budget"):
+        run.budget(file=budget, seed=sampling.seed)
     if show:
-        show_budget(made)
-    report = run.report(ahead.figures())
+        show_budget(run.error_budget)
+    run.report(ahead.figures())
+
+
+def _conclude(run: Run) -> None:
+    """Verdict and place of the report; status 1 when a check or a requirement failed."""
     show_verdict(run.verdict)
-    print(f"Report: {report.resolve()}")
-    fail_if_violated(made)
+    print(f"Report: {run.report().resolve()}")
+    fail_if_violated(run.error_budget)
     end_with(run.verdict.level)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
-from dataclasses import astuple, dataclass, fields, is_dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, astuple, dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
@@ -204,6 +204,20 @@ def refuse_others(images: bool, sky: SkySettings, of_images: ImageSettings) -> N
     for name, value in given.items():
         if value not in (None, []):
             raise typer.BadParameter(f"--{name.replace('_', '-')} belongs to {kind}: leave it out.")
+
+
+def command_of(name: str, settings: Mapping[str, Any], files: Mapping[str, Path]) -> AnyDict:
+    """All that the result of a command depends on: what it was told, and hashes of the files that it reads."""
+    from starcal_uq.runs.manifest import identity
+
+    told: AnyDict = {}
+    for key, value in settings.items():
+        given = asdict(value) if is_dataclass(value) and not isinstance(value, type) else {key: value}
+        told |= {key: str(content) if isinstance(content, Path) else content for key, content in given.items()}
+        files = {**files, **{name: content for name, content in given.items() if isinstance(content, Path)}}
+    aligned = Path(str(settings.get("alignment")))
+    files = {**files, "alignment": aligned} if aligned.is_file() else files
+    return {"command": name, "settings": told, "inputs": identity(files)}
 
 
 def unfolded(command: Callable[..., None]) -> Callable[..., None]:

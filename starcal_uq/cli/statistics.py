@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 import starcal_uq as sc
+from starcal_uq.cli.console import note, print_json, print_table, progress_bar, records, show_calibration
 from starcal_uq.cli.console import out as console
-from starcal_uq.cli.console import print_json, print_table, progress_bar, records, show_calibration
 from starcal_uq.cli.options import (
     LEAST_SIGMA_PX,
     CameraFile,
@@ -93,6 +93,7 @@ def diagnose_command(
     run: RunPath,
     starts: Annotated[int, number("n_starts", "Fits from other starts.")] = 5,
     seed: Seed = 0,
+    force: Force = False,
     json: Json = False,
 ) -> None:
     """Question the model: misfit, jackknife, other distortion models, predictive checks, other starts."""
@@ -105,7 +106,7 @@ def diagnose_command(
     )
 
     with progress_bar("diagnosis") as progress:
-        found = sc.Run(run).diagnose(n_starts=starts, seed=seed, progress=progress)
+        found = sc.Run(run, tell=note).diagnose(n_starts=starts, seed=seed, force=force, progress=progress)
     parts = {
         "Misfit": found.misfit,
         "Jackknife over frames": found.jackknife,

@@ -12,6 +12,7 @@ import starcal_uq as sc
 from starcal_uq.cli.console import (
     end_with,
     err,
+    note,
     print_json,
     progress_bar,
     records,
@@ -194,7 +195,7 @@ def calibrate_command(
     json: Json = False,
 ) -> None:
     """Estimate optics and distortion: three stages and refinement, with covariance."""
-    run = sc.Run(out)
+    run = sc.Run(out, tell=note)
     check_new_folder(out, force)
     obs, nominal = load_table(observations, camera, sky)
     with progress_bar("passes over the files") as progress:
@@ -211,7 +212,7 @@ def calibrate_command(
 
 def sample_command(run: RunPath, sampling: SamplingSettings, force: Force = False, json: Json = False) -> None:
     """Sample the posterior with emcee from the calibration; an interrupted command goes on where it stopped."""
-    posterior = sample_run(sc.Run(run), sampling, force=force)
+    posterior = sample_run(sc.Run(run, tell=note), sampling, force=force)
     if json:
         print_json({"ok": posterior.diagnostics.ok, "parameters": records(posterior.summary())})
     else:
@@ -230,9 +231,9 @@ def sample_run(run: Run, sampling: SamplingSettings, *, force: bool) -> Posterio
     return posterior
 
 
-def coupling_command(run: RunPath, json: Json = False) -> None:
+def coupling_command(run: RunPath, force: Force = False, json: Json = False) -> None:
     """Correlations, variance inflation, weak directions and the principal point's near-gauge with the boresight."""
-    coupling = sc.Run(run).couple()
+    coupling = sc.Run(run, tell=note).couple(force=force)
     if json:
         words = [direction.words for direction in coupling.weak_directions]
         print_json({"parameters": records(coupling.to_dataframe()), "directions": words})
@@ -268,6 +269,7 @@ def propagate_command(
     alignment_frames: AlignmentFrames = None,
     draws: Draws = 300,
     seed: Seed = 0,
+    force: Force = False,
     json: Json = False,
 ) -> None:
     """Attitude error that the calibration contributes, through QUEST: common rotation, the rest, and centroid noise."""
@@ -286,11 +288,8 @@ def propagate_command(
     if sky is None and (rate is not None or scalar is not None):
         raise typer.BadParameter("--rate and --scalar belong to an attitude profile: give --attitudes FILE.")
 
-    def tell(message: str) -> None:
-        err.print(f"note: {message}", style="yellow", highlight=False, soft_wrap=True)
-
-    error, _, spectrum = sc.Run(run).propagate(
-        n_draws=draws, seed=seed, sky=sky, alignment=alignment, alignment_frames=alignment_frames, tell=tell
+    error, _, spectrum = sc.Run(run, tell=note).propagate(
+        n_draws=draws, seed=seed, sky=sky, alignment=alignment, alignment_frames=alignment_frames, force=force
     )
     if json:
         document = {
@@ -306,6 +305,6 @@ def propagate_command(
         console.print(spectrum.text, highlight=False, soft_wrap=True)
 
 
-def report_command(run: RunPath) -> None:
+def report_command(run: RunPath, force: Force = False) -> None:
     """Write RUN/report.html, one self-contained file, from whatever the run holds."""
-    print(f"Report: {sc.Run(run).report().resolve()}")
+    print(f"Report: {sc.Run(run, tell=note).report(force=force).resolve()}")

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from pyarrow.parquet import ParquetFile
 
 PathLike = str | os.PathLike[str]
+# Names of files that are being written; a killed process leaves them.
+TEMPORARY = re.compile(r"\.[0-9a-f]{16}\.tmp")
 
 
 def ensure_new(path: PathLike, force: bool = False) -> None:
@@ -51,7 +53,7 @@ def check_new_folder(path: PathLike, force: bool = False) -> None:
     path = Path(path)
     if path.exists() and not path.is_dir():
         raise RunFolderError(f"{path}: is a file, not a folder for results; name another folder.")
-    if path.is_dir() and any(path.iterdir()) and not force:
+    if path.is_dir() and not force and any(not TEMPORARY.match(inside.name) for inside in path.iterdir()):
         raise RunFolderError(
             f"{path}: the folder exists and is not empty; name another, or replace its results with --force."
         )
@@ -68,10 +70,11 @@ def new_folder(path: PathLike) -> Path:
 
 
 @contextmanager
-def atomic_path(path: PathLike) -> Iterator[Path]:
+def atomic_path(path: PathLike, *, durable: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside `path`, and rename it to `path` if the block succeeds; if not, `path` is as it was.
 
-    The temporary name keeps the ending, because many writers choose the format by it.
+    The temporary name keeps the ending, because many writers choose the format by it. What is `durable` is on the disk
+    before it is renamed, so that a loss of power, too, leaves the old file or the new one.
 
     Raises
     ------
@@ -87,6 +90,9 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
     temporary = target.parent / f".{secrets.token_hex(8)}.tmp{target.suffix}"
     try:
         yield temporary
+        if durable:
+            with open(temporary, "rb+") as file:
+                os.fsync(file.fileno())
         os.replace(temporary, target)
     except OSError as error:
         reason = error.strerror or str(error)
@@ -97,6 +103,17 @@ def atomic_path(path: PathLike) -> Iterator[Path]:
         # Asked first: in a folder that may not be searched, unlink would raise and hide the reason.
         if os.path.lexists(temporary):
             temporary.unlink()
+
+
+def flush_folder(path: PathLike) -> None:
+    """Have the names in a folder on the disk, where the system can."""
+    if os.name != "posix":
+        return
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def atomic_write_bytes(path: PathLike, data: bytes) -> None:

@@ -101,13 +101,13 @@ def run_ensembles(
     """Run one ensemble per seed, each from its own draws of the Laplace approximation.
 
     `density` takes whitened points (n, dim). The checkpoint is rewritten while sampling and read at the start; a
-    resumed run gives the same draws, bit for bit, as one that was not interrupted. It is left in place, and refused
+    resumed run gives the same draws, bit for bit, as one that was not interrupted. It is left in place, and passed over
     where the `fingerprint` of data and settings is another. `moves` stand in for those of the settings.
 
     Raises
     ------
     SamplingError
-        If a start is not finite or the checkpoint belongs to another run.
+        If a start is not finite.
     """
     import emcee
 
@@ -205,7 +205,7 @@ class _Store:
 
     def _write(self, path: str | os.PathLike[str]) -> None:
         _, key, position, has_gauss, gauss = self.state.random_state
-        with atomic_path(path) as temporary, open(temporary, "wb") as file:
+        with atomic_path(path, durable=False) as temporary, open(temporary, "wb") as file:
             np.savez(
                 file,
                 fingerprint=np.array(self._fingerprint),
@@ -224,22 +224,24 @@ class _Store:
     def _read(self, path: str | os.PathLike[str]) -> None:
         import emcee
 
-        with reading(path, "a checkpoint of sampling", "delete it", SamplingError):
-            content = read_arrays(path)
-            if str(content["fingerprint"]) != self._fingerprint:
-                raise SamplingError(
-                    f"{path}: the checkpoint was made with other data or settings; delete it, or repeat its settings."
-                )
-            shapes = {"u": self._u.shape, "log_density": self._log_density.shape, "accepted": self._accepted.shape}
-            n_walkers, dim = self._u.shape[2:]
-            shapes |= {"coords": (n_walkers, dim), "log_prob": (n_walkers,), "place": (2,), "rest": (2,), "gauss": ()}
-            for name, shape in shapes.items():
-                if content[name].shape != shape or not np.isfinite(content[name]).all():
-                    raise ValueError(f"{name} does not hold what it should")
-            position, has_gauss = (int(v) for v in content["rest"])
-            random_state = ("MT19937", content["key"], position, has_gauss, float(content["gauss"]))
-            np.random.RandomState(0).set_state(random_state)
-            self.state = emcee.State(content["coords"], log_prob=content["log_prob"], random_state=random_state)
-            self._u, self._log_density = content["u"], content["log_density"]
-            self._accepted = content["accepted"]
-            self.ensemble, self.step = (int(v) for v in content["place"])
+        try:
+            with reading(path, "a checkpoint of sampling", "delete it", SamplingError):
+                content = read_arrays(path)
+                if str(content["fingerprint"]) != self._fingerprint:
+                    return
+                shapes = {"u": self._u.shape, "log_density": self._log_density.shape, "accepted": self._accepted.shape}
+                n_walkers, dim = self._u.shape[2:]
+                shapes |= {"coords": (n_walkers, dim), "log_prob": (n_walkers,), "place": (2,), "rest": (2,)}
+                for name, shape in (shapes | {"gauss": ()}).items():
+                    if content[name].shape != shape or not np.isfinite(content[name]).all():
+                        raise ValueError(f"{name} does not hold what it should")
+                position, has_gauss = (int(v) for v in content["rest"])
+                random_state = ("MT19937", content["key"], position, has_gauss, float(content["gauss"]))
+                np.random.RandomState(0).set_state(random_state)
+        except SamplingError:
+            # What cannot be gone on with is made again.
+            return
+        self.state = emcee.State(content["coords"], log_prob=content["log_prob"], random_state=random_state)
+        self._u, self._log_density = content["u"], content["log_density"]
+        self._accepted = content["accepted"]
+        self.ensemble, self.step = (int(v) for v in content["place"])

@@ -10,6 +10,7 @@ import json
 import os
 from dataclasses import dataclass
 from functools import cached_property
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -20,7 +21,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import Parameter, parameters, sigma_parameter
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import atomic_path, check_hdf5, ensure_new, reading
+from starcal_uq.core.files import atomic_write_bytes, check_hdf5, ensure_new, reading
 from starcal_uq.core.records import Arrays, from_plain, to_plain
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.status import Check, Level, worst
@@ -390,11 +391,14 @@ class Posterior(Shown):
         text = json.dumps({name: record[name] for name in _RECORD})
         attrs = {"format": _FORMAT, "record": text, "sha256": _sha256(text, arrays)}
         # xarray would do it, but loads Dask for a lock, which takes longer than sampling.
-        with atomic_path(path) as temporary, h5netcdf.File(temporary, "w") as file:
+        # In memory first: on a full disk the HDF5 library ends the process without a word.
+        content = BytesIO()
+        with h5netcdf.File(content, "w") as file:
             _write(file, {name: (_ARRAYS[name], value, {}) for name, value in arrays.items()}, attrs)
             for group, (variables, coords, about) in self._groups().items():
                 dimensions: Variables = {name: ((name,), values, {}) for name, values in coords.items()}
                 _write(file.create_group(group), dimensions | variables, about)
+        atomic_write_bytes(path, content.getvalue())
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Posterior:

@@ -114,8 +114,8 @@ def sample(
     progress : callable, optional
         Called as ``progress(steps_done, steps_total)``; starts again if the exact likelihood takes over.
     checkpoint : path, optional
-        Written while sampling, read if it exists, removed at the end. A resumed run gives the draws of an uninterrupted
-        one, bit for bit.
+        Written while sampling, read if it exists and is of the same data and settings, removed at the end. A resumed
+        run gives the draws of an uninterrupted one, bit for bit.
 
     Returns
     -------
@@ -124,7 +124,7 @@ def sample(
     Raises
     ------
     SamplingError
-        For settings that cannot work, a calibration that is not sound, or a checkpoint of another run.
+        For settings that cannot work, or a calibration that is not sound.
     """
     settings = _settings(n_ensembles, n_walkers, n_steps, n_burn, moves, sigma, cal)
     obs = None if obs is None else weighed(obs, cal)

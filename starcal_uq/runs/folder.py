@@ -1,26 +1,46 @@
-"""The run folder: its file names, atomic writes, and the provenance stored with every result.
+"""The run folder: its file names, the rule by which steps replace results, and the check that a file is of this run.
 
-A file is written under a temporary name in its own folder and then renamed, so that a killed run leaves
-either the old file or the new one, never half of one.
+The rule. What a run holds is kept unless it is forced to go. A step that is done again removes what rests on its
+result, and names it first. All files of a step are replaced at once; files that the run has not written are left alone.
 """
 
 from __future__ import annotations
 
+import json
 import os
-from dataclasses import dataclass
+import shutil
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import PathLike, new_folder
+from starcal_uq.core.files import PathLike, as_plain, check_new_folder, new_folder
+from starcal_uq.core.types import AnyDict
+from starcal_uq.runs.manifest import (
+    MANIFEST,
+    NEW,
+    STEP,
+    Entry,
+    Manifest,
+    alone,
+    check_file,
+    commit,
+    discard,
+    entry_of,
+    read_manifest,
+    sweep,
+    write_manifest,
+)
 
-_CALIBRATE = "run `starcal-uq calibrate OBS CAMERA -o RUN` first"
+_CALIBRATE = "starcal-uq calibrate OBS CAMERA -o RUN"
 
 
 class _File:
-    """A file of a run folder: its name, and the command that makes it."""
+    """A file of a run folder: its name, the command that makes it, and the step that it belongs to."""
 
-    def __init__(self, name: str, remedy: str) -> None:
-        self.name, self.remedy = name, remedy
+    def __init__(self, name: str, command: str) -> None:
+        self.name, self.command, self.step = name, command, command.split()[1]
 
     def __get__(self, folder: RunFolder | None, _: type) -> Path:
         return Path(self.name) if folder is None else folder.path / self.name
@@ -34,10 +54,25 @@ DIAGNOSIS_TABLES = {
     "comparison": "comparison.csv",
     "predictive": "predictive.csv",
 }
-
-# Files that rest on the draws, and all files that rest on the calibration, which is among them.
-DERIVED = ("coupling", "attitude", "mission", "alignment", "field_map", "spectrum", "budget", "report")
-RESULTS = ("observations", "camera", "calibration", "arrays", "posterior", "rejected", "diagnosis", *DERIVED)
+HISTORY = "history.csv"
+CHECKPOINT = "sampling.checkpoint.npz"
+# Step -> steps that rest on its result.
+REST_ON: dict[str, tuple[str, ...]] = {
+    "calibrate": ("images", "sample", "coupling", "propagate", "diagnose", "budget", "report"),
+    "images": ("report",),
+    "sample": ("coupling", "propagate", "budget", "report"),
+    "coupling": ("report",),
+    "propagate": ("budget", "report"),
+    "diagnose": ("budget", "report"),
+    "budget": ("report",),
+    "report": (),
+}
+# Files that have no name of their own in a run.
+_OTHERS = {
+    **dict.fromkeys(DIAGNOSIS_TABLES.values(), "diagnose"),
+    **dict.fromkeys(("centroids.parquet", "identification.csv", "images.json"), "images"),
+    HISTORY: "calibrate",
+}
 
 
 @dataclass(frozen=True)
@@ -88,18 +123,18 @@ class RunFolder:
     camera = _File("camera.toml", _CALIBRATE)
     calibration = _File("calibration.json", _CALIBRATE)
     arrays = _File("calibration.npz", _CALIBRATE)
-    posterior = _File("posterior.nc", "run `starcal-uq sample RUN` first")
-    coupling = _File("coupling.csv", "run `starcal-uq coupling RUN` first")
-    attitude = _File("attitude.csv", "run `starcal-uq propagate RUN` first")
-    mission = _File("mission_frames.parquet", "run `starcal-uq propagate RUN --attitudes random` first")
-    alignment = _File("alignment_frames.parquet", "run `starcal-uq propagate RUN` first")
-    field_map = _File("field_map.npz", "run `starcal-uq propagate RUN` first")
-    spectrum = _File("error_spectrum.npz", "run `starcal-uq propagate RUN --attitudes PROFILE` first")
-    budget = _File("budget.csv", "run `starcal-uq budget RUN` first")
-    diagnosis = _File("diagnosis.json", "run `starcal-uq diagnose RUN` first")
-    rejected = _File("rejected.csv", "run `starcal-uq calibrate OBS CAMERA -o RUN --screen` first")
-    figures = _File("figures", "run `starcal-uq report RUN` first")
-    report = _File("report.html", "run `starcal-uq report RUN` first")
+    posterior = _File("posterior.nc", "starcal-uq sample RUN")
+    coupling = _File("coupling.csv", "starcal-uq coupling RUN")
+    attitude = _File("attitude.csv", "starcal-uq propagate RUN")
+    mission = _File("mission_frames.parquet", "starcal-uq propagate RUN --attitudes random")
+    alignment = _File("alignment_frames.parquet", "starcal-uq propagate RUN")
+    field_map = _File("field_map.npz", "starcal-uq propagate RUN")
+    spectrum = _File("error_spectrum.npz", "starcal-uq propagate RUN --attitudes PROFILE")
+    budget = _File("budget.csv", "starcal-uq budget RUN")
+    diagnosis = _File("diagnosis.json", "starcal-uq diagnose RUN")
+    rejected = _File("rejected.csv", f"{_CALIBRATE} --screen")
+    figures = _File("figures", "starcal-uq report RUN")
+    report = _File("report.html", "starcal-uq report RUN")
 
     def __init__(self, path: PathLike) -> None:
         object.__setattr__(self, "path", Path(path))
@@ -116,24 +151,157 @@ class RunFolder:
         return self
 
     def require(self, name: str) -> Path:
-        """Path of a file that must exist, such as ``"calibration"``.
+        """Path of a file that must exist and be of this run, such as ``"calibration"``.
 
         Raises
         ------
         RunFolderError
-            If the folder or the file is missing; the message names the command that makes it.
+            If the folder or the file is missing, or the file is not the one that the run has written; the message names
+            the command that makes it.
         ValueError
             If a run folder has no file of that name.
         """
-        files = {key: value for key, value in vars(RunFolder).items() if isinstance(value, _File)}
-        if name not in files:
-            raise ValueError(f"a run folder has no {name!r}: use one of {', '.join(files)}")
+        if name not in FILES:
+            raise ValueError(f"a run folder has no {name!r}: use one of {', '.join(FILES)}")
+        file = FILES[name]
         if os.path.exists(self.path) and not os.path.isdir(self.path):
             raise RunFolderError(f"{self.path}: is not a run folder but a file; name the folder given to -o.")
-        file_name, remedy = files[name].name, files[name].remedy
         if not os.path.isdir(self.path):
-            raise RunFolderError(f"{self.path}: the run folder does not exist; check the path, or {remedy}.")
-        path = self.path / file_name
+            raise RunFolderError(
+                f"{self.path}: the run folder does not exist; check the path, or run `{file.command}` first."
+            )
+        # Read first: it may have files to put in their places.
+        manifest = read_manifest(self.path)
+        path = self.path / file.name
         if not os.path.exists(path):
-            raise RunFolderError(f"{self.path}: the run folder has no {file_name}; {remedy}.")
+            raise RunFolderError(f"{self.path}: the run folder has no {file.name}; run `{file.command}` first.")
+        # Folders of versions before this one have no record.
+        if manifest is not None:
+            check_file(path, manifest.files.get(file.name), f"run `{file.command} --force` to make it again")
         return path
+
+    @property
+    def manifest(self) -> Manifest:
+        """What the run holds; of a folder made by a version without records, the files by their names."""
+        found = read_manifest(self.path)
+        if found is not None:
+            return found
+        if not (os.path.exists(self.calibration) or os.path.exists(self.posterior)):
+            return Manifest()
+        steps = {file.name: file.step for file in FILES.values()} | _OTHERS
+        steps |= {path.relative_to(self.path).as_posix(): "report" for path in self.figures.glob("*.png")}
+        files = {name: entry_of(self.path / name, steps[name]) for name in steps if (self.path / name).is_file()}
+        return Manifest(files, {entry.step: {} for entry in files.values()})
+
+    def resting_on(self, step: str) -> list[str]:
+        """Files that go when a step is done again, because they rest on its result."""
+        return [name for name, entry in self.manifest.files.items() if entry.step in REST_ON[step]]
+
+    @contextmanager
+    def step(
+        self, step: str, record: AnyDict, *, making: bool = False, tell: Callable[[str], None] | None = None
+    ) -> Iterator[RunFolder]:
+        """Yield a folder for the files of a step, which take their places all at once if the block succeeds.
+
+        Parameters
+        ----------
+        step : str
+            Name of the step.
+        record : dict
+            Its provenance.
+        making : bool
+            Whether it belongs to the command that makes the whole run; a step of its own ends what that had begun.
+        tell : callable, optional
+            Function that gets the sentence on what goes.
+        """
+        old = self.create().manifest
+        sweep(self.path)
+        stage = RunFolder(self.path / STEP).create()
+        try:
+            yield stage
+            made: dict[str, Entry] = {}
+            for path in sorted(path for path in stage.path.rglob("*") if path.is_file()):
+                name = path.relative_to(stage.path).as_posix()
+                # A file of another step that this one has changed stays a file of that step.
+                made[name] = entry_of(path, old.files[name].step if name in old.files else step)
+            stale = (step, *REST_ON[step])
+            kept = {name: entry for name, entry in old.files.items() if entry.step not in stale}
+            gone = [name for name in self.resting_on(step) if name not in made]
+            if gone and tell is not None:
+                tell(_gone(gone, self.path))
+            if step == "calibrate":
+                remove_checkpoints(self.path)
+                shutil.rmtree(self.path / NEW, ignore_errors=True)
+            steps = {name: content for name, content in old.steps.items() if name not in stale} | {step: record}
+            new = replace(old, files=kept | made, steps=steps, stage=STEP)
+            if not making:
+                new = replace(new, command=None, complete=True)
+            commit(self.path, new, old.files)
+        finally:
+            discard(self.path, STEP)
+
+    @contextmanager
+    def making(self, command: Mapping[str, object], force: bool) -> Iterator[RunFolder]:
+        """Yield the folder in which one command makes a whole run, which goes on where it was interrupted.
+
+        That is this folder. Where it holds another run, it is a hidden one inside, whose files take their places all at
+        once when the run is complete; an error, a kill or a full disk leaves the run of before.
+
+        Parameters
+        ----------
+        command : mapping
+            All that the run depends on; an unfinished one of something else is not gone on with.
+        force : bool
+            Whether to replace a run that is complete.
+        """
+        wanted = json.loads(json.dumps(command, default=as_plain, sort_keys=True))
+        old = self.manifest
+        if old.complete:
+            check_new_folder(self.path, force)
+        place = self.create()
+        if old.files and (old.complete or old.command != wanted):
+            place = RunFolder(self.path / NEW).create()
+        with alone(self.path):
+            present = place.manifest
+            if present.complete or present.command != wanted:
+                if place != self:
+                    shutil.rmtree(place.path)
+                    place.create()
+                write_manifest(place.path, Manifest(command=wanted, complete=False))
+            sweep(place.path)
+            try:
+                yield place
+            except BaseException:
+                if not place.manifest.steps:
+                    _unmake(place.path)
+                raise
+            done = replace(place.manifest, complete=True)
+            if place == self:
+                write_manifest(self.path, done)
+            else:
+                commit(self.path, replace(done, stage=NEW), old.files)
+
+
+FILES = {key: value for key, value in vars(RunFolder).items() if isinstance(value, _File)}
+
+
+def remove_checkpoints(folder: Path) -> None:
+    """Remove what sampling has kept on its way."""
+    for path in folder.glob(f"{CHECKPOINT}*"):
+        path.unlink(missing_ok=True)
+
+
+def _unmake(folder: Path) -> None:
+    """Leave nothing of a run that has not come to its first result."""
+    remove_checkpoints(folder)
+    (folder / MANIFEST).unlink(missing_ok=True)
+    if not any(folder.iterdir()):
+        folder.rmdir()
+
+
+def _gone(names: list[str], folder: Path) -> str:
+    """What goes, and how to make it again."""
+    shown = [name for name in names if not name.startswith("figures/")]
+    commands = dict.fromkeys(file.command for file in FILES.values() if file.name in shown)
+    again = ", ".join(f"`{command.replace('RUN', str(folder), 1)}`" for command in commands)
+    return f"{', '.join(shown)}: removed, because it rested on what is replaced; run {again} to make it again."

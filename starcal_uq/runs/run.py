@@ -1,12 +1,12 @@
 """A run: the results in a folder, each loaded once, and the steps that add to them.
 
-A step takes results and gives one, and writes it. What rests on a result of before (couplings, attitude error, report)
-is removed when a step is done again, so that a folder never mixes two runs.
+A step takes results and gives one, and writes it. `RunFolder` has the rule by which it replaces what was there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -20,11 +20,12 @@ from starcal_uq.core.files import (
     atomic_write_bytes,
     atomic_write_text,
     check_new_folder,
-    ensure_new,
+    new_folder,
     read_parquet,
     reading,
     write_csv,
 )
+from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import Progress
 from starcal_uq.estimation.calibration import Calibration
@@ -33,9 +34,11 @@ from starcal_uq.observations.files import arrow_values
 from starcal_uq.observations.partitions import PartitionedObservations
 from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.presentation.report.results import Missing, Results
-from starcal_uq.runs.folder import DERIVED, DIAGNOSIS_TABLES, RESULTS, RunFolder
+from starcal_uq.runs.folder import CHECKPOINT, DIAGNOSIS_TABLES, FILES, HISTORY, REST_ON, RunFolder, remove_checkpoints
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from starcal_uq.budgeting.file import BudgetFile
     from starcal_uq.budgeting.result import Budget
     from starcal_uq.core.settings import Scalar, Sense
@@ -113,27 +116,28 @@ class Run:
         The folder, which need not exist before the first step.
     truth : Camera, optional
         The camera of a simulation, shown beside the estimate; that of the observations by default.
+    tell : callable, optional
+        Function that gets what a user should know, one sentence each, such as which results go.
 
     Attributes
     ----------
+    path : Path
+        The folder.
     folder : RunFolder
-        The folder and the paths of its files.
+        The folder and the paths of its files; a hidden one inside, while a command makes a run to replace this one.
     screening : Screening or None
         What the last `calibrate` of this object left out, if it screened.
     """
 
-    def __init__(self, path: PathLike, truth: Camera | None = None) -> None:
-        self.folder = RunFolder(path)
-        self._truth = truth
+    def __init__(
+        self, path: PathLike, truth: Camera | None = None, *, tell: Callable[[str], None] | None = None
+    ) -> None:
+        self.path, self.folder = Path(path), RunFolder(path)
+        self._truth, self._tell, self._making = truth, tell, False
         self.screening: Screening | None = None
 
     def __repr__(self) -> str:
-        return f"Run({str(self.folder.path)!r})"
-
-    @property
-    def path(self) -> Path:
-        """The folder."""
-        return self.folder.path
+        return f"Run({str(self.path)!r})"
 
     @property
     def name(self) -> str:
@@ -148,6 +152,7 @@ class Run:
     @cached_property
     def calibration(self) -> Calibration:
         """The estimate."""
+        self.folder.require("arrays")
         return Calibration.load(self.folder.require("calibration"))
 
     @cached_property
@@ -221,10 +226,9 @@ class Run:
         """
         from starcal_uq.diagnostics.diagnose import Diagnosis
 
-        path = self.folder.diagnosis
-        if not path.exists():
+        if not self.has("diagnosis"):
             return None
-        stored = Diagnosis.load(path)
+        stored = Diagnosis.load(self.folder.require("diagnosis"))
         return stored if stored.is_of(self.calibration) else None
 
     @cached_property
@@ -239,7 +243,7 @@ class Run:
         """What became of the images that the run started from; None where it started from a table."""
         from starcal_uq.pipeline.record import IMAGES, ImageRecord
 
-        path = self.path / IMAGES
+        path = self.folder.path / IMAGES
         return ImageRecord.load(path) if path.exists() else None
 
     @property
@@ -307,6 +311,45 @@ class Run:
         path: Path = getattr(self.folder, name)
         return path.exists()
 
+    def did(self, step: str) -> bool:
+        """Whether a step is done, such as ``"sample"``."""
+        return step in self.folder.manifest.steps
+
+    @contextmanager
+    def making(self, command: Mapping[str, object], *, force: bool = False) -> Iterator[None]:
+        """All steps within the block make one run, which replaces that of before when it is complete, and not sooner.
+
+        An interrupted one goes on where it was: steps that are done, `did`, need not be done again.
+
+        Parameters
+        ----------
+        command : mapping
+            All that the run depends on; an unfinished one of something else starts again.
+        force : bool
+            Whether to replace a run that is complete.
+        """
+        record = {**command, "versions": provenance(None, {}, None)["versions"]}
+        here = self.folder
+        try:
+            with here.making(record, force) as self.folder:
+                self._making = True
+                if self.folder == here:
+                    self._forget(*_LOADED)
+                yield
+        except BaseException:
+            self._forget(*_LOADED)
+            raise
+        finally:
+            self.folder, self._making = here, False
+
+    @contextmanager
+    def _step(self, step: str, seed: int | None, settings: Mapping[str, Any]) -> Iterator[RunFolder]:
+        record = provenance(seed, {name: as_setting(value) for name, value in settings.items()}, None)
+        with self.folder.step(step, record, making=self._making, tell=self._tell) as files:
+            yield files
+        if "report" in REST_ON[step]:
+            self._forget(*(["error_budget"] if "budget" in REST_ON[step] else []))
+
     def calibrate(
         self,
         obs: Observations | PartitionedObservations,
@@ -361,33 +404,46 @@ class Run:
                 obs = obs.sample()
             elif calibration.n_frames < obs.n_frames:
                 obs = obs.select_frames(calibration.frame_ids)
-        check_new_folder(self.path, force)
-        self.write(calibration, obs)
-        if screened is not None:
-            screened.save_rejected(self.folder.rejected, force=True)
-        self.screening = screened
+        if not self._making:
+            check_new_folder(self.path, force)
+        self.write(calibration, obs, screened)
         return calibration
 
-    def write(self, calibration: Calibration, obs: Observations | None) -> None:
-        """Write a calibration with its nominal camera and its observations, if there are any; all else is removed."""
-        self._remove(RESULTS)
-        self.folder.create()
+    def write(
+        self,
+        calibration: Calibration,
+        obs: Observations | None,
+        screened: Screening | None = None,
+        history: pd.DataFrame | None = None,
+    ) -> None:
+        """Write a calibration with its nominal camera, and with observations and more where there are any.
+
+        Whatever the run has written before goes.
+        """
+        with self._step("calibrate", None, calibration.provenance.get("settings", {})) as files:
+            if obs is not None:
+                obs = weighed(obs, calibration)
+                obs.unweighted.save(files.observations)
+            calibration.nominal.save(files.camera)
+            calibration.save(files.calibration)
+            if screened is not None:
+                screened.save_rejected(files.rejected)
+            if history is not None:
+                write_csv(history, files.path / HISTORY)
+        self._forget(*_LOADED)
         if obs is not None:
-            obs = weighed(obs, calibration)
-            obs.unweighted.save(self.folder.observations, force=True)
             self.observations = obs
-        calibration.nominal.save(self.folder.camera, force=True)
-        calibration.save(self.folder.calibration)
-        self.camera, self.calibration = calibration.nominal, calibration
+        self.camera, self.calibration, self.screening = calibration.nominal, calibration, screened
 
     def keep_images(self, centroids: Centroids, images: ImageCalibration) -> None:
         """Keep the centroids and the record of every image that the run started from."""
         from starcal_uq.pipeline.images import CENTROIDS, IDENTIFICATION
         from starcal_uq.pipeline.record import IMAGES, record_images
 
-        centroids.save(self.path / CENTROIDS, force=True)
-        record_images(centroids, images).save(self.path / IMAGES)
-        write_csv(images.identification.to_dataframe(), self.path / IDENTIFICATION)
+        with self._step("images", None, {}) as files:
+            centroids.save(files.path / CENTROIDS)
+            record_images(centroids, images).save(files.path / IMAGES)
+            write_csv(images.identification.to_dataframe(), files.path / IDENTIFICATION)
         self._forget("images")
 
     def sample(self, *, force: bool = False, progress: Progress | None = None, **options: Any) -> Posterior:
@@ -402,22 +458,31 @@ class Run:
         """
         from starcal_uq.inference.sample import sample
 
+        self._keep("posterior", force)
         obs = self.observations if self._keeps_observations else None
-        ensure_new(self.folder.posterior, force)
         if options.get("likelihood") is None:
             # A calibration knows which likelihood its estimate maximises.
             options["likelihood"] = self.calibration.provenance.get("settings", {}).get("likelihood", "marginal")
-        checkpoint = self.path / "sampling.checkpoint.npz"
+        checkpoint = self.folder.path / CHECKPOINT
         posterior = sample(obs, self.calibration, progress=progress, checkpoint=checkpoint, **options)
-        posterior.save(self.folder.posterior, force=True)
-        checkpoint.unlink(missing_ok=True)
-        self._remove(DERIVED)
+        with self._step("sample", posterior.provenance["seed"], posterior.provenance["settings"]) as files:
+            posterior.save(files.posterior)
+        remove_checkpoints(self.folder.path)
+        self._forget("coupling", "attitude", "field_map", "spectrum")
         self.posterior = posterior
         return posterior
 
-    def couple(self) -> Coupling:
-        """Write the table of the couplings."""
-        write_csv(self.coupling.to_dataframe(), self.folder.coupling)
+    def couple(self, *, force: bool = False) -> Coupling:
+        """Write the table of the couplings, which follow from the rest of the run: one that is there is left as it is.
+
+        Parameters
+        ----------
+        force : bool
+            Whether to write it again.
+        """
+        if force or not self.has("coupling"):
+            with self._step("coupling", None, {}) as files:
+                write_csv(self.coupling.to_dataframe(), files.coupling)
         return self.coupling
 
     @bounded
@@ -429,7 +494,7 @@ class Run:
         sky: MissionSky | None = None,
         alignment: str | PathLike = "random",
         alignment_frames: int | None = None,
-        tell: Callable[[str], None] | None = None,
+        force: bool = False,
     ) -> tuple[AttitudeError, FieldMap, ErrorSpectrum | None]:
         """Carry the posterior through QUEST on the observed frames or a mission's, and over the field; write all of it.
 
@@ -445,9 +510,10 @@ class Run:
             Frames on which alignment is calibrated: ``random`` sky, those ``observed`` for this run, or a table.
         alignment_frames : int, optional
             Number of frames of the random sky; 100 by default.
-        tell : callable, optional
-            Function that gets what a user should know, one sentence each.
+        force : bool
+            Whether to replace the attitude error of before.
         """
+        self._keep("attitude", force)
         posterior = self.posterior
         if not self._keeps_observations and not self.has("observations"):
             raise RunFolderError(
@@ -480,50 +546,59 @@ class Run:
                 told.append(
                     f"the profile has {frames.n_frames} frames, too few for a spectrum ({MIN_SPECTRUM_FRAMES})."
                 )
-        if self.has("budget"):
-            told.append(
-                f"the budget rested on the numbers of before and was removed: run `starcal-uq budget {self.path}`."
-            )
-        # What rests on the attitude error of before goes with it.
-        self._remove(("spectrum", "budget", "mission", "alignment"))
-        # A diagnosis of later is carried to the same frames.
-        if sky is not None:
-            frames.save(self.folder.mission)
-        if error.aligned is not None:
-            error.aligned.save(self.folder.alignment)
         error = self._with_misfit(error)
-        error.save(self.folder.attitude)
-        fields.save(self.folder.field_map)
-        if spectrum is not None:
-            spectrum.save(self.folder.spectrum)
+        settings = {"n_draws": n_draws, "sky": sky, "alignment": alignment, "alignment_frames": alignment_frames}
+        with self._step("propagate", seed, settings) as files:
+            # A diagnosis of later is carried to the same frames.
+            if sky is not None:
+                frames.save(files.mission)
+            if error.aligned is not None:
+                error.aligned.save(files.alignment)
+            error.save(files.attitude)
+            fields.save(files.field_map)
+            if spectrum is not None:
+                spectrum.save(files.spectrum)
         # The file of the attitude error holds less than the result, and a report shows what is in the file.
-        self._forget("attitude")
+        self._forget("attitude", "spectrum")
         self.field_map = fields
-        if tell is not None:
+        if self._tell is not None:
             for message in told:
-                tell(message)
+                self._tell(message)
         return error, fields, spectrum
 
-    def diagnose(self, **options: Any) -> Diagnosis:
+    def diagnose(self, *, force: bool = False, **options: Any) -> Diagnosis:
         """Question the model; writes ``diagnosis.json``, with the tables as CSV beside it.
 
-        The attitude error is written again with what was found, and a budget that rested on it is removed. Options are
-        those of `starcal_uq.diagnose`.
+        The attitude error is written again with what was found, and a budget that rested on it is removed.
+
+        Parameters
+        ----------
+        force : bool
+            Whether to replace the diagnosis of before.
+        **options
+            Those of `starcal_uq.diagnose`.
         """
         from starcal_uq.diagnostics.diagnose import diagnose
 
+        self._keep("diagnosis", force)
+
         posterior = self.posterior if self.has("posterior") else None
         diagnosis = diagnose(self.observations, self.calibration, posterior, **options)
-        for name, file_name in DIAGNOSIS_TABLES.items():
-            part = getattr(diagnosis, name)
-            if part is not None:
-                write_csv(part.to_dataframe(), self.path / file_name)
-        diagnosis.save(self.folder.diagnosis)
-        self._forget("diagnosis")
+        found = None
         if posterior is not None and self.has("attitude"):
+            self.diagnosis = diagnosis if diagnosis.is_of(self.calibration) else None
             found = self._with_misfit(self.attitude)
-            found.save(self.folder.attitude)
-            self._remove(("budget",))
+        settings = {name: value for name, value in options.items() if name != "progress"}
+        with self._step("diagnose", settings.pop("seed", None), settings) as files:
+            for name, file_name in DIAGNOSIS_TABLES.items():
+                part = getattr(diagnosis, name)
+                if part is not None:
+                    write_csv(part.to_dataframe(), files.path / file_name)
+            diagnosis.save(files.diagnosis)
+            if found is not None:
+                found.save(files.attitude)
+        self._forget("diagnosis")
+        if found is not None:
             # As the file holds it, without its frames.
             self.attitude = replace(found, seen=None, aligned=None)
         return diagnosis
@@ -543,7 +618,12 @@ class Run:
 
     @bounded
     def budget(
-        self, *, file: BudgetFile | PathLike | None = None, confidence: float | None = None, seed: int = 0
+        self,
+        *,
+        file: BudgetFile | PathLike | None = None,
+        confidence: float | None = None,
+        seed: int = 0,
+        force: bool = False,
     ) -> Budget:
         """Make the attitude error budget and write it.
 
@@ -553,6 +633,8 @@ class Run:
         ----------
         file, confidence, seed
             As for `starcal_uq.budget`.
+        force : bool
+            Whether to replace the budget of before.
 
         Raises
         ------
@@ -564,6 +646,7 @@ class Run:
         from starcal_uq.budgeting.budget import budget
         from starcal_uq.budgeting.file import BudgetFile, load_budget_file
 
+        self._keep("budget", force)
         stated = file if isinstance(file, BudgetFile) or file is None else load_budget_file(file)
         posterior, attitude = self.posterior, self.attitude
         made = budget(
@@ -574,35 +657,41 @@ class Run:
             confidence=confidence,
             seed=seed,
         )
-        made.save(self.folder.budget)
-        self._forget()
+        with self._step("budget", seed, {"file": file, "confidence": confidence}) as files:
+            made.save(files.budget)
         self.error_budget = made
         return made
 
-    def report(self, drawn: Mapping[str, bytes] | None = None) -> Path:
+    def report(self, drawn: Mapping[str, bytes] | None = None, *, force: bool = False) -> Path:
         """Write ``RUN/report.html`` of whatever the run holds, and the figures in ``RUN/figures``.
+
+        A report follows from the rest of the run, and goes when that changes: one that is there is left as it is.
 
         Parameters
         ----------
         drawn : mapping, optional
             Figures of these results that were drawn before, as PNG by name; the others are drawn now.
+        force : bool
+            Whether to write it again.
 
         Raises
         ------
         RunFolderError
-            If there is no calibration, a file cannot be read, or files of different runs are mixed.
+            If there is no calibration, or a file cannot be read or is not of this run.
         """
-        from starcal_uq.presentation.report.drawing import FIGURES, draw_figures
-        from starcal_uq.presentation.report.page import render
+        if force or not self.has("report"):
+            from starcal_uq.presentation.report.drawing import FIGURES, draw_figures
+            from starcal_uq.presentation.report.page import render
 
-        figures = dict(drawn or {})
-        figures |= draw_figures(self.results, [name for name in FIGURES if name not in figures])
-        page = render(self.results, figures)
-        self.folder.figures.mkdir(exist_ok=True)
-        for name, png in figures.items():
-            atomic_write_bytes(self.folder.figures / f"{name}.png", png)
-        atomic_write_text(self.folder.report, page)
-        return self.folder.report
+            figures = dict(drawn or {})
+            figures |= draw_figures(self.results, [name for name in FIGURES if name not in figures])
+            page = render(self.results, figures)
+            with self._step("report", None, {}) as files:
+                new_folder(files.figures)
+                for name, png in figures.items():
+                    atomic_write_bytes(files.figures / f"{name}.png", png)
+                atomic_write_text(files.report, page)
+        return self.path / RunFolder.report
 
     @property
     def _keeps_observations(self) -> bool:
@@ -611,20 +700,25 @@ class Run:
         merged = record.get("merge", {}).get("has_observations") is False
         return not merged and not record["settings"].get("stream", False)
 
-    def _remove(self, names: Sequence[str]) -> None:
-        """Remove files, and what was loaded from them."""
-        for name in names:
-            path: Path = getattr(self.folder, name)
-            path.unlink(missing_ok=True)
-        if "calibration" in names:
-            for file_name in DIAGNOSIS_TABLES.values():
-                (self.path / file_name).unlink(missing_ok=True)
-        self._forget(*names, "error_budget")
+    def _keep(self, name: str, force: bool) -> None:
+        """Refuse to do a step again whose result is there."""
+        if self.has(name) and not force:
+            place = self.path / FILES[name].name
+            raise RunFolderError(f"{place}: exists already; make it again with --force (force=True in Python).")
 
     def _forget(self, *names: str) -> None:
         """Load results again when they are next asked for."""
         for name in ("results", *names):
             vars(self).pop(name, None)
+
+
+# What is loaded when it is first asked for.
+_LOADED = tuple(name for name, value in vars(Run).items() if isinstance(value, cached_property))
+
+
+def as_setting(value: object) -> object:
+    """A setting as a record holds it."""
+    return value if value is None or isinstance(value, bool | int | float | str | list | dict) else str(value)
 
 
 def _frames_of(path: Path) -> Observations:

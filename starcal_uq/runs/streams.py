@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcal_uq.camera.distortion import parameters
-from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import atomic_write_text, check_new_folder, write_csv
+from starcal_uq.core.files import atomic_write_text, check_new_folder
 from starcal_uq.core.records import to_plain
 from starcal_uq.core.tasks import interrupt_between_steps
 from starcal_uq.core.types import AnyDict
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.estimation.calibration import Calibration
 
-STATE, SOURCE, HISTORY = "recursion.npz", "recursion.json", "history.csv"
+STATE, SOURCE = "recursion.npz", "recursion.json"
 # Frames between two looks at Ctrl-C, and between two savings of the state.
 _CHUNK, _SAVE_EVERY = 64, 4096
 
@@ -59,12 +58,12 @@ def filter_run(
     columns : mapping, optional
         Names in the file of columns that are called otherwise.
     force : bool
-        Replace what the folder holds, and start anew.
+        Replace the run that the folder holds.
 
     Raises
     ------
     RunFolderError
-        When the folder holds results, or the state of another calibration.
+        When the folder holds results.
     ObservationError, CalibrationError
         As `stream_frames` and `RecursiveCalibration`.
     KeyboardInterrupt
@@ -81,13 +80,15 @@ def filter_run(
         "options": to_plain(options),
     }
     state = run.path / STATE
-    if force:
-        state.unlink(missing_ok=True)
-    if state.exists():
-        _check_same(run.path / SOURCE, identity)
-        filtering = RecursiveCalibration.load(state)
-    else:
+    if run.has("calibration"):
         check_new_folder(run.path, force)
+    if state.exists() and _same(run.path / SOURCE, identity):
+        filtering = RecursiveCalibration.load(state)
+    elif not state.exists():
+        check_new_folder(run.path, force)
+    # Gone before the source of the next is written, so that the two never mix.
+    else:
+        state.unlink()
 
     def keep() -> None:
         run.folder.create()
@@ -96,8 +97,7 @@ def filter_run(
 
     _feed(filtering, stream, keep)
     calibration = filtering.result()
-    run.write(calibration, None)
-    write_csv(history(calibration), run.path / HISTORY)
+    run.write(calibration, None, history=history(calibration))
     for name in (STATE, SOURCE):
         (run.path / name).unlink(missing_ok=True)
     return calibration
@@ -122,16 +122,12 @@ def _feed(filtering: RecursiveCalibration, stream: FrameStream, keep: Callable[[
             raise
 
 
-def _check_same(path: Path, identity: AnyDict) -> None:
+def _same(path: Path, identity: AnyDict) -> bool:
+    """Whether what was begun is of these data and settings; anything else starts again."""
     try:
-        same = json.loads(path.read_text(encoding="utf-8")) == json.loads(json.dumps(identity))
+        return bool(json.loads(path.read_text(encoding="utf-8")) == json.loads(json.dumps(identity)))
     except (OSError, ValueError):
-        same = False
-    if not same:
-        raise RunFolderError(
-            f"{path.parent}: holds an unfinished calibration of other data or with other settings: repeat its call to "
-            "go on, or start anew with --force."
-        )
+        return False
 
 
 def history(calibration: Calibration) -> pd.DataFrame:

@@ -84,6 +84,9 @@ def test_violated_requirement_is_named_and_ends_with_status_1(cli, run, tmp_path
     assert "R-2" not in err
     (tmp_path / "kind.toml").write_text(REQUIREMENTS.replace("0.001", "1e4"))
     status, out, err = cli("budget", "run", "--file", "kind.toml", "--json")
+    assert status == 2
+    assert "budget.csv: exists already; make it again with --force" in err
+    status, out, err = cli("budget", "run", "--file", "kind.toml", "--json", "--force")
     assert status == 0
     assert json.loads(out)["requirements"]
     # The report of the run now has the section, and its figure.
@@ -115,7 +118,7 @@ def test_mission_sky_takes_the_place_of_the_observed_frames(cli, run):
     observed = sc.propagation.AttitudeError.load(run / "attitude.csv")
     cli("budget", "run")
     assert (run / "budget.csv").exists()
-    options = ("--attitudes", "random", "--max-mag", 6.5, "--frames", 200, "--draws", 60, "--json")
+    options = ("--attitudes", "random", "--max-mag", 6.5, "--frames", 200, "--draws", 60, "--json", "--force")
     status, out, _ = cli("propagate", "run", *options)
     assert status == 0
     assert "random attitudes" in json.loads(out)["frames"]
@@ -130,14 +133,14 @@ def test_slew_has_a_spectrum(cli, run, tmp_path):
     angle = np.radians(0.3 * time)
     q = {"qx": np.sin(angle / 2), "qy": 0.0 * time, "qz": 0.0 * time, "qw": np.cos(angle / 2)}
     pd.DataFrame({"time_s": time, **q}).to_csv(tmp_path / "slew.csv", index=False)
-    status, out, err = cli("propagate", "run", "--attitudes", "slew.csv", "--rate", 1.0, "--draws", 60)
+    status, out, err = cli("propagate", "run", "--attitudes", "slew.csv", "--rate", 1.0, "--draws", 60, "--force")
     assert status == 0, err
     assert "correlat" in out or "frequenc" in out
     spectrum = sc.propagation.ErrorSpectrum.load(run / "error_spectrum.npz")
     integral_arcsec2 = spectrum.psd_arcsec2_hz.sum(axis=0) * spectrum.frequency_hz[0]
     assert integral_arcsec2 == pytest.approx(spectrum.variance_arcsec2, rel=1e-6)
     for wrong, word in (("none.csv", "none.csv"), ("run/calibration.json", "calibration.json")):
-        status, _, err = cli("propagate", "run", "--attitudes", wrong)
+        status, _, err = cli("propagate", "run", "--attitudes", wrong, "--force")
         assert status == 2
         assert word in err
     status, _, err = cli("propagate", "run", "--attitudes", "slew.csv", "--scalar", "middle")
@@ -268,10 +271,10 @@ def test_a_gap_in_a_profile_is_told(cli, run, tmp_path):
     half = np.radians(0.01 * time) / 2
     turn = {"time_s": time, "qx": np.sin(half), "qy": 0.0, "qz": 0.0, "qw": np.cos(half)}
     pd.DataFrame(turn).to_csv(tmp_path / "gap.csv", index=False)
-    status, _, err = cli("propagate", "run", "--attitudes", "gap.csv", "--draws", 60)
+    status, _, err = cli("propagate", "run", "--attitudes", "gap.csv", "--draws", 60, "--force")
     assert status == 2
     assert "the longest gap begins at 19 s" in err
-    status, _, err = cli("propagate", "run", "--attitudes", "gap.csv", "--rate", 0.1, "--draws", 60)
+    status, _, err = cli("propagate", "run", "--attitudes", "gap.csv", "--rate", 0.1, "--draws", 60, "--force")
     assert status == 0
     assert "no attitude between 19 and 5020 s" in err
 
@@ -281,11 +284,11 @@ def test_propagate_tells_what_it_found_odd(cli, run, tmp_path):
     half = np.radians(np.arange(10.0)) / 2
     pointings = {"time_s": np.arange(10.0), "qx": np.sin(half), "qy": 0.0, "qz": 0.0, "qw": 1.001 * np.cos(half)}
     pd.DataFrame(pointings).to_csv(tmp_path / "ten.csv", index=False)
-    status, _, err = cli("propagate", "run", "--attitudes", "ten.csv", "--draws", 60)
+    status, _, err = cli("propagate", "run", "--attitudes", "ten.csv", "--draws", 60, "--force")
     assert status == 0
     assert "normalised" in err
     assert "too few for a spectrum" in err
-    assert "the budget rested on the numbers of before" in err
+    assert "note: budget.csv: removed, because it rested on what is replaced; run `starcal-uq budget run`" in err
     assert not (run / "error_spectrum.npz").exists()
     status, _, err = cli("propagate", "run", "--rate", 2)
     assert status == 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import numpy as np
 import pandas as pd
@@ -10,7 +11,8 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.runs import streams as filter_runs
-from starcal_uq.runs.streams import HISTORY, STATE, filter_run
+from starcal_uq.runs.folder import HISTORY
+from starcal_uq.runs.streams import STATE, filter_run
 from tests.helpers.scenes import camera, nominal, observations
 
 ALL = sc.estimation.RecursionOptions(parameters="all")
@@ -63,9 +65,10 @@ def test_an_interrupted_run_goes_on_bit_for_bit(table, tmp_path, monkeypatch):
     monkeypatch.undo()
     assert sc.estimation.RecursiveCalibration.load(tmp_path / "run" / STATE).n_frames == 20
 
-    # Another file under the same name is not what the state was made from.
-    with pytest.raises(sc.errors.RunFolderError, match="unfinished calibration of other data"):
-        filter_run(table, nominal(camera()), tmp_path / "run", method="samaan")
+    # With other settings it starts again, and nothing of the first goes in.
+    shutil.copytree(tmp_path / "run", tmp_path / "other")
+    other = filter_run(table, nominal(camera()), tmp_path / "other", method="samaan")
+    assert np.array_equal(other.theta, filter_run(table, nominal(camera()), tmp_path / "o", method="samaan").theta)
     resumed = filter_run(table, nominal(camera()), tmp_path / "run", options=ALL)
 
     assert np.array_equal(resumed.theta, whole.theta)

@@ -64,7 +64,7 @@ def test_a_demo_reads_each_file_once_at_most_and_is_judged_once(
     assert set(calls) == {"AttitudeError", "Diagnosis", "judge", "coupling"}
     # The control: a new object reads what the report needs, each file once.
     calls.clear()
-    sc.Run(tmp_path / "demo").report()
+    sc.Run(tmp_path / "demo").report(force=True)
     assert set(calls.values()) == {1}
     assert {"Calibration", "Posterior", "load_observations", "Budget"} <= set(calls)
 
@@ -100,5 +100,9 @@ def test_steps_give_what_they_write_and_remove_what_is_stale(tmp_path: Path) -> 
 def test_data_of_another_calibration_are_refused_with_one_sentence(step: str, tmp_path: Path) -> None:
     sc.Run(tmp_path).calibrate(observations(), sc.paper.paper_start())
     observations(seed=4).save(tmp_path / "observations.parquet", force=True)
+    with pytest.raises(sc.errors.RunFolderError, match=r"not the file that this run .* run `starcal-uq calibrate"):
+        getattr(sc.Run(tmp_path), step)()
+    # A folder of a version without records.
+    (tmp_path / "run.json").unlink()
     with pytest.raises(sc.errors.RunFolderError, match=r"made from other observations .* run `starcal-uq calibrate`"):
         getattr(sc.Run(tmp_path), step)()

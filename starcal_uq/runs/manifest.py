@@ -1,0 +1,218 @@
+"""The record of a run, ``run.json``: which files belong together, and how a step replaces some of them at once.
+
+A step writes its files into a folder within the run, and the record of what the run then holds is the one file whose
+renaming makes them count: before it the run is the old one, after it the new one, whatever comes between. Whoever opens
+the run next moves the files to their places, if the process that should have done it is gone.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.files import TEMPORARY, flush_folder
+from starcal_uq.core.records import read_json, write_json
+from starcal_uq.core.types import AnyDict
+
+MANIFEST, STEP, NEW = "run.json", ".step", ".new"
+_FORMAT = "starcal_uq run 1"
+_WHAT = ("the record of a run", "delete it, and the folder is read without it")
+# Larger files are known by their size and time.
+_MAX_HASHED = 2**26
+# Device, number, size and time of a file -> its hash; each is read once in a process.
+_digests: dict[tuple[int, int, int, int], str] = {}
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One file of a run.
+
+    Attributes
+    ----------
+    bytes : int
+        Its size.
+    sha256 : str
+        Hash of its content.
+    step : str
+        The step that it belongs to.
+    """
+
+    bytes: int
+    sha256: str
+    step: str
+
+
+@dataclass(frozen=True)
+class Manifest:
+    """What a run holds.
+
+    Attributes
+    ----------
+    files : dict of Entry
+        The files that the run has written, by their names within the folder; others are the user's.
+    steps : dict of dict
+        Provenance of each step that is done: time, seed, settings, versions.
+    command : dict or None
+        What the whole run is made of, of one that a single command makes: settings and hashes of the inputs.
+    complete : bool
+        False while that command is under way, or was interrupted.
+    stage : str
+        Folder in which files of the last step wait to be moved to their places.
+    gone : tuple of str
+        Files that rested on what the last step replaced, to be removed.
+    """
+
+    files: dict[str, Entry] = field(default_factory=dict)
+    steps: dict[str, AnyDict] = field(default_factory=dict)
+    command: AnyDict | None = None
+    complete: bool = True
+    stage: str = ""
+    gone: tuple[str, ...] = ()
+    format: str = _FORMAT
+
+
+def read_manifest(folder: Path) -> Manifest | None:
+    """The record of a run, its files at their places; None for a folder that has none."""
+    path = folder / MANIFEST
+    if not os.path.exists(path):
+        return None
+    found = read_json(Manifest, path, *_WHAT)
+    return _settle(folder, found) if found.stage else found
+
+
+def write_manifest(folder: Path, manifest: Manifest) -> None:
+    """Replace the record of a run."""
+    write_json(manifest, folder / MANIFEST)
+
+
+def commit(folder: Path, manifest: Manifest, old: Collection[str]) -> Manifest:
+    """Let the files in ``manifest.stage`` count, and remove those of `old` that are no more; all or nothing.
+
+    Raises
+    ------
+    RunFolderError
+        If a file is in the way that the run has not written.
+    """
+    for name in manifest.files:
+        if name not in old and os.path.lexists(folder / name):
+            raise RunFolderError(
+                f"{folder / name}: is in the way of a result, and not of this run: move it elsewhere, and start again."
+            )
+    flush_folder(folder / manifest.stage)
+    manifest = replace(manifest, gone=tuple(sorted(set(old) - set(manifest.files))))
+    write_manifest(folder, manifest)
+    flush_folder(folder)
+    return _settle(folder, manifest)
+
+
+def _settle(folder: Path, manifest: Manifest) -> Manifest:
+    """Move what waits to its place; may be done twice, or by two processes."""
+    stage = folder / manifest.stage
+    try:
+        for name in manifest.files:
+            if os.path.lexists(stage / name):
+                (folder / name).parent.mkdir(exist_ok=True)
+                # Another process that settles the same may have been faster.
+                with suppress(FileNotFoundError):
+                    os.replace(stage / name, folder / name)
+        for name in manifest.gone:
+            (folder / name).unlink(missing_ok=True)
+        flush_folder(folder)
+        settled = replace(manifest, stage="", gone=())
+        write_manifest(folder, settled)
+    except OSError as error:
+        raise RunFolderError(
+            f"{folder}: its last step cannot be completed ({error.strerror}); check the permissions of the folder and "
+            "the space on the disk, and start again."
+        ) from error
+    shutil.rmtree(stage, ignore_errors=True)
+    return settled
+
+
+def entry_of(path: Path, step: str) -> Entry:
+    """A file as it is, as a file of a step."""
+    return Entry(path.stat().st_size, digest(path), step)
+
+
+def digest(path: Path) -> str:
+    """Hash of a file; read once in a process as long as size and time stay."""
+    state = path.stat()
+    key = (state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns)
+    if key not in _digests:
+        with path.open("rb") as file:
+            _digests[key] = hashlib.file_digest(file, "sha256").hexdigest()
+    return _digests[key]
+
+
+def check_file(path: Path, entry: Entry | None, remedy: str) -> None:
+    """Refuse a file that is not the one that the run has written; the remedy is an order."""
+    if entry is None:
+        raise RunFolderError(f"{path}: is not a file of this run ({MANIFEST} does not list it); {remedy}.")
+    size = path.stat().st_size
+    if size != entry.bytes:
+        reason = f"it has {size} bytes and had {entry.bytes}"
+    elif digest(path) != entry.sha256:
+        reason = f"its content is not that which {MANIFEST} states"
+    else:
+        return
+    raise RunFolderError(f"{path}: is not the file that this run has written ({reason}); {remedy}.")
+
+
+def identity(paths: Mapping[str, Path]) -> AnyDict:
+    """What tells inputs from others: hashes of the files, or of those in a folder; size and time of large ones."""
+    found: AnyDict = {}
+    for label, path in paths.items():
+        if not path.exists():
+            # Whoever reads it says so.
+            continue
+        files = sorted(file for file in path.rglob("*") if file.is_file()) if path.is_dir() else [path]
+        for file in files:
+            state = file.stat()
+            large = state.st_size > _MAX_HASHED
+            place = file.relative_to(path).as_posix() if path.is_dir() else file.name
+            found[f"{label}: {place}"] = [state.st_size, state.st_mtime_ns] if large else digest(file)
+    return found
+
+
+def discard(folder: Path, stage: str) -> None:
+    """Remove the files of a step, unless the record says that they count."""
+    path = folder / MANIFEST
+    counts = os.path.exists(path) and read_json(Manifest, path, *_WHAT).stage == stage
+    if not counts:
+        shutil.rmtree(folder / stage, ignore_errors=True)
+
+
+def sweep(folder: Path) -> None:
+    """Remove what a killed process has left: temporary files, and a step that does not count."""
+    discard(folder, STEP)
+    for path in folder.glob(".*"):
+        if TEMPORARY.match(path.name):
+            path.unlink(missing_ok=True)
+
+
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Refuse a folder in which another process is making a run; a process that is killed leaves nothing locked."""
+    try:
+        import fcntl
+    except ImportError:
+        yield
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise RunFolderError(f"{folder}: another process is making a run there; wait for it, or end it.") from None
+        except OSError:
+            # A file system without locks.
+            pass
+        yield
+    finally:
+        os.close(handle)

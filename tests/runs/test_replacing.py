@@ -1,0 +1,245 @@
+"""Nothing is lost and nothing is mixed: at every moment a folder holds the old run or the new one."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.core.errors import RunFolderError
+from tests.helpers.crashes import small_files, snapshots
+from tests.helpers.scenes import observations
+
+SAMPLING = {"n_ensembles": 2, "n_walkers": 14, "n_steps": 30, "n_burn": 10}
+STEPS = ("calibrate", "sample", "couple", "propagate", "budget", "report")
+FIRST, SECOND = 3, 5
+NOTES = "mine"
+
+
+@pytest.fixture(autouse=True)
+def one_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    _one_page(monkeypatch)
+
+
+def _one_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports of one line and one figure: what is in them does not matter here, and takes most of the time."""
+    monkeypatch.setattr("starcal_uq.presentation.report.drawing.draw_figures", lambda *_: {"figure": b"png"})
+    monkeypatch.setattr("starcal_uq.presentation.report.page.render", lambda results, _: f"report of {results.name}")
+
+
+def make(folder: Path, seed: int, *, force: bool = False, stop: str | None = None) -> None:
+    """A small run, by all steps in one; interrupted before one of them."""
+    run = sc.Run(folder)
+    # Versions before had nothing for all steps together.
+    making = run.making({"seed": seed}, force=force) if hasattr(run, "making") else nullcontext()
+    options: dict[str, dict[str, Any]] = {
+        "sample": SAMPLING | {"seed": seed},
+        "propagate": {"n_draws": 50, "seed": seed},
+        "budget": {"seed": seed},
+    }
+    with making:
+        for step in STEPS:
+            if step == stop:
+                raise KeyboardInterrupt
+            if hasattr(run, "did") and run.did("coupling" if step == "couple" else step):
+                continue
+            if step == "calibrate":
+                obs = observations(n_frames=12, seed=seed)
+                run.calibrate(obs, sc.paper.paper_start(), **({} if hasattr(run, "did") else {"force": force}))
+            else:
+                more = {"force": True} if force and step == "sample" and not hasattr(run, "did") else {}
+                getattr(run, step)(**options.get(step, {}), **more)
+
+
+def content(folder: Path) -> str:
+    """What a run holds, as its readers get it; a folder that holds none, or a mix, raises."""
+    run = sc.Run(folder)
+    posterior = run.posterior
+    assert posterior.provenance["data_sha256"] == run.observations.data_hash
+    tables = [run.attitude.to_written().to_csv(), run.error_budget.to_dataframe().to_csv(), str(run.field_map)]
+    if not run.folder.report.exists() or not run.folder.coupling.exists():
+        raise RunFolderError(f"{folder}: not whole")
+    whole = run.calibration.theta.tobytes() + posterior.draws.tobytes() + "".join(tables).encode()
+    return hashlib.sha256(whole).hexdigest()
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
+    folder = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        _one_page(patch)
+        for seed in (FIRST, SECOND):
+            make(folder / str(seed), seed)
+    return {seed: folder / str(seed) for seed in (FIRST, SECOND)}
+
+
+@pytest.fixture
+def run(whole: dict[int, Path], tmp_path: Path) -> Path:
+    """The first run, with files of the user."""
+    folder = Path(shutil.copytree(whole[FIRST], tmp_path / "work" / "run"))
+    (folder / "notes.txt").write_text(NOTES)
+    (folder / "mine").mkdir()
+    (folder / "mine" / "data.csv").write_text(NOTES)
+    return folder
+
+
+def notes(folder: Path) -> bool:
+    return (folder / "notes.txt").read_text() == (folder / "mine" / "data.csv").read_text() == NOTES
+
+
+def test_at_every_moment_there_is_the_old_run_or_the_new_one(whole: dict[int, Path], run: Path, tmp_path: Path) -> None:
+    old, new = content(run), content(whole[SECOND])
+    assert old != new
+    with snapshots(run.parent, tmp_path / "states") as states:
+        make(run, SECOND, force=True)
+    assert content(run) == new
+    assert notes(run)
+    assert not [path for path in run.iterdir() if path.name.startswith(".")]
+    found = []
+    for state in states:
+        assert notes(state / "run")
+        try:
+            found.append(content(state / "run") in (old, new))
+        except (RunFolderError, OSError):
+            found.append(False)
+    assert len(found) > 20
+    assert sum(found) == len(found), f"{len(found) - sum(found)} of {len(found)} states hold no whole run"
+
+
+def test_a_new_sample_is_never_believed_with_what_rested_on_the_old(run: Path, tmp_path: Path) -> None:
+    old = sc.Run(run).posterior.draws
+    told: list[str] = []
+    with snapshots(run.parent, tmp_path / "states") as states:
+        sc.Run(run, tell=told.append).sample(seed=9, force=True, **SAMPLING)
+    new = sc.Run(run).posterior.draws
+    for state in states:
+        found = sc.Run(state / "run")
+        is_old, is_new = (np.array_equal(found.posterior.draws, draws) for draws in (old, new))
+        assert is_old != is_new
+        assert all(found.has(name) == is_old for name in ("coupling", "attitude", "field_map", "budget", "report"))
+        assert found.verdict.headline
+    (sentence,) = told
+    assert "report.html: removed, because it rested on what is replaced" in sentence
+    assert f"`starcal-uq propagate {run}`" in sentence
+
+
+@pytest.mark.parametrize("stop", ["sample", *(pytest.param(s, marks=pytest.mark.slow) for s in STEPS if s != "sample")])
+def test_an_interrupted_run_goes_on_to_the_same_result(
+    stop: str, whole: dict[int, Path], run: Path, tmp_path: Path
+) -> None:
+    for folder, force in ((tmp_path / "new", False), (run, True)):
+        with pytest.raises(KeyboardInterrupt):
+            make(folder, SECOND, force=force, stop=stop)
+        if force:
+            assert content(run) == content(whole[FIRST])
+        # The folder of a run that has come to nothing is not left behind.
+        assert folder.exists() == (force or stop != "calibrate")
+        make(folder, SECOND, force=force)
+        assert content(folder) == content(whole[SECOND])
+        assert not [path for path in folder.iterdir() if path.name.startswith(".")]
+
+
+def test_an_unfinished_run_of_other_settings_starts_again_and_the_first_one_stays(
+    whole: dict[int, Path], tmp_path: Path
+) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        make(tmp_path / "run", FIRST, stop="propagate")
+    kept = sc.Run(tmp_path / "run").posterior.draws
+    with pytest.raises(KeyboardInterrupt):
+        make(tmp_path / "run", SECOND, stop="couple")
+    assert np.array_equal(sc.Run(tmp_path / "run").posterior.draws, kept)
+    make(tmp_path / "run", SECOND)
+    assert content(tmp_path / "run") == content(whole[SECOND])
+    with pytest.raises(RunFolderError, match=r"not empty; .* --force"):
+        make(tmp_path / "run", FIRST)
+
+
+@pytest.mark.parametrize(
+    "largest", [8000, 30_000, *(pytest.param(n, marks=pytest.mark.slow) for n in (0, 1000, 60_000))]
+)
+def test_a_full_disk_leaves_the_old_run(largest: int, whole: dict[int, Path], run: Path) -> None:
+    with small_files(largest), pytest.raises(RunFolderError, match=r"cannot be written .*free space"):
+        make(run, SECOND, force=True)
+    assert content(run) == content(whole[FIRST])
+    assert notes(run)
+    make(run, SECOND, force=True)
+    assert content(run) == content(whole[SECOND])
+
+
+def test_what_the_run_has_not_written_is_never_overwritten(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "camera.toml").write_text(NOTES)
+    with pytest.raises(RunFolderError, match=r"camera\.toml: is in the way .* not of this run: move it elsewhere"):
+        make(folder, FIRST, force=True)
+    assert [path.name for path in folder.iterdir()] == ["camera.toml"]
+    assert (folder / "camera.toml").read_text() == NOTES
+
+
+def test_links_and_the_current_folder_are_replaced_like_others(
+    whole: dict[int, Path], run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "link").symlink_to(run)
+    make(tmp_path / "link", SECOND, force=True)
+    assert (tmp_path / "link").is_symlink()
+    assert content(run) == content(whole[SECOND])
+    monkeypatch.chdir(run)
+    make(Path(), FIRST, force=True)
+    assert os.path.samefile(run, os.curdir)
+    assert content(run) == content(whole[FIRST])
+
+
+@pytest.mark.parametrize(
+    ("name", "step", "remedy"),
+    [
+        ("posterior.nc", "posterior", "sample RUN --force"),
+        ("calibration.npz", "calibration", "calibrate OBS CAMERA -o RUN --force"),
+        ("field_map.npz", "field_map", "propagate RUN --force"),
+        ("attitude.csv", "attitude", "propagate RUN --force"),
+        ("budget.csv", "error_budget", "budget RUN --force"),
+        ("camera.toml", "camera", "calibrate OBS CAMERA -o RUN --force"),
+    ],
+)
+def test_a_file_that_is_not_of_this_run_is_refused_by_name(
+    name: str, step: str, remedy: str, whole: dict[int, Path], run: Path
+) -> None:
+    good = (run / name).read_bytes()
+    middle = len(good) // 2
+    flipped = good[:middle] + bytes([good[middle] ^ 1]) + good[middle + 1 :]
+    for content in ((whole[SECOND] / name).read_bytes() + b" ", good[:-20], flipped, b""):
+        (run / name).write_bytes(content)
+        with pytest.raises(RunFolderError, match=rf"{name}: is not the file .* run `starcal-uq {remedy}`"):
+            getattr(sc.Run(run), step)
+    (run / name).write_bytes(good)
+    getattr(sc.Run(run), step)
+
+
+def test_a_file_of_another_run_where_there_was_none_is_refused(whole: dict[int, Path], tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        make(tmp_path / "run", SECOND, stop="sample")
+    shutil.copy(whole[FIRST] / "posterior.nc", tmp_path / "run")
+    with pytest.raises(RunFolderError, match=r"posterior\.nc: is not a file of this run"):
+        sc.Run(tmp_path / "run").report()
+
+
+def test_a_folder_of_a_version_without_records_is_read_and_gets_one(whole: dict[int, Path], run: Path) -> None:
+    (run / "run.json").unlink()
+    assert content(run) == content(whole[FIRST])
+    sc.Run(run).report(force=True)
+    assert content(run) == content(whole[FIRST])
+    (run / "posterior.nc").write_bytes((whole[SECOND] / "posterior.nc").read_bytes())
+    with pytest.raises(RunFolderError, match=r"posterior\.nc: is not the file"):
+        content(run)
+
+
+def test_a_damaged_record_is_named(run: Path) -> None:
+    (run / "run.json").write_text("{")
+    with pytest.raises(RunFolderError, match=r"run\.json: is not the record of a run .*; delete it, and the folder is"):
+        sc.Run(run).report(force=True)
