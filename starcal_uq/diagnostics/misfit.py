@@ -242,6 +242,11 @@ def _detectable(test: MisfitTest, level: float) -> float:
     return float(np.sqrt(ncfdtrinc(test.dof, test.dof_residual, 1.0 - POWER, limit)))
 
 
+def _frame_products(frames: StarFrames, few: Sequence[FloatArray], many: FloatArray) -> FloatArray:
+    """Products (i, q, K) of few columns (2, n) with many (q, 2, n) over the stars of each frame."""
+    return np.stack([frames.sum(np.einsum("xn,qxn->qn", column, many)) for column in few])
+
+
 @dataclass
 class _Sums:
     """Sums over all stars from which every test follows; the table is visited once, some frames at a time.
@@ -293,14 +298,14 @@ class _Sums:
             part = MarginalLikelihood(likelihood.frames.part(first, last), cal.camera.distortion)
             state, _ = part.profile(theta, rotations[first:last])
             rows = slice(int(starts[first]), int(starts[last]))
-            projected, view = found._add(part, state, theta, rows)
-            h, e = projected[:p], projected[p]
+            fitted, columns, view = found._add(part, state, theta, rows)
             if stars is not None:
-                stars.add(part, state, projected, rows)
-                e = cal.residuals_px[rows].T * (1.0 if part.frames.weight is None else part.frames.weight)
-            flat = np.concatenate([h, e[None]]).reshape(p + 1, -1)
+                stars.add(part, state, np.concatenate([fitted, part.project_out(state, columns)]), rows)
+                fitted[p] = cal.residuals_px[rows].T * (1.0 if part.frames.weight is None else part.frames.weight)
+            h, e = fitted[:p], fitted[p]
+            flat = fitted.reshape(p + 1, -1)
             found.plain += flat @ flat.T
-            found._add_blocks(part, state, view, np.concatenate([h, e[None], projected[p + 1 :]]))
+            found._add_blocks(part, state, view, fitted, columns)
             found.noise.add(part.frames, state, h, e, rows)
             matrices = np.moveaxis(part.frames.sum(np.einsum("axn,bxn->abn", h, h)), 2, 0)
             squares = part.frames.sum(np.sum(e**2, axis=0))
@@ -309,22 +314,36 @@ class _Sums:
             found.gram -= stars.solved(model.ratio(cal.star_errors.tau_px**2, cal.sigma)).correction()
         return found
 
-    def _add(self, part: MarginalLikelihood, state: Any, theta: FloatArray, rows: slice) -> tuple[FloatArray, View]:
-        """Add all columns of some frames; they come back with the attitudes projected out."""
-        weight = part.frames.weight
-        h = part.derivatives(theta, state)
-        view = View.of(part, state, theta, rows)
+    def _add(
+        self, part: MarginalLikelihood, state: Any, theta: FloatArray, rows: slice
+    ) -> tuple[FloatArray, FloatArray, View]:
+        """Add some frames: parameters and residuals, attitudes projected out, and all columns, as they are.
+
+        A product of columns after projection is that before, less the products of what rotations of the frames make of
+        both: nothing of the size of the many columns is written for it.
+        """
+        view, weight = View.of(part, state, theta, rows), part.frames.weight
         columns = np.concatenate([family.columns(view) for family in self.families])
         if weight is not None:
-            columns = columns * weight
-        everything = np.concatenate([h, state.e[None], columns])
-        self.raw += np.sum(everything**2, axis=(1, 2))
-        projected = part.project_out(state, everything)
-        flat = projected.reshape(len(projected), -1)
-        self.gram += flat @ flat.T
-        return projected, view
+            columns *= weight
+        h = view.parameter_columns if weight is None else view.parameter_columns * weight
+        own = np.concatenate([h, state.e[None]])
+        fitted = part.project_out(state, own)
+        n, flat, many = len(own), fitted.reshape(len(own), -1), columns.reshape(len(columns), -1)
+        inner, across = many @ many.T, many @ flat.T
+        self.raw[:n] += np.sum(own**2, axis=(1, 2))
+        self.raw[n:] += np.diag(inner)
+        turned = _frame_products(part.frames, state.attitude, columns)
+        answer = sum(turned[i][:, None] * state.inverse[i] for i in range(3))
+        self.gram[:n, :n] += flat @ flat.T
+        self.gram[n:, :n] += across
+        self.gram[:n, n:] += across.T
+        self.gram[n:, n:] += inner - np.tensordot(np.moveaxis(turned, 0, 1), answer, ((1, 2), (1, 2)))
+        return fitted, columns, view
 
-    def _add_blocks(self, part: MarginalLikelihood, state: Any, view: View, projected: FloatArray) -> None:
+    def _add_blocks(
+        self, part: MarginalLikelihood, state: Any, view: View, fitted: FloatArray, others: FloatArray
+    ) -> None:
         """Scale and quadrupole of every frame by itself: three columns per frame, which no other frame sees."""
         frames = part.frames
         columns = self.own.columns(view)
@@ -336,8 +355,9 @@ class _Sums:
         values, vectors = np.linalg.eigh(gram)
         kept = values > _ABSORBED
         root = vectors * np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)[:, None, :]
-        with_all = np.stack([frames.sum(np.sum(column * projected, axis=1)) for column in columns])
-        explained = np.einsum("kab,ajk->kbj", root, with_all).reshape(-1, len(projected))
+        # Attitudes are out of these, and so out of their products with anything.
+        with_all = np.concatenate([_frame_products(frames, list(columns), some) for some in (fitted, others)], axis=1)
+        explained = np.einsum("kab,ajk->kbj", root, with_all).reshape(-1, with_all.shape[1])
         self.blocks += explained.T @ explained
         self.block_rank += int(np.count_nonzero(kept))
 
