@@ -184,6 +184,8 @@ def _solve(
         status = Status.SINGULAR if is_singular(final.matrix) else Status.CONVERGED
     elif outcome == "Maximum_Iterations_Exceeded":
         status = Status.MAX_ITERATIONS
+    elif not np.isfinite(final.matrix).all():
+        status = Status.NOT_FINITE
     else:
         # IPOPT also stops with a search direction too small once rounding is reached; the gradient decides.
         gain = float(final.gradient @ np.linalg.pinv(final.matrix) @ final.gradient) / max(final.cost, 1e-300)

@@ -162,7 +162,7 @@ def levenberg_marquardt(
 
     if not (np.isfinite(normal.cost) and np.isfinite(normal.matrix).all()):
         return finish(Status.NOT_FINITE)
-    scale = np.sqrt(np.diag(normal.matrix))
+    scale = _lengths(normal.matrix)
     if np.any(scale == 0.0):
         return finish(Status.SINGULAR)
     size = float(np.linalg.norm(scale * theta))
@@ -201,7 +201,7 @@ def levenberg_marquardt(
             theta, normal = trial_theta, trial
             trajectory.append(theta)
             costs.append(normal.cost)
-            scale = np.maximum(scale, np.sqrt(np.diag(normal.matrix)))
+            scale = np.maximum(scale, _lengths(normal.matrix))
         if predicted <= tolerance and ratio > 1e-4:
             return finish(Status.CONVERGED)
         if bound <= step_tolerance * float(np.linalg.norm(scale * theta)):
@@ -210,6 +210,11 @@ def levenberg_marquardt(
             )
             return finish(Status.CONVERGED if settled else Status.STALLED)
     return finish(Status.MAX_ITERATIONS)
+
+
+def _lengths(matrix: FloatArray) -> FloatArray:
+    """Lengths (p,) of the Jacobian's columns; zero where attitudes take one up, but for rounding."""
+    return np.sqrt(np.maximum(np.diag(matrix), 0.0))
 
 
 def _newton_length(normal: Normal, scale: FloatArray) -> float:

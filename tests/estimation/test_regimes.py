@@ -4,6 +4,10 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
+from starcal_uq.estimation.recursive import innovations
+from starcal_uq.estimation.recursive.innovations import frame_normals
+from starcal_uq.estimation.robust import star_scores
+from starcal_uq.observations.frames import StarFrames
 from tests.helpers.outside import Campaign, campaign
 
 # Field (deg), side (px), focal length (mm), stars a frame, frames, noise (px), focal length of the data sheet (relative
@@ -81,3 +85,26 @@ def test_a_sigma_that_claims_too_much_is_seen():
         assert squared_error(cal, c.theta) < UNLIKELY
         found.append(squared_error(cal, c.theta, claim=0.2))
     assert max(found) > UNLIKELY
+
+
+@pytest.mark.parametrize("field", [0.5, 90.0])
+def test_frames_of_many_stars_take_a_shorter_way_to_the_same_innovations(field, monkeypatch):
+    c = campaign(np.random.default_rng(0), n_frames=2, stars_per_frame=230, field_deg=field)
+    frames = StarFrames.from_observations(sc.Observations(**c.columns))
+    scale = np.array([1.0, 1.0, 1.0, 1e-6, 1e-12])
+    short = frame_normals(frames, "brown", c.theta, scale).grams
+    monkeypatch.setattr(innovations, "_DENSE_STARS", 1000)
+    dense = frame_normals(frames, "brown", c.theta, scale).grams
+    size = np.sqrt(np.einsum("kii->ki", dense))
+    # The conditioning of half a degree takes five digits.
+    assert np.max(np.abs(short - dense) / (size[:, :, None] * size[:, None])) < 1e-9
+
+
+def test_four_hundred_partners_find_the_wrong_stars_of_a_frame_of_thousands():
+    c = campaign(np.random.default_rng(1), n_frames=1, stars_per_frame=1500, field_deg=20.0)
+    wrong = np.arange(0, 1500, 3)
+    c.columns["x_px"][wrong] = np.roll(c.columns["x_px"][wrong], 1)
+    scores = star_scores(StarFrames.from_observations(sc.Observations(**c.columns)), "brown", c.theta)
+    right = np.setdiff1d(np.arange(1500), wrong)
+    assert np.max(scores[right]) < 0.2
+    assert np.mean(scores[wrong] > 0.2) > 0.98
