@@ -13,7 +13,7 @@ import shutil
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import TEMPORARY, flush_folder
@@ -75,6 +75,13 @@ class Manifest:
     stage: str = ""
     gone: tuple[str, ...] = ()
     format: str = _FORMAT
+
+    def __post_init__(self) -> None:
+        # What is named here is moved and removed.
+        for name in (*self.files, *self.gone, self.stage):
+            place = PurePath(name)
+            if place.is_absolute() or ".." in place.parts or not name.isprintable():
+                raise ValueError("the record of the run names a file elsewhere")
 
 
 def read_manifest(folder: Path) -> Manifest | None:

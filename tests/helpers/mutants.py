@@ -84,7 +84,10 @@ def _observations() -> sc.Observations:
 def _checkpoint(path: Path) -> Any:
     from starcal_uq.inference.ensemble import EnsembleSettings, _Store
 
-    return _Store(2, EnsembleSettings(16, 6, 10, 2), 6, path, "fingerprint")
+    store = _Store(2, EnsembleSettings(16, 6, 10, 2), 6, path, "fingerprint")
+    if store.state is None:
+        raise StarcalError(f"{path}: the draws are made again.")
+    return store
 
 
 def _pairs(path: Path) -> Any:
@@ -118,6 +121,12 @@ def _image_record(path: Path) -> Any:
     from starcal_uq.pipeline.record import ImageRecord
 
     return ImageRecord.load(path)
+
+
+def _manifest(path: Path) -> Any:
+    from starcal_uq.runs.manifest import read_manifest
+
+    return read_manifest(path.parent)
 
 
 def _partitions(path: Path) -> Any:
@@ -174,12 +183,17 @@ SAMPLES = (
     Sample("diagnosis.json", sc.diagnostics.Diagnosis.load, ("diagnostics.Diagnosis.load",)),
     Sample("validation.npz", sc.diagnostics.Validation.load, ("diagnostics.Validation.load",)),
     Sample("images.json", _image_record, ("Run",)),
+    Sample("run.json", _manifest, ("Run",)),
     Sample("replicates.npz", sc.paper.Replicates.load, ("paper.Replicates.load",)),
     Sample("interaction.csv", sc.paper.InteractionStudy.load_csv, ("paper.InteractionStudy.load_csv",)),
     Sample("study.nc", sc.studies.Study.load, ("studies.Study.load",)),
     Sample("cells.parquet", _store, ("study",)),
     Sample("pairs.npz", _pairs, ("identification.identify",)),
 )
+
+
+# Written after all others.
+LAST = "pairs.npz"
 
 
 def write_samples(folder: Path) -> None:
@@ -282,6 +296,7 @@ def _write_results(folder: Path) -> None:
 
     from starcal_uq.identification.pairs import StarPairs
     from starcal_uq.inference.ensemble import EnsembleSettings, _Store
+    from starcal_uq.runs.manifest import Entry, Manifest, write_manifest
     from starcal_uq.studies.store import _write, row, rows_table
     from tests.helpers.studies import made_study
 
@@ -294,6 +309,7 @@ def _write_results(folder: Path) -> None:
     study = made_study({"max_mag": (5.0, 6.0)}, lambda cell: {}, seeds=2)
     study.data.attrs["definition"] = json.dumps(study.definition.to_dict())
     study.save(folder)
+    write_manifest(folder, Manifest({"camera.toml": Entry(680, "0" * 64, "calibrate")}, {"calibrate": {"seed": 1}}))
     _write(rows_table([row("a", "brown", {"status": "ok", "truth": np.arange(5.0)})]), folder / "cells.parquet")
     import emcee
 
@@ -742,7 +758,7 @@ class Bench:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         (folder / "valid").mkdir(parents=True, exist_ok=True)
-        if not (folder / "valid" / "pairs.npz").exists():
+        if not (folder / "valid" / LAST).exists():
             write_samples(folder / "valid")
         self._known: dict[str, tuple[bytes, str, Path]] = {}
 
@@ -761,7 +777,7 @@ class Bench:
     def damaged(self, sample: Sample, rng: random.Random) -> tuple[bytes, Outcome]:
         """One mutant, and what became of it."""
         data, expected, path = self.valid(sample)
-        other = self.valid(SAMPLES[rng.randrange(len(SAMPLES))])[0]
+        other = (self.folder / "valid" / SAMPLES[rng.randrange(len(SAMPLES))].file).read_bytes()
         made = mutant(sample, data, rng, other)
         return made, self.judged(sample, made, expected, path)
 
