@@ -62,7 +62,7 @@ def copy_notebooks(_app: object) -> None:
 
 def command_names() -> list[str]:
     """The commands of the command line, in the order of its help."""
-    from starcal_uq.cli.app import app
+    from starcal_uq.cli.commands import app
 
     return [str(command.name or command.callback.__name__) for command in app.registered_commands if command.callback]
 

@@ -1,103 +1,100 @@
-"""The command line: the only place where the steps are wired together and printed.
+"""The command line's entry, which catches what comes out of the commands.
 
-Exit status 0 when all is well, 1 when a result is there but should not be trusted or the work was interrupted, 2 for
-bad input, always with one sentence that says what to do.
+Exit status 0 when all is well, 1 when a result is there but should not be trusted, 2 for bad input, and 130 or 143 when
+Ctrl-C or SIGTERM has ended the work; but for 0, always with one sentence that says what to do. Nothing that takes time
+is loaded before the signals are caught.
 """
 
 from __future__ import annotations
 
 import gc
+import os
+import signal
 import sys
-from typing import Annotated, Any, get_args
+import threading
+from collections.abc import Callable
+from typing import Any, NoReturn
 
-import typer
-
-from starcal_uq.cli import filter as cli_filter
-from starcal_uq.cli import images as cli_images
-from starcal_uq.cli import mission as cli_mission
-from starcal_uq.cli import paper as cli_paper
-from starcal_uq.cli import run as cli_run
-from starcal_uq.cli import statistics as cli_statistics
-from starcal_uq.cli import steps as cli_steps
-from starcal_uq.cli import study as cli_study
-from starcal_uq.core.errors import StarcalError
-from starcal_uq.core.settings import clipped, wanted
-from starcal_uq.core.types import AnyDict
-
-app = typer.Typer(
-    name="starcal-uq",
-    help="Probabilistic calibration of star sensors: from identified stars to a posterior and its attitude error.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="markdown",
-    epilog="Start with `starcal-uq demo`: the experiment of Ye & Yang 2017, from a star catalogue to a report.",
-)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
-        from starcal_uq.core.provenance import installed_version
-
-        print(f"starcal-uq {installed_version('starcal-uq')}")
-        raise typer.Exit
-
-
-@app.callback()
-def common(
-    version: Annotated[
-        bool, typer.Option("--version", help="Print the version.", callback=_print_version, is_eager=True)
-    ] = False,
-) -> None:
-    """Probabilistic calibration of star sensors: from identified stars to a posterior and its attitude error."""
-
-
-for module in (cli_run, cli_steps, cli_mission, cli_study, cli_images, cli_filter, cli_statistics, cli_paper):
-    module.register(app)
+def program() -> NoReturn:
+    """The program: `main`, after which no signal is of interest any more."""
+    sys.unraisablehook = _again
+    try:
+        main()
+    finally:
+        _catch(signal.SIG_IGN)
+    sys.exit(0)
 
 
 def main() -> None:
-    """Entry point: every error a user can make is one sentence on standard error, never a traceback."""
+    """Run a command: every error a user can make is one sentence on standard error, never a traceback."""
+    before = _catch(_end_at_once)
+    try:
+        _main()
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _main() -> None:
+    from typer import Abort, Exit
     from typer.exceptions import TyperException
 
+    from starcal_uq.cli.commands import app, usage_sentence
+    from starcal_uq.core.errors import StarcalError
+    from starcal_uq.core.tasks import caught_signal, interrupt
+
+    caught_signal()
+    _catch(interrupt)
     # Imports and figures make a million objects that live as long as the command; to look through them every 700 new
     # ones for what could be thrown away takes a twentieth of the time.
     gc.set_threshold(50_000, 20, 50)
     try:
         code = app(standalone_mode=False)
+        if code == 128 + signal.SIGINT:
+            # What Typer makes of it.
+            raise KeyboardInterrupt
         sys.exit(code if isinstance(code, int) else 0)
-    except typer.Exit as stop:
-        sys.exit(stop.exit_code)
-    except TyperException as error:
-        _fail(_usage_sentence(error), 2)
-    except StarcalError as error:
-        _fail(str(error), 2)
-    except (typer.Abort, KeyboardInterrupt):
-        _fail("interrupted; what was complete is kept, and `sample`, `filter` and `study` go on where they stopped.", 1)
-    except OSError as error:
-        place = f"{error.filename}: " if error.filename else ""
-        _fail(f"{place}{error.strerror or error}; check the path, its permissions and the space on the disk.", 2)
+    except (Exception, KeyboardInterrupt) as error:
+        # Libraries make other errors of a KeyboardInterrupt that they meet.
+        number = caught_signal()
+        if number is not None or isinstance(error, Abort | KeyboardInterrupt):
+            words = "interrupted; what was complete is kept: give the same command again, and it goes on."
+            _fail(words, 128 + (number or signal.SIGINT))
+        if isinstance(error, Exit):
+            sys.exit(error.exit_code)
+        if isinstance(error, TyperException):
+            _fail(usage_sentence(error), 2)
+        if isinstance(error, StarcalError):
+            _fail(str(error), 2)
+        if isinstance(error, OSError):
+            place = f"{error.filename}: " if error.filename else ""
+            _fail(f"{place}{error.strerror or error}; check the path, its permissions and the space on the disk.", 2)
+        raise
 
 
-def _usage_sentence(error: Exception) -> str:
-    """What is wrong with a call, and where to look."""
-    parameter, cause = getattr(error, "param", None), error.__cause__
-    if isinstance(error, typer.BadParameter) and parameter is not None:
-        name = max(parameter.opts, key=len) if parameter.opts[0].startswith("-") else parameter.display_name_raw
-        problems: list[AnyDict] = getattr(cause, "errors", list)()
-        return f"{name} {_problem(parameter, problems[0]['input']) if problems else error.message}"
-    words = getattr(error, "format_message", None)
-    message = words() if callable(words) else str(error)
-    return f"{message.strip().rstrip('.')}; see `starcal-uq --help`."
+def _catch(handler: Callable[[int, Any], None] | signal.Handlers) -> dict[signal.Signals, Any]:
+    """Let a function take the signals that end a program; those of before, but for signals that were ignored."""
+    if threading.current_thread() is not threading.main_thread():
+        return {}
+    caught = [number for number in _SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+    return {number: signal.signal(number, handler) for number in caught}
 
 
-def _problem(parameter: Any, value: object) -> str:
-    """What is wrong with a value that does not fit the declaration of its parameter."""
-    kind = parameter.type_descriptor
-    if kind.choices is not None:
-        return f"{clipped(value)} is unknown: use one of {', '.join(kind.choices)}."
-    kinds = {kind.annotation, *get_args(kind.annotation)}
-    return f"{clipped(value)}: {wanted(parameter.min, parameter.max, int in kinds)}."
+def _end_at_once(number: int, _frame: Any) -> None:
+    """While loading, where an exception could be taken for that of a library that is missing."""
+    os.write(2, b"error: interrupted before anything was begun.\n")
+    os._exit(128 + number)
+
+
+def _again(unraisable: Any) -> None:
+    """An interrupt that came where none can be raised, such as in a finaliser, comes again a moment later."""
+    if issubclass(unraisable.exc_type, KeyboardInterrupt):
+        threading.Timer(0.05, os.kill, (os.getpid(), signal.SIGINT)).start()
+    else:
+        sys.__unraisablehook__(unraisable)
 
 
 def _fail(message: str, status: int) -> None:

@@ -59,8 +59,7 @@ def study_command(
 ) -> None:
     """Vary camera, sky, noise and observation: what couples, what decouples it, and what it does to attitudes.
 
-    Cells that are there already are not computed again; `--force` begins anew. Status 1 when no cell has numbers, or
-    after Ctrl-C, which keeps those that were complete.
+    Cells that are there already are not computed again; `--force` begins anew. Status 1 when no cell has numbers.
     """
     if template is not None:
         sc.studies.write_study_template(template, file, force)
@@ -85,8 +84,8 @@ def study_command(
     else:
         _show(found, page)
     if not found.complete:
-        err.print("interrupted; start the command again, and it goes on.", style="yellow")
-    if not found.complete or not found.ok.any():
+        raise KeyboardInterrupt
+    if not found.ok.any():
         raise typer.Exit(1)
 
 

@@ -7,12 +7,14 @@ import pickle
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import lru_cache
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import wait as wait_for
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, TypeVar
@@ -26,6 +28,8 @@ Numbered = list[tuple[int, T]]
 _WAIT_S = 0.2
 _THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _shared: list[Callable[[int], Any]] = []
+# Signals that have ended the work.
+_caught: list[int] = []
 # How many `one_thread` are under way.
 _limited = [0]
 
@@ -125,13 +129,20 @@ def _submit(path: Path, chunks: list[range], workers: int, caller: str, keep: Ca
     pool = ProcessPoolExecutor(workers, get_context("spawn"), initializer=_start, initargs=(path,))
     try:
         with interrupt_between_steps() as check, one_thread():
-            pending: set[Future[Numbered[T]]] = {pool.submit(_run, numbers) for numbers in chunks}
+            # Processes start while they are given work, and take along what is blocked.
+            with _blocked():
+                pending: set[Future[Numbered[T]]] = {pool.submit(_run, numbers) for numbers in chunks}
             try:
                 while pending:
                     check()
                     for future in wait(pending, _WAIT_S, FIRST_COMPLETED).done:
                         pending.discard(future)
                         keep(future.result())
+            except BrokenProcessPool:
+                # SIGTERM may have gone to all processes, and have come to this one last.
+                time.sleep(_WAIT_S)
+                check()
+                raise
             except KeyboardInterrupt:
                 _keep_running(pool, pending, keep)
                 raise
@@ -189,41 +200,84 @@ def one_thread() -> Iterator[None]:
 
 
 def _start(path: Path) -> None:
-    # Ctrl-C reaches every process of a terminal; the first one decides what to do about it.
-    if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    else:
+    if not hasattr(signal, "pthread_sigmask"):
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     _shared[:] = [pickle.loads(path.read_bytes())]
+
+
+def _end_with_parent() -> None:
+    """A process whose parent was killed has nobody left to work for."""
+    parent = parent_process()
+    if parent is not None:
+        wait_for([parent.sentinel])
+        os._exit(1)
+
+
+@contextmanager
+def _blocked() -> Iterator[None]:
+    """Hold Ctrl-C back in this thread and in the processes that it starts.
+
+    It reaches every process of a terminal, and the first one decides what to do about it.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _run(numbers: range) -> Numbered[Any]:
     return [(number, _shared[0](number)) for number in numbers]
 
 
+def interrupt(number: int, _frame: Any) -> None:
+    """Handler of a signal that ends a command: KeyboardInterrupt, and `caught_signal` knows which it was."""
+    _caught.append(number)
+    raise KeyboardInterrupt
+
+
+def caught_signal() -> int | None:
+    """Number of the signal that has ended the work, which is then forgotten; None where there was none."""
+    number = _caught[-1] if _caught else None
+    _caught.clear()
+    return number
+
+
 @contextmanager
 def interrupt_between_steps() -> Iterator[Callable[[], None]]:
     """Hold Ctrl-C back until the function that this yields is called, which raises KeyboardInterrupt if it was pressed.
 
-    In a thread other than the main one, which receives no signals, it does nothing.
+    SIGTERM is held back as well where `interrupt` takes it. In a thread other than the main one, which receives no
+    signals, it does nothing.
     """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: None
         return
-    pressed = threading.Event()
+    pressed: list[int] = []
 
-    def note(_signal: int, _frame: Any) -> None:
-        pressed.set()
+    def note(number: int, _frame: Any) -> None:
+        pressed.append(number)
+
+    note.of_steps = True  # type: ignore[attr-defined]
 
     def check() -> None:
-        if pressed.is_set():
+        if pressed:
+            _caught.append(pressed[-1])
             pressed.clear()
             raise KeyboardInterrupt
 
-    previous = signal.signal(signal.SIGINT, note)
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    ours = {n for n, handler in handlers.items() if handler is interrupt or hasattr(handler, "of_steps")}
+    taken = ours if handlers[signal.SIGINT] is signal.SIG_IGN else ours | {signal.SIGINT}
+    previous = {number: signal.signal(number, note) for number in taken}
     try:
         yield check
         # Ctrl-C after the last step must not be lost.
         check()
     finally:
-        signal.signal(signal.SIGINT, previous)
+        for number, before in previous.items():
+            signal.signal(number, before)

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import typer
 
-from starcal_uq.cli import app as cli_app
+from starcal_uq.cli import commands as cli_app
 
 # Arguments with which each command would work.
 VALID = {
