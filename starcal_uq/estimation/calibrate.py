@@ -29,6 +29,7 @@ from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import NOISES, fit_noise, weighed
 from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.estimation.partitioned import calibrate_partitions, kernels_for
+from starcal_uq.estimation.plausibility import explained
 from starcal_uq.estimation.recursive.start import RECURSIVE_METHODS, RecursionOptions
 from starcal_uq.estimation.recursive.stream import raise_unless_good
 from starcal_uq.estimation.robust import compress_reweighted, refine, robust_start
@@ -62,6 +63,7 @@ _SAMPLE_FRAMES, _SAMPLE_STARS = 150, 2500
 
 
 @bounded
+@explained
 @one_thread()
 def calibrate(
     obs: Observations | PartitionedObservations | Iterable[Observations],

@@ -189,10 +189,10 @@ def test_what_follows_a_calibration_follows_these(method, options):
 def test_a_mirror_is_seen(method):
     obs = observations()
     mirrored = dataclasses.replace(obs, y_px=1023.0 - obs.y_px)
-    with pytest.raises(CalibrationError, match="parity") as caught:
+    with pytest.raises(CalibrationError, match="the image is mirrored") as caught:
         run(mirrored, sc.paper.paper_start(), method)
     assert caught.value.status is Status.INCONSISTENT
-    with pytest.raises(CalibrationError, match="parity"):
+    with pytest.raises(CalibrationError, match="the image is mirrored"):
         run(one_by_one(mirrored), sc.paper.paper_start(), method)
     assert run(one_by_one(mirrored), sc.paper.paper_start(), method, throw=False).status is Status.INCONSISTENT
     rng = np.random.default_rng(0)

@@ -22,6 +22,7 @@ from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.duplicates import check_duplicates, repeating_frames
+from starcal_uq.estimation.plausibility import explained
 from starcal_uq.estimation.screening.consensus import MIN_STARS, consensus, measured_directions, pre_screen
 from starcal_uq.estimation.screening.outliers import (
     StarResiduals,
@@ -63,6 +64,7 @@ class _Rates:
     shrinkage: float
 
 
+@explained
 @one_thread()
 def screen(
     obs: Observations,
