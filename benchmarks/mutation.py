@@ -290,12 +290,12 @@ def files_of(subject: str) -> list[str]:
     return [path.relative_to(ROOT).as_posix() for path in found if path.name != "__init__.py"]
 
 
-def sampled(subject: str, number: int, seed: int) -> tuple[list[Mutant], int]:
-    """Some mutants of a subject in the order of the source, and how many there are."""
+def sampled(subject: str, number: int, seed: int) -> tuple[list[Mutant], dict[str, str], int]:
+    """Some mutants of a subject in the order of the source, the text of each file, and how many there are."""
     texts = {file: (ROOT / file).read_text("utf-8") for file in files_of(subject)}
     everything = [mutant for file in texts for mutant in mutants(file)]
     drawn = sorted(everything, key=lambda m: hashlib.sha256(f"{seed} {key(m, texts[m.file])}".encode()).digest())
-    return sorted(drawn[:number], key=lambda m: (m.file, m.start)), len(everything)
+    return sorted(drawn[:number], key=lambda m: (m.file, m.start)), texts, len(everything)
 
 
 class Changed(importlib.abc.MetaPathFinder, importlib.machinery.SourceFileLoader):
@@ -453,13 +453,13 @@ def try_one(mutant: Mutant, text: str, tests: dict[str, dict[str, Any]]) -> str:
 
 def run(subject: str, number: int, seed: int, again: bool) -> dict[str, Any]:
     """Try the mutants of a subject that were not tried yet."""
-    chosen, total = sampled(subject, number, seed)
+    chosen, texts, total = sampled(subject, number, seed)
     log = OUT / "tried.jsonl"
     known = dict(_known(log))
     tests = None
     outcomes: list[tuple[Mutant, str, str]] = []
     for i, mutant in enumerate(chosen):
-        text = (ROOT / mutant.file).read_text("utf-8")
+        text = texts[mutant.file]
         name = key(mutant, text)
         if name not in known or (again and known[name] == "survived"):
             tests = reach(subject) if tests is None else tests
