@@ -13,8 +13,8 @@ edits the tree in place and starts a new interpreter for each mutant, which take
 neither samples nor which tests reach a line. Hence these lines, and `fork` after the heavy libraries are loaded.
 
 Not mutated, because no test should care: sentences, annotations, decorators, what follows ``raise``, sizes of blocks,
-and -1 where it stands for the last axis of two or for a size to be found. `estimation/loops` is left out: its compiled
-code is cached by the file on the disk. Tests hold it equal to `estimation/sums`.
+seeds, and -1 where it stands for the last axis of two or for a size to be found. `estimation/loops` is left out: its
+compiled code is cached by the file on the disk. Tests hold it equal to `estimation/sums`.
 """
 
 from __future__ import annotations
@@ -151,8 +151,10 @@ class Places(ast.NodeVisitor):
     def visit_ImportFrom(self, node: ast.ImportFrom) -> None: ...
 
     def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
-        for default in (*node.args.defaults, *node.args.kw_defaults):
-            if default is not None:
+        named = [*node.args.posonlyargs, *node.args.args][::-1]
+        defaults = [*zip(named, node.args.defaults[::-1], strict=False)]
+        for argument, default in (*defaults, *zip(node.args.kwonlyargs, node.args.kw_defaults, strict=True)):
+            if default is not None and argument.arg != "seed":
                 self.visit(default)
         self.body(node.body)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -10,8 +12,13 @@ from tests.helpers.scenes import camera, nominal, observations
 
 
 @pytest.fixture(scope="module")
-def found():
-    return sc.coupling(sc.calibrate(observations(n_frames=300), sc.paper.paper_start()))
+def calibrated():
+    return sc.calibrate(observations(n_frames=300), sc.paper.paper_start())
+
+
+@pytest.fixture(scope="module")
+def found(calibrated):
+    return sc.coupling(calibrated)
 
 
 def test_correlations_of_the_paper_set_up(found):
@@ -37,6 +44,14 @@ def test_inflation_is_the_price_of_not_knowing_the_others(found):
     assert np.allclose(found.variance_inflation, np.diag(precision))
     assert np.allclose(found.crlb_sigma, found.sigma_marginal, rtol=1e-6)
     assert found.contraction is None
+
+
+def test_contraction_is_the_share_of_the_prior_variance_that_went(calibrated, found):
+    priors = SimpleNamespace(sd=lambda names: 3.0 * found.sigma_marginal)
+    names = ("camera", "covariance", "information", "rotation_per_theta", "attitude_noise")
+    contracted = sc.coupling(SimpleNamespace(priors=priors, **{name: getattr(calibrated, name) for name in names}))
+    assert np.allclose(contracted.contraction, 8.0 / 9.0, rtol=1e-12)
+    assert np.array_equal(contracted.covariance, found.covariance)
 
 
 def test_principal_point_and_boresight_are_one_near_gauge(found):

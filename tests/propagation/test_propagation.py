@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 import starcal_uq as sc
 from starcal_uq.attitude.rotations import left_error, rotation_to_quaternion, rotation_vector
@@ -22,7 +23,7 @@ from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.observations.table import Observations
 from starcal_uq.paper.camera import paper_start
 from starcal_uq.propagation.alignment import alignment_weights
-from starcal_uq.propagation.attitude_error import CONTRIBUTORS, AttitudeError
+from starcal_uq.propagation.attitude_error import CONTRIBUTORS, AttitudeError, MisfitFound
 from starcal_uq.propagation.propagate import FrameGeometry
 from starcal_uq.propagation.propagate import propagate as propagate_aligned
 from starcal_uq.simulation.mission import mission_frames, noise_by_magnitude
@@ -294,6 +295,43 @@ def test_batches_do_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> No
     parts = propagate(post, obs, n_draws=10)
     np.testing.assert_array_equal(whole.common_draws_arcsec, parts.common_draws_arcsec)
     np.testing.assert_allclose(whole.rest_arcsec, parts.rest_arcsec, rtol=1e-10)
+
+
+def test_what_the_model_misses_is_added_to_the_calibration() -> None:
+    """Equal errors of pitch and yaw make the angle across a Rayleigh variable, whose quantiles are known."""
+    held = dataclasses.replace(
+        error(), nea_arcsec=np.array([3.0, 3.0, 9.0]), common_arcsec=np.array([1.0, 1.0, 2.0]),
+        rest_arcsec=np.array([0.5, 0.5, 1.0]), total_arcsec=np.array([1.1, 1.1, 2.2]),
+        interaction_arcsec=np.array([0.1, 0.1, 0.2]),
+    )  # fmt: skip
+    sigma = held.if_model_holds_arcsec
+    np.testing.assert_array_equal(sigma[:, 3], sigma[:, 0])
+    quantiles = [
+        np.array([norm.isf(0.5 * (1.0 - share))] * 3 + [np.sqrt(-2.0 * np.log(1.0 - share))]) for share in (0.95, 0.997)
+    ]
+    # The rest and the total have tails a fifth longer than Gaussian ones.
+    longer = np.array([1.0, 1.0, 1.2, 1.2, 1.0])[:, None]
+    p95, p997 = (quantile * longer * sigma for quantile in quantiles)
+    misfit = MisfitFound(1.5, np.array([0.3, 0.4, 0.5]), np.array([0.6, 0.6, 0.8]), ())
+    held = dataclasses.replace(held, p95_arcsec=p95, p997_arcsec=p997)
+    assert np.isnan(held.with_misfit_found_arcsec).all() and held.headline_arcsec is not held.with_misfit_found_arcsec
+    np.testing.assert_array_equal(held.headline_arcsec, sigma)
+    found = dataclasses.replace(held, misfit=misfit)
+    common = np.sqrt(1.5**2 * sigma[1, :3] ** 2 + np.array([0.3, 0.4, 0.5]) ** 2)
+    rest = np.sqrt(1.5**2 * sigma[2, :3] ** 2 + np.array([0.6, 0.6, 0.8]) ** 2)
+    both = np.sqrt(1.5**2 * sigma[3, :3] ** 2 + misfit.common_arcsec**2 + misfit.rest_arcsec**2)
+    expected = np.array([sigma[0, :3], common, rest, both, sigma[4, :3]])
+    np.testing.assert_allclose(found.with_misfit_found_arcsec[:, :3], expected, rtol=1e-12)
+    across = np.sqrt(0.5 * (expected[:, 0] ** 2 + expected[:, 1] ** 2))
+    np.testing.assert_allclose(found.with_misfit_found_arcsec[:, 3], across, rtol=1e-12)
+    np.testing.assert_array_equal(found.headline_arcsec, found.with_misfit_found_arcsec)
+    # The excess of a tail shrinks with the share that has it.
+    share = (1.5 * 0.5) ** 2 / (1.5**2 * 0.5**2 + 0.6**2)
+    for widths, quantile, own in zip(found.half_widths_with_misfit_found_arcsec, quantiles, (p95, p997), strict=True):
+        np.testing.assert_allclose(widths[[0, 4]], own[[0, 4]], rtol=1e-6)
+        np.testing.assert_allclose(widths[1, :3], quantile[:3] * common, rtol=1e-6)
+        np.testing.assert_allclose(widths[2, 0], quantile[0] * (1.0 + 0.2 * share) * rest[0], rtol=1e-6)
+        np.testing.assert_allclose(widths[2, 3], quantile[3] * (1.0 + 0.2 * share) * rest[0], rtol=1e-6)
 
 
 def test_table_has_one_row_per_contributor_and_axis() -> None:
