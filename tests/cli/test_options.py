@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 import typer
 
-from starcal_uq.cli import commands as cli_app
+from starcal_uq.cli import commands as declared
+from starcal_uq.cli.app import main
 
 # Arguments with which each command would work.
 VALID = {
@@ -53,14 +54,14 @@ class BeginsError(Exception):
 
 @pytest.fixture(scope="module")
 def commands():
-    return typer.main.get_command(cli_app.app).commands
+    return typer.main.get_command(declared.app).commands
 
 
 @pytest.fixture
 def parse(commands, monkeypatch, capsys, tmp_path):
     """Whether a command accepts its arguments; the sentence with which it refuses them otherwise."""
     monkeypatch.chdir(tmp_path)
-    group = typer.main.get_command(cli_app.app)
+    group = typer.main.get_command(declared.app)
     for folder in ("folder", "RUN", "IMAGES"):
         Path(folder).mkdir()
     for file in ("OBS", "CAMERA"):
@@ -71,12 +72,12 @@ def parse(commands, monkeypatch, capsys, tmp_path):
 
     for command in group.commands.values():
         monkeypatch.setattr(command, "callback", begin)
-    monkeypatch.setattr(cli_app, "app", group)
+    monkeypatch.setattr(declared, "app", group)
 
     def call(*arguments):
         monkeypatch.setattr(sys, "argv", ["starcal-uq", *arguments])
         try:
-            cli_app.main()
+            main()
         except BeginsError:
             return None
         except SystemExit as stop:
