@@ -139,6 +139,9 @@ def test_averages_are_those_of_the_series() -> None:
     for axis, time in enumerate(after):
         assert np.greater(*quiet.averaged_arcsec(time))[axis]
     assert "it comes to exceed centroid noise: pitch after" in quiet.text
+    # Noise that equals it after 20 s: from there on, to the next of the averages tried, and not before.
+    level = dataclasses.replace(found, nea_arcsec=np.sqrt(20.0) * found.averaged_arcsec(20.0)[0])
+    assert np.all((level.dominates_after_s >= 20.0) & (level.dominates_after_s < 21.5))
     for seconds in (0.5, 200.0):
         with pytest.raises(ValueError, match=r"choose 1 s to 150\.25 s"):
             found.averaged_arcsec(seconds)
