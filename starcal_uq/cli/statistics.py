@@ -27,6 +27,7 @@ from starcal_uq.cli.options import (
 )
 from starcal_uq.core import settings
 from starcal_uq.core.files import atomic_write_bytes, check_new_folder, new_folder, write_csv
+from starcal_uq.core.store import finished
 
 
 def register(app: typer.Typer) -> None:
@@ -55,7 +56,10 @@ def validate_command(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Show that the intervals are right for this sensor and this volume of data, by simulation-based calibration."""
+    """Show that the intervals are right for this sensor and this volume of data, by simulation-based calibration.
+
+    Replicates are kept as they are made: an interrupted command goes on, also with more of them.
+    """
     sensor = sc.Camera.load(camera)
     check_new_folder(out, force)
     with progress_bar("replicates") as progress:
@@ -70,7 +74,10 @@ def validate_command(
             workers=workers,
             truth=truth,
             progress=progress,
+            keep=out,
         )
+    if found.interrupted:
+        raise KeyboardInterrupt
     from starcal_uq.presentation.figures.style import png_bytes
     from starcal_uq.presentation.words.diagnostics import validation_table
 
@@ -79,6 +86,7 @@ def validate_command(
     table = found.to_dataframe()
     write_csv(table, out / "validation.csv")
     atomic_write_bytes(out / "validation.png", png_bytes(found.plot.ranks()))
+    finished(out)
     if json:
         print_json({"ok": found.ok, "verdict": found.text, "quantities": records(table)})
     else:

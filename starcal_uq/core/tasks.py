@@ -12,14 +12,18 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import lru_cache
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait as wait_for
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from starcal_uq.core.errors import SamplingError
+
+if TYPE_CHECKING:
+    from starcal_uq.core.store import Kept
 
 Progress = Callable[[int, int], None]
 T = TypeVar("T")
@@ -43,6 +47,7 @@ def run_tasks(
     workers: int | None = None,
     progress: Progress | None = None,
     each: Callable[[T], None] | None = None,
+    kept: Kept | None = None,
 ) -> tuple[list[T], bool]:
     """Run task 0 .. n_tasks - 1; the results in order, and whether Ctrl-C was pressed before all were complete.
 
@@ -62,6 +67,8 @@ def run_tasks(
         Called as ``progress(done, total)``.
     each : callable, optional
         Called with every result as it arrives, in this process; what it keeps survives whatever comes later.
+    kept : Kept, optional
+        Results of an earlier call, which are not computed again, and to which each new one is added.
 
     Raises
     ------
@@ -70,13 +77,18 @@ def run_tasks(
     KeyboardInterrupt
         If Ctrl-C was pressed before the first result.
     """
-    n_chunks = -(-n_tasks // chunk)
-    workers = min(processors() if workers is None else workers, n_chunks)
-    results: Numbered[T] = []
+    known: dict[int, T] = {} if kept is None else kept.results(n_tasks)
+    results: Numbered[T] = list(known.items())
+    todo = [number for number in range(n_tasks) if number not in known]
+    task = _Some(task, todo) if known else task
+    workers = min(processors() if workers is None else workers, -(-len(todo) // chunk))
     interrupted = False
 
     def keep(some: Numbered[T]) -> None:
+        some = [(todo[place], result) for place, result in some]
         results.extend(some)
+        if kept is not None:
+            kept.keep(some)
         if each is not None:
             for _, result in some:
                 each(result)
@@ -86,17 +98,28 @@ def run_tasks(
     try:
         if workers == 0:
             with interrupt_between_steps() as check:
-                for index in range(n_tasks):
+                for index in range(len(todo)):
                     keep([(index, task(index))])
                     check()
         else:
-            _spread(task, n_tasks, workers, chunk, caller, keep)
+            _spread(task, len(todo), workers, chunk, caller, keep)
     except KeyboardInterrupt:
         if not results:
             raise
         interrupted = True
     results.sort(key=lambda numbered: numbered[0])
     return [result for _, result in results], interrupted
+
+
+@dataclass(frozen=True)
+class _Some(Generic[T]):
+    """Some of the tasks, by their places."""
+
+    task: Callable[[int], T]
+    numbers: list[int]
+
+    def __call__(self, place: int) -> T:
+        return self.task(self.numbers[place])
 
 
 def processors() -> int:

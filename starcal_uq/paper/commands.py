@@ -12,6 +12,8 @@ from starcal_uq.core.tasks import Progress, run_tasks
 if TYPE_CHECKING:
     import pandas as pd
 
+    from starcal_uq.core.store import Kept
+
 T = TypeVar("T")
 
 
@@ -46,9 +48,12 @@ def run_or_stop(
     workers: int | None,
     progress: Progress | None,
     caller: str = "field_experiment",
+    kept: Kept | None = None,
 ) -> list[T]:
     """Every result of the tasks of an experiment (`run_tasks`); Ctrl-C is an interrupt."""
-    found, interrupted = run_tasks(task, n_tasks, caller=caller, chunk=chunk, workers=workers, progress=progress)
+    found, interrupted = run_tasks(
+        task, n_tasks, caller=caller, chunk=chunk, workers=workers, progress=progress, kept=kept
+    )
     if interrupted:
         raise KeyboardInterrupt
     return found

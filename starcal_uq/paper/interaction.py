@@ -27,9 +27,10 @@ import numpy as np
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import SamplingError, StarcalError
-from starcal_uq.core.files import cell_content, reading, write_csv
+from starcal_uq.core.files import PathLike, cell_content, reading, write_csv
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import bounded
+from starcal_uq.core.store import Kept
 from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.calibrate import calibrate
@@ -339,6 +340,7 @@ def interaction_study(
     seed: int = 2017,
     workers: int | None = None,
     progress: Progress | None = None,
+    keep: PathLike | None = None,
 ) -> InteractionStudy:
     """Bias and spread of x0, y0 and f for methods that ignore, decouple or couple optics and distortion.
 
@@ -359,7 +361,7 @@ def interaction_study(
         Designs at every point; 16 know a spread to 18 %, 50 to 10 %.
     n_frames, min_stars, sigma_px, max_mag
         Data of one calibration where an axis does not say otherwise.
-    seed, workers, progress
+    seed, workers, progress, keep
         As in `replicate`; the seed repeats the study bit for bit for any number of processes.
 
     Returns
@@ -393,6 +395,10 @@ def interaction_study(
     # Where the axes cross they share their data.
     conditions = tuple(dict.fromkeys(point.condition for point in points))
     plan = Plan(sky, conditions, seed)
+    kept = None
+    if keep is not None:
+        told = [[c.truth, c.start, dataclasses.asdict(c.campaign)] for c in conditions]
+        kept = Kept(keep, ["interaction", told, seed, sky.source], (Outcome,))
     outcomes, interrupted = run_tasks(
         partial(run_one, plan),
         n_replicates * len(conditions),
@@ -400,6 +406,7 @@ def interaction_study(
         chunk=1,
         workers=workers,
         progress=progress,
+        kept=kept,
     )
     rows: list[AnyDict] = []
     for point in points:

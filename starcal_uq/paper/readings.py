@@ -19,7 +19,9 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import unproject_jacobian
 from starcal_uq.core.errors import StarcalError
+from starcal_uq.core.files import PathLike
 from starcal_uq.core.status import Status
+from starcal_uq.core.store import Kept
 from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.calibrate import calibrate
@@ -78,6 +80,7 @@ def run_readings(
     seed: int = 2017,
     workers: int | None = None,
     progress: Progress | None = None,
+    keep: PathLike | None = None,
 ) -> Readings:
     """Repeat the experiment over seeds under every reading; parameters as in `replicate`.
 
@@ -89,7 +92,8 @@ def run_readings(
     sparse = stars.select(np.sort(np.argsort(stars.mag, kind="stable")[:N_STARS]))
     plan = Plan(stars, sparse, convention, Campaign(n_frames), seed)
     task = partial(draw, plan)
-    found = run_or_stop(task, n_draws, caller="reproduce", chunk=1, workers=workers, progress=progress)
+    kept = None if keep is None else Kept(keep, ["readings", convention, n_frames, seed, stars.source], (Key,))
+    found = run_or_stop(task, n_draws, caller="reproduce", chunk=1, workers=workers, progress=progress, kept=kept)
     keys = tuple(found[0])
     return Readings(keys, np.array([[one.get(key, np.nan) for one in found] for key in keys]))
 

@@ -18,9 +18,11 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError, DistortionError, SamplingError, StarcalError
+from starcal_uq.core.files import PathLike
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import read, write
 from starcal_uq.core.settings import bounded
+from starcal_uq.core.store import Kept
 from starcal_uq.core.tasks import Progress, run_tasks
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray, Shapes
 from starcal_uq.estimation.calibrate import calibrate
@@ -299,6 +301,7 @@ def replicate(
     progress: Progress | None = None,
     stars: StarCatalogue | None = None,
     share_slow: bool = False,
+    keep: PathLike | None = None,
 ) -> Replicates:
     """Calibrate many simulated data sets with every method, and set their errors against their claims.
 
@@ -325,6 +328,8 @@ def replicate(
     share_slow : bool
         Run the filter that forms every pair in the first quarter of the replicates only, at least 8; the others hold
         NaN for it.
+    keep : path, optional
+        Folder in which replicates are kept as they are made; a later call goes on from them.
 
     Returns
     -------
@@ -357,6 +362,10 @@ def replicate(
     sky = load_catalogue(max_mag=max_mag) if stars is None else stars
     n_slow = max(_LEAST, n_replicates // SHARE) if share_slow else n_replicates
     experiment = Experiment(sky, methods, truth, start, campaign, seed, n_slow)
+    kept = None
+    if keep is not None:
+        identity = ["replicates", methods, truth, start, campaign.settings(stars), seed, n_slow, sky.source]
+        kept = Kept(keep, identity)
     outcomes, interrupted = run_tasks(
         partial(run_replicate, experiment),
         n_replicates,
@@ -364,6 +373,7 @@ def replicate(
         chunk=_CHUNK,
         workers=workers,
         progress=progress,
+        kept=kept,
     )
     arrays = {name: np.stack([one[name] for one in outcomes], axis=int(name in _BY_METHOD)) for name in _ARRAYS}
     failures = tuple(zip(*(outcome["failures"] for outcome in outcomes), strict=True))

@@ -8,6 +8,7 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.files import PathLike, atomic_write_text, check_new_folder
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import bounded
+from starcal_uq.core.store import finished
 from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import AnyDict
 from starcal_uq.paper.camera import paper_camera, paper_start
@@ -47,7 +48,8 @@ def reproduce(
     out : path
         Folder to write: ``reproduction.html`` (self-contained), ``table_2.csv``, ``rows.csv``, ``published.csv``,
         ``trials.csv``, ``checks.csv``, ``errors.csv``, ``replicates.csv``, ``replicates.npz``, ``interaction.csv``, and
-        the figures as PNG in ``figures``. Nothing is written before everything is computed.
+        the figures as PNG in ``figures``. They are written when everything is computed; until then data sets that are
+        done are kept in the folder, and an interrupted call goes on from them.
     n_replicates : int
         Data sets over which every method is repeated, at least 8; the filter that takes pairs as independent, a slow
         option, has a quarter of them.
@@ -81,7 +83,7 @@ def reproduce(
     SamplingError
         If processes cannot be used.
     KeyboardInterrupt
-        After Ctrl-C; nothing is written then.
+        After Ctrl-C; the same call then goes on.
     """
     folder = Path(out)
     check_new_folder(folder, force)
@@ -100,6 +102,7 @@ def reproduce(
         seed=seed,
         workers=workers,
         progress=bar.part("readings"),
+        keep=folder,
     )
     replicates = replicate(
         truth=truth,
@@ -110,6 +113,7 @@ def reproduce(
         seed=seed,
         workers=workers,
         progress=bar.part("replicates"),
+        keep=folder,
     )
     _stop_if(replicates.interrupted)
     varied = None
@@ -121,6 +125,7 @@ def reproduce(
             seed=seed,
             workers=workers,
             progress=bar.part("study"),
+            keep=folder,
         )
         _stop_if(varied.interrupted)
     settings: AnyDict = {"convention": convention, "n_replicates": n_replicates, "n_frames": n_frames}
@@ -142,6 +147,7 @@ def reproduce(
     write_tables(folder, found.tables(), figures)
     replicates.save(folder / "replicates.npz")
     atomic_write_text(found.report, page)
+    finished(folder)
     bar.finish("report")
     return found
 

@@ -331,6 +331,24 @@ def test_interrupt_keeps_what_is_done(stars):
     np.testing.assert_array_equal(found.ranks[0], validate_study(settings, stars, 1, workers=0).ranks[0])
 
 
+def test_an_interrupted_validation_goes_on_with_what_it_kept(tmp_path):
+    settings = {"n_frames": 4, "min_stars": 6, "seed": 11, "workers": 0}
+
+    def press(done, total):
+        if done == 2:
+            signal.raise_signal(signal.SIGINT)
+
+    assert sc.validate(camera(), n_replicates=4, keep=tmp_path, progress=press, **settings).interrupted
+    told = []
+    resumed = sc.validate(
+        camera(), n_replicates=4, keep=tmp_path, progress=lambda done, _: told.append(done), **settings
+    )
+    assert told == [3, 4]
+    _same(resumed, sc.validate(camera(), n_replicates=4, **settings))
+    with pytest.raises(SamplingError, match="leave out `keep`"):
+        sc.validate(camera(), keep=tmp_path, likelihood=lambda obs, cal: cal.compressed)
+
+
 def test_interrupt_before_the_first_result_is_an_interrupt(stars, monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt

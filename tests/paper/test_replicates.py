@@ -288,6 +288,18 @@ def test_interrupt_keeps_what_is_done():
     np.testing.assert_array_equal(found.estimates[:, found.replicate < 2], first.estimates)
 
 
+def test_interrupted_replicates_go_on_with_what_was_kept(tmp_path):
+    def press(done, total):
+        if done == 2:
+            signal.raise_signal(signal.SIGINT)
+
+    assert replicate(n_replicates=4, workers=0, keep=tmp_path, progress=press, **SMALL).interrupted
+    told = []
+    resumed = replicate(n_replicates=4, workers=0, keep=tmp_path, progress=lambda done, _: told.append(done), **SMALL)
+    assert told == [3, 4]
+    _same(resumed, replicate(n_replicates=4, workers=0, **SMALL))
+
+
 def test_interrupt_before_the_first_result_is_an_interrupt(monkeypatch):
     def stop(*_):
         raise KeyboardInterrupt

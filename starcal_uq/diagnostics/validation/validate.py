@@ -24,8 +24,10 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError, PriorError, SamplingError
+from starcal_uq.core.files import PathLike
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import Truth, bounded
+from starcal_uq.core.store import Kept
 from starcal_uq.core.tasks import Progress, one_thread, run_tasks
 from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.validation.replicates import MARGINAL, LikelihoodMaker, Study, TrialOutcome, run_replicate
@@ -64,6 +66,7 @@ def validate(
     stars: StarCatalogue | None = None,
     assumed_sigma_px: float | None = None,
     likelihood: str | LikelihoodMaker = MARGINAL,
+    keep: PathLike | None = None,
 ) -> Validation:
     """Check intervals, ranks and errors of calibration and posterior for a sensor and its volume of data.
 
@@ -97,6 +100,9 @@ def validate(
     likelihood : {"marginal", "pairs", "pairs_naive"} or callable
         As in `sample`; or ``(obs, cal) -> object with log_likelihood(theta (n, p), sigma (n,)) -> (n,)``, to validate
         one's own, which with several workers must be a function at the top level of a module.
+    keep : path, optional
+        Folder in which replicates are kept as they are made; a later call goes on from them, with more replicates as
+        well. Not for a likelihood of one's own.
 
     Returns
     -------
@@ -127,7 +133,13 @@ def validate(
         "likelihood": likelihood if isinstance(likelihood, str) else getattr(likelihood, "__name__", repr(likelihood)),
     }
     sky = load_catalogue(max_mag=max_mag) if stars is None else stars
-    return validate_study(study, sky, n_replicates, workers=workers, progress=progress, settings=settings)
+    kept = None
+    if keep is not None:
+        if not isinstance(likelihood, str):
+            raise SamplingError("replicates of a likelihood of your own cannot be kept: leave out `keep`.")
+        identity = [camera, nominal, priors, seed, settings, sky.source]
+        kept = Kept(keep, identity, (TrialOutcome,))
+    return validate_study(study, sky, n_replicates, workers=workers, progress=progress, settings=settings, kept=kept)
 
 
 def validate_study(
@@ -138,9 +150,10 @@ def validate_study(
     workers: int | None = None,
     progress: Progress | None = None,
     settings: AnyDict | None = None,
+    kept: Kept | None = None,
 ) -> Validation:
     """Run the replicates of a study, whose settings may be any, and collect them."""
-    outcomes, interrupted = run_replicates(study, stars, n_replicates, workers, progress)
+    outcomes, interrupted = run_replicates(study, stars, n_replicates, workers, progress, kept)
     good = [o for o in outcomes if not o.failure]
     failures = tuple(o.failure for o in outcomes if o.failure)
     if not good:
@@ -222,7 +235,12 @@ _CHUNK = 8
 
 
 def run_replicates(
-    study: Study, stars: StarCatalogue, n_replicates: int, workers: int | None, progress: Progress | None
+    study: Study,
+    stars: StarCatalogue,
+    n_replicates: int,
+    workers: int | None,
+    progress: Progress | None,
+    kept: Kept | None = None,
 ) -> tuple[list[TrialOutcome], bool]:
     """Run replicates 0 .. n_replicates - 1; as `run_tasks`."""
     return run_tasks(
@@ -232,4 +250,5 @@ def run_replicates(
         chunk=_CHUNK,
         workers=workers,
         progress=progress,
+        kept=kept,
     )

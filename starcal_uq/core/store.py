@@ -1,0 +1,168 @@
+"""Results on disk while they are made: appended in parts, each written whole, found again by what they depend on."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import secrets
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.files import UNFINISHED, PathLike, atomic_path, new_folder, read_parquet, reading
+from starcal_uq.core.provenance import provenance
+from starcal_uq.core.records import to_plain
+from starcal_uq.core.types import AnyDict
+
+if TYPE_CHECKING:
+    import pyarrow as pa
+
+_PATTERN, _WHOLE = "[!.]*.parquet", "all-{}.parquet"
+
+
+class Store:
+    """Rows with a key, of a folder, or of memory alone where there is none.
+
+    Parameters
+    ----------
+    folder : path or None
+        The folder, which is made.
+    schema : pyarrow.Schema
+        Columns of the rows, ``key`` among them.
+    read : callable
+        From the path of a part to its rows.
+    """
+
+    def __init__(self, folder: PathLike | None, schema: pa.Schema, read: Callable[[Path], pa.Table]) -> None:
+        self.folder, self.schema = None if folder is None else new_folder(folder), schema
+        self._tables = [read(path) for path in sorted(self.folder.glob(_PATTERN))] if self.folder is not None else []
+
+    def clear(self) -> None:
+        """Forget all rows."""
+        self._tables = []
+        for path in self.folder.glob(_PATTERN) if self.folder is not None else []:
+            path.unlink()
+
+    def keys(self) -> set[str]:
+        """Keys of the rows that are there."""
+        return {key for table in self._tables for key in table["key"].to_pylist()}
+
+    def append(self, rows: Sequence[AnyDict]) -> None:
+        """Add rows; a part of the folder is there as a whole or not at all."""
+        import pyarrow as pa
+
+        table = pa.Table.from_pylist(list(rows), schema=self.schema)
+        self._tables.append(table)
+        if self.folder is not None:
+            write_part(table, self.folder / f"part-{secrets.token_hex(8)}.parquet")
+
+    def table(self) -> pa.Table:
+        """All rows, each once."""
+        import pyarrow as pa
+
+        whole = pa.concat_tables(self._tables) if self._tables else pa.Table.from_pylist([], schema=self.schema)
+        _, first = np.unique(np.array(whole["key"].to_pylist(), dtype=object).astype(str), return_index=True)
+        return whole if len(first) == len(whole) else whole.take(np.sort(first))
+
+    def consolidate(self) -> None:
+        """One file instead of many parts; until they are gone, rows that stand in both count once."""
+        if self.folder is None or len(self._tables) < 2:
+            return
+        parts = list(self.folder.glob(_PATTERN))
+        whole = self.table()
+        write_part(whole, self.folder / _WHOLE.format(secrets.token_hex(8)))
+        for path in parts:
+            path.unlink(missing_ok=True)
+        self._tables = [whole]
+
+
+def write_part(table: pa.Table, path: Path) -> None:
+    """Write rows, all or nothing."""
+    import pyarrow.parquet as pq
+
+    with atomic_path(path) as temporary:
+        pq.write_table(table, temporary)
+
+
+class Kept:
+    """Results of numbered tasks in the folder of a command that is not finished.
+
+    Those that depend on something else than is wanted now are not found, and a part that cannot be read is passed over.
+
+    Parameters
+    ----------
+    folder : path
+        The folder of the command.
+    identity : object
+        All that the tasks depend on but their number: a record, or what a record may hold.
+    kinds : types, optional
+        Named tuples that results are, or hold.
+    """
+
+    def __init__(self, folder: PathLike, identity: object, kinds: Sequence[type] = ()) -> None:
+        import pyarrow as pa
+
+        told = to_plain([identity, provenance(None, {}, None)["versions"]])
+        self._identity = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+        self._kinds = {kind.__name__: kind for kind in kinds}
+        schema = pa.schema([("key", pa.string()), ("result", pa.string())])
+
+        def read(path: Path) -> pa.Table:
+            try:
+                with reading(path, "a part of the results", "delete it"):
+                    table = read_parquet(path)
+                    return table if table.schema == schema else schema.empty_table()
+            except RunFolderError:
+                return schema.empty_table()
+
+        self._store = Store(Path(folder) / UNFINISHED, schema, read)
+
+    def _key(self, number: int) -> str:
+        return f"{self._identity}-{number}"
+
+    def results(self, n_tasks: int) -> dict[int, Any]:
+        """Results that are there, by the numbers of their tasks."""
+        table = self._store.table()
+        found = dict(zip(table["key"].to_pylist(), table["result"].to_pylist(), strict=True))
+        numbers = [number for number in range(n_tasks) if self._key(number) in found]
+        return {number: self._value(json.loads(found[self._key(number)])) for number in numbers}
+
+    def keep(self, results: Sequence[tuple[int, Any]]) -> None:
+        """Add results."""
+        self._store.append([{"key": self._key(n), "result": json.dumps(_plain(value))} for n, value in results])
+
+    def _value(self, plain: Any) -> Any:
+        if not isinstance(plain, dict):
+            return plain
+        ((kind, content),) = plain.items()
+        if kind == "array":
+            dtype, shape, data = content
+            return np.frombuffer(base64.b64decode(data), dtype=np.dtype(dtype)).reshape(shape).copy()
+        if kind == "dict":
+            return {self._value(key): self._value(value) for key, value in content}
+        items = [self._value(item) for item in content]
+        return items if kind == "list" else tuple(items) if kind == "tuple" else self._kinds[kind](*items)
+
+
+def _plain(value: Any) -> Any:
+    """A result for JSON: every bit of its numbers, and of what kind its parts are."""
+    if isinstance(value, np.ndarray):
+        return {"array": [value.dtype.str, value.shape, base64.b64encode(value.tobytes()).decode()]}
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, dict):
+        return {"dict": [[_plain(key), _plain(item)] for key, item in value.items()]}
+    if isinstance(value, list | tuple):
+        kind = type(value).__name__
+        return {kind: [_plain(item) for item in value]}
+    return value
+
+
+def finished(folder: PathLike) -> None:
+    """Remove what a command has kept, now that its results are written."""
+    shutil.rmtree(Path(folder) / UNFINISHED, ignore_errors=True)
