@@ -9,7 +9,7 @@ import numpy as np
 
 from starcal_uq.core.errors import ImageError
 from starcal_uq.core.types import BoolArray, FloatArray
-from starcal_uq.images.image import Image
+from starcal_uq.images.image import LARGEST_COUNTS, Image
 
 # SExtractor's clipping at 3 sigma takes this part of Gaussian noise.
 _CLIPPED = 0.983
@@ -68,8 +68,9 @@ def prepare_image(
     name = image.name or "image"
     # A copy, which becomes the counts above the background where it stands: a new array for each step takes longer
     # than the step.
-    data = np.array(image.data, dtype=np.float32, order="C")
-    finite = np.isfinite(data)
+    with np.errstate(over="ignore"):
+        data = np.array(image.data, dtype=np.float32, order="C")
+    finite = np.abs(data) < LARGEST_COUNTS
     whole = bool(finite.all())
     values = data if whole else data[finite]
     if not values.size:

@@ -1,11 +1,13 @@
-"""Frames read from files: FITS, TIFF, PNG and JPEG become arrays whose first row is y = 0."""
+"""Frames read from files: FITS, TIFF, PNG, JPEG and BMP become arrays whose first row is y = 0."""
 
 from __future__ import annotations
 
 import gzip
 import io
+import math
 import os
 import re
+import sys
 import warnings
 import zlib
 from collections.abc import Mapping
@@ -17,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.errors import ImageError
+from starcal_uq.core.files import check_size
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.times import FIRST_YEAR, LAST_YEAR, utc_of_scale
 from starcal_uq.core.types import AnyDict
@@ -25,11 +28,24 @@ if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
 
 FITS_ENDINGS = (".fits", ".fit", ".fts", ".fits.gz", ".fit.gz", ".fts.gz")
-IMAGE_ENDINGS = (*FITS_ENDINGS, ".tiff", ".tif", ".png", ".jpg", ".jpeg")
+IMAGE_ENDINGS = (*FITS_ENDINGS, ".tiff", ".tif", ".png", ".jpg", ".jpeg", ".bmp")
+# Of Pillow's formats: others start programs (EPS) or turn the image upside down (FITS).
+_PICTURES = ("TIFF", "PNG", "JPEG", "BMP")
+# Beyond, sums over pixels leave the range of 32-bit numbers, and no counts are.
+LARGEST_COUNTS = 1e30
 # Rec. 601, as pillow weighs the colours of 8-bit images.
 _LUMINANCE = (0.299, 0.587, 0.114)
 # Full scale of the converters that write into 16 bits without shifting.
 _FULL_SCALES = (1023, 4095, 16383)
+# Of an image, and columns of a table.
+_MOST_AXES = 999
+_PIECE_BYTES = 1 << 22
+# What the comment of GAIN says where it is electrons per count.
+_PER_COUNT = re.compile(r"electron|\be-? ?(/|per )", re.IGNORECASE | re.ASCII)
+_SIZE = re.compile(rb"([A-Z]+\d{0,3}) *=([^/]{0,70})")
+_SIZES = re.compile(rb"NAXIS[1-9] *= *(\d{1,20})")
+# Bytes of a pixel by Pillow's modes; four for all others.
+_PIXEL_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2, "I;16B": 2}
 # Ten blocks, of 36 cards each.
 _HEADER_BYTES = 28800
 # ISO 8601 as far as names of files allow it: colons are left out or replaced.
@@ -116,7 +132,7 @@ class Image:
 
 
 def read_image(path: str | os.PathLike[str], camera: Camera | None = None) -> Image:
-    """Read one frame (``.fits``, ``.fit``, ``.fits.gz``, ``.tiff``, ``.png``, ``.jpg``).
+    """Read one frame (``.fits``, ``.fit``, ``.fits.gz``, ``.tiff``, ``.png``, ``.jpg``, ``.bmp``).
 
     The rows are kept in the order of the file, so the first row is y = 0. A colour image becomes its luminance; of a
     file with several planes the first is taken, of a FITS file with several images the first of the camera's size, or
@@ -133,7 +149,8 @@ def read_image(path: str | os.PathLike[str], camera: Camera | None = None) -> Im
     Raises
     ------
     ImageError
-        If the file is missing, truncated, no image, or of the wrong size.
+        If the file is missing, truncated, no image, of the wrong size, declares more pixels than it can hold, or has
+        colours of 16 bits, of which half would be lost.
     """
     image = read_any_size(path, camera)
     if camera is not None:
@@ -188,6 +205,8 @@ def time_in_name_message(name: str) -> str:
 def _read_bytes(path: Path) -> bytes:
     if os.path.isdir(path):
         raise ImageError(f"{path}: is a directory; name an image file.")
+    if os.path.exists(path) and not os.path.isfile(path):
+        raise ImageError(f"{path}: is not a regular file; name an image file.")
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -203,16 +222,42 @@ def _broken(path: Path) -> ImageError:
     return ImageError(f"{path}: the file is truncated or damaged; copy it again or leave it out.")
 
 
+def _check_declared(path: Path, declared: int, stored: int) -> None:
+    """Refuse an image of `declared` bytes that a file of `stored` bytes cannot hold, before memory is taken for it."""
+    try:
+        check_size(declared, stored)
+    except ValueError as error:
+        raise ImageError(
+            f"{path}: the file is damaged ({error}); copy it again, or save the image without compression."
+        ) from None
+
+
+def _unpacked(path: Path, data: bytes) -> bytes:
+    """Content of a file of gzip."""
+    content = bytearray()
+    try:
+        with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+            while piece := file.read(_PIECE_BYTES):
+                if not content:
+                    # What the first header says spares the rest.
+                    sizes = _SIZES.findall(piece.partition(b"END" + b" " * 77)[0])
+                    _check_declared(path, math.prod(map(int, sizes)) if sizes else 0, len(data))
+                content += piece
+                _check_declared(path, len(content), len(data))
+    except (OSError, EOFError, zlib.error) as error:
+        raise _broken(path) from error
+    return bytes(content)
+
+
 def _read_fits(path: Path, data: bytes, camera: Camera | None) -> Image:
     from astropy.io import fits
 
+    stored = len(data)
     if data.startswith(b"\x1f\x8b"):
-        try:
-            data = gzip.decompress(data)
-        except (OSError, EOFError, zlib.error) as error:
-            raise _broken(path) from error
+        data = _unpacked(path, data)
     if not data.startswith(b"SIMPLE"):
         raise ImageError(f"{path}: the file is not a FITS image; check what it is, or name it by its format.")
+    _check_counts(path, data)
     messages: list[str] = []
     with warnings.catch_warnings():
         # Astropy warns of a truncated file and then pads it or fails later; both are one error here.
@@ -224,7 +269,9 @@ def _read_fits(path: Path, data: bytes, camera: Camera | None) -> Image:
                 if chosen is None:
                     raise ImageError(f"{path}: the FITS file holds no image; leave it out.")
                 hdu = hdus[chosen]
+                _check_declared(path, math.prod(hdu.shape) * abs(hdu.header["BITPIX"]) // 8, max(stored, len(data)))
                 pixels, header = np.array(hdu.data), _plain(hdu.header)
+                unit = next((str(h.comments["GAIN"]) for h in (hdu.header, hdus[0].header) if "GAIN" in h), "")
                 if chosen and header.get("INHERIT", True):
                     # Exposures of several images say in the first header what is common to them.
                     header = _plain(hdus[0].header) | header
@@ -248,6 +295,20 @@ def _read_fits(path: Path, data: bytes, camera: Camera | None) -> Image:
     exposure = _positive(header, "EXPTIME", "EXPOSURE")
     time, words = _middle(header, exposure)
     messages += [f"{path.name}: {words}"] if words else []
+    gain = _positive(header, "EGAIN")
+    if gain is None and (bare := _positive(header, "GAIN")) is not None:
+        # Of many cameras it is a setting.
+        gain = bare if _PER_COUNT.search(unit) else None
+        if gain is None:
+            messages.append(
+                f"{path.name}: GAIN ({bare:g}) does not say that it is in electrons per count and was not used; give "
+                "the gain."
+            )
+    if mosaic := str(header.get("BAYERPAT", "")).strip():
+        messages.append(
+            f"{path.name}: the pixels are a mosaic of colours ({mosaic}) and were read as grey, which makes centroids "
+            "worse than predicted."
+        )
     return Image(
         _checked(path, pixels, messages),
         path.name,
@@ -255,9 +316,27 @@ def _read_fits(path: Path, data: bytes, camera: Camera | None) -> Image:
         exposure_s=exposure,
         saturation=_positive(header, "SATURATE", "SATLEVEL") or _full_scale(pixels),
         header=header,
-        gain_e_per_count=_positive(header, "EGAIN", "GAIN"),
+        gain_e_per_count=gain,
         messages=tuple(messages),
     )
+
+
+def _check_counts(path: Path, data: bytes) -> None:
+    """Refuse headers whose sizes are none, or that count more axes or columns than FITS knows.
+
+    Astropy would go through them one by one, or go back by negative sizes, without end.
+    """
+    for key in (b"NAXIS", b"TFIELDS", b"PCOUNT", b"GCOUNT"):
+        place = data.find(key)
+        while place >= 0:
+            card = _SIZE.match(data, place)
+            first = place - (data[place - 1 : place] == b"Z")
+            if first % 80 == 0 and card is not None:
+                value = card[2].strip()
+                most = _MOST_AXES if card[1] in (b"NAXIS", b"TFIELDS") else sys.maxsize
+                if not (value.isdigit() and int(value) <= most):
+                    raise _broken(path)
+            place = data.find(key, place + 1)
 
 
 def _science_image(hdus: Any, camera: Camera | None) -> tuple[int | None, int]:
@@ -278,8 +357,15 @@ def _science_image(hdus: Any, camera: Camera | None) -> tuple[int | None, int]:
 
 
 def _plain(header: Any) -> AnyDict:
-    plain = {k: v for k, v in header.items() if k and k not in ("COMMENT", "HISTORY")}
-    return {k: v for k, v in plain.items() if isinstance(v, str | bool | int | float)}
+    plain: AnyDict = {}
+    for card in header.cards:
+        try:
+            key, value = card.keyword, card.value
+        except Exception:  # astropy raises errors of its own for a value that is none; the others are as good as before
+            continue
+        if key and key not in ("COMMENT", "HISTORY") and isinstance(value, str | bool | int | float):
+            plain.setdefault(key, value)
+    return plain
 
 
 def _read_picture(path: Path, data: bytes) -> Image:
@@ -291,15 +377,28 @@ def _read_picture(path: Path, data: bytes) -> Image:
     messages: list[str] = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
+        most, PIL.Image.MAX_IMAGE_PIXELS = PIL.Image.MAX_IMAGE_PIXELS, None
         try:
-            picture: Any = PIL.Image.open(io.BytesIO(data))
+            picture: Any = PIL.Image.open(io.BytesIO(data), formats=_PICTURES)
         except PIL.UnidentifiedImageError:
+            if data.startswith(b"SIMPLE"):
+                raise ImageError(f"{path}: the file is a FITS image; give its name the ending .fits.") from None
             raise ImageError(
                 f"{path}: the file is not an image, is damaged, or is of a kind that is not read (such as colour in "
                 "16 bits); save it as FITS or as a grey TIFF or PNG."
             ) from None
         except Exception as error:
             raise _broken(path) from error
+        finally:
+            # Its own limit knows neither the size of the file nor of sensors.
+            PIL.Image.MAX_IMAGE_PIXELS = most
+        _check_declared(path, picture.width * picture.height * _PIXEL_BYTES.get(picture.mode, 4), len(data))
+        # Depth and kind of colour of a PNG file.
+        if picture.format == "PNG" and data[24] == 16 and data[25] != 0:
+            raise ImageError(
+                f"{path}: the colours have 16 bits, of which only 8 would be read; save the image as FITS, or as a "
+                "grey TIFF or PNG."
+            )
         try:
             picture.load()
             # A palette or transparency is resolved first; black and white become 0 and 255.
@@ -308,6 +407,7 @@ def _read_picture(path: Path, data: bytes) -> Image:
             elif picture.mode in ("1", "LA"):
                 picture = picture.convert("L")
             pixels = np.array(picture)
+            planes = getattr(picture, "n_frames", 1)
         except Exception as error:  # decoders raise whatever the broken bytes lead to
             raise _broken(path) from error
     if pixels.ndim == 3:
@@ -329,7 +429,6 @@ def _read_picture(path: Path, data: bytes) -> Image:
         saturation = _full_scale(pixels)
     if picture.format == "JPEG" or path.suffix.lower() in (".jpg", ".jpeg"):
         messages.append(f"{path.name}: JPEG compression changes the noise; use FITS, TIFF or PNG where you can.")
-    planes = getattr(picture, "n_frames", 1)
     if planes > 1:
         messages.append(f"{path.name}: the first of {planes} planes was taken.")
     return Image(_checked(path, pixels, messages), path.name, saturation=saturation, messages=tuple(messages))
@@ -339,11 +438,12 @@ def _checked(path: Path, pixels: Any, messages: list[str]) -> Any:
     """`pixels` as 32-bit floats where they are floats; a message where some are no numbers."""
     if pixels.dtype.kind != "f":
         return pixels
-    bad = int(np.count_nonzero(~np.isfinite(pixels)))
+    good = np.abs(pixels) < LARGEST_COUNTS
+    bad = int(np.count_nonzero(~good))
     if bad == pixels.size:
         raise ImageError(f"{path}: no pixel has a value; leave the image out.")
     if bad:
-        pixels = np.where(np.isfinite(pixels), pixels, np.nan)
+        pixels = np.where(good, pixels, np.nan)
         messages.append(
             f"{path.name}: {plural(bad, 'pixel')} without a value (NaN) {'was' if bad == 1 else 'were'} masked."
         )

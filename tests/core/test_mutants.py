@@ -23,11 +23,10 @@ from starcal_uq.core.errors import StarcalError
 from tests.helpers.mutants import SAMPLES, Bench, Sample
 
 BY_FILE = {sample.file: sample for sample in SAMPLES}
-# What reads files and is tested elsewhere: images, and folders of runs.
+# What reads files and is tested elsewhere: folders of runs, and what reads images by `read_image`.
 ELSEWHERE = {
     *(
         "studies.StudyDefinition.from_dict",
-        "images.read_image",
         "images.extract_centroids",
         "simulation.read_truth",
         "report",

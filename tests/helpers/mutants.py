@@ -59,7 +59,7 @@ class Sample:
 
     @property
     def binary(self) -> bool:
-        return self.ending in ("npz", "nc", "parquet", "fits", "bin", "gz")
+        return self.ending in ("npz", "nc", "parquet", "fits", "bin", "gz", "tiff", "png", "jpg", "bmp")
 
 
 def _all(items: Any) -> list[Any]:
@@ -134,7 +134,23 @@ def _partitions(path: Path) -> Any:
     return [whole.meta, whole.n_frames, _all(whole)]
 
 
+def _image(path: Path) -> Any:
+    image = sc.images.read_image(path)
+    return [image, sc.images.extract_centroids(image)]
+
+
+IMAGES = (
+    "image.fits",
+    "image.fits.gz",
+    "tiles.fits",
+    "image.tiff",
+    "image.png",
+    "colours.png",
+    "image.jpg",
+    "image.bmp",
+)
 SAMPLES = (
+    *(Sample(name, _image, ("images.read_image",)) for name in IMAGES),
     Sample("camera.toml", sc.Camera.load, ("Camera.load",)),
     Sample("sensor.toml", sc.simulation.Sensor.load, ("simulation.Sensor.load",)),
     Sample("site.toml", sc.sky.Site.load, ("sky.Site.load",)),
@@ -207,8 +223,31 @@ def write_samples(folder: Path) -> None:
         obs.save(folder / name)
     shutil.copy(PREVIOUS / "observations.parquet", folder / "part.parquet")
     shutil.copy(PREVIOUS / "observations.parquet", folder / "frames.parquet")
+    _write_images(folder)
     _write_tables(folder)
     _write_results(folder)
+
+
+def _write_images(folder: Path) -> None:
+    import gzip
+
+    import PIL.Image
+    from astropy.io import fits
+
+    rng = np.random.default_rng(2)
+    pixels = rng.normal(90.0, 3.0, (40, 48))
+    pixels[20, 20:22] += 120.0
+    header = fits.Header({"DATE-OBS": "2026-11-21T01:02:03", "EXPTIME": 1.0, "EGAIN": 2.0, "SATURATE": 4000.0})
+    whole = fits.PrimaryHDU(pixels.astype(np.uint16), header)
+    whole.writeto(folder / "image.fits")
+    (folder / "image.fits.gz").write_bytes(gzip.compress((folder / "image.fits").read_bytes(), mtime=0))
+    fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(whole.data, header)]).writeto(folder / "tiles.fits")
+    PIL.Image.fromarray(whole.data).save(folder / "image.tiff", compression="tiff_deflate")
+    PIL.Image.fromarray(whole.data).save(folder / "image.png")
+    grey = PIL.Image.fromarray(pixels.astype(np.uint8))
+    grey.save(folder / "image.jpg")
+    grey.save(folder / "image.bmp")
+    grey.convert("P").save(folder / "colours.png", transparency=3)
 
 
 def _write_tables(folder: Path) -> None:
@@ -358,7 +397,11 @@ def mutant(sample: Sample, data: bytes, rng: random.Random, other: bytes = b"") 
         ways.append(_text)
     if ending in ("toml",):
         ways.append(_toml)
-    structural = {"json": _json, "npz": _npz, "parquet": _parquet, "nc": _netcdf}.get(ending)
+    structural = {"json": _json, "npz": _npz, "parquet": _parquet, "nc": _netcdf, "fits": _fits, "png": _png}.get(
+        ending
+    )
+    if ending == "gz":
+        structural = _packed
     if structural is not None:
         ways += [structural, structural]
     way = rng.choice(ways)
@@ -500,6 +543,77 @@ def _node(document: Any, rng: random.Random) -> Any:
             return rng.choice(NODES)
         return [*document[:i], _node(document[i], rng), *document[i + 1 :]]
     return rng.choice(NODES)
+
+
+# Values of cards, and of the sizes in other headers.
+CARDS = (
+    *(
+        b"T",
+        b"0",
+        b"1",
+        b"-1",
+        b"8",
+        b"-32",
+        b"64",
+        b"999",
+        b"1000000000000",
+        b"99999999999999999999",
+        b"1E300",
+        b"NaN",
+    ),
+    *(b"''", b"'text'", b"'2026-11-21T25:00:00'", b"(1.0, 2.0)", b"", b"\xff", b"'open", b"-1E400", b"40000"),
+)
+
+
+def _fits(data: bytes, rng: random.Random) -> bytes:
+    """A card of a header changed, left out, repeated, or in the place of another."""
+    cards = [i for i in range(0, len(data), 80) if re.match(rb"[A-Z0-9_-]{1,8} *=", data[i : i + 10])]
+    i, j, way = rng.choice(cards), rng.choice(cards), rng.randrange(6)
+    card = data[i : i + 80]
+    if way == 0:
+        return data[:i] + b" " * 80 + data[i + 80 :]
+    if way == 1:
+        return data[:j] + card + data[j + 80 :]
+    if way == 2:
+        names = (b"BSCALE", b"BZERO", b"BLANK", b"PCOUNT", b"GCOUNT", b"GROUPS", b"NAXIS3", b"EXTEND", b"BAYERPAT")
+        card = rng.choice(names).ljust(8) + card[8:]
+    return data[:i] + (card[:10] + rng.choice(CARDS).rjust(20)).ljust(80) + data[i + 80 :]
+
+
+def _png(data: bytes, rng: random.Random) -> bytes:
+    """A part of a PNG file changed, left out or repeated, with its checksum."""
+    import zlib
+
+    parts, place = [], 8
+    while place + 12 <= len(data):
+        (size,) = struct.unpack(">I", data[place : place + 4])
+        parts.append((data[place + 4 : place + 8], data[place + 8 : place + 8 + size]))
+        place += size + 12
+    i, way = rng.randrange(len(parts)), rng.randrange(5)
+    name, content = parts[i]
+    if way == 0:
+        del parts[i]
+    elif way == 1:
+        parts.insert(i, parts[i])
+    elif way == 2 and name == b"IHDR":
+        sizes = struct.pack(">II", *(rng.choice((0, 1, 7, 40, 70_000, 2**31 - 1, 2**32 - 1)) for _ in range(2)))
+        parts[i] = name, sizes + bytes(rng.choice((0, 1, 2, 3, 4, 6, 8, 16, 255)) for _ in range(5))
+    else:
+        parts[i] = name, _bytes(content, rng, data)
+    made = (struct.pack(">I", len(c)) + n + c + struct.pack(">I", zlib.crc32(n + c)) for n, c in parts)
+    return data[:8] + b"".join(made)
+
+
+def _packed(data: bytes, rng: random.Random) -> bytes:
+    """What is inside a file of gzip, damaged and packed again."""
+    import gzip
+
+    content = gzip.decompress(data)
+    if content.startswith(b"SIMPLE"):
+        content = rng.choice((_fits, lambda d, r: _bytes(d, r, data), lambda d, r: d + bytes(10**6)))(content, rng)
+    else:
+        content = _text(content, rng)
+    return gzip.compress(content, mtime=0)
 
 
 def _npz(data: bytes, rng: random.Random) -> bytes:

@@ -414,9 +414,8 @@ def test_options_out_of_range_are_named():
 
 
 def test_fits_with_time_exposure_gain_and_saturation(tmp_path):
-    header = fits.Header(
-        {"DATE-OBS": "2026-11-21T01:02:03.5", "EXPTIME": 1.0, "GAIN": 2.5, "SATURATE": 4000.0, "OBJECT": "sky"}
-    )
+    header = fits.Header({"DATE-OBS": "2026-11-21T01:02:03.5", "EXPTIME": 1.0, "SATURATE": 4000.0, "OBJECT": "sky"})
+    header["GAIN"] = 2.5, "[e-/ADU]"
     data = np.arange(12, dtype=np.float32).reshape(3, 4)
     for name in ("a.fits", "a.fit", "a.fits.gz"):
         fits.writeto(tmp_path / name, data, header)
