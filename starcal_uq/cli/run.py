@@ -46,7 +46,13 @@ from starcal_uq.cli.settings import (
 )
 from starcal_uq.cli.steps import load_table, sample_run
 from starcal_uq.core.tasks import one_thread
-from starcal_uq.presentation.report.drawing import AFTER_CALIBRATION, AFTER_DIAGNOSIS, AFTER_SAMPLING, Ahead
+from starcal_uq.presentation.report.drawing import (
+    AFTER_BUDGET,
+    AFTER_CALIBRATION,
+    AFTER_DIAGNOSIS,
+    AFTER_SAMPLING,
+    Ahead,
+)
 
 if TYPE_CHECKING:
     from starcal_uq.observations.partitions import PartitionedObservations
@@ -193,6 +199,7 @@ def _after_calibration(
         run.budget(file=budget, seed=sampling.seed)
     if show:
         show_budget(run.error_budget)
+    ahead.draw(run.results, AFTER_BUDGET)
     run.report(ahead.figures())
 
 

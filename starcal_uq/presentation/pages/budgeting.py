@@ -262,8 +262,8 @@ def write_budget(budget: Budget, path: str | os.PathLike[str]) -> Path:
     return Path(path)
 
 
-def budget_context(budget: Budget | None) -> dict[str, Any]:
+def budget_context(budget: Budget | None, png: bytes | None = None) -> dict[str, Any]:
     """What the template ``budget_section.html.j2`` shows, under the one name ``budget``; None where there is none."""
     if budget is None:
         return {"budget": None}
-    return {"budget": {**tables(budget), "image": embedded_image(png_bytes(plot_budget(budget)))}}
+    return {"budget": {**tables(budget), "image": embedded_image(png or png_bytes(plot_budget(budget)))}}

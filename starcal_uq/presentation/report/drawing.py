@@ -6,6 +6,7 @@ from collections.abc import Collection
 from typing import Any
 
 from starcal_uq.core.beside import Beside
+from starcal_uq.presentation.figures.budgeting import plot_budget
 from starcal_uq.presentation.figures.coupling import plot_correlations, plot_couplings
 from starcal_uq.presentation.figures.diagnostics import plot_diagnosis, plot_residual_profiles
 from starcal_uq.presentation.figures.estimation import plot_convergence, plot_residuals
@@ -18,7 +19,8 @@ from starcal_uq.presentation.report.results import Results
 AFTER_CALIBRATION = ("residuals", "residual_profiles", "convergence")
 AFTER_SAMPLING = ("corner", "prior_posterior", "correlation", "price_of_coupling", "distortion_curve")
 AFTER_DIAGNOSIS = ("misfit", "attitude", "field_map")
-FIGURES = (*AFTER_CALIBRATION, *AFTER_SAMPLING, *AFTER_DIAGNOSIS)
+AFTER_BUDGET = ("budget",)
+FIGURES = (*AFTER_CALIBRATION, *AFTER_SAMPLING, *AFTER_DIAGNOSIS, *AFTER_BUDGET)
 
 
 def draw_figures(results: Results, names: Collection[str] = FIGURES) -> dict[str, bytes]:
@@ -52,6 +54,8 @@ def _figure(results: Results, name: str) -> Any:
         return plot_field_map(results.field_map)
     if name == "distortion_curve" and results.distortion_curve is not None:
         return plot_distortion_curve(results.distortion_curve)
+    if name == "budget" and results.budget is not None:
+        return plot_budget(results.budget)
     return None
 
 

@@ -80,7 +80,7 @@ def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
         "derived_table": None if post is None else model_tables.derived_table(post),
         **model_tables.diagnosis_context(results.diagnosis, cal),
         **image_tables.image_context(results.images, cal),
-        **budget_tables.budget_context(results.budget),
+        **budget_tables.budget_context(results.budget, figures.get("budget")),
         "stage_rows": tables.stage_rows(results),
         "pair_table": tables.pair_table(cal),
         "noise_table": tables.noise_table(cal),
@@ -93,7 +93,7 @@ def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
         **_distortion(results),
         "degrees_of_freedom": count(cal.dof),
         "provenance_rows": words.provenance_rows(results),
-        "images": {name: embedded_image(png) for name, png in figures.items()},
+        "images": {name: embedded_image(png) for name, png in figures.items() if name != "budget"},
     }
 
 
