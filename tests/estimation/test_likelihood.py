@@ -10,7 +10,7 @@ from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.camera.distortion import model_names
 from starcal_uq.camera.projection import project
 from starcal_uq.core.records import from_plain, to_plain
-from starcal_uq.estimation.compressed import CompressedLikelihood, compress, gram_sums
+from starcal_uq.estimation.compressed import CompressedLikelihood, _Expansion, compress, gram_sums, moved, scaled
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
 from tests.helpers.scenes import camera, observations, with_sigmas
@@ -117,6 +117,36 @@ def test_slope_of_the_determinant_is_that_along_the_parameters(model):
         for sign in (0.5, -0.5)
     )
     assert np.allclose(slope, np.subtract(ahead, behind), rtol=0, atol=5e-4 * np.max(np.abs(slope)))
+
+
+@pytest.mark.parametrize("model", ["brown", "brown_tangential"])
+def test_gram_is_that_of_columns_without_what_attitudes_reproduce(model):
+    exact, theta = MarginalLikelihood(with_sigmas(observations(model, n_frames=8)), model), camera(model).theta
+    whitening = scaled_cholesky(symmetric_inverse(exact.evaluate(theta).matrix))
+    block = _Expansion(model, theta, whitening).block(exact.frames, exact.start_rotations(theta))
+    state, _ = exact.profile(theta, block.rotations)
+    columns = exact.project_out(state, block.columns).reshape(len(block.columns), -1)
+    scale = 1.0 / np.linalg.norm(columns, axis=1)
+    difference = (block.gram(exact.frames, len(theta)) - columns @ columns.T) * np.outer(scale, scale)
+    assert np.max(np.abs(difference)) < 1e-6
+    # Control: attitudes reproduce a large part of some second derivatives.
+    raw = np.linalg.norm(block.columns.reshape(len(columns), -1), axis=1)
+    assert np.max(raw * scale) > 1.3
+
+
+def test_moved_and_scaled_are_the_same_function():
+    cal = _estimate(observations(n_frames=10), "brown")
+    before, rng = cal.compressed, np.random.default_rng(5)
+    theta = cal.theta + rng.standard_normal((40, 5)) @ before.whitening.T
+    turned = before.whitening @ (np.eye(5) + 0.3 * rng.standard_normal((5, 5)))
+    after = moved(before, theta[0], turned)
+    assert np.allclose(after.gram, after.gram.T, rtol=1e-12)
+    assert np.ptp(before.log_likelihood(theta, cal.sigma)) > 3.0
+    assert np.allclose(after.log_likelihood(theta, cal.sigma), before.log_likelihood(theta, cal.sigma), atol=1e-7)
+    unit, sigma = 0.04, np.linspace(0.03, 0.09, 40)
+    difference = scaled(before, unit).log_likelihood(theta, sigma / unit) - before.log_likelihood(theta, sigma)
+    expected = before.dof * np.log(unit) + 3.0 * before.n_frames * np.log(unit)
+    assert np.allclose(difference, expected, atol=1e-7)
 
 
 def test_compressed_adds_over_frames_and_survives_a_round_trip():
