@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import pickle
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -13,7 +15,7 @@ from typing import IO, Any
 
 from starcal_uq.core.tasks import processors
 
-_PROGRAM = "import sys; sys.path[:] = {path!r}; from starcal_uq.core.beside import serve; serve({folder!r})"
+_PROGRAM = "import sys; sys.path[:] = {path!r}; from starcal_uq.core.beside import serve; serve({folder!r}, {parent})"
 
 
 class Beside:
@@ -33,7 +35,7 @@ class Beside:
 
     def __enter__(self) -> Beside:
         if processors() > 1:
-            program = _PROGRAM.format(path=sys.path, folder=self._folder.name)
+            program = _PROGRAM.format(path=sys.path, folder=self._folder.name, parent=os.getpid())
             with contextlib.suppress(OSError):
                 self._process = subprocess.Popen(
                     [sys.executable, "-c", program],
@@ -72,8 +74,8 @@ class Beside:
         return [pickle.loads(path.read_bytes()) if path.exists() else None for path in found]
 
 
-def serve(folder: str) -> None:
-    """Do the calls of a `Beside`, until it closes the pipe or is gone."""
+def serve(folder: str, parent: int) -> None:
+    """Do the calls of a `Beside` in the process `parent`, until it closes the pipe or is gone."""
     for line in sys.stdin:
         function, arguments = pickle.loads(_path(folder, int(line), "call").read_bytes())
         try:
@@ -84,6 +86,9 @@ def serve(folder: str) -> None:
         part = _path(folder, int(line), "part")
         part.write_bytes(result)
         part.replace(_path(folder, int(line), "result"))
+    if os.name == "posix" and os.getppid() != parent:
+        # It was killed, and nobody else removes what it left.
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _path(folder: str, number: int, kind: str) -> Path:
