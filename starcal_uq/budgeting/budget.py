@@ -27,7 +27,7 @@ from starcal_uq.core.constants import AXES
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.provenance import provenance
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import bounded, check_memory
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import AnyDict
 
@@ -90,6 +90,7 @@ def budget(
     chosen = checked_confidence(_CONFIDENCE if chosen is None else chosen, "the confidence of the budget")
     if n_samples < 10_000:
         raise BudgetError(f"n_samples is {n_samples}, too few for the tails of an error; use at least 10000.")
+    check_memory(f"n_samples={n_samples}", 8.0 * 12 * n_samples)
     if misfit is not None and attitude.misfit is None:
         from starcal_uq.diagnostics.inflation import with_misfit
 

@@ -69,6 +69,8 @@ def _main() -> None:
             _fail(usage_sentence(error), 2)
         if isinstance(error, StarcalError):
             _fail(str(error), 2)
+        if isinstance(error, MemoryError):
+            _fail("there is not enough memory for this: ask for fewer draws, frames or samples.", 2)
         if isinstance(error, OSError):
             place = f"{error.filename}: " if error.filename else ""
             _fail(f"{place}{error.strerror or error}; check the path, its permissions and the space on the disk.", 2)

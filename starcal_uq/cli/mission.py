@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 _CHOSEN = Limit(1, 10**6)
 _ARCSEC = Limit(1e-9, 1e6, whole=False)
 # The displacement of the corner by a distortion that still folds nowhere stays far within.
-_PERCENT = Limit(-100.0, 100.0, whole=False)
+_PERCENT = Limit(-30.0, 30.0, whole=False)
 
 
 def register(app: typer.Typer) -> None:

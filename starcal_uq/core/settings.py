@@ -7,6 +7,7 @@ outside, before it does anything.
 from __future__ import annotations
 
 import inspect
+import os
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import wraps
@@ -81,7 +82,7 @@ def _written(number: float) -> str:
 
 # What `numpy.random.SeedSequence` makes of one seed for others.
 SEED = Limit(0, 2**64 - 1)
-SIGMA_PX = Limit(0.0, 1e4, whole=False)
+SIGMA_PX = Limit(0.0, 100.0, whole=False)
 EPOCH = Limit(1800.0, 2200.0, whole=False)
 LIMITS = {
     "seed": SEED,
@@ -110,7 +111,7 @@ LIMITS = {
     "psf_sigma_px": Limit(0.2, 20.0, whole=False),
     "min_pixels": Limit(1, 10**6),
     "focal_tolerance": Limit(1e-9, 0.3, whole=False),
-    "centre_tolerance_px": Limit(0.0, 1e5, whole=False),
+    "centre_tolerance_px": Limit(1e-3, 1e5, whole=False),
     "distortion_tolerance_px": Limit(0.0, 1e5, whole=False),
 }
 
@@ -129,6 +130,20 @@ def bounded(function: Callable[P, R]) -> Callable[P, R]:
         return function(*args, **kwargs)
 
     return checked
+
+
+def check_memory(setting: str, n_bytes: float) -> None:
+    """Refuse a setting, such as "n_steps=10", with which results alone take more memory than this machine has."""
+    try:
+        installed = float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):
+        # Not every system tells.
+        return
+    if n_bytes > installed:
+        raise SettingError(
+            f"{setting}: the result needs {n_bytes / 1e9:.3g} GB of memory at the least, and this machine has "
+            f"{installed / 1e9:.3g} GB: give less."
+        )
 
 
 def clipped(value: object, most: int = 60) -> str:

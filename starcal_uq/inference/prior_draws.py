@@ -18,7 +18,7 @@ from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import fold_radius_px, forward_kernel, forward_root, unproject_theta
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PriorError
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import bounded, check_memory
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.observations.frames import StarFrames
@@ -135,6 +135,7 @@ def prior_predictive(
     rng = np.random.default_rng(seed)
     draws = priors.draw(n_draws, rng)
     field = _field(camera)
+    check_memory(f"n_draws={n_draws}", 8.0 * n_draws * len(field))
     columns = {name: np.full(n_draws, np.nan) for name in ("fov_h_deg", "fov_v_deg", "corner_displacement_px")}
     shift, folded = np.full((n_draws, len(field)), np.nan), np.zeros(n_draws, dtype=bool)
     nominal = unproject_theta(camera.distortion, camera.theta, field)

@@ -16,7 +16,7 @@ from starcal_uq.camera.distortion import parameters, sigma_parameter
 from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.provenance import data_hashes, provenance
 from starcal_uq.core.records import to_plain
-from starcal_uq.core.settings import Evaluation, LikelihoodName, bounded
+from starcal_uq.core.settings import Evaluation, LikelihoodName, bounded, check_memory
 from starcal_uq.core.tasks import Progress, one_thread
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.noise_model import weighed
@@ -361,6 +361,10 @@ def _settings(
     ):
         if not good:
             raise SamplingError(text)
+    check_memory(
+        f"n_ensembles={n_ensembles}, n_walkers={n_walkers}, n_steps={n_steps}",
+        8.0 * dim * n_ensembles * n_walkers * (n_steps + n_burn),
+    )
     if not cal.status.ok:
         raise SamplingError(f"the calibration did not converge ({cal.status.name}): {cal.status.remedy}.")
     return EnsembleSettings(n_walkers, n_steps, n_burn, moves)

@@ -12,8 +12,8 @@ import numpy as np
 from starcal_uq.attitude.rotations import random_rotations
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import fold_radius_px, project, unproject
-from starcal_uq.core.errors import CatalogueError, StarcalError
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.errors import CatalogueError, SettingError, StarcalError
+from starcal_uq.core.settings import bounded, check_memory
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
 from starcal_uq.observations.table import Observations
 
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
     from starcal_uq.sky.catalogue import StarCatalogue
 
+# Of a row of a table: seven columns.
+_BYTES_PER_STAR = 56.0
 # Attitudes drawn at once; also how many are tried before a camera is declared too narrow for its catalogue.
 _BATCH = 256
 _MAX_TRIES_PER_FRAME = 2000
@@ -121,11 +123,10 @@ def simulate(
     DistortionError
         When the camera's distortion folds over inside the field.
     """
-    if not sigma_px >= 0.0 or min_stars < 3 or n_frames < 1:
-        raise ValueError(
-            f"sigma_px={sigma_px}, min_stars={min_stars}, n_frames={n_frames}: noise must not be negative, a frame "
-            "needs at least 3 stars, and there must be at least one frame."
-        )
+    if min_stars < 3:
+        raise SettingError(f"min_stars is {min_stars}: a frame needs at least 3 stars.")
+    if attitudes is None:
+        check_memory(f"n_frames={n_frames}, min_stars={min_stars}", _BYTES_PER_STAR * n_frames * min_stars)
     rng = np.random.default_rng(seed)
     sky = Sky(stars, camera, EDGE_SIGMAS * sigma_px)
     frame, index, xy = observed(sky, rng, sigma_px, n_frames=n_frames, min_stars=min_stars, attitudes=attitudes)

@@ -12,8 +12,10 @@ from pathlib import Path
 import pytest
 import typer
 
+import starcal_uq as sc
 from starcal_uq.cli import commands as declared
 from starcal_uq.cli.app import main
+from tests.helpers.scenes import observations
 
 # Arguments with which each command would work.
 VALID = {
@@ -164,6 +166,14 @@ def test_every_option_refuses_odd_values_in_one_sentence(commands, parse):
     assert refused > 1000 and accepted < 0.2 * refused
 
 
+def test_memory_that_is_not_there_is_a_sentence(parse, monkeypatch):
+    def begin(*_, **__):
+        raise MemoryError
+
+    monkeypatch.setattr(declared, "app", begin)
+    assert parse("demo") == "error: there is not enough memory for this: ask for fewer draws, frames or samples.\n"
+
+
 def test_control_sentences_and_the_judge_of_accepted_values(commands, parse):
     seed = next(p for p in commands["demo"].params if p.name == "seed")
     assert not legitimate(seed, int, "-1")
@@ -174,3 +184,48 @@ def test_control_sentences_and_the_judge_of_accepted_values(commands, parse):
     assert parse("sample", "RUN", "--likelihood", "magic") == (
         "error: --likelihood 'magic' is unknown: use one of marginal, pairs, pairs_naive, student_t.\n"
     )
+
+
+# Calls that end soon; sampling last, because it makes the rest of a run stale.
+WORK = {
+    "simulate": "CAMERA.toml -o o.csv --frames 5 --force",
+    "centroid": "IMAGES -o c.csv --force",
+    "identify": "CENTROIDS.csv CAMERA.toml -o i.csv --max-mag 6 --force",
+    "filter": "OBS.csv CAMERA.toml -o FILTERED --sigma 0.05 --force",
+    "propagate": "RUN --attitudes random --frames 20 --alignment-frames 3 --draws 50 --force",
+    "diagnose": "RUN --starts 1 --force",
+    "budget": "RUN --force",
+    "compare": "RUN --split halves",
+    "sample": "RUN --ensembles 2 --walkers 14 --steps 20 --force",
+}
+
+
+@pytest.mark.slow
+def test_the_least_and_oddest_numbers_that_are_accepted_work_or_are_refused(commands, cli, tmp_path):
+    camera = sc.paper.paper_start()
+    camera.save(tmp_path / "CAMERA.toml")
+    obs = observations(n_frames=12, seed=3)
+    obs.save(tmp_path / "OBS.csv")
+    run = sc.Run(tmp_path / "RUN")
+    run.calibrate(obs, camera)
+    run.sample(seed=0, n_ensembles=2, n_walkers=14, n_steps=20)
+    run.propagate(n_draws=50, seed=0)
+    assert cli("simulate", "CAMERA.toml", "-o", "s.csv", "--frames", 3, "--images", "IMAGES")[0] == 0
+    assert cli("centroid", "IMAGES", "-o", "CENTROIDS.csv")[0] == 0
+    tried = 0
+    for name, arguments in WORK.items():
+        for parameter in commands[name].params:
+            kind = kind_of(parameter)
+            if kind not in (int, float):
+                continue
+            odd = {parameter.min} | ({0.0, 1e-300, -1.0} if kind is float else set())
+            for value in sorted(v for v in odd if parameter.min <= v <= parameter.max):
+                words, option = arguments.split(), max(parameter.opts, key=len)
+                if option in words:
+                    del words[words.index(option) : words.index(option) + 2]
+                status, _, err = cli(name, *words, f"{option}={value}")
+                lines = [line for line in err.splitlines() if line.startswith("error: ")]
+                assert status in (0, 1) or (status == 2 and len(lines) == 1 and lines[0].endswith(".")), (option, err)
+                assert "nan" not in " ".join(lines), (option, value, err)
+                tried += 1
+    assert tried > 40

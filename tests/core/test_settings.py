@@ -52,6 +52,17 @@ def test_errors_of_settings_are_errors_of_values():
         sc.simulate(None, None, n_frames=0)
 
 
+def test_counts_that_no_memory_holds_are_refused_before_it_is_taken(monkeypatch):
+    with pytest.raises(
+        SettingError, match=r"^n_frames=1000000000, min_stars=10000: the result needs 5.6e\+05 GB of memory"
+    ):
+        sc.simulate(None, None, n_frames=10**9, min_stars=10**4)
+    settings.check_memory("n_steps=1", 8.0)
+    # A system that does not tell how much it has refuses nothing.
+    monkeypatch.delattr("os.sysconf")
+    settings.check_memory("n_steps=1", 1e30)
+
+
 def test_numbers_of_any_type_are_judged_and_others_left_alone():
     whole, real = Limit(1, 9), Limit(0.5, 2.0, whole=False)
     assert all(map(whole.holds, (1, 9, np.int64(3), (1, 2), [9], None, np.arange(3), np.random.SeedSequence(1))))
