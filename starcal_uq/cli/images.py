@@ -44,7 +44,7 @@ def centroid_command(
     images: Annotated[
         list[Path],
         typer.Argument(
-            metavar="IMAGES...", help="FITS, TIFF, PNG or JPEG files, or folders of them.", parser=read_path
+            metavar="IMAGES...", help="FITS, TIFF, PNG, JPEG or BMP files, or folders of them.", parser=read_path
         ),
     ],
     out: Annotated[
@@ -73,6 +73,9 @@ def centroid_command(
         bool, typer.Option(help="Take out errors that repeat with the place within a pixel, where images show them.")
     ] = True,
     time: TimeUtc = None,
+    workers: Annotated[
+        int | None, number("workers", "Processes; as many as processors from a hundred images on, 0 for this one.")
+    ] = None,
     force: Force = False,
     json: Json = False,
 ) -> None:
@@ -96,6 +99,7 @@ def centroid_command(
             psf_sigma_px=psf_sigma,
             max_stars=max_stars,
             correct_pixel_phase=pixel_phase,
+            workers=workers,
             progress=progress,
         )
     found = with_time(found, time)
@@ -186,6 +190,7 @@ def load_images(
             gain_e_per_count=settings.gain,
             time_utc=settings.time,
             engine=settings.engine or "pyramid",
+            workers=None,
             tell=lambda message: err.print(message, style=_style(message), highlight=False, soft_wrap=True),
             progress=progress,
             **known,

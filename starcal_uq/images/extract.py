@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ import numpy as np
 from starcal_uq.core.errors import ImageError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.settings import bounded
+from starcal_uq.core.tasks import Progress, processors, run_tasks
 from starcal_uq.core.types import AnyDict
 from starcal_uq.images.centroids import COLUMNS, FRAME_COLUMNS, Centroids
 from starcal_uq.images.detection import DetectionOptions, FrameStars, find_stars
@@ -31,6 +32,8 @@ _UNDERSAMPLED_PX = 0.85
 # Fainter stars are more easily found where the light falls into one pixel.
 _PHASE_SNR = 10.0
 
+# Starting processes takes as long as measuring this many images; so many are sent to one at once.
+_WORTH_PROCESSES, _CHUNK = 100, 16
 # Just below the most that glibc keeps.
 _KEPT_BYTES = 31 << 20
 
@@ -50,7 +53,8 @@ def extract_centroids(
     psf_sigma_px: float | None = None,
     max_stars: int | None = None,
     correct_pixel_phase: bool = True,
-    progress: Callable[[int, int], None] | None = None,
+    workers: int | None = 0,
+    progress: Progress | None = None,
 ) -> Centroids:
     """Find the stars in images and measure their positions with covariances.
 
@@ -82,6 +86,9 @@ def extract_centroids(
         Centroids of undersampled star images that are no Gaussians are drawn to the centres of the pixels. Where the
         places of many stars show it (4 standard deviations), it is taken out, and a message says how much it was. All
         images are then taken to be of one camera.
+    workers
+        Processes, with the same results for any number of them; 0 stays in this one. None takes as many as there are
+        processors from a hundred images on; fewer are measured before a process has started.
     progress
         Called with (frames done, frames in all).
 
@@ -94,6 +101,8 @@ def extract_centroids(
     ------
     ImageError
         If an option is out of range, or there is no image at all.
+    SamplingError
+        If processes cannot be used.
     """
     sources = _sources(images)
     options = DetectionOptions(
@@ -105,15 +114,85 @@ def extract_centroids(
         psf_sigma_px=psf_sigma_px,
         max_stars=max_stars,
     )
-    # glibc gives memory back to the system when arrays the size of an image are freed, and gets it again page by page,
-    # until a larger one has been freed. This one is never written to.
-    np.empty(_KEPT_BYTES, dtype=np.uint8)
+    task = _Measure(sources, camera, options)
+    if workers is None:
+        workers = processors() if len(sources) >= _WORTH_PROCESSES else 0
     table = _Table()
-    for number, source in enumerate(sources):
-        table.add(number, source, camera, options)
-        if progress is not None:
-            progress(number + 1, len(sources))
+    if workers > 0:
+        frames, interrupted = run_tasks(
+            task,
+            len(sources),
+            caller="starcal_uq.images.extract_centroids",
+            chunk=_CHUNK,
+            workers=workers,
+            progress=progress,
+        )
+        if interrupted:
+            raise KeyboardInterrupt
+        for frame in frames:
+            table.add(frame)
+    else:
+        for number in range(len(sources)):
+            table.add(task(number))
+            if progress is not None:
+                progress(number + 1, len(sources))
     return table.centroids(options, correct_pixel_phase)
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """What became of one image: its entry in the table, messages, hash of its pixels, and its stars, if it has any."""
+
+    entry: AnyDict
+    messages: list[str]
+    sha256: bytes = b""
+    stars: FrameStars | None = None
+
+
+@dataclass(frozen=True)
+class _Measure:
+    """From the number of an image to its stars."""
+
+    sources: list[Source]
+    camera: Camera | None
+    options: DetectionOptions
+
+    def __call__(self, number: int) -> _Frame:
+        # glibc gives memory back to the system when arrays the size of an image are freed, and gets it again page by
+        # page, until a larger one has been freed. This one is never written to.
+        np.empty(_KEPT_BYTES, dtype=np.uint8)
+        source = self.sources[number]
+        name = (source.name or f"image {number}") if isinstance(source, Image) else Path(source).name
+        entry: AnyDict = {
+            "frame_ids": number,
+            "image": name,
+            "time_utc": "",
+            "background": np.nan,
+            "noise": np.nan,
+            "psf_sigma_px": np.nan,
+            "problem": "",
+        }
+        sha256: Any = hashlib.sha256()
+        try:
+            image = source if isinstance(source, Image) else read_any_size(source, self.camera)
+            entry["time_utc"] = image.time_utc or ""
+            sha256.update(f"{image.data.dtype}{image.data.shape}".encode())
+            sha256.update(np.ascontiguousarray(image.data))
+            if self.camera is not None:
+                image.check_size(self.camera)
+            found = find_stars(image, self.options)
+        except ImageError as error:
+            text = str(error)
+            message = f"Frame {number} was left out: {text}"
+            # Reasons are counted over frames, so the name of this one is taken off.
+            prefixes = [f"{source}: "] if not isinstance(source, Image) else []
+            for prefix in (*prefixes, f"{name}: ", "image: "):
+                text = text.removeprefix(prefix)
+            entry["problem"] = text.partition(";")[0].rstrip(".")
+            return _Frame(entry, [message], sha256.digest())
+        entry.update(background=found.background, noise=found.noise, psf_sigma_px=found.psf_sigma_px)
+        messages = [*image.messages, *(f"{name}: {text}" for text in found.messages)]
+        return _Frame(entry, messages, sha256.digest(), found)
 
 
 @dataclass
@@ -127,40 +206,14 @@ class _Table:
     gains: list[float | None] = field(default_factory=list)
     digest: Any = field(default_factory=hashlib.sha256)
 
-    def add(self, number: int, source: Source, camera: Camera | None, options: DetectionOptions) -> None:
-        name = (source.name or f"image {number}") if isinstance(source, Image) else Path(source).name
-        entry: AnyDict = {
-            "frame_ids": number,
-            "image": name,
-            "time_utc": "",
-            "background": np.nan,
-            "noise": np.nan,
-            "psf_sigma_px": np.nan,
-            "problem": "",
-        }
-        self.frames.append(entry)
-        try:
-            image = source if isinstance(source, Image) else read_any_size(source, camera)
-            entry["time_utc"] = image.time_utc or ""
-            self.digest.update(f"{image.data.dtype}{image.data.shape}".encode())
-            self.digest.update(np.ascontiguousarray(image.data))
-            if camera is not None:
-                image.check_size(camera)
-            found = find_stars(image, options)
-        except ImageError as error:
-            text = str(error)
-            self.messages.append(f"Frame {number} was left out: {text}")
-            # Reasons are counted over frames, so the name of this one is taken off.
-            prefixes = [f"{source}: "] if not isinstance(source, Image) else []
-            for prefix in (*prefixes, f"{name}: ", "image: "):
-                text = text.removeprefix(prefix)
-            entry["problem"] = text.partition(";")[0].rstrip(".")
-            return
-        entry.update(background=found.background, noise=found.noise, psf_sigma_px=found.psf_sigma_px)
-        self.messages += [*image.messages, *(f"{name}: {text}" for text in found.messages)]
-        self.stars.append(found)
-        self.numbers += [number] * len(found.columns["x_px"])
-        self.gains.append(found.gain_e_per_count)
+    def add(self, frame: _Frame) -> None:
+        self.frames.append(frame.entry)
+        self.messages += frame.messages
+        self.digest.update(frame.sha256)
+        if frame.stars is not None:
+            self.stars.append(frame.stars)
+            self.numbers += [frame.entry["frame_ids"]] * len(frame.stars.columns["x_px"])
+            self.gains.append(frame.stars.gain_e_per_count)
 
     def centroids(self, options: DetectionOptions, correct_pixel_phase: bool) -> Centroids:
         columns: AnyDict = {"frame": np.array(self.numbers, dtype=np.int64)}

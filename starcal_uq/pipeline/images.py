@@ -86,6 +86,7 @@ def observations_from_images(
     in_space: bool = False,
     time_utc: str | None = None,
     engine: Engine = "pyramid",
+    workers: int | None = 0,
     tell: Callable[[str], None] | None = None,
     progress: Progress | None = None,
 ) -> tuple[Observations, Centroids, ImageCalibration]:
@@ -115,6 +116,8 @@ def observations_from_images(
         Middle of the exposure of all images whose files do not say it; it goes before a time in a file's name.
     engine : {"pyramid", "tetra3rs"}
         Solver that finds attitudes.
+    workers : int, optional
+        Processes that measure the images, as in `extract_centroids`.
     tell : callable, optional
         Gets what a user should know of the images, one sentence each, before anything is made of them.
     progress : callable, optional
@@ -137,7 +140,9 @@ def observations_from_images(
     check_sky(directions, site, in_space)
     if time_utc is not None:
         time_utc = utc_text(time_utc)
-    centroids = extract_centroids(list(images), camera=camera, gain_e_per_count=gain_e_per_count, progress=progress)
+    centroids = extract_centroids(
+        list(images), camera=camera, gain_e_per_count=gain_e_per_count, workers=workers, progress=progress
+    )
     centroids = with_time(centroids, time_utc)
     if tell is not None:
         for message in counted(centroids.messages):

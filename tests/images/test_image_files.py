@@ -123,3 +123,20 @@ def test_a_gain_without_a_unit_is_not_believed_and_a_mosaic_is_named(tmp_path):
     assert "GAIN (120)" in setting.messages[0] and "mosaic of colours (RGGB)" in setting.messages[1]
     assert made(card("GAIN", 2.5, "Gain in e-/ADU")).gain_e_per_count == 2.5
     assert made(card("GAIN", 120), card("EGAIN", 0.8)).gain_e_per_count == 0.8
+
+
+def test_centroids_do_not_depend_on_the_number_of_processes(tmp_path):
+    rng = np.random.default_rng(4)
+    for k in range(18):
+        counts = rng.normal(100.0, 3.0, (40, 48))
+        counts[5 + k, 20:22] += 200.0
+        PIL.Image.fromarray(counts.astype(np.uint16)).save(tmp_path / f"{k:02d}.png")
+    (tmp_path / "07.png").write_bytes(b"cut off")
+    done = []
+    one, two = (
+        extract_centroids(tmp_path, workers=workers, progress=lambda n, of: done.append((n, of))) for workers in (0, 2)
+    )
+    for name in ("frame", "x_px", "y_px", "flux", "image", "problem"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+    assert (one.messages, one.meta) == (two.messages, two.meta) and len(one) > 5 and one.n_left_out == 1
+    assert done[-1] == (18, 18)
