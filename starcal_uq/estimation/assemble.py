@@ -24,6 +24,7 @@ from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.solvers import is_singular
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.estimation.star_errors import StarLikelihood, StarModel
+from starcal_uq.estimation.undetermined import EXPLAINED, WEAK, open_parameters, remedy_of, undetermined
 from starcal_uq.maths.linear import scaled_inverse
 
 if TYPE_CHECKING:
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 IMPLAUSIBLE_NOISE = 0.01
 # Attitudes this near to the best ones tell such a noise.
 _NEARLY_RAD = 1e-4
+# Noise that is assumed where there is no estimate to take it from.
+_USUAL_NOISE_PX = 0.1
 # Fewer stars than this that are seen twice do not tell their errors from noise.
 _FEWEST_STARS = 5
 
@@ -64,13 +67,16 @@ def assemble(
     refined = stages[-1].name == "refinement"
     p = len(theta)
     if not status.ok and not np.isfinite(noise_px(likelihood, theta)):
-        raise CalibrationError(f"the calibration failed ({status.name}): {status.remedy}.", status)
+        raise failed(likelihood, nominal.theta, nominal, status)
     normal = likelihood.evaluate(theta)
     if not np.isfinite(normal.cost) or is_singular(normal.matrix):
         reason = status if not status.ok else Status.SINGULAR if np.isfinite(normal.cost) else Status.NOT_FINITE
-        raise CalibrationError(f"the calibration failed ({reason.name}): {reason.remedy}.", reason)
+        raise failed(likelihood, theta, nominal, reason)
     dof = likelihood.dof - p
     sigma = float(np.sqrt(normal.cost / dof))
+    status = check_camera(nominal.with_theta(theta), status)
+    if names := undetermined(likelihood, theta, normal.matrix, sigma, nominal, status):
+        status = Status.SINGULAR
     efficient = scaled_inverse(normal.matrix) * sigma**2
     compressed = compress(likelihood, theta, efficient, likelihood.rotations)
     if refined:
@@ -92,7 +98,8 @@ def assemble(
         sigma_std=sigma / float(np.sqrt(2.0 * dof)),
         sigma_name=sigma_parameter(likelihood.frames.weight is not None).name,
         stages=tuple(stages),
-        status=check_camera(camera, status),
+        status=status,
+        undetermined=names,
         frame_ids=obs.frame_ids,
         quaternions=rotation_to_quaternion(attitudes.rotations),
         residuals_px=residuals,
@@ -107,6 +114,20 @@ def assemble(
         provenance=provenance(None, record | (settings or {}), obs.data_hash) | {"kernels": likelihood.kernels},
         fingerprints=Fingerprints.of(obs, residuals, nominal.centre_px),
     )
+
+
+def failed(likelihood: MarginalLikelihood, theta: FloatArray, nominal: Camera, status: Status) -> CalibrationError:
+    """The error of a calibration without an estimate: what its stars hardly determine at theta, or else its status."""
+    noise = _USUAL_NOISE_PX if likelihood.frames.weight is None else 1.0
+    # Where coefficients ended that nothing holds, others may seem to be open as well.
+    plain = np.concatenate([theta[:3], np.zeros(len(theta) - 3)])
+    found = []
+    for at in (theta, plain, nominal.theta) if status in EXPLAINED else ():
+        own = MarginalLikelihood(likelihood.frames, likelihood.model_name)
+        found.append(open_parameters(own.evaluate(at).matrix, noise, nominal, WEAK))
+    names = min(filter(None, found), key=len, default=())
+    status = Status.SINGULAR if names else status
+    return CalibrationError(f"the calibration failed ({status.name}): {remedy_of(status, names)}.", status)
 
 
 def with_star_errors(obs: Observations, cal: Calibration) -> Calibration:

@@ -19,7 +19,7 @@ from starcal_uq.core.settings import Method, Solver, bounded
 from starcal_uq.core.status import Status
 from starcal_uq.core.tasks import Progress, one_thread, processors
 from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, assemble, check_camera, noise_px, with_star_errors
+from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, assemble, check_camera, failed, noise_px, with_star_errors
 from starcal_uq.estimation.baselines import check_count, least_squares, recursive
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.composite import enough_frames, pair_covariance
@@ -39,11 +39,14 @@ from starcal_uq.estimation.stages import (
     begun_on_sample,
     direct_stage,
     distortion_stage,
+    focal_stage,
     joint_stage,
     optics_stage,
     refinement_stage,
 )
 from starcal_uq.estimation.student import parse_dof
+from starcal_uq.estimation.undetermined import EXPLAINED, undetermined
+from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.partitions import PartitionedObservations
 from starcal_uq.observations.table import Observations
@@ -235,7 +238,7 @@ def calibrate(
         if star_errors and calibration.status.ok:
             calibration = with_star_errors(weighed(obs, calibration), calibration)
     if throw:
-        raise_unless_good(calibration.status)
+        raise_unless_good(calibration.status, calibration.remedy)
     repeating = repeating_frames(calibration, duplicates)
     if not len(repeating) or not isinstance(obs, Observations):
         return calibration
@@ -414,19 +417,34 @@ def _robust(
     model = camera.distortion
 
     def fit(trusted: StarFrames, all_parameters: bool) -> list[Stage]:
-        if all_parameters:
-            return _pair_stages(PairObjective(trusted, model), camera, solver, max_iterations)
-        return [optics_stage(trusted, camera, solver, max_iterations)]
+        if not all_parameters:
+            stage = optics_stage(trusted, camera, solver, max_iterations)
+            return [stage if stage.status.ok else focal_stage(trusted, camera, max_iterations)]
+        stages = _pair_stages(PairObjective(trusted, model), camera, solver, max_iterations)
+        if not stages[-1].status.ok:
+            own = MarginalLikelihood(trusted, model)
+            direct = direct_stage(own, camera, min(max_iterations, _DIRECT_ITERATIONS))
+            stages[-1] = replace(direct, name=stages[-1].name) if direct.status.ok else stages[-1]
+        return stages
 
-    start = robust_start(frames, model, camera.theta, fit)
+    try:
+        start = robust_start(frames, model, camera.theta, fit)
+    except CalibrationError as error:
+        if error.status is None or error.status not in EXPLAINED:
+            raise
+        raise failed(MarginalLikelihood(frames, model), camera.theta, camera, error.status) from None
     pair_theta = start.stages[-1].theta
     found = refine(frames, model, pair_theta, start.rotations, nu, max_iterations)
     theta, sigma, state, information = found.stage.theta, found.sigma, found.state, found.information
     status = found.stage.status
-    if not np.isfinite(state.value) or is_singular(information.matrix):
+    if not np.isfinite(state.value) or is_singular(information.matrix) or is_singular(found.covariance):
         reason = status if not status.ok else Status.SINGULAR
-        raise CalibrationError(f"the calibration failed ({reason.name}): {reason.remedy}.", reason)
+        raise failed(MarginalLikelihood(start.frames, model), theta, camera, reason)
     result = camera.with_theta(theta)
+    status = check_camera(result, status)
+    gaussian, matrix = MarginalLikelihood(start.frames, model), scaled_inverse(found.covariance) * sigma**2
+    if names := undetermined(gaussian, theta, matrix, sigma, camera, status):
+        status = Status.SINGULAR
     settings: dict[str, object] = {"method": "efficient", "solver": solver, "distortion": model}
     settings |= {"likelihood": "student_t", "dof": "free" if nu is None else nu}
     record = provenance(None, settings, obs.data_hash)
@@ -443,7 +461,8 @@ def _robust(
         sigma_std=found.sigma_std,
         sigma_name=sigma_parameter(frames.weight is not None).name,
         stages=(*start.stages, found.stage),
-        status=check_camera(result, status),
+        status=status,
+        undetermined=names,
         frame_ids=obs.frame_ids,
         quaternions=rotation_to_quaternion(state.rotations),
         residuals_px=residuals,
@@ -453,9 +472,7 @@ def _robust(
         rotation_per_theta=information.rotation_per_theta,
         attitude_noise=information.attitude_noise,
         pair_theta=pair_theta,
-        pair_covariance=_pair_covariance(
-            PairObjective(start.frames, model), MarginalLikelihood(start.frames, model), pair_theta
-        ),
+        pair_covariance=_pair_covariance(PairObjective(start.frames, model), gaussian, pair_theta),
         compressed=compress_reweighted(found),
         provenance=record,
         fingerprints=Fingerprints.of(obs, residuals, camera.centre_px),

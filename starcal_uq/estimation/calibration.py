@@ -21,6 +21,7 @@ from starcal_uq.estimation.fingerprints import Fingerprints
 from starcal_uq.estimation.residual_map import PartitionSums
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.estimation.star_errors import StarErrors
+from starcal_uq.estimation.undetermined import remedy_of
 from starcal_uq.maths.intervals import student_quantile
 from starcal_uq.maths.linear import correlation_of
 
@@ -36,7 +37,7 @@ _APART = ("frame_ids", "quaternions", "residuals_px", "trajectory", "cost", "sig
 _DOCUMENT = (
     *("status", "parameter_names", "method", "solver", "sigma", "sigma_std", "sigma_name", "chi2", "dof", "provenance"),
     *("theta", "covariance", "information", "rotation_per_theta", "attitude_noise", "pair_theta", "pair_covariance"),
-    *("camera", "nominal", "stages", "compressed", "fingerprints", "star_errors", "partitions"),
+    *("camera", "nominal", "stages", "compressed", "fingerprints", "star_errors", "partitions", "undetermined"),
 )
 # What the document says of a stage; its last estimate is there for readers.
 _STAGE = ("name", "status", "iterations", "evaluations", "seconds", "theta")
@@ -108,6 +109,8 @@ class Calibration(Shown):
     partitions : PartitionSums or None
         Of a calibration of partitioned observations, sums over all of their residuals: `frame_ids`, `quaternions`,
         `residuals_px`, `pair_theta` and `pair_covariance` are those of a sample of frames, everything else of all.
+    undetermined : tuple of str
+        Names of parameters that the data leave open; `status` is then SINGULAR.
     """
 
     camera: Camera
@@ -136,6 +139,7 @@ class Calibration(Shown):
     fingerprints: Fingerprints | None = None
     star_errors: StarErrors | None = None
     partitions: PartitionSums | None = None
+    undetermined: tuple[str, ...] = ()
 
     SHAPES: ClassVar[Shapes] = {
         **{"parameter_names": ("p",), "theta": ("p",), "covariance": ("p", "p"), "information": ("p", "p")},
@@ -149,6 +153,11 @@ class Calibration(Shown):
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the parameters, in order."""
         return self.camera.parameter_names
+
+    @property
+    def remedy(self) -> str:
+        """What is wrong with a calibration that did not end well, and what helps, in one clause."""
+        return remedy_of(self.status, self.undetermined)
 
     @property
     def sigmas(self) -> FloatArray:
@@ -260,7 +269,8 @@ class Calibration(Shown):
         plain["stages"] = [{name: kept[name] for name in _STAGE} for kept in plain["stages"]]
         with atomic_path(path.with_suffix(".npz")) as temporary, temporary.open("wb") as stream:
             np.savez_compressed(stream, allow_pickle=False, **arrays)
-        write_json({name: plain[name] for name in _DOCUMENT if plain[name] is not None}, path)
+        kept = {name: plain[name] for name in _DOCUMENT if plain[name] is not None and plain[name] != []}
+        write_json(kept, path)
 
     @classmethod
     def load(cls, path: str | Path) -> Calibration:

@@ -161,6 +161,7 @@ def _solve(
             "hess_lag": hessian,
             "iteration_callback": recorder,
             "print_time": False,
+            "show_eval_warnings": False,
             "ipopt.print_level": 0,
             "ipopt.sb": "yes",
             "ipopt.max_iter": max_iterations,

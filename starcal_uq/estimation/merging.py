@@ -222,9 +222,7 @@ def check_mergeable(
     seen: dict[str, str] = {}
     for cal, name in zip(calibrations, names, strict=True):
         if not cal.status.ok:
-            raise CalibrationError(
-                f"{name}: the calibration did not converge ({cal.status.name}): {cal.status.remedy}."
-            )
+            raise CalibrationError(f"{name}: the calibration did not converge ({cal.status.name}): {cal.remedy}.")
         for what in ("width_px", "height_px", "pixel_um", "distortion"):
             ours, theirs = getattr(first.camera, what), getattr(cal.camera, what)
             if ours != theirs:

@@ -139,6 +139,13 @@ def optics_stage(frames: StarFrames, camera: Camera, solver: str, max_iterations
     return _timed("optics", lambda: _solve(objective, start, camera, solver, max_iterations), zeros)
 
 
+def focal_stage(frames: StarFrames, camera: Camera, max_iterations: int) -> Stage:
+    """Stage 1 for stars that do not determine the principal point without distortion: f alone, on positions."""
+    own = MarginalLikelihood(frames, "none")
+    zeros = np.zeros(len(camera.theta) - 3)
+    return _timed("optics", lambda: _held(own, camera.theta[:3], max_iterations), zeros)
+
+
 def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> Stage:
     """Stage 2: the coefficients by linear least squares at fixed optics (the paper's section 2.2).
 

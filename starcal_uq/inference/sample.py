@@ -366,5 +366,5 @@ def _settings(
         8.0 * dim * n_ensembles * n_walkers * (n_steps + n_burn),
     )
     if not cal.status.ok:
-        raise SamplingError(f"the calibration did not converge ({cal.status.name}): {cal.status.remedy}.")
+        raise SamplingError(f"the calibration did not converge ({cal.status.name}): {cal.remedy}.")
     return EnsembleSettings(n_walkers, n_steps, n_burn, moves)

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
+from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.status import Status
 from starcal_uq.estimation.recursive import innovations
 from starcal_uq.estimation.recursive.innovations import frame_normals
 from starcal_uq.estimation.robust import star_scores
@@ -108,3 +110,80 @@ def test_four_hundred_partners_find_the_wrong_stars_of_a_frame_of_thousands():
     right = np.setdiff1d(np.arange(1500), wrong)
     assert np.max(scores[right]) < 0.2
     assert np.mean(scores[wrong] > 0.2) > 0.98
+
+
+def drawn(place, *, n_frames=40, sigma_px=0.05, size_px=1024, field_deg=15.0, corner_px=(3.0, -1.5), seed=3):
+    """Stars at places (2, m) px off the principal point, where an ideal camera would see them."""
+    rng = np.random.default_rng(seed)
+    focal, centre = 0.5 * size_px / np.tan(np.radians(0.5 * field_deg)), np.array([[0.52 * size_px], [0.47 * size_px]])
+    k = np.array(corner_px) / (size_px / np.sqrt(2.0)) ** np.array([3, 5])
+    columns = {name: [] for name in ("frame", "x_px", "y_px", "ra_deg", "dec_deg")}
+    for frame in range(n_frames):
+        ideal = place(rng)
+        r2 = np.sum(ideal**2, axis=0)
+        xy = centre + ideal * (1.0 + k[0] * r2 + k[1] * r2**2) + sigma_px * rng.standard_normal(ideal.shape)
+        b = np.vstack([ideal, np.full(ideal.shape[1], focal)])
+        turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+        r = np.linalg.det(turn) * turn @ b
+        found = (np.full(len(r2), frame), *xy, np.degrees(np.arctan2(r[1], r[0])) % 360.0)
+        found += (np.degrees(np.arctan2(r[2], np.hypot(r[0], r[1]))),)
+        for column, values in zip(columns.values(), found, strict=True):
+            column.append(values)
+    sheet = sc.Camera(size_px, size_px, 10.0, 0.0101 * focal, 0.5 * size_px - 0.5, 0.5 * size_px - 0.5)
+    theta = np.array([*centre[:, 0], focal, *k])
+    return sc.Observations(**{name: np.concatenate(values) for name, values in columns.items()}), sheet, theta
+
+
+def on_a_ring(rng, radius=0.4, m=12):
+    angle = rng.uniform(0.0, 2.0 * np.pi, m)
+    return radius * 1024.0 * np.array([np.cos(angle), np.sin(angle)])
+
+
+def in_the_middle(rng):
+    return rng.uniform(-4.0, 4.0, (2, 12))
+
+
+def anywhere(rng):
+    return rng.uniform(-0.46, 0.46, (2, 12)) * 1024.0
+
+
+def on_a_line(rng):
+    return rng.uniform(-0.44, 0.44, 12) * np.array([[1024.0], [300.0]])
+
+
+def in_a_corner(rng):
+    return rng.uniform(0.36, 0.44, (2, 12)) * 1024.0
+
+
+LEFT_OPEN = {
+    "one radius": (on_a_ring, {}, "brown", "do not tell k1 and k2 apart: stars at more radii are needed"),
+    "one radius, without noise": (on_a_ring, {"sigma_px": 1e-7}, "brown", "stars at more radii are needed"),
+    "the middle of the field": (in_the_middle, {}, "k1", "k1.* are needed, or a distortion model with fewer"),
+    "a field of half a degree, 64 px": (
+        lambda rng: rng.uniform(-28.0, 28.0, (2, 10)),
+        {"n_frames": 20, "size_px": 64, "field_deg": 0.5, "corner_px": (0.0, 0.0)},
+        "brown",
+        "do not determine .*0: more frames, or stars over a wider field, are needed",
+    ),
+}
+
+
+@pytest.mark.parametrize("likelihood", ["marginal", "student_t"])
+@pytest.mark.parametrize("name", LEFT_OPEN)
+def test_what_the_data_leave_open_is_named_and_what_would_determine_it(name, likelihood):
+    place, options, model, words = LEFT_OPEN[name]
+    # The Student t ends elsewhere along what is open, where other parameters are open as well.
+    words = words if likelihood == "marginal" else "the data do not .* are needed"
+    obs, sheet, _ = drawn(place, **options)
+    with pytest.raises(CalibrationError, match=words) as caught:
+        sc.calibrate(obs, sheet.replace(distortion=model), likelihood=likelihood)
+    assert caught.value.status is Status.SINGULAR
+
+
+@pytest.mark.parametrize("place", [anywhere, on_a_line, in_a_corner])
+@pytest.mark.parametrize("likelihood", ["marginal", "student_t"])
+def test_stars_in_odd_places_that_determine_everything(place, likelihood):
+    obs, sheet, theta = drawn(place)
+    cal = sc.calibrate(obs, sheet, likelihood=likelihood)
+    assert not cal.undetermined
+    assert squared_error(cal, theta) < UNLIKELY

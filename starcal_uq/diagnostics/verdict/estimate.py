@@ -46,7 +46,7 @@ def estimation(cal: Calibration) -> Check:
     if cal.status.ok:
         sentence = f"All {plural(len(cal.stages), 'stage')} ended at an optimum, after {plural(steps, 'iteration')}."
     else:
-        sentence = f"The estimate is not an optimum: {cal.status.remedy}."
+        sentence = f"The estimate is not an optimum: {cal.remedy}."
     level, remedy = pass_or_fail(cal.status.ok), _REMEDIES.get(cal.status, "")
     return Check("Estimation", Question.CONVERGED, level, words, "converged", sentence, remedy)
 

@@ -336,7 +336,7 @@ class RecursiveCalibration:
         return loaded
 
 
-def raise_unless_good(status: Status) -> None:
+def raise_unless_good(status: Status, remedy: str = "") -> None:
     """Raise the `CalibrationError` of a status that is not CONVERGED."""
     if not status.ok:
-        raise CalibrationError(f"the calibration did not end well ({status.name}): {status.remedy}.", status)
+        raise CalibrationError(f"the calibration did not end well ({status.name}): {remedy or status.remedy}.", status)

@@ -1,0 +1,107 @@
+"""Which parameters data leave open, and what would determine them."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.camera.distortion import get_model
+from starcal_uq.core.formatting import join_words
+from starcal_uq.core.status import Status
+from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.maths.linear import scaled_inverse
+
+if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
+    from starcal_uq.core.types import FloatArray
+
+# A standard deviation of a third of its natural size (`_natural`) is no knowledge: the likelihood bends before that.
+_OPEN = 0.3
+# So little is no reason to distrust an estimate, and enough to explain why there is none.
+WEAK = 0.05
+# Part of a direction below which a parameter does not count as one of those that it mixes.
+_PART = 0.15
+# Principal points known better than this do not depend on whether there is distortion.
+_POINT = 0.03
+# Squared length, in standard deviations, up to which distortion may be none.
+_INSIGNIFICANT = 30.0
+# Ends that undetermined parameters explain.
+EXPLAINED = (
+    *(Status.CONVERGED, Status.MAX_ITERATIONS, Status.SINGULAR, Status.STALLED),
+    *(Status.OUTSIDE_DETECTOR, Status.FOLDED),
+)
+
+
+def open_parameters(matrix: FloatArray, noise: float, camera: Camera, limit: float = _OPEN) -> tuple[str, ...]:
+    """Names of the parameters of all directions that data leave open.
+
+    Parameters
+    ----------
+    matrix : (p, p) array
+        Gauss-Newton matrix of the marginal likelihood, px units.
+    noise : float
+        Noise per axis, px, or the factor on the stated noise.
+    camera : Camera
+        Its detector, focal length and model say how large each parameter can be at most: half the detector, the focal
+        length, a displacement of the corner as large as its distance.
+    limit : float
+        Standard deviation, as a fraction of that, from which on a direction is open.
+    """
+    natural = _natural(camera)
+    scaled = matrix * np.outer(natural, natural) / noise**2
+    if not np.isfinite(scaled).all():
+        return ()
+    values, vectors = np.linalg.eigh(scaled)
+    # What is a hundred times better known than the rest is not what is missing.
+    mixed = np.abs(vectors[:, values < min(1.0 / limit**2, max(1e4 * values[0], 1e-12 * values[-1]))])
+    named = (mixed > _PART * np.max(mixed, axis=0, initial=0.0)).any(axis=1)
+    return tuple(name for name, flag in zip(camera.parameter_names, named, strict=True) if flag)
+
+
+def _natural(camera: Camera) -> FloatArray:
+    """Largest sensible size (p,) of each parameter, px units."""
+    powers = np.array([c.order for c in get_model(camera.distortion).coefficients], dtype=np.float64)
+    sizes = [0.5 * camera.width_px, 0.5 * camera.height_px, camera.focal_px]
+    return np.concatenate([sizes, camera.half_diagonal_px ** (1.0 - powers)])
+
+
+def undetermined(
+    likelihood: MarginalLikelihood, theta: FloatArray, matrix: FloatArray, noise: float, camera: Camera, status: Status
+) -> tuple[str, ...]:
+    """Names of the parameters that the data leave open at an estimate theta (p,), if that can explain the status.
+
+    The coma of the distortion tells where the principal point is, and in narrow fields nothing else does: where the
+    distortion may be none, the data must determine the point without it.
+    """
+    if status not in EXPLAINED or not noise > 0.0:
+        return ()
+    found = open_parameters(matrix, noise, camera)
+    if found or len(theta) == 3:
+        return found
+    covariance = scaled_inverse(matrix) * noise**2
+    point = np.sqrt(np.diag(covariance))[:2] / _natural(camera)[:2]
+    k = theta[3:]
+    if np.max(point) < _POINT or float(k @ scaled_inverse(covariance[3:, 3:]) @ k) > _INSIGNIFICANT:
+        return ()
+    without = MarginalLikelihood(likelihood.frames, likelihood.model_name)
+    if likelihood.rotations is not None:
+        without.use_rotations(likelihood.rotations)
+    plain = np.concatenate([theta[:3], np.zeros(len(k))])
+    return open_parameters(without.evaluate(plain).matrix, noise, camera)
+
+
+def what_is_missing(names: tuple[str, ...]) -> str:
+    """One clause: what the data leave open, and what would determine it."""
+    words = join_words(names)
+    if set(names) <= {"x0", "y0"}:
+        return f"the data do not determine {words}: more frames, or stars over a wider field, are needed"
+    first = f"do not determine {words}" if len(names) == 1 else f"do not tell {words} apart"
+    where = "over the whole field, along both axes," if set(names) & {"x0", "y0", "p1", "p2"} else "at more radii"
+    fewer = ", or a distortion model with fewer coefficients" if set(names) - {"x0", "y0", "f"} else ""
+    return f"the data {first}: stars {where} are needed{fewer}"
+
+
+def remedy_of(status: Status, names: tuple[str, ...]) -> str:
+    """The remedy of a status, in terms of the parameters that the data leave open, where there are some."""
+    return what_is_missing(names) if names else status.remedy
