@@ -47,7 +47,7 @@ PAGE = ROOT / "docs" / "explanation" / "reliability.md"
 SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "likelihood": (
         ("estimation/marginal.py", "estimation/sums.py", "estimation/compressed.py", "estimation/student.py"),
-        ("estimation/test_likelihood.py", "estimation/test_sums.py", "estimation/test_student.py"),
+        tuple(f"estimation/test_{name}.py" for name in ("likelihood", "sums", "student", "merging")),
     ),
     "pairs": (
         ("estimation/pairs.py", "estimation/composite.py"),

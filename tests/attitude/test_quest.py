@@ -113,12 +113,12 @@ def test_agrees_with_scipy_also_at_half_turns(sigma_rad: float) -> None:
 
 def test_eigenvector_before_it_is_polished() -> None:
     """One step of Newton would mend a wrong entry of the adjugate; whichever row is largest, it needs none."""
-    rotations = np.concatenate((half_turns(), random_rotations(200, np.random.default_rng(5))))
+    # At the identity and at half turns about an axis, one row alone is not zero.
+    rotations = np.concatenate(([np.eye(3)], half_turns(), random_rotations(200, np.random.default_rng(5))))
     b, r, starts, _ = frames([8] * len(rotations), 90.0, 1e-3, 6, rotations)
     quaternions, values = davenport(b, r, starts, np.ones(len(b)))
     B = [[np.add.reduceat(b[:, i] * r[:, j], starts[:-1])[None] / 8.0 for j in range(3)] for i in range(3)]
     found = _adjugate_quaternion(B, values[None])[:, 0].T
-    # Half turns reach the rows of x, y and z, small ones that of w.
     assert set(np.argmax(np.abs(quaternions), axis=1)) == {0, 1, 2, 3}
     np.testing.assert_allclose(np.abs(np.sum(found * quaternions, axis=1)), 1.0, rtol=0, atol=1e-12)
 
