@@ -115,7 +115,7 @@ def test_eigenvector_before_it_is_polished() -> None:
     """One step of Newton would mend a wrong entry of the adjugate; whichever row is largest, it needs none."""
     # At the identity and at half turns about an axis, one row alone is not zero.
     rotations = np.concatenate(([np.eye(3)], half_turns(), random_rotations(200, np.random.default_rng(5))))
-    b, r, starts, _ = frames([8] * len(rotations), 90.0, 1e-3, 6, rotations)
+    b, r, starts, _ = frames([8] * len(rotations), 90.0, 1e-9, 6, rotations)
     quaternions, values = davenport(b, r, starts, np.ones(len(b)))
     B = [[np.add.reduceat(b[:, i] * r[:, j], starts[:-1])[None] / 8.0 for j in range(3)] for i in range(3)]
     found = _adjugate_quaternion(B, values[None])[:, 0].T
