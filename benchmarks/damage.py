@@ -23,6 +23,7 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +34,7 @@ from tests.helpers.mutants import LAST, SAMPLES, Bench, Outcome, Sample, write_s
 
 OUT = ROOT / ".bench" / "damage"
 PAGE = ROOT / "docs" / "explanation" / "reliability.md"
-CHUNK = 5000
+FIRST, CHUNK = (0, 500, 1000, 2000), 5000
 LONGEST_S, MOST_BYTES = 20.0, 2**30
 KINDS = ("refused", "same", "other", "words", "escaped", "slow", "died")
 BAD = ("words", "escaped", "slow", "died")
@@ -131,9 +132,11 @@ def campaign(samples: Sequence[Sample], text: int, binary: int, processes: int, 
     if not (out / "valid" / LAST).exists():
         (out / "valid").mkdir(exist_ok=True)
         write_samples(out / "valid")
+    # All kinds a little first: whoever looks early sees something of each.
+    edges = [*FIRST, *range(CHUNK, max(text, binary, CHUNK) + CHUNK, CHUNK)]
     jobs = [
-        (sample.file, first, min(first + CHUNK, wanted))
-        for first in range(0, max(text, binary), CHUNK)
+        (sample.file, first, min(last, wanted))
+        for first, last in pairwise(edges)
         for sample in samples
         if first < (wanted := binary if sample.binary else text)
     ]

@@ -81,6 +81,8 @@ SENSOR = "sensor"
 FRAME_KEYS: Keys = {"rotation": list}
 # Rows of a matrix that people round to six digits.
 _ORTHONORMAL = 1e-5
+# Parts of a quaternion, which need not have unit length.
+_LARGE = 1e6
 # Keys of earlier versions, and why to delete them.
 _GONE = {"time_class": "interpretation alone decides how a row is combined"}
 
@@ -258,7 +260,9 @@ def _frames(tables: Any, path: str | os.PathLike[str]) -> dict[str, FloatArray]:
             raise BudgetError(f"{where}: key rotation is missing; write a matrix of three rows, or a quaternion.")
         try:
             values = np.array(table.data["rotation"], dtype=np.float64)
-        except (TypeError, ValueError):
+        except (TypeError, ValueError, OverflowError):
+            values = np.zeros(0)
+        if values.size and not np.abs(values).max() < _LARGE:
             values = np.zeros(0)
         if values.shape == (4,) and np.isfinite(values).all() and np.any(values):
             values = quaternion_to_rotation(values / np.linalg.norm(values))

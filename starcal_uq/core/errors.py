@@ -25,7 +25,7 @@ class StarcalError(Exception):
 
 
 # A word that is longer is cut, and so is a message, whose remedy stands at its end.
-_LONGEST_WORD, _LONGEST = 250, 700
+_LONGEST_WORD, _LONGEST = 250, 450
 
 
 def _one_line(message: str) -> str:
@@ -34,7 +34,7 @@ def _one_line(message: str) -> str:
     line = " ".join(message.splitlines())
     line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
     line = re.sub(rf"\S{{{_LONGEST_WORD},}}", lambda word: f"{word[0][:40]}...{word[0][-20:]}", line)
-    return line if len(line) <= _LONGEST else f"{line[:480]} ... {line[-200:]}"
+    return line if len(line) <= _LONGEST else f"{line[:290]} ... {line[-100:]}"
 
 
 class SettingError(StarcalError, ValueError):

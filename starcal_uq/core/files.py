@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import gzip
+import hashlib
 import json
 import os
 import re
@@ -214,11 +215,29 @@ def check_parquet(file: ParquetFile, stored: int) -> None:
     check_size(file.metadata.num_rows * len(names) * 8, stored)
 
 
+_SEAL = re.compile(rb"\nsha256 ([0-9a-f]{64})\n")
+_SEAL_BYTES = 73
+
+
+def sealed(content: bytes) -> bytes:
+    """The content of an HDF5 file with its hash behind it, where readers of HDF5 do not look."""
+    return content + b"\nsha256 %s\n" % hashlib.sha256(content).hexdigest().encode()
+
+
 def check_hdf5(path: PathLike) -> None:
-    """Refuse a file that is no HDF5, or declares more than it can hold; readers of netCDF would stumble over it."""
+    """Refuse, with ValueError, an HDF5 file that is not as `sealed` left it, or declares more than it can hold.
+
+    The HDF5 library does not find that its files were damaged: it may give other numbers, or never come back.
+    """
     import h5py
 
-    stored = os.path.getsize(path)
+    content = Path(path).read_bytes()
+    seal = _SEAL.fullmatch(content[-_SEAL_BYTES:])
+    if seal is None:
+        raise ValueError("it is cut off, or not of this version")
+    if hashlib.sha256(content[:-_SEAL_BYTES]).hexdigest().encode() != seal[1]:
+        raise ValueError("its content was changed after it was written")
+    stored = len(content)
 
     def check(name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset):

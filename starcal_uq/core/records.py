@@ -128,8 +128,11 @@ def _value(hint: Any, data: Any, arrays: Arrays, name: str) -> Any:
             return float("nan")
         if not isinstance(data, _SCALARS[hint]) or (isinstance(data, bool) and hint is not bool):
             raise ValueError(f"{name} is {shown(data)}, not {_WORDS[hint]}")
-        if hint is float and isinstance(data, int):
-            float(data)  # it may be too large for one
+        if isinstance(data, int) and not isinstance(data, bool):
+            if hint is float:
+                return float(data)
+            if not -(2**63) <= data < 2**63:
+                raise ValueError(f"{name} is {shown(data)}, too large a number")
         return data
     if origin is Literal:
         if data not in args:
@@ -230,14 +233,16 @@ def _check_sizes(record: Any, name: str) -> None:
     neither NaN nor infinities.
     """
     sizes: dict[str, int] = {}
+    empty: dict[str, set[str]] = {}
     for field, wanted in getattr(record, "SHAPES", {}).items():
         value = getattr(record, field)
         if value is None:
             continue
         shape = value.shape if isinstance(value, np.ndarray) else (len(value),)
         place = f"{name}_{field}" if name else field
-        if not all(shape) and len(shape) < len(wanted):
-            continue  # lists of JSON do not tell the sizes of an array that holds nothing
+        if shape == (0,) and len(wanted) > 1:
+            empty[place] = {str(want).partition("+")[0] for want in wanted}
+            continue
         if len(shape) != len(wanted):
             raise ValueError(f"{place} has {len(shape)} dimensions, not {len(wanted)}")
         for size, want in zip(shape, wanted, strict=True):
@@ -245,6 +250,10 @@ def _check_sizes(record: Any, name: str) -> None:
             known = sizes.setdefault(letter, int(letter) if letter.isdigit() else size - int(more or 0))
             if size != known + int(more or 0):
                 raise ValueError(f"{place} has {size} entries where there should be {known + int(more or 0)}")
+    # A list of JSON does not tell the sizes of an array that holds nothing.
+    for place, letters in empty.items():
+        if all(int(letter) if letter.isdigit() else sizes.get(letter, 0) for letter in letters):
+            raise ValueError(f"{place} holds nothing")
     for field in getattr(record, "FINITE", ()):
         if not np.isfinite(getattr(record, field)).all():
             raise ValueError(f"{f'{name}_{field}' if name else field} holds a value that is not finite")

@@ -319,13 +319,13 @@ class PhysicalPriors(Priors):
 
 _FIELDS = tuple(field.name for field in dataclasses.fields(PhysicalPriors))
 _POSITIVE = tuple(name for name in _FIELDS if name not in ("principal_point_centre_px", "distortion", "per_star_sigma"))
-_NUMBER = "a finite number above zero"
+_NUMBER = "a number above zero and below 1e12"
 
 PRIORS = Section(
     {
-        "principal_point_px": Key(float, _NUMBER, gt=0.0),
+        "principal_point_px": Key(float, _NUMBER, gt=0.0, lt=1e12),
         "principal_point_centre_px": Key(list[float], "two numbers in brackets", min_length=2, max_length=2),
-        **{name: Key(float, _NUMBER, gt=0.0) for name in _POSITIVE[1:]},
+        **{name: Key(float, _NUMBER, gt=0.0, lt=1e12) for name in _POSITIVE[1:]},
     },
     PriorError,
 )

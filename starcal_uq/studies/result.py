@@ -14,7 +14,7 @@ import numpy as np
 from starcal_uq.core.constants import AXES as ATTITUDE
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StudyError
-from starcal_uq.core.files import PathLike, atomic_path, check_hdf5, new_folder, reading
+from starcal_uq.core.files import PathLike, atomic_path, check_hdf5, new_folder, reading, sealed
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.studies.axes import AXES
 from starcal_uq.studies.definition import StudyDefinition
@@ -233,6 +233,7 @@ class Study(Shown):
         with atomic_path(path / NETCDF) as temporary:
             packed = {name: {"zlib": True, "complevel": 1} for name, v in self.data.items() if v.dtype.kind in "fi"}
             self.data.to_netcdf(temporary, engine="h5netcdf", encoding=packed)
+            temporary.write_bytes(sealed(temporary.read_bytes()))
         with atomic_path(path / PARQUET) as temporary:
             self.table().to_parquet(temporary, index=False)
 
