@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 from typing import TYPE_CHECKING, ClassVar
 
@@ -42,9 +43,10 @@ _FALSE_ALARM = 1e-6
 _STARE, _ASKED = 5, 8
 _MOST_CANDIDATES, _PART = 2_000_000, 20_000
 # Pairs that are tried one by one before a tree is quicker, and the reach of a key that was rounded.
-_MOST_TRIED, _WINDOW = 20_000_000, 1.0 + 1e-6
-# Terms of a smooth misfit up to the fifth degree, with so many stars for each, from at most so many stars.
-_DEGREE, _STARS_PER_TERM, _MOST_STARS = 5, 20, 50_000
+_MOST_TRIED, _WINDOW = 20_000_000, 2.0 + 1e-6
+# Terms of a smooth misfit up to the fifth degree, with so many stars for each, from about so many stars; stars whose
+# terms stay in the cache.
+_DEGREE, _STARS_PER_TERM, _MOST_STARS, _BLOCK = 5, 20, 5_000, 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +74,8 @@ class Fingerprints:
     def of(cls, obs: Observations, residuals_px: FloatArray, centre_px: tuple[float, float]) -> Fingerprints:
         """Take those of a table with its residuals (N, 2)."""
         sizes = obs.stars_per_frame
-        rows = _most_central(np.hypot(*(obs.xy - centre_px).T), obs.frame_starts[:-1], sizes)
+        distance2 = (obs.x_px - centre_px[0]) ** 2 + (obs.y_px - centre_px[1]) ** 2
+        rows = _most_central(distance2, obs.frame_starts[:-1], sizes)
         error = np.hypot(*_unsmooth(obs.xy, residuals_px, rows).T)
         free = np.sqrt(1.0 - 1.5 / np.maximum(sizes, 2))
         error /= np.repeat(free, np.minimum(sizes, _MARKS))
@@ -115,44 +118,32 @@ def _most_central(distance: FloatArray, starts: IntArray, sizes: IntArray) -> In
 def _unsmooth(xy: FloatArray, residuals: FloatArray, rows: IntArray) -> FloatArray:
     """Residuals of some rows without a polynomial over the detector: what a model cannot follow is no noise."""
     step = max(1, len(xy) // _MOST_STARS)
-    place = xy - xy.mean(axis=0)
-    place /= np.abs(place).max() or 1.0
+    some, found = xy[::step], residuals[::step]
+    middle = some.mean(axis=0)
+    unit = np.abs(some - middle).max() or 1.0
     degree = max(d for d in range(_DEGREE + 1) if d == 0 or (d + 1) * (d + 2) // 2 * _STARS_PER_TERM <= len(xy))
 
     def terms(at: FloatArray) -> FloatArray:
-        x, y = np.ascontiguousarray(at.T)
+        x, y = np.ascontiguousarray((at - middle).T) / unit
         powers = np.ones((degree + 1, len(y)))
         for j in range(degree):
             np.multiply(powers[j], y, out=powers[j + 1])
-        rows, first = np.empty(((degree + 1) * (degree + 2) // 2, len(y))), 0
+        table, first = np.empty(((degree + 1) * (degree + 2) // 2, len(y))), 0
         for i in range(degree + 1):
-            np.copyto(rows[first : first + degree + 1 - i], powers[: degree + 1 - i])
+            np.copyto(table[first : first + degree + 1 - i], powers[: degree + 1 - i])
             first += degree + 1 - i
             powers *= x
-        return rows
+        return table
 
-    def smooth(at: FloatArray, coefficients: FloatArray) -> FloatArray:
-        # Horner's scheme in both coordinates: no table of all terms.
-        x, y = np.ascontiguousarray(at.T)
-        value, last = np.zeros(len(at)), len(coefficients)
-        for i in range(degree, -1, -1):
-            first = last - (degree + 1 - i)
-            inner = np.full(len(at), coefficients[last - 1])
-            for j in range(last - 2, first - 1, -1):
-                inner = inner * y + coefficients[j]
-            value, last = value * x + inner, first
-        return value
-
-    length = np.hypot(*residuals.T)
+    length = np.hypot(*found.T)
     # A few wrong stars would bend the polynomial for all others.
-    used = np.flatnonzero(length <= 5.0 * np.median(length))[::step]
-    x = terms(place[used])
-    solution = np.linalg.lstsq(x @ x.T, x @ residuals[used], rcond=None)[0]
+    used = length <= 5.0 * np.median(length)
+    x = terms(some[used])
+    solution = np.linalg.lstsq(x @ x.T, x @ found[used], rcond=None)[0]
     left = residuals[rows]
-    for first in range(0, len(rows), _PART):
-        part = slice(first, first + _PART)
-        for axis in range(2):
-            left[part, axis] -= smooth(place[rows[part]], np.asarray(solution[:, axis], dtype=np.float64))
+    for first in range(0, len(rows), _BLOCK):
+        part = slice(first, first + _BLOCK)
+        left[part] -= terms(xy[rows[part]]).T @ solution
     return left
 
 
@@ -198,31 +189,34 @@ def repeats(marks: Fingerprints, group: IntArray | None = None) -> IntArray:
 
 
 def _near(points: FloatArray) -> IntArray | None:
-    """Pairs (n, 2) of points (m, d) that differ by at most 1 in every coordinate; None where too many are to be tried.
+    """Pairs (n, 2) of triangles (m, 6) that differ by at most 1 in every number; None where too many are to be tried.
 
-    Points are sorted into strips of the first coordinate and, within them, by the third.
+    They are sorted into strips of the first number and, within them, by a sum of two sides, because those of one frame
+    have single sides in common. For that few have one near, this takes a tenth of the time of SciPy's tree.
     """
     strip = np.floor(points[:, 0])
     strip -= strip.min(initial=0.0)
-    along = points[:, 2] - points[:, 2].min(initial=0.0)
-    length = along.max(initial=0.0) + 3.0
-    order = np.argsort(strip * length + along)
-    points, strip, along = points[order], strip[order], along[order]
+    along = points[:, 2] + points[:, 4]
+    along -= along.min(initial=0.0)
+    length = along.max(initial=0.0) + 5.0
     keys = strip * length + along
+    order = np.argsort(keys)
+    keys = keys[order]
     found = []
     for step in (0, 1):
-        at = (strip + step) * length + along
+        at = keys + step * length
         first = np.arange(1, len(keys) + 1) if step == 0 else np.searchsorted(keys, at - _WINDOW)
-        count = np.maximum(np.searchsorted(keys, at + _WINDOW, side="right") - first, 0)
+        nearest = np.append(keys, np.inf)[first]
+        one = np.flatnonzero(nearest <= at + _WINDOW)
+        count = np.searchsorted(keys, at[one] + _WINDOW, side="right") - first[one]
         if count.sum() > _MOST_TRIED:
             return None
-        one = np.repeat(np.arange(len(keys)), count)
-        two = np.arange(len(one)) + np.repeat(first - (np.cumsum(count) - count), count)
-        for axis in (2, 0, *range(1, points.shape[1])):
+        start = np.repeat(first[one] - (np.cumsum(count) - count), count)
+        pairs = order[np.column_stack([np.repeat(one, count), np.arange(len(start)) + start])]
+        for axis in (2, 0, 1, 3, 4, 5):
             column = points[:, axis]
-            alike = np.abs(column[one] - column[two]) <= 1.0
-            one, two = one[alike], two[alike]
-        found.append(np.column_stack([order[one], order[two]]))
+            pairs = pairs[np.abs(column[pairs[:, 0]] - column[pairs[:, 1]]) <= 1.0]
+        found.append(pairs)
     return np.concatenate(found)
 
 
@@ -236,31 +230,47 @@ class _Search:
         self.square = np.asarray(marks.error_px, dtype=np.float64) ** 2
         # Median length of two normal errors, so that wrong stars do not count.
         self.sigma = float(np.median(marks.error_px)) / 1.1774 + 1e-4
-        frames, triangles = [], []
-        for chosen in combinations(range(_CORNERS), 3):
-            frame = np.flatnonzero(self.counts > chosen[-1])
-            corner = self.xy[self.starts[frame, None] + np.array(chosen)]
-            corner = np.take_along_axis(corner, np.argsort(corner[..., :1], axis=1), axis=1)
-            sides = (corner[:, 1:] - corner[:, :1]).reshape(-1, 4)
-            frames.append(frame)
-            triangles.append(np.hstack([corner[:, 0], sides]))
-        self.frame, self.triangle = np.concatenate(frames), np.concatenate(triangles)
-        # One triangle of each frame (that of its three most central stars) tells how many others look the same way.
-        has, self.first = frames[0], np.full(len(self.counts), -1)
-        self.first[has] = np.arange(len(has))
-        points = triangles[0] / _SHIFT
-        self.partners = np.zeros(len(self.counts))
-        near = _near(points)
+        # The most central stars from left to right; where a frame has fewer, what is missing comes last.
+        place = np.arange(_CORNERS)
+        there = place < self.counts[:, None]
+        corner = np.sort(np.where(there, self._point(np.where(there, self.starts[:, None] + place, 0)), np.nan), axis=1)
+        chosen = np.array(list(combinations(range(_CORNERS), 3)))
+        whole = self.counts[:, None] > chosen[:, 2]
+        self.frame, self.triangle = np.nonzero(whole)[0], _triangles(np.take(corner, chosen, axis=1)[whole])
+
+    def _point(self, rows: IntArray) -> NDArray[np.complex128]:
+        """Positions of stars as complex numbers, which are sorted from left to right."""
+        points: NDArray[np.complex128] = self.xy.view(np.complex128)[rows, 0]
+        return points
+
+    @cached_property
+    def first(self) -> IntArray:
+        """Frames (H,) of three stars and more."""
+        return np.flatnonzero(self.counts >= 3)
+
+    @cached_property
+    def points(self) -> FloatArray:
+        """The triangle (H, 6) of the three most central stars of each of them, which tells which way a frame looks."""
+        return _triangles(np.sort(self._point(self.starts[self.first, None] + np.arange(3)), axis=1)) / _SHIFT
+
+    @cached_property
+    def partners(self) -> FloatArray:
+        """How many other frames look the same way, (K,)."""
+        partners = np.zeros(len(self.counts))
+        near = _near(self.points)
         if near is not None:
-            self.partners[has] = np.bincount(near.ravel(), minlength=len(has))
+            partners[self.first] = np.bincount(near.ravel(), minlength=len(self.first))
         else:
-            self.partners[has] = _tree(points).query_ball_point(points, 1.0, p=np.inf, return_length=True) - 1
+            partners[self.first] = (
+                _tree(self.points).query_ball_point(self.points, 1.0, p=np.inf, return_length=True) - 1
+            )
+        return partners
 
     def candidates(self, group: IntArray | None) -> IntArray:
         """Pairs of frames with a triangle in common."""
         points = self.triangle / np.array([_SHIFT, _SHIFT, *[self.sigma] * 4])
-        near = _near(points) if self.partners.sum() <= _MOST_CANDIDATES else None
-        if near is None:
+        near = _near(points)
+        if near is None or len(near) > _MOST_CANDIDATES:
             near = self._nearest(points)
         pairs = np.sort(self.frame[near], axis=1)
         pairs = pairs[pairs[:, 0] != pairs[:, 1]]
@@ -354,7 +364,9 @@ class _Search:
     def _common(self, frames: IntArray) -> tuple[FloatArray, FloatArray]:
         """What r is for other exposures of the pointing of frames, at most 1, and half its degrees of freedom."""
         points = self.triangle / _SHIFT
-        _, near = _tree(points).query(points[self.first[frames]], k=4 * _ASKED, p=np.inf, distance_upper_bound=1.0)
+        _, near = _tree(points).query(
+            self.points[np.searchsorted(self.first, frames)], k=4 * _ASKED, p=np.inf, distance_upper_bound=1.0
+        )
         others = np.append(self.frame, -1)[near]
         row, column = np.nonzero((others >= 0) & (others != frames[:, None]))
         r, half = np.full(others.shape, np.nan), np.full(others.shape, np.nan)
@@ -364,6 +376,12 @@ class _Search:
         r[~enough], half[~enough] = 1.0, 1.5
         # Trimmed of its largest differences, r is about 2/3 for independent exposures.
         return np.clip(1.5 * np.nanmedian(r, axis=1), 1e-12, 1.0), np.nanmedian(half, axis=1)
+
+
+def _triangles(corner: NDArray[np.complex128]) -> FloatArray:
+    """Of corners (n, 3) from left to right: the first one, and the sides from there to the others, (n, 6)."""
+    corner[:, 1:] -= corner[:, :1]
+    return corner.view(np.float64)
 
 
 def _tree(points: FloatArray) -> cKDTree:
