@@ -177,6 +177,31 @@ def quest(
     )
 
 
+def profile_attitudes(profile: FloatArray, counts: IntArray) -> tuple[FloatArray, BoolArray]:
+    """Attitudes of frames from sums over their stars, as `quest` finds them without weights.
+
+    Parameters
+    ----------
+    profile : (3, 3, K) array
+        Sums of ``b r^T`` of every frame.
+    counts : (K,) array of int
+        Their stars.
+
+    Returns
+    -------
+    rotations : (K, 3, 3) array
+        R_cam_icrs; NaN where the stars determine no attitude.
+    ok : (K,) array of bool
+        Where they do.
+    """
+    rows = [[entry[None] for entry in row] for row in profile / counts]
+    with np.errstate(invalid="ignore"):
+        quaternions, lambda_max, gap = _solve(rows)
+    ok = np.isfinite(lambda_max[0]) & (gap[0] > _DEGENERATE)
+    found = np.where(ok, quaternions[:, 0], np.nan).T
+    return quaternion_to_rotation(found), ok
+
+
 def _check_shapes(b: FloatArray, r: FloatArray, starts: IntArray) -> None:
     if b.ndim not in (2, 3) or b.shape[-1] != 3:
         raise ValueError(f"b has shape {b.shape}, expected (N, 3) or (D, N, 3).")

@@ -7,7 +7,7 @@ in the first cache; a column is a row of `STRIDE` numbers in one buffer, at a di
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any
 
@@ -21,14 +21,14 @@ from starcal_uq.core.types import FloatArray
 from starcal_uq.observations.frames import StarFrames
 
 # Columns of a buffer: more than a chunk, and no multiple of what makes rows compete for places in the cache.
-_STRIDE = 136
+_STRIDE, _CHUNK = 136, 128
 _NONE = np.empty(0)
 
 _HEAD = """
 import numpy as np
 from numba import float64, int64, njit, types
 
-P, STRIDE, CHUNK, GRAM_CHUNK, ROWS, EXPLICIT = {p}, {stride}, 128, 64, {rows}, {explicit}
+P, STRIDE, CHUNK, GRAM_CHUNK, ROWS, EXPLICIT, WIDTH = {p}, {stride}, {chunk}, 64, {rows}, {explicit}, {width}
 # Sums in another order and fused products, nothing that changes what is done with NaN and infinity.
 HELPER = dict(no_cpython_wrapper=True, no_cfunc_wrapper=True)
 ORDERED = dict(nogil=True, cache=True, error_model="numpy", fastmath={{"contract"}})
@@ -40,35 +40,37 @@ GIVEN, TABLE, BLOCKS = (types.Array(float64, n, "C", readonly=True) for n in (1,
 THETA = types.UniTuple(float64, P)
 STARS = (*[GIVEN] * 6, types.Array(int64, 1, "C", readonly=True), BLOCKS)
 FRAME_SUMS = types.void(THETA, *STARS, TWO, TWO, TWO, THREE, THREE, ONE)
-PAIR_SUMS = types.float64(THETA, *[GIVEN] * 5, types.Array(int64, 1, "C", readonly=True), TWO, TWO)
+FRAMED = (*[GIVEN] * 5, types.Array(int64, 1, "C", readonly=True))
+PROFILE_SUMS = types.void(THETA, *FRAMED, THREE)
+PAIR_SUMS = types.float64(THETA, *FRAMED, BLOCKS, TWO, TWO)
 GRAM_SUMS = types.void(THETA, types.UniTuple(float64, P * P), *STARS, TABLE, BLOCKS, BLOCKS, TWO, ONE)
 """
 
 _LOOPS = '''
 @njit(**FAST, **HELPER)
 def fill_root(theta, buf, row, target, m):
-    """Newton's method for the point that a model displaces to the targets; as `solve_displacement` does it."""
+    """Newton's method for the points that a model displaces to the targets; as `solve_displacement` does it."""
     flat = True
     for q in range(3, P):
         flat = flat and theta[q] == 0.0
     for i in range(m):
-        x, y = buf[target * STRIDE + i], buf[(target + 1) * STRIDE + i]
-        u, v = x, y
-        if not flat:
-            settled = False
-            for _ in range(60):
-                newton(theta, x, y, u, v, buf, row, i)
-                du, dv = buf[row * STRIDE + i] - u, buf[(row + 1) * STRIDE + i] - v
-                u, v = buf[row * STRIDE + i], buf[(row + 1) * STRIDE + i]
-                if not buf[(row + 2) * STRIDE + i] > 0.0:
-                    break
-                if max(abs(du), abs(dv)) < 1e-5:
-                    settled = True
-                    break
-            if not settled:
-                u, v = np.nan, np.nan
-        buf[row * STRIDE + i] = u
-        buf[(row + 1) * STRIDE + i] = v
+        buf[row * STRIDE + i], buf[(row + 1) * STRIDE + i] = buf[target * STRIDE + i], buf[(target + 1) * STRIDE + i]
+    if flat:
+        return
+    for step in range(60):
+        moving = 0.0
+        for i in range(m):
+            u, v = buf[row * STRIDE + i], buf[(row + 1) * STRIDE + i]
+            newton(theta, buf[target * STRIDE + i], buf[(target + 1) * STRIDE + i], u, v, buf, row, i)
+            du, dv = buf[row * STRIDE + i] - u, buf[(row + 1) * STRIDE + i] - v
+            far = max(abs(du), abs(dv)) >= 1e-5
+            # Past a fold the determinant changes sign: that branch is not an image of the field.
+            lost = not buf[(row + 2) * STRIDE + i] > 0.0 or (far and step == 59)
+            moving += 1.0 if far and not lost else 0.0
+            if lost:
+                buf[row * STRIDE + i], buf[(row + 1) * STRIDE + i] = np.nan, np.nan
+        if moving == 0.0:
+            return
 
 
 @njit(**FAST, **HELPER)
@@ -191,12 +193,39 @@ def frame_sums(theta, x0, y0, r0, r1, r2, weight, starts, rotations, residuals, 
 '''
 
 _PAIRS = """
+@njit(**FAST, **HELPER)
+def fill_backward(theta, x0, y0, s0, m, work, buf):
+    for i in range(m):
+        work[i], work[STRIDE + i] = x0[s0 + i] - theta[0], y0[s0 + i] - theta[1]
+    if EXPLICIT:
+        fill_root(theta, work, 3, 0, m)
+
+
+@njit(PROFILE_SUMS, **FAST)
+def profile_sums(theta, x0, y0, r0, r1, r2, starts, profile):
+    work, buf = np.zeros(8 * STRIDE), np.empty(6 * STRIDE)
+    n_frames, first = len(starts) - 1, 0
+    while first < n_frames:
+        s0, last = starts[first], first + 1
+        while last < n_frames and starts[last + 1] - s0 <= CHUNK:
+            last += 1
+        m = starts[last] - s0
+        fill_backward(theta, x0, y0, s0, m, work, buf)
+        for i in range(m):
+            direction_kernel(theta, x0[s0 + i], y0[s0 + i], work[3 * STRIDE + i], work[4 * STRIDE + i], buf, i)
+        for i in range(m):
+            buf[3 * STRIDE + i], buf[4 * STRIDE + i], buf[5 * STRIDE + i] = r0[s0 + i], r1[s0 + i], r2[s0 + i]
+        for f in range(first, last):
+            pair_profile(buf, starts[f] - s0, starts[f + 1] - s0, profile, f)
+        first = last
+
+
 @njit(PAIR_SUMS, **FAST)
-def pair_sums(theta, x0, y0, r0, r1, r2, starts, scores, matrix):
-    B, DB, R, E, D, W = 0, 3, 3 + 3 * P, 6 + 3 * P, 9 + 3 * P, 12 + 3 * P
-    work, buf = np.zeros(8 * STRIDE), np.empty((12 + 6 * P) * STRIDE)
-    ee, rr, re = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    eb, bb, cross, score = np.empty((3, 3)), np.empty((3, 3)), np.empty((P, 3, 3)), np.empty(P)
+def pair_sums(theta, x0, y0, r0, r1, r2, starts, rotations, scores, matrix):
+    # Rows of the buffer: b, its derivatives, R', E, D B, and of each star's frame B^T B and E^T B.
+    R, E, BB, EB = 3 + 3 * P, 6 + 3 * P, 12 + 3 * P, 18 + 3 * P
+    work, buf, stars = np.zeros(8 * STRIDE), np.empty((27 + 3 * P) * STRIDE), np.zeros(CHUNK * WIDTH)
+    acc, eb, bb, score = np.empty((3, WIDTH + 12)), np.empty((3, 3)), np.empty((3, 3)), np.empty(P)
     n_frames = len(starts) - 1
     cost, first = 0.0, 0
     while first < n_frames:
@@ -204,63 +233,59 @@ def pair_sums(theta, x0, y0, r0, r1, r2, starts, scores, matrix):
         while last < n_frames and starts[last + 1] - s0 <= CHUNK:
             last += 1
         m = starts[last] - s0
+        fill_backward(theta, x0, y0, s0, m, work, buf)
         for i in range(m):
-            work[i], work[STRIDE + i] = x0[s0 + i] - theta[0], y0[s0 + i] - theta[1]
-        if not EXPLICIT:
+            backward_kernel(theta, x0[s0 + i], y0[s0 + i], work[3 * STRIDE + i], work[4 * STRIDE + i], buf, i)
+        for f in range(first, last):
+            a00, a01, a02 = rotations[f, 0, 0], rotations[f, 0, 1], rotations[f, 0, 2]
+            a10, a11, a12 = rotations[f, 1, 0], rotations[f, 1, 1], rotations[f, 1, 2]
+            a20, a21, a22 = rotations[f, 2, 0], rotations[f, 2, 1], rotations[f, 2, 2]
+            for i in range(starts[f] - s0, starts[f + 1] - s0):
+                x, y, z = r0[s0 + i], r1[s0 + i], r2[s0 + i]
+                buf[R * STRIDE + i] = a00 * x + a01 * y + a02 * z
+                buf[(R + 1) * STRIDE + i] = a10 * x + a11 * y + a12 * z
+                buf[(R + 2) * STRIDE + i] = a20 * x + a21 * y + a22 * z
+        for q in range(3):
             for i in range(m):
-                backward_kernel(theta, x0[s0 + i], y0[s0 + i], 0.0, 0.0, buf, i)
-        else:
-            fill_root(theta, work, 3, 0, m)
-            for i in range(m):
-                backward_kernel(theta, x0[s0 + i], y0[s0 + i], work[3 * STRIDE + i], work[4 * STRIDE + i], buf, i)
+                buf[(E + q) * STRIDE + i] = buf[q * STRIDE + i] - buf[(R + q) * STRIDE + i]
+        # Star by star, for the sums over the stars of a frame.
         for i in range(m):
-            x, y, z = r0[s0 + i], r1[s0 + i], r2[s0 + i]
-            buf[R * STRIDE + i], buf[(R + 1) * STRIDE + i], buf[(R + 2) * STRIDE + i] = x, y, z
-            buf[E * STRIDE + i] = buf[i] - x
-            buf[(E + 1) * STRIDE + i] = buf[STRIDE + i] - y
-            buf[(E + 2) * STRIDE + i] = buf[2 * STRIDE + i] - z
+            for q in range(3 * P + 6):
+                stars[i * WIDTH + q] = buf[(3 + q) * STRIDE + i]
         for f in range(first, last):
             j, end = starts[f] - s0, starts[f + 1] - s0
-            ee[:], rr[:], re[:], cross[:], score[:] = 0.0, 0.0, 0.0, 0.0, 0.0
-            pair_grams(buf, j, end, ee, rr, re)
-            pair_cross(buf, j, end, cross)
-            for a in range(1, 3):
-                for c in range(a):
-                    ee[a, c], rr[a, c] = ee[c, a], rr[c, a]
+            pair_products_0(stars, j, end, acc)
+            pair_products_1(stars, j, end, acc)
+            pair_products_2(stars, j, end, acc)
             for a in range(3):
                 for c in range(3):
-                    cost += ee[a, c] * rr[a, c] + re[a, c] * re[c, a] + ee[a, c] * (2.0 * re[a, c] + 0.5 * ee[a, c])
-                    eb[a, c] = re[c, a] + ee[a, c]
-                    bb[a, c] = rr[a, c] + re[a, c] + re[c, a] + ee[a, c]
-            for c in range(3):
-                p0, p1, p2, q0, q1, q2 = eb[0, c], eb[1, c], eb[2, c], bb[0, c], bb[1, c], bb[2, c]
-                for i in range(j, end):
-                    buf[(D + c) * STRIDE + i] = (
-                        p0 * buf[R * STRIDE + i]
-                        + p1 * buf[(R + 1) * STRIDE + i]
-                        + p2 * buf[(R + 2) * STRIDE + i]
-                        + q0 * buf[E * STRIDE + i]
-                        + q1 * buf[(E + 1) * STRIDE + i]
-                        + q2 * buf[(E + 2) * STRIDE + i]
-                    )
-            for a in range(P):
-                o = (DB + 3 * a) * STRIDE
+                    rr, ee = acc[a, WIDTH + c], acc[a, WIDTH + 8 + c]
+                    re, er = acc[a, WIDTH + 3 + c], acc[c, WIDTH + 3 + a]
+                    cost += ee * rr + re * er + ee * (2.0 * re + 0.5 * ee)
+                    eb[a, c] = er + ee
+                    bb[a, c] = rr + re + er + ee
+            for a in range(3):
                 for c in range(3):
-                    q0, q1, q2 = bb[0, c], bb[1, c], bb[2, c]
+                    value = eb[a, c]
                     for i in range(j, end):
-                        buf[(W + 3 * a + c) * STRIDE + i] = (
-                            q0 * buf[o + i] + q1 * buf[o + STRIDE + i] + q2 * buf[o + 2 * STRIDE + i]
-                        )
-            pair_scores(buf, j, end, score)
+                        buf[(EB + 3 * a + c) * STRIDE + i] = value
+                for c in range(a, 3):
+                    value = bb[a, c]
+                    for i in range(j, end):
+                        buf[(BB + 3 * a - a * (a + 1) // 2 + c) * STRIDE + i] = value
             for a in range(P):
-                scores[a, f] = score[a]
                 for c in range(a, P):
                     total = 0.0
                     for x in range(3):
                         for y in range(3):
-                            total += cross[a, x, y] * cross[c, y, x]
+                            total += acc[x, 3 * a + y] * acc[y, 3 * c + x]
                     matrix[a, c] += total
         pair_matrix(buf, m, matrix)
+        for f in range(first, last):
+            score[:] = 0.0
+            pair_scores(buf, starts[f] - s0, starts[f + 1] - s0, score)
+            for a in range(P):
+                scores[a, f] = score[a]
         first = last
     return cost
 """
@@ -346,46 +371,21 @@ def gram_sums(theta, l, x0, y0, r0, r1, r2, weight, starts, rotations, shift, pa
 """
 
 
-def _row(first: Iterable[int]) -> Any:
-    """Where the elements of each output stand in the buffer."""
-    starts = list(first)
-    return lambda output, element: f"out[{starts[output] + element} * STRIDE + i]"
+def _star_source(
+    kernel: Kernel, name: str, into: Callable[[int, int], object], inputs: str = "x, y", given: str = ""
+) -> str:
+    """A kernel for one star: `into` tells the row of the buffer of an element of an output, in column i.
 
-
-def _scalar_source(kernel: Kernel, name: str, first: Iterable[int]) -> str:
-    """A kernel for one star: its outputs go to rows of the buffer that begin at `first`, in column i."""
-    arguments = [None, ("x", "y", "z"), ("u", "v")]
+    Its inputs are the parameters t, those of the star and the root u, v; `given` are further names that `into` uses.
+    """
 
     def read(source: int, element: int) -> str:
-        names = arguments[source]
-        return f"t[{element}]" if names is None else names[element]
-
-    return emit_source(kernel.function, name, "t, x, y, z, u, v, out, i", read, _row(first))
-
-
-def _newton_source(kernel: Kernel) -> str:
-    names = ("t", ("x", "y"), ("u", "v"))
-
-    def read(source: int, element: int) -> str:
-        return f"t[{element}]" if source == 0 else names[source][element]
+        return f"t[{element}]" if source == 0 else (inputs.split(", "), ("u", "v"))[source - 1][element]
 
     def write(output: int, element: int) -> str:
-        return f"out[(row + {2 * output + element}) * STRIDE + i]"
+        return f"out[({into(output, element)}) * STRIDE + i]"
 
-    return emit_source(kernel.function, "newton", "t, x, y, u, v, out, row, i", read, write)
-
-
-def _backward_source(kernel: Kernel) -> str:
-    names = ("t", ("x", "y"), ("u", "v"))
-
-    def read(source: int, element: int) -> str:
-        return f"t[{element}]" if source == 0 else names[source][element]
-
-    def write(output: int, element: int) -> str:
-        # Derivatives come as rows of (p, 3).
-        return f"out[{3 * output + element} * STRIDE + i]"
-
-    return emit_source(kernel.function, "backward_kernel", "t, x, y, u, v, out, i", read, write)
+    return emit_source(kernel.function, name, f"t, {inputs}, u, v, out, {given}i", read, write)
 
 
 # An entry of an array, and the pairs of rows whose products are summed into it.
@@ -420,36 +420,56 @@ def _normal_sources(rows: int) -> list[str]:
 
 def _pair_sources(p: int) -> list[str]:
     """Sums over a frame or a chunk for the interstar angles; rows as `pair_sums` fills them."""
-    b, db, r, e, d, w = 0, 3, 3 + 3 * p, 6 + 3 * p, 9 + 3 * p, 12 + 3 * p
-    square = [(i, j) for i in range(3) for j in range(i, 3)]
-    grams: _Sums = [(f"ee[{i}, {j}]", [(e + i, e + j)]) for i, j in square]
-    grams += [(f"rr[{i}, {j}]", [(r + i, r + j)]) for i, j in square]
-    grams += [(f"re[{i}, {j}]", [(r + i, e + j)]) for i in range(3) for j in range(3)]
-    crosses = [
-        _sums_source(
-            f"pair_cross_{a}",
-            "buf, j, end, cross",
-            "j",
-            "end",
-            [(f"cross[{a}, {i}, {k}]", [(b + i, db + 3 * a + k)]) for i in range(3) for k in range(3)],
-        )
-        for a in range(p)
+    db, r, e, d, bb, eb = 3, 3 + 3 * p, 6 + 3 * p, 9 + 3 * p, 12 + 3 * p, 18 + 3 * p
+    profile: _Sums = [(f"profile[{i}, {k}, f]", [(i, 3 + k)]) for i in range(3) for k in range(3)]
+    sources = [
+        "@njit(**ORDERED, **HELPER)\n" + _sums_source("pair_profile", "buf, j, end, profile, f", "j", "end", profile)
     ]
-    every = "def pair_cross(buf, j, end, cross):\n" + "".join(
-        f"    pair_cross_{a}(buf, j, end, cross)\n" for a in range(p)
-    )
+    # B^T [dB], R'^T [R' E] and E^T [E] of a frame, from stars that hold [dB R' E] each: neighbours fill a register.
+    width, first = _width(p), 3 * p
+    for x in range(3):
+        terms = [("b", q) for q in range(width)]
+        terms += [("r", first + q) for q in range(8)] + [("e", first + 3 + q) for q in range(4)]
+        lines = [f"def pair_products_{x}(stars, j, end, acc):"]
+        lines += [f"    s{n} = 0.0" for n in range(len(terms))]
+        lines += ["    for i in range(j, end):", f"        o = i * {width}"]
+        lines += [f"        r, e = stars[o + {first + x}], stars[o + {first + 3 + x}]", "        b = r + e"]
+        lines += [f"        s{n} += {left} * stars[o + {q}]" for n, (left, q) in enumerate(terms)]
+        lines += [f"    acc[{x}, {n}] = s{n}" for n in range(len(terms))]
+        sources.append("@njit(**ORDERED, **HELPER)\n" + "\n".join(lines) + "\n")
+    pairs = [(a, c) for a in range(p) for c in range(a, p)]
+    lines = [
+        "def pair_matrix(buf, m, matrix):",
+        *(f"    s{n} = 0.0" for n in range(len(pairs))),
+        "    for i in range(m):",
+    ]
+    lines += [f"        v{row} = buf[{row} * STRIDE + i]" for row in (*range(db, d), *range(bb, eb + 9))]
+    for c in range(3):
+        terms_of = [f"v{eb + 3 * a + c} * v{r + a} + v{bb + _packed(a, c)} * v{e + a}" for a in range(3)]
+        lines.append(f"        buf[{d + c} * STRIDE + i] = " + " + ".join(terms_of))
+    for a in range(p):
+        for c in range(3):
+            weighed = " + ".join(f"v{bb + _packed(c, x)} * v{db + 3 * a + x}" for x in range(3))
+            lines.append(f"        w{a}_{c} = {weighed}")
+    for n, (a, c) in enumerate(pairs):
+        lines.append(f"        s{n} += " + " + ".join(f"w{a}_{x} * v{db + 3 * c + x}" for x in range(3)))
+    lines += [f"    matrix[{a}, {c}] += s{n}" for n, (a, c) in enumerate(pairs)]
+    sources.append("@njit(**FAST, **HELPER)\n" + "\n".join(lines) + "\n")
     scores: _Sums = [(f"score[{a}]", [(db + 3 * a + i, d + i) for i in range(3)]) for a in range(p)]
-    matrix: _Sums = [
-        (f"matrix[{a}, {c}]", [(w + 3 * a + i, db + 3 * c + i) for i in range(3)])
-        for a in range(p)
-        for c in range(a, p)
-    ]
-    return [
-        "@njit(**ORDERED, **HELPER)\n" + _sums_source("pair_grams", "buf, j, end, ee, rr, re", "j", "end", grams),
-        *("@njit(**ORDERED, **HELPER)\n" + text for text in (*crosses, every)),
-        "@njit(**ORDERED, **HELPER)\n" + _sums_source("pair_scores", "buf, j, end, score", "j", "end", scores),
-        "@njit(**FAST, **HELPER)\n" + _sums_source("pair_matrix", "buf, m, matrix", "0", "m", matrix),
-    ]
+    sources.append(
+        "@njit(**ORDERED, **HELPER)\n" + _sums_source("pair_scores", "buf, j, end, score", "j", "end", scores)
+    )
+    return sources
+
+
+def _width(p: int) -> int:
+    """Numbers of a star in `pair_sums`, a multiple of four: derivatives, R', E and what is read beyond them."""
+    return -(-(3 * p + 8) // 4) * 4
+
+
+def _packed(i: int, j: int) -> int:
+    """Place of an entry of a symmetric matrix among its six unique ones."""
+    return 3 * min(i, j) - min(i, j) * (min(i, j) + 1) // 2 + max(i, j)
 
 
 def _expansion_sources(model_name: str, p: int) -> list[str]:
@@ -541,13 +561,16 @@ def source(model_name: str) -> str:
     p = 3 + len(get_model(model_name).coefficients)
     rows = p + 4
     explicit = get_model(model_name).direction == "forward"
+    first, bent = (6, 8, 0), (0, 2, 2 + 2 * p, 8 + 2 * p)
     kernels = [
-        _scalar_source(forward_kernel(model_name, "first"), "first_kernel", (6, 8, 0)),
-        _newton_source(newton_kernel(model_name)),
-        _backward_source(backward_kernel(model_name, True)),
-        _scalar_source(forward_kernel(model_name, "bent"), "bent_kernel", (0, 2, 2 + 2 * p, 8 + 2 * p)),
+        _star_source(forward_kernel(model_name, "first"), "first_kernel", lambda o, n: first[o] + n, "x, y, z"),
+        _star_source(newton_kernel(model_name), "newton", lambda o, n: f"row + {2 * o + n}", given="row, "),
+        _star_source(backward_kernel(model_name, False), "direction_kernel", lambda o, n: n),
+        # Derivatives come as rows of (p, 3).
+        _star_source(backward_kernel(model_name, True), "backward_kernel", lambda o, n: 3 * o + n),
+        _star_source(forward_kernel(model_name, "bent"), "bent_kernel", lambda o, n: bent[o] + n, "x, y, z"),
     ]
-    head = _HEAD.format(p=p, stride=_STRIDE, rows=rows, explicit=explicit)
+    head = _HEAD.format(p=p, stride=_STRIDE, chunk=_CHUNK, rows=rows, explicit=explicit, width=_width(p))
     inlined = ["@njit(**INLINE)\n" + kernel for kernel in kernels]
     parts = [head, *inlined, *_normal_sources(rows), *_pair_sources(p), _LOOPS, _PAIRS]
     parts += [*_expansion_sources(model_name, p), _GRAM]
@@ -587,19 +610,33 @@ def frame_loop(
     return _both(gram), shift, response, inverse, volume
 
 
-def pair_loop(
-    frames: StarFrames, model_name: str, theta: FloatArray, turned: FloatArray
-) -> tuple[float, FloatArray, FloatArray] | None:
-    """Cost, Gauss-Newton matrix (p, p) and gradients (p, K) of frames over interstar angles; `turned` as in `pairs`.
+def profile_loop(frames: StarFrames, model_name: str, theta: FloatArray) -> FloatArray | None:
+    """Sums (3, 3, K) of ``b r^T`` over the stars of each frame, b the directions of their pixels.
 
     None where a frame has more stars than the loops take.
     """
-    if int(frames.sizes.max()) > _STRIDE:
+    if int(frames.sizes.max()) > _CHUNK:
+        return None
+    profile = np.zeros((3, 3, frames.n_frames))
+    loops = compiled.load(model_name, source(model_name))
+    loops.profile_sums(tuple(theta.tolist()), *frames.pixel, *frames.r, frames.starts, profile)
+    return profile
+
+
+def pair_loop(
+    frames: StarFrames, model_name: str, theta: FloatArray, rotations: FloatArray
+) -> tuple[float, FloatArray, FloatArray] | None:
+    """Cost, Gauss-Newton matrix (p, p) and gradients (p, K) of frames over interstar angles.
+
+    `rotations` (K, 3, 3) turn the catalogue nearly into the camera frame. None as in `profile_loop`.
+    """
+    if int(frames.sizes.max()) > _CHUNK:
         return None
     p = len(theta)
     scores, matrix = np.empty((p, frames.n_frames)), np.zeros((p, p))
     loops = compiled.load(model_name, source(model_name))
-    cost = loops.pair_sums(tuple(theta.tolist()), *frames.pixel, *turned, frames.starts, scores, matrix)
+    at = np.ascontiguousarray(rotations)
+    cost = loops.pair_sums(tuple(theta.tolist()), *frames.pixel, *frames.r, frames.starts, at, scores, matrix)
     return cost, _both(matrix), scores
 
 

@@ -9,13 +9,15 @@ small, and every term below is formed from E, so that nothing cancels:
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
-from starcal_uq.attitude.wahba import quest
+from starcal_uq.attitude.wahba import profile_attitudes, quest
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import backward_kernel, backward_root, unproject_theta
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.estimation.loops import pair_loop, wanted
+from starcal_uq.estimation.loops import pair_loop, profile_loop, wanted
 from starcal_uq.estimation.solvers import Normal, is_singular
 from starcal_uq.maths.linear import COLUMNS, ROWS, unit_inverse
 from starcal_uq.observations.frames import StarFrames
@@ -79,10 +81,9 @@ class PairObjective:
         self.frames = frames
         self.model_name = model_name
         self.n_parameters = 3 + len(get_model(model_name).coefficients)
-        self._blocks = [frames.part(first, last) for first, last in frames.parts(_BLOCK_STARS)]
+        self._blocks = frames.parts(_BLOCK_STARS)
         self._turned_at: FloatArray | None = None
-        self._turned: list[FloatArray] = []
-        self._rotations: list[FloatArray] = []
+        self._turned, self._rotations = np.empty((3, 0)), np.empty((0, 3, 3))
         self._compiled = wanted(model_name, frames.n_stars)
         self._last: tuple[FloatArray, Normal, FloatArray] | None = None
 
@@ -95,9 +96,7 @@ class PairObjective:
     @property
     def rotations(self) -> FloatArray | None:
         """Attitudes (K, 3, 3) by QUEST near to the last point, if that was finite."""
-        if self._turned_at is None or len(self._rotations) < len(self._blocks):
-            return None
-        return np.concatenate(self._rotations)
+        return None if self._turned_at is None else self._rotations
 
     def directions(self, theta: FloatArray, frames: StarFrames) -> tuple[FloatArray, FloatArray]:
         """Measured unit vectors (3, N) and their derivatives (p, 3, N)."""
@@ -105,19 +104,22 @@ class PairObjective:
         b, db = backward_kernel(self.model_name, True)(frames.n_stars, theta, frames.pixel, root)
         return b, db
 
-    def _turn(self, theta: FloatArray) -> None:
-        """Turn the catalogue nearly into the camera frame, if the last time is too far away."""
+    def _turn(self, theta: FloatArray) -> FloatArray:
+        """Attitudes (K, 3, 3) that turn the catalogue nearly into the camera frame; new ones if these are too far."""
         if self._turned_at is not None and np.max(np.abs(theta[:3] - self._turned_at)) <= _TURN_AGAIN_PX:
-            return
-        self._turned_at, self._turned, self._rotations = theta[:3].copy(), [], []
-        for frames in self._blocks:
+            return self._rotations
+        frames = self.frames
+        profile = profile_loop(frames, self.model_name, theta) if self._compiled else None
+        if profile is None:
             b = unproject_theta(self.model_name, theta, frames.pixel.T)
             found = quest(b, frames.r.T, frames.starts, covariance=False, on_degenerate="flag")
-            self._turned.append(frames.rotated(found.rotations))
-            self._rotations.append(found.rotations)
-            if not found.ok.all():
-                # No reference to keep: the model is not finite here.
-                self._turned_at = None
+            rotations, ok = found.rotations, found.ok
+            self._turned = frames.rotated(rotations)
+        else:
+            rotations, ok = profile_attitudes(profile, frames.sizes)
+        # Where the model is not finite there is no reference to keep.
+        self._rotations, self._turned_at = rotations, theta[:3].copy() if ok.all() else None
+        return rotations
 
     def cost(self, theta: FloatArray) -> float:
         """The objective S(theta)."""
@@ -141,15 +143,20 @@ class PairObjective:
         p = self.n_parameters
         cost, matrix, scores = 0.0, np.zeros((p, p)), []
         with np.errstate(all="ignore"):
-            self._turn(theta)
-            for frames, turned in zip(self._blocks, self._turned, strict=True):
-                own = pair_loop(frames, self.model_name, theta, turned) if self._compiled else None
-                part = self._block_sums(frames, theta, turned) if own is None else own
+            rotations = self._turn(theta)
+            whole = pair_loop(self.frames, self.model_name, theta, rotations) if self._compiled else None
+            for part in self._parts(theta) if whole is None else [whole]:
                 cost += part[0]
                 matrix += part[1]
                 scores.append(part[2])
             frame_scores = np.concatenate(scores, axis=1)
         return Normal(cost, np.sum(frame_scores, axis=1), 0.5 * (matrix + matrix.T)), frame_scores
+
+    def _parts(self, theta: FloatArray) -> Iterator[tuple[float, FloatArray, FloatArray]]:
+        starts = self.frames.starts
+        for first, last in self._blocks:
+            turned = self._turned[:, int(starts[first]) : int(starts[last])]
+            yield self._block_sums(self.frames.part(first, last), theta, turned)
 
     def _block_sums(
         self, frames: StarFrames, theta: FloatArray, turned: FloatArray
