@@ -18,7 +18,7 @@ from starcal_uq.core.provenance import provenance
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibration import Calibration
-from starcal_uq.estimation.compressed import compress, optimum
+from starcal_uq.estimation.compressed import compress, optimum, settled
 from starcal_uq.estimation.fingerprints import Fingerprints
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.solvers import is_singular
@@ -79,6 +79,15 @@ def assemble(
         status = Status.SINGULAR
     efficient = scaled_inverse(normal.matrix) * sigma**2
     compressed = compress(likelihood, theta, efficient, likelihood.rotations)
+    if refined and status.ok:
+        compressed = settled(compressed)
+        theta, last = compressed.theta_hat, stages[-1]
+        ended = replace(
+            last,
+            trajectory=np.vstack([last.trajectory, theta]),
+            cost=np.append(last.cost, compressed.gram[0, 0]),
+        )
+        stages = [*stages[:-1], ended]
     if refined:
         # The rotation-volume term of the likelihood moves its maximum by about 0.01 sigma: one Newton step.
         theta = theta - 0.5 * compressed.whitening @ compressed.log_determinant_slope

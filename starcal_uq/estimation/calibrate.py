@@ -35,6 +35,8 @@ from starcal_uq.estimation.recursive.stream import raise_unless_good
 from starcal_uq.estimation.robust import compress_reweighted, refine, robust_start
 from starcal_uq.estimation.solvers import is_singular
 from starcal_uq.estimation.stages import (
+    PAIR_TOLERANCE,
+    REFINEMENT_TOLERANCE,
     Stage,
     begun_on_sample,
     direct_stage,
@@ -61,8 +63,11 @@ _ITERATIONS = 200
 _DIRECT_ITERATIONS = 60
 # Starting processes takes two seconds.
 _STARS_WORTH_PROCESSES = 1_000_000
-# Frames and stars of a sample that is near enough to the minimum of all.
-_SAMPLE_FRAMES, _SAMPLE_STARS = 150, 2500
+# Frames and stars of a sample that is near enough to the minimum of all, and the relative gain of its last steps.
+_SAMPLE_FRAMES, _SAMPLE_STARS, _SAMPLE_TOLERANCE = 150, 2500, 1e-5
+# Standard deviations of the last step where more follows: of the estimate from interstar angles of all frames, which is
+# then known to a thousandth of that, and of the refinement, from where one of Newton's on the expansion is exact.
+_LAST_PAIR_STEP, _LAST_STEP = 0.05, 5e-3
 
 
 @bounded
@@ -270,7 +275,7 @@ def _gaussian(
     obs: Observations, camera: Camera, likelihood: MarginalLikelihood, method: str, solver: str, max_iterations: int
 ) -> Calibration:
     pairs = PairObjective(likelihood.frames, camera.distortion)
-    stages, status = _stages(pairs, camera, likelihood, method, solver, max_iterations)
+    stages, status = _stages(pairs, camera, likelihood, method, solver, max_iterations, _gain(likelihood, _LAST_STEP))
     pair_theta = stages[-2 if stages[-1].name == "refinement" else -1].theta
     covariance = _pair_covariance(pairs, likelihood, pair_theta)
     return assemble(obs, camera, method, solver, likelihood, stages, status, pair_theta, covariance)
@@ -349,11 +354,23 @@ def _fitted(likelihood: MarginalLikelihood, camera: Camera, theta: FloatArray, s
     return Fit(theta, sums.normal.cost, attitudes.rotations)
 
 
+def _gain(likelihood: MarginalLikelihood, step: float) -> float:
+    """Relative gain of a step of so many standard deviations."""
+    return step**2 / max(likelihood.dof, 1)
+
+
 def _stages(
-    pairs: PairObjective, camera: Camera, likelihood: MarginalLikelihood, method: str, solver: str, max_iterations: int
+    pairs: PairObjective,
+    camera: Camera,
+    likelihood: MarginalLikelihood,
+    method: str,
+    solver: str,
+    max_iterations: int,
+    tolerance: float = REFINEMENT_TOLERANCE,
 ) -> tuple[list[Stage], Status]:
-    """All stages of a Gaussian fit, and how they ended."""
-    stages = _sampled_stages(pairs, camera, max_iterations) if method == "efficient" and solver == "lm" else []
+    """All stages of a Gaussian fit, and how they ended; `tolerance` is that of the refinement."""
+    sampled = method == "efficient" and solver == "lm"
+    stages = _sampled_stages(pairs, camera, max_iterations, _gain(likelihood, _LAST_PAIR_STEP)) if sampled else []
     stages = stages or _pair_stages(pairs, camera, solver, max_iterations)
     most = IMPLAUSIBLE_NOISE * camera.width_px
     noise = _noise_at(pairs, likelihood, stages[-1].theta)
@@ -375,7 +392,7 @@ def _stages(
             # Interstar angles do not see a mirror, nor does their noise show a few wrong stars; positions do.
             status = Status.INCONSISTENT
         elif method == "efficient":
-            stages.append(refinement_stage(likelihood, pair_theta, max_iterations))
+            stages.append(refinement_stage(likelihood, pair_theta, max_iterations, tolerance))
             status = stages[-1].status
     return stages, status
 
@@ -479,7 +496,7 @@ def _robust(
     )
 
 
-def _sampled_stages(pairs: PairObjective, camera: Camera, max_iterations: int) -> list[Stage]:
+def _sampled_stages(pairs: PairObjective, camera: Camera, max_iterations: int, tolerance: float) -> list[Stage]:
     """The stages on interstar angles, from their start values near to the minimum on a sample of the frames alone.
 
     The last stage ends on all frames, so that the estimate is theirs. Empty where there are not so many frames that it
@@ -493,10 +510,10 @@ def _sampled_stages(pairs: PairObjective, camera: Camera, max_iterations: int) -
     chosen = np.zeros(frames.n_frames, dtype=bool)
     chosen[np.random.default_rng(0).choice(frames.n_frames, wanted, replace=False)] = True
     sample = PairObjective(frames.select(np.repeat(chosen, frames.sizes)), pairs.model_name)
-    stages = _pair_stages(sample, camera, "lm", max_iterations)
+    stages = _pair_stages(sample, camera, "lm", max_iterations, _SAMPLE_TOLERANCE)
     if not stages[-1].status.ok:
         return []
-    last = joint_stage(pairs, camera, stages[-1].theta, "lm", max_iterations)
+    last = joint_stage(pairs, camera, stages[-1].theta, "lm", max_iterations, tolerance)
     if not last.status.ok:
         return []
     scales = {"distortion": frames.n_stars / sample.frames.n_stars}
@@ -505,19 +522,21 @@ def _sampled_stages(pairs: PairObjective, camera: Camera, max_iterations: int) -
     return [*first, begun_on_sample(stages[-1], last, by_pair)]
 
 
-def _pair_stages(pairs: PairObjective, camera: Camera, solver: str, max_iterations: int) -> list[Stage]:
+def _pair_stages(
+    pairs: PairObjective, camera: Camera, solver: str, max_iterations: int, tolerance: float = PAIR_TOLERANCE
+) -> list[Stage]:
     frames = pairs.frames
-    stages = [optics_stage(frames, camera, solver, max_iterations)]
+    stages = [optics_stage(frames, camera, solver, max_iterations, tolerance)]
     # Without an optical axis there is nothing to attach the distortion to; later stages would only hide it.
     if len(camera.theta) > 3 and stages[0].status is not Status.NOT_FINITE:
         stages.append(distortion_stage(frames, camera, stages[0].theta))
-        stages.append(joint_stage(pairs, camera, stages[1].theta, solver, max_iterations))
+        stages.append(joint_stage(pairs, camera, stages[1].theta, solver, max_iterations, tolerance))
         moved = float(np.max(np.abs(stages[0].theta[:2] - camera.theta[:2])))
         if not stages[-1].status.ok or moved > _FAR * camera.width_px:
             # Distortion of tens of pixels pulls the undistorted fit far from the axis, and the linear stage may then
             # lead to another minimum or into a fold; the nominal optics without distortion are the safer start.
             start = np.concatenate([camera.theta[:3], np.zeros(len(camera.theta) - 3)])
-            again = joint_stage(pairs, camera, start, solver, max_iterations)
+            again = joint_stage(pairs, camera, start, solver, max_iterations, tolerance)
             stages[-1] = min(stages[-1], again, key=_badness)
     return stages
 

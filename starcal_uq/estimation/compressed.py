@@ -24,7 +24,7 @@ from starcal_uq.core.types import FloatArray, Shapes
 from starcal_uq.estimation.loops import gram_loop, wanted
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.star_errors import StarSums
-from starcal_uq.estimation.sums import ATTITUDE_STEPS, ATTITUDE_TOLERANCE_RAD, settled_sums
+from starcal_uq.estimation.sums import ATTITUDE_STEPS, ATTITUDE_TOLERANCE_RAD, Attitudes, NormalSums, settled_sums
 from starcal_uq.maths.linear import COLUMNS, ROWS, inverse_symmetric, scaled_cholesky, symmetric_inverse
 from starcal_uq.observations.frames import StarFrames
 
@@ -274,7 +274,12 @@ class _Block:
 
 
 def gram_sums(
-    frames: StarFrames, model_name: str, theta: FloatArray, whitening: FloatArray, rotations: FloatArray
+    frames: StarFrames,
+    model_name: str,
+    theta: FloatArray,
+    whitening: FloatArray,
+    rotations: FloatArray,
+    known: tuple[NormalSums, Attitudes] | None = None,
 ) -> GramSums:
     """What a part of the frames adds to the compressed likelihood around theta (p,), in one pass.
 
@@ -290,10 +295,12 @@ def gram_sums(
         L in ``theta = theta_hat + L z``; the same for all parts.
     rotations : (K, 3, 3) array
         Attitudes to start from.
+    known : tuple of NormalSums and Attitudes, optional
+        Sums at theta with settled attitudes, where there are any; the compiled path need not make them again.
     """
     theta = np.asarray(theta, dtype=np.float64)
     if wanted(model_name, frames.n_stars):
-        sums, at = settled_sums(frames, model_name, theta, rotations)
+        sums, at = settled_sums(frames, model_name, theta, rotations) if known is None else known
         moved = (at.shift, at.response, at.inverse)
         gram, slope = gram_loop(frames, model_name, theta, whitening, at.rotations, moved)
         return GramSums(gram, sums.log_determinant, slope, frames.n_stars, frames.n_frames)
@@ -338,7 +345,10 @@ def compress(
     frames, model_name = likelihood.frames, likelihood.model_name
     if rotations is None:
         rotations = likelihood.start_rotations(theta)
-    sums = gram_sums(frames, model_name, theta, whitening, rotations)
+    known = likelihood.last_sums
+    if known is not None and not (np.array_equal(known[1].theta, theta) and known[0].turn < ATTITUDE_TOLERANCE_RAD):
+        known = None
+    sums = gram_sums(frames, model_name, theta, whitening, rotations, known)
     if stars is not None and ratio is not None:
         expansion = _Expansion(model_name, theta, whitening)
         for first, last in frames.parts(_BLOCK_STARS):

@@ -21,10 +21,10 @@ from starcal_uq.estimation.solvers import Constraints, Normal, Solution, levenbe
 from starcal_uq.estimation.sums import Descent
 from starcal_uq.observations.frames import StarFrames
 
-# Predicted gain of a pair stage that is not worth an evaluation: 1e-4 sigma or less for 30,000 residuals.
-_PAIR_TOLERANCE = 1e-13
+# Relative gain that the last step of a pair stage promises: 1e-4 sigma or less for 30,000 residuals.
+PAIR_TOLERANCE = 1e-13
 # The estimate itself is taken to rounding, so that every start ends in the same digits.
-_REFINEMENT_TOLERANCE = 1e-18
+REFINEMENT_TOLERANCE = 1e-18
 # What a start value for the principal point needs: places to try in widths and heights, on so many stars.
 _HELD_TOLERANCE = 1e-6
 _GRID = 0.25 * np.array([(i, j) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j])
@@ -93,7 +93,9 @@ def constraints_for(camera: Camera, n_parameters: int) -> Constraints:
     return Constraints(lower, upper, lambda theta: monotonic_expression(camera.distortion, theta, radius))
 
 
-def _solve(objective: PairObjective, start: FloatArray, camera: Camera, solver: str, max_iterations: int) -> Solution:
+def _solve(
+    objective: PairObjective, start: FloatArray, camera: Camera, solver: str, max_iterations: int, tolerance: float
+) -> Solution:
     if solver == "ipopt":
         # CasADi takes a while to load, and few need it.
         from starcal_uq.estimation.ipopt import ipopt
@@ -102,7 +104,7 @@ def _solve(objective: PairObjective, start: FloatArray, camera: Camera, solver: 
         return ipopt(objective.evaluate, start, constraints, max_iterations=max_iterations)
     if solver == "minpack" and objective.n_pairs <= MAX_EXPLICIT_PAIRS:
         return minpack(objective.residuals, objective.evaluate, start, max_iterations=max_iterations)
-    return levenberg_marquardt(objective.evaluate, start, max_iterations=max_iterations, tolerance=_PAIR_TOLERANCE)
+    return levenberg_marquardt(objective.evaluate, start, max_iterations=max_iterations, tolerance=tolerance)
 
 
 def _timed(name: str, run: Callable[[], Solution], tail: FloatArray) -> Stage:
@@ -131,12 +133,14 @@ def begun_on_sample(sample: Stage, whole: Stage, scale: float) -> Stage:
     )
 
 
-def optics_stage(frames: StarFrames, camera: Camera, solver: str, max_iterations: int) -> Stage:
+def optics_stage(
+    frames: StarFrames, camera: Camera, solver: str, max_iterations: int, tolerance: float = PAIR_TOLERANCE
+) -> Stage:
     """Stage 1: x0, y0 and f on interstar angles, distortion ignored (the paper's section 2.1)."""
     objective = PairObjective(frames, "none")
     start = np.array(camera.theta[:3])
     zeros = np.zeros(len(camera.theta) - 3)
-    return _timed("optics", lambda: _solve(objective, start, camera, solver, max_iterations), zeros)
+    return _timed("optics", lambda: _solve(objective, start, camera, solver, max_iterations, tolerance), zeros)
 
 
 def focal_stage(frames: StarFrames, camera: Camera, max_iterations: int) -> Stage:
@@ -174,17 +178,26 @@ def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> S
     return Stage("distortion", trajectory, np.array(cost), Status.CONVERGED, 1, perf_counter() - began)
 
 
-def joint_stage(objective: PairObjective, camera: Camera, theta: FloatArray, solver: str, max_iterations: int) -> Stage:
+def joint_stage(
+    objective: PairObjective,
+    camera: Camera,
+    theta: FloatArray,
+    solver: str,
+    max_iterations: int,
+    tolerance: float = PAIR_TOLERANCE,
+) -> Stage:
     """Stage 3: all parameters on interstar angles (the paper's section 2.3)."""
-    return _timed("all", lambda: _solve(objective, theta, camera, solver, max_iterations), np.zeros(0))
+    return _timed("all", lambda: _solve(objective, theta, camera, solver, max_iterations, tolerance), np.zeros(0))
 
 
-def refinement_stage(likelihood: MarginalLikelihood, theta: FloatArray, max_iterations: int) -> Stage:
+def refinement_stage(
+    likelihood: MarginalLikelihood, theta: FloatArray, max_iterations: int, tolerance: float = REFINEMENT_TOLERANCE
+) -> Stage:
     """Stage 4: all parameters on the attitude-marginalised likelihood, which reaches the Cramer-Rao bound.
 
     The attitudes move along; `likelihood` starts its later searches from where they end.
     """
-    return _timed("refinement", lambda: _descended(likelihood, theta, max_iterations), np.zeros(0))
+    return _timed("refinement", lambda: _descended(likelihood, theta, max_iterations, tolerance), np.zeros(0))
 
 
 def direct_stage(likelihood: MarginalLikelihood, camera: Camera, max_iterations: int) -> Stage:
@@ -210,7 +223,7 @@ def direct_stage(likelihood: MarginalLikelihood, camera: Camera, max_iterations:
             if costs[-1] == min(costs):
                 best = there
         likelihood.use_rotations(likelihood.start_rotations(best.theta))
-        last = _descended(likelihood, best.theta, max_iterations)
+        last = _descended(likelihood, best.theta, max_iterations, REFINEMENT_TOLERANCE)
         return replace(
             last,
             trajectory=np.concatenate([first.trajectory, last.trajectory]),
@@ -234,13 +247,11 @@ def _held(likelihood: MarginalLikelihood, theta: FloatArray, max_iterations: int
     return replace(found, theta=trajectory[-1], trajectory=trajectory)
 
 
-def _descended(likelihood: MarginalLikelihood, theta: FloatArray, max_iterations: int) -> Solution:
+def _descended(likelihood: MarginalLikelihood, theta: FloatArray, max_iterations: int, tolerance: float) -> Solution:
     """The minimum of the likelihood's sum of squares, near whose attitudes its later searches start."""
     start = likelihood.start_rotations(theta) if likelihood.rotations is None else likelihood.rotations
     descent = Descent(likelihood.frames, likelihood.model_name, start, likelihood.last_sums)
-    solution = levenberg_marquardt(
-        descent.evaluate, theta, max_iterations=max_iterations, tolerance=_REFINEMENT_TOLERANCE
-    )
+    solution = levenberg_marquardt(descent.evaluate, theta, max_iterations=max_iterations, tolerance=tolerance)
     if descent.best is not None:
         likelihood.use_sums(*descent.best)
     return solution
