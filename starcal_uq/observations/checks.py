@@ -158,7 +158,9 @@ def check_columns(
     ra, dec = columns["ra_deg"], columns["dec_deg"]
     # 360 is let pass: rounding to a few decimals turns 359.99999999 into it.
     problems += _each("ra_deg", ra, (ra < 0.0) | (ra > 360.0), "is outside 0..360 deg")
-    problems += _each("dec_deg", dec, np.abs(dec) > 90.0, "is outside -90..90 deg")
+    swapped = bool(np.all(np.abs(ra) <= 90.0) and np.all((dec >= 0.0) & (dec <= 360.0)))
+    remedy = "exchange ra_deg and dec_deg, which look swapped" if swapped else _REPAIR
+    problems += _each("dec_deg", dec, np.abs(dec) > 90.0, "is outside -90..90 deg", remedy)
     if "sigma_px" in columns:
         sigma = columns["sigma_px"]
         problems += _each("sigma_px", sigma, sigma <= 0.0, "is not above 0")
@@ -170,12 +172,19 @@ def check_columns(
             values = columns[name]
             outside = (values < -0.5) | (values > size - 0.5)
             reason = f"is outside the detector, -0.5..{size - 0.5} px"
-            problems += _each(name, values, outside, reason, "check the camera file, or " + _REPAIR)
+            problems += _each(name, values, outside, reason, _pixel_remedy(columns, camera))
     rows = np.arange(len(ra))
     if unknown_frame is not None and unknown_frame.any():
         # Which frame has too few stars is not known while some rows belong to none.
         return problems + _check_repeats(columns, rows[~unknown_frame])
     return problems + _check_counts(columns["frame"]) + _check_repeats(columns, rows)
+
+
+def _pixel_remedy(columns: Mapping[str, Any], camera: Camera) -> str:
+    x, y, width, height = columns["x_px"], columns["y_px"], camera.width_px, camera.height_px
+    if np.all((y >= -0.5) & (y <= width - 0.5) & (x >= -0.5) & (x <= height - 0.5)):
+        return "exchange x_px and y_px, which look swapped"
+    return "check the camera file, or " + _REPAIR
 
 
 def _each(name: str, values: Any, wrong: BoolArray, reason: str, remedy: str = _REPAIR) -> list[Problem]:

@@ -22,6 +22,7 @@ from starcal_uq.diagnostics.verdict.observed import OUTLIER_P, PATTERN_P, aberra
 from starcal_uq.inference.checks import check_draws
 from starcal_uq.presentation.report.tables import mean_to_mcse
 from starcal_uq.propagation.attitude_error import AttitudeError, MisfitFound
+from tests.helpers.outside import campaign
 from tests.helpers.scenes import camera, observations, with_sigmas
 
 
@@ -365,3 +366,23 @@ def test_annual_aberration_is_that_of_the_field(run):
     """The sentence that named 10 degrees and 3.6 arcsec for every camera is the control."""
     narrow = run.truth.replace(focal_mm=5.0 * run.truth.focal_mm)
     assert "5.0 arcsec" in aberration_size(run.truth) and "1.0 arcsec" in aberration_size(narrow)
+
+
+def test_a_stated_noise_that_is_not_in_pixels_is_recognised():
+    c = campaign(np.random.default_rng(3), n_frames=25)
+    sheet = sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
+    arcsec_per_px = 648000.0 / np.pi / c.theta[2]
+    unnamed = {name: values for name, values in c.columns.items() if name != "mag"}
+    uneven = np.random.default_rng(4).uniform(0.04, 0.06, len(c.columns["mag"]))
+    for columns, stated, words in (
+        (c.columns, c.columns["mag"], "Column sigma_px holds the magnitudes"),
+        (unnamed, c.columns["mag"], "looks like magnitudes"),
+        (c.columns, uneven * arcsec_per_px, "looks like arcseconds, of which a pixel has"),
+        # Wrong by a factor that is no unit's, and right.
+        (c.columns, 4.0 * uneven, "the stated noise is too large"),
+        (c.columns, uneven, "is confirmed"),
+    ):
+        obs = sc.Observations(**columns, sigma_px=stated)
+        found = outcome("Factor on the stated noise", obs, sc.calibrate(obs, sheet))
+        assert words in found.sentence, found.sentence
+        assert (found.level is Level.PASS) == (words == "is confirmed")

@@ -14,6 +14,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import ObservationError, RunFolderError
 from starcal_uq.observations.columns import COLUMNS
 from starcal_uq.observations.table import Observations, load_observations
+from tests.helpers.outside import campaign
 from tests.helpers.speed import sort_a_million, times_as_long
 
 APPARENT = {"ra_deg": "ra_apparent_deg", "dec_deg": "dec_apparent_deg"}
@@ -628,3 +629,20 @@ def test_large_table_is_read_quickly(tmp_path):
         obs.save(path)
         load_observations(path)  # imports
         assert times_as_long(partial(load_observations, path, CAMERA), sort_a_million) < sorts
+
+
+def test_columns_that_look_exchanged_are_said_so():
+    c = campaign(np.random.default_rng(1), n_frames=4)
+    sheet = Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
+    good = c.columns | {"ra_deg": 200.0 + 0.1 * c.columns["ra_deg"], "dec_deg": 0.5 * np.abs(c.columns["dec_deg"])}
+    swapped = {"ra_deg": good["dec_deg"], "dec_deg": good["ra_deg"]}
+    wide, tall = sheet.replace(height_px=700, y0_px=350.0), {"x_px": 0.6 * good["x_px"], "y_px": good["y_px"]}
+    far = {"x_px": np.append(good["x_px"][:-1], 5000.0)}
+    for columns, used, words in (
+        (swapped, sheet, "exchange ra_deg and dec_deg, which look swapped"),
+        (tall, wide, "exchange x_px and y_px, which look swapped"),
+        (far, sheet, "check the camera file"),
+        ({"dec_deg": np.where(good["frame"] == 0, 95.0, good["dec_deg"])}, sheet, "correct or remove the row"),
+    ):
+        with pytest.raises(ObservationError, match=words):
+            Observations(**(good | columns)).check(used)

@@ -27,6 +27,9 @@ PLAUSIBLE_SCALE = (0.7, 1.5)
 PATTERN_P, OUTLIER_P = 1e-3, 1e-3
 PATTERN_FAIL_SIGMA = 0.5
 COVERED_SHARE = 0.85
+# Stated noise that is magnitudes: a small factor on it, its range, and what it stays below.
+_FAR_BELOW, _MAGNITUDES = 0.2, (1.5, 20.0)
+_SAME_UNIT = 1.3
 MIN_FRAMES = 5
 # Commands and calls that checks give as remedies.
 CALIBRATE = "starcal-uq calibrate OBS CAMERA -o RUN --force"
@@ -119,7 +122,7 @@ def outliers(obs: Observations, cal: Calibration) -> Check:
     return Check("Outliers", Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, remedy)
 
 
-def noise(cal: Calibration) -> Check:
+def noise(obs: Observations, cal: Calibration) -> Check:
     """Is the estimated noise that of star centroids?"""
     scaled = cal.sigma_name == "sigma_scale"
     low, high = PLAUSIBLE_SCALE if scaled else PLAUSIBLE_NOISE_PX
@@ -139,9 +142,28 @@ def noise(cal: Calibration) -> Check:
         )
     else:
         sentence = "Less scatter than centroids have: the stated noise is too large, or the data are not measurements."
+    if not good and scaled and fitted is None:
+        sentence = _stated_unit(obs, cal) or sentence
     name = f"Factor on the {'stated' if fitted is None else 'fitted'} noise" if scaled else "Centroid noise per axis"
     bound = f"{low:g} to {high:g}{unit}"
     return Check(name, Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence)
+
+
+def _stated_unit(obs: Observations, cal: Calibration) -> str:
+    """What the column of stated noise holds, where it is not px; empty if that cannot be told."""
+    stated = obs.sigma_px
+    if stated is None:
+        return ""
+    arcsec_per_px = ARCSEC / cal.camera.focal_px
+    if obs.mag is not None and np.array_equal(stated, obs.mag):
+        return "Column sigma_px holds the magnitudes: give the noise in px, or leave it out."
+    if cal.sigma < _FAR_BELOW and np.ptp(stated) > _MAGNITUDES[0] and stated.max() < _MAGNITUDES[1]:
+        ends = f"{stated.min():.3g} to {stated.max():.3g}"
+        return f"Column sigma_px ({ends}) looks like magnitudes: give the noise in px, or leave it out."
+    if 1.0 / _SAME_UNIT < cal.sigma * arcsec_per_px < _SAME_UNIT:
+        per = significant(arcsec_per_px, 3)
+        return f"Column sigma_px looks like arcseconds, of which a pixel has {per}: divide it by that."
+    return ""
 
 
 def partitions(cal: Calibration) -> Check | None:
