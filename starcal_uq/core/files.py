@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 PathLike = str | os.PathLike[str]
 # Names of files that are being written; a killed process leaves them.
 TEMPORARY = re.compile(r"\.[0-9a-f]{16}\.tmp")
-# Where a command keeps what it has not finished; gone at its end.
-UNFINISHED = ".unfinished"
+# Where a command keeps what it has not finished, and a step of a run its files; gone at their end.
+UNFINISHED, STEP = ".unfinished", ".step"
 
 
 def ensure_new(path: PathLike, force: bool = False) -> None:
@@ -57,7 +57,7 @@ def check_new_folder(path: PathLike, force: bool = False) -> None:
     if path.exists() and not path.is_dir():
         raise RunFolderError(f"{path}: is a file, not a folder for results; name another folder.")
     names = [inside.name for inside in path.iterdir()] if path.is_dir() else []
-    if not force and any(name != UNFINISHED and not TEMPORARY.match(name) for name in names):
+    if not force and any(name not in (UNFINISHED, STEP) and not TEMPORARY.match(name) for name in names):
         raise RunFolderError(
             f"{path}: the folder exists and is not empty; name another, or replace its results with --force."
         )

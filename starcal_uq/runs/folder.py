@@ -15,12 +15,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import PathLike, as_plain, check_new_folder, new_folder
+from starcal_uq.core.files import STEP, PathLike, as_plain, check_new_folder, new_folder
 from starcal_uq.core.types import AnyDict
 from starcal_uq.runs.manifest import (
     MANIFEST,
     NEW,
-    STEP,
     Entry,
     Manifest,
     alone,

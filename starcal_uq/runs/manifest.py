@@ -16,11 +16,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
 
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import TEMPORARY, flush_folder
+from starcal_uq.core.files import STEP, TEMPORARY, flush_folder
 from starcal_uq.core.records import read_json, write_json
 from starcal_uq.core.types import AnyDict
 
-MANIFEST, STEP, NEW = "run.json", ".step", ".new"
+MANIFEST, NEW = "run.json", ".new"
 _FORMAT = "starcal_uq run 1"
 _WHAT = ("the record of a run", "delete it, and the folder is read without it")
 # Larger files are known by their size and time.

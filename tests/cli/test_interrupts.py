@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import starcal_uq as sc
 from starcal_uq.cli.app import main
 from starcal_uq.core import tasks
+from starcal_uq.core.files import TEMPORARY
 from tests.conftest import ROOT
+from tests.helpers.scenes import observations
 
 PROGRAM = (sys.executable, "-c", "from starcal_uq.cli.app import program; program()")
 SENTENCE = "error: interrupted; what was complete is kept: give the same command again, and it goes on."
@@ -80,3 +86,100 @@ def test_a_signal_ends_a_command_with_its_status(
     assert reached == ["held back"] * held
     assert not (tmp_path / "demo").exists()
     assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+TINY = "--walkers 14 --steps 40 --ensembles 2"
+# Command -> what it is called with, and files that are compared with those of a call that was left alone.
+TABLES = (
+    "coupling.csv",
+    "attitude.csv",
+    "budget.csv",
+    "misfit.csv",
+    "jackknife.csv",
+    "comparison.csv",
+    "field_map.npz",
+)
+LONG = {
+    "run": (f"run obs.parquet camera.toml {TINY} --draws 50 -o out", TABLES),
+    "run from images": (
+        f"run img camera.toml {TINY} --draws 50 --directions apparent --max-mag 6 -o out",
+        (*TABLES, "identification.csv", "images.json"),
+    ),
+    "sample": ("sample out --walkers 32 --steps 1000", ()),
+    "calibrate": ("calibrate parts camera.toml --workers 0 -o out", ()),
+    "filter": ("filter obs.parquet camera.toml -o out", ("history.csv",)),
+    "validate": ("validate camera.toml --replicates 20 --frames 8 --workers 1 -o out", ("validation.csv",)),
+}
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("given")
+    stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
+    observations().save(folder / "obs.parquet")
+    sc.paper.paper_start().save(folder / "camera.toml")
+    truth = sc.paper.paper_camera()
+    sc.simulation.simulate_partitions(
+        stars, truth, folder / "parts", n_frames=40, partition_frames=10, seed=1, workers=0
+    )
+    sc.simulation.render_frames(stars, truth, folder / "img", n_frames=8, seed=3, times_utc=["2026-11-25T00:00:00"] * 8)
+    sc.Run(folder / "calibrated").calibrate(observations(), sc.paper.paper_start())
+    return folder
+
+
+def stopped(folder: Path, words: str, number: signal.Signals, n_names: int) -> tuple[int, str]:
+    """Signal all processes of a command once it has made so many names in its folder; status and last words."""
+    before = {path.name for path in (folder / "out").rglob("*")}
+    process, seen = start(folder, *words.split()), set()
+    while process.poll() is None and len(seen) < n_names:
+        with suppress(OSError):
+            seen |= {path.name for path in (folder / "out").rglob("*")} - before
+        time.sleep(0.002)
+    with suppress(ProcessLookupError):
+        os.killpg(process.pid, number)
+    _, err = process.communicate(timeout=120)
+    with pytest.raises(ProcessLookupError):
+        os.killpg(process.pid, 0)
+    return process.returncode, err.strip().rpartition("\n")[2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", LONG)
+def test_a_command_that_is_stopped_goes_on_to_the_same_result(command: str, given: Path, tmp_path: Path) -> None:
+    words, compared = LONG[command]
+    for name in ("whole", "stopped"):
+        shutil.copytree(given, tmp_path / name)
+        if command == "sample":
+            shutil.copytree(given / "calibrated", tmp_path / name / "out")
+    whole, folder = tmp_path / "whole", tmp_path / "stopped"
+    process = start(whole, *words.split())
+    assert process.communicate(timeout=120) and process.returncode in (0, 1)
+    rng = np.random.default_rng(len(command))
+    names = len(
+        {path.name for path in (whole / "out").rglob("*")} - {path.name for path in (folder / "out").rglob("*")}
+    )
+    statuses = []
+    for number in rng.permutation([signal.SIGKILL, signal.SIGTERM, signal.SIGINT]).tolist():
+        left = {path.name for path in folder.rglob(".*")}
+        status, last = stopped(folder, words, number, int(rng.integers(1, max(names, 2))))
+        statuses.append(status)
+        if status in (0, 1):
+            break
+        assert status == (-number if number == signal.SIGKILL else 128 + number)
+        assert number == signal.SIGKILL or last == SENTENCE
+        temporary = [path.name for path in folder.rglob(".*") if TEMPORARY.match(path.name) and path.name not in left]
+        assert number == signal.SIGKILL or not temporary
+    assert statuses[0] not in (0, 1)
+    if statuses[-1] not in (0, 1):
+        process = start(folder, *words.split())
+        _, err = process.communicate(timeout=120)
+        assert process.returncode in (0, 1), err
+    for name in compared:
+        assert (folder / "out" / name).read_bytes() == (whole / "out" / name).read_bytes(), name
+    assert {path.name for path in (folder / "out").iterdir()} == {path.name for path in (whole / "out").iterdir()}
+    if command == "validate":
+        return
+    found, wanted = sc.Run(folder / "out"), sc.Run(whole / "out")
+    assert found.calibration.theta.tobytes() == wanted.calibration.theta.tobytes()
+    if wanted.has("posterior"):
+        assert found.posterior.draws.tobytes() == wanted.posterior.draws.tobytes()
