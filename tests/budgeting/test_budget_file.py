@@ -108,6 +108,8 @@ def test_a_byte_order_mark_is_no_error(tmp_path: Path) -> None:
 BAD = {
     "sigmas": (ROW.replace("sigma_arcsec", "sigma_arcsecs"), "did you mean sigma_arcsec"),
     "no name": (ROW.replace('name = "star catalogue"', ""), "key name is missing"),
+    "name no text": (ROW.replace('"star catalogue"', "5"), "key name is 5; write text in quotes"),
+    "name blank": (ROW.replace('"star catalogue"', '" "'), "key name is ' '; write text in quotes"),
     "axis": (ROW.replace('"all"', '"w"'), "key axis is 'w'"),
     "sigma text": (ROW.replace("0.2", '"0.2"'), "key sigma_arcsec is '0.2'; write a finite number"),
     "sigma true": (ROW.replace("0.2", "true"), "key sigma_arcsec is True"),

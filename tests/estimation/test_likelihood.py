@@ -10,7 +10,15 @@ from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.camera.distortion import model_names
 from starcal_uq.camera.projection import project
 from starcal_uq.core.records import from_plain, to_plain
-from starcal_uq.estimation.compressed import CompressedLikelihood, _Expansion, compress, gram_sums, moved, scaled
+from starcal_uq.estimation.compressed import (
+    CompressedLikelihood,
+    _Expansion,
+    combined,
+    compress,
+    gram_sums,
+    moved,
+    scaled,
+)
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
 from tests.helpers.scenes import camera, observations, with_sigmas
@@ -147,6 +155,19 @@ def test_moved_and_scaled_are_the_same_function():
     difference = scaled(before, unit).log_likelihood(theta, sigma / unit) - before.log_likelihood(theta, sigma)
     expected = before.dof * np.log(unit) + 3.0 * before.n_frames * np.log(unit)
     assert np.allclose(difference, expected, atol=1e-7)
+
+
+def test_combined_estimates_have_the_sum_of_the_precisions():
+    rng = np.random.default_rng(3)
+    roots = rng.standard_normal((3, 5, 5)) * np.array([0.1, 0.1, 0.1, 1e-10, 1e-15])[:, None]
+    covariances, thetas = [root @ root.T for root in roots], camera().theta + roots[..., 0]
+    mean, covariance = combined(thetas, covariances)
+    precisions = [symmetric_inverse(matrix) for matrix in covariances]
+    expected = symmetric_inverse(sum(precisions))
+    scale = 1.0 / np.sqrt(np.diag(expected))
+    assert np.allclose(covariance * np.outer(scale, scale), expected * np.outer(scale, scale), atol=1e-6)
+    shift = expected @ sum(p @ (theta - thetas[0]) for p, theta in zip(precisions, thetas, strict=True))
+    assert np.allclose((mean - thetas[0]) * scale, shift * scale, atol=1e-4)
 
 
 def test_compressed_adds_over_frames_and_survives_a_round_trip():
