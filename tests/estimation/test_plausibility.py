@@ -134,9 +134,13 @@ def test_wrong_stars_and_noise_are_told_apart(field):
     noisy = seen(field, sigma_px=12.0)
     with pytest.raises(CalibrationError, match=r"the stars scatter by about 1\d px around their attitudes"):
         sc.calibrate(sc.Observations(**noisy.columns), sheet(noisy))
-    # Five pixels are noise that a calibration bears.
+    # Five pixels are noise that a wide field bears; a narrow one no longer tells the principal point from the pointing.
     noisy = seen(field, sigma_px=5.0)
-    assert sc.calibrate(sc.Observations(**noisy.columns), sheet(noisy)).sigma == pytest.approx(5.0, rel=0.1)
+    if field > 20.0:
+        assert sc.calibrate(sc.Observations(**noisy.columns), sheet(noisy)).sigma == pytest.approx(5.0, rel=0.1)
+    else:
+        with pytest.raises(CalibrationError, match=r"the data do not determine x0: more frames"):
+            sc.calibrate(sc.Observations(**noisy.columns), sheet(noisy))
 
 
 def test_swapped_directions_near_the_equinox_are_named():
