@@ -70,9 +70,14 @@ def prepare_image(
     # than the step.
     with np.errstate(over="ignore"):
         data = np.array(image.data, dtype=np.float32, order="C")
-    finite = np.abs(data) < LARGEST_COUNTS
-    whole = bool(finite.all())
-    values = data if whole else data[finite]
+    # Whole numbers are all finite.
+    usable = None
+    if image.data.dtype.kind == "f":
+        usable = np.abs(data) < LARGEST_COUNTS
+        if usable.all():
+            usable = None
+    mask = None if usable is None else ~usable
+    values = data if usable is None else data[usable]
     if not values.size:
         raise ImageError(f"{name}: no pixel has a value; leave the image out.")
     low, high = float(values.min()), float(values.max())
@@ -87,10 +92,8 @@ def prepare_image(
             )
     if low == high:
         raise ImageError(f"{name}: every pixel has the value {low:g}; check the exposure, or leave the image out.")
-    usable = None if whole else finite
     if too_bright is not None:
-        usable = finite & ~too_bright
-    mask = None if whole else ~finite
+        usable = ~too_bright if usable is None else usable & ~too_bright
     if mask is not None:
         data[mask] = np.median(values)
     counts_per_e = 1.0 / gain if gain else 0.0

@@ -75,7 +75,8 @@ def measure_psf(frame: PreparedImage, objects: Any) -> Psf | None:
     # The brightest of equally faint stars are those whose noise adds light and width: then more are taken.
     clear = np.count_nonzero(snr[bright] > 4.0 * _PSF_SNR) >= _PSF_STARS
     most = _PSF_STARS if clear else 5 * _PSF_STARS
-    x, y, widths = chosen["x"].astype(np.float64), chosen["y"].astype(np.float64), np.full(len(chosen), sigma)
+    # Moments are of the filtered image, in which stars are wider.
+    x, y, widths = chosen["x"].astype(np.float64), chosen["y"].astype(np.float64), np.full(len(chosen), 0.8 * sigma)
     for left_moving in _LEFT_MOVING:
         clean, stamps = _clean_stamps(frame, chosen, sigma, most)
         if not len(clean):
