@@ -513,6 +513,23 @@ def test_excel_has_numbers_units_and_marks(stated: Path, tmp_path: Path) -> None
     assert "Requirements" not in load_workbook(tmp_path / "plain.xlsx").sheetnames
 
 
+def test_names_with_characters_that_no_workbook_holds_are_written(tmp_path: Path) -> None:
+    from openpyxl import load_workbook
+
+    path = tmp_path / "odd.toml"
+    text = FILE.replace("Test &", "=bell\\u0007 &").replace("analysis #3", "@SUM(A1)\\u0000\\r\\n'-1+1")
+    path.write_text(text, encoding="utf-8")
+    found = made(path)
+    write_budget(found, tmp_path / "budget.xlsx")
+    notes = [row[0].value for row in load_workbook(tmp_path / "budget.xlsx")["Notes"]]
+    assert any(str(note).startswith("'=bell\N{REPLACEMENT CHARACTER} &") for note in notes)
+    found.save(tmp_path / "budget.csv")
+    again = Budget.load(tmp_path / "budget.csv")
+    assert again.title == found.title == "=bell\x07 & <budget>_1"
+    assert [row.provenance for row in again.rows] == [row.provenance.replace("\r", "") for row in found.rows]
+    assert ",@SUM" not in (tmp_path / "budget.csv").read_text(encoding="utf-8")
+
+
 def test_latex_is_balanced_and_escaped(stated: Path, tmp_path: Path) -> None:
     write_budget(made(stated), tmp_path / "budget.tex")
     text = (tmp_path / "budget.tex").read_text(encoding="utf-8")
