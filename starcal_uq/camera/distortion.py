@@ -155,6 +155,16 @@ def get_model(name: str) -> DistortionModel:
         raise DistortionError(f"distortion model {name!r} is unknown: use one of {', '.join(model_names())}.") from None
 
 
+def simpler_models(name: str) -> tuple[str, ...]:
+    """Models that a model becomes when some of its coefficients are zero; without any, both directions are one."""
+    own, names = get_model(name), {c.name for c in get_model(name).coefficients}
+    return tuple(
+        other.name
+        for other in _MODELS.values()
+        if {c.name for c in other.coefficients} < names and (other.direction == own.direction or not other.coefficients)
+    )
+
+
 def parameters(model_name: str) -> tuple[Parameter, ...]:
     """Parameters of a camera with this distortion model, in their fixed order x0, y0, f, k..."""
     return _OPTICS + get_model(model_name).coefficients

@@ -18,14 +18,14 @@ from starcal_uq.core.provenance import provenance
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibration import Calibration
-from starcal_uq.estimation.compressed import compress, optimum, settled
+from starcal_uq.estimation.compressed import compress, optimum, settled, unit_covariance
 from starcal_uq.estimation.fingerprints import Fingerprints
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.solvers import is_singular
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.estimation.star_errors import StarLikelihood, StarModel
 from starcal_uq.estimation.undetermined import EXPLAINED, WEAK, open_parameters, remedy_of, undetermined
-from starcal_uq.maths.linear import scaled_inverse
+from starcal_uq.maths.linear import scaled_inverse, symmetric_inverse
 
 if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
@@ -77,11 +77,13 @@ def assemble(
     status = check_camera(nominal.with_theta(theta), status)
     if names := undetermined(likelihood, theta, normal.matrix, sigma, nominal, status):
         status = Status.SINGULAR
-    efficient = scaled_inverse(normal.matrix) * sigma**2
+    efficient, information = scaled_inverse(normal.matrix) * sigma**2, normal.matrix / sigma**2
     compressed = compress(likelihood, theta, efficient, likelihood.rotations)
     if refined and status.ok:
         compressed = settled(compressed)
         theta, last = compressed.theta_hat, stages[-1]
+        efficient = unit_covariance(compressed) * sigma**2
+        information = symmetric_inverse(efficient)
         ended = replace(
             last,
             trajectory=np.vstack([last.trajectory, theta]),
@@ -114,7 +116,7 @@ def assemble(
         residuals_px=residuals,
         chi2=sums.normal.cost,
         dof=dof,
-        information=normal.matrix / sigma**2,
+        information=information,
         rotation_per_theta=np.mean(attitudes.response, axis=2),
         attitude_noise=np.mean(attitudes.inverse, axis=2) * sigma**2,
         pair_theta=pair_theta,
@@ -217,6 +219,11 @@ def noise_px(likelihood: MarginalLikelihood, theta: FloatArray) -> float:
     likelihood.use_sums(*found)
     weight = likelihood.frames.weight
     return float(np.sqrt(cost / (2.0 * (likelihood.frames.n_stars if weight is None else np.sum(weight**2)))))
+
+
+def check_noise(noise: float, camera: Camera, status: Status) -> Status:
+    """`status`, unless residuals of this size, px, say that the stars are not the ones they are said to be."""
+    return Status.INCONSISTENT if status.ok and noise > IMPLAUSIBLE_NOISE * camera.width_px else status
 
 
 def check_camera(camera: Camera, status: Status) -> Status:

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
-from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, assemble, noise_px
+from starcal_uq.estimation.assemble import assemble, check_noise, noise_px
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.estimation.recursive.result import distortion_after, joint_estimate, sums_at_estimate
@@ -41,7 +40,8 @@ def least_squares(obs: Observations, camera: Camera, solver: str, max_iterations
     frames = likelihood.frames
     stage = optics_stage(frames, plain, solver, max_iterations)
     covariance = PairObjective(frames, "none").godambe(stage.theta)
-    status = _plausible(likelihood, plain, stage.status, stage.theta)
+    # A mirror or wrong stars, which interstar angles do not see.
+    status = check_noise(noise_px(likelihood, stage.theta), plain, stage.status) if stage.status.ok else stage.status
     settings = {"ignored_distortion": camera.distortion} if camera.distortion != "none" else {}
     return assemble(
         obs, plain, "least_squares", solver, likelihood, [stage], status, stage.theta, covariance, settings=settings
@@ -71,7 +71,7 @@ def recursive(
     estimate = joint_estimate(recursion, sums)
     if sums is not None:
         stages.append(distortion_after(recursion, estimate, sums))
-    status = _plausible(likelihood, camera, status, estimate.theta)
+    status = check_noise(noise_px(likelihood, estimate.theta), camera, status) if status.ok else status
     return assemble(
         obs,
         filtering.nominal,
@@ -106,13 +106,6 @@ def _chunks(source: Iterable[Observations]) -> Iterator[StarFrames]:
                     f"the stream of frames holds a {type(piece).__name__}: give Observations, or stream_frames(path)."
                 )
         yield StarFrames.joined([StarFrames.from_observations(piece) for piece in chunk])
-
-
-def _plausible(likelihood: MarginalLikelihood, camera: Camera, status: Status, theta: FloatArray) -> Status:
-    """INCONSISTENT where the positions contradict what the interstar angles have found (a mirror, wrong stars)."""
-    if status.ok and noise_px(likelihood, theta) > IMPLAUSIBLE_NOISE * camera.width_px:
-        return Status.INCONSISTENT
-    return status
 
 
 def check_count(likelihood: MarginalLikelihood, camera: Camera) -> None:

@@ -19,16 +19,25 @@ from starcal_uq.core.settings import Method, Solver, bounded
 from starcal_uq.core.status import Status
 from starcal_uq.core.tasks import Progress, one_thread, processors
 from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, assemble, check_camera, failed, noise_px, with_star_errors
+from starcal_uq.estimation.assemble import (
+    IMPLAUSIBLE_NOISE,
+    assemble,
+    check_camera,
+    check_noise,
+    failed,
+    noise_px,
+    with_star_errors,
+)
 from starcal_uq.estimation.baselines import check_count, least_squares, recursive
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.composite import enough_frames, pair_covariance
 from starcal_uq.estimation.duplicates import check_duplicates, repeating_frames
 from starcal_uq.estimation.fingerprints import Fingerprints
+from starcal_uq.estimation.loops import kernels
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import NOISES, fit_noise, weighed
 from starcal_uq.estimation.pairs import PairObjective
-from starcal_uq.estimation.partitioned import calibrate_partitions, kernels_for
+from starcal_uq.estimation.partitioned import calibrate_partitions
 from starcal_uq.estimation.plausibility import explained
 from starcal_uq.estimation.recursive.start import RECURSIVE_METHODS, RecursionOptions
 from starcal_uq.estimation.recursive.stream import raise_unless_good
@@ -51,6 +60,7 @@ from starcal_uq.estimation.undetermined import EXPLAINED, undetermined
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.partitions import PartitionedObservations
+from starcal_uq.observations.splits import one_of_each
 from starcal_uq.observations.table import Observations
 
 METHODS = get_args(Method)
@@ -208,7 +218,7 @@ def calibrate(
             )
         sample = obs.sample()
         # What is compiled is compiled here, before other processes ask for it.
-        with compiled.using(kernels_for(camera.distortion, obs.n_stars)):
+        with compiled.using(kernels(camera.distortion, obs.n_stars)):
             start = calibrate(sample, camera, solver=solver, max_iterations=max_iterations, duplicates=duplicates)
         with cluster(scheduler, workers=_enough(workers, obs), caller="calibrate") as processes:
             calibration = calibrate_partitions(
@@ -349,8 +359,7 @@ def refit(obs: Observations, cal: Calibration, model: str) -> Fit:
 def _fitted(likelihood: MarginalLikelihood, camera: Camera, theta: FloatArray, status: Status) -> Fit:
     raise_unless_good(check_camera(camera.with_theta(theta), status))
     sums, attitudes = likelihood.sums(theta)
-    if noise_px(likelihood, theta) > IMPLAUSIBLE_NOISE * camera.width_px:
-        raise_unless_good(Status.INCONSISTENT)
+    raise_unless_good(check_noise(noise_px(likelihood, theta), camera, Status.CONVERGED))
     return Fit(theta, sums.normal.cost, attitudes.rotations)
 
 
@@ -386,14 +395,11 @@ def _stages(
             if method == "efficient" and noise_px(own, direct.theta) <= min(noise, most):
                 likelihood.use_sums(*own.sums(direct.theta))
                 return [*stages, direct], direct.status
-    pair_theta, status = stages[-1].theta, stages[-1].status
-    if status.ok:
-        if noise > most:
-            # Interstar angles do not see a mirror, nor does their noise show a few wrong stars; positions do.
-            status = Status.INCONSISTENT
-        elif method == "efficient":
-            stages.append(refinement_stage(likelihood, pair_theta, max_iterations, tolerance))
-            status = stages[-1].status
+    # Interstar angles do not see a mirror, nor does their noise show a few wrong stars; positions do.
+    status = check_noise(noise, camera, stages[-1].status)
+    if status.ok and method == "efficient":
+        stages.append(refinement_stage(likelihood, stages[-1].theta, max_iterations, tolerance))
+        status = stages[-1].status
     return stages, status
 
 
@@ -506,9 +512,8 @@ def _sampled_stages(pairs: PairObjective, camera: Camera, max_iterations: int, t
     wanted = max(_SAMPLE_FRAMES, -(-_SAMPLE_STARS * frames.n_frames // frames.n_stars))
     if frames.n_frames < 3 * wanted:
         return []
-    # Not every n-th: a scan has periods of its own.
     chosen = np.zeros(frames.n_frames, dtype=bool)
-    chosen[np.random.default_rng(0).choice(frames.n_frames, wanted, replace=False)] = True
+    chosen[one_of_each(frames.n_frames, wanted)] = True
     sample = PairObjective(frames.select(np.repeat(chosen, frames.sizes)), pairs.model_name)
     stages = _pair_stages(sample, camera, "lm", max_iterations, _SAMPLE_TOLERANCE)
     if not stages[-1].status.ok:

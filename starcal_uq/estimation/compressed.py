@@ -9,7 +9,7 @@ adds up over frames. An evaluation then costs the same for any number of stars.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import ClassVar
@@ -21,7 +21,7 @@ from starcal_uq.camera.projection import bent_index, forward_kernel, forward_roo
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray, Shapes
-from starcal_uq.estimation.loops import gram_loop, wanted
+from starcal_uq.estimation.loops import gram_loop, kernels
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.star_errors import StarSums
 from starcal_uq.estimation.sums import ATTITUDE_STEPS, ATTITUDE_TOLERANCE_RAD, Attitudes, NormalSums, settled_sums
@@ -299,11 +299,23 @@ def gram_sums(
         Sums at theta with settled attitudes, where there are any; the compiled path need not make them again.
     """
     theta = np.asarray(theta, dtype=np.float64)
-    if wanted(model_name, frames.n_stars):
+    if kernels(model_name, frames.n_stars) == "numba":
         sums, at = settled_sums(frames, model_name, theta, rotations) if known is None else known
         moved = (at.shift, at.response, at.inverse)
         gram, slope = gram_loop(frames, model_name, theta, whitening, at.rotations, moved)
         return GramSums(gram, sums.log_determinant, slope, frames.n_stars, frames.n_frames)
+    return _expanded(frames, model_name, theta, whitening, rotations, lambda part, block, stars: None)
+
+
+def _expanded(
+    frames: StarFrames,
+    model_name: str,
+    theta: FloatArray,
+    whitening: FloatArray,
+    rotations: FloatArray,
+    look: Callable[[StarFrames, _Block, slice], None],
+) -> GramSums:
+    """As `gram_sums`, with NumPy; `look` is shown every block, and where its stars stand."""
     expansion, p = _Expansion(model_name, theta, whitening), len(theta)
     gram, slope, log_determinant = np.zeros((expansion.q, expansion.q)), np.zeros(p), 0.0
     with np.errstate(all="ignore"):
@@ -313,6 +325,7 @@ def gram_sums(
             gram += block.gram(part, p)
             slope += block.log_determinant_slope
             log_determinant += block.log_determinant
+            look(part, block, slice(int(frames.starts[first]), int(frames.starts[last])))
     return GramSums(gram, log_determinant, slope, frames.n_stars, frames.n_frames)
 
 
@@ -345,20 +358,21 @@ def compress(
     frames, model_name = likelihood.frames, likelihood.model_name
     if rotations is None:
         rotations = likelihood.start_rotations(theta)
+    if stars is not None and ratio is not None:
+        # Bound here: the types of what a function closes over are those of the arguments.
+        bringing = stars
+
+        def add(part: StarFrames, block: _Block, rows: slice) -> None:
+            own = MarginalLikelihood(part, model_name)
+            state, _ = own.profile(theta, block.rotations)
+            bringing.add(own, state, own.project_out(state, block.columns), rows)
+
+        sums = _expanded(frames, model_name, theta, whitening, rotations, add)
+        return dataclasses.replace(sums, gram=sums.gram - stars.solved(ratio).correction()).likelihood(theta, whitening)
     known = likelihood.last_sums
     if known is not None and not (np.array_equal(known[1].theta, theta) and known[0].turn < ATTITUDE_TOLERANCE_RAD):
         known = None
-    sums = gram_sums(frames, model_name, theta, whitening, rotations, known)
-    if stars is not None and ratio is not None:
-        expansion = _Expansion(model_name, theta, whitening)
-        for first, last in frames.parts(_BLOCK_STARS):
-            part = MarginalLikelihood(frames.part(first, last), model_name)
-            block = expansion.block(part.frames, rotations[first:last])
-            state, _ = part.profile(theta, block.rotations)
-            rows = slice(int(frames.starts[first]), int(frames.starts[last]))
-            stars.add(part, state, part.project_out(state, block.columns), rows)
-        sums = dataclasses.replace(sums, gram=sums.gram - stars.solved(ratio).correction())
-    return sums.likelihood(theta, whitening)
+    return gram_sums(frames, model_name, theta, whitening, rotations, known).likelihood(theta, whitening)
 
 
 _STEPS = 50
@@ -539,18 +553,24 @@ def optimum(compressed: CompressedLikelihood) -> Optimum:
             Status.STALLED,
         )
     sigma2 = cost[-1] / dof
-    unit = np.linalg.inv(here.gram[1 : p + 1, 1 : p + 1])
-    root = here.whitening @ np.linalg.cholesky(0.5 * (unit + unit.T))
-    covariance = root @ root.T * sigma2
+    covariance = unit_covariance(here) * sigma2
     return Optimum(
         compressed=moved(here, here.theta_hat, scaled_cholesky(covariance)),
         information=symmetric_inverse(covariance),
-        covariance=np.asarray(covariance),
+        covariance=covariance,
         sigma=float(np.sqrt(sigma2)),
         sum_of_squares=cost[-1],
         trajectory=np.array(trajectory),
         cost=np.array(cost),
     )
+
+
+def unit_covariance(compressed: CompressedLikelihood) -> FloatArray:
+    """Covariance (p, p) at the point of expansion for a noise of one: the inverse of the Gauss-Newton matrix."""
+    p = len(compressed.theta_hat)
+    unit = np.linalg.inv(compressed.gram[1 : p + 1, 1 : p + 1])
+    root = compressed.whitening @ np.linalg.cholesky(0.5 * (unit + unit.T))
+    return np.asarray(root @ root.T)
 
 
 def settled(compressed: CompressedLikelihood) -> CompressedLikelihood:

@@ -64,6 +64,13 @@ def check_duplicates(duplicates: str) -> None:
         raise CalibrationError(f"duplicates {duplicates!r} is unknown: use one of {', '.join(DUPLICATES)}.")
 
 
+def repeated(what: str, pairs: IntArray, n_frames: int) -> str:
+    """First part of a sentence about so many frames that hold the same as others; pairs (n, 2) of frame numbers."""
+    more = n_frames - 1
+    others = f", and {more} more repeat others" if more > 1 else ", and one more repeats another" if more else ""
+    return f"frame {pairs[0, 1]} holds the same {what} as frame {pairs[0, 0]}{others}"
+
+
 def repeating_frames(calibration: Calibration, duplicates: str) -> IntArray:
     """Numbers of the frames to leave out: none where they are kept, and an error where they are refused."""
     if duplicates == "keep" or calibration.fingerprints is None:
@@ -71,11 +78,9 @@ def repeating_frames(calibration: Calibration, duplicates: str) -> IntArray:
     pairs = repeated_frames(calibration)
     later = np.unique(pairs[:, 1])
     if len(later) and duplicates == "refuse":
-        more = len(later) - 1
-        others = f", and {more} more repeat others" if more > 1 else ", and one more repeats another" if more else ""
         raise RepeatedFramesError(
-            f"frame {pairs[0, 1]} holds the same measurement as frame {pairs[0, 0]}{others}: their stars differ by "
-            "far less than their noise, and would count twice; leave the later ones out (duplicates='drop', "
+            f"{repeated('measurement', pairs, len(later))}: their stars differ by far less than "
+            "their noise, and would count twice; leave the later ones out (duplicates='drop', "
             "--duplicates drop), or, if you know them to be exposures of their own, keep them (duplicates='keep').",
             pairs=pairs.tolist(),
         )

@@ -562,7 +562,7 @@ def source(model_name: str) -> str:
     rows = p + 4
     explicit = get_model(model_name).direction == "forward"
     first, bent = (6, 8, 0), (0, 2, 2 + 2 * p, 8 + 2 * p)
-    kernels = [
+    functions = [
         _star_source(forward_kernel(model_name, "first"), "first_kernel", lambda o, n: first[o] + n, "x, y, z"),
         _star_source(newton_kernel(model_name), "newton", lambda o, n: f"row + {2 * o + n}", given="row, "),
         _star_source(backward_kernel(model_name, False), "direction_kernel", lambda o, n: n),
@@ -571,15 +571,15 @@ def source(model_name: str) -> str:
         _star_source(forward_kernel(model_name, "bent"), "bent_kernel", lambda o, n: bent[o] + n, "x, y, z"),
     ]
     head = _HEAD.format(p=p, stride=_STRIDE, chunk=_CHUNK, rows=rows, explicit=explicit, width=_width(p))
-    inlined = ["@njit(**INLINE)\n" + kernel for kernel in kernels]
+    inlined = ["@njit(**INLINE)\n" + kernel for kernel in functions]
     parts = [head, *inlined, *_normal_sources(rows), *_pair_sources(p), _LOOPS, _PAIRS]
     parts += [*_expansion_sources(model_name, p), _GRAM]
     return "\n\n".join(parts)
 
 
-def wanted(model_name: str, n_stars: int) -> bool:
-    """Whether the compiled loops are to be used for so many stars."""
-    return compiled.chosen(n_stars, lambda: source(model_name)) == "numba"
+def kernels(model_name: str, n_stars: int) -> str:
+    """Path of the sums over so many stars: ``numba`` for the compiled loops, or ``numpy``."""
+    return compiled.chosen(n_stars, lambda: source(model_name))
 
 
 def _stars(frames: StarFrames, rotations: FloatArray) -> tuple[Any, ...]:

@@ -19,7 +19,7 @@ from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.projection import forward_kernel, forward_root, unproject_theta
 from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.loops import wanted
+from starcal_uq.estimation.loops import kernels
 from starcal_uq.estimation.solvers import Normal
 from starcal_uq.estimation.sums import (
     ATTITUDE_STEPS,
@@ -34,6 +34,9 @@ from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
+
+# Attitudes that are wrong by this much cost a likelihood nothing that is left after their elimination to first order.
+_TURN_RAD = 1e-8
 
 
 @dataclass(frozen=True)
@@ -89,7 +92,7 @@ class MarginalLikelihood:
     @property
     def kernels(self) -> str:
         """``numpy`` or ``numba``: what sums over all frames are made with."""
-        return "numba" if wanted(self.model_name, self.frames.n_stars) else "numpy"
+        return kernels(self.model_name, self.frames.n_stars)
 
     def start_rotations(self, theta: FloatArray) -> FloatArray:
         """Attitudes (K, 3, 3) by QUEST at theta."""
@@ -188,10 +191,10 @@ class MarginalLikelihood:
 
     def log_likelihood(self, theta: FloatArray, sigma: float) -> float:
         """Log likelihood at theta (p,) and sigma (px, or the common factor on stated noise)."""
-        state, cost = self.profile(theta, self._rotations)
-        if not np.isfinite(cost):
+        sums, _ = self.sums(theta, tolerance=_TURN_RAD)
+        if not np.isfinite(sums.cost):
             return -np.inf
-        return float(-0.5 * cost / sigma**2 - self.dof * np.log(sigma) - 0.5 * np.sum(state.log_determinant))
+        return float(-0.5 * sums.cost / sigma**2 - self.dof * np.log(sigma) - 0.5 * sums.log_determinant)
 
     def derivatives(self, theta: FloatArray, state: Profile) -> FloatArray:
         """Derivative (p, 2, N) of the whitened prediction with respect to theta at fixed attitudes."""

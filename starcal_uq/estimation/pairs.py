@@ -17,7 +17,7 @@ from starcal_uq.attitude.wahba import profile_attitudes, quest
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import backward_kernel, backward_root, unproject_theta
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.estimation.loops import pair_loop, profile_loop, wanted
+from starcal_uq.estimation.loops import kernels, pair_loop, profile_loop
 from starcal_uq.estimation.solvers import Normal, is_singular
 from starcal_uq.maths.linear import COLUMNS, ROWS, unit_inverse
 from starcal_uq.observations.frames import StarFrames
@@ -84,7 +84,7 @@ class PairObjective:
         self._blocks = frames.parts(_BLOCK_STARS)
         self._turned_at: FloatArray | None = None
         self._turned, self._rotations = np.empty((3, 0)), np.empty((0, 3, 3))
-        self._compiled = wanted(model_name, frames.n_stars)
+        self._compiled = kernels(model_name, frames.n_stars) == "numba"
         self._last: tuple[FloatArray, Normal, FloatArray] | None = None
 
     @property

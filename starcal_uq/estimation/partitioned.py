@@ -10,8 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial, reduce
-from operator import add
+from functools import partial
 from time import perf_counter
 from typing import TypeVar
 
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 from starcal_uq.attitude.rotations import rotation_to_quaternion
 from starcal_uq.camera import compiled
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import get_model, model_names
+from starcal_uq.camera.distortion import get_model, model_names, simpler_models
 from starcal_uq.core.cluster import Cluster
 from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
 from starcal_uq.core.provenance import provenance
@@ -29,9 +28,10 @@ from starcal_uq.core.status import Status
 from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation import loops
-from starcal_uq.estimation.assemble import IMPLAUSIBLE_NOISE, check_camera
+from starcal_uq.estimation.assemble import check_camera, check_noise
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.compressed import GramSums, gram_sums, optimum, settled
+from starcal_uq.estimation.duplicates import repeated
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.residual_map import OUTLIER_SIGMA, PartitionSums, ResidualMap, RicherModel
 from starcal_uq.estimation.solvers import Normal, is_singular, levenberg_marquardt
@@ -56,11 +56,6 @@ class _Seen:
     hashes: tuple[str, ...]
     frames: IntArray
     content: NDArray[np.uint64]
-
-
-def kernels_for(model_name: str, n_stars: int) -> str:
-    """Path of the loops, ``numpy`` or ``numba``, for all partitions together."""
-    return "numba" if loops.wanted(model_name, n_stars) else "numpy"
 
 
 def _with_kernels(kernels: str, one: Callable[[Partition], T], part: Partition) -> T:
@@ -102,10 +97,6 @@ def _gram(reader: PartitionReader, model: str, theta: FloatArray, whitening: Flo
     return gram_sums(likelihood.frames, model, theta, whitening, likelihood.start_rotations(theta))
 
 
-def _gram_together(parts: Sequence[GramSums]) -> GramSums:
-    return reduce(add, parts)
-
-
 @dataclass(frozen=True)
 class _Residuals:
     """Sums over stars and frames at the estimate: attitude response (3, p) and covariance (3, 3), and the residuals.
@@ -121,16 +112,14 @@ class _Residuals:
 
 def _richer(camera: Camera) -> list[Camera]:
     """The same camera by every model with more terms."""
-    own = get_model(camera.distortion)
-    values = dict(zip((c.name for c in own.coefficients), camera.coefficients, strict=True))
-    found = []
-    for name in model_names():
-        model = get_model(name)
-        terms = [c.name for c in model.coefficients]
-        if model.direction == own.direction and values.keys() < set(terms):
-            coefficients = tuple(values.get(term, 0.0) for term in terms)
-            found.append(camera.replace(distortion=name, coefficients=coefficients))
-    return found
+    values = dict(zip(camera.parameter_names, camera.theta, strict=True))
+    return [
+        camera.replace(
+            distortion=name, coefficients=tuple(float(values.get(c.name, 0.0)) for c in get_model(name).coefficients)
+        )
+        for name in model_names()
+        if camera.distortion in simpler_models(name)
+    ]
 
 
 def _residuals(
@@ -225,7 +214,7 @@ def calibrate_partitions(
     """
     reader, model, began = obs.reader, start.camera.distortion, perf_counter()
     # Chosen here once: what one process has compiled in the meantime must not change the digits of another.
-    kernels = kernels_for(model, obs.n_stars)
+    kernels = loops.kernels(model, obs.n_stars)
     first = start.stages[-1].theta
 
     def total(one: Callable[[Partition], T], together: Callable[[Sequence[T]], T]) -> T:
@@ -247,7 +236,7 @@ def calibrate_partitions(
         raise CalibrationError(f"the calibration failed ({reason.name}): {reason.remedy}.", reason)
     whitening = scaled_cholesky(scaled_inverse(normal.matrix) * normal.cost / dof)
     for _ in range(max_iterations):
-        gram = total(partial(_gram, reader, model, theta, whitening), _gram_together)
+        gram = total(partial(_gram, reader, model, theta, whitening), sum_of)
         here = gram.likelihood(theta, whitening)
         best = optimum(settled(here))
         theta = best.theta
@@ -266,8 +255,7 @@ def calibrate_partitions(
     likelihood = MarginalLikelihood(sample, model)
     state, _ = likelihood.profile(theta)
     residuals = likelihood.frames.in_pixels(state.e).T
-    if status.ok and float(np.sqrt(np.mean(residuals**2))) > IMPLAUSIBLE_NOISE * camera.width_px:
-        status = Status.INCONSISTENT
+    status = check_noise(float(np.sqrt(np.mean(residuals**2))), camera, status)
     record = provenance(None, start.provenance["settings"], joined_hash(seen.hashes))
     record["partitions"] = {
         "folder": str(obs.folder),
@@ -307,10 +295,8 @@ def _refuse_repeated(seen: _Seen) -> None:
     if not len(same):
         return
     pairs = np.sort(np.column_stack([seen.frames[order[same]], seen.frames[order[same + 1]]]), axis=1)
-    more = len(pairs) - 1
-    others = f", and {more} more repeat others" if more > 1 else ", and one more repeats another" if more else ""
     raise RepeatedFramesError(
-        f"frame {pairs[0, 1]} holds the same pixels as frame {pairs[0, 0]}{others}: they would count twice; remove the "
+        f"{repeated('pixels', pairs, len(pairs))}: they would count twice; remove the "
         "later ones from the files, or, if you know them to be exposures of their own, keep them (duplicates='keep', "
         "--duplicates keep).",
         pairs=pairs.tolist(),

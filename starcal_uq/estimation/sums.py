@@ -23,13 +23,15 @@ take of it would lose five digits in a field of ten degrees, and nine in one of 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from starcal_uq.attitude.rotations import exp_rotation
-from starcal_uq.camera.kernels import Kernel
 from starcal_uq.camera.projection import forward_kernel, forward_root
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation import loops
@@ -39,6 +41,7 @@ from starcal_uq.observations.frames import StarFrames
 
 # Stars whose arrays stay in the second-level cache, and are enough to hide the interpreter.
 BLOCK_STARS = 3072
+T = TypeVar("T")
 ATTITUDE_STEPS = 12
 ATTITUDE_TOLERANCE_RAD = 1e-9
 
@@ -92,11 +95,9 @@ class NormalSums:
         return Normal(max(self.cost, 0.0), self.gradient, 0.5 * (self.matrix + self.matrix.T))
 
 
-def sum_of(parts: Sequence[NormalSums]) -> NormalSums:
-    """All parts together."""
-    total = parts[0]
-    for part in parts[1:]:
-        total = total + part
+def sum_of(parts: Sequence[T]) -> T:
+    """All parts together, of whatever adds up."""
+    total: T = reduce(add, parts)
     return total
 
 
@@ -146,7 +147,7 @@ class _Buffers:
         """A, e and H: (3 + 1 + p, 2, n)."""
         return self._columns[: (4 + self.p) * 2 * n].reshape(4 + self.p, 2, n)
 
-    def products(self, columns: FloatArray, depth: int = 3) -> FloatArray:
+    def products(self, columns: FloatArray, depth: int) -> FloatArray:
         """Products of the first rows (those of A) with themselves and the ones that follow, over both axes: (.., n)."""
         rows, _, n = columns.shape
         total = depth * rows - depth * (depth - 1) // 2
@@ -212,7 +213,7 @@ def frame_sums(
         What stays with the part.
     """
     theta = np.asarray(theta, dtype=np.float64)
-    path = loops.frame_loop if loops.wanted(model_name, frames.n_stars) else _frame_blocks
+    path = loops.frame_loop if loops.kernels(model_name, frames.n_stars) == "numba" else _frame_blocks
     with np.errstate(all="ignore"):
         gram, shift, response, inverse, volume = path(frames, model_name, theta, rotations, residuals)
         sums = NormalSums(
@@ -232,41 +233,60 @@ def _frame_blocks(
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
     """As `starcal_uq.estimation.loops.frame_loop`, with NumPy."""
     p, k = len(theta), frames.n_frames
-    rows = p + 4
-    blocks, starts = frames.parts(BLOCK_STARS), frames.starts
-    largest = max((int(starts[last] - starts[first]) for first, last in blocks), default=0)
-    buffers, kernel = _Buffers(p, largest), forward_kernel(model_name, "first")
     gram, turn = np.zeros((p + 1, p + 1)), np.zeros((3, p))
     packed, mixed = np.empty((6, k)), np.empty((3, p + 1, k))
-    for first, last in blocks:
-        part = frames.part(first, last)
-        columns = _filled(part, model_name, theta, rotations[first:last], buffers, kernel)
-        if residuals is not None:
-            residuals[:, int(starts[first]) : int(starts[last])] = columns[3]
-        if first == 0:
-            turn = _common_turn(columns)
-        flat = columns.reshape(rows, -1)
-        flat[4:] -= turn.T @ flat[:3]
+    for block in _columns(frames, model_name, theta, rotations, residuals):
+        flat, turn = block.columns.reshape(p + 4, -1), block.turn
         gram += flat[3:] @ flat[3:].T
-        packed[:, first:last], mixed[:, :, first:last] = _unpacked(part.sum(buffers.products(columns)), rows)
+        packed[:, block.place], mixed[:, :, block.place] = _unpacked(block.products(3), p + 4)
     inverse, determinant = inverse_symmetric(packed)
     solved = np.einsum("ijk,jqk->iqk", inverse, mixed)
     gram -= np.tensordot(mixed, solved, axes=([0, 2], [0, 2]))
     return gram, solved[:, 0], -solved[:, 1:] - turn[:, :, None], inverse, np.log(determinant)
 
 
-def _filled(
-    part: StarFrames, model_name: str, theta: FloatArray, rotations: FloatArray, buffers: _Buffers, kernel: Kernel
-) -> FloatArray:
-    """A, e and H of one block (4 + p, 2, n), whitened, in its buffer."""
-    columns = buffers.columns(part.n_stars)
-    b = part.rotated(rotations)
-    flat = columns.reshape(2 * len(columns), -1)
-    kernel.into((theta, b, forward_root(model_name, theta, b)), (flat[6:8], flat[8:], flat[:6]))
-    np.subtract(part.pixel, columns[3], out=columns[3])
-    if part.weight is not None:
-        columns *= part.weight
-    return columns
+class _Block(NamedTuple):
+    """A (3, 2, n), e (2, n) and H' (p, 2, n) of some frames, in a buffer that the next block uses again."""
+
+    place: slice
+    part: StarFrames
+    columns: FloatArray
+    turn: FloatArray
+    buffers: _Buffers
+
+    def products(self, depth: int) -> FloatArray:
+        """Sums over the stars of each frame of `_Buffers.products`."""
+        return self.part.sum(self.buffers.products(self.columns, depth))
+
+
+def _columns(
+    frames: StarFrames,
+    model_name: str,
+    theta: FloatArray,
+    rotations: FloatArray,
+    residuals: FloatArray | None = None,
+) -> Iterator[_Block]:
+    """All frames in blocks, whitened; the common turn C is that of the first."""
+    p, starts = len(theta), frames.starts
+    blocks = frames.parts(BLOCK_STARS)
+    largest = max((int(starts[last] - starts[first]) for first, last in blocks), default=0)
+    buffers, kernel, turn = _Buffers(p, largest), forward_kernel(model_name, "first"), np.zeros((3, p))
+    for first, last in blocks:
+        part = frames.part(first, last)
+        columns = buffers.columns(part.n_stars)
+        b = part.rotated(rotations[first:last])
+        flat = columns.reshape(2 * (p + 4), -1)
+        kernel.into((theta, b, forward_root(model_name, theta, b)), (flat[6:8], flat[8:], flat[:6]))
+        np.subtract(part.pixel, columns[3], out=columns[3])
+        if part.weight is not None:
+            columns *= part.weight
+        if residuals is not None:
+            residuals[:, int(starts[first]) : int(starts[last])] = columns[3]
+        if first == 0:
+            turn = _common_turn(columns)
+        flat = columns.reshape(p + 4, -1)
+        flat[4:] -= turn.T @ flat[:3]
+        yield _Block(slice(first, last), part, columns, turn, buffers)
 
 
 def frame_normals(
@@ -285,19 +305,10 @@ def frame_normals(
     """
     p, k = len(theta), frames.n_frames
     rows = p + 4
-    blocks, starts = frames.parts(BLOCK_STARS), frames.starts
-    buffers = _Buffers(p, max(int(starts[last] - starts[first]) for first, last in blocks))
-    kernel = forward_kernel(model_name, "first")
-    sums, turn = np.empty((rows * (rows + 1) // 2, k)), np.zeros((3, p))
+    sums = np.empty((rows * (rows + 1) // 2, k))
     with np.errstate(all="ignore"):
-        for first, last in blocks:
-            part = frames.part(first, last)
-            columns = _filled(part, model_name, theta, rotations[first:last], buffers, kernel)
-            if first == 0:
-                turn = _common_turn(columns)
-            flat = columns.reshape(rows, -1)
-            flat[4:] -= turn.T @ flat[:3]
-            sums[:, first:last] = part.sum(buffers.products(columns, rows))
+        for block in _columns(frames, model_name, theta, rotations):
+            sums[:, block.place] = block.products(rows)
         packed, mixed = _unpacked(sums[: 3 * (rows - 1)], rows)
         inverse, determinant = inverse_symmetric(packed)
         solved = np.einsum("ijk,jqk->iqk", inverse, mixed)

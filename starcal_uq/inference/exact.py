@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 
 # Frames of a sample, and the batches that tell its standard error.
 SAMPLED_FRAMES, BATCHES = 1000, 10
-# Attitudes that are wrong by this much, rad, cost nothing that is left after their elimination to first order.
-_TURN = 1e-8
 
 
 class ExactMarginal:
@@ -38,13 +36,12 @@ class ExactMarginal:
 
     def __init__(self, obs: Observations | StarFrames, cal: Calibration, rotations: FloatArray | None = None) -> None:
         model, theta = cal.camera.distortion, cal.theta
-        self._plain: MarginalLikelihood | None = None
         if cal.star_errors is not None and not isinstance(obs, StarFrames):
             start = quaternion_to_rotation(cal.quaternions)
             self._one: MarginalLikelihood = StarLikelihood(obs, model, theta, start, cal.star_errors, cal.sigma)
             self._one.use_rotations(self._one.rotations_at(theta))
             return
-        self._one = self._plain = MarginalLikelihood(obs, model)
+        self._one = MarginalLikelihood(obs, model)
         if rotations is None and len(cal.quaternions) == self._one.frames.n_frames:
             rotations = quaternion_to_rotation(cal.quaternions)
         if rotations is not None:
@@ -53,15 +50,7 @@ class ExactMarginal:
 
     def log_likelihood(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
         """Log likelihood (n,) at theta (n, p) and sigma (n,)."""
-        return np.array([self._at(t, float(s)) for t, s in zip(theta, sigma, strict=True)])
-
-    def _at(self, theta: FloatArray, sigma: float) -> float:
-        if self._plain is None:
-            return self._one.log_likelihood(theta, sigma)
-        sums, _ = self._plain.sums(theta, tolerance=_TURN)
-        if not np.isfinite(sums.cost):
-            return -np.inf
-        return float(-0.5 * sums.cost / sigma**2 - self._plain.dof * np.log(sigma) - 0.5 * sums.log_determinant)
+        return np.array([self._one.log_likelihood(t, float(s)) for t, s in zip(theta, sigma, strict=True)])
 
 
 class FrameSample:

@@ -161,8 +161,15 @@ class PartitionedObservations:
     def sample(self, n_frames: int = SAMPLE_FRAMES) -> Observations:
         """About `n_frames` frames with all of their columns: evenly spaced ones of at most 16 files, evenly spaced too.
 
-        The same files give the same frames. All of a smaller table is taken.
+        The same files give the same frames. All of a smaller table is taken. The sample of the usual size is kept.
         """
+        return self._usual_sample if n_frames == SAMPLE_FRAMES else self._sampled(n_frames)
+
+    @cached_property
+    def _usual_sample(self) -> Observations:
+        return self._sampled(SAMPLE_FRAMES)
+
+    def _sampled(self, n_frames: int) -> Observations:
         place = np.linspace(0, len(self.parts) - 1, min(len(self.parts), _SAMPLE_PARTS)).round().astype(int)
         chosen = [self.parts[i] for i in place]
         numbers = [frame_numbers(part, self.reader) for part in chosen]

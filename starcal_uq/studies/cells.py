@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.camera.distortion import get_model, model_names, parameter_names
+from starcal_uq.camera.distortion import parameter_names, simpler_models
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import StarcalError, StudyError
 from starcal_uq.core.types import AnyDict, FloatArray
@@ -50,18 +50,6 @@ _PRIOR_OF = {"principal_point_px": slice(0, 2), "focal_fraction": slice(2, 3), "
 _KEPT = 8
 UNDETERMINED = "the frames do not determine every parameter: use more stars, a simpler model, or a prior."
 Numbers = AnyDict
-
-
-def simpler_models(model: str) -> tuple[str, ...]:
-    """Models that a model becomes when some of its coefficients are zero."""
-    own = get_model(model)
-    names = {c.name for c in own.coefficients}
-    return tuple(
-        other
-        for other in model_names()
-        if {c.name for c in get_model(other).coefficients} < names
-        and get_model(other).direction in (own.direction, "forward" if other == "none" else own.direction)
-    )
 
 
 class Cells(ABC):

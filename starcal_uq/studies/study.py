@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.camera.distortion import model_names, parameter_names
+from starcal_uq.camera.distortion import model_names, parameter_names, simpler_models
 from starcal_uq.core.cluster import Scheduler, cluster
 from starcal_uq.core.constants import AXES as ATTITUDE
 from starcal_uq.core.errors import StudyError
@@ -22,7 +22,7 @@ from starcal_uq.core.tasks import Progress, one_thread, run_tasks
 from starcal_uq.core.types import AnyDict
 from starcal_uq.sky.catalogue import load_catalogue
 from starcal_uq.studies.axes import AXES
-from starcal_uq.studies.cells import FRAME_FACTORS, FisherCells, simpler_models
+from starcal_uq.studies.cells import FRAME_FACTORS, FisherCells
 from starcal_uq.studies.definition import Cell, StudyDefinition
 from starcal_uq.studies.geometry import Heaven, frames_of, weights_of
 from starcal_uq.studies.result import TEXTS, VARIABLES, Study, frames_for
