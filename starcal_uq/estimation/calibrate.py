@@ -74,10 +74,10 @@ _DIRECT_ITERATIONS = 60
 # Starting processes takes two seconds.
 _STARS_WORTH_PROCESSES = 1_000_000
 # Frames and stars of a sample that is near enough to the minimum of all, and the relative gain of its last steps.
-_SAMPLE_FRAMES, _SAMPLE_STARS, _SAMPLE_TOLERANCE = 150, 2500, 1e-5
+_SAMPLE_FRAMES, _SAMPLE_STARS, _SAMPLE_TOLERANCE = 150, 2500, 1e-4
 # Standard deviations of the last step where more follows: of the estimate from interstar angles of all frames, which is
 # then known to a thousandth of that, and of the refinement, from where one of Newton's on the expansion is exact.
-_LAST_PAIR_STEP, _LAST_STEP = 0.05, 5e-3
+_LAST_PAIR_STEP, _LAST_STEP = 0.05, 0.02
 
 
 @bounded
