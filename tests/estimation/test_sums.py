@@ -131,8 +131,12 @@ def _compare_pairs(frames, model, theta, monkeypatch):
     for path in ("numba", "numpy"):
         monkeypatch.setenv(compiled.SWITCH, path)
         objective = PairObjective(frames, model)
-        both.append((objective.evaluate(theta), objective.godambe(theta)))
-    (fused, fused_covariance), (plain, covariance) = both
+        both.append((objective.evaluate(theta), objective.godambe(theta), objective.rotations))
+        # Pixels beyond the fold of a strong distortion have no direction.
+        folded = np.concatenate([theta[:3], np.full(len(theta) - 3, -4e-6)])
+        assert np.isfinite(objective.evaluate(folded).cost) == (len(theta) == 3 or model == "inverse")
+    (fused, fused_covariance, turned), (plain, covariance, rotations) = both
+    assert np.allclose(turned, rotations, rtol=0, atol=1e-13)
     # The matrix is what a common turn leaves of ten thousand times as much: neither path knows its twelfth digit.
     assert fused.cost == pytest.approx(plain.cost, rel=1e-11)
     assert np.max(np.abs(_scaled(fused.matrix - plain.matrix, plain.matrix))) < 1e-10
