@@ -15,7 +15,7 @@ from starcal_uq.core.errors import CalibrationError, SamplingError
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.robust import star_scores, subset
-from starcal_uq.estimation.student import StudentLikelihood
+from starcal_uq.estimation.student import StudentLikelihood, log_excess_prior
 from starcal_uq.inference.posterior import Posterior
 from starcal_uq.inference.priors import Priors
 from starcal_uq.inference.sample import sample
@@ -320,3 +320,12 @@ def test_polynomial_stands_for_a_likelihood_and_stays_tame() -> None:
     assert np.max(np.abs(flat(*target.arguments(target.natural(u))) - exact)) > 0.5
     far = target.natural(30.0 * u)
     assert np.all(cubic(*target.arguments(far)) < 1e6 - 100.0)
+
+
+def test_prior_of_the_tails_is_a_gamma_density():
+    from scipy.stats import gamma
+
+    log_excess = np.linspace(-3.0, 6.0, 20)
+    # The density of a logarithm has the number itself as a factor.
+    expected = gamma.logpdf(np.exp(log_excess), 2.0, scale=10.0) + log_excess
+    assert np.ptp(log_excess_prior(log_excess) - expected) < 1e-12
