@@ -191,7 +191,7 @@ def test_weak_direction_names_the_distortion(full):
 def test_without_posterior_the_report_says_which_command_makes_it(run, unpainted):
     for path in (run.posterior, run.attitude, run.field_map):
         path.unlink()
-    sc.report(run.path)
+    sc.Run(run.path).report(force=True)
     found = page(run)
     assert f"starcal-uq sample {run.path}" in found.text
     assert f"starcal-uq propagate {run.path}" in found.text
