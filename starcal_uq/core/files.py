@@ -11,6 +11,7 @@ import re
 import reprlib
 import secrets
 import struct
+import sys
 import tokenize
 import zipfile
 import zlib
@@ -213,6 +214,30 @@ def check_parquet(file: ParquetFile, stored: int) -> None:
     if twice := {name for name in names if names.count(name) > 1}:
         raise ValueError(f"column {min(twice)} occurs twice")
     check_size(file.metadata.num_rows * len(names) * 8, stored)
+
+
+# A card of a header that counts something, up to its comment.
+_COUNT = re.compile(rb"([A-Z]+\d{0,3}) *=([^/]{0,70})")
+# Of an image, and columns of a table.
+_MOST_AXES = 999
+
+
+def check_fits(content: bytes) -> None:
+    """Refuse, with ValueError, FITS headers whose sizes are none, or that count more axes or columns than FITS knows.
+
+    Astropy would go through them one by one, or go back by negative sizes, without end.
+    """
+    for key in (b"NAXIS", b"TFIELDS", b"PCOUNT", b"GCOUNT"):
+        place = content.find(key)
+        while place >= 0:
+            card = _COUNT.match(content, place)
+            first = place - (content[place - 1 : place] == b"Z")
+            if first % 80 == 0 and card is not None:
+                value = card[2].strip()
+                most = _MOST_AXES if card[1] in (b"NAXIS", b"TFIELDS") else sys.maxsize
+                if not (value.isdigit() and int(value) <= most):
+                    raise ValueError(f"its header states {card[1].decode()} as {value[:20].decode('latin-1')}")
+            place = content.find(key, place + 1)
 
 
 _SEAL = re.compile(rb"\nsha256 ([0-9a-f]{64})\n")

@@ -3,6 +3,7 @@ CDS."""
 
 from __future__ import annotations
 
+import gzip
 import re
 import warnings
 from collections.abc import Mapping, Sequence
@@ -13,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from starcal_uq.core.errors import CatalogueError
-from starcal_uq.core.files import check_packed, reading
+from starcal_uq.core.files import check_fits, check_packed, reading
 from starcal_uq.core.types import FloatArray, IntArray, StrArray
 from starcal_uq.sky.catalogue import StarCatalogue, check_epoch, prepare
 from starcal_uq.sky.cds import CdsFormat, read_cds
@@ -226,6 +227,9 @@ def _load_table(path: Path, kind: Format) -> Any:
         "ecsv": {"format": "ascii.ecsv"},
         "fits": {"format": "fits"},
     }[kind]
+    if kind == "fits":
+        content = path.read_bytes()
+        check_fits(gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content)
     with warnings.catch_warnings():
         # What is odd matters only in a column that is used, whose conversion complains about it; but a cut-off file is
         # no catalogue.

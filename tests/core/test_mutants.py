@@ -253,6 +253,11 @@ ONCE = [
     ("centroids.ecsv", lambda d: d.split(b"\n")[0] + b"\n", "is not a readable table"),
     ("observations.csv", lambda d: b"\x07,x\n1,2\n", r"one of the file's columns \(\\x07, x\)"),
     ("catalogue.csv.gz", lambda d: d[:100], "is not readable as CSV"),
+    (
+        "catalogue.fits",
+        lambda d: d.replace(b"NAXIS   =                    2", b"NAXIS   = " + b"9" * 20),
+        "its header states NAXIS as 9+",
+    ),
     ("state.npz", lambda d: _members(d, header=None), r"\(header is missing\); give a file written by"),
 ]
 
