@@ -183,7 +183,7 @@ LEFT_OPEN = {
 }
 
 
-@pytest.mark.parametrize("likelihood", ["marginal", "student_t"])
+@pytest.mark.parametrize("likelihood", ["marginal", pytest.param("student_t", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", LEFT_OPEN)
 def test_what_the_data_leave_open_is_named_and_what_would_determine_it(name, likelihood):
     place, options, model, words = LEFT_OPEN[name]
@@ -196,7 +196,7 @@ def test_what_the_data_leave_open_is_named_and_what_would_determine_it(name, lik
 
 
 @pytest.mark.parametrize("place", [anywhere, on_a_line, in_a_corner])
-@pytest.mark.parametrize("likelihood", ["marginal", "student_t"])
+@pytest.mark.parametrize("likelihood", ["marginal", pytest.param("student_t", marks=pytest.mark.slow)])
 def test_stars_in_odd_places_that_determine_everything(place, likelihood):
     obs, sheet, theta = drawn(place)
     cal = sc.calibrate(obs, sheet, likelihood=likelihood)
