@@ -8,9 +8,7 @@ process of its own; it is killed when one of them fails. What was tried is kept 
 ``--again`` tries those that survived, after tests were strengthened. ``--show`` prints survivors as differences,
 ``--write`` puts the table into the documentation (`docs/explanation/reliability.md`).
 
-Ready-made tools were tried first. mutmut leaves out whatever is decorated and cannot leave out sentences; cosmic-ray
-edits the tree in place and starts a new interpreter for each mutant, which takes 20 times as long here; both know
-neither samples nor which tests reach a line. Hence these lines, and `fork` after the heavy libraries are loaded.
+Only the tests that reach a line are run for it, in a process that is forked after the heavy libraries are loaded.
 
 Not mutated, because no test should care: sentences, annotations, decorators, what follows ``raise``, sizes of blocks,
 seeds, and -1 where it stands for the last axis of two or for a size to be found. `estimation/loops` is left out: its
