@@ -57,6 +57,7 @@ from starcal_uq.presentation.report.drawing import (
 if TYPE_CHECKING:
     from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
+    from starcal_uq.presentation.report.drawing import Ahead
     from starcal_uq.runs.run import Run
 
 
@@ -75,6 +76,8 @@ def demo(
     force: Force = False,
 ) -> None:
     """The experiment of Ye & Yang 2017, end to end, ending in DIR/report.html."""
+    from starcal_uq.presentation.report.drawing import Ahead
+
     run = sc.Run(out, tell=note)
     with run.making({"command": "demo", "frames": frames, "seed": seed}, force=force), Ahead() as ahead:
         truth = sc.paper.paper_camera()
@@ -121,6 +124,7 @@ def run_command(
 ) -> None:
     """Calibrate, sample, couple, propagate, budget and report: all from stars or images to RUN/report.html."""
     from starcal_uq.pipeline.images import are_images
+    from starcal_uq.presentation.report.drawing import Ahead
 
     run = sc.Run(out, tell=note)
     if budget is not None:
@@ -179,6 +183,7 @@ def _after_calibration(
     **aligning: Any,
 ) -> None:
     """Sample, couple, propagate, question the model, budget, report: what is not done yet."""
+
     ahead.draw(run.calibrated, AFTER_CALIBRATION)
     if not run.did("sample"):
         sample_run(run, sampling, force=False)
