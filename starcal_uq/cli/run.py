@@ -46,13 +46,6 @@ from starcal_uq.cli.settings import (
 )
 from starcal_uq.cli.steps import load_table, sample_run
 from starcal_uq.core.tasks import one_thread
-from starcal_uq.presentation.report.drawing import (
-    AFTER_BUDGET,
-    AFTER_CALIBRATION,
-    AFTER_DIAGNOSIS,
-    AFTER_SAMPLING,
-    Ahead,
-)
 
 if TYPE_CHECKING:
     from starcal_uq.observations.partitions import PartitionedObservations
