@@ -302,7 +302,7 @@ class Budget(Shown):
         RunFolderError
             If the file is missing or is not a budget.
         """
-        with reading(path, "an error budget", "run `starcal-uq budget RUN` to write it"):
+        with reading(path, "an error budget", "run `starcal-uq budget RUN --force` to write it again"):
             with open(path, newline="", encoding="utf-8") as file:
                 records = [
                     {name: cell_content(cell) for name, cell in record.items()} for record in csv.DictReader(file)

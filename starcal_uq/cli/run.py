@@ -176,6 +176,7 @@ def _after_calibration(
     **aligning: Any,
 ) -> None:
     """Sample, couple, propagate, question the model, budget, report: what is not done yet."""
+    from starcal_uq.presentation.report.drawing import AFTER_BUDGET, AFTER_CALIBRATION, AFTER_DIAGNOSIS, AFTER_SAMPLING
 
     ahead.draw(run.calibrated, AFTER_CALIBRATION)
     if not run.did("sample"):

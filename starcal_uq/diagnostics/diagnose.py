@@ -127,7 +127,7 @@ class Diagnosis(Shown):
         RunFolderError
             If the file is missing or is not a diagnosis.
         """
-        return read_json(cls, path, "a diagnosis", "run `starcal-uq diagnose` again")
+        return read_json(cls, path, "a diagnosis", "run `starcal-uq diagnose RUN --force` to write it again")
 
 
 @bounded

@@ -282,7 +282,8 @@ class Calibration(Shown):
             When a file is missing or not a calibration.
         """
         path, remedy = Path(path), "run `starcal-uq calibrate` again"
-        with reading(path.with_suffix(".npz"), "the archive of a calibration", remedy):
-            arrays = read_arrays(path.with_suffix(".npz"))
         with reading(path, "a calibration", remedy):
-            return from_plain(cls, json.loads(path.read_text(encoding="utf-8")), arrays)
+            document = json.loads(path.read_text(encoding="utf-8"))
+            with reading(path.with_suffix(".npz"), "the archive of a calibration", remedy):
+                arrays = read_arrays(path.with_suffix(".npz"))
+            return from_plain(cls, document, arrays)

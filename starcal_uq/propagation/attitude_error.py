@@ -370,7 +370,7 @@ class AttitudeError(Shown):
         names: tuple[str, ...] = ("if_model_holds", "p95_if_model_holds", "p997_if_model_holds", "first_order")
         # What earlier versions called them.
         old = {"if_model_holds": "sigma", "p95_if_model_holds": "p95", "p997_if_model_holds": "p997"}
-        with reading(path, "a table of attitude errors", "run `starcal-uq propagate RUN` to write it"):
+        with reading(path, "a table of attitude errors", "run `starcal-uq propagate RUN --force` to write it again"):
             with open(path, newline="", encoding="utf-8") as file:
                 rows = {(row["contributor"], row["axis"]): row for row in csv.DictReader(file)}
             known = CONTRIBUTORS if (INTERACTION, AXES[0]) in rows else _REQUIRED

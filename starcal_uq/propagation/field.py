@@ -121,7 +121,7 @@ class FieldMap(Shown):
         RunFolderError
             If the file is missing or is not a field map.
         """
-        return read(cls, path, "", "a field map", "run `starcal-uq propagate RUN` to write it")
+        return read(cls, path, "", "a field map", "run `starcal-uq propagate RUN --force` to write it again")
 
 
 def field_map(post: Posterior, obs: Observations, n: int = 25) -> FieldMap:

@@ -52,7 +52,8 @@ def report(
     if isinstance(what, Run):
         return what.report()
     if isinstance(what, str | os.PathLike):
-        return Run(what, truth).report()
+        # A truth that is given is not of the folder.
+        return Run(what, truth).report(force=truth is not None)
     if to is None:
         raise TypeError(f"say where the page of a {type(what).__name__} goes: report(what, to).")
     from starcal_uq.presentation.pages.write import write_page

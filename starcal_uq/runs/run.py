@@ -723,6 +723,6 @@ def as_setting(value: object) -> object:
 
 def _frames_of(path: Path) -> Observations:
     """Frames that a run keeps for itself; random places of a drawn sky may coincide, which no measured table may."""
-    with reading(path, "a table of frames", "run `starcal-uq propagate RUN` again"):
+    with reading(path, "a table of frames", "run `starcal-uq propagate RUN --force` to write it again"):
         table = read_parquet(path)
         return Observations(**{name: arrow_values(table.column(name)) for name in table.column_names})

@@ -668,4 +668,4 @@ def test_a_missing_part_is_named_with_its_command(full: Any, tmp_path: Path) -> 
     with pytest.raises(RunFolderError, match="starcal-uq propagate RUN"):
         sc.Run(tmp_path / "run").budget()
     with pytest.raises(BudgetError, match="does not exist"):
-        sc.Run(full.path).budget(file=tmp_path / "none.toml")
+        sc.Run(full.path).budget(file=tmp_path / "none.toml", force=True)

@@ -248,7 +248,7 @@ def test_plan_refuses_what_it_cannot_mean(cli, run, tmp_path, small_plans):
     for wrong, word in (
         (("--after", "run", "--check", 10), "--check"),
         (("--max-mag", 30), "--max-mag '30': give a number from -2 to 10"),
-        (("--sigma", 300), "px per axis"),
+        (("--sigma", 300), "--sigma '300': give a number from 1e-06 to 100"),
     ):
         status, _, err = cli("plan", "camera.toml", "--frames", 30, *wrong)
         assert status == 2

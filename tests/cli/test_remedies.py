@@ -17,6 +17,7 @@ import starcal_uq as sc
 from starcal_uq.core.status import Level, Status
 from starcal_uq.diagnostics.verdict import draws, estimate, observed
 from starcal_uq.inference import checks
+from starcal_uq.runs.folder import FILES
 from tests.helpers.ground_scenes import NOMINAL, SITE, ground_frames
 from tests.helpers.outside import campaign
 from tests.helpers.scenes import observations
@@ -134,8 +135,10 @@ COMMANDS = {
     "calibrate OBS CAMERA -o RUN --screen": "--force",
     "compare RUN_A RUN_B -o DIR": "",
     "coupling RUN": "",
-    "propagate RUN": "--draws 50",
-    "propagate RUN --attitudes random": "--draws 50",
+    "budget RUN --force": "",
+    "propagate RUN": "--draws 50 --force",
+    "propagate RUN --attitudes random": "--draws 50 --force",
+    "propagate RUN --force": "--draws 50",
     "report RUN": "",
     "sample RUN": "--force --steps 20",
     "sample RUN --force": "--steps 20",
@@ -144,8 +147,8 @@ COMMANDS = {
 ELSEWHERE = {
     "centroid": "tests/cli/test_cli_images.py",
     "demo": "tests/cli/test_cli.py",
-    "diagnose": "tests/cli/test_cli_statistics.py",
     "diagnose RUN": "tests/cli/test_cli_statistics.py",
+    "diagnose RUN --force": "tests/cli/test_cli_statistics.py",
     "propagate RUN --attitudes PROFILE": "tests/cli/test_cli_mission.py",
     "reproduce": "tests/cli/test_cli_paper.py",
     "run IMAGES... CAMERA -o RUN": "tests/cli/test_cli_images.py",
@@ -256,6 +259,8 @@ def named(pattern):
 
 def test_every_command_in_a_sentence_can_be_executed(execute, root):
     commands = {re.sub(r"\{\}", "RUN", command) for command in named(r"`starcal-uq ([^`]*)`")}
+    # Those that make the files of a run.
+    commands |= {file.command.removeprefix("starcal-uq ") for file in FILES.values()}
     assert commands == COMMANDS.keys() | ELSEWHERE.keys()
     for command, more in COMMANDS.items():
         execute(command, more)

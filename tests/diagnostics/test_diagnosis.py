@@ -307,6 +307,7 @@ def test_diagnosis_of_a_run_is_stored_and_belongs_to_its_calibration(obs, cal, t
     with (run.path / DIAGNOSIS_TABLES["comparison"]).open() as stream:
         assert {row["model"] for row in csv.DictReader(stream)} == {"k1", "brown"}
     # The control: the diagnosis of another estimate is not shown with this one.
+    (run.path / "run.json").unlink()
     dataclasses.replace(cal, theta=cal.theta + 1e-9).save(run.calibration)
     assert sc.Run(run.path).diagnosis is None
     run.diagnosis.write_text("{}")
@@ -314,7 +315,7 @@ def test_diagnosis_of_a_run_is_stored_and_belongs_to_its_calibration(obs, cal, t
         _ = sc.Run(run.path).diagnosis
     observations(n_frames=60, seed=4).save(run.observations, force=True)
     with pytest.raises(sc.errors.RunFolderError, match="other observations"):
-        sc.Run(run.path).diagnose()
+        sc.Run(run.path).diagnose(force=True)
 
 
 def test_two_frames_have_no_jackknife_but_a_diagnosis(obs):

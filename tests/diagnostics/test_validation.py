@@ -14,7 +14,7 @@ import starcal_uq as sc
 from starcal_uq.attitude.rotations import left_error
 from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.constants import ARCSEC
-from starcal_uq.core.errors import CatalogueError, PriorError, RunFolderError, SamplingError
+from starcal_uq.core.errors import CatalogueError, PriorError, RunFolderError, SamplingError, SettingError
 from starcal_uq.diagnostics.validation.replicates import LOG_LIKELIHOOD, Study, run_replicate
 from starcal_uq.diagnostics.validation.result import Validation
 from starcal_uq.diagnostics.validation.validate import narrow_priors, validate, validate_study
@@ -390,7 +390,7 @@ def test_validate_from_the_camera_alone():
     ],
 )
 def test_bad_settings_are_one_sentence(options, words):
-    with pytest.raises(SamplingError, match=words):
+    with pytest.raises((SamplingError, SettingError), match=words):
         validate(sc.paper.paper_camera(), **options)
 
 

@@ -60,7 +60,8 @@ def gaussian_calibration(dof: int = 25_000, sigma: float = 0.05, **changes: Any)
         "star_errors": None,
         "noise_model": None,
     }
-    return SimpleNamespace(**{**values, **changes})
+    values |= changes
+    return SimpleNamespace(**values, remedy=values["status"].value)
 
 
 def gaussian_posterior(cal: Calibration, n: int = 4000, scale: float = 1.0, seed: int = 0) -> SimpleNamespace:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.core.errors import RunFolderError, SamplingError
+from starcal_uq.core.errors import RunFolderError, SamplingError, SettingError
 from starcal_uq.estimation.recursive.start import RecursionOptions
 from starcal_uq.paper.interaction import (
     AXES,
@@ -213,7 +213,7 @@ def test_a_method_that_fails_is_counted(monkeypatch):
     ],
 )
 def test_bad_settings_are_one_sentence(options, words):
-    with pytest.raises(SamplingError, match=words):
+    with pytest.raises((SamplingError, SettingError), match=words):
         interaction_study(**options)
 
 

@@ -90,6 +90,13 @@ def run(full, tmp_path):
     return sc.runs.RunFolder(tmp_path / "run")
 
 
+@pytest.fixture
+def unrecorded(run):
+    """A copy whose files a test may change, as those of versions without a record of the run."""
+    (run.path / "run.json").unlink()
+    return run
+
+
 def page(run) -> Page:
     return Page(run.report.read_text(encoding="utf-8"))
 
@@ -217,32 +224,32 @@ def test_misfit_section_shows_tests_jackknife_models_and_replicates(full):
     assert "Focal length" in text and "Common rotation, yaw" in text
 
 
-def test_without_diagnosis_or_with_that_of_another_estimate_the_command_is_named(run):
-    text = run.diagnosis.read_text(encoding="utf-8")
-    run.diagnosis.write_text(text.replace('"theta": [\n  5', '"theta": [\n  6'), encoding="utf-8")
+def test_without_diagnosis_or_with_that_of_another_estimate_the_command_is_named(unrecorded):
+    text = unrecorded.diagnosis.read_text(encoding="utf-8")
+    unrecorded.diagnosis.write_text(text.replace('"theta": [\n  5', '"theta": [\n  6'), encoding="utf-8")
     for _ in range(2):
-        found = words(run)
-        assert f"starcal-uq diagnose {run.path}" in found
+        found = words(unrecorded)
+        assert f"starcal-uq diagnose {unrecorded.path}" in found
         assert "Jackknife over frames" not in found
-        run.diagnosis.unlink(missing_ok=True)
+        unrecorded.diagnosis.unlink(missing_ok=True)
 
 
-def test_undeclared_directions_are_warned_of_before_any_table(run):
-    obs = sc.load_observations(run.observations)
-    obs.with_meta(directions="undeclared").save(run.observations, force=True)
-    text = words(run)
+def test_undeclared_directions_are_warned_of_before_any_table(unrecorded):
+    obs = sc.load_observations(unrecorded.observations)
+    obs.with_meta(directions="undeclared").save(unrecorded.observations, force=True)
+    text = words(unrecorded)
     assert text.index("Neither time nor observer velocity was declared") < text.index("95 % interval")
     assert "not declared as apparent" in text
 
 
-def test_without_truth_there_is_no_truth(run):
-    obs = sc.load_observations(run.observations)
+def test_without_truth_there_is_no_truth(unrecorded):
+    obs = sc.load_observations(unrecorded.observations)
     meta = {name: value for name, value in obs.meta.items() if name != "truth"}
-    dataclasses.replace(obs, meta=meta).save(run.observations, force=True)
-    assert "Truth" not in words(run)
-    assert "Truth" in words(run, camera())
+    dataclasses.replace(obs, meta=meta).save(unrecorded.observations, force=True)
+    assert "Truth" not in words(unrecorded)
+    assert "Truth" in words(unrecorded, camera())
     # A truth of another distortion model cannot be compared parameter by parameter.
-    assert "Truth" not in words(run, camera("brown3"))
+    assert "Truth" not in words(unrecorded, camera("brown3"))
 
 
 def test_a_failed_check_turns_the_verdict_red(full):
@@ -270,8 +277,11 @@ def test_names_from_outside_are_text_and_not_markup(full):
 def test_mixed_runs_are_refused_and_nothing_is_touched(run):
     before = run.report.read_bytes()
     observations(n_frames=60, seed=4).save(run.observations, force=True)
+    with pytest.raises(sc.errors.RunFolderError, match="parquet: is not the file that this run has written"):
+        sc.Run(run.path).report(force=True)
+    (run.path / "run.json").unlink()
     with pytest.raises(sc.errors.RunFolderError, match="other observations"):
-        sc.report(run.path)
+        sc.Run(run.path).report(force=True)
     assert run.report.read_bytes() == before
 
 
@@ -414,27 +424,30 @@ def stated_everywhere(run, capsys) -> dict[str, dict[str, list[str]]]:
 
 
 @pytest.mark.usefixtures("unpainted")
-def test_every_place_shows_the_same_two_figures_under_the_same_two_names(run, capsys):
+def test_every_place_shows_the_same_two_figures_under_the_same_two_names(unrecorded, capsys):
     found = MisfitFound(1.3, np.array([0.7, 0.3, 0.02]), np.array([0.52, 0.41, 7.3]), ("test",), ("test",))
-    error = dataclasses.replace(AttitudeError.load(run.attitude), misfit=found)
-    error.save(run.attitude)
-    sc.Run(run.path).budget()
+    error = dataclasses.replace(AttitudeError.load(unrecorded.attitude), misfit=found)
+    error.save(unrecorded.attitude)
+    sc.Run(unrecorded.path).budget()
     wanted = both_figures(error)
     assert wanted["with the misfit found"] != wanted["if the model holds"]
-    places = stated_everywhere(run, capsys)
+    places = stated_everywhere(unrecorded, capsys)
     assert len(places) == 11
     assert {place: figures for place, figures in places.items() if figures != wanted} == {}
     # Control: one source that has its own idea is noticed.
     other = dataclasses.replace(error, misfit=dataclasses.replace(found, rest_arcsec=2.0 * found.rest_arcsec))
-    other.save(run.attitude)
-    differing = {place for place, figures in stated_everywhere(run, capsys).items() if figures != wanted}
+    forget = (unrecorded.path / "run.json").unlink
+    forget()
+    other.save(unrecorded.attitude)
+    differing = {place for place, figures in stated_everywhere(unrecorded, capsys).items() if figures != wanted}
     assert "attitude.csv" in differing and "budget.csv" not in differing
     # Never equal to the first by silence.
-    dataclasses.replace(error, misfit=None).save(run.attitude)
-    sc.Run(run.path).budget()
-    opened = sc.Run(run.path)
+    forget(missing_ok=True)
+    dataclasses.replace(error, misfit=None).save(unrecorded.attitude)
+    sc.Run(unrecorded.path).budget(force=True)
+    opened = sc.Run(unrecorded.path)
     for text in (
-        run.attitude.read_text(encoding="utf-8"),
+        unrecorded.attitude.read_text(encoding="utf-8"),
         opened.attitude._repr_html_(),
         opened.error_budget._repr_html_(),
         render(opened.results, {}),

@@ -43,7 +43,7 @@ def propagation(error: AttitudeError) -> Check:
         else "Draws through QUEST and first-order propagation differ: prefer the draws, and raise their number."
     )
     value = f"sigmas within {percent(largest)}"
-    remedy = "" if good else f"starcal-uq propagate RUN --draws {4 * error.n_draws}"
+    remedy = "" if good else f"starcal-uq propagate RUN --force --draws {4 * error.n_draws}"
     level = pass_or_warn(good)
     return Check("Propagation to attitude", Question.TRUSTWORTHY, level, value, f"≤ {percent(bound)}", sentence, remedy)
 
