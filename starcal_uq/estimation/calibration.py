@@ -284,6 +284,7 @@ class Calibration(Shown):
         path, remedy = Path(path), "run `starcal-uq calibrate` again"
         with reading(path, "a calibration", remedy):
             document = json.loads(path.read_text(encoding="utf-8"))
-            with reading(path.with_suffix(".npz"), "the archive of a calibration", remedy):
-                arrays = read_arrays(path.with_suffix(".npz"))
+        with reading(path.with_suffix(".npz"), "the archive of a calibration", remedy):
+            arrays = read_arrays(path.with_suffix(".npz"))
+        with reading(path, "a calibration", remedy):
             return from_plain(cls, document, arrays)
