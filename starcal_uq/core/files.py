@@ -64,6 +64,13 @@ def check_new_folder(path: PathLike, force: bool = False) -> None:
         )
 
 
+def sweep_temporary(folder: PathLike) -> None:
+    """Remove files that a killed process was writing in a folder."""
+    for path in Path(folder).glob(".*"):
+        if TEMPORARY.match(path.name):
+            path.unlink(missing_ok=True)
+
+
 def new_folder(path: PathLike) -> Path:
     """Make a folder, with its parents, if it does not exist."""
     path = Path(path)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import UNFINISHED, PathLike, atomic_path, new_folder, read_parquet, reading
+from starcal_uq.core.files import UNFINISHED, PathLike, atomic_path, new_folder, read_parquet, reading, sweep_temporary
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import to_plain
 from starcal_uq.core.types import AnyDict
@@ -164,5 +164,6 @@ def _plain(value: Any) -> Any:
 
 
 def finished(folder: PathLike) -> None:
-    """Remove what a command has kept, now that its results are written."""
+    """Remove what a command has kept, now that its results are written, and what killed ones have left."""
+    sweep_temporary(folder)
     shutil.rmtree(Path(folder) / UNFINISHED, ignore_errors=True)

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
 
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import STEP, TEMPORARY, flush_folder
+from starcal_uq.core.files import STEP, flush_folder, sweep_temporary
 from starcal_uq.core.records import read_json, write_json
 from starcal_uq.core.types import AnyDict
 
@@ -198,9 +198,7 @@ def discard(folder: Path, stage: str) -> None:
 def sweep(folder: Path) -> None:
     """Remove what a killed process has left: temporary files, and a step that does not count."""
     discard(folder, STEP)
-    for path in folder.glob(".*"):
-        if TEMPORARY.match(path.name):
-            path.unlink(missing_ok=True)
+    sweep_temporary(folder)
 
 
 @contextmanager
