@@ -360,8 +360,10 @@ class Sweep:
         chosen = {self.axes[i]: self.values[self.axes[i]][int(places[j, best])] for j, i in enumerate(free)}
         return chosen | given
 
-    def pooled(self, numbers: FloatArray, along: str, at: Mapping[str, Any] | None = None) -> FloatArray:
-        """Median of a number at every value of an axis, over seeds and all axes that `at` does not hold.
+    def pooled(
+        self, numbers: FloatArray, along: str, at: Mapping[str, Any] | None = None, statistic: Statistic = "median"
+    ) -> FloatArray:
+        """A statistic of a number at every value of an axis, over seeds and all axes that `at` does not hold.
 
         Raises
         ------
@@ -370,7 +372,7 @@ class Sweep:
         """
         self._check(along)
         others = [axis for axis in self.axes if axis != along]
-        return self.over(numbers, "median", others, self._cells(at or {})).ravel()
+        return self.over(numbers, statistic, others, self._cells(at or {})).ravel()
 
     def _cells(self, at: Mapping[str, Any]) -> BoolArray:
         """Cells (C,) at values of axes."""

@@ -18,7 +18,7 @@ from starcal_uq.core.files import PathLike, atomic_path, check_hdf5, new_folder,
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.studies.axes import AXES
 from starcal_uq.studies.definition import StudyDefinition
-from starcal_uq.studies.findings import Sweep, cross
+from starcal_uq.studies.findings import Statistic, Sweep, cross
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -136,7 +136,7 @@ class Study(Shown):
         """
         labels = {_PARAMETER: parameter, _OTHER: parameter_2, _AXIS: axis, _SIMPLER: simpler}
         if variable == "frames_needed" and variable not in self.data:
-            raise StudyError("the study has no target: use frames_for(target_arcsec).")
+            raise StudyError("the study has no target: use needed(along, target_arcsec).")
         if variable not in self.data:
             raise StudyError(f"the study has no variable {variable!r}: use one of {', '.join(map(str, self.data))}.")
         array = self.data[variable]
@@ -164,35 +164,76 @@ class Study(Shown):
         curve, factors, frames = (self.data[name].values for name in ("error_curve_arcsec", _FACTOR, "n_frames"))
         return frames_for(curve, factors, frames, target_arcsec)
 
+    def band(
+        self, variable: str, along: str, *, at: Mapping[str, Any] | None = None, **labels: str | None
+    ) -> pd.DataFrame:
+        """A variable along an axis, over seeds and all axes that `at` does not hold.
+
+        Parameters
+        ----------
+        variable, **labels
+            As for `values`.
+        along : str
+            The axis.
+        at : dict, optional
+            Values at which other axes are held; none by default.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Columns ``value`` (of the axis), ``median``, ``low``, ``high`` (least and most), ``n`` (cells).
+
+        Raises
+        ------
+        StudyError
+            For an axis or a value that is not in the sweep, and as `values` does.
+        """
+        return self._band(self.values(variable, **labels), along, at)
+
+    def _band(self, numbers: FloatArray, along: str, at: Mapping[str, Any] | None) -> pd.DataFrame:
+        import pandas as pd
+
+        names: dict[str, Statistic] = {"median": "median", "low": "low", "high": "high", "n": "count"}
+        try:
+            columns = {name: self.sweep.pooled(numbers, along, at, statistic) for name, statistic in names.items()}
+        except ValueError as error:
+            raise StudyError(str(error)) from None
+        return pd.DataFrame({"value": self.sweep.values[along], **columns})
+
+    def needed(
+        self, along: str, target_arcsec: float | None = None, *, at: Mapping[str, Any] | None = None
+    ) -> pd.DataFrame:
+        """Frames that a target takes, along an axis, as `band` gives a variable; by default the study's own target.
+
+        Raises
+        ------
+        StudyError
+            Without a target, and as `band` does.
+        """
+        return self._band(self.frames_for(self._target(target_arcsec)), along, at)
+
+    def _target(self, target_arcsec: float | None) -> float:
+        target = self.definition.target_arcsec if target_arcsec is None else target_arcsec
+        if target is None or not target > 0.0:
+            raise StudyError("no target is set: give target_arcsec above zero, here or in [study].")
+        return target
+
     def met(
         self, along: str, target_arcsec: float | None = None, *, at: Mapping[str, Any] | None = None
     ) -> list[float]:
         """Values of an axis of numbers at which the median frame-dependent error crosses the target, interpolated.
 
-        Parameters
-        ----------
-        along : str
-            The axis.
-        target_arcsec : float, optional
-            Error across the boresight per axis, 1 sigma, arcsec; the study's own target by default.
-        at : dict, optional
-            Values at which other axes are held; the median is over all of theirs by default.
-
         Raises
         ------
         StudyError
-            Without a target, along names, or for an axis or a value that is not in the sweep.
+            Without a target, along names, and as `band` does.
         """
-        target = self.definition.target_arcsec if target_arcsec is None else target_arcsec
-        if target is None or not target > 0.0 or AXES[along].kind == "name":
-            raise StudyError("give target_arcsec above zero, and an axis of numbers.")
-        try:
-            median = self.sweep.pooled(self.sweep.frame_error, along, at)
-        except ValueError as error:
-            raise StudyError(str(error)) from None
-        known = np.isfinite(median)
-        value = np.asarray(self.sweep.values[along], dtype=np.float64)[known]
-        excess = np.log(median[known] / target)
+        target = self._target(target_arcsec)
+        if AXES[along].kind == "name":
+            raise StudyError(f"{along} has names for values: give an axis of numbers.")
+        table = self._band(self.sweep.frame_error, along, at).dropna()
+        value = table["value"].to_numpy(dtype=np.float64)
+        excess = np.log(table["median"].to_numpy(dtype=np.float64) / target)
         changes = np.flatnonzero(np.sign(excess[:-1]) * np.sign(excess[1:]) < 0)
         return [float(value[i] + (value[i + 1] - value[i]) * excess[i] / (excess[i] - excess[i + 1])) for i in changes]
 

@@ -113,7 +113,7 @@ def test_broken_files_are_named(tmp_path: Path) -> None:
     np.save(tmp_path / "array.npy", np.zeros(3))
     with pytest.raises(RunFolderError, match="is not a field map"):
         FieldMap.load(tmp_path / "array.npy")
-    with pytest.raises(RunFolderError, match=r"none\.npz: cannot be read .*; run `starcal-uq propagate RUN`"):
+    with pytest.raises(RunFolderError, match=r"none\.npz: cannot be read .*; run `starcal-uq propagate RUN --force`"):
         FieldMap.load(tmp_path / "none.npz")
 
 

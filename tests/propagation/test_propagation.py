@@ -430,7 +430,7 @@ def test_broken_files_are_named(tmp_path: Path, text: str) -> None:
     path.write_text(text)
     with pytest.raises(RunFolderError, match=r"attitude\.csv: is not a table of attitude errors"):
         AttitudeError.load(path)
-    with pytest.raises(RunFolderError, match=r"none\.csv: cannot be read .*; run `starcal-uq propagate RUN`"):
+    with pytest.raises(RunFolderError, match=r"none\.csv: cannot be read .*; run `starcal-uq propagate RUN --force`"):
         AttitudeError.load(tmp_path / "none.csv")
 
 

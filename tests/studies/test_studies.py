@@ -169,7 +169,7 @@ def test_frames_that_a_target_takes_give_it() -> None:
         np.ceil(250 * (first.values("sigma", parameter="f")[0] / 0.05) ** 2),
         atol=1,
     )
-    assert np.all(np.diff(first.sweep.pooled(first.frames_for(0.02), "sigma_px")) > 0.0)
+    assert first.needed("sigma_px")["median"].is_monotonic_increasing
     assert np.isnan(first.data["frames_needed_sigma"].sel(parameter="x0").values).all()
     assert first.met("sigma_px", float(np.sqrt(error[3] * error[4])), at={"frames": 1000})[0] == pytest.approx(
         0.075, abs=0.01
@@ -412,19 +412,18 @@ def test_templates_are_definitions_with_a_question(name: str, tmp_path: Path) ->
 def test_a_hypercube_is_grouped_along_its_axes() -> None:
     span = {"start": 0.02, "stop": 0.3, "spacing": "log"}
     found = sc.study(definition(sweep={}, latin={"sigma_px": span}, latin_n=60, geometries=100), workers=0)
-    sweep, sigma = found.sweep, found.values("sigma", parameter="f")
-    median = sweep.pooled(sigma, "sigma_px")
-    assert len(median) == 6
-    assert sweep.over(sigma, "count").sum() == 60
-    assert np.all(np.diff(median) > 0.0)
+    band = found.band("sigma", "sigma_px", parameter="f")
+    assert len(band) == 6
+    assert band["n"].sum() == 60
+    assert band["median"].is_monotonic_increasing
 
 
 def test_questions_that_have_no_answer(small: Study) -> None:
     for ask, words in (
         (lambda: small.values("sigma"), "sigma needs parameter=: give one of x0, y0, f, k1, k2"),
         (lambda: small.values("sigmas"), "no variable 'sigmas'"),
-        (lambda: small.met("fov_deg", 1.0), "'fov_deg' was not swept"),
-        (lambda: small.met("frames"), "give target_arcsec above zero"),
+        (lambda: small.band("sigma", "fov_deg", parameter="f"), "'fov_deg' was not swept"),
+        (lambda: small.needed("frames"), "no target is set"),
         (lambda: small.met("frames", 1.0, at={"sigma_px": 3.0}), "sigma_px has no value 3.0"),
     ):
         with pytest.raises(StudyError, match=words):
