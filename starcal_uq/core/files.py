@@ -58,7 +58,10 @@ def check_new_folder(path: PathLike, force: bool = False) -> None:
     if path.exists() and not path.is_dir():
         raise RunFolderError(f"{path}: is a file, not a folder for results; name another folder.")
     names = [inside.name for inside in path.iterdir()] if path.is_dir() else []
-    if not force and any(name not in (UNFINISHED, STEP) and not TEMPORARY.match(name) for name in names):
+    # What a command has not finished, it goes on with, whatever it had written by then.
+    if force or UNFINISHED in names:
+        return
+    if any(name != STEP and not TEMPORARY.match(name) for name in names):
         raise RunFolderError(
             f"{path}: the folder exists and is not empty; name another, or replace its results with --force."
         )

@@ -192,7 +192,8 @@ def test_a_command_that_is_stopped_goes_on_to_the_same_result(command: str, give
     if statuses[-1] not in (0, 1):
         process = start(folder, *words.split())
         _, err = process.communicate(timeout=120)
-        assert process.returncode in (0, 1), err
+        # One that was stopped after its last file is complete, and what is complete is kept.
+        assert process.returncode in (0, 1) or "is not empty" in err, err
     for name in compared:
         # But for the time of day in a provenance, and the time that identification took.
         one, other = (CLOCK.sub(b"", (place / "out" / name).read_bytes()) for place in (folder, whole))
