@@ -100,7 +100,8 @@ def _again(unraisable: Any) -> None:
 
 
 def _fail(message: str, status: int) -> None:
+    from starcal_uq.core.errors import printable
+
     # Names of files may hold anything, and a message is one line.
-    line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in message.strip())
-    print(f"error: {line}", file=sys.stderr)
+    print(f"error: {printable(message.strip())}", file=sys.stderr)
     sys.exit(status)

@@ -28,11 +28,15 @@ class StarcalError(Exception):
 _LONGEST_WORD, _LONGEST = 250, 450
 
 
+def printable(text: str) -> str:
+    """A text with escapes for what does not print; line feeds are among it."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
 def _one_line(message: str) -> str:
     if message.isprintable() and len(message) <= _LONGEST_WORD:
         return message
-    line = " ".join(message.splitlines())
-    line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+    line = printable(" ".join(message.splitlines()))
     line = re.sub(rf"\S{{{_LONGEST_WORD},}}", lambda word: f"{word[0][:40]}...{word[0][-20:]}", line)
     return line if len(line) <= _LONGEST else f"{line[:290]} ... {line[-100:]}"
 
