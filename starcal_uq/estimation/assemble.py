@@ -28,6 +28,7 @@ from starcal_uq.estimation.undetermined import EXPLAINED, WEAK, open_parameters,
 from starcal_uq.maths.linear import scaled_inverse, symmetric_inverse
 
 if TYPE_CHECKING:
+    from starcal_uq.observations.frames import StarFrames
     from starcal_uq.observations.table import Observations
 
 # Noise above this fraction of the detector's width means that the stars are not the ones they are said to be.
@@ -213,12 +214,17 @@ def noise_px(likelihood: MarginalLikelihood, theta: FloatArray) -> float:
     `likelihood` starts its later attitude searches from those found here.
     """
     found = likelihood.sums(theta, tolerance=_NEARLY_RAD)
-    cost = found[0].normal.cost
+    noise = noise_of(found[0].normal.cost, likelihood.frames)
+    if np.isfinite(noise):
+        likelihood.use_sums(*found)
+    return noise
+
+
+def noise_of(cost: float, frames: StarFrames) -> float:
+    """As `noise_px`, from the sum of squares over these frames."""
     if not np.isfinite(cost):
         return float("inf")
-    likelihood.use_sums(*found)
-    weight = likelihood.frames.weight
-    return float(np.sqrt(cost / (2.0 * (likelihood.frames.n_stars if weight is None else np.sum(weight**2)))))
+    return float(np.sqrt(cost / (2.0 * (frames.n_stars if frames.weight is None else np.sum(frames.weight**2)))))
 
 
 def check_noise(noise: float, camera: Camera, status: Status) -> Status:

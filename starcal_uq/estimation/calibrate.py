@@ -25,6 +25,7 @@ from starcal_uq.estimation.assemble import (
     check_camera,
     check_noise,
     failed,
+    noise_of,
     noise_px,
     with_star_errors,
 )
@@ -359,7 +360,7 @@ def refit(obs: Observations, cal: Calibration, model: str) -> Fit:
 def _fitted(likelihood: MarginalLikelihood, camera: Camera, theta: FloatArray, status: Status) -> Fit:
     raise_unless_good(check_camera(camera.with_theta(theta), status))
     sums, attitudes = likelihood.sums(theta)
-    raise_unless_good(check_noise(noise_px(likelihood, theta), camera, Status.CONVERGED))
+    raise_unless_good(check_noise(noise_of(sums.normal.cost, likelihood.frames), camera, Status.CONVERGED))
     return Fit(theta, sums.normal.cost, attitudes.rotations)
 
 
@@ -410,7 +411,11 @@ def _noise_at(pairs: PairObjective, likelihood: MarginalLikelihood, theta: Float
 
 def _strayed(stage: Stage, camera: Camera) -> bool:
     """Whether a stage did not converge, or ended far from the nominal principal point."""
-    return not stage.status.ok or float(np.max(np.abs(stage.theta[:2] - camera.theta[:2]))) > _FAR * camera.width_px
+    return not stage.status.ok or _far(stage, camera)
+
+
+def _far(stage: Stage, camera: Camera) -> bool:
+    return float(np.max(np.abs(stage.theta[:2] - camera.theta[:2]))) > _FAR * camera.width_px
 
 
 def _with_noise_model(obs: Observations, camera: Camera, method: str, solver: str, max_iterations: int) -> Calibration:
@@ -536,8 +541,7 @@ def _pair_stages(
     if len(camera.theta) > 3 and stages[0].status is not Status.NOT_FINITE:
         stages.append(distortion_stage(frames, camera, stages[0].theta))
         stages.append(joint_stage(pairs, camera, stages[1].theta, solver, max_iterations, tolerance))
-        moved = float(np.max(np.abs(stages[0].theta[:2] - camera.theta[:2])))
-        if not stages[-1].status.ok or moved > _FAR * camera.width_px:
+        if not stages[-1].status.ok or _far(stages[0], camera):
             # Distortion of tens of pixels pulls the undistorted fit far from the axis, and the linear stage may then
             # lead to another minimum or into a fold; the nominal optics without distortion are the safer start.
             start = np.concatenate([camera.theta[:3], np.zeros(len(camera.theta) - 3)])
