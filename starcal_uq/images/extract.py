@@ -118,24 +118,18 @@ def extract_centroids(
     if workers is None:
         workers = processors() if len(sources) >= _WORTH_PROCESSES else 0
     table = _Table()
-    if workers > 0:
-        frames, interrupted = run_tasks(
-            task,
-            len(sources),
-            caller="starcal_uq.images.extract_centroids",
-            chunk=_CHUNK,
-            workers=workers,
-            progress=progress,
-        )
-        if interrupted:
-            raise KeyboardInterrupt
-        for frame in frames:
-            table.add(frame)
-    else:
-        for number in range(len(sources)):
-            table.add(task(number))
-            if progress is not None:
-                progress(number + 1, len(sources))
+    frames, interrupted = run_tasks(
+        task,
+        len(sources),
+        caller="starcal_uq.images.extract_centroids",
+        chunk=_CHUNK,
+        workers=workers,
+        progress=progress,
+    )
+    if interrupted:
+        raise KeyboardInterrupt
+    for frame in frames:
+        table.add(frame)
     return table.centroids(options, correct_pixel_phase)
 
 
