@@ -14,7 +14,8 @@ from starcal_uq.cli import run as cli_run
 from starcal_uq.cli import statistics as cli_statistics
 from starcal_uq.cli import steps as cli_steps
 from starcal_uq.cli import study as cli_study
-from starcal_uq.core.settings import clipped, wanted
+from starcal_uq.core.files import shown
+from starcal_uq.core.settings import wanted
 from starcal_uq.core.types import AnyDict
 
 app = typer.Typer(
@@ -65,6 +66,6 @@ def _problem(parameter: Any, value: object) -> str:
     """What is wrong with a value that does not fit the declaration of its parameter."""
     kind = parameter.type_descriptor
     if kind.choices is not None:
-        return f"{clipped(value)} is unknown: use one of {', '.join(kind.choices)}."
+        return f"{shown(value)} is unknown: use one of {', '.join(kind.choices)}."
     kinds = {kind.annotation, *get_args(kind.annotation)}
-    return f"{clipped(value)}: {wanted(parameter.min, parameter.max, int in kinds)}."
+    return f"{shown(value)}: {wanted(parameter.min, parameter.max, int in kinds)}."

@@ -12,7 +12,8 @@ import typer
 
 from starcal_uq.core import settings
 from starcal_uq.core.errors import StarcalError
-from starcal_uq.core.settings import EPOCH, LIMITS, Limit, clipped
+from starcal_uq.core.files import shown
+from starcal_uq.core.settings import EPOCH, LIMITS, Limit
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -34,7 +35,7 @@ def number(limit: str | Limit, text: str, *names: str, least: float | None = Non
 
 
 def _refuse(value: object, problem: str) -> typer.BadParameter:
-    return typer.BadParameter(f"{clipped(str(value))}: {problem}.")
+    return typer.BadParameter(f"{shown(str(value))}: {problem}.")
 
 
 def _mode(path: Path) -> int | None:
@@ -82,7 +83,7 @@ def write_path(value: str | Path) -> Path:
             mode = _mode(parent)
             if mode is not None:
                 if not stat.S_ISDIR(mode):
-                    raise _refuse(path, f"cannot be made, because {clipped(str(parent))} is a file")
+                    raise _refuse(path, f"cannot be made, because {shown(str(parent))} is a file")
                 break
     return path
 
@@ -101,7 +102,7 @@ def parse_columns(pairs: list[str] | None) -> dict[str, str]:
     for pair in pairs or []:
         name, separator, in_file = pair.partition("=")
         if not (name and separator and in_file):
-            raise typer.BadParameter(f"{clipped(pair)} is not NAME=IN_FILE, such as ra_deg=ra_apparent_deg.")
+            raise typer.BadParameter(f"{shown(pair)} is not NAME=IN_FILE, such as ra_deg=ra_apparent_deg.")
         found[name] = in_file
     return found
 
@@ -113,9 +114,9 @@ def parse_velocity(text: str | None) -> tuple[float, float, float] | None:
     try:
         x, y, z = (float(part) for part in text.split(","))
     except ValueError:
-        raise typer.BadParameter(f"{clipped(text)} is not three numbers in km/s, such as 7.5,0.0,0.0.") from None
+        raise typer.BadParameter(f"{shown(text)} is not three numbers in km/s, such as 7.5,0.0,0.0.") from None
     if not _VELOCITY.holds([x, y, z]):
-        raise typer.BadParameter(f"{clipped(text)} is no velocity in km/s: {_VELOCITY.wanted()}.")
+        raise typer.BadParameter(f"{shown(text)} is no velocity in km/s: {_VELOCITY.wanted()}.")
     return x, y, z
 
 
@@ -125,7 +126,7 @@ def parse_labels(text: str | None) -> tuple[str, str] | None:
         return None
     first, comma, second = (part.strip() for part in text.partition(","))
     if not (first and comma and second) or first == second or not text.isprintable() or len(text) > _LONGEST_LABELS:
-        raise typer.BadParameter(f"{clipped(text)} is not two different short names such as cold,hot.")
+        raise typer.BadParameter(f"{shown(text)} is not two different short names such as cold,hot.")
     return first, second
 
 
@@ -140,7 +141,7 @@ def _check_time(text: str) -> None:
 
 def _check_text(text: str) -> None:
     if not text.strip() or not text.isprintable() or len(text) > _LONGEST_ADDRESS:
-        raise typer.BadParameter(f"{clipped(text)} is no address, such as tcp://10.0.0.1:8786.")
+        raise typer.BadParameter(f"{shown(text)} is no address, such as tcp://10.0.0.1:8786.")
 
 
 def check_word_or_file(text: str) -> None:

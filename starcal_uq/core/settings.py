@@ -15,6 +15,7 @@ from numbers import Integral, Real
 from typing import Any, Literal, ParamSpec, TypeVar
 
 from starcal_uq.core.errors import SettingError
+from starcal_uq.core.files import shown
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -126,7 +127,7 @@ def bounded(function: Callable[P, R]) -> Callable[P, R]:
         given: Iterable[tuple[str, Any]] = (*zip(names, args, strict=False), *kwargs.items())
         for name, value in given:
             if name in limits and not limits[name].holds(value):
-                raise SettingError(f"{name} is {clipped(value)}: {limits[name].wanted()}.")
+                raise SettingError(f"{name} is {shown(value)}: {limits[name].wanted()}.")
         return function(*args, **kwargs)
 
     return checked
@@ -144,13 +145,3 @@ def check_memory(setting: str, n_bytes: float) -> None:
             f"{setting}: the result needs {n_bytes / 1e9:.3g} GB of memory at the least, and this machine has "
             f"{installed / 1e9:.3g} GB: give less."
         )
-
-
-def clipped(value: object, most: int = 60) -> str:
-    """A value as it would be typed, not longer than is needed to know it."""
-    try:
-        text = repr(value)
-    except ValueError:
-        # Python writes no whole number of more than 4300 digits.
-        text = "a number of thousands of digits"
-    return text if len(text) <= most else f"{text[: most // 2]}...{text[-most // 4 :]}"

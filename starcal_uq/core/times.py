@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.core.errors import CatalogueError
-from starcal_uq.core.settings import clipped
+from starcal_uq.core.files import shown
 from starcal_uq.core.types import FloatArray, IntArray
 
 FIRST_YEAR, LAST_YEAR = 1960, 2100
@@ -73,7 +73,7 @@ def utc_text(time: str) -> str:
     if match is not None and match[4] is None and match[7] is None:
         # Dates that do not exist are named as such.
         julian_days(time)
-        raise CatalogueError(f"The time {clipped(time)} is a date without a time of day; write it as {_EXAMPLE}.")
+        raise CatalogueError(f"The time {shown(time)} is a date without a time of day; write it as {_EXAMPLE}.")
     try:
         if match is None or match[4] is None:
             raise ValueError("not ISO 8601")
@@ -110,7 +110,7 @@ def utc_of_scale(time: datetime, scale: str) -> datetime:
 
 def _unreadable(text: str, place: str = "") -> CatalogueError:
     years = f"between {FIRST_YEAR} and {LAST_YEAR}"
-    return CatalogueError(f"The time {clipped(text)}{place} is not a UTC time {years}; write it as {_EXAMPLE}.")
+    return CatalogueError(f"The time {shown(text)}{place} is not a UTC time {years}; write it as {_EXAMPLE}.")
 
 
 def _days(text: str, times: Any, ut1_minus_utc_s: float) -> tuple[tuple[float, float], tuple[float, float]]:

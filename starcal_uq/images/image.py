@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import io
 import math
 import os
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.errors import ImageError
-from starcal_uq.core.files import check_fits, check_size
+from starcal_uq.core.files import check_fits, check_size, unpack
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.times import FIRST_YEAR, LAST_YEAR, utc_of_scale
 from starcal_uq.core.types import AnyDict
@@ -36,7 +35,6 @@ LARGEST_COUNTS = 1e30
 _LUMINANCE = (0.299, 0.587, 0.114)
 # Full scale of the converters that write into 16 bits without shifting.
 _FULL_SCALES = (1023, 4095, 16383)
-_PIECE_BYTES = 1 << 22
 # What the comment of GAIN says where it is electrons per count.
 _PER_COUNT = re.compile(r"electron|\be-? ?(/|per )", re.IGNORECASE | re.ASCII)
 _SIZES = re.compile(rb"NAXIS[1-9] *= *(\d{1,20})")
@@ -223,23 +221,25 @@ def _check_declared(path: Path, declared: int, stored: int) -> None:
     try:
         check_size(declared, stored)
     except ValueError as error:
-        raise ImageError(
-            f"{path}: the file is damaged ({error}); copy it again, or save the image without compression."
-        ) from None
+        raise _too_much(path, error) from None
+
+
+def _too_much(path: Path, error: ValueError) -> ImageError:
+    return ImageError(f"{path}: the file is damaged ({error}); copy it again, or save the image without compression.")
 
 
 def _unpacked(path: Path, data: bytes) -> bytes:
     """Content of a file of gzip."""
     content = bytearray()
     try:
-        with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
-            while piece := file.read(_PIECE_BYTES):
-                if not content:
-                    # What the first header says spares the rest.
-                    sizes = _SIZES.findall(piece.partition(b"END" + b" " * 77)[0])
-                    _check_declared(path, math.prod(map(int, sizes)) if sizes else 0, len(data))
-                content += piece
-                _check_declared(path, len(content), len(data))
+        for piece in unpack(data):
+            if not content:
+                # What the first header says spares the rest.
+                sizes = _SIZES.findall(piece.partition(b"END" + b" " * 77)[0])
+                _check_declared(path, math.prod(map(int, sizes)) if sizes else 0, len(data))
+            content += piece
+    except ValueError as error:
+        raise _too_much(path, error) from None
     except (OSError, EOFError, zlib.error) as error:
         raise _broken(path) from error
     return bytes(content)

@@ -7,7 +7,6 @@ at hand, the description of the few needed columns below is used in its place.
 
 from __future__ import annotations
 
-import gzip
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from starcal_uq.core.errors import CatalogueError
-from starcal_uq.core.files import check_packed, reading
+from starcal_uq.core.files import reading, unpack
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.sky.catalogue import StarCatalogue
 
@@ -306,10 +305,7 @@ def _needed(section: str, layout: _Layout) -> list[str] | None:
 def _text(path: Path) -> str:
     """A text file, unpacked if it is compressed; every byte is one character."""
     with reading(path, "a readable text", "check the path and its permissions", CatalogueError):
-        check_packed(path)
-        data = path.read_bytes()
-        if data[:2] == b"\x1f\x8b":
-            data = gzip.decompress(data)
+        data = b"".join(unpack(path.read_bytes()))
     return data.decode("latin-1").replace("\r\n", "\n")
 
 

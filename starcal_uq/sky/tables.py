@@ -3,7 +3,6 @@ CDS."""
 
 from __future__ import annotations
 
-import gzip
 import re
 import warnings
 from collections.abc import Mapping, Sequence
@@ -14,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from starcal_uq.core.errors import CatalogueError
-from starcal_uq.core.files import check_fits, check_packed, reading
+from starcal_uq.core.files import check_fits, reading, unpack
 from starcal_uq.core.types import FloatArray, IntArray, StrArray
 from starcal_uq.sky.catalogue import StarCatalogue, check_epoch, prepare
 from starcal_uq.sky.cds import CdsFormat, read_cds
@@ -129,7 +128,6 @@ def read_catalogue(
         raise CatalogueError(f"{path}: does not exist; check the path.")
     kind = _format_of(path) if format is None else format
     with reading(path, f"readable as {kind.upper()}", "check the file", CatalogueError):
-        check_packed(path)
         if kind in ("hipparcos", "sao", "bsc"):
             if columns is not None or file_epoch is not None:
                 raise CatalogueError(f"{path}: the columns and the epoch of format {kind!r} are fixed; leave them out.")
@@ -227,9 +225,9 @@ def _load_table(path: Path, kind: Format) -> Any:
         "ecsv": {"format": "ascii.ecsv"},
         "fits": {"format": "fits"},
     }[kind]
+    content = b"".join(unpack(path.read_bytes()))
     if kind == "fits":
-        content = path.read_bytes()
-        check_fits(gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content)
+        check_fits(content)
     with warnings.catch_warnings():
         # What is odd matters only in a column that is used, whose conversion complains about it; but a cut-off file is
         # no catalogue.
