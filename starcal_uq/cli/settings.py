@@ -208,7 +208,7 @@ def refuse_others(images: bool, sky: SkySettings, of_images: ImageSettings) -> N
 
 def command_of(name: str, settings: Mapping[str, Any], files: Mapping[str, Path]) -> AnyDict:
     """All that the result of a command depends on: what it was told, and hashes of the files that it reads."""
-    from starcal_uq.runs.manifest import identity
+    from starcal_uq.core.manifest import identity
 
     told: AnyDict = {}
     for key, value in settings.items():

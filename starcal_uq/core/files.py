@@ -56,8 +56,7 @@ def ensure_new(path: PathLike, force: bool = False) -> None:
 def check_new_folder(path: PathLike, force: bool = False) -> None:
     """Refuse a folder that holds anything, unless forced, or a file in its place; called before any work is done."""
     path = Path(path)
-    if path.exists() and not path.is_dir():
-        raise RunFolderError(f"{path}: is a file, not a folder for results; name another folder.")
+    _refuse_file(path)
     names = [inside.name for inside in path.iterdir()] if path.is_dir() else []
     # What a command has not finished, it goes on with, whatever it had written by then.
     if force or UNFINISHED in names:
@@ -66,6 +65,12 @@ def check_new_folder(path: PathLike, force: bool = False) -> None:
         raise RunFolderError(
             f"{path}: the folder exists and is not empty; name another, or replace its results with --force."
         )
+
+
+def _refuse_file(path: Path) -> None:
+    # os.path, because Path.exists raises in a folder that may not be searched.
+    if os.path.exists(path) and not os.path.isdir(path):
+        raise RunFolderError(f"{path}: is a file, not a folder for results; name another folder.")
 
 
 def sweep_temporary(folder: PathLike) -> None:
@@ -78,6 +83,7 @@ def sweep_temporary(folder: PathLike) -> None:
 def new_folder(path: PathLike) -> Path:
     """Make a folder, with its parents, if it does not exist."""
     path = Path(path)
+    _refuse_file(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:

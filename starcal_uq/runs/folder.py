@@ -16,21 +16,22 @@ from pathlib import Path
 
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import STEP, PathLike, as_plain, check_new_folder, new_folder
-from starcal_uq.core.types import AnyDict
-from starcal_uq.runs.manifest import (
+from starcal_uq.core.manifest import (
     MANIFEST,
     NEW,
-    Entry,
     Manifest,
     alone,
     check_file,
     commit,
-    discard,
     entry_of,
+    files_in,
     read_manifest,
+    refuse_others,
+    staged,
     sweep,
     write_manifest,
 )
+from starcal_uq.core.types import AnyDict
 
 _CALIBRATE = "starcal-uq calibrate OBS CAMERA -o RUN"
 
@@ -197,6 +198,13 @@ class RunFolder:
         return [name for name, entry in self.manifest.files.items() if entry.step in REST_ON[step]]
 
     @contextmanager
+    def writing(self, *, make: bool = False) -> Iterator[None]:
+        """No other process may write into the folder meanwhile, which `make` makes."""
+        with alone(self.path, make=make):
+            refuse_others(self.path, REST_ON)
+            yield
+
+    @contextmanager
     def step(
         self, step: str, record: AnyDict, *, making: bool = False, tell: Callable[[str], None] | None = None
     ) -> Iterator[RunFolder]:
@@ -214,15 +222,13 @@ class RunFolder:
             Function that gets the sentence on what goes.
         """
         old = self.create().manifest
-        sweep(self.path)
-        stage = RunFolder(self.path / STEP).create()
-        try:
-            yield stage
-            made: dict[str, Entry] = {}
-            for path in sorted(path for path in stage.path.rglob("*") if path.is_file()):
-                name = path.relative_to(stage.path).as_posix()
-                # A file of another step that this one has changed stays a file of that step.
-                made[name] = entry_of(path, old.files[name].step if name in old.files else step)
+        with self.writing(), staged(self.path) as stage:
+            yield RunFolder(stage)
+            # A file of another step that this one has changed stays a file of that step.
+            made = {
+                name: entry_of(path, old.files[name].step if name in old.files else step)
+                for name, path in files_in(stage).items()
+            }
             stale = (step, *REST_ON[step])
             kept = {name: entry for name, entry in old.files.items() if entry.step not in stale}
             gone = [name for name in self.resting_on(step) if name not in made]
@@ -236,8 +242,6 @@ class RunFolder:
             if not making:
                 new = replace(new, command=None, complete=True)
             commit(self.path, new, old.files)
-        finally:
-            discard(self.path, STEP)
 
     @contextmanager
     def making(self, command: Mapping[str, object], force: bool) -> Iterator[RunFolder]:
@@ -254,13 +258,13 @@ class RunFolder:
             Whether to replace a run that is complete.
         """
         wanted = json.loads(json.dumps(command, default=as_plain, sort_keys=True))
-        old = self.manifest
-        if old.complete:
-            check_new_folder(self.path, force)
-        place = self.create()
-        if old.files and (old.complete or old.command != wanted):
-            place = RunFolder(self.path / NEW).create()
-        with alone(self.path):
+        with self.writing(make=True):
+            old = self.manifest
+            if old.complete:
+                check_new_folder(self.path, force)
+            place = self
+            if old.files and (old.complete or old.command != wanted):
+                place = RunFolder(self.path / NEW).create()
             present = place.manifest
             if present.complete or present.command != wanted:
                 if place != self:

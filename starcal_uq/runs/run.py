@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import sigma_parameter
@@ -53,6 +53,10 @@ if TYPE_CHECKING:
     from starcal_uq.propagation.coupling import Coupling
     from starcal_uq.propagation.field import FieldMap
     from starcal_uq.propagation.spectrum import ErrorSpectrum
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 @dataclass(frozen=True)
@@ -103,6 +107,18 @@ class MissionSky:
         profile = load_attitude_profile(self.profile, scalar=self.scalar, sense=self.sense)
         frames = profile_frames(stars, camera, profile, self.rate_hz, min_stars=self.min_stars or 3, noise_like=like)
         return frames.with_meta(messages=[*profile.messages])
+
+
+def _writing(method: Callable[P, R]) -> Callable[P, R]:
+    """A step during which no other process may write into the folder of the run."""
+
+    @wraps(method)
+    def alone(*args: P.args, **kwargs: P.kwargs) -> R:
+        folder = RunFolder(cast(Run, args[0]).path)
+        with folder.writing(make=method.__name__ in ("calibrate", "write")):
+            return method(*args, **kwargs)
+
+    return alone
 
 
 class Run:
@@ -350,6 +366,7 @@ class Run:
         if "report" in REST_ON[step]:
             self._forget(*(["error_budget"] if "budget" in REST_ON[step] else []))
 
+    @_writing
     def calibrate(
         self,
         obs: Observations | PartitionedObservations,
@@ -409,6 +426,7 @@ class Run:
         self.write(calibration, obs, screened)
         return calibration
 
+    @_writing
     def write(
         self,
         calibration: Calibration,
@@ -435,6 +453,7 @@ class Run:
             self.observations = obs
         self.camera, self.calibration, self.screening = calibration.nominal, calibration, screened
 
+    @_writing
     def keep_images(self, centroids: Centroids, images: ImageCalibration) -> None:
         """Keep the centroids and the record of every image that the run started from."""
         from starcal_uq.pipeline.images import CENTROIDS, IDENTIFICATION
@@ -446,6 +465,7 @@ class Run:
             write_csv(images.identification.to_dataframe(), files.path / IDENTIFICATION)
         self._forget("images")
 
+    @_writing
     def sample(self, *, force: bool = False, progress: Progress | None = None, **options: Any) -> Posterior:
         """Sample the posterior and write it; an interrupted call goes on from its checkpoint.
 
@@ -486,6 +506,7 @@ class Run:
         return self.coupling
 
     @bounded
+    @_writing
     def propagate(
         self,
         *,
@@ -566,6 +587,7 @@ class Run:
                 self._tell(message)
         return error, fields, spectrum
 
+    @_writing
     def diagnose(self, *, force: bool = False, **options: Any) -> Diagnosis:
         """Question the model; writes ``diagnosis.json``, with the tables as CSV beside it.
 
@@ -617,6 +639,7 @@ class Run:
         return with_misfit(error, diagnosis, self.posterior, self.observations)
 
     @bounded
+    @_writing
     def budget(
         self,
         *,

@@ -20,6 +20,7 @@ from starcal_uq.core.types import AnyDict
 from starcal_uq.estimation.recursive.start import RecursionOptions
 from starcal_uq.estimation.recursive.stream import RecursiveCalibration
 from starcal_uq.observations.streams import FrameStream, stream_frames
+from starcal_uq.runs.folder import RunFolder
 from starcal_uq.runs.run import Run
 
 if TYPE_CHECKING:
@@ -69,7 +70,19 @@ def filter_run(
     KeyboardInterrupt
         After Ctrl-C; the state is kept, and the same call goes on from it.
     """
-    run, stream = Run(out), stream_frames(path, camera, columns)
+    with RunFolder(out).writing(make=True):
+        return _filter_run(Run(out), stream_frames(path, camera, columns), camera, method, options, columns, force)
+
+
+def _filter_run(
+    run: Run,
+    stream: FrameStream,
+    camera: Camera,
+    method: str,
+    options: RecursionOptions | None,
+    columns: Mapping[str, str] | None,
+    force: bool,
+) -> Calibration:
     options = options or RecursionOptions()
     filtering = RecursiveCalibration(camera, method, options)
     identity: AnyDict = {

@@ -13,6 +13,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.core.cluster import Scheduler, cluster
 from starcal_uq.core.errors import ObservationError, RunFolderError
 from starcal_uq.core.files import PathLike
+from starcal_uq.core.manifest import alone
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import AnyDict
 from starcal_uq.observations.files import parquet_summary, write_partition
@@ -92,12 +93,13 @@ def simulate_partitions(
     meta = simulated_meta(camera, sigma_px, seed) | known
     make = _Maker(stars, camera, folder, n_frames, partition_frames, min_stars, sigma_px, seed, meta)
     numbers = range(-(-n_frames // partition_frames))
-    _check_folder(folder, [make.path(number) for number in numbers], force)
-    missing = [number for number in numbers if force or not make.is_made(number)]
-    # Starting processes takes as long as making a few files.
-    few = workers is None and scheduler is None and len(missing) * partition_frames < _FRAMES_WORTH_PROCESSES
-    with cluster(scheduler, workers=0 if few else workers, caller="simulate_partitions") as processes:
-        processes.map(make, missing, progress=progress)
+    with alone(folder):
+        _check_folder(folder, [make.path(number) for number in numbers], force)
+        missing = [number for number in numbers if force or not make.is_made(number)]
+        # Starting processes takes as long as making a few files.
+        few = workers is None and scheduler is None and len(missing) * partition_frames < _FRAMES_WORTH_PROCESSES
+        with cluster(scheduler, workers=0 if few else workers, caller="simulate_partitions") as processes:
+            processes.map(make, missing, progress=progress)
     return open_partitions(folder)
 
 

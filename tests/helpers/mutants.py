@@ -125,7 +125,7 @@ def _image_record(path: Path) -> Any:
 
 
 def _manifest(path: Path) -> Any:
-    from starcal_uq.runs.manifest import read_manifest
+    from starcal_uq.core.manifest import read_manifest
 
     return read_manifest(path.parent)
 
@@ -334,10 +334,10 @@ frame = "payload"
 def _write_results(folder: Path) -> None:
     import pandas as pd
 
+    from starcal_uq.core.manifest import Entry, Manifest, write_manifest
     from starcal_uq.core.store import write_part
     from starcal_uq.identification.pairs import StarPairs
     from starcal_uq.inference.ensemble import EnsembleSettings, _Store
-    from starcal_uq.runs.manifest import Entry, Manifest, write_manifest
     from starcal_uq.studies.store import row, rows_table
     from tests.helpers.studies import made_study
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import os
 import shutil
@@ -238,6 +239,30 @@ def test_a_folder_of_a_version_without_records_is_read_and_gets_one(whole: dict[
     (run / "posterior.nc").write_bytes((whole[SECOND] / "posterior.nc").read_bytes())
     with pytest.raises(RunFolderError, match=r"posterior\.nc: is not the file"):
         content(run)
+
+
+def test_one_process_at_a_time_writes_into_a_folder(whole: dict[int, Path], run: Path, tmp_path: Path) -> None:
+    """A lock by another handle is what another process holds; it ends with the process."""
+    stars, camera = sc.load_catalogue(max_mag=5.0), sc.paper.paper_camera()
+    writers = {
+        "sample": lambda: sc.Run(run).sample(force=True, seed=1, **SAMPLING),
+        "report": lambda: sc.Run(run).report(force=True),
+        "run": lambda: make(run, SECOND, force=True),
+        "write": lambda: sc.Run(run).write(sc.Run(whole[SECOND]).calibration, None),
+        "simulate": lambda: sc.simulation.simulate_partitions(stars, camera, run, n_frames=5, force=True),
+    }
+    before = content(run)
+    other = os.open(run, os.O_RDONLY)
+    fcntl.flock(other, fcntl.LOCK_EX)
+    try:
+        for writer in writers.values():
+            with pytest.raises(RunFolderError, match=r"run: another process is writing there; wait for"):
+                writer()
+        assert content(run) == before
+        assert sc.Run(run).report().exists()
+    finally:
+        os.close(other)
+    writers["report"]()
 
 
 def test_a_damaged_record_is_named(run: Path) -> None:

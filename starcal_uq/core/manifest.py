@@ -10,18 +10,23 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
+import threading
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
 
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import STEP, flush_folder, sweep_temporary
+from starcal_uq.core.files import STEP, PathLike, check_new_folder, flush_folder, new_folder, sweep_temporary
+from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import read_json, write_json
+from starcal_uq.core.store import finished
 from starcal_uq.core.types import AnyDict
 
 MANIFEST, NEW = "run.json", ".new"
 _FORMAT = "starcal_uq run 1"
+# By it a run is known whose version wrote no record.
+_OF_A_RUN = "calibration.json"
 _WHAT = ("the record of a run", "delete it, and the folder is read without it")
 # Larger files are known by their size and time.
 _MAX_HASHED = 2**26
@@ -202,22 +207,135 @@ def sweep(folder: Path) -> None:
 
 
 @contextmanager
-def alone(folder: Path) -> Iterator[None]:
-    """Refuse a folder in which another process is making a run; a process that is killed leaves nothing locked."""
+def staged(folder: Path) -> Iterator[Path]:
+    """Yield a folder for files that wait for `commit`; gone at the end, unless they count."""
+    sweep(folder)
     try:
-        import fcntl
-    except ImportError:
+        yield new_folder(folder / STEP)
+    finally:
+        discard(folder, STEP)
+
+
+def files_in(folder: Path) -> dict[str, Path]:
+    """All files in a folder and those within it, by their names in it."""
+    return {path.relative_to(folder).as_posix(): path for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+@contextmanager
+def making(folder: PathLike, command: str, *, main: str, force: bool = False, goes_on: bool = False) -> Iterator[Path]:
+    """Yield a folder for all results of a command; they take their places at once, if the block succeeds.
+
+    Until then `folder` holds the results of before. What the command has kept there on its way (`core.store.Kept`) goes
+    when the results are there.
+
+    Parameters
+    ----------
+    folder : path
+        Folder of the results, which is made; no other process can make results there.
+    command : str
+        Name of the command.
+    main : str
+        The result that versions without records always wrote.
+    force : bool
+        Whether to replace results of before.
+    goes_on : bool
+        Whether the command takes up results of its own without being forced.
+
+    Raises
+    ------
+    RunFolderError
+        If the folder holds something else, or another process makes results there; in the end, if a file is in the way
+        of a result, or the system refuses to write.
+    """
+    place = Path(folder)
+    with alone(place):
+        old = read_manifest(place)
+        refuse_others(place, (command,))
+        ours = old is not None or os.path.exists(place / main)
+        check_new_folder(place, force or (goes_on and ours))
+        with staged(place) as stage:
+            yield stage
+            made = files_in(stage)
+            if made:
+                before = old.files if old is not None else [name for name in made if ours and (place / name).is_file()]
+                record = provenance(None, {}, None)
+                files = {name: entry_of(path, command) for name, path in made.items()}
+                commit(place, Manifest(files, {command: record}, stage=STEP), before)
+        finished(place)
+
+
+def refuse_others(folder: Path, steps: Collection[str]) -> None:
+    """Refuse a folder with results of other commands than these."""
+    found = read_manifest(folder)
+    of_a_run = os.path.exists(folder / _OF_A_RUN) and "calibrate" not in steps
+    if of_a_run if found is None else not set(found.steps) <= set(steps):
+        raise RunFolderError(
+            f"{folder}: holds the results of another command, with which these would be mixed; name another folder."
+        )
+
+
+# Device and number of a folder -> the thread that writes there, and may do so in parts.
+_writing: dict[tuple[int, int], int] = {}
+
+
+@contextmanager
+def alone(folder: PathLike, *, make: bool = True) -> Iterator[None]:
+    """Refuse a folder into which another process writes; one that is killed leaves nothing locked.
+
+    Parameters
+    ----------
+    folder : path
+        The folder; one that was made for this is removed if it stays empty.
+    make : bool
+        Whether to make a folder that is missing; otherwise nothing is locked then.
+    """
+    if not (make or os.path.isdir(folder)):
         yield
         return
-    handle = os.open(folder, os.O_RDONLY)
+    missing = not os.path.isdir(folder)
+    place = new_folder(folder)
     try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise RunFolderError(f"{folder}: another process is making a run there; wait for it, or end it.") from None
-        except OSError:
-            # A file system without locks.
-            pass
+        with _locked(place):
+            yield
+    finally:
+        if missing:
+            with suppress(OSError):
+                place.rmdir()
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    refused = RunFolderError(f"{folder}: another process is writing there; wait for it, or end it.")
+    state = os.stat(folder)
+    place, thread = (state.st_dev, state.st_ino), threading.get_ident()
+    if _writing.get(place) == thread:
+        yield
+        return
+    handle = _lock(folder, refused)
+    _writing[place] = thread
+    try:
         yield
     finally:
+        del _writing[place]
+        if handle >= 0:
+            os.close(handle)
+
+
+def _lock(folder: Path, refused: RunFolderError) -> int:
+    """A handle whose end, like that of the process, ends the lock; -1 where there are no locks."""
+    try:
+        import fcntl
+
+        handle = os.open(folder, os.O_RDONLY)
+    except (ImportError, OSError):
+        # Whoever writes there says what is wrong with the folder.
+        return -1
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
         os.close(handle)
+        raise refused from None
+    except OSError:
+        # A file system without locks.
+        pass
+    return handle
