@@ -395,7 +395,7 @@ def test_broken_files_are_named(tmp_path: Path) -> None:
         with pytest.raises(RunFolderError, match="is not a comparison of cameras"):
             CameraComparison.load(tmp_path)
     (tmp_path / "file").write_text("")
-    with pytest.raises(RunFolderError, match="cannot be made"):
+    with pytest.raises(RunFolderError, match="is a file, not a folder"):
         write_comparison(halves(), tmp_path / "file")
 
 

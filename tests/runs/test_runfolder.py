@@ -139,5 +139,5 @@ def test_a_file_is_no_run_folder(tmp_path):
     path.write_text("", encoding="utf-8")
     with pytest.raises(RunFolderError, match="not a run folder but a file"):
         RunFolder(path).require("calibration")
-    with pytest.raises(RunFolderError, match="cannot be made"):
+    with pytest.raises(RunFolderError, match="is a file, not a folder"):
         RunFolder(path).create()

@@ -523,7 +523,7 @@ def test_frames_are_not_written_over_or_among_others(tmp_path: Path) -> None:
     with pytest.raises(RunFolderError, match="1 other frame"):
         render_frames(sky, SMALL, tmp_path, min_stars=3, attitudes=two[:1], force=True)
     (tmp_path / "file").write_text("")
-    with pytest.raises(RunFolderError, match="cannot be made"):
+    with pytest.raises(RunFolderError, match="is a file, not a folder"):
         render_frames(sky, SMALL, tmp_path / "file", min_stars=3, attitudes=two)
 
 
