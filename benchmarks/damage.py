@@ -19,6 +19,7 @@ import resource
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -34,7 +35,8 @@ from tests.helpers.mutants import LAST, SAMPLES, Bench, Outcome, Sample, write_s
 
 OUT = ROOT / ".bench" / "damage"
 PAGE = ROOT / "docs" / "explanation" / "reliability.md"
-FIRST, CHUNK = (0, 500, 1000, 2000), 5000
+# A process takes seconds to load what it needs.
+FIRST, CHUNK = (0, 1000, 10_000), 30_000
 LONGEST_S, MOST_BYTES = 20.0, 2**30
 KINDS = ("refused", "same", "other", "words", "escaped", "slow", "died")
 BAD = ("words", "escaped", "slow", "died")
@@ -59,10 +61,11 @@ def work(folder: Path, name: str, first: int, last: int) -> None:
     signal.signal(signal.SIGALRM, _too_long)
     counts: Counter[str] = Counter()
     bad: list[tuple[int, str, str]] = []
+    place = os.open(folder / "seed", os.O_WRONLY | os.O_CREAT)
     slowest, before = 0.0, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for seed in range(first, last):
         # Where it was, if the process dies.
-        (folder / "seed").write_text(str(seed))
+        os.pwrite(place, f"{seed:12d}".encode(), 0)
         signal.setitimer(signal.ITIMER_REAL, LONGEST_S)
         start = time.process_time()
         try:
@@ -85,10 +88,15 @@ def tried(name: str, first: int, last: int, out: Path) -> dict[str, Any]:
     if kept.exists():
         result: dict[str, Any] = json.loads(kept.read_text("utf-8"))
         return result
-    folder = out / "at" / f"{name}-{first}-{last}"
-    if not (folder / "valid").exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / "valid").symlink_to((out / "valid").resolve())
+    # Files of a moment are written into memory where the system offers that.
+    with tempfile.TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as folder:
+        result = _tried(name, first, last, out, Path(folder))
+    kept.write_text(json.dumps(result) + "\n", "utf-8")
+    return result
+
+
+def _tried(name: str, first: int, last: int, out: Path, folder: Path) -> dict[str, Any]:
+    (folder / "valid").symlink_to((out / "valid").resolve())
     command = [sys.executable, __file__, "--work", str(folder), name, str(first), str(last)]
     environment = {
         **os.environ,
@@ -98,22 +106,21 @@ def tried(name: str, first: int, last: int, out: Path) -> dict[str, Any]:
     }
     process = subprocess.run(command, env=environment, capture_output=True, text=True)
     if process.returncode == 0:
-        result = json.loads(process.stdout.splitlines()[-1])
-    elif not (folder / "seed").exists():
+        done: dict[str, Any] = json.loads(process.stdout.splitlines()[-1])
+        return done
+    if not (folder / "seed").exists():
         raise SystemExit(f"the samples cannot be loaded:\n{process.stderr[-2000:]}")
-    else:
-        seed = int((folder / "seed").read_text())
-        words = (process.stderr.strip().splitlines() or [""])[-1][:200]
-        result = {
-            "counts": {"died": 1},
-            "bad": [(seed, "died", f"{process.returncode}: {words}")],
-            "slowest_s": 0,
-            "memory_mb": 0,
-        }
-        for part in ((first, seed), (seed + 1, last)):
-            if part[0] < part[1]:
-                result = _sum([result, tried(name, *part, out)])
-    kept.write_text(json.dumps(result) + "\n", "utf-8")
+    seed = int((folder / "seed").read_text())
+    words = (process.stderr.strip().splitlines() or [""])[-1][:200]
+    result: dict[str, Any] = {
+        "counts": {"died": 1},
+        "bad": [(seed, "died", f"{process.returncode}: {words}")],
+        "slowest_s": 0,
+        "memory_mb": 0,
+    }
+    for part in ((first, seed), (seed + 1, last)):
+        if part[0] < part[1]:
+            result = _sum([result, tried(name, *part, out)])
     return result
 
 
@@ -133,7 +140,7 @@ def campaign(samples: Sequence[Sample], text: int, binary: int, processes: int, 
         (out / "valid").mkdir(exist_ok=True)
         write_samples(out / "valid")
     # All kinds a little first: whoever looks early sees something of each.
-    edges = [*FIRST, *range(CHUNK, max(text, binary, CHUNK) + CHUNK, CHUNK)]
+    edges = [*FIRST, *range(FIRST[-1] + CHUNK, max(text, binary) + CHUNK, CHUNK)]
     jobs = [
         (sample.file, first, min(last, wanted))
         for first, last in pairwise(edges)

@@ -63,6 +63,11 @@ class Sample:
         return self.ending in ("npz", "nc", "parquet", "fits", "bin", "gz", "tiff", "png", "jpg", "bmp")
 
 
+@cache
+def _content(path: Path) -> bytes:
+    return path.read_bytes()
+
+
 def _all(items: Any) -> list[Any]:
     return list(items)
 
@@ -895,7 +900,7 @@ class Bench:
     def damaged(self, sample: Sample, rng: random.Random) -> tuple[bytes, Outcome]:
         """One mutant, and what became of it."""
         data, expected, path = self.valid(sample)
-        other = (self.folder / "valid" / SAMPLES[rng.randrange(len(SAMPLES))].file).read_bytes()
+        other = _content(self.folder / "valid" / SAMPLES[rng.randrange(len(SAMPLES))].file)
         made = mutant(sample, data, rng, other)
         return made, self.judged(sample, made, expected, path)
 
