@@ -1,9 +1,10 @@
 """Do the tests notice when the mathematics is changed? Mutation testing by one command.
 
-    python benchmarks/mutation.py [--subject NAME ...] [--number 80] [--seed 1] [--again] [--show] [--write]
+    python benchmarks/mutation.py [--subject NAME ...] [--number N] [--seed 1] [--again] [--show] [--write]
 
 A mutant is one small change of the source: a sign, a comparison, a constant, a transpose. Of all mutants of a subject
-some are drawn by the seed; a larger number holds a smaller one. Each is given to the tests that reach its line, in a
+some are drawn by the seed: one of each function, and beyond that a second of each; a larger number holds a smaller
+one. Each is given to the tests that reach its line, in a
 process of its own; it is killed when one of them fails. What was tried is kept in `.bench/mutation`;
 ``--again`` tries those that survived, after tests were strengthened. ``--show`` prints survivors as differences,
 ``--write`` puts the table into the documentation (`docs/explanation/reliability.md`).
@@ -31,7 +32,8 @@ import resource
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import CodeType, FrameType
@@ -54,6 +56,7 @@ SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "attitude": (("attitude/*.py",), ("attitude",)),
     "propagation": (("propagation/*.py",), ("propagation",)),
     "budget": (("budgeting/*.py",), ("budgeting",)),
+    "inference": (("inference/*.py",), ("inference",)),
 }
 HEAVY = (
     *("numpy", "scipy.linalg", "scipy.optimize", "scipy.stats", "scipy.special", "scipy.spatial", "scipy.interpolate"),
@@ -93,6 +96,7 @@ class Mutant:
     end: int
     new: str
     what: str
+    function: str
 
     def source(self, text: str) -> str:
         """The changed file."""
@@ -112,6 +116,7 @@ class Places(ast.NodeVisitor):
 
     def __init__(self, file: str, text: str) -> None:
         self.file, self.text, self.found = file, text, list[Mutant]()
+        self.around: list[str] = []
         # `ast` counts columns in bytes.
         self.lines = [line.encode() for line in text.splitlines(keepends=True)]
         self.offsets = [0]
@@ -132,7 +137,10 @@ class Places(ast.NodeVisitor):
         start, end = self.span(node)
         # The line breaks of the text that goes stay, so that later lines keep their numbers.
         gone = self.text[start:end].count("\n") - new.count("\n")
-        self.found.append(Mutant(self.file, node.lineno, start, end, f"({new}{chr(10) * gone})" if gone else new, what))
+        self.put(node.lineno, start, end, f"({new}{chr(10) * gone})" if gone else new, what)
+
+    def put(self, line: int, start: int, end: int, new: str, what: str) -> None:
+        self.found.append(Mutant(self.file, line, start, end, new, what, ".".join(self.around)))
 
     def swap(self, left: Any, right: Any, new: str, what: str) -> None:
         """Another operator between two operands."""
@@ -140,7 +148,7 @@ class Places(ast.NodeVisitor):
         between = self.text[start:end]
         sign = re.sub(r"#.*", lambda found: " " * len(found[0]), between).strip(" ()\n")
         place = start + between.index(sign)
-        self.found.append(Mutant(self.file, left.end_lineno, place, place + len(sign), new, what))
+        self.put(left.end_lineno, place, place + len(sign), new, what)
 
     # --- what is left alone
     def visit_Raise(self, node: ast.Raise) -> None: ...
@@ -154,10 +162,15 @@ class Places(ast.NodeVisitor):
         for argument, default in (*defaults, *zip(node.args.kwonlyargs, node.args.kw_defaults, strict=True)):
             if default is not None and argument.arg != "seed":
                 self.visit(default)
-        self.body(node.body)
+        self.within(node)
 
     def visit_ClassDef(self, node: ast.ClassDef) -> None:
+        self.within(node)
+
+    def within(self, node: ast.FunctionDef | ast.ClassDef) -> None:
+        self.around.append(node.name)
         self.body(node.body)
+        self.around.pop()
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> None:
         if node.value is not None and not self.a_size(node.target):
@@ -290,12 +303,23 @@ def files_of(subject: str) -> list[str]:
     return [path.relative_to(ROOT).as_posix() for path in found if path.name != "__init__.py"]
 
 
-def sampled(subject: str, number: int, seed: int) -> tuple[list[Mutant], dict[str, str], int]:
-    """Some mutants of a subject in the order of the source, the text of each file, and how many there are."""
+def functions(found: Iterable[Mutant]) -> int:
+    """In how many functions (a class and a file count as one for what is outside its own) some mutants are."""
+    return len({(mutant.file, mutant.function) for mutant in found})
+
+
+def sampled(subject: str, number: int | None, seed: int) -> tuple[list[Mutant], dict[str, str], list[Mutant]]:
+    """Some mutants of a subject in the order of the source, the text of each file, and all mutants."""
     texts = {file: (ROOT / file).read_text("utf-8") for file in files_of(subject)}
     everything = [mutant for file in texts for mutant in mutants(file)]
     drawn = sorted(everything, key=lambda m: hashlib.sha256(f"{seed} {key(m, texts[m.file])}".encode()).digest())
-    return sorted(drawn[:number], key=lambda m: (m.file, m.start)), texts, len(everything)
+    turns = Counter[tuple[str, str]]()
+    ranks = []
+    for mutant in drawn:
+        ranks.append(turns[mutant.file, mutant.function])
+        turns[mutant.file, mutant.function] += 1
+    drawn = [mutant for _, mutant in sorted(zip(ranks, drawn, strict=True), key=lambda pair: pair[0])]
+    return sorted(drawn[: number or len(turns)], key=lambda m: (m.file, m.start)), texts, everything
 
 
 class Changed(importlib.abc.MetaPathFinder, importlib.machinery.SourceFileLoader):
@@ -451,9 +475,9 @@ def try_one(mutant: Mutant, text: str, tests: dict[str, dict[str, Any]]) -> str:
     return "survived"
 
 
-def run(subject: str, number: int, seed: int, again: bool) -> dict[str, Any]:
+def run(subject: str, number: int | None, seed: int, again: bool) -> dict[str, Any]:
     """Try the mutants of a subject that were not tried yet."""
-    chosen, texts, total = sampled(subject, number, seed)
+    chosen, texts, everything = sampled(subject, number, seed)
     log = OUT / "tried.jsonl"
     known = dict(_known(log))
     tests = None
@@ -470,7 +494,7 @@ def run(subject: str, number: int, seed: int, again: bool) -> dict[str, Any]:
                 f"{subject} {i + 1}/{len(chosen)} {mutant.file}:{mutant.line} {mutant.what}: {known[name]}", flush=True
             )
         outcomes.append((mutant, known[name], text))
-    return {"subject": subject, "all": total, "outcomes": outcomes}
+    return {"subject": subject, "all": everything, "outcomes": outcomes}
 
 
 def _known(log: Path) -> Iterator[tuple[str, str]]:
@@ -485,16 +509,19 @@ def table(results: list[dict[str, Any]]) -> str:
     from starcal_uq.maths.intervals import binomial_interval
 
     lines = [
-        "| Subject | Mutants | Tried | Killed | Of these by time | Survived | Share killed (95 %) |",
-        "|---|---|---|---|---|---|---|",
+        "| Subject | Mutants | In functions | Tried | In functions | Killed | Of these by time | Survived | "
+        "Share killed (95 %) |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for result in results:
         outcomes = [outcome for _, outcome, _ in result["outcomes"]]
         n, survived, late = len(outcomes), outcomes.count("survived"), outcomes.count("timeout")
         low, high = binomial_interval(n - survived, n)
         share = f"{100 * (n - survived) / n:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
+        reached = functions(mutant for mutant, _, _ in result["outcomes"])
         lines.append(
-            f"| {result['subject']} | {result['all']} | {n} | {n - survived} | {late} | {survived} | {share} |"
+            f"| {result['subject']} | {len(result['all'])} | {functions(result['all'])} | {n} | {reached} | "
+            f"{n - survived} | {late} | {survived} | {share} |"
         )
     return "\n".join(lines)
 
@@ -503,7 +530,7 @@ def main(arguments: list[str] | None = None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(description="Mutation testing of the mathematics.")
     parser.add_argument("--subject", nargs="+", choices=[*SUBJECTS], default=[*SUBJECTS])
-    parser.add_argument("--number", type=int, default=80, help="mutants of each subject")
+    parser.add_argument("--number", type=int, help="mutants of each subject (one of each function)")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--again", action="store_true", help="try again those that survived")
     parser.add_argument("--show", action="store_true", help="print what survived")
