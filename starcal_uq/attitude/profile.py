@@ -328,10 +328,7 @@ def _parquet(path: Path) -> tuple[dict[str, Any], IntArray, str]:
     columns: dict[str, Any] = {}
     for name in table.column_names:
         column = table.column(name)
-        if pa.types.is_timestamp(column.type):
-            columns[name] = np.datetime_as_string(column.to_numpy().astype("datetime64[ns]"))
-        elif pa.types.is_floating(column.type) or pa.types.is_integer(column.type):
-            columns[name] = column.to_numpy()
-        else:
-            columns[name] = column.to_pylist()
+        cells = column.to_numpy()
+        stamps = pa.types.is_timestamp(column.type)
+        columns[name] = np.datetime_as_string(cells.astype("datetime64[ns]")) if stamps else cells
     return columns, np.arange(1, table.num_rows + 1), "row"

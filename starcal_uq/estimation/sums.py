@@ -175,12 +175,13 @@ def _common_turn(columns: FloatArray) -> FloatArray:
     """C (3, p): the turn of all frames of a block together that follows theta best."""
     flat = columns.reshape(len(columns), -1)
     a, h = flat[:3], flat[4:]
-    with np.errstate(all="ignore"):
-        try:
+    none = np.zeros((3, len(h)))
+    try:
+        with np.errstate(all="ignore"):
             turn = np.linalg.solve(a @ a.T, a @ h.T)
-        except np.linalg.LinAlgError:
-            turn = np.full((3, len(h)), np.nan)
-    return np.asarray(turn) if np.isfinite(turn).all() else np.zeros((3, len(h)))
+    except np.linalg.LinAlgError:
+        return none
+    return turn if np.isfinite(turn).all() else none
 
 
 def frame_sums(

@@ -295,7 +295,21 @@ class Study(Shown):
             check_hdf5(file)
             with xr.open_dataset(file, engine="h5netcdf", phony_dims="access") as opened:
                 data = opened.load()
-            return cls(data, StudyDefinition.from_dict(json.loads(data.attrs["definition"])))
+            study = cls(data, StudyDefinition.from_dict(json.loads(data.attrs["definition"])))
+            study._check()
+            return study
+
+    def _check(self) -> None:
+        """Refuse a data set that is not one of this definition, as a damaged file may hold it."""
+        expected = {name: () for name in (*self.definition.axes, "seed_index", "key", "status")}
+        expected |= {name: dims for name, (dims, _, _) in VARIABLES.items() if name in self.data}
+        for name, dims in expected.items():
+            if name not in self.data.variables:
+                raise ValueError(f"{name} is missing")
+            if self.data[name].dims != ("cell", *dims):
+                raise ValueError(f"{name} is not along cell{''.join(f', {dim}' for dim in dims)}")
+        if self.parameter_names != tuple(self.definition.parameter_names):
+            raise ValueError("its parameters are not those of its definition")
 
     def __repr__(self) -> str:
         swept = ", ".join(f"{name} ({len(values)})" for name, values in self.definition.axes.items())

@@ -81,6 +81,15 @@ def test_order_and_sense_of_quaternions_are_stated_or_refused(tmp_path: Path) ->
     np.testing.assert_allclose(quaternion_to_rotation(back), np.swapaxes(quaternion_to_rotation(q), 1, 2), atol=1e-14)
 
 
+def test_what_is_given_is_copied_and_kept_from_change() -> None:
+    time, q = np.arange(3.0), np.tile([0.0, 0.0, 0.0, 1.0], (3, 1))
+    profile = AttitudeProfile(time, q)
+    for given, kept in ((time, profile.time_s), (q, profile.quaternions)):
+        assert not np.shares_memory(given, kept)
+        with pytest.raises(ValueError, match="read-only"):
+            kept[0] = 2.0
+
+
 def test_signs_are_made_continuous() -> None:
     profile = slew()
     signs = np.random.default_rng(0).choice([-1.0, 1.0], len(profile.time_s))

@@ -159,6 +159,11 @@ def _huge_draws(file: Any) -> None:
     file.create_dataset("draws", shape=(10**12,), dtype="f8", chunks=(1000,))
 
 
+def _one_for_another(file: Any) -> None:
+    del file["n_frames"]
+    file.move("sigma", "n_frames")
+
+
 def _header_only(data: bytes) -> bytes:
     lines = data.decode().splitlines(keepends=True)
     first = next(i for i, line in enumerate(lines) if not line.startswith("#"))
@@ -227,6 +232,9 @@ ONCE = [
         _hdf5(_huge_draws),
         r"\(it declares 8e\+12 bytes of content, far more",
     ),
+    ("study.nc", _hdf5(lambda f: f.pop("status")), r"\(status is missing\); run `starcal-uq study` again\.$"),
+    ("study.nc", _hdf5(lambda f: f.pop("max_mag")), r"\(max_mag is missing\)"),
+    ("study.nc", _hdf5(_one_for_another), r"\(n_frames is not along cell\)"),
     ("checkpoint.npz", lambda d: _members(d, key=None), "the draws are made again"),
     ("run.json", lambda d: d.replace(b'"gone": []', b'"gone": ["../kept.csv"]'), "of the run names a file elsewhere"),
     ("run.json", lambda d: d.replace(b'"stage": ""', b'"stage": "/tmp"'), "of the run names a file elsewhere"),

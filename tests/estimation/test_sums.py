@@ -9,12 +9,16 @@ import sys
 import numpy as np
 import pytest
 
+import starcal_uq as sc
 from starcal_uq.camera import compiled
+from starcal_uq.camera.projection import forward_kernel
 from starcal_uq.core.errors import StarcalError
+from starcal_uq.estimation import sums
 from starcal_uq.estimation.compressed import gram_sums
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
-from starcal_uq.estimation.sums import Descent, frame_sums, settled_sums, sum_of
+from starcal_uq.estimation.sums import Descent, frame_normals, frame_sums, settled_sums, sum_of
+from tests.helpers.outside import campaign
 from tests.helpers.scenes import camera, observations, with_sigmas
 
 needs_numba = pytest.mark.skipif(importlib.util.find_spec("numba") is None, reason="Numba is not installed")
@@ -43,6 +47,57 @@ def test_parts_add_up_wherever_they_are_cut():
     size = np.abs(gram.gram).max()
     assert np.allclose(added.gram, gram.gram, rtol=0, atol=1e-14 * size)
     assert added.log_determinant == pytest.approx(gram.log_determinant, rel=1e-12)
+
+
+def test_blocks_of_any_size_give_the_same_sums_and_residuals(monkeypatch):
+    likelihood = MarginalLikelihood(with_sigmas(observations(n_frames=12)), "brown")
+    frames, theta = likelihood.frames, camera().theta
+    rotations = likelihood.start_rotations(theta)
+    both = []
+    for block in (3000, 40):
+        monkeypatch.setattr(sums, "BLOCK_STARS", block)
+        residuals = np.full((2, frames.n_stars), np.nan)
+        both.append((*frame_sums(frames, "brown", theta, rotations, residuals), residuals))
+    assert len(frames.parts(40)) > 2
+    (whole, attitudes, left), (cut, others, same) = both
+    assert cut.cost == pytest.approx(whole.cost, rel=1e-12)
+    assert np.allclose(_scaled(cut.matrix, whole.matrix), _scaled(whole.matrix, whole.matrix), rtol=0, atol=1e-12)
+    assert np.allclose(others.shift, attitudes.shift, rtol=0, atol=1e-15)
+    assert np.array_equal(same, left)
+    b = frames.rotated(rotations)
+    (xy,) = forward_kernel("brown", "value")(frames.n_stars, theta, b, np.zeros(2))
+    assert np.allclose(left, (frames.pixel - xy) * frames.weight, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("field_deg", [0.5, 10.0])
+def test_sums_of_single_frames_keep_their_digits_in_a_narrow_field(field_deg):
+    c = campaign(np.random.default_rng(1), n_frames=6, stars_per_frame=9, field_deg=field_deg)
+    likelihood = MarginalLikelihood(with_sigmas(sc.Observations(**c.columns)), "brown")
+    frames = likelihood.frames
+    _, attitudes = settled_sums(frames, "brown", c.theta, likelihood.start_rotations(c.theta))
+    gram, shift, log_determinant = frame_normals(frames, "brown", c.theta, attitudes.rotations)
+    b = frames.rotated(attitudes.rotations)
+    xy, h, a = forward_kernel("brown", "first")(frames.n_stars, c.theta, b, np.zeros(2))
+    e = (frames.pixel - xy)[None]
+    own = np.empty_like(gram)
+    for k, (first, last) in enumerate(zip(frames.starts[:-1], frames.starts[1:], strict=True)):
+        rows = [(array[..., first:last] * frames.weight[first:last]).reshape(len(array), -1).T for array in (a, e, h)]
+        # Without differences of large numbers: what the orthogonal columns of the attitude leave.
+        q, r = np.linalg.qr(rows[0])
+        left = np.hstack(rows[1:]) - q @ (q.T @ np.hstack(rows[1:]))
+        own[k] = left.T @ left
+        assert log_determinant[k] == pytest.approx(2.0 * np.sum(np.log(np.abs(np.diag(r)))), rel=1e-9)
+    size = np.sqrt(np.einsum("kii->ki", own))
+    assert np.max(np.abs(gram - own) / (size[:, :, None] * size[:, None])) < 1e-7
+    assert np.max(np.abs(shift)) < 1e-9
+
+
+def test_a_model_that_is_not_finite_costs_infinitely_much():
+    likelihood = MarginalLikelihood(observations(n_frames=5), "brown")
+    theta = np.array(camera().theta)
+    rotations = likelihood.start_rotations(theta)
+    theta[2] = np.nan
+    assert frame_sums(likelihood.frames, "brown", theta, rotations)[0].normal.cost == np.inf
 
 
 def test_attitudes_follow_the_parameters_in_one_pass():
