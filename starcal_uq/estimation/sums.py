@@ -181,7 +181,7 @@ def _common_turn(columns: FloatArray) -> FloatArray:
             turn = np.linalg.solve(a @ a.T, a @ h.T)
     except np.linalg.LinAlgError:
         return none
-    return turn if np.isfinite(turn).all() else none
+    return np.asarray(turn) if np.isfinite(turn).all() else none
 
 
 def frame_sums(

@@ -301,7 +301,7 @@ class Study(Shown):
 
     def _check(self) -> None:
         """Refuse a data set that is not one of this definition, as a damaged file may hold it."""
-        expected = {name: () for name in (*self.definition.axes, "seed_index", "key", "status")}
+        expected: dict[str, tuple[str, ...]] = dict.fromkeys((*self.definition.axes, "seed_index", "key", "status"), ())
         expected |= {name: dims for name, (dims, _, _) in VARIABLES.items() if name in self.data}
         for name, dims in expected.items():
             if name not in self.data.variables:
