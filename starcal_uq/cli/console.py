@@ -68,11 +68,12 @@ def records(frame: pd.DataFrame) -> list[AnyDict]:
 
 def show_calibration(calibration: Calibration, truth: Camera | None = None) -> None:
     """Table of start, estimate and sigma; with a truth, also truth and z."""
+    from starcal_uq.estimation.fallback import fallback_words
     from starcal_uq.presentation.words.estimation import calibration_table, fitted_noise_text, focal_length
 
     print_table(calibration_table(calibration, truth))
     out.print(f"Focal length {focal_length(calibration)}. Status: {calibration.status.name.lower()}.")
-    if words := fitted_noise_text(calibration).strip():
+    for words in filter(None, (fitted_noise_text(calibration).strip(), fallback_words(calibration))):
         out.print(words, highlight=False, soft_wrap=True)
 
 

@@ -38,6 +38,13 @@ if TYPE_CHECKING:
 class EstimationSettings:
     """How a camera is estimated."""
 
+    model: Annotated[
+        settings.ModelName | None,
+        typer.Option(
+            help="Distortion model, fitted or refused; by default that of CAMERA, or the richest simpler one that the "
+            "data determine."
+        ),
+    ] = None
     method: Annotated[
         settings.Method,
         typer.Option(
@@ -73,6 +80,7 @@ class EstimationSettings:
     def options(self) -> AnyDict:
         """Keyword arguments of `Run.calibrate`."""
         options: AnyDict = {
+            "model": self.model,
             "method": self.method,
             "solver": self.solver,
             "screening": self.screen,

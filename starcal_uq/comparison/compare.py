@@ -195,7 +195,8 @@ def compare_halves(
         When a half does not determine the camera.
     """
     first, second = (
-        calibrate(part, camera, method=method, duplicates="keep") for part in split_frames(obs, how, seed=seed)
+        calibrate(part, camera, model=camera.distortion, method=method, duplicates="keep")
+        for part in split_frames(obs, how, seed=seed)
     )
     options = {"labels": split_labels(how), **options}
     return compare(first, second, seed=seed, **options)

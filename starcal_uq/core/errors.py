@@ -102,11 +102,12 @@ class IdentificationError(StarcalError):
 
 
 class CalibrationError(StarcalError):
-    """The estimate was not found; `status` says why and what to do."""
+    """The estimate was not found; `status` says why and what to do, `undetermined` names what the data leave open."""
 
-    def __init__(self, message: str, status: Status | None = None) -> None:
+    def __init__(self, message: str, status: Status | None = None, undetermined: Sequence[str] = ()) -> None:
         super().__init__(message)
         self.status = status
+        self.undetermined = tuple(undetermined)
 
 
 class RepeatedFramesError(CalibrationError):

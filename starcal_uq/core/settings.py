@@ -23,6 +23,7 @@ R = TypeVar("R")
 Method = Literal["efficient", "three_stage", "least_squares", "samaan", "griffith"]
 RecursiveMethod = Literal["samaan", "griffith"]
 Solver = Literal["lm", "minpack", "ipopt"]
+ModelName = Literal["none", "k1", "brown", "brown3", "brown_tangential", "inverse"]
 NoiseKind = Literal["common", "model"]
 MergedNoise = Literal["auto", "common", "own"]
 Duplicates = Literal["refuse", "drop", "keep"]

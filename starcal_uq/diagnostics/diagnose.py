@@ -164,7 +164,7 @@ def diagnose(
     obs, whole = weighed(obs, cal), cal
     misfit = misfit_tests(obs, cal)
     if whole.partitions is not None:
-        cal = calibrate(obs, whole.nominal, duplicates="keep")
+        cal = calibrate(obs, whole.nominal, model=whole.nominal.distortion, duplicates="keep")
     step(1, 5)
     normals = FrameNormals.at(obs, cal)
     found = _jackknife(obs, cal, normals)
@@ -257,7 +257,7 @@ def _optimum(obs: Observations, cal: Calibration, start: Camera) -> tuple[FloatA
     likelihood = cal.provenance.get("settings", {}).get("likelihood", "marginal")
     if likelihood != "marginal" or method not in ("efficient", "three_stage"):
         options: AnyDict = {} if likelihood == "marginal" else {"likelihood": likelihood}
-        other = calibrate(obs, start, method=method, duplicates="keep", **options)
+        other = calibrate(obs, start, model=start.distortion, method=method, duplicates="keep", **options)
         return other.theta, other.chi2
     found = fit(obs, start, method=method)
     if cal.star_errors is not None:

@@ -139,7 +139,7 @@ def failed(likelihood: MarginalLikelihood, theta: FloatArray, nominal: Camera, s
         found.append(open_parameters(own.evaluate(at).matrix, noise, nominal, WEAK))
     names = min(filter(None, found), key=len, default=())
     status = Status.SINGULAR if names else status
-    return CalibrationError(f"the calibration failed ({status.name}): {remedy_of(status, names)}.", status)
+    return CalibrationError(f"the calibration failed ({status.name}): {remedy_of(status, names)}.", status, names)
 
 
 def with_star_errors(obs: Observations, cal: Calibration) -> Calibration:

@@ -33,6 +33,7 @@ from starcal_uq.estimation.baselines import check_count, least_squares, recursiv
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.composite import enough_frames, pair_covariance
 from starcal_uq.estimation.duplicates import check_duplicates, repeating_frames
+from starcal_uq.estimation.fallback import fit_determined
 from starcal_uq.estimation.fingerprints import Fingerprints
 from starcal_uq.estimation.loops import kernels
 from starcal_uq.estimation.marginal import MarginalLikelihood
@@ -88,6 +89,7 @@ def calibrate(
     obs: Observations | PartitionedObservations | Iterable[Observations],
     camera: Camera,
     *,
+    model: str | None = None,
     method: str = "efficient",
     solver: str = "lm",
     max_iterations: int = _ITERATIONS,
@@ -114,6 +116,10 @@ def calibrate(
         them, so that the result has no residuals and attitudes.
     camera : Camera
         Start values; its `distortion` names the model. The coefficients start from zero, as in the paper.
+    model : str, optional
+        Distortion model in place of the camera's. A model asked for here is fitted or refused. By default it is that of
+        `camera`, and where the data do not determine it (methods ``efficient`` and ``three_stage`` on a table), the
+        richest simpler one that they do: ``provenance["fallback"]`` then says which, and why.
     method : {"efficient", "three_stage", "least_squares", "samaan", "griffith"}
         ``three_stage`` is Ye & Yang 2017: interstar angles without distortion, linear distortion, interstar angles with
         both; its covariance is the sandwich of composite likelihood, from the scatter of frames if there are 50 for
@@ -177,6 +183,7 @@ def calibrate(
         When frames hold the same measurement, and `duplicates` is ``refuse``.
     """
     check_duplicates(duplicates)
+    camera = camera if model is None else camera.replace(distortion=model)
     if method not in METHODS:
         raise CalibrationError(f"method {method!r} is unknown: use one of {', '.join(METHODS)}.")
     if solver not in SOLVERS:
@@ -220,7 +227,14 @@ def calibrate(
         sample = obs.sample()
         # What is compiled is compiled here, before other processes ask for it.
         with compiled.using(kernels(camera.distortion, obs.n_stars)):
-            start = calibrate(sample, camera, solver=solver, max_iterations=max_iterations, duplicates=duplicates)
+            start = calibrate(
+                sample,
+                camera,
+                model=camera.distortion,
+                solver=solver,
+                max_iterations=max_iterations,
+                duplicates=duplicates,
+            )
         with cluster(scheduler, workers=_enough(workers, obs), caller="calibrate") as processes:
             calibration = calibrate_partitions(
                 obs,
@@ -243,14 +257,17 @@ def calibrate(
         # Weights of another calibration's noise model are what this table states.
         obs = replace(obs, stated_px=None) if obs.stated_px is not None and noise == "common" else obs
         frames = StarFrames.from_observations(obs)
-        gaussian = MarginalLikelihood(frames, camera.distortion)
-        check_count(gaussian, camera)
-        if noise == "model":
-            calibration = _with_noise_model(obs.unweighted, camera, method, solver, max_iterations)
-        elif likelihood == "student_t":
-            calibration = _robust(obs, camera, frames, solver, max_iterations, nu)
-        else:
-            calibration = _gaussian(obs, camera, gaussian, method, solver, max_iterations)
+
+        def fitted(nominal: Camera) -> Calibration:
+            gaussian = MarginalLikelihood(frames, nominal.distortion)
+            check_count(gaussian, nominal)
+            if noise == "model":
+                return _with_noise_model(obs.unweighted, nominal, method, solver, max_iterations)
+            if likelihood == "student_t":
+                return _robust(obs, nominal, frames, solver, max_iterations, nu)
+            return _gaussian(obs, nominal, gaussian, method, solver, max_iterations)
+
+        calibration = fit_determined(obs, camera, fitted, asked=model is not None, throw=throw)
         if star_errors and calibration.status.ok:
             calibration = with_star_errors(weighed(obs, calibration), calibration)
     if throw:
@@ -261,6 +278,7 @@ def calibrate(
     rest = calibrate(
         obs.select_frames(np.setdiff1d(obs.frame_ids, repeating)),
         camera,
+        model=model,
         method=method,
         solver=solver,
         max_iterations=max_iterations,

@@ -115,7 +115,8 @@ def settle_noise(obs: Observations, cal: Calibration) -> Observations:
         if not found.needed:
             break
         before = found.floor_px
-        found = noise_floor(calibrate(raised, cal.nominal, duplicates="keep"), raised, obs.sigma_px)
+        again = calibrate(raised, cal.nominal, model=cal.nominal.distortion, duplicates="keep")
+        found = noise_floor(again, raised, obs.sigma_px)
         raised = with_noise_floor(obs, found)
         if abs(found.floor_px - before) < _SETTLED * before:
             break

@@ -91,15 +91,21 @@ def undetermined(
     return open_parameters(without.evaluate(plain).matrix, noise, camera)
 
 
+def what_is_open(names: tuple[str, ...]) -> str:
+    """One clause: what the data leave open."""
+    apart = len(names) > 1 and not set(names) <= {"x0", "y0"}
+    return (
+        f"the data do not tell {join_words(names)} apart" if apart else f"the data do not determine {join_words(names)}"
+    )
+
+
 def what_is_missing(names: tuple[str, ...]) -> str:
     """One clause: what the data leave open, and what would determine it."""
-    words = join_words(names)
     if set(names) <= {"x0", "y0"}:
-        return f"the data do not determine {words}: more frames, or stars over a wider field, are needed"
-    first = f"do not determine {words}" if len(names) == 1 else f"do not tell {words} apart"
+        return f"{what_is_open(names)}: more frames, or stars over a wider field, are needed"
     where = "over the whole field, along both axes," if set(names) & {"x0", "y0", "p1", "p2"} else "at more radii"
     fewer = ", or a distortion model with fewer coefficients" if set(names) - {"x0", "y0", "f"} else ""
-    return f"the data {first}: stars {where} are needed{fewer}"
+    return f"{what_is_open(names)}: stars {where} are needed{fewer}"
 
 
 def remedy_of(status: Status, names: tuple[str, ...]) -> str:

@@ -248,7 +248,7 @@ def _campaign(study: _Campaigns, index: int) -> _Calibrated:
     seed = np.random.SeedSequence([study.seed, 4], spawn_key=(index,)).generate_state(1, np.uint64)[0]
     try:
         obs = study.campaigns[index // study.n_campaigns].simulate(study.stars, camera, seed)
-        cal = calibrate(obs, camera.data_sheet())
+        cal = calibrate(obs, camera.data_sheet(), model=camera.distortion)
     except CatalogueError:
         raise
     except StarcalError as error:

@@ -201,7 +201,8 @@ def _drop_shared(calibrations: list[Calibration], tables: list[Observations | No
         rest = table.select_frames(np.delete(table.frame_ids, repeating))
         tables[i] = rest
         noise = cal.provenance["settings"].get("noise", "common")
-        calibrations[i] = calibrate(rest, cal.nominal, method=cal.method, noise=noise, duplicates="keep")
+        model = cal.nominal.distortion
+        calibrations[i] = calibrate(rest, cal.nominal, model=model, method=cal.method, noise=noise, duplicates="keep")
 
 
 def _own_observations(run: Run) -> Observations | None:

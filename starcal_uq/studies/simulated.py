@@ -73,6 +73,7 @@ class SimulatedCells(Cells):
         cal = calibrate(
             obs,
             camera.data_sheet(),
+            model=camera.distortion,
             method=settings["method"],
             likelihood="student_t" if likelihood == "student_t" else "marginal",
             star_errors=settings["direction_mas"] > 0.0,

@@ -45,6 +45,7 @@ def small(tmp_path_factory):
     patch, sheet = sc.Observations(**c.columns), sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
     c = campaign(np.random.default_rng(2), n_frames=30, sigma_px=lambda radius, mag, frame: 0.03 * (1.0 + 3.0 * radius))
     uneven = sc.Observations(**c.columns)
+    bent = sc.Observations(**campaign(np.random.default_rng(3), n_frames=30).columns)
     patch.save(folder / "PATCH_OBS.csv")
     sheet.save(folder / "PATCH_CAMERA.toml")
     for name, seed in (("RUN_B", 5), ("RUN_A", 3)):
@@ -55,7 +56,7 @@ def small(tmp_path_factory):
         run.propagate(n_draws=50, seed=0)
     obs.save(folder / "OBS.csv")
     shutil.copytree(folder / "RUN_A", folder / "RUN")
-    tables = {"obs": obs, "patch": patch, "uneven": uneven}
+    tables = {"obs": obs, "patch": patch, "uneven": uneven, "bent": bent}
     return SimpleNamespace(folder=folder, camera=camera, cal=cal, post=post, sheet=sheet, **tables)
 
 
@@ -100,6 +101,17 @@ EXAMPLES = {
     ],
     "diagnostics.verdict.estimate.estimation": lambda s: [
         estimate.estimation(dataclasses.replace(s.cal, status=status)) for status in Status if not status.ok
+    ],
+    "diagnostics.verdict.estimate.determined": lambda s: [
+        estimate.determined(
+            dataclasses.replace(
+                s.cal,
+                provenance={"fallback": {"model": "brown3", "used": "brown", "because": "the stars are too few"}},
+            )
+        )
+    ],
+    "diagnostics.verdict.estimate.comparison": lambda s: [
+        estimate.comparison(sc.diagnostics.compare_models(s.bent, sc.calibrate(s.bent, s.sheet, model="none")))
     ],
     "diagnostics.verdict.estimate.even_noise": lambda s: [
         estimate.even_noise(sc.diagnostics.misfit_tests(s.uneven, sc.calibrate(s.uneven, s.sheet)))

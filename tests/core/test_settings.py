@@ -81,10 +81,12 @@ def test_control_an_unbounded_function_takes_anything():
 
 
 def test_words_with_explanations_are_those_of_the_lists():
+    from starcal_uq.camera.distortion import model_names
     from starcal_uq.paper.camera import CONVENTIONS
     from starcal_uq.paper.field.published import READINGS
     from starcal_uq.planning.forecast import SCOPES
 
+    assert model_names() == get_args(settings.ModelName)
     assert tuple(SCOPES) == get_args(settings.Scope)
     assert tuple(CONVENTIONS) == get_args(settings.Convention)
     assert tuple(READINGS) == get_args(settings.FieldReading)

@@ -154,7 +154,7 @@ def run_replicate(study: Study, stars: StarCatalogue, index: int) -> TrialOutcom
     try:
         campaign = replace(study.campaign, sigma_px=sigma_px)
         obs = campaign.simulate(stars, camera, noise.generate_state(1, np.uint64)[0])
-        cal = calibrate(obs, study.nominal)
+        cal = calibrate(obs, study.nominal, model=study.nominal.distortion)
         draws, likelihood = _sample(study, obs, cal, sampler)
     except CatalogueError:
         raise

@@ -12,6 +12,7 @@ from starcal_uq.core.status import Check, Level, Question, Status, pass_or_fail,
 from starcal_uq.core.types import BoolArray
 from starcal_uq.diagnostics.misfit import ALPHA
 from starcal_uq.diagnostics.verdict.observed import CALIBRATE, SCREEN
+from starcal_uq.estimation.fallback import fallback_words
 from starcal_uq.maths.intervals import student_quantile
 
 if TYPE_CHECKING:
@@ -49,6 +50,21 @@ def estimation(cal: Calibration) -> Check:
         sentence = f"The estimate is not an optimum: {cal.remedy}."
     level, remedy = pass_or_fail(cal.status.ok), _REMEDIES.get(cal.status, "")
     return Check("Estimation", Question.CONVERGED, level, words, "converged", sentence, remedy)
+
+
+def determined(cal: Calibration) -> Check | None:
+    """Was the model of the camera left for a simpler one, because the data do not determine it?"""
+    record, sentence = cal.provenance.get("fallback"), fallback_words(cal)
+    if not record:
+        return None
+    used, asked = str(record["used"]), str(record["model"])
+    name, remedy = "Model that the data determine", model_remedy(used)
+    return Check(name, Question.TRUSTWORTHY, Level.WARN, used, asked, sentence, remedy)
+
+
+def model_remedy(name: str) -> str:
+    """How to calibrate with a distortion model."""
+    return f"{CALIBRATE} --model {name} or sc.calibrate(obs, camera, model={name!r})"
 
 
 def estimators_agree(cal: Calibration) -> Check | None:
@@ -276,7 +292,9 @@ def comparison(models: ModelComparison) -> Check:
     else:
         value = f"{fixed(mine.difference, 1)} ± {fixed(mine.difference_se, 1)} nat from {models.scores[0].model!r}"
     level = Level.FAIL if rejected else Level.PASS
-    return Check("Distortion model", Question.TRUSTWORTHY, level, value, "not rejected", models_sentence(models))
+    remedy = model_remedy(models.simplest.model) if rejected else ""
+    sentence = models_sentence(models)
+    return Check("Distortion model", Question.TRUSTWORTHY, level, value, "not rejected", sentence, remedy)
 
 
 def models_sentence(models: ModelComparison) -> str:

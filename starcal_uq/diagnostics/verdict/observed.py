@@ -205,10 +205,10 @@ def terms(cal: Calibration) -> Check | None:
     sentence = (
         f"No richer distortion model fits all stars better than chance lets it ({name!r} comes nearest)."
         if good
-        else f"All stars together ask for the terms of the distortion model {name!r}: name it in CAMERA."
+        else f"All stars together ask for the terms of the distortion model {name!r}."
     )
     value, bound = f"p = {significant(p_value)}", f"p ≥ {PATTERN_P:g}"
-    remedy = "" if good else CALIBRATE
+    remedy = "" if good else f"{CALIBRATE} --model {name}"
     return Check("Terms of the distortion", Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, remedy)
 
 

@@ -8,6 +8,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.formatting import decimals_for, fixed, percent, plural, pretty_unit, significant
 from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.fallback import fallback_words
 from starcal_uq.estimation.merging import ALPHA, Consistency
 from starcal_uq.estimation.screening.result import REASONS, Screening
 from starcal_uq.presentation.tables import TextTable
@@ -33,11 +34,12 @@ def fitted_noise_text(cal: Calibration) -> str:
 
 
 def calibration_text(cal: Calibration) -> str:
-    """What was calibrated, how it ended, the focal length, and how the noise varies where that was fitted."""
-    return (
+    """What was calibrated, how it ended, the focal length, and what was decided on the way: noise, model."""
+    first = (
         f"{plural(cal.n_stars, 'star')} in {plural(cal.n_frames, 'frame')}, {cal.method} ({cal.solver}): "
         f"{cal.status.name.lower().replace('_', ' ')}; focal length {focal_length(cal)}.{fitted_noise_text(cal)}"
     )
+    return f"{first} {fallback_words(cal)}".strip()
 
 
 def calibration_table(cal: Calibration, truth: Camera | None = None) -> TextTable:

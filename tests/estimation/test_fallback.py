@@ -1,0 +1,103 @@
+"""A model that the data do not determine: the richest that they do is fitted, what is asked for is refused."""
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.status import Level, Status
+from starcal_uq.diagnostics.verdict import estimate
+from starcal_uq.estimation.fallback import fallback_words
+from starcal_uq.maths.intervals import student_quantile
+from tests.helpers.outside import Campaign, campaign
+
+
+def few_stars(seed: int, **options) -> Campaign:
+    """Three frames of five stars in a field of 3 degrees."""
+    own = {"n_frames": 3, "stars_per_frame": 5, "field_deg": 3.0, "corner_px": (0.0, 0.0), "sigma_px": 0.1}
+    return campaign(np.random.default_rng(seed), **own | options)
+
+
+def given(c: Campaign, model: str = "brown") -> tuple[sc.Observations, sc.Camera]:
+    return sc.Observations(**c.columns), sc.Camera(**c.camera_toml()).replace(distortion=model)
+
+
+# Where the richer model is left open, and where it is not.
+OPEN, DETERMINED = 4, 0
+
+
+def test_the_richest_model_that_the_data_determine_is_fitted_and_said(tmp_path):
+    obs, camera = given(few_stars(OPEN))
+    cal = sc.calibrate(obs, camera)
+    assert cal.status.ok and cal.camera.distortion == cal.nominal.distortion == "none"
+    record = cal.provenance["fallback"]
+    assert (record["model"], record["used"], record["status"]) == ("brown", "none", "SINGULAR")
+    assert set(record["undetermined"]) <= {"x0", "y0"}
+    assert fallback_words(cal) in cal.text and "k1 and k2 are zero" in fallback_words(cal)
+    check = estimate.determined(cal)
+    assert check.level is Level.WARN and "--model none" in check.remedy
+    cal.save(tmp_path / "calibration.json")
+    assert fallback_words(sc.Calibration.load(tmp_path / "calibration.json")) == fallback_words(cal)
+
+
+def test_what_is_asked_for_is_refused_with_the_model_that_converges():
+    obs, camera = given(few_stars(OPEN))
+    with pytest.raises(CalibrationError, match=r"do not determine .*'none' converges \(--model none, or") as caught:
+        sc.calibrate(obs, camera, model="brown")
+    assert caught.value.status is Status.SINGULAR and caught.value.undetermined
+    assert sc.calibrate(obs, camera, model="brown", throw=False).status is Status.SINGULAR
+    accepted = sc.calibrate(obs, camera, model="none")
+    assert estimate.determined(accepted) is None
+
+
+def test_a_model_that_the_data_determine_stays():
+    obs, camera = given(few_stars(DETERMINED))
+    cal = sc.calibrate(obs, camera)
+    assert cal.camera.distortion == "brown" and "fallback" not in cal.provenance
+    assert np.array_equal(cal.theta, sc.calibrate(obs, camera, model="brown").theta)
+
+
+@pytest.mark.parametrize(
+    ("model", "n_stars", "used"), [("brown", 4, ("none", "k1")), ("brown_tangential", 5, ("brown", "k1"))]
+)
+def test_too_few_stars_for_a_model(model, n_stars, used):
+    obs, camera = given(few_stars(0, n_frames=1, stars_per_frame=n_stars, field_deg=15.0), model)
+    assert sc.calibrate(obs, camera).camera.distortion in used
+
+
+def test_terms_that_the_stars_ask_for_are_not_left_out():
+    """Too few iterations are no reason to fit another camera: its residuals ask for the terms."""
+    obs, camera = given(campaign(np.random.default_rng(0), n_frames=20, corner_px=(6.0, -2.0)))
+    with pytest.raises(CalibrationError) as caught:
+        sc.calibrate(obs, camera, max_iterations=4)
+    assert caught.value.status is Status.MAX_ITERATIONS and "converges" not in str(caught.value)
+    # The same without distortion: nothing is asked for.
+    obs, camera = given(campaign(np.random.default_rng(0), n_frames=20, corner_px=(0.0, 0.0)))
+    assert sc.calibrate(obs, camera, max_iterations=4).camera.distortion in ("none", "k1", "brown")
+
+
+def test_wrong_stars_are_not_blamed_on_the_model():
+    c = few_stars(OPEN, n_frames=6, stars_per_frame=10)
+    rng = np.random.default_rng(0)
+    for name in ("x_px", "y_px"):
+        c.columns[name] = rng.uniform(0.0, 1023.0, len(c.columns[name]))
+    obs, camera = given(c)
+    with pytest.raises(CalibrationError, match="fit no common attitude"):
+        sc.calibrate(obs, camera)
+
+
+@pytest.mark.slow
+def test_estimates_after_a_fall_err_as_their_sigmas_say():
+    inside = []
+    for seed in range(40):
+        c = few_stars(seed, n_frames=1, stars_per_frame=4, field_deg=15.0)
+        obs, camera = given(c)
+        try:
+            cal = sc.calibrate(obs, camera)
+        except CalibrationError:
+            continue
+        if "fallback" in cal.provenance:
+            z = abs(cal.theta[2] - c.theta[2]) / cal.sigmas[2]
+            inside.append(z < student_quantile(0.9, cal.dof))
+    # All are fitted with 1 or 2 degrees of freedom; two in a million fall outside of this.
+    assert len(inside) == 40 and sum(inside) > 26
