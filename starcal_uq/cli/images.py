@@ -11,6 +11,7 @@ import typer
 import starcal_uq as sc
 from starcal_uq.cli.console import err, note, print_json, print_table, progress_bar, records, warn_undeclared
 from starcal_uq.cli.options import (
+    BayerMosaic,
     CameraFile,
     Engine,
     Force,
@@ -44,7 +45,7 @@ def centroid_command(
     images: Annotated[
         list[Path],
         typer.Argument(
-            metavar="IMAGES...", help="FITS, TIFF, PNG, JPEG or BMP files, or folders of them.", parser=read_path
+            metavar="IMAGES...", help="FITS, TIFF, PNG, JPEG, BMP or raw files, or folders of them.", parser=read_path
         ),
     ],
     out: Annotated[
@@ -73,6 +74,7 @@ def centroid_command(
         bool, typer.Option(help="Take out errors that repeat with the place within a pixel, where images show them.")
     ] = True,
     time: TimeUtc = None,
+    bayer: BayerMosaic = None,
     workers: Annotated[
         int | None, number("workers", "Processes; as many as processors from a hundred images on, 0 for this one.")
     ] = None,
@@ -99,6 +101,7 @@ def centroid_command(
             psf_sigma_px=psf_sigma,
             max_stars=max_stars,
             correct_pixel_phase=pixel_phase,
+            bayer=bayer,
             workers=workers,
             progress=progress,
         )
@@ -189,6 +192,7 @@ def load_images(
             epoch=settings.epoch,
             gain_e_per_count=settings.gain,
             time_utc=settings.time,
+            bayer=settings.bayer,
             engine=settings.engine or "pyramid",
             workers=None,
             tell=lambda message: err.print(message, style=_style(message), highlight=False, soft_wrap=True),

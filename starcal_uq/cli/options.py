@@ -203,6 +203,14 @@ TimeUtc = Annotated[
         callback=checked(_check_time),
     ),
 ]
+BayerMosaic = Annotated[
+    settings.Bayer | None,
+    typer.Option(
+        "--bayer",
+        help="Images: colours of the first 2 x 2 pixels, row by row, where each pixel sees one colour and the files do "
+        "not say it: RGGB, BGGR, GRBG or GBRG; none for none.",
+    ),
+]
 Engine = Annotated[
     settings.Engine, typer.Option(help="What finds attitudes: pyramid, or tetra3rs (extra of that name).")
 ]

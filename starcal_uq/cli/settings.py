@@ -15,6 +15,7 @@ import starcal_uq as sc
 from starcal_uq.cli.options import (
     LEAST_SIGMA_PX,
     MAGNITUDES,
+    BayerMosaic,
     Columns,
     Duplicates,
     FileWorkers,
@@ -151,6 +152,7 @@ class ImageSettings:
         float | None, number("gain_e_per_count", "Images: electrons per count, where they do not say it.")
     ] = None
     time: TimeUtc = None
+    bayer: BayerMosaic = None
     engine: Annotated[
         settings.Engine | None,
         typer.Option(help="Images: what finds attitudes: pyramid, or tetra3rs (extra of that name)."),

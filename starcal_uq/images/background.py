@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -40,6 +40,9 @@ class PreparedImage:
         Inverse gain, 0 where unknown.
     gain_is_measured : bool
         Whether the gain was read off the noise of the background because none is known.
+    parity : int or None
+        Remainder of (x + y) / 2 of the pixels that were measured, those that see green in a mosaic of colours; the
+        others hold the mean of their neighbours, and are not `usable`. None where all were measured.
     """
 
     counts: Any
@@ -48,6 +51,7 @@ class PreparedImage:
     saturated: BoolArray | None
     counts_per_e: float
     gain_is_measured: bool = False
+    parity: int | None = None
 
 
 def prepare_image(
@@ -66,6 +70,9 @@ def prepare_image(
     import sep
 
     name = image.name or "image"
+    parity, shape = image.green_parity, image.data.shape
+    if parity is not None:
+        image = replace(image, data=_measured_pixels(image.data, parity), mosaic="")
     # A copy, which becomes the counts above the background where it stands: a new array for each step takes longer
     # than the step.
     with np.errstate(over="ignore"):
@@ -101,13 +108,15 @@ def prepare_image(
         counts_per_e = counts_per_electron(data)
     cut_off = np.count_nonzero(values == low) > _CUT_OFF * values.size
     mesh = min(_MESH_PX, *data.shape)
-    background = sep.Background(_smooth(image, data), mask=mask, bw=mesh, bh=mesh)
+    # Every other column of a mosaic was left out.
+    mesh_x = mesh if parity is None else min(mesh, max(_MESH_PX // 2, 1))
+    background = sep.Background(_smooth(image, data), mask=mask, bw=mesh_x, bh=mesh)
     background.subfrom(data)
     counts = data
     spread = background
     if background.globalrms > _UNEVEN * 1.4826 * float(_median(np.abs(counts[::5, ::5]).ravel())):
         # Where the background is steep, its slope inside a mesh is no noise.
-        spread = sep.Background(counts, mask=mask, bw=mesh, bh=mesh)
+        spread = sep.Background(counts, mask=mask, bw=mesh_x, bh=mesh)
     # Numbers are rounded to whole counts at best; floating-point images without noise get a floor to divide by.
     floor = 12.0**-0.5 if image.data.dtype.kind in "ui" else 1e-7 * (high - low)
     if gain and read_noise_e:
@@ -121,8 +130,42 @@ def prepare_image(
     np.maximum(noise, np.float32(floor), out=noise)
     if mask is not None:
         counts[mask] = 0.0
-    frame = PreparedImage(counts, noise, usable, too_bright, counts_per_e, not gain and counts_per_e > 0.0)
+    if parity is not None:
+        everywhere = np.ones(counts.shape, dtype=np.bool_)
+        usable = _at_their_places(everywhere if usable is None else usable, parity, shape)
+        too_bright = None if too_bright is None else _at_their_places(too_bright, parity, shape)
+        counts = _filled(_at_their_places(counts, parity, shape), parity)
+        noise = np.pad(np.repeat(noise, 2, axis=1), ((0, 0), (0, shape[1] % 2)), mode="edge")
+    frame = PreparedImage(counts, noise, usable, too_bright, counts_per_e, not gain and counts_per_e > 0.0, parity)
     return frame, float(background.globalback), max(float(spread.globalrms) / _CLIPPED, floor)
+
+
+def _measured_pixels(data: Any, parity: int) -> Any:
+    """The pixels (x, y) of a mosaic whose x + y has this parity, row by row: half as wide."""
+    half = data.shape[1] // 2
+    pixels = np.empty((data.shape[0], half), dtype=data.dtype)
+    for row in (0, 1):
+        pixels[row::2] = data[row::2, (parity + row) % 2 :: 2][:, :half]
+    return pixels
+
+
+def _at_their_places(pixels: Any, parity: int, shape: tuple[int, ...]) -> Any:
+    """Inverse of `_measured_pixels`, with zeros between."""
+    whole = np.zeros(shape, dtype=pixels.dtype)
+    for row in (0, 1):
+        whole[row::2, (parity + row) % 2 :: 2][:, : pixels.shape[1]] = pixels[row::2]
+    return whole
+
+
+def _filled(counts: Any, parity: int) -> Any:
+    """`counts` with the mean of the neighbours, which have been measured, where they are zero for a mosaic."""
+    height, width = counts.shape
+    padded = np.pad(counts, 1, mode="reflect") if min(height, width) > 1 else np.pad(counts, 1)
+    means = padded[:-2, 1:-1] + padded[2:, 1:-1] + padded[1:-1, :-2] + padded[1:-1, 2:]
+    means *= np.float32(0.25)
+    for row in (0, 1):
+        counts[row::2, (parity + row + 1) % 2 :: 2] = means[row::2, (parity + row + 1) % 2 :: 2]
+    return counts
 
 
 def _smooth(image: Image, filled: Any) -> Any:

@@ -87,6 +87,10 @@ def find_stars(image: Image, options: DetectionOptions) -> FrameStars:
     start = options.psf_sigma_px or FIRST_SIGMA_PX
     objects = _detect(frame, name, start, options)
     messages: list[str] = []
+    if image.mosaic:
+        messages.append(
+            f"of the mosaic of colours ({image.mosaic}), the green pixels were measured, each at its own place."
+        )
     objects, n_blobs = _without_blobs(objects, moment_sigma_px(objects, start))
     measured = measure_psf(frame, objects)
     sigma = start if measured is None else measured.sigma_px
@@ -130,6 +134,8 @@ def _detect(frame: PreparedImage, name: str, sigma: float, options: DetectionOpt
     line = np.exp(-0.5 * (np.arange(-half, half + 1) / sigma) ** 2)
     # The noise that is left of noise 1.
     left = np.sum(line**2) / line.sum() ** 2
+    if frame.parity is not None:
+        left *= _mosaic_noise(line)
     filtered = _filtered(frame.counts, (line / line.sum()).astype(np.float32))
     threshold = np.float32(options.threshold_sigma * left)
     n_above = np.count_nonzero(filtered > threshold * frame.noise)
@@ -164,6 +170,19 @@ def _detect(frame: PreparedImage, name: str, sigma: float, options: DetectionOpt
     objects["flux"] = np.bincount(labels[inside], frame.counts.ravel()[inside], minlength=len(objects) + 1)[1:]
     objects = objects[np.isfinite(objects["x"]) & np.isfinite(objects["y"])]
     return objects[np.argsort(-objects["cflux"], kind="stable")][:_MAX_DETECTIONS]
+
+
+def _mosaic_noise(line: Any) -> float:
+    """Factor of the noise left by a filter, the product of `line` with itself, where half of the pixels were measured.
+
+    The others are the mean of their four neighbours, so that each that was measured has some of the weights of these.
+    """
+    weights = np.pad(np.outer(line, line), 2)
+    own = weights[1:-1, 1:-1]
+    own = own + 0.25 * (weights[:-2, 1:-1] + weights[2:, 1:-1] + weights[1:-1, :-2] + weights[1:-1, 2:])
+    place = np.add.outer(np.arange(len(own)), np.arange(len(own))) % 2
+    worst = max(np.sum(own[place == parity] ** 2) for parity in (0, 1))
+    return float(np.sqrt(worst / np.sum(weights**2)))
 
 
 # The list of pixels is longer than those above the threshold by so many.
@@ -266,7 +285,7 @@ def _fit(frame: PreparedImage, objects: Any, sigma: float) -> tuple[Stamps, Star
     """Windowed centroids as a start, then the fit of the pixel-integrated star image."""
     half = half_stamp_px(sigma)
     x, y = objects["x"].astype(np.float64), objects["y"].astype(np.float64)
-    stamps = cut_stamps(frame.counts, frame.usable, x, y, half, frame.noise, frame.counts_per_e)
+    stamps = cut_stamps(frame.counts, frame.usable, x, y, half, frame.noise, frame.counts_per_e, frame.parity)
     width = np.full(len(x), sigma)
     xw, yw, good = window_positions(
         stamps, frame.counts.shape, x, y, np.hypot(width, 12.0**-0.5), width, _START_STEP_PX
@@ -303,7 +322,7 @@ def _core_is_whole(stamps: Stamps, fit: StarFit) -> BoolArray:
     u, v = (fit.x_px - stamps.x0)[:, None, None], (fit.y_px - stamps.y0)[:, None, None]
     grid = np.arange(m)
     far = np.hypot(grid[None, None, :] - u, grid[None, :, None] - v) > 2.0 * fit.sigma_px[:, None, None]
-    whole: BoolArray = np.all(np.logical_or(stamps.good, far), axis=(1, 2))
+    whole: BoolArray = np.all(np.logical_or(stamps.fine, far), axis=(1, 2))
     return whole
 
 

@@ -16,12 +16,12 @@ import numpy as np
 
 from starcal_uq.core.errors import ImageError
 from starcal_uq.core.formatting import plural
-from starcal_uq.core.settings import bounded
+from starcal_uq.core.settings import Bayer, bounded
 from starcal_uq.core.tasks import Progress, processors, run_tasks
 from starcal_uq.core.types import AnyDict
 from starcal_uq.images.centroids import COLUMNS, FRAME_COLUMNS, Centroids
 from starcal_uq.images.detection import DetectionOptions, FrameStars, find_stars
-from starcal_uq.images.image import IMAGE_ENDINGS, Image, read_any_size
+from starcal_uq.images.image import IMAGE_ENDINGS, Image, read_images
 from starcal_uq.images.pixel_phase import phase_error, without_phase_error
 
 if TYPE_CHECKING:
@@ -53,6 +53,7 @@ def extract_centroids(
     psf_sigma_px: float | None = None,
     max_stars: int | None = None,
     correct_pixel_phase: bool = True,
+    bayer: Bayer | None = None,
     workers: int | None = 0,
     progress: Progress | None = None,
 ) -> Centroids:
@@ -62,7 +63,8 @@ def extract_centroids(
     ----------
     images
         An image, a file, a folder of image files (in the order of their names), or several of them. The first frame
-        has the number 0.
+        has the number 0; a file may hold several (see `read_images`). Files of a folder that are none are named in
+        `messages`.
     camera
         If given, every image must be the size of its detector.
     gain_e_per_count
@@ -86,11 +88,15 @@ def extract_centroids(
         Centroids of undersampled star images that are no Gaussians are drawn to the centres of the pixels. Where the
         places of many stars show it (4 standard deviations), it is taken out, and a message says how much it was. All
         images are then taken to be of one camera.
+    bayer
+        Colours of the 2 x 2 pixels in the first corner, row by row, of images whose pixels see one colour each; by
+        default what the file says (``BAYERPAT``, raw files), "none" for none. The green pixels alone are then measured,
+        each at its place, so that positions are those of the whole detector.
     workers
         Processes, with the same results for any number of them; 0 stays in this one. None takes as many as there are
         processors from a hundred images on; fewer are measured before a process has started.
     progress
-        Called with (frames done, frames in all).
+        Called with (files done, files in all).
 
     Returns
     -------
@@ -104,7 +110,7 @@ def extract_centroids(
     SamplingError
         If processes cannot be used.
     """
-    sources = _sources(images)
+    sources, messages = _sources(images)
     options = DetectionOptions(
         gain_e_per_count=gain_e_per_count,
         read_noise_e=read_noise_e,
@@ -114,10 +120,10 @@ def extract_centroids(
         psf_sigma_px=psf_sigma_px,
         max_stars=max_stars,
     )
-    task = _Measure(sources, camera, options)
+    task = _Measure(sources, camera, options, bayer)
     if workers is None:
         workers = processors() if len(sources) >= _WORTH_PROCESSES else 0
-    table = _Table()
+    table = _Table(messages=messages)
     frames, interrupted = run_tasks(
         task,
         len(sources),
@@ -128,14 +134,14 @@ def extract_centroids(
     )
     if interrupted:
         raise KeyboardInterrupt
-    for frame in frames:
-        table.add(frame)
+    for found in frames:
+        table.add(found)
     return table.centroids(options, correct_pixel_phase)
 
 
 @dataclass(frozen=True)
 class _Frame:
-    """What became of one image: its entry in the table, messages, hash of its pixels, and its stars, if it has any."""
+    """What became of one frame: its entry in the table, messages, hash of its pixels, and its stars, if it has any."""
 
     entry: AnyDict
     messages: list[str]
@@ -145,48 +151,62 @@ class _Frame:
 
 @dataclass(frozen=True)
 class _Measure:
-    """From the number of an image to its stars."""
+    """From the number of a file to the stars of its frames."""
 
     sources: list[Source]
     camera: Camera | None
     options: DetectionOptions
+    bayer: Bayer | None = None
 
-    def __call__(self, number: int) -> _Frame:
+    def __call__(self, number: int) -> list[_Frame]:
         # glibc gives memory back to the system when arrays the size of an image are freed, and gets it again page by
         # page, until a larger one has been freed. This one is never written to.
         np.empty(_KEPT_BYTES, dtype=np.uint8)
         source = self.sources[number]
-        name = (source.name or f"image {number}") if isinstance(source, Image) else Path(source).name
-        entry: AnyDict = {
-            "frame_ids": number,
-            "image": name,
-            "time_utc": "",
-            "background": np.nan,
-            "noise": np.nan,
-            "psf_sigma_px": np.nan,
-            "problem": "",
-        }
-        sha256: Any = hashlib.sha256()
+        if isinstance(source, Image):
+            return [self._measured(source, source.name or f"image {number}")]
         try:
-            image = source if isinstance(source, Image) else read_any_size(source, self.camera)
-            entry["time_utc"] = image.time_utc or ""
-            sha256.update(f"{image.data.dtype}{image.data.shape}".encode())
-            sha256.update(np.ascontiguousarray(image.data))
+            images = read_images(source, self.camera)
+        except ImageError as error:
+            return [_left_out(error, Path(source).name, source)]
+        return [self._measured(image, image.name) for image in images]
+
+    def _measured(self, image: Image, name: str) -> _Frame:
+        sha256: Any = hashlib.sha256(f"{image.data.dtype}{image.data.shape}".encode())
+        sha256.update(np.ascontiguousarray(image.data))
+        try:
+            image = image.as_mosaic(self.bayer)
             if self.camera is not None:
                 image.check_size(self.camera)
             found = find_stars(image, self.options)
         except ImageError as error:
-            text = str(error)
-            message = f"Frame {number} was left out: {text}"
-            # Reasons are counted over frames, so the name of this one is taken off.
-            prefixes = [f"{source}: "] if not isinstance(source, Image) else []
-            for prefix in (*prefixes, f"{name}: ", "image: "):
-                text = text.removeprefix(prefix)
-            entry["problem"] = text.partition(";")[0].rstrip(".")
-            return _Frame(entry, [message], sha256.digest())
+            return _left_out(error, name, None, image.time_utc or "", sha256.digest())
+        entry = _entry(name, image.time_utc or "")
         entry.update(background=found.background, noise=found.noise, psf_sigma_px=found.psf_sigma_px)
         messages = [*image.messages, *(f"{name}: {text}" for text in found.messages)]
         return _Frame(entry, messages, sha256.digest(), found)
+
+
+def _entry(name: str, time_utc: str = "", problem: str = "") -> AnyDict:
+    return {
+        "image": name,
+        "time_utc": time_utc,
+        "background": np.nan,
+        "noise": np.nan,
+        "psf_sigma_px": np.nan,
+        "problem": problem,
+    }
+
+
+def _left_out(error: ImageError, name: str, source: Any, time_utc: str = "", sha256: bytes | None = None) -> _Frame:
+    """The entry of an image that cannot be used, with its reason."""
+    text = str(error)
+    message = f"was left out: {text}"
+    # Reasons are counted over frames, so the name of this one is taken off.
+    for prefix in (f"{source}: ", f"{name}: ", "image: "):
+        text = text.removeprefix(prefix)
+    entry = _entry(name, time_utc, text.partition(";")[0].rstrip("."))
+    return _Frame(entry, [message], hashlib.sha256().digest() if sha256 is None else sha256)
 
 
 @dataclass
@@ -200,13 +220,17 @@ class _Table:
     gains: list[float | None] = field(default_factory=list)
     digest: Any = field(default_factory=hashlib.sha256)
 
-    def add(self, frame: _Frame) -> None:
-        self.frames.append(frame.entry)
-        self.messages += frame.messages
-        self.digest.update(frame.sha256)
-        if frame.stars is not None:
+    def add(self, frames: list[_Frame]) -> None:
+        for frame in frames:
+            number = len(self.frames)
+            self.frames.append({"frame_ids": number, **frame.entry})
+            self.digest.update(frame.sha256)
+            if frame.stars is None:
+                self.messages += [f"Frame {number} {text}" for text in frame.messages]
+                continue
+            self.messages += frame.messages
             self.stars.append(frame.stars)
-            self.numbers += [frame.entry["frame_ids"]] * len(frame.stars.columns["x_px"])
+            self.numbers += [number] * len(frame.stars.columns["x_px"])
             self.gains.append(frame.stars.gain_e_per_count)
 
     def centroids(self, options: DetectionOptions, correct_pixel_phase: bool) -> Centroids:
@@ -271,20 +295,36 @@ class _Table:
         return found[0].amplitude_px, found[1].amplitude_px
 
 
-def _sources(images: Source | Iterable[Source]) -> list[Source]:
+# So many names of files that are not read are listed.
+_MOST_NAMES = 20
+
+
+def _sources(images: Source | Iterable[Source]) -> tuple[list[Source], list[str]]:
+    """Images and files, and what is to be said of those in folders that are not among them."""
     given = [images] if isinstance(images, Image | str | os.PathLike) else list(images)
     sources: list[Source] = []
+    messages: list[str] = []
     for source in given:
         if isinstance(source, Image) or not os.path.isdir(source):
             sources.append(source)
             continue
-        inside = sorted(p for p in Path(source).iterdir() if p.name.lower().endswith(IMAGE_ENDINGS))
-        if not inside:
+        inside = sorted(Path(source).iterdir())
+        files = [path for path in inside if path.name.lower().endswith(IMAGE_ENDINGS) and not path.is_dir()]
+        if not files:
             raise ImageError(
                 f"{source}: the folder holds no image ({', '.join(IMAGE_ENDINGS)}); name the folder that does, as "
                 "subfolders are not searched."
             )
-        sources += inside
+        sources += files
+        others = [path for path in inside if path not in files and not path.name.startswith(".")]
+        for reason, names in (
+            ("subfolders are not searched", [path.name for path in others if path.is_dir()]),
+            ("the ending is of no image that is read", [path.name for path in others if not path.is_dir()]),
+        ):
+            if names:
+                more = [f"and {len(names) - _MOST_NAMES} more"] if len(names) > _MOST_NAMES else []
+                listed = ", ".join([*names[:_MOST_NAMES], *more])
+                messages.append(f"{source}: not read, because {reason}: {listed}.")
     if not sources:
         raise ImageError("images: there is none; give files, a folder or Image objects.")
-    return sources
+    return sources, messages

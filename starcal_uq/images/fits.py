@@ -34,9 +34,11 @@ class Stamps:
     x0, y0 : array of int64, shape (n,)
         First column and row.
     counts : array, shape (n, m, m)
-        Counts above the background; 0 where not `good`.
+        Counts above the background; 0 where not `fine`.
     good : array of bool, shape (n, m, m)
         Pixels to use.
+    fine : array of bool, shape (n, m, m)
+        Pixels that are good, or no loss: those between, in a mosaic of colours, hold the mean of their neighbours.
     variance : array, shape (n,)
         Variance of the background, counts squared.
     counts_per_e : float
@@ -47,12 +49,13 @@ class Stamps:
     y0: IntArray
     counts: FloatArray
     good: BoolArray
+    fine: BoolArray
     variance: FloatArray
     counts_per_e: float = 0.0
 
     def subset(self, chosen: Any) -> Stamps:
         """The stamps of some of the stars."""
-        names = ("x0", "y0", "counts", "good", "variance")
+        names = ("x0", "y0", "counts", "good", "fine", "variance")
         return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
 
@@ -86,9 +89,19 @@ class StarFit:
 
 
 def cut_stamps(
-    counts: Any, usable: BoolArray | None, x: FloatArray, y: FloatArray, half_px: int, noise: Any, counts_per_e: float
+    counts: Any,
+    usable: BoolArray | None,
+    x: FloatArray,
+    y: FloatArray,
+    half_px: int,
+    noise: Any,
+    counts_per_e: float,
+    parity: int | None = None,
 ) -> Stamps:
-    """Cut the pixels around positions; what lies outside the image or is not `usable` is marked as not good."""
+    """Cut the pixels around positions; what lies outside the image or is not `usable` is marked as not good.
+
+    Of a mosaic, the pixels with this `parity` were measured.
+    """
     height, width = counts.shape
     size = 2 * half_px + 1
     x0, y0 = np.rint(x).astype(np.int64), np.rint(y).astype(np.int64)
@@ -109,9 +122,15 @@ def cut_stamps(
         at = (rows.clip(0, height - 1)[:, :, None], columns.clip(0, width - 1)[:, None, :])
         part = ((columns >= 0) & (columns < width))[:, None, :] & ((rows >= 0) & (rows < height))[:, :, None]
         stamp[~inside], good[~inside] = counts[at], part if usable is None else part & usable[at]
+    fine = good
+    if parity is not None:
+        steps = np.arange(size)
+        at_x, at_y = (x0[:, None] + steps)[:, None, :], (y0[:, None] + steps)[:, :, None]
+        on_image = (at_x >= 0) & (at_x < width) & (at_y >= 0) & (at_y < height)
+        fine = good | (on_image & ((at_x + at_y) % 2 != parity))
     if usable is not None or not inside.all():
-        stamp[~good] = 0.0
-    return Stamps(x0, y0, stamp, good, variance, counts_per_e)
+        stamp[~fine] = 0.0
+    return Stamps(x0, y0, stamp, good, fine, variance, counts_per_e)
 
 
 def _profiles(
@@ -440,10 +459,10 @@ def window_positions(
     height, width = shape
     radius = _WINDOW_SIGMAS * window_px
     good &= (x - radius >= -0.5) & (x + radius <= width - 0.5) & (y - radius >= -0.5) & (y + radius <= height - 0.5)
-    cut = np.flatnonzero(good & ~stamps.good.all((1, 2)))
+    cut = np.flatnonzero(good & ~stamps.fine.all((1, 2)))
     u, v = (steps + stamps.x0[cut, None]) - x[cut, None], (steps + stamps.y0[cut, None]) - y[cut, None]
     far = u[:, None, :] ** 2 + v[:, :, None] ** 2 > radius[cut, None, None] ** 2
-    good[cut] = (stamps.good[cut] | far).all((1, 2))
+    good[cut] = (stamps.fine[cut] | far).all((1, 2))
     return x, y, good
 
 
@@ -451,7 +470,7 @@ def windowed(frame: PreparedImage, fit: StarFit) -> StarFit:
     """`fit` with windowed centroids and their covariance for the stars that stand alone."""
     window = np.maximum(_WINDOW_SIGMA_PX, 1.2 * fit.sigma_px)
     half = int(np.ceil(_WINDOW_SIGMAS * window.max(initial=_WINDOW_SIGMA_PX)))
-    stamps = cut_stamps(frame.counts, None, fit.x_px, fit.y_px, half, frame.noise, frame.counts_per_e)
+    stamps = cut_stamps(frame.counts, None, fit.x_px, fit.y_px, half, frame.noise, frame.counts_per_e, frame.parity)
     steps_px = np.maximum(_WINDOW_STEP_PX, _WINDOW_STEP_SIGMAS * np.sqrt(fit.covariance[:, 0, 0]))
     x, y, whole = window_positions(stamps, frame.counts.shape, fit.x_px, fit.y_px, window, fit.sigma_px, steps_px)
     steps = np.arange(2 * half + 1)
@@ -465,6 +484,9 @@ def windowed(frame: PreparedImage, fit: StarFit) -> StarFit:
     variance *= stamps.counts_per_e
     variance += stamps.variance[:, None, None]
     variance *= stamps.good
+    if frame.parity is not None:
+        # What half of the pixels have measured counts for twice as many.
+        variance *= 2.0
     spread = _second_moments(_contracted(powers_u * wu**2, variance, powers_v * wv**2))
     near = near_pairs(fit.x_px, fit.y_px, 4.0 * float(window.max(initial=0.0)))
     use = whole & (light > 0.0) & (np.hypot(x - fit.x_px, y - fit.y_px) < 1.0) & stamps.good.all((1, 2))

@@ -91,14 +91,14 @@ def measure_psf(frame: PreparedImage, objects: Any) -> Psf | None:
         x, y = np.where(good, x, chosen["x"]), np.where(good, y, chosen["y"])
         widths = np.where(good, widths, sigma)
     # All pixels with the same weight, so that what counts as core and wings does not hang on whether the gain is known.
-    stamps = cut_stamps(frame.counts, frame.usable, x, y, half_stamp_px(sigma), frame.noise, 0.0)
+    stamps = cut_stamps(frame.counts, frame.usable, x, y, half_stamp_px(sigma), frame.noise, 0.0, frame.parity)
     width = sigma
     if frame.counts_per_e:
         x, y, _, widths = fit_widths(stamps, x, y, widths, left_moving)
         width = float(np.clip(np.median(widths[good]), *_WIDTHS))
     fit = fit_stars(stamps, x, y, width, once=True)
     # Fainter stars that are found are those whose noise adds light.
-    good &= stamps.good.all((1, 2)) & (fit.flux > _MISFIT_SNR * np.sqrt(fit.covariance[:, 2, 2]))
+    good &= stamps.fine.all((1, 2)) & (fit.flux > _MISFIT_SNR * np.sqrt(fit.covariance[:, 2, 2]))
     if np.count_nonzero(good) <= 3:
         return Psf(sigma)
     return Psf(
@@ -151,8 +151,10 @@ def _common_width(frame: PreparedImage, objects: Any, sigma: float) -> Psf | Non
 def _clean_stamps(frame: PreparedImage, objects: Any, sigma: float, most: int) -> tuple[IntArray, Stamps]:
     """Which detections have all their pixels and no hot pixel, and their stamps."""
     x, y = objects["x"].astype(np.float64), objects["y"].astype(np.float64)
-    stamps = cut_stamps(frame.counts, frame.usable, x, y, half_stamp_px(sigma), frame.noise, frame.counts_per_e)
-    clean = np.flatnonzero(stamps.good.all((1, 2)) & ~_single_pixels(stamps))[:most]
+    stamps = cut_stamps(
+        frame.counts, frame.usable, x, y, half_stamp_px(sigma), frame.noise, frame.counts_per_e, frame.parity
+    )
+    clean = np.flatnonzero(stamps.fine.all((1, 2)) & ~_single_pixels(stamps))[:most]
     return clean.astype(np.int64), stamps.subset(clean)
 
 
@@ -163,7 +165,7 @@ def half_stamp_px(sigma: float) -> int:
 def _single_pixels(stamps: Stamps) -> BoolArray:
     """Stamps in which one pixel holds more than its eight neighbours together: hot pixels."""
     c = stamps.counts.shape[1] // 2
-    core = stamps.counts[:, c - 1 : c + 2, c - 1 : c + 2]
+    core = (stamps.counts * stamps.good)[:, c - 1 : c + 2, c - 1 : c + 2]
     highest = core.max((1, 2))
     hot: BoolArray = highest > 0.6 * core.sum((1, 2))
     return hot

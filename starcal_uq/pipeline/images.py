@@ -19,7 +19,7 @@ from starcal_uq.sky.site import check_sky
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
-    from starcal_uq.core.settings import Engine
+    from starcal_uq.core.settings import Bayer, Engine
     from starcal_uq.core.tasks import Progress
     from starcal_uq.core.types import FloatArray, StrArray
     from starcal_uq.images.centroids import Centroids
@@ -85,6 +85,7 @@ def observations_from_images(
     site: Site | None = None,
     in_space: bool = False,
     time_utc: str | None = None,
+    bayer: Bayer | None = None,
     engine: Engine = "pyramid",
     workers: int | None = 0,
     tell: Callable[[str], None] | None = None,
@@ -114,6 +115,8 @@ def observations_from_images(
         Whether the camera was above the air, so that nothing need be said of refraction.
     time_utc : str, optional
         Middle of the exposure of all images whose files do not say it; it goes before a time in a file's name.
+    bayer : {"RGGB", "BGGR", "GRBG", "GBRG", "none"}, optional
+        Mosaic of colours of the images, as in `extract_centroids`.
     engine : {"pyramid", "tetra3rs"}
         Solver that finds attitudes.
     workers : int, optional
@@ -141,7 +144,12 @@ def observations_from_images(
     if time_utc is not None:
         time_utc = utc_text(time_utc)
     centroids = extract_centroids(
-        list(images), camera=camera, gain_e_per_count=gain_e_per_count, workers=workers, progress=progress
+        list(images),
+        camera=camera,
+        gain_e_per_count=gain_e_per_count,
+        bayer=bayer,
+        workers=workers,
+        progress=progress,
     )
     centroids = with_time(centroids, time_utc)
     if tell is not None:

@@ -1,0 +1,103 @@
+"""What needs a library that is not always there: cameras' raw files (rawpy) and colours of 16 bits (OpenCV)."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from starcal_uq.core.errors import ImageError
+from starcal_uq.core.settings import Mosaic
+
+_EXTRA = 'pip install "starcal-uq[raw]"'
+_SIZE_TAGS = 256, 257
+
+
+@dataclass(frozen=True)
+class RawFrame:
+    """Counts of a raw file, the pattern of its colours ("" for none), and what else it says, None where it does not."""
+
+    pixels: Any
+    mosaic: str
+    saturation: float | None
+    exposure_s: float | None
+    focal_mm: float | None
+
+
+def read_raw(path: Path, data: bytes) -> RawFrame:
+    """A raw file as the detector gave it, black borders left out.
+
+    Its clock is the camera's own, of no stated zone, and is not taken for a time.
+    """
+    try:
+        import rawpy
+    except ImportError:
+        raise ImageError(
+            f"{path}: raw files of cameras need the library rawpy; {_EXTRA}, or save the image as FITS without "
+            "turning it into colours."
+        ) from None
+    try:
+        with rawpy.imread(io.BytesIO(data)) as raw:
+            pixels = np.array(raw.raw_image_visible)
+            pattern, names = raw.raw_pattern, raw.color_desc.decode("ascii")
+            colours = "".join(names[k] for k in raw.raw_colors_visible[:2, :2].ravel())
+            white, exposure, focal = (
+                float(value or 0.0) or None for value in (raw.white_level, raw.other.shutter, raw.other.focal_len)
+            )
+    except Exception as error:  # whatever the broken bytes lead to
+        raise ImageError(
+            f"{path}: the file is damaged, or no raw file that LibRaw reads; copy it again, or save it as FITS."
+        ) from error
+    mosaic = "" if pattern is None else colours
+    if pixels.ndim != 2 or (mosaic and (pattern.shape != (2, 2) or mosaic not in get_args(Mosaic))):
+        raise ImageError(f"{path}: its mosaic of colours is not red, green, green and blue; save a grey image as FITS.")
+    return RawFrame(pixels, mosaic, white, exposure, focal)
+
+
+def deep_colours(path: Path, data: bytes, check_declared: Callable[[Path, int, int], None]) -> list[Any] | None:
+    """Pages (height, width, 3) of 16 bits of a colour PNG or TIFF file, red first; None where it is none."""
+    is_png = data.startswith(b"\x89PNG")
+    if not is_png and not _is_deep_tiff(path, data, check_declared):
+        return None
+    try:
+        import cv2
+    except ImportError:
+        raise ImageError(
+            f"{path}: the colours have 16 bits, which need the library OpenCV; {_EXTRA}, or save the image as FITS, or "
+            "as a grey TIFF or PNG."
+        ) from None
+    content = np.frombuffer(data, dtype=np.uint8)
+    try:
+        if is_png:
+            pages: Any = [cv2.imdecode(content, cv2.IMREAD_UNCHANGED)]
+        else:
+            pages = cv2.imdecodemulti(content, cv2.IMREAD_UNCHANGED)[1]
+    except cv2.error:
+        return None
+    if not len(pages) or any(page is None or page.dtype != np.uint16 or page.ndim != 3 for page in pages):
+        return None
+    # OpenCV has blue first, and perhaps transparency last.
+    return [page[..., 2::-1] for page in pages]
+
+
+def _is_deep_tiff(path: Path, data: bytes, check_declared: Callable[[Path, int, int], None]) -> bool:
+    """Whether a file is a TIFF of three or four colours of 16 bits that can hold the pixels that it declares."""
+    from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+    try:
+        tags = ImageFileDirectory_v2(data[:8])
+        stream = io.BytesIO(data)
+        stream.seek(tags.next)
+        tags.load(stream)
+        width, height = (int(tags[tag]) for tag in _SIZE_TAGS)
+        depths = tuple(tags[258])
+    except Exception:  # Pillow raises whatever the bytes lead to
+        return False
+    if depths not in ((16,) * 3, (16,) * 4):
+        return False
+    check_declared(path, width * height * 8, len(data))
+    return True
