@@ -530,8 +530,7 @@ def _read_picture(path: Path, data: bytes, camera: Camera | None, every: bool) -
         finally:
             # Its own limit knows neither the size of the file nor of sensors.
             PIL.Image.MAX_IMAGE_PIXELS = most
-        # Depth and kind of colour of a PNG file.
-        if picture is None or (picture.format == "PNG" and data[24] == 16 and data[25] != 0):
+        if picture is None or _is_deep(picture, data):
             from starcal_uq.images.raw import deep_colours
 
             if picture is not None:
@@ -578,6 +577,14 @@ def _read_picture(path: Path, data: bytes, camera: Camera | None, every: bool) -
         messages = [f"{path.name}: {text}" for text in (*notes, *words)] if not found else []
         found.append(Image(_checked(path, pixels, messages), name, saturation=saturation, messages=tuple(messages)))
     return found
+
+
+def _is_deep(picture: Any, data: bytes) -> bool:
+    """Whether a picture has colours of 16 bits, of which Pillow reads 8 without a word."""
+    if picture.format == "PNG":
+        return bool(data[24] == 16 and data[25] != 0)
+    depths = picture.tag_v2.get(258, ()) if picture.format == "TIFF" else ()
+    return len(depths) > 1 and max(depths) > 8
 
 
 def _page(picture: Any) -> tuple[Any, float | None, list[str]]:

@@ -45,9 +45,8 @@ def read_raw(path: Path, data: bytes) -> RawFrame:
             pixels = np.array(raw.raw_image_visible)
             pattern, names = raw.raw_pattern, raw.color_desc.decode("ascii")
             colours = "".join(names[k] for k in raw.raw_colors_visible[:2, :2].ravel())
-            white, exposure, focal = (
-                float(value or 0.0) or None for value in (raw.white_level, raw.other.shutter, raw.other.focal_len)
-            )
+            said = (raw.white_level, raw.other.shutter_speed, raw.other.focal_length)
+            white, exposure, focal = (float(value or 0.0) or None for value in said)
     except Exception as error:  # whatever the broken bytes lead to
         raise ImageError(
             f"{path}: the file is damaged, or no raw file that LibRaw reads; copy it again, or save it as FITS."
