@@ -32,6 +32,7 @@ from starcal_uq.cli.options import (
 )
 from starcal_uq.core import settings
 from starcal_uq.core.files import check_new_folder, ensure_new
+from starcal_uq.core.manifest import refuse_others
 from starcal_uq.core.settings import Limit
 
 if TYPE_CHECKING:
@@ -57,16 +58,11 @@ def register(app: typer.Typer) -> None:
     app.command("plan")(plan_command)
 
 
-def check_output(out: Path | None, force: bool) -> None:
-    """Refuse a folder that holds something, and a run's own folder even with `force`: its results would be mixed."""
-
-    if out is None:
-        return
-    if sc.Run(out).has("calibration"):
-        raise sc.errors.RunFolderError(
-            f"{out}: is the folder of a run, whose files would be mixed with these; name another."
-        )
-    check_new_folder(out, force)
+def check_output(out: Path | None, command: str, force: bool) -> None:
+    """Refuse a folder that holds something, and one of another command's results even with `force`."""
+    if out is not None:
+        refuse_others(out, (command,))
+        check_new_folder(out, force)
 
 
 def budget_command(
@@ -199,7 +195,7 @@ def compare_command(
             if split is None
             else f"--split compares parts of one run: leave out {runs[-1]}."
         )
-    check_output(out, force)
+    check_output(out, "compare", force)
     options: dict[str, Any] = {"level": level, "seed": seed}
     names = parse_labels(labels)
     if split is None:
@@ -279,7 +275,7 @@ def plan_command(
     from starcal_uq.presentation.pages.planning import plan_record
     from starcal_uq.presentation.pages.write import write_page
 
-    check_output(out, force)
+    check_output(out, "plan", force)
     if after is not None and check is not None:
         raise typer.BadParameter("--check simulates campaigns from nothing: leave it out with --after.")
     sheet, known = sc.Camera.load(camera), None

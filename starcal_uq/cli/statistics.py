@@ -26,8 +26,8 @@ from starcal_uq.cli.options import (
     write_path,
 )
 from starcal_uq.core import settings
-from starcal_uq.core.files import atomic_write_bytes, check_new_folder, new_folder, write_csv
-from starcal_uq.core.store import finished
+from starcal_uq.core.files import atomic_write_bytes, write_csv
+from starcal_uq.core.manifest import making
 
 
 def register(app: typer.Typer) -> None:
@@ -61,32 +61,30 @@ def validate_command(
     Replicates are kept as they are made: an interrupted command goes on, also with more of them.
     """
     sensor = sc.Camera.load(camera)
-    check_new_folder(out, force)
-    with progress_bar("replicates") as progress:
-        found = sc.validate(
-            sensor,
-            n_replicates=replicates,
-            n_frames=frames,
-            min_stars=min_stars,
-            sigma_px=sigma,
-            max_mag=max_mag,
-            seed=seed,
-            workers=workers,
-            truth=truth,
-            progress=progress,
-            keep=out,
-        )
-    if found.interrupted:
-        raise KeyboardInterrupt
-    from starcal_uq.presentation.figures.style import png_bytes
-    from starcal_uq.presentation.words.diagnostics import validation_table
+    with making(out, "validate", "validation.npz", force=force) as stage:
+        with progress_bar("replicates") as progress:
+            found = sc.validate(
+                sensor,
+                n_replicates=replicates,
+                n_frames=frames,
+                min_stars=min_stars,
+                sigma_px=sigma,
+                max_mag=max_mag,
+                seed=seed,
+                workers=workers,
+                truth=truth,
+                progress=progress,
+                keep=out,
+            )
+        if found.interrupted:
+            raise KeyboardInterrupt
+        from starcal_uq.presentation.figures.style import png_bytes
+        from starcal_uq.presentation.words.diagnostics import validation_table
 
-    new_folder(out)
-    found.save(out / "validation.npz")
-    table = found.to_dataframe()
-    write_csv(table, out / "validation.csv")
-    atomic_write_bytes(out / "validation.png", png_bytes(found.plot.ranks()))
-    finished(out)
+        found.save(stage / "validation.npz")
+        table = found.to_dataframe()
+        write_csv(table, stage / "validation.csv")
+        atomic_write_bytes(stage / "validation.png", png_bytes(found.plot.ranks()))
     if json:
         print_json({"ok": found.ok, "verdict": found.text, "quantities": records(table)})
     else:

@@ -11,13 +11,21 @@ import hashlib
 import os
 import shutil
 import threading
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
 
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import STEP, PathLike, check_new_folder, flush_folder, new_folder, sweep_temporary
+from starcal_uq.core.files import (
+    STEP,
+    UNFINISHED,
+    PathLike,
+    check_new_folder,
+    flush_folder,
+    new_folder,
+    sweep_temporary,
+)
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import read_json, write_json
 from starcal_uq.core.store import finished
@@ -222,7 +230,9 @@ def files_in(folder: Path) -> dict[str, Path]:
 
 
 @contextmanager
-def making(folder: PathLike, command: str, *, main: str, force: bool = False, goes_on: bool = False) -> Iterator[Path]:
+def making(
+    folder: PathLike, command: str, main: str, *, force: bool = False, also: Sequence[str] = ()
+) -> Iterator[Path]:
     """Yield a folder for all results of a command; they take their places at once, if the block succeeds.
 
     Until then `folder` holds the results of before. What the command has kept there on its way (`core.store.Kept`) goes
@@ -238,8 +248,8 @@ def making(folder: PathLike, command: str, *, main: str, force: bool = False, go
         The result that versions without records always wrote.
     force : bool
         Whether to replace results of before.
-    goes_on : bool
-        Whether the command takes up results of its own without being forced.
+    also : sequence of str
+        Patterns of results that functions write without a record.
 
     Raises
     ------
@@ -251,17 +261,23 @@ def making(folder: PathLike, command: str, *, main: str, force: bool = False, go
     with alone(place):
         old = read_manifest(place)
         refuse_others(place, (command,))
-        ours = old is not None or os.path.exists(place / main)
-        check_new_folder(place, force or (goes_on and ours))
-        with staged(place) as stage:
-            yield stage
-            made = files_in(stage)
-            if made:
-                before = old.files if old is not None else [name for name in made if ours and (place / name).is_file()]
-                record = provenance(None, {}, None)
-                files = {name: entry_of(path, command) for name, path in made.items()}
-                commit(place, Manifest(files, {command: record}, stage=STEP), before)
-        finished(place)
+        check_new_folder(place, force)
+        try:
+            with staged(place) as stage:
+                yield stage
+                made = {name: entry_of(path, command) for name, path in files_in(stage).items()}
+                before = set() if old is None else set(old.files)
+                if old is not None or os.path.exists(place / main):
+                    patterns = also if old is not None else (*also, *made)
+                    before |= {path.relative_to(place).as_posix() for name in patterns for path in place.glob(name)}
+                if made:
+                    record = provenance(None, {}, None)
+                    commit(place, Manifest(made, {command: record}, stage=STEP), before)
+            finished(place)
+        finally:
+            with suppress(OSError):
+                # Nothing was kept.
+                (place / UNFINISHED).rmdir()
 
 
 def refuse_others(folder: Path, steps: Collection[str]) -> None:

@@ -8,6 +8,7 @@ import json
 import secrets
 import shutil
 from collections.abc import Callable, Sequence
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -101,7 +102,7 @@ class Kept:
     identity : object
         All that the tasks depend on but their number: a record, or what a record may hold.
     kinds : types, optional
-        Named tuples that results are, or hold.
+        Named tuples and dataclasses that results are, or hold.
     """
 
     def __init__(self, folder: PathLike, identity: object, kinds: Sequence[type] = ()) -> None:
@@ -157,6 +158,8 @@ def _plain(value: Any) -> Any:
         return value.item()
     if isinstance(value, dict):
         return {"dict": [[_plain(key), _plain(item)] for key, item in value.items()]}
+    if is_dataclass(value):
+        return {type(value).__name__: [_plain(getattr(value, field.name)) for field in fields(value) if field.init]}
     if isinstance(value, list | tuple):
         kind = type(value).__name__
         return {kind: [_plain(item) for item in value]}

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.files import PathLike, atomic_write_text, check_new_folder
+from starcal_uq.core.files import PathLike, atomic_write_text
+from starcal_uq.core.manifest import making
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import bounded
-from starcal_uq.core.store import finished
 from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import AnyDict
 from starcal_uq.paper.camera import paper_camera, paper_start
@@ -18,7 +18,7 @@ from starcal_uq.paper.interaction import interaction_study
 from starcal_uq.paper.published import PAPER_METHODS
 from starcal_uq.paper.readings import run_readings
 from starcal_uq.paper.replicates import replicate
-from starcal_uq.paper.result import Reproduction, judge_all, run_paper
+from starcal_uq.paper.result import REPORT, Reproduction, judge_all, run_paper
 from starcal_uq.paper.show.pages import reproduction_figures, reproduction_page
 
 # Replicates of every reading, and of the study: enough for z-values to ten per cent, and for the figure.
@@ -66,7 +66,7 @@ def reproduce(
     study : bool
         Also vary the experiment along four axes (`interaction_study`).
     force : bool
-        Write into a folder that holds files already; those of the same names are replaced.
+        Replace results of before, when those of this call are complete; other files in the folder stay.
 
     Returns
     -------
@@ -85,13 +85,33 @@ def reproduce(
     KeyboardInterrupt
         After Ctrl-C; the same call then goes on.
     """
-    folder = Path(out)
-    check_new_folder(folder, force)
     if n_replicates < 8:
         raise CalibrationError(f"n_replicates is {n_replicates}: a comparison over seeds needs at least 8.")
     if n_frames < 20:
         raise CalibrationError(f"n_frames is {n_frames}: the experiment needs at least 20.")
     bar = Bar(progress, {name: share for name, share in _SHARES.items() if study or name != "study"})
+    with making(out, "reproduce", REPORT, force=force) as stage:
+        found = _reproduced(Path(out), n_replicates, n_frames, seed, convention, workers, study, bar)
+        figures = reproduction_figures(found)
+        page = reproduction_page(found, figures)
+        write_tables(stage, found.tables(), figures)
+        found.replicates.save(stage / "replicates.npz")
+        atomic_write_text(stage / REPORT, page)
+    bar.finish("report")
+    return found
+
+
+def _reproduced(
+    folder: Path,
+    n_replicates: int,
+    n_frames: int,
+    seed: int,
+    convention: str,
+    workers: int | None,
+    study: bool,
+    bar: Bar,
+) -> Reproduction:
+    """All numbers; data sets that are done are kept in the folder."""
     truth, start = paper_camera(convention), paper_start(convention)
     run = run_paper(convention=convention, n_frames=n_frames, seed=seed)
     bar.finish("run")
@@ -132,7 +152,7 @@ def reproduce(
     settings |= {"n_reading_draws": readings.n_draws, "study": study}
     calibrations = {name: run.of(name) for name in PAPER_METHODS}
     sigmas = {name: dict(zip(c.parameter_names, c.sigmas.tolist(), strict=True)) for name, c in calibrations.items()}
-    found = Reproduction(
+    return Reproduction(
         path=folder,
         run=run,
         replicates=replicates,
@@ -142,14 +162,6 @@ def reproduce(
         study=varied,
         provenance=provenance(seed, settings, run.observations.data_hash),
     )
-    figures = reproduction_figures(found)
-    page = reproduction_page(found, figures)
-    write_tables(folder, found.tables(), figures)
-    replicates.save(folder / "replicates.npz")
-    atomic_write_text(found.report, page)
-    finished(folder)
-    bar.finish("report")
-    return found
 
 
 def _stop_if(interrupted: bool) -> None:

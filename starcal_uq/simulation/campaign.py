@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import RunFolderError, SensorError
 from starcal_uq.core.files import ensure_new
+from starcal_uq.core.manifest import alone
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import FloatArray
 from starcal_uq.simulation.frames import EDGE_SIGMAS, Sky, choose_attitudes
@@ -110,31 +111,28 @@ def render_frames(
     times = [None] * n if times_utc is None else [check_time(text) for text in times_utc]
     if len(times) != n:
         raise SensorError(f"rendering: there are {len(times)} times for {n} frames; give one for each.")
-    paths = _targets(Path(out_dir), n, force)
     scene = Scene(stars, camera, Sensor() if sensor is None else sensor)
-    for number, path in enumerate(paths):
-        frame = scene.render(
-            rotations[number],
-            np.random.default_rng([seed, number]),
-            rate_rad_s=np.broadcast_to(rates, (n, 3))[number],
-            frame=number,
-            seed=seed,
-            time_utc=times[number],
-        )
-        write_frame(frame, path, force)
-        if progress is not None:
-            progress(number + 1, n)
+    with alone(out_dir):
+        paths = _targets(Path(out_dir), n, force)
+        for number, path in enumerate(paths):
+            frame = scene.render(
+                rotations[number],
+                np.random.default_rng([seed, number]),
+                rate_rad_s=np.broadcast_to(rates, (n, 3))[number],
+                frame=number,
+                seed=seed,
+                time_utc=times[number],
+            )
+            write_frame(frame, path, force)
+            if progress is not None:
+                progress(number + 1, n)
     return paths
 
 
 def _targets(folder: Path, n: int, force: bool) -> list[Path]:
     """The files to write, in a folder where no other frames would be taken for theirs."""
     paths = [folder / f"frame_{number:05d}.fits" for number in range(n)]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        present = sorted(folder.glob(_PATTERN))
-    except OSError as error:
-        raise RunFolderError(f"{folder}: the folder cannot be made ({error.strerror}); choose another.") from error
+    present = sorted(folder.glob(_PATTERN))
     others = sorted(set(present) - set(paths))
     if others:
         raise RunFolderError(

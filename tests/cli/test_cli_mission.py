@@ -217,7 +217,7 @@ def test_a_runs_own_files_are_not_mixed_with_others(cli, run, tmp_path, small_pl
     ):
         status, _, err = cli(*arguments)
         assert status == 2
-        assert "is the folder of a run" in err
+        assert "holds the results of another command" in err
     assert {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
     (tmp_path / "b.toml").touch()
     status, _, err = cli("budget", "run", "--file", "b.toml", "--template", "./b.toml", "--force")

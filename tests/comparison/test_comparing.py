@@ -356,6 +356,7 @@ def test_page_tables_and_file(tmp_path: Path) -> None:
         "difference.csv",
         "difference_map.csv",
         "difference_map.png",
+        "run.json",
     ]
     text = page.read_text(encoding="utf-8")
     assert "http" not in text.replace("http-equiv", "")

@@ -155,13 +155,14 @@ def test_refuses_a_used_folder(tmp_path) -> None:
         field_experiment(tmp_path)
 
 
-def test_ctrl_c_leaves_nothing(tmp_path) -> None:
+def test_ctrl_c_leaves_no_results(tmp_path) -> None:
     def stop(done: int, total: int) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         field_experiment(tmp_path / "out", n_frames=20, n_calibration_frames=20, workers=0, progress=stop)
-    assert not (tmp_path / "out").exists()
+    # But what it goes on with.
+    assert [path.name for path in (tmp_path / "out").iterdir()] == [".unfinished"]
 
 
 # A small experiment for the tests, smaller than users are let: its parts are those of a large one.
@@ -178,14 +179,26 @@ def small_sizes():
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory, small_sizes):
+    """The experiment, interrupted in each of its parts and gone on with, and what its progress callback was told."""
+    folder = tmp_path_factory.mktemp("field") / "out"
     seen: list[int] = []
+    end = 0
+
+    def show(done: int, total: int) -> None:
+        seen.append(100 * done // total)
+        if seen[-1] >= end:
+            raise KeyboardInterrupt
+
     with without_painting():
-        found = field_experiment(
-            tmp_path_factory.mktemp("field") / "out",
-            workers=0,
-            progress=lambda done, total: seen.append(100 * done // total),
-            **SMALL,
-        )
+        for part in (20, 60, 88):
+            end = part
+            seen.clear()
+            with pytest.raises(KeyboardInterrupt):
+                field_experiment(folder, workers=0, progress=show, **SMALL)
+            assert [path.name for path in folder.iterdir()] == [".unfinished"]
+        end = 101
+        seen.clear()
+        found = field_experiment(folder, workers=0, progress=show, **SMALL)
     return found, seen
 
 
@@ -225,6 +238,7 @@ def test_control_has_noise_alone(small) -> None:
 def test_does_not_depend_on_processes(small, tmp_path) -> None:
     found = small[0]
     again = field_experiment(tmp_path / "out", workers=2, **SMALL)
+    # Nor on interrupts.
     for name in ("table_3", "rates", "parts", "frames", "cameras"):
         assert (found.path / f"{name}.csv").read_bytes() == (again.path / f"{name}.csv").read_bytes()
 

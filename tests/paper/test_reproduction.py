@@ -373,15 +373,22 @@ def test_the_paper_against_itself() -> None:
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Reproduction, list[tuple[int, int]]]:
-    """A reproduction of few frames, and what its progress callback was told."""
+    """A reproduction of few frames, interrupted and gone on with, and what its progress callback was told."""
     told: list[tuple[int, int]] = []
     folder = tmp_path_factory.mktemp("reproduction") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(command, "N_READING_DRAWS", 2)
+        few = {"n_replicates": 8, "n_frames": 40, "seed": 3, "workers": 0, "study": False}
+
+        def stop(done: int, total: int) -> None:
+            if done > 0.4 * total:
+                raise KeyboardInterrupt
+
         with without_painting():
-            found = command.reproduce(
-                folder, n_replicates=8, n_frames=40, seed=3, workers=0, study=False, progress=lambda *n: told.append(n)
-            )
+            with pytest.raises(KeyboardInterrupt):
+                command.reproduce(folder, progress=stop, **few)
+            assert [path.name for path in folder.iterdir()] == [".unfinished"]
+            found = command.reproduce(folder, progress=lambda *n: told.append(n), **few)
     return found, told
 
 

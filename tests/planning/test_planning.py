@@ -487,7 +487,7 @@ def test_folder_of_a_plan(tmp_path):
     assert found.text.split(".")[0] in text
     written = {path.relative_to(page.parent).as_posix() for path in page.parent.rglob("*") if path.is_file()}
     assert written == {
-        *("plan.html", "plan.csv", "sweeps.csv", "plan.json", "figures/forecast.png", "figures/sweeps.png")
+        *("plan.html", "plan.csv", "sweeps.csv", "plan.json", "figures/forecast.png", "figures/sweeps.png", "run.json")
     }
     record = json.loads((page.parent / "plan.json").read_text())
     assert record["needs"][0]["frames"] == found.frames_needed

@@ -20,6 +20,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import unproject
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import CalibrationError, DistortionError
+from starcal_uq.core.store import Kept
 from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.calibrate import calibrate
@@ -210,10 +211,14 @@ class Repetition:
 
 
 def replicate_field(
-    repetition: Repetition, n_replicates: int, workers: int | None, progress: Progress | None
+    repetition: Repetition,
+    n_replicates: int,
+    workers: int | None,
+    progress: Progress | None,
+    kept: Kept | None = None,
 ) -> FieldReplicates:
     """Every repetition; `FieldReplicates`."""
-    results = run_or_stop(repetition, n_replicates, chunk=_CHUNK, workers=workers, progress=progress)
+    results = run_or_stop(repetition, n_replicates, chunk=_CHUNK, workers=workers, progress=progress, kept=kept)
     empty = np.empty((0, 3))
     return FieldReplicates(
         {

@@ -7,14 +7,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.files import PathLike, atomic_write_text, check_new_folder
+from starcal_uq.core.files import PathLike, atomic_write_text
+from starcal_uq.core.manifest import making
 from starcal_uq.core.provenance import provenance
+from starcal_uq.core.store import Kept
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.paper.commands import Bar, write_tables
 from starcal_uq.paper.field.attitudes import Repetition, attitude_errors, identified_stars, replicate_field
-from starcal_uq.paper.field.frames import WRONG_PX, FieldFrames, identify_all, take_frames, true_pixels
+from starcal_uq.paper.field.frames import (
+    WRONG_PX,
+    FieldFrames,
+    FieldIdentification,
+    identify_all,
+    take_frames,
+    true_pixels,
+)
 from starcal_uq.paper.field.published import (
     FIELD_CAMERAS,
     NOMINAL_FOCAL_MM,
@@ -24,7 +34,7 @@ from starcal_uq.paper.field.published import (
     UNCALIBRATED,
     FieldReading,
 )
-from starcal_uq.paper.field.result import FieldExperiment
+from starcal_uq.paper.field.result import FIELD_REPORT, FieldExperiment
 from starcal_uq.paper.published import PAPER_METHODS
 from starcal_uq.paper.show.pages import field_figures, field_page
 from starcal_uq.pipeline.refine import identify_and_calibrate
@@ -32,7 +42,6 @@ from starcal_uq.sky.catalogue import load_catalogue
 from starcal_uq.sky.neighbours import without_disturbed
 
 if TYPE_CHECKING:
-    from starcal_uq.camera.camera import Camera
     from starcal_uq.core.tasks import Progress
     from starcal_uq.observations.table import Observations
     from starcal_uq.pipeline.refine import ImageCalibration
@@ -74,7 +83,8 @@ def field_experiment(
     ----------
     out : path
         Folder to write: ``field.html`` (self-contained), the tables of `FieldExperiment.tables` as CSV, and the figures
-        as PNG in ``figures``. Nothing is written before everything is computed.
+        as PNG in ``figures``, when everything is computed. Until then what is done is kept in the folder, and an
+        interrupted call goes on from it.
     n_frames, n_calibration_frames, n_replicates : int
         Frames of the test, of which the paper has 200, and of the calibration, of which it does not say; repetitions
         with other noise, from which the ranges of the errors come. Each at least 20.
@@ -92,17 +102,39 @@ def field_experiment(
     IdentificationError
         When the frames of the calibration cannot be identified.
     """
-    check_new_folder(out, force)
     if reading not in READINGS:
         raise CalibrationError(f"reading {reading!r} of the field unit is unknown: use one of {', '.join(READINGS)}.")
     sizes = {"n_frames": n_frames, "n_calibration_frames": n_calibration_frames, "n_replicates": n_replicates}
     for name, number in sizes.items():
         if number < _LEAST:
             raise CalibrationError(f"{name} is {number}: the field experiment needs at least {_LEAST}.")
-    sensor = READINGS[reading]
     bar = Bar(progress, _SHARES)
+    with making(out, "reproduce-field", FIELD_REPORT, force=force) as stage:
+        experiment = _experiment(
+            Path(out), n_frames, n_calibration_frames, READINGS[reading], seed, n_replicates, workers, bar
+        )
+        figures = field_figures(experiment)
+        page = field_page(experiment, figures)
+        write_tables(stage, experiment.tables(), figures)
+        atomic_write_text(stage / FIELD_REPORT, page)
+    bar.finish("report")
+    return experiment
+
+
+def _experiment(
+    folder: Path,
+    n_frames: int,
+    n_calibration_frames: int,
+    sensor: FieldReading,
+    seed: int,
+    n_replicates: int,
+    workers: int | None,
+    bar: Bar,
+) -> FieldExperiment:
+    """All numbers; frames, identifications and repetitions that are done are kept in the folder."""
     stars = load_catalogue(max_mag=sensor.limit_mag + _CATALOGUE_MORE_MAG)
-    taken = take_frames(sensor, n_calibration_frames + n_frames, seed, workers, bar.part("frames"))
+    made_of = ["field", sensor.name, n_calibration_frames, n_frames, seed, stars.source]
+    taken = take_frames(sensor, n_calibration_frames + n_frames, seed, workers, bar.part("frames"), keep=folder)
     campaign, frames = taken.part(0, n_calibration_frames), taken.part(n_calibration_frames, len(taken.rotations))
     found, counts = _campaign(campaign, sensor, stars)
     calibrations = {name: calibrate(found.observations, sensor.nominal(), method=name) for name in PAPER_METHODS}
@@ -116,7 +148,8 @@ def field_experiment(
     jobs: list[tuple[Camera, float]] = [(camera, TOLERANCE_PX) for camera in sheets.values()]
     named = [(name, tolerance) for name in FIELD_CAMERAS for tolerance in TOLERANCES_PX]
     jobs += [(cameras[name], tolerance) for name, tolerance in named]
-    results = identify_all(frames, sensor.truth, stars, jobs, workers, bar.part("identification"))
+    kept = Kept(folder, [*made_of, jobs], (FieldIdentification, Camera))
+    results = identify_all(frames, sensor.truth, stars, jobs, workers, bar.part("identification"), kept)
     sweep = dict(zip(named, results[len(sheets) :], strict=True))
     seen = {name: identified_stars(frames, sensor.truth, stars, sweep[name, TOLERANCE_PX]) for name in FIELD_CAMERAS}
     tests = {name: chosen for name, chosen in seen.items() if chosen is not None}
@@ -133,11 +166,16 @@ def field_experiment(
         cameras=cameras,
         seed=seed,
     )
-    replicates = replicate_field(repetition, n_replicates, workers, bar.part("replicates"))
-    settings: dict[str, Any] = {"reading": reading, "n_frames": n_frames, "n_calibration_frames": n_calibration_frames}
+    kept = Kept(folder, [*made_of, cameras])
+    replicates = replicate_field(repetition, n_replicates, workers, bar.part("replicates"), kept)
+    settings: dict[str, Any] = {
+        "reading": sensor.name,
+        "n_frames": n_frames,
+        "n_calibration_frames": n_calibration_frames,
+    }
     settings |= {"tolerance_px": TOLERANCE_PX, "n_replicates": n_replicates, "nominal_focal_mm": NOMINAL_FOCAL_MM}
-    experiment = FieldExperiment(
-        path=Path(out),
+    return FieldExperiment(
+        path=folder,
         reading=sensor,
         tolerance_px=TOLERANCE_PX,
         frames=frames,
@@ -151,12 +189,6 @@ def field_experiment(
         replicates=replicates,
         provenance=provenance(seed, settings, found.observations.data_hash),
     )
-    figures = field_figures(experiment)
-    page = field_page(experiment, figures)
-    write_tables(experiment.path, experiment.tables(), figures)
-    atomic_write_text(experiment.report, page)
-    bar.finish("report")
-    return experiment
 
 
 def _campaign(

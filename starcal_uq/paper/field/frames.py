@@ -16,6 +16,8 @@ from starcal_uq.attitude.rotations import random_rotations
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.projection import project
 from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.files import PathLike
+from starcal_uq.core.store import Kept
 from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
 from starcal_uq.identification.proposers import Proposer, prepare_engine
@@ -81,33 +83,41 @@ class _RenderTask:
 
 
 def take_frames(
-    reading: FieldReading, n_frames: int, seed: int, workers: int | None, progress: Progress | None
+    reading: FieldReading,
+    n_frames: int,
+    seed: int,
+    workers: int | None,
+    progress: Progress | None,
+    keep: PathLike | None = None,
 ) -> FieldFrames:
-    """Render random attitudes until `n_frames` of them show more than six stars."""
+    """Render random attitudes until `n_frames` of them show more than six stars; a folder keeps what is done."""
     stars, camera = load_catalogue(max_mag=reading.limit_mag + _FAINTER_MAG), reading.truth
     scene = Scene(stars, camera, reading.sensor)
     attitudes = _Attitudes(reading, np.random.default_rng([seed, 0]))
-    kept: list[Centroids] = []
+    chosen: list[Centroids] = []
     rotations: list[FloatArray] = []
     rank, done = 0, 0
-    while len(kept) < n_frames:
-        missing = n_frames - len(kept)
+    while len(chosen) < n_frames:
+        missing = n_frames - len(chosen)
         some, ranks = attitudes.take(int(np.ceil(missing * _CANDIDATES)) + _MORE_CANDIDATES)
-        before = len(kept)
+        before = len(chosen)
 
         def move(number: int, total: int, before: int = before) -> None:
             if progress is not None:
                 progress(min(n_frames, before + number * (n_frames - before) // total), n_frames)
 
         task = _RenderTask(scene, some, done, seed)
-        tables = run_or_stop(task, len(some), chunk=_CHUNK, workers=workers, progress=move)
+        # A candidate depends on the seed and its own number.
+        identity = ["field frames", reading.name, seed, done, stars.source]
+        kept = None if keep is None else Kept(keep, identity, (Centroids,))
+        tables = run_or_stop(task, len(some), chunk=_CHUNK, workers=workers, progress=move, kept=kept)
         done += len(some)
         for table, rotation, number in zip(tables, some, ranks, strict=True):
-            if len(kept) < n_frames and len(table.frame) > MORE_THAN_STARS:
-                kept.append(table)
+            if len(chosen) < n_frames and len(table.frame) > MORE_THAN_STARS:
+                chosen.append(table)
                 rotations.append(rotation)
                 rank = int(number)
-    return FieldFrames(_joined(kept), np.array(rotations), n_frames / (rank + 1))
+    return FieldFrames(_joined(chosen), np.array(rotations), n_frames / (rank + 1))
 
 
 class _Attitudes:
@@ -223,10 +233,11 @@ def identify_all(
     jobs: list[tuple[Camera, float]],
     workers: int | None,
     progress: Progress | None,
+    kept: Kept | None = None,
 ) -> list[FieldIdentification]:
     """Identify the frames once for each job (camera, tolerance in px)."""
     # One set of pairs serves all cameras, whose fields differ little.
     wide = CameraTolerance(0.03, 0.0, 0.0)
     proposer = prepare_engine("pyramid", stars, field_geometry(truth), wide, False, None)
     task = _IdentifyTask(frames, truth, stars, jobs, proposer)
-    return run_or_stop(task, len(jobs), chunk=1, workers=workers, progress=progress)
+    return run_or_stop(task, len(jobs), chunk=1, workers=workers, progress=progress, kept=kept)

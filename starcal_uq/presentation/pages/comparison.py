@@ -9,8 +9,9 @@ import numpy as np
 
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.comparison.result import CameraComparison
-from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, new_folder, write_csv
+from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, write_csv
 from starcal_uq.core.formatting import fixed, percent, pretty_unit, significant, with_sigma
+from starcal_uq.core.manifest import making
 from starcal_uq.presentation.figures.comparison import plot_camera_comparison
 from starcal_uq.presentation.figures.style import png_bytes
 from starcal_uq.presentation.html import embedded_image, template_environment
@@ -26,8 +27,11 @@ _BADGES = {
 }
 
 
+_PAGE = "comparison.html"
+
+
 def write_comparison(comparison: CameraComparison, folder: str | os.PathLike[str]) -> Path:
-    """Write the page, the tables, the figure and a lossless file into a folder; existing ones are overwritten.
+    """Write the page, the tables, the figure and a lossless file into a folder, in place of those of before.
 
     Returns
     -------
@@ -39,15 +43,14 @@ def write_comparison(comparison: CameraComparison, folder: str | os.PathLike[str
     RunFolderError
         If the folder cannot be made or written to.
     """
-    path = new_folder(folder)
     image = png_bytes(plot_camera_comparison(comparison))
-    comparison.save(path / "comparison.json")
-    write_csv(comparison.to_dataframe(), path / "difference.csv")
-    write_csv(comparison.field_dataframe(), path / "difference_map.csv")
-    atomic_write_bytes(path / "difference_map.png", image)
-    page = path / "comparison.html"
-    atomic_write_text(page, render_comparison(comparison, image))
-    return page
+    with making(folder, "compare", _PAGE, force=True) as path:
+        comparison.save(path / "comparison.json")
+        write_csv(comparison.to_dataframe(), path / "difference.csv")
+        write_csv(comparison.field_dataframe(), path / "difference_map.csv")
+        atomic_write_bytes(path / "difference_map.png", image)
+        atomic_write_text(path / _PAGE, render_comparison(comparison, image))
+    return Path(folder) / _PAGE
 
 
 def render_comparison(comparison: CameraComparison, image: bytes) -> str:

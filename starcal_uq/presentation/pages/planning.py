@@ -13,6 +13,7 @@ import numpy as np
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, new_folder, write_csv
 from starcal_uq.core.formatting import count, fixed, significant
+from starcal_uq.core.manifest import making
 from starcal_uq.core.records import to_plain
 from starcal_uq.planning.check import ForecastCheck
 from starcal_uq.planning.design import FrameChoice
@@ -58,14 +59,14 @@ def write_plan(
 ) -> Path:
     """Write ``plan.html`` (self-contained), the tables as CSV, ``plan.json`` and the figures into a folder.
 
-    The page comes last: it is there only if all else is.
+    All files count at once, when they are complete.
 
     Parameters
     ----------
     plan : Plan
         What was forecast.
     folder : path
-        Folder, made if it is missing; files in it are overwritten.
+        Folder, made if it is missing; those of a plan of before are replaced.
     choice : FrameChoice, optional
         Frames to take, for the page and ``frames.csv``.
     check : ForecastCheck, optional
@@ -76,25 +77,25 @@ def write_plan(
     Path
         The page.
     """
-    path = new_folder(folder)
     images = plan_figures(plan, choice, check)
     page = render_plan(plan, images, choice, check)
-    figures = new_folder(path / "figures")
-    for name, png in images.items():
-        atomic_write_bytes(figures / f"{name}.png", png)
     tables = {
         "plan": plan.to_dataframe(),
         "sweeps": plan.sweeps,
         "frames": None if choice is None else choice.to_dataframe(),
         "check": None if check is None else check.to_dataframe(),
     }
-    for name, table in tables.items():
-        if table is None:
-            continue
-        write_csv(table, path / f"{name}.csv")
-    atomic_write_text(path / "plan.json", json.dumps(plan_record(plan), indent=1) + "\n")
-    atomic_write_text(path / PAGE, page)
-    return path / PAGE
+    with making(folder, "plan", PAGE, force=True) as path:
+        figures = new_folder(path / "figures")
+        for name, png in images.items():
+            atomic_write_bytes(figures / f"{name}.png", png)
+        for name, table in tables.items():
+            if table is None:
+                continue
+            write_csv(table, path / f"{name}.csv")
+        atomic_write_text(path / "plan.json", json.dumps(plan_record(plan), indent=1) + "\n")
+        atomic_write_text(path / PAGE, page)
+    return Path(folder) / PAGE
 
 
 def plan_record(plan: Plan) -> dict[str, Any]:

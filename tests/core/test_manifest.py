@@ -1,0 +1,137 @@
+"""Results of a command replace those of before all at once, and one process at a time writes into a folder."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.files import atomic_write_text, new_folder
+from starcal_uq.core.manifest import alone, making, read_manifest
+from starcal_uq.core.store import UNFINISHED, Kept
+from tests.helpers.crashes import small_files, snapshots
+
+OLD = {"page.html": "old", "table.csv": "old, 1", "figures/one.png": "old, 2", "figures/gone.png": "old, 3"}
+NEW = {"page.html": "new", "table.csv": "new, 1", "figures/one.png": "new, 2", "more.csv": "new, 4"}
+MINE = {"notes.txt": "mine", "figures/mine.png": "mine"}
+
+
+def write(folder: Path, files: Mapping[str, str]) -> None:
+    for name, text in files.items():
+        new_folder((folder / name).parent)
+        atomic_write_text(folder / name, text)
+
+
+def make(folder: Path, files: Mapping[str, str], *, force: bool = False, stop: bool = False) -> None:
+    with making(folder, "command", "page.html", force=force) as stage:
+        Kept(folder, {"seed": 1}).keep([(0, "done")])
+        write(stage, files)
+        if stop:
+            raise KeyboardInterrupt
+
+
+def content(folder: Path) -> dict[str, str]:
+    """All files but those that are hidden and the record, which puts the others in their places when it is read."""
+    read_manifest(folder)
+    files = {path.relative_to(folder): path for path in folder.rglob("*") if path.is_file()}
+    return {
+        name.as_posix(): path.read_text()
+        for name, path in files.items()
+        if not name.parts[0].startswith(".") and path.name != "run.json"
+    }
+
+
+def test_at_every_moment_there_are_the_old_results_or_the_new_ones(tmp_path: Path) -> None:
+    folder = tmp_path / "work" / "out"
+    make(folder, OLD)
+    write(folder, MINE)
+    with snapshots(folder.parent, tmp_path / "states") as states:
+        make(folder, NEW, force=True)
+    assert content(folder) == NEW | MINE
+    assert not [path for path in folder.iterdir() if path.name.startswith(".")]
+    found = [content(state / "out") for state in states]
+    assert all(one in (OLD | MINE, NEW | MINE) for one in found)
+    assert found.index(NEW | MINE) > 5
+    # Control: files that are replaced one by one show a mix.
+    with snapshots(folder.parent, tmp_path / "control") as states:
+        write(folder, OLD)
+    assert not all(content(state / "out") in (OLD | MINE, NEW | MINE) for state in states[1:-1])
+
+
+def test_an_interrupt_keeps_what_is_done_and_the_results_of_before(tmp_path: Path) -> None:
+    make(tmp_path / "out", OLD)
+    with pytest.raises(KeyboardInterrupt):
+        make(tmp_path / "out", NEW, force=True, stop=True)
+    assert content(tmp_path / "out") == OLD
+    assert Kept(tmp_path / "out", {"seed": 1}).results(1) == {0: "done"}
+    # The same command goes on without being forced.
+    make(tmp_path / "out", NEW)
+    assert content(tmp_path / "out") == NEW
+    assert not (tmp_path / "out" / UNFINISHED).exists()
+    with pytest.raises(RunFolderError, match=r"not empty; .* --force"):
+        make(tmp_path / "out", NEW)
+
+
+def test_a_full_disk_leaves_the_results_of_before(tmp_path: Path) -> None:
+    make(tmp_path / "out", OLD)
+    with small_files(20_000), pytest.raises(RunFolderError, match=r"cannot be written .*free space"):
+        make(tmp_path / "out", NEW | {"table.csv": "1" * 30_000}, force=True)
+    assert content(tmp_path / "out") == OLD
+
+
+def test_files_of_others_are_neither_replaced_nor_mixed(tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    write(folder, {"table.csv": "mine"})
+    with pytest.raises(RunFolderError, match="not empty"):
+        make(folder, NEW)
+    with pytest.raises(RunFolderError, match=r"table\.csv: is in the way of a result"):
+        make(folder, NEW, force=True)
+    assert content(folder) == {"table.csv": "mine"}
+    # A version without records wrote the page, and so the table.
+    write(folder, {"page.html": "of before"})
+    make(folder, NEW, force=True)
+    assert content(folder) == NEW
+    with (
+        pytest.raises(RunFolderError, match=r"out: holds the results of another command, with which .* name another"),
+        making(folder, "other", "page.html", force=True),
+    ):
+        pass
+    write(tmp_path / "run", {"calibration.json": "{}"})
+    with pytest.raises(RunFolderError, match="holds the results of another command"):
+        make(tmp_path / "run", NEW, force=True)
+
+
+def test_one_writes_and_others_are_refused(tmp_path: Path) -> None:
+    folder, refused = tmp_path / "out", []
+
+    def other() -> None:
+        with pytest.raises(RunFolderError, match=r"out: another process is writing there; wait for it, or end it\.$"):
+            make(folder, NEW)
+        refused.append(True)
+
+    with alone(folder), alone(folder):
+        thread = threading.Thread(target=other)
+        thread.start()
+        thread.join()
+        handle = os.open(folder, os.O_RDONLY)
+        with pytest.raises(BlockingIOError):
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    assert refused == [True]
+    # Nothing was made there.
+    assert not folder.exists()
+    make(folder, OLD)
+    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    os.close(handle)
+    handle = os.open(folder, os.O_RDONLY)
+    fcntl.flock(handle, fcntl.LOCK_EX)
+    with pytest.raises(RunFolderError, match="another process"):
+        make(folder, NEW, force=True)
+    # As when a process ends, however it ends.
+    os.close(handle)
+    make(folder, NEW, force=True)
+    assert content(folder) == NEW
