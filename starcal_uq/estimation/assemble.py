@@ -83,6 +83,7 @@ def assemble(
     if refined and status.ok:
         compressed = settled(compressed)
         theta, last = compressed.theta_hat, stages[-1]
+        sigma = float(np.sqrt(compressed.gram[0, 0] / dof))
         efficient = unit_covariance(compressed) * sigma**2
         information = symmetric_inverse(efficient)
         ended = replace(

@@ -44,7 +44,7 @@ from starcal_uq.estimation.plausibility import explained
 from starcal_uq.estimation.recursive.start import RECURSIVE_METHODS, RecursionOptions
 from starcal_uq.estimation.recursive.stream import raise_unless_good
 from starcal_uq.estimation.robust import compress_reweighted, refine, robust_start
-from starcal_uq.estimation.solvers import is_singular
+from starcal_uq.estimation.solvers import Last, is_singular
 from starcal_uq.estimation.stages import (
     PAIR_TOLERANCE,
     REFINEMENT_TOLERANCE,
@@ -77,9 +77,9 @@ _DIRECT_ITERATIONS = 60
 _STARS_WORTH_PROCESSES = 1_000_000
 # Frames and stars of a sample that is near enough to the minimum of all, and the relative gain of its last steps.
 _SAMPLE_FRAMES, _SAMPLE_STARS, _SAMPLE_TOLERANCE = 150, 2500, 1e-4
-# Standard deviations of the last step where more follows: of the estimate from interstar angles of all frames, which is
-# then known to a thousandth of that, and of the refinement, from where one of Newton's on the expansion is exact.
-_LAST_PAIR_STEP, _LAST_STEP = 0.05, 0.02
+# Standard deviations of the last step: of the estimate from interstar angles of all frames, which is then known to a
+# thousandth of that, and of the refinement, which is left to Newton's method on the expansion: to 1e-9 of them.
+_LAST_PAIR_STEP, _LAST_STEP = 0.05, 0.003
 
 
 @bounded
@@ -304,7 +304,8 @@ def _gaussian(
     obs: Observations, camera: Camera, likelihood: MarginalLikelihood, method: str, solver: str, max_iterations: int
 ) -> Calibration:
     pairs = PairObjective(likelihood.frames, camera.distortion)
-    stages, status = _stages(pairs, camera, likelihood, method, solver, max_iterations, _gain(likelihood, _LAST_STEP))
+    last = _gain(likelihood, _LAST_STEP)
+    stages, status = _stages(pairs, camera, likelihood, method, solver, max_iterations, last, "left")
     pair_theta = stages[-2 if stages[-1].name == "refinement" else -1].theta
     covariance = _pair_covariance(pairs, likelihood, pair_theta)
     return assemble(obs, camera, method, solver, likelihood, stages, status, pair_theta, covariance)
@@ -313,7 +314,9 @@ def _gaussian(
 def _pair_covariance(pairs: PairObjective, likelihood: MarginalLikelihood, pair_theta: FloatArray) -> FloatArray:
     # The scatter of many frames needs no noise.
     chi2 = np.nan if enough_frames(pairs) else likelihood.profile(pair_theta, likelihood.rotations)[1]
-    return pair_covariance(pairs, pair_theta, chi2, likelihood.dof - len(pair_theta))
+    # The last step was not followed by an evaluation.
+    near = _gain(likelihood, _LAST_PAIR_STEP)
+    return pair_covariance(pairs, pair_theta, chi2, likelihood.dof - len(pair_theta), near)
 
 
 @dataclass(frozen=True)
@@ -395,8 +398,9 @@ def _stages(
     solver: str,
     max_iterations: int,
     tolerance: float = REFINEMENT_TOLERANCE,
+    last: Last = "seen",
 ) -> tuple[list[Stage], Status]:
-    """All stages of a Gaussian fit, and how they ended; `tolerance` is that of the refinement."""
+    """All stages of a Gaussian fit, and how they ended; `tolerance` and `last` are those of the refinement."""
     sampled = method == "efficient" and solver == "lm"
     stages = _sampled_stages(pairs, camera, max_iterations, _gain(likelihood, _LAST_PAIR_STEP)) if sampled else []
     stages = stages or _pair_stages(pairs, camera, solver, max_iterations)
@@ -417,7 +421,7 @@ def _stages(
     # Interstar angles do not see a mirror, nor does their noise show a few wrong stars; positions do.
     status = check_noise(noise, camera, stages[-1].status)
     if status.ok and method == "efficient":
-        stages.append(refinement_stage(likelihood, stages[-1].theta, max_iterations, tolerance))
+        stages.append(refinement_stage(likelihood, stages[-1].theta, max_iterations, tolerance, last))
         status = stages[-1].status
     return stages, status
 
@@ -538,10 +542,10 @@ def _sampled_stages(pairs: PairObjective, camera: Camera, max_iterations: int, t
     chosen = np.zeros(frames.n_frames, dtype=bool)
     chosen[one_of_each(frames.n_frames, wanted)] = True
     sample = PairObjective(frames.select(np.repeat(chosen, frames.sizes)), pairs.model_name)
-    stages = _pair_stages(sample, camera, "lm", max_iterations, _SAMPLE_TOLERANCE)
+    stages = _pair_stages(sample, camera, "lm", max_iterations, _SAMPLE_TOLERANCE, "unseen")
     if not stages[-1].status.ok:
         return []
-    last = joint_stage(pairs, camera, stages[-1].theta, "lm", max_iterations, tolerance)
+    last = joint_stage(pairs, camera, stages[-1].theta, "lm", max_iterations, tolerance, "unseen")
     if not last.status.ok:
         return []
     scales = {"distortion": frames.n_stars / sample.frames.n_stars}
@@ -551,10 +555,15 @@ def _sampled_stages(pairs: PairObjective, camera: Camera, max_iterations: int, t
 
 
 def _pair_stages(
-    pairs: PairObjective, camera: Camera, solver: str, max_iterations: int, tolerance: float = PAIR_TOLERANCE
+    pairs: PairObjective,
+    camera: Camera,
+    solver: str,
+    max_iterations: int,
+    tolerance: float = PAIR_TOLERANCE,
+    last: Last = "seen",
 ) -> list[Stage]:
     frames = pairs.frames
-    stages = [optics_stage(frames, camera, solver, max_iterations, tolerance)]
+    stages = [optics_stage(frames, camera, solver, max_iterations, tolerance, last)]
     # Without an optical axis there is nothing to attach the distortion to; later stages would only hide it.
     if len(camera.theta) > 3 and stages[0].status is not Status.NOT_FINITE:
         stages.append(distortion_stage(frames, camera, stages[0].theta))
@@ -563,7 +572,7 @@ def _pair_stages(
             # Distortion of tens of pixels pulls the undistorted fit far from the axis, and the linear stage may then
             # lead to another minimum or into a fold; the nominal optics without distortion are the safer start.
             start = np.concatenate([camera.theta[:3], np.zeros(len(camera.theta) - 3)])
-            again = joint_stage(pairs, camera, start, solver, max_iterations, tolerance)
+            again = joint_stage(pairs, camera, start, solver, max_iterations, tolerance, last)
             stages[-1] = min(stages[-1], again, key=_badness)
     return stages
 

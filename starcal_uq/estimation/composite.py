@@ -193,14 +193,17 @@ def enough_frames(objective: PairObjective) -> bool:
     return objective.frames.n_frames >= _FRAMES_PER_PARAMETER * objective.n_parameters
 
 
-def pair_covariance(objective: PairObjective, theta: FloatArray, chi2: float, residual_dof: int) -> FloatArray:
+def pair_covariance(
+    objective: PairObjective, theta: FloatArray, chi2: float, residual_dof: int, tolerance: float = 0.0
+) -> FloatArray:
     """Covariance (p, p) of the pair estimate: empirical where there are `enough_frames`, else that of Gaussian noise.
 
     With fewer frames than parameters the empirical one is not defined, and with few its intervals are too short. `chi2`
-    and `residual_dof` are those of `pair_likelihood`. Not finite where the pairs do not determine every parameter.
+    and `residual_dof` are those of `pair_likelihood`, `tolerance` that of `PairObjective.godambe`. Not finite where the
+    pairs do not determine every parameter.
     """
     if enough_frames(objective):
-        return objective.godambe(theta)
+        return objective.godambe(theta, tolerance)
     if not np.isfinite(chi2) or is_singular(objective.evaluate(theta).matrix):
         return np.full((len(theta), len(theta)), np.nan)
     return expected_godambe(objective, theta, float(np.sqrt(chi2 / max(residual_dof, 1))))

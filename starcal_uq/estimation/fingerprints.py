@@ -46,7 +46,7 @@ _MOST_CANDIDATES, _PART = 2_000_000, 20_000
 _MOST_TRIED, _WINDOW = 20_000_000, 2.0 + 1e-6
 # Terms of a smooth misfit up to the fifth degree, with so many stars for each, from about so many stars; stars whose
 # terms stay in the cache.
-_DEGREE, _STARS_PER_TERM, _MOST_STARS, _BLOCK = 5, 20, 5_000, 4096
+_DEGREE, _STARS_PER_TERM, _MOST_STARS, _BLOCK = 5, 20, 3_000, 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +73,14 @@ class Fingerprints:
     @classmethod
     def of(cls, obs: Observations, residuals_px: FloatArray, centre_px: tuple[float, float]) -> Fingerprints:
         """Take those of a table with its residuals (N, 2)."""
-        sizes = obs.stars_per_frame
-        distance2 = (obs.x_px - centre_px[0]) ** 2 + (obs.y_px - centre_px[1]) ** 2
-        rows = _most_central(distance2, obs.frame_starts[:-1], sizes)
-        error = np.hypot(*_unsmooth(obs.xy, residuals_px, rows).T)
+        sizes, xy = obs.stars_per_frame, np.stack([obs.x_px, obs.y_px])
+        offset = xy - np.asarray(centre_px)[:, None]
+        rows = _most_central(np.sum(np.square(offset, out=offset), axis=0), obs.frame_starts[:-1], sizes)
+        found = np.take(xy, rows, axis=1)
+        error = np.hypot(*_unsmooth(xy, residuals_px.T, rows, found))
         free = np.sqrt(1.0 - 1.5 / np.maximum(sizes, 2))
         error /= np.repeat(free, np.minimum(sizes, _MARKS))
-        return cls(sizes.astype(np.int64), obs.xy[rows].astype(np.float32), error.astype(np.float32))
+        return cls(sizes.astype(np.int64), found.T.astype(np.float32, order="C"), error.astype(np.float32))
 
     @classmethod
     def joined(cls, parts: Sequence[Fingerprints]) -> Fingerprints:
@@ -104,47 +105,47 @@ class Fingerprints:
 
 def _most_central(distance: FloatArray, starts: IntArray, sizes: IntArray) -> IntArray:
     """Rows of at most 12 stars of each frame, nearest first, frame by frame."""
-    kept = np.minimum(sizes, _MARKS)
-    into = np.cumsum(kept) - kept
-    rows = np.empty(int(kept.sum()), dtype=np.int64)
-    for size in np.unique(sizes):
-        frames = np.flatnonzero(sizes == size)
-        stars = starts[frames, None] + np.arange(size)
-        nearest = np.argsort(distance[stars], axis=1, kind="stable")[:, :_MARKS]
-        rows[into[frames, None] + np.arange(nearest.shape[1])] = np.take_along_axis(stars, nearest, axis=1)
-    return rows
+    frame = np.repeat(np.arange(len(sizes)), sizes)
+    # Whole numbers that are nearly in order sort in a tenth of the time: 2^40 distances, and above them the frame.
+    near = (distance * (2.0**39 / max(float(np.max(distance, initial=0.0)), 1e-300))).astype(np.int64)
+    order = np.argsort((frame << 40) + near, kind="stable")
+    return np.asarray(order[np.arange(len(order)) - np.repeat(starts, sizes) < _MARKS])
 
 
-def _unsmooth(xy: FloatArray, residuals: FloatArray, rows: IntArray) -> FloatArray:
-    """Residuals of some rows without a polynomial over the detector: what a model cannot follow is no noise."""
-    step = max(1, len(xy) // _MOST_STARS)
-    some, found = xy[::step], residuals[::step]
-    middle = some.mean(axis=0)
+def _unsmooth(xy: FloatArray, residuals: FloatArray, rows: IntArray, at: FloatArray) -> FloatArray:
+    """Residuals (2, n) of some rows, which stand `at` (2, n), without a polynomial over the detector.
+
+    What a model cannot follow is no noise.
+    """
+    step = max(1, xy.shape[1] // _MOST_STARS)
+    some, found = xy[:, ::step], residuals[:, ::step]
+    middle = some.mean(axis=1, keepdims=True)
     unit = np.abs(some - middle).max() or 1.0
-    degree = max(d for d in range(_DEGREE + 1) if d == 0 or (d + 1) * (d + 2) // 2 * _STARS_PER_TERM <= len(xy))
-
-    def terms(at: FloatArray) -> FloatArray:
-        x, y = np.ascontiguousarray((at - middle).T) / unit
-        powers = np.ones((degree + 1, len(y)))
-        for j in range(degree):
-            np.multiply(powers[j], y, out=powers[j + 1])
-        table, first = np.empty(((degree + 1) * (degree + 2) // 2, len(y))), 0
-        for i in range(degree + 1):
-            np.copyto(table[first : first + degree + 1 - i], powers[: degree + 1 - i])
-            first += degree + 1 - i
-            powers *= x
-        return table
-
-    length = np.hypot(*found.T)
+    degree = max(d for d in range(_DEGREE + 1) if d == 0 or (d + 1) * (d + 2) // 2 * _STARS_PER_TERM <= xy.shape[1])
+    square = np.sum(found * found, axis=0)
     # A few wrong stars would bend the polynomial for all others.
-    used = length <= 5.0 * np.median(length)
-    x = terms(some[used])
-    solution = np.linalg.lstsq(x @ x.T, x @ found[used], rcond=None)[0]
-    left = residuals[rows]
+    used = np.flatnonzero(square <= 25.0 * np.median(square))
+    table = _powers((np.take(some, used, axis=1) - middle) / unit, degree)
+    solution = np.linalg.lstsq(table @ table.T, table @ np.take(found, used, axis=1).T, rcond=None)[0].T
+    left = np.take(residuals, rows, axis=1)
     for first in range(0, len(rows), _BLOCK):
         part = slice(first, first + _BLOCK)
-        left[part] -= terms(xy[rows[part]]).T @ solution
+        left[:, part] -= solution @ _powers((at[:, part] - middle) / unit, degree)
     return left
+
+
+def _powers(xy: FloatArray, degree: int) -> FloatArray:
+    """All ``x^i y^j`` up to a degree, (t, n)."""
+    x, y = xy
+    table = np.empty(((degree + 1) * (degree + 2) // 2, len(x)))
+    table[0] = 1.0
+    for i in range(degree):
+        np.multiply(table[i], x, out=table[i + 1])
+    first = 0
+    for count in range(degree, 0, -1):
+        np.multiply(table[first : first + count], y, out=table[first + count + 1 : first + 2 * count + 1])
+        first += count + 1
+    return table
 
 
 def shared(a: Fingerprints, b: Fingerprints) -> IntArray:
@@ -200,15 +201,19 @@ def _near(points: FloatArray) -> IntArray | None:
     along -= along.min(initial=0.0)
     length = along.max(initial=0.0) + 5.0
     keys = strip * length + along
-    order = np.argsort(keys)
-    keys = keys[order]
+    # Sorted by 32 bits of them, 16 at a time, for which NumPy sorts by radix: four times as fast as by comparison.
+    quantum = max(float(keys.max(initial=0.0)), 1.0) / (2.0**32 - 2.0)
+    bits = (keys / quantum).astype(np.uint32)
+    order = np.argsort(bits.astype(np.uint16), kind="stable")
+    order = order[np.argsort((bits >> 16).astype(np.uint16)[order], kind="stable")]
+    keys, reach = np.maximum.accumulate(keys[order]), _WINDOW + 2.0 * quantum
     found = []
     for step in (0, 1):
         at = keys + step * length
-        first = np.arange(1, len(keys) + 1) if step == 0 else np.searchsorted(keys, at - _WINDOW)
+        first = np.arange(1, len(keys) + 1) if step == 0 else np.searchsorted(keys, at - reach)
         nearest = np.append(keys, np.inf)[first]
-        one = np.flatnonzero(nearest <= at + _WINDOW)
-        count = np.searchsorted(keys, at[one] + _WINDOW, side="right") - first[one]
+        one = np.flatnonzero(nearest <= at + reach)
+        count = np.searchsorted(keys, at[one] + reach, side="right") - first[one]
         if count.sum() > _MOST_TRIED:
             return None
         start = np.repeat(first[one] - (np.cumsum(count) - count), count)
@@ -228,15 +233,22 @@ class _Search:
         self.starts = np.cumsum(self.counts) - self.counts
         self.xy = np.asarray(marks.xy_px, dtype=np.float64)
         self.square = np.asarray(marks.error_px, dtype=np.float64) ** 2
-        # Median length of two normal errors, so that wrong stars do not count.
-        self.sigma = float(np.median(marks.error_px)) / 1.1774 + 1e-4
+        # Median length of two normal errors, so that wrong stars do not count; it is that of a sample.
+        self.sigma = float(np.median(marks.error_px[:: max(1, len(marks.error_px) // _MOST_STARS)])) / 1.1774 + 1e-4
         # The most central stars from left to right; where a frame has fewer, what is missing comes last.
         place = np.arange(_CORNERS)
         there = place < self.counts[:, None]
         corner = np.sort(np.where(there, self._point(np.where(there, self.starts[:, None] + place, 0)), np.nan), axis=1)
         chosen = np.array(list(combinations(range(_CORNERS), 3)))
         whole = self.counts[:, None] > chosen[:, 2]
-        self.frame, self.triangle = np.nonzero(whole)[0], _triangles(np.take(corner, chosen, axis=1)[whole])
+        triangle = np.take(corner, chosen, axis=1)
+        if whole.all():
+            self.frame, self.triangle = (
+                np.repeat(np.arange(len(whole)), len(chosen)),
+                _triangles(triangle.reshape(-1, 3)),
+            )
+        else:
+            self.frame, self.triangle = np.nonzero(whole)[0], _triangles(triangle[whole])
 
     def _point(self, rows: IntArray) -> NDArray[np.complex128]:
         """Positions of stars as complex numbers, which are sorted from left to right."""
@@ -276,7 +288,7 @@ class _Search:
         pairs = pairs[pairs[:, 0] != pairs[:, 1]]
         if group is not None:
             pairs = pairs[group[pairs[:, 0]] != group[pairs[:, 1]]]
-        return np.unique(pairs, axis=0)
+        return np.column_stack(np.divmod(np.unique(pairs[:, 0] * len(self.counts) + pairs[:, 1]), len(self.counts)))
 
     def _nearest(self, points: FloatArray) -> IntArray:
         """Pairs of triangles that look alike, by a tree."""

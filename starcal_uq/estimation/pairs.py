@@ -129,14 +129,22 @@ class PairObjective:
         """Cost, gradient ``J^T r`` and Gauss-Newton matrix ``J^T J`` over all pairs."""
         return self._evaluate(theta)[0]
 
-    def _evaluate(self, theta: FloatArray) -> tuple[Normal, FloatArray]:
-        """As `evaluate`, with the gradient of every frame (p, K); the last point is remembered."""
+    def _evaluate(self, theta: FloatArray, tolerance: float = 0.0) -> tuple[Normal, FloatArray]:
+        """As `evaluate`, with the gradient of every frame (p, K).
+
+        The last point is remembered; it serves where a step from there changes the cost by a share of `tolerance`.
+        """
         theta = np.array(theta, dtype=np.float64)
         if not np.isfinite(theta).all():
             p = self.n_parameters
             return Normal(float("inf"), np.full(p, np.nan), np.full((p, p), np.nan)), np.full((p, 1), np.nan)
-        if self._last is None or not np.array_equal(theta, self._last[0]):
-            self._last = (theta, *self._sum_over_blocks(theta))
+        if self._last is not None:
+            at, normal, _ = self._last
+            step = theta - at
+            near = tolerance > 0.0 and float(step @ normal.matrix @ step) <= tolerance * normal.cost
+            if near or np.array_equal(theta, at):
+                return self._last[1:]
+        self._last = (theta, *self._sum_over_blocks(theta))
         return self._last[1:]
 
     def _sum_over_blocks(self, theta: FloatArray) -> tuple[Normal, FloatArray]:
@@ -176,14 +184,15 @@ class PairObjective:
         matrix += cross.reshape(p, -1) @ cross.transpose(0, 2, 1, 3).reshape(p, -1).T
         return cost, matrix, scores
 
-    def godambe(self, theta: FloatArray) -> FloatArray:
+    def godambe(self, theta: FloatArray, tolerance: float = 0.0) -> FloatArray:
         """Sandwich covariance ``H^-1 V H^-1`` of the estimator that minimises the objective, (p, p).
 
         H is the Gauss-Newton matrix and V the sum over frames of the outer products of their gradients (Godambe
         information): the pairs of a frame are dependent, so that ``H^-1`` alone would claim far too little. Not
-        finite where H is singular.
+        finite where H is singular. The last point that was evaluated serves for theta where the cost differs by a share
+        of `tolerance`.
         """
-        normal, scores = self._evaluate(theta)
+        normal, scores = self._evaluate(theta, tolerance)
         p, k = self.n_parameters, self.frames.n_frames
         if is_singular(normal.matrix):
             return np.full((p, p), np.nan)

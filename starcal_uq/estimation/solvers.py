@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -43,6 +43,7 @@ class Normal(NamedTuple):
 
 
 Evaluate = Callable[[FloatArray], Normal]
+Last = Literal["seen", "unseen", "left"]
 Residuals = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 
@@ -55,11 +56,11 @@ class Solution:
     theta : (p,) array
         Final parameters.
     normal : Normal
-        Cost, gradient and Gauss-Newton matrix there.
+        Cost, gradient and Gauss-Newton matrix there, or one unseen step before.
     trajectory : (n, p) array
         Accepted points, the start first.
     costs : (n,) array
-        Costs of the points.
+        Costs of the points; that of an unseen one as its step promised.
     status : Status
         Converged, or why not.
     evaluations : int
@@ -130,6 +131,7 @@ def levenberg_marquardt(
     max_iterations: int = 200,
     tolerance: float = 1e-15,
     step_tolerance: float = 1e-13,
+    last: Last = "seen",
 ) -> Solution:
     """Minimise a sum of squares from its normal equations.
 
@@ -145,6 +147,9 @@ def levenberg_marquardt(
         Converged when the predicted relative reduction of the cost is below this.
     step_tolerance : float
         Converged when the trust region is this small against the scaled parameters.
+    last : {"seen", "unseen", "left"}
+        What becomes of a full step that promises no more than `tolerance`: it is taken and the model evaluated there,
+        taken without that, or left to what follows.
 
     Returns
     -------
@@ -176,11 +181,17 @@ def levenberg_marquardt(
         if iteration == 0:
             bound = min(bound, length)
         trial_theta = theta + step
-        trial = evaluate(trial_theta)
-        evaluations += 1
         curvature = float(step @ normal.matrix @ step) / normal.cost
         penalty = damping * length**2 / normal.cost
         predicted = curvature + 2.0 * penalty
+        if last != "seen" and damping == 0.0 and predicted <= tolerance:
+            if last == "unseen":
+                theta = trial_theta
+                trajectory.append(theta)
+                costs.append(normal.cost * (1.0 - predicted))
+            return finish(Status.CONVERGED)
+        trial = evaluate(trial_theta)
+        evaluations += 1
         actual = 1.0 - trial.cost / normal.cost if np.isfinite(trial.cost) else -np.inf
         ratio = actual / predicted if predicted > 0.0 else 0.0
         if predicted <= _ROUNDING and abs(actual) <= _ROUNDING:

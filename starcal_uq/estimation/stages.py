@@ -17,7 +17,7 @@ from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray, Shapes
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
-from starcal_uq.estimation.solvers import Constraints, Normal, Solution, levenberg_marquardt, minpack
+from starcal_uq.estimation.solvers import Constraints, Last, Normal, Solution, levenberg_marquardt, minpack
 from starcal_uq.estimation.sums import Descent
 from starcal_uq.observations.frames import StarFrames
 
@@ -94,7 +94,13 @@ def constraints_for(camera: Camera, n_parameters: int) -> Constraints:
 
 
 def _solve(
-    objective: PairObjective, start: FloatArray, camera: Camera, solver: str, max_iterations: int, tolerance: float
+    objective: PairObjective,
+    start: FloatArray,
+    camera: Camera,
+    solver: str,
+    max_iterations: int,
+    tolerance: float,
+    last: Last,
 ) -> Solution:
     if solver == "ipopt":
         # CasADi takes a while to load, and few need it.
@@ -104,7 +110,7 @@ def _solve(
         return ipopt(objective.evaluate, start, constraints, max_iterations=max_iterations)
     if solver == "minpack" and objective.n_pairs <= MAX_EXPLICIT_PAIRS:
         return minpack(objective.residuals, objective.evaluate, start, max_iterations=max_iterations)
-    return levenberg_marquardt(objective.evaluate, start, max_iterations=max_iterations, tolerance=tolerance)
+    return levenberg_marquardt(objective.evaluate, start, max_iterations=max_iterations, tolerance=tolerance, last=last)
 
 
 def _timed(name: str, run: Callable[[], Solution], tail: FloatArray) -> Stage:
@@ -134,13 +140,18 @@ def begun_on_sample(sample: Stage, whole: Stage, scale: float) -> Stage:
 
 
 def optics_stage(
-    frames: StarFrames, camera: Camera, solver: str, max_iterations: int, tolerance: float = PAIR_TOLERANCE
+    frames: StarFrames,
+    camera: Camera,
+    solver: str,
+    max_iterations: int,
+    tolerance: float = PAIR_TOLERANCE,
+    last: Last = "seen",
 ) -> Stage:
     """Stage 1: x0, y0 and f on interstar angles, distortion ignored (the paper's section 2.1)."""
     objective = PairObjective(frames, "none")
     start = np.array(camera.theta[:3])
     zeros = np.zeros(len(camera.theta) - 3)
-    return _timed("optics", lambda: _solve(objective, start, camera, solver, max_iterations, tolerance), zeros)
+    return _timed("optics", lambda: _solve(objective, start, camera, solver, max_iterations, tolerance, last), zeros)
 
 
 def focal_stage(frames: StarFrames, camera: Camera, max_iterations: int) -> Stage:
@@ -185,19 +196,28 @@ def joint_stage(
     solver: str,
     max_iterations: int,
     tolerance: float = PAIR_TOLERANCE,
+    last: Last = "seen",
 ) -> Stage:
     """Stage 3: all parameters on interstar angles (the paper's section 2.3)."""
-    return _timed("all", lambda: _solve(objective, theta, camera, solver, max_iterations, tolerance), np.zeros(0))
+
+    def run() -> Solution:
+        return _solve(objective, theta, camera, solver, max_iterations, tolerance, last)
+
+    return _timed("all", run, np.zeros(0))
 
 
 def refinement_stage(
-    likelihood: MarginalLikelihood, theta: FloatArray, max_iterations: int, tolerance: float = REFINEMENT_TOLERANCE
+    likelihood: MarginalLikelihood,
+    theta: FloatArray,
+    max_iterations: int,
+    tolerance: float = REFINEMENT_TOLERANCE,
+    last: Last = "seen",
 ) -> Stage:
     """Stage 4: all parameters on the attitude-marginalised likelihood, which reaches the Cramer-Rao bound.
 
     The attitudes move along; `likelihood` starts its later searches from where they end.
     """
-    return _timed("refinement", lambda: _descended(likelihood, theta, max_iterations, tolerance), np.zeros(0))
+    return _timed("refinement", lambda: _descended(likelihood, theta, max_iterations, tolerance, last), np.zeros(0))
 
 
 def direct_stage(likelihood: MarginalLikelihood, camera: Camera, max_iterations: int) -> Stage:
@@ -247,11 +267,15 @@ def _held(likelihood: MarginalLikelihood, theta: FloatArray, max_iterations: int
     return replace(found, theta=trajectory[-1], trajectory=trajectory)
 
 
-def _descended(likelihood: MarginalLikelihood, theta: FloatArray, max_iterations: int, tolerance: float) -> Solution:
+def _descended(
+    likelihood: MarginalLikelihood, theta: FloatArray, max_iterations: int, tolerance: float, last: Last = "seen"
+) -> Solution:
     """The minimum of the likelihood's sum of squares, near whose attitudes its later searches start."""
     start = likelihood.start_rotations(theta) if likelihood.rotations is None else likelihood.rotations
     descent = Descent(likelihood.frames, likelihood.model_name, start, likelihood.last_sums)
-    solution = levenberg_marquardt(descent.evaluate, theta, max_iterations=max_iterations, tolerance=tolerance)
+    solution = levenberg_marquardt(
+        descent.evaluate, theta, max_iterations=max_iterations, tolerance=tolerance, last=last
+    )
     if descent.best is not None:
         likelihood.use_sums(*descent.best)
     return solution
