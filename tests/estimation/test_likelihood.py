@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
@@ -26,6 +28,37 @@ from tests.helpers.scenes import camera, observations, with_sigmas
 
 def _information_scale(matrix):
     return 1.0 / np.sqrt(np.diag(matrix))
+
+
+def test_attitudes_are_searched_from_where_it_was_said():
+    likelihood, theta = MarginalLikelihood(with_sigmas(observations(n_frames=20)), "brown"), camera().theta
+    assert likelihood.rotations is None and likelihood.last_sums is None
+    assert likelihood.kernels == "numpy"
+    best = likelihood.profile(theta)[0].rotations
+
+    def off(rotations):
+        return np.linalg.norm(rotations - best, axis=(1, 2))
+
+    # QUEST on the stars' own noise begins nearer than on one noise for all.
+    plain = MarginalLikelihood(dataclasses.replace(likelihood.frames, weight=None), "brown").start_rotations(theta)
+    assert np.median(off(likelihood.start_rotations(theta))) < 0.5 * np.median(off(plain))
+    sums, attitudes = likelihood.sums(theta)
+    likelihood.use_sums(sums, attitudes)
+    assert likelihood.last_sums == (sums, attitudes)
+    assert np.max(off(likelihood.rotations)) < 1e-9
+    likelihood.use_rotations(best)
+    assert likelihood.last_sums is None and likelihood.rotations is best
+    assert np.max(off(likelihood.rotations_at(theta))) < 1e-9
+
+
+def test_derivatives_are_whitened_and_no_model_is_likeliest_where_it_is_not_finite():
+    likelihood, theta = MarginalLikelihood(with_sigmas(observations(n_frames=20)), "brown"), camera().theta
+    state, _ = likelihood.profile(theta)
+    # A principal point shifts every star, in units of its own noise.
+    along, across = likelihood.derivatives(theta, state)[0]
+    assert np.allclose(along, likelihood.frames.weight, rtol=1e-12)
+    assert np.max(np.abs(across)) == 0.0
+    assert likelihood.log_likelihood(np.array([*theta[:2], np.nan, *theta[3:]]), 1.0) == -np.inf
 
 
 def test_profile_is_the_least_squares_attitude_of_every_frame():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -329,3 +330,42 @@ def test_prior_of_the_tails_is_a_gamma_density():
     # The density of a logarithm has the number itself as a factor.
     expected = gamma.logpdf(np.exp(log_excess), 2.0, scale=10.0) + log_excess
     assert np.ptp(log_excess_prior(log_excess) - expected) < 1e-12
+
+
+def _curvature(state: Any, frame_stars: slice) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Curvatures (3, 3) of one frame: as observed, with what is negative counted as none, and reweighted."""
+    curvatures = np.zeros((3, 3, 3))
+    for i in range(*frame_stars.indices(state.e.shape[1])):
+        e, a, w = state.e[:, i], state.attitude[:, :, i], state.weight[i]
+        own = w * np.eye(2) - state.radial[i] * np.outer(e, e)
+        values, vectors = np.linalg.eigh(own)
+        mild = (vectors * np.maximum(values, 0.0)) @ vectors.T
+        curvatures += [a @ own @ a.T, a @ mild @ a.T, w * a @ a.T]
+    return tuple(curvatures)
+
+
+def test_a_frame_of_doubtful_stars_is_curved_by_the_first_way_that_curves_it() -> None:
+    obs = with_sigmas(observations(n_frames=60))
+    heavy, theta = student(obs), camera().theta
+    starts, sigma, ways = heavy.frames.starts, 1.2, []
+    turn = np.radians(np.linspace(0.0, 90.0, len(starts) - 1) / 3600.0)
+    at = exp_rotation(turn[:, None] * np.random.default_rng(3).standard_normal((len(turn), 3))) @ heavy.rotations
+    state, step, gain = heavy._step(theta, sigma, 4.0, at)
+    volume = 0.0
+    for k, (first, last) in enumerate(pairwise(starts)):
+        curvatures = _curvature(state, slice(first, last))
+        enough = 0.01 * np.linalg.det(curvatures[2])
+        curved = [np.linalg.eigvalsh(c)[0] > 0.0 for c in curvatures]
+        way = next(i for i, c in enumerate(curvatures) if curved[i] and np.linalg.det(c) > enough)
+        ways.append((way, curved.index(True)))
+        assert np.allclose(state.inverse[..., k] @ curvatures[way], np.eye(3), atol=1e-6)
+        volume -= 0.5 * np.linalg.slogdet(curvatures[way])[1]
+        # The step never overshoots: where it is long it is the reweighted one.
+        slope = np.einsum("iun,un,n->i", *(x[..., first:last] for x in (state.attitude, state.e, state.weight)))
+        assert gain[k] == pytest.approx(0.5 * slope @ np.linalg.solve(curvatures[way], slope) / sigma**2, rel=1e-5)
+        chosen = curvatures[way] if gain[k] < 1.0 else curvatures[2]
+        assert np.allclose(step[:, k], np.linalg.solve(chosen, slope), rtol=1e-5, atol=1e-15)
+    assert state.log_volume == pytest.approx(volume, abs=1e-6)
+    # All ways are gone, and one is left that curves, but by too little.
+    assert {way for way, _ in ways} == {0, 1, 2}
+    assert any(way > first for way, first in ways)

@@ -43,6 +43,7 @@ def test_parts_add_up_wherever_they_are_cut():
     assert np.allclose(_scaled(total.matrix, whole.matrix), _scaled(whole.matrix, whole.matrix), rtol=0, atol=1e-12)
     assert (total.n_stars, total.n_frames) == (frames.n_stars, 60)
     added = grams[0] + grams[1] + grams[2]
+    assert (added.n_stars, added.n_frames) == (frames.n_stars, 60)
     assert np.allclose(_scaled(added.gram, gram.gram), _scaled(gram.gram, gram.gram), rtol=0, atol=1e-9)
     size = np.abs(gram.gram).max()
     assert np.allclose(added.gram, gram.gram, rtol=0, atol=1e-14 * size)

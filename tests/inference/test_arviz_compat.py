@@ -88,7 +88,24 @@ def test_chains_that_disagree_are_caught() -> None:
 def test_container_holds_the_groups() -> None:
     dataset = xr.Dataset({"f": (("chain", "draw"), np.zeros((2, 3)), {"units": "px"})}, attrs={"made_by": "test"})
     data = arviz_compat.to_arviz({"posterior": dataset})
-    assert type(data).__name__ == ("InferenceData" if arviz_compat.is_legacy() else "DataTree")
+    import arviz
+
+    assert type(data) is getattr(arviz, "InferenceData", xr.DataTree)
     assert data.posterior["f"].shape == (2, 3)
     assert data.posterior["f"].attrs["units"] == "px"
     assert data.posterior.attrs["made_by"] == "test"
+
+
+def test_tails_are_those_of_five_per_cent() -> None:
+    # A chain that sticks below its 7 % quantile: tails of ten per cent would not tell.
+    rng = np.random.default_rng(5)
+    draws = rng.standard_normal((4, 1000))
+    draws[:, :40] = -3.0
+    found = arviz_compat.ess_tail(draws)
+
+    def ess(share: float) -> float:
+        """Of the indicator of a quantile, by its own words (Vehtari et al. 2021)."""
+        return arviz_compat._diagnostic("ess", (draws <= np.quantile(draws, share)).astype(float), method="mean")
+
+    assert found == pytest.approx(min(ess(0.05), ess(0.95)), rel=0.05)
+    assert found < 0.8 * min(ess(0.1), ess(0.9))

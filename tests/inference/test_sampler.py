@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from scipy import integrate, stats
 from starcal_uq.core.errors import SamplingError, SettingError
 from starcal_uq.core.status import Level, Status
 from starcal_uq.estimation.calibrate import calibrate
-from starcal_uq.inference.checks import check_compression
+from starcal_uq.inference.checks import _OPTIONS, check_compression
 from starcal_uq.inference.priors import Priors
 from starcal_uq.inference.sample import sample
 from starcal_uq.inference.target import importance_check, laplace_approximation, start_target
@@ -24,6 +25,13 @@ from tests.helpers.scenes import camera, nominal, observations, with_sigmas
 QUICK: dict[str, Any] = {"n_ensembles": 2, "n_walkers": 16, "n_steps": 60, "n_burn": 5, "seed": 3}
 # 50 steps of both ensembles together.
 QUICKER = {**QUICK, "n_steps": 20}
+
+
+def test_a_remedy_knows_what_sample_does_by_itself() -> None:
+    own = inspect.signature(sample).parameters
+    assert {name: own[name].default for name in _OPTIONS if name != "dof"} == {
+        name: default for name, (_, default) in _OPTIONS.items() if name != "dof"
+    }
 
 
 def whitened(draws: np.ndarray, mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
