@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import zipfile
 from collections.abc import Collection, Mapping
 from dataclasses import MISSING, fields, is_dataclass
@@ -30,6 +31,8 @@ _WORDS: dict[Any, str] = {bool: "true or false", int: "a whole number", float: "
 # Kinds of arrays that each kind may be made of.
 _FROM = {"f": "fiu", "i": "iu", "u": "iu"}
 _SCALARS: dict[Any, tuple[type, ...]] = {bool: (bool,), int: (int,), float: (int, float), str: (str,)}
+# Halves of characters, which JSON can write by their numbers and UTF-8 cannot hold.
+_HALVES = re.compile("[\ud800-\udfff]")
 
 
 def to_plain(
@@ -133,6 +136,8 @@ def _value(hint: Any, data: Any, arrays: Arrays, name: str) -> Any:
                 return float(data)
             if not -(2**63) <= data < 2**63:
                 raise ValueError(f"{name} is {shown(data)}, too large a number")
+        if isinstance(data, str) and _HALVES.search(data):
+            raise ValueError(f"{name} is {shown(data)}, which no file can hold")
         return data
     if origin is Literal:
         if data not in args:

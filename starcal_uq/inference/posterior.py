@@ -422,6 +422,8 @@ class Posterior(Shown):
             made = from_plain(cls, record, arrays)
             if made.n_ensembles * made.n_walkers * made.n_steps != len(made.draws):
                 raise ValueError("it holds another number of draws than it says")
+            if not set(made.parameter_names) <= set(made.priors.names):
+                raise ValueError("its priors are those of other parameters")
             return made
 
 

@@ -154,6 +154,10 @@ def _nan_draw(file: Any) -> None:
     file["draws"][...] = draws
 
 
+def _other_names(file: Any) -> None:
+    file.attrs["record"] = file.attrs["record"].replace('"parameter_names": ["x0"', '"parameter_names": ["text"')
+
+
 def _huge_draws(file: Any) -> None:
     del file["draws"]
     file.create_dataset("draws", shape=(10**12,), dtype="f8", chunks=(1000,))
@@ -223,6 +227,12 @@ ONCE = [
     ("calibration.json", lambda d: _DEEP.encode(), r"\(its values are nested too deeply\)" + CALIBRATE),
     ("diagnosis.json", lambda d: _DEEP.encode(), "nested too deeply"),
     ("images.json", lambda d: b"[1, 2]", r"\(the document is \[1, 2\], not a table\)"),
+    (
+        "calibration.json",
+        lambda d: d.replace(b'"sigma_name": "sigma', b'"sigma_name": "\\ud800'),
+        "which no file can hold",
+    ),
+    ("posterior.nc", _hdf5(_other_names), r"\(its priors are those of other parameters\)" + SAMPLE),
     ("posterior.nc", lambda d: b"", r"\(the file is empty\)" + SAMPLE),
     ("posterior.nc", lambda d: d[:-1000], r"\(it is cut off, or not of this version\)" + SAMPLE),
     ("posterior.nc", _hdf5(_nan_draw), r"\(draws holds a value that is not finite\)" + SAMPLE),
