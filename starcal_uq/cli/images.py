@@ -12,11 +12,11 @@ import starcal_uq as sc
 from starcal_uq.cli.console import err, note, print_json, print_table, progress_bar, records, warn_undeclared
 from starcal_uq.cli.options import (
     BayerMosaic,
-    CameraFile,
     Engine,
     Force,
     Json,
     MaxMag,
+    OptionalCamera,
     TimeUtc,
     check_same_sensor,
     number,
@@ -120,11 +120,11 @@ def identify_command(
     centroids: Annotated[
         Path, typer.Argument(metavar="CENTROIDS", help="Table made by `starcal-uq centroid`.", parser=read_file)
     ],
-    camera: CameraFile,
     out: Annotated[
         Path,
         typer.Option("-o", "--out", metavar="OBS", help="Table to write (.csv, .ecsv, .parquet).", parser=write_file),
     ],
+    camera: OptionalCamera = None,
     max_mag: MaxMag = 7.0,
     epoch: Annotated[
         float | None, number(EPOCH, "Julian year of the star positions; the images' own by default.")
@@ -142,15 +142,17 @@ def identify_command(
     json: Json = False,
 ) -> None:
     """Identify the stars of every frame without knowing where the camera pointed; frames that do not fit are named."""
-    from starcal_uq.pipeline.images import epoch_of
+    from starcal_uq.pipeline.images import epoch_of, of_one_size
     from starcal_uq.presentation.words.images import MOST_FRAMES, identification_table
 
     table_ending(out)
     ensure_new(out, force)
     table = sc.images.Centroids.load(centroids)
-    nominal = sc.Camera.load(camera)
+    nominal = None if camera is None else sc.Camera.load(camera)
+    if nominal is None:
+        table = of_one_size(table)
     known = None if calibration is None else sc.Run(calibration).best
-    if calibration is not None and known is not None:
+    if calibration is not None and known is not None and nominal is not None and camera is not None:
         check_same_sensor(known.camera, calibration, nominal, camera)
     stars = sc.load_catalogue(max_mag=max_mag, epoch=epoch_of(table) if epoch is None else epoch)
     _say_epoch(table, epoch)
@@ -178,12 +180,12 @@ def identify_command(
 
 
 def load_images(
-    images: list[Path], camera_path: Path, settings: ImageSettings, sky: SkySettings
+    images: list[Path], camera_path: Path | None, settings: ImageSettings, sky: SkySettings
 ) -> tuple[Observations, Camera, Centroids, ImageCalibration]:
     """Observations of images with the nominal camera, and what is worth telling on the way."""
     from starcal_uq.pipeline.images import observations_from_images
 
-    known, camera = sky.options(), sc.Camera.load(camera_path)
+    known, camera = sky.options(), None if camera_path is None else sc.Camera.load(camera_path)
     with progress_bar("images") as progress:
         obs, centroids, found = observations_from_images(
             images,
@@ -193,6 +195,7 @@ def load_images(
             gain_e_per_count=settings.gain,
             time_utc=settings.time,
             bayer=settings.bayer,
+            focal_tolerance=0.03 if settings.focal_tolerance is None else settings.focal_tolerance,
             engine=settings.engine or "pyramid",
             workers=None,
             tell=lambda message: err.print(message, style=_style(message), highlight=False, soft_wrap=True),
@@ -205,9 +208,10 @@ def load_images(
     left_out = obs.meta.get("disturbed_stars", 0)
     if left_out:
         err.print(f"{left_out} stars left out, because the light of a neighbour displaces them.", highlight=False)
-    warn_undeclared(obs, camera)
     # Of mirrored images x is counted from the right edge, and so is this camera's.
-    return obs, found.rounds[0][0].nominal if found.identification.parity == "mirrored" else camera, centroids, found
+    nominal = found.rounds[0][0].nominal
+    warn_undeclared(obs, nominal)
+    return obs, nominal, centroids, found
 
 
 def _say_epoch(centroids: Centroids, epoch: float | None) -> None:

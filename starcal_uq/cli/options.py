@@ -178,6 +178,14 @@ CameraFile = Annotated[
         parser=read_file,
     ),
 ]
+OptionalCamera = Annotated[
+    Path | None,
+    typer.Argument(
+        metavar="[CAMERA]",
+        help="Nominal camera (TOML with a [camera] table); without one, the stars tell the focal length.",
+        parser=read_file,
+    ),
+]
 RunPath = Annotated[
     Path, typer.Argument(metavar="RUN", help="Run folder made by `starcal-uq calibrate`.", parser=read_path)
 ]

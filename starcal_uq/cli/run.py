@@ -25,7 +25,6 @@ from starcal_uq.cli.mission import fail_if_violated, show_budget
 from starcal_uq.cli.options import (
     Alignment,
     AlignmentFrames,
-    CameraFile,
     Draws,
     Force,
     NewRun,
@@ -90,13 +89,13 @@ def run_command(
     inputs: Annotated[
         list[Path],
         typer.Argument(
-            metavar="OBS|IMAGES...",
+            metavar="OBS|IMAGES... [CAMERA]",
             help="A table of identified stars or a folder of partitions (see `calibrate`), or images (FITS, TIFF, PNG, "
-            "JPEG) or folders of them, whose stars are then found and identified.",
+            "JPEG) or folders of them, whose stars are then found and identified; then the nominal camera (TOML with a "
+            "[camera] table), which images can do without: the stars tell the focal length.",
             parser=read_path,
         ),
     ],
-    camera: CameraFile,
     out: NewRun,
     estimation: EstimationSettings,
     sky: SkySettings,
@@ -123,14 +122,23 @@ def run_command(
     if budget is not None:
         # A mistake in it should not show after the work.
         sc.budgeting.load_budget_file(budget)
+    *given, last = inputs
+    table = last.suffix.lower() in (".csv", ".ecsv", ".parquet")
+    other = bool(given) and last.is_file() and not table and not are_images([last])
+    inputs, camera = (given, last) if last.suffix.lower() == ".toml" or other else (inputs, None)
+    if not inputs:
+        raise typer.BadParameter(f"{last} is a camera: give images or a table of stars before it.")
     folder = len(inputs) == 1 and inputs[0].is_dir() and any(inputs[0].glob("*.parquet"))
     from_images = not folder and are_images(inputs)
     refuse_others(from_images, sky, images)
     if len(inputs) > 1 and not from_images:
         raise typer.BadParameter(f"{inputs[1]} is no image: give one table of observations, or images only.")
+    if camera is None and not from_images:
+        raise typer.BadParameter("a table of stars needs the nominal camera (TOML) after it; only images do without.")
     aligning = {"alignment": alignment, "alignment_frames": alignment_frames}
     settings = {"estimation": estimation, "sky": sky, "images": images, "sampling": sampling, "draws": draws}
-    files = {f"input {number}": path for number, path in enumerate(inputs)} | {"camera": camera}
+    files = {f"input {number}": path for number, path in enumerate(inputs)}
+    files |= {} if camera is None else {"camera": camera}
     command = command_of("run", settings | aligning | {"budget": budget}, files)
     with run.making(command, force=force), Ahead() as ahead:
         if not (run.did("calibrate") and (run.did("images") or not from_images)):
@@ -144,7 +152,7 @@ def run_command(
 def _calibrate(
     run: Run,
     inputs: list[Path],
-    camera: Path,
+    camera: Path | None,
     from_images: bool,
     estimation: EstimationSettings,
     sky: SkySettings,
@@ -154,7 +162,7 @@ def _calibrate(
     obs: Observations | PartitionedObservations
     if from_images:
         obs, nominal, centroids, identified = load_images(inputs, camera, images, sky)
-    else:
+    elif camera is not None:
         obs, nominal = load_table(inputs[0], camera, sky)
     with progress_bar("passes over the files") as progress:
         run.calibrate(obs, nominal, progress=progress, **estimation.options())

@@ -148,6 +148,10 @@ class ImageSettings:
     epoch: Annotated[
         float | None, number(EPOCH, "Images: Julian year of the star positions; the images' own by default.")
     ] = None
+    focal_tolerance: Annotated[
+        float | None,
+        number("focal_tolerance", "Images: relative error of the nominal focal length; 0.03 by default."),
+    ] = None
     gain: Annotated[
         float | None, number("gain_e_per_count", "Images: electrons per count, where they do not say it.")
     ] = None

@@ -7,7 +7,9 @@ say together about the camera narrows the tolerances for a second pass over all 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from functools import partial
 from os import PathLike
 from typing import Protocol
 
@@ -21,12 +23,15 @@ from starcal_uq.camera.projection import unproject
 from starcal_uq.core.errors import IdentificationError
 from starcal_uq.core.settings import Engine, bounded
 from starcal_uq.core.types import FloatArray
-from starcal_uq.identification.proposers import prepare_engine
+from starcal_uq.identification.blind import AGREEMENT, FOCAL_RANGE, find_optics
+from starcal_uq.identification.match import Match
+from starcal_uq.identification.proposers import Proposer, prepare_engine
 from starcal_uq.identification.pyramid import CameraTolerance
-from starcal_uq.identification.result import FrameIdentification, Identification, Parity
+from starcal_uq.identification.result import FoundOptics, FrameIdentification, Identification, Parity
 from starcal_uq.identification.search import (
     LEAST_SIGMA_PX,
     MIN_STARS,
+    NOT_SEARCHED,
     CentroidTable,
     Found,
     FrameTable,
@@ -43,6 +48,11 @@ _WORSE_LENS = 4.0
 _PROBES = 10
 # Frames with fewer stars say nothing about the common camera.
 _CAMERA_STARS = 7
+# A focal length is looked for within this factor of the camera's before it is looked for anywhere.
+_NEAR = 2.0
+# Where images say neither: the pixel pitch, without which the focal length has no millimetres, and a focal length in
+# detector widths to begin with.
+ASSUMED_PIXEL_UM, _ASSUMED_FOCAL = 5.0, 5.0
 
 
 class CalibratedCamera(Protocol):
@@ -57,13 +67,14 @@ class CalibratedCamera(Protocol):
 @bounded
 def identify(
     centroids: CentroidTable,
-    camera: Camera,
+    camera: Camera | None,
     stars: StarCatalogue,
     *,
     calibration: CalibratedCamera | None = None,
     focal_tolerance: float = 0.03,
     centre_tolerance_px: float = 20.0,
     distortion_tolerance_px: float = 1.0,
+    search_focal: bool = True,
     engine: Engine = "pyramid",
     share_camera: bool = True,
     cache: bool = True,
@@ -80,7 +91,8 @@ def identify(
         catalogue's magnitudes frame by frame (`brightness`), except where `saturated`, if there, says otherwise;
         equal fluxes say nothing.
     camera
-        The nominal camera.
+        The nominal camera. Without one, its size is that of the images (``centroids.meta``), and its focal length what
+        they say, or else what the stars say.
     stars
         Catalogue; it may be deeper than the sensor. Its directions are those of the result.
     calibration
@@ -93,6 +105,9 @@ def identify(
     distortion_tolerance_px
         Displacement at the detector's corner by distortion that the nominal camera does not have, px. Where less than
         half of the frames are found, the others are tried with four times as much, and as mirror images.
+    search_focal
+        Whether the focal length is searched for, from the stars alone, where less than half of the frames are found:
+        within a factor of two of the camera's first, and then for any field of view.
     engine
         Solver that finds attitudes: "pyramid", this package's pattern search, or "tetra3rs", a solver in Rust, which
         needs the package of that name (extra `tetra3rs`). Matching and acceptance are the same.
@@ -117,48 +132,174 @@ def identify(
         A centroid is not finite or off the detector, the catalogue is too small, or the
         engine is not installed.
     """
-    _check(centroids, camera, stars)
+    sheet, told = (camera, True) if camera is not None else sheet_of(centroids)
+    _check(centroids, sheet, stars)
     tolerance = CameraTolerance(focal_tolerance, centre_tolerance_px, distortion_tolerance_px)
     if calibration is not None:
-        camera, tolerance = calibration.camera, calibrated_tolerance(calibration, tolerance)
-    field = FrameTable(centroids, camera)
-    proposer = prepare_engine(engine, stars, field_geometry(camera), tolerance, cache, cache_dir)
-    search = Search(camera, stars, tolerance, proposer)
-    n = len(field.ids)
-    results = []
-    for k in range(n):
-        results.append(search.frame(field, k))
-        if progress is not None:
-            progress(k + 1, n)
-    failed = _failed(results, field)
-    parity: Parity = "normal"
-    if len(failed) > _solved(results):
-        # Every frame of a camera has one handedness: the one that more frames have.
-        flipped = FrameTable(centroids, camera, mirrored=True)
-        mirror = Search(flipped.camera, stars, tolerance, proposer)
-        other = _retry(mirror, flipped, failed)
-        if _solved(other.values()) > _solved(results):
-            parity, field, search = "mirrored", flipped, mirror
-            results = [other[k] if k in other else mirror.frame(flipped, k) for k in range(n)]
-    failed = _failed(results, field)
-    if len(failed) > _solved(results):
-        worse = search.widened(_WORSE_LENS)
-        other = _retry(worse, field, failed)
-        results = [other.get(k, results[k]) for k in range(n)]
-        search = worse if _solved(other.values()) else search
-    useful = [f.match for f in results if f.match is not None and len(f.match) >= _CAMERA_STARS]
-    refined = field.camera
-    if useful:
-        shared, covariance = search.common_camera(useful)
-        refined = _moved(field.camera, shared)
-        if share_camera and len(useful) > 1:
-            second = search.narrowed(refined, covariance)
-            again = field.seen_by(refined)
-            results = [second.again(again, k, results[k], shared) for k in range(n)]
-            useful = [f.match for f in results if f.match is not None and len(f.match) >= _CAMERA_STARS]
-            if useful:
-                refined = _moved(refined, second.common_camera(useful)[0])
-    return _result(field, results, refined, stars, parity, centroids)
+        sheet, tolerance = calibration.camera, calibrated_tolerance(calibration, tolerance)
+    prepare = partial(prepare_engine, engine, stars, cache=cache, cache_dir=cache_dir)
+    attempt = _Attempt(centroids, stars, sheet, tolerance, prepare)
+    searching = search_focal and calibration is None
+    if told:
+        attempt.run(progress, searching)
+    optics = None
+    if searching and not attempt.good:
+        optics = _found_optics(attempt.field, stars, sheet, told)
+        if optics is not None:
+            other = _Attempt(centroids, stars, *_with(sheet, tolerance, optics, told), prepare, optics.mirrored)
+            other.run(progress, False)
+            if other.n_solved > attempt.n_solved:
+                attempt = other
+    if told or optics is not None:
+        attempt.finish(progress)
+    return attempt.result(share_camera, optics)
+
+
+class _Attempt:
+    """All frames, identified with one camera and its tolerances."""
+
+    def __init__(
+        self,
+        centroids: CentroidTable,
+        stars: StarCatalogue,
+        camera: Camera,
+        tolerance: CameraTolerance,
+        prepare: Callable[..., Proposer],
+        mirrored: bool = False,
+    ) -> None:
+        self.centroids, self.stars, self.camera, self.prepare = centroids, stars, camera, prepare
+        self.tolerance = tolerance
+        self.parity: Parity = "mirrored" if mirrored else "normal"
+        self.field = FrameTable(centroids, camera, mirrored)
+        self.results: dict[int, Found] = {}
+        self._search: Search | None = None
+
+    @property
+    def search(self) -> Search:
+        """The catalogue prepared for the camera, when it is first needed."""
+        if self._search is None:
+            proposer = self.prepare(field_geometry(self.field.camera), self.tolerance)
+            self._search = Search(self.field.camera, self.stars, self.tolerance, proposer)
+        return self._search
+
+    @property
+    def n_solved(self) -> int:
+        return _solved(self.results.values())
+
+    @property
+    def good(self) -> bool:
+        """Whether all frames were searched, and half of them are found."""
+        return len(self.results) == len(self.field.ids) and len(self._failed()) <= self.n_solved
+
+    def _failed(self) -> list[int]:
+        return _failed(self.results, self.field)
+
+    def run(self, progress: Callable[[int, int], None] | None, stop: bool) -> None:
+        """Search every frame; with `stop`, none after the first few with most stars if none of those is found."""
+        n = len(self.field.ids)
+        frames = [k for k in range(n) if len(self.field.xy[k]) >= MIN_STARS]
+        first = sorted(frames, key=lambda k: -len(self.field.xy[k]))[:_PROBES] if stop else []
+        for k in [*first, *range(n)]:
+            if stop and len(self.results) == len(first) and first and not self.n_solved:
+                return
+            if k not in self.results:
+                self.results[k] = self.search.frame(self.field, k)
+                if progress is not None:
+                    progress(len(self.results), n)
+
+    def finish(self, progress: Callable[[int, int], None] | None) -> None:
+        """Search what is left, as mirror images and with a worse lens where most frames fail."""
+        self.run(progress, False)
+        failed = self._failed()
+        if len(failed) > self.n_solved and self.parity == "normal":
+            # Every frame of a camera has one handedness: the one that more frames have.
+            flipped = FrameTable(self.centroids, self.camera, mirrored=True)
+            mirror = Search(flipped.camera, self.stars, self.tolerance, self.search.proposer)
+            other = _retry(mirror, flipped, failed)
+            if _solved(other.values()) > self.n_solved:
+                self.parity, self.field, self._search = "mirrored", flipped, mirror
+                self.results = {k: other[k] if k in other else mirror.frame(flipped, k) for k in self.results}
+        failed = self._failed()
+        if len(failed) > self.n_solved:
+            worse = self.search.widened(_WORSE_LENS)
+            other = _retry(worse, self.field, failed)
+            self.results |= other
+            self._search = worse if _solved(other.values()) else self.search
+
+    def result(self, share_camera: bool, optics: FoundOptics | None) -> Identification:
+        """What became of all frames, with what they say together about the camera."""
+        results = [self.results.get(k, NOT_SEARCHED) for k in range(len(self.field.ids))]
+        useful = _useful(results)
+        refined = self.field.camera
+        if useful:
+            shared, covariance = self.search.common_camera(useful)
+            refined = _moved(self.field.camera, shared)
+            if share_camera and len(useful) > 1:
+                second = self.search.narrowed(refined, covariance)
+                again = self.field.seen_by(refined)
+                results = [second.again(again, k, found, shared) for k, found in enumerate(results)]
+                if useful := _useful(results):
+                    refined = _moved(refined, second.common_camera(useful)[0])
+        return _result(self.field, results, refined, self.stars, self.parity, self.centroids, optics)
+
+
+def sheet_of(centroids: CentroidTable) -> tuple[Camera, bool]:
+    """The camera as its images describe it, and whether they say its focal length.
+
+    Raises
+    ------
+    IdentificationError
+        If the table does not say the size of the images.
+    """
+    said = getattr(centroids, "meta", {}).get("optics", {})
+    if not said:
+        raise IdentificationError(
+            "the centroids do not say the size of their images: give a camera, or measure the images again."
+        )
+    width, height = int(said["width_px"]), int(said["height_px"])
+    pixel, focal_mm, focal_px = said.get("pixel_um"), said.get("focal_mm"), said.get("focal_px")
+    if focal_px is None and pixel and focal_mm:
+        focal_px = 1000.0 * focal_mm / pixel
+    if pixel is None:
+        pixel = 1000.0 * focal_mm / focal_px if focal_mm and focal_px else ASSUMED_PIXEL_UM
+    focal = focal_px if focal_px else _ASSUMED_FOCAL * width
+    name = "as its images describe it" + ("" if pixel in said.values() else "; the pixel pitch is assumed")
+    centre = (width - 1) / 2.0, (height - 1) / 2.0
+    camera = Camera(width, height, pixel, focal * pixel / 1000.0, *centre, name=name)
+    return camera, bool(focal_px)
+
+
+def _found_optics(field: FrameTable, stars: StarCatalogue, sheet: Camera, told: bool) -> FoundOptics | None:
+    """What the stars alone say of the lens."""
+    frames = []
+    for xy, sigma in zip(field.xy, field.sigma, strict=True):
+        frames.append((xy - np.array(sheet.centre_px), sigma))
+    everything = FOCAL_RANGE[0] * sheet.width_px, FOCAL_RANGE[1] * sheet.width_px
+    near = [(sheet.focal_px / _NEAR, sheet.focal_px * _NEAR)] if told else []
+    return find_optics(frames, stars, sheet.width_px, sheet.height_px, [*near, everything])
+
+
+def _with(sheet: Camera, tolerance: CameraTolerance, optics: FoundOptics, told: bool) -> tuple[Camera, CameraTolerance]:
+    """The camera with the focal length found, and its tolerances; a sheet that allows it is kept."""
+    if told and abs(optics.focal_px / sheet.focal_px - 1.0) < tolerance.focal:
+        camera = sheet
+    else:
+        focal_mm = optics.focal_px * sheet.pixel_um / 1000.0
+        name = f"{sheet.name}; " if sheet.name else ""
+        camera = sheet.replace(focal_mm=focal_mm, name=f"{name}focal length found from the stars")
+        tolerance = replace(tolerance, focal=min(tolerance.focal, AGREEMENT))
+    if told:
+        return camera, tolerance
+    return camera, replace(
+        tolerance,
+        centre_px=max(tolerance.centre_px, AGREEMENT * sheet.width_px),
+        distortion_px=max(tolerance.distortion_px, 1.5 * optics.distortion_px),
+    )
+
+
+def _useful(results: Iterable[Found]) -> list[Match]:
+    """Matches that say something about the common camera."""
+    return [f.match for f in results if f.match is not None and len(f.match) >= _CAMERA_STARS]
 
 
 def calibrated_tolerance(calibration: CalibratedCamera, largest: CameraTolerance) -> CameraTolerance:
@@ -177,9 +318,9 @@ def calibrated_tolerance(calibration: CalibratedCamera, largest: CameraTolerance
     )
 
 
-def _failed(results: Iterable[Found], field: FrameTable) -> list[int]:
+def _failed(results: Mapping[int, Found], field: FrameTable) -> list[int]:
     """Frames with enough stars that are not identified, those with most stars first."""
-    frames = [k for k, f in enumerate(results) if f.match is None and len(field.xy[k]) >= MIN_STARS]
+    frames = [k for k, f in results.items() if f.match is None and len(field.xy[k]) >= MIN_STARS]
     return sorted(frames, key=lambda k: -len(field.xy[k]))
 
 
@@ -211,7 +352,13 @@ def _moved(camera: Camera, shared: FloatArray) -> Camera:
 
 
 def _result(
-    field: FrameTable, results: list[Found], camera: Camera, stars: StarCatalogue, parity: Parity, table: CentroidTable
+    field: FrameTable,
+    results: list[Found],
+    camera: Camera,
+    stars: StarCatalogue,
+    parity: Parity,
+    table: CentroidTable,
+    optics: FoundOptics | None,
 ) -> Identification:
     """Attitudes and TASTE with the common camera, and the tables."""
     from scipy.special import chdtrc
@@ -272,7 +419,7 @@ def _result(
     # Not every table says which frames were left out.
     problems = getattr(table, "problem", [""] * len(records))
     n_left_out = sum(bool(problems[k]) and record.status == "too few stars" for k, record in enumerate(records))
-    return Identification(observations, tuple(records), camera, field.camera, parity, n_left_out)
+    return Identification(observations, tuple(records), camera, field.camera, parity, n_left_out, optics)
 
 
 def _check(table: CentroidTable, camera: Camera, stars: StarCatalogue) -> None:

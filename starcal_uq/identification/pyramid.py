@@ -217,8 +217,8 @@ def _supported(
     b = _directions(u, geometry.focal_px * scale)
     # Roll from the longest side.
     p, q = max(((0, 1), (1, 2), (2, 0)), key=lambda side: length[corner[side[0]], corner[side[1]]])
-    camera_axes = _axes(b[:, corner], p, q)
-    rotation = camera_axes.transpose(0, 2, 1) @ _axes(r, p, q)
+    camera_axes = axes_of(b[:, corner], p, q)
+    rotation = camera_axes.transpose(0, 2, 1) @ axes_of(r, p, q)
     others = np.array([m for m in range(len(u)) if m not in corner])
     sky = b[:, others] @ rotation
     span = length[corner[p], corner[q]]
@@ -253,7 +253,7 @@ def _triple(directions: FloatArray, triangles: IntArray) -> FloatArray:
     return product
 
 
-def _axes(v: FloatArray, p: int, q: int) -> FloatArray:
+def axes_of(v: FloatArray, p: int, q: int) -> FloatArray:
     """Orthonormal axes (m, 3 axes, 3) of triangles (m, 3, 3): towards the middle, and along one side."""
     z = v.sum(axis=1)
     z = z / np.sqrt(np.einsum("mi,mi->m", z, z))[:, None]

@@ -68,6 +68,33 @@ class FrameIdentification:
     milliseconds: float
 
 
+@dataclass(frozen=True)
+class FoundOptics:
+    """A focal length found from the stars alone.
+
+    Attributes
+    ----------
+    focal_px : float
+        Focal length, px.
+    mirrored : bool
+        Whether the images are mirror images of the sky.
+    n_frames, n_searched : int
+        Frames that agree, of those that were searched.
+    distortion_px : float
+        Largest displacement that their lens showed at the detector's corner.
+    log10_expected_false : float
+        Decimal logarithm of the number of wrong attitudes, on the whole sky and at any focal length, expected to match
+        as well as the best of the frames.
+    """
+
+    focal_px: float
+    mirrored: bool
+    n_frames: int
+    n_searched: int
+    distortion_px: float
+    log10_expected_false: float
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class Identification(Shown):
     """Identified stars of all frames.
@@ -87,6 +114,8 @@ class Identification(Shown):
         "normal", or "mirrored" where the images are mirror images of the sky.
     n_left_out : int
         Frames whose images had been left out before, when the centroids were measured; the text is of the others.
+    optics : FoundOptics or None
+        What the stars alone said of the lens, where the search had to ask them.
     """
 
     observations: Observations
@@ -95,6 +124,7 @@ class Identification(Shown):
     nominal: Camera
     parity: Parity
     n_left_out: int = 0
+    optics: FoundOptics | None = None
 
     @property
     def n_identified(self) -> int:

@@ -76,6 +76,9 @@ class Found:
     seconds: float
 
 
+NOT_SEARCHED = Found("not identified", None, 0.0)
+
+
 class FrameTable:
     """Centroids frame by frame, brightest first, as pixels and as ideal pixels of one camera."""
 

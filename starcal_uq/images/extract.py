@@ -22,6 +22,7 @@ from starcal_uq.core.types import AnyDict
 from starcal_uq.images.centroids import COLUMNS, FRAME_COLUMNS, Centroids
 from starcal_uq.images.detection import DetectionOptions, FrameStars, find_stars
 from starcal_uq.images.image import IMAGE_ENDINGS, Image, read_images
+from starcal_uq.images.optics import common_optics, optics_of, other_sizes
 from starcal_uq.images.pixel_phase import phase_error, without_phase_error
 
 if TYPE_CHECKING:
@@ -183,6 +184,7 @@ class _Measure:
             return _left_out(error, name, None, image.time_utc or "", sha256.digest())
         entry = _entry(name, image.time_utc or "")
         entry.update(background=found.background, noise=found.noise, psf_sigma_px=found.psf_sigma_px)
+        entry["optics"] = optics_of(image.header, image.width_px, image.height_px)
         messages = [*image.messages, *(f"{name}: {text}" for text in found.messages)]
         return _Frame(entry, messages, sha256.digest(), found)
 
@@ -257,6 +259,8 @@ class _Table:
                 f"{plural(n_without, 'frame')}, so the photon noise of the stars is not in their "
                 "sigma, which is too small for bright stars; give the gain in electrons per count."
             )
+        said = {entry["frame_ids"]: entry["optics"] for entry in self.frames if "optics" in entry}
+        optics = common_optics(list(said.values()))
         meta = {
             "settings": asdict(options),
             "gain_e_per_count": known[0] if len(set(known)) == 1 and len(known) == len(self.gains) else None,
@@ -264,6 +268,8 @@ class _Table:
             "flux_unit": "electrons" if known and len(known) == len(self.gains) else "counts",
             "pixel_phase_px": list(amplitudes),
             "images_sha256": self.digest.hexdigest(),
+            "optics": optics,
+            "other_sizes": other_sizes(said, optics),
         }
         if known and len(known) < len(self.gains):
             per_star = np.repeat([g or 1.0 for g in self.gains], [len(s.columns["x_px"]) for s in self.stars])

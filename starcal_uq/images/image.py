@@ -22,6 +22,7 @@ from starcal_uq.core.formatting import plural
 from starcal_uq.core.settings import Bayer, Mosaic
 from starcal_uq.core.times import FIRST_YEAR, LAST_YEAR, utc_of_scale
 from starcal_uq.core.types import AnyDict
+from starcal_uq.images.optics import exif_of
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -575,7 +576,15 @@ def _read_picture(path: Path, data: bytes, camera: Camera | None, every: bool) -
         pixels, saturation, notes = pages[k]
         name = f"{path.name}[{k}]" if len(chosen) > 1 else path.name
         messages = [f"{path.name}: {text}" for text in (*notes, *words)] if not found else []
-        found.append(Image(_checked(path, pixels, messages), name, saturation=saturation, messages=tuple(messages)))
+        found.append(
+            Image(
+                _checked(path, pixels, messages),
+                name,
+                saturation=saturation,
+                header={} if picture is None else exif_of(picture),
+                messages=tuple(messages),
+            )
+        )
     return found
 
 

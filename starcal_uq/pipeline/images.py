@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -76,9 +76,10 @@ def _together(messages: Sequence[str]) -> str:
 
 def observations_from_images(
     images: Sequence[Path],
-    camera: Camera,
+    camera: Camera | None,
     *,
     max_mag: float,
+    focal_tolerance: float = 0.03,
     epoch: float | None = None,
     gain_e_per_count: float | None = None,
     directions: str | None = None,
@@ -97,10 +98,12 @@ def observations_from_images(
     ----------
     images : sequence of Path
         Image files or folders of them.
-    camera : Camera
-        The nominal camera.
+    camera : Camera or None
+        The nominal camera. Without one, it is what the images say of it, and the focal length is found from the stars.
     max_mag : float
         Magnitude limit of the embedded catalogue, Gaia G.
+    focal_tolerance : float
+        Relative error of the focal length that is looked for first.
     epoch : float, optional
         Julian year of the star positions; that of the images by default (`epoch_of`).
     gain_e_per_count : float, optional
@@ -135,6 +138,7 @@ def observations_from_images(
     CatalogueError
         When the time is not readable.
     """
+    from starcal_uq.identification.engine import identify
     from starcal_uq.images.extract import extract_centroids
     from starcal_uq.pipeline.refine import identify_and_calibrate
     from starcal_uq.sky.catalogue import load_catalogue
@@ -152,6 +156,8 @@ def observations_from_images(
         progress=progress,
     )
     centroids = with_time(centroids, time_utc)
+    if camera is None:
+        centroids = of_one_size(centroids)
     if tell is not None:
         for message in counted(centroids.messages):
             tell(f"note: {message}")
@@ -163,13 +169,15 @@ def observations_from_images(
     # A neighbour need not be bright enough to be identified to displace a star.
     neighbours = load_catalogue(max_mag=max(max_mag, min(max_mag + _FAINTER_NEIGHBOURS, _FAINTEST)), epoch=year)
 
+    options: dict[str, Any] = {"engine": engine, "focal_tolerance": focal_tolerance}
+    first = identify(centroids, camera, stars, **options)
     rendered = _rendered(images)
     motion = directions in (None, "catalogue")
     width = centroids.psf_sigma_px[np.isfinite(centroids.psf_sigma_px)]
     psf_sigma_px = float(np.median(width)) if len(width) else 1.0
 
     def prepare(obs: Observations) -> Observations:
-        obs = without_disturbed(obs, neighbours, camera, psf_sigma_px)
+        obs = without_disturbed(obs, neighbours, first.nominal, psf_sigma_px)
         if in_space or rendered:
             obs = obs.with_meta(observer="space" if in_space else "rendered")
         timed = obs.time_utc is not None and bool((obs.time_utc != "").all())
@@ -185,11 +193,12 @@ def observations_from_images(
         centroids,
         camera,
         stars,
+        first=first,
         prepare=prepare,
         to_catalogue=to_catalogue if motion else None,
         # The calibration of the run will ask which frames repeat others.
         method={"duplicates": "keep"},
-        identification={"engine": engine},
+        identification=options,
     )
     return settle_noise(found.observations, found.calibration), centroids, found
 
@@ -222,6 +231,30 @@ def with_time(centroids: Centroids, time_utc: str | None) -> Centroids:
     ]
     kept = tuple(message for message in centroids.messages if message not in said)
     return replace(centroids, time_utc=np.array(times, dtype=np.str_), messages=kept)
+
+
+def of_one_size(centroids: Centroids) -> Centroids:
+    """The frames of the size that most images have; the others are left out, with their reason.
+
+    Parameters
+    ----------
+    centroids : Centroids
+        As `extract_centroids` gives them.
+    """
+    sizes = centroids.meta.get("other_sizes", {})
+    if not sizes:
+        return centroids
+    common = centroids.meta["optics"]
+    most = f"most are {common['width_px']} x {common['height_px']} px"
+    problem = [
+        f"the image is {sizes[str(k)][0]} x {sizes[str(k)][1]} px and {most}" if str(k) in sizes and not why else why
+        for k, why in zip(centroids.frame_ids.tolist(), centroids.problem.tolist(), strict=True)
+    ]
+    odd = [int(k) for k in sizes]
+    kept = centroids.select(~np.isin(centroids.frame, odd))
+    names = centroids.image[np.isin(centroids.frame_ids, odd)]
+    said = [f"{n}: the image was left out, because it is not of the size of most; run it by itself." for n in names]
+    return replace(kept, problem=np.array(problem, dtype=np.str_), messages=(*kept.messages, *said))
 
 
 def _rendered(images: Sequence[Path]) -> bool:

@@ -56,9 +56,10 @@ class ImageCalibration(Shown):
 
 def identify_and_calibrate(
     centroids: Centroids,
-    camera: Camera,
+    camera: Camera | None,
     stars: StarCatalogue,
     *,
+    first: Identification | None = None,
     prepare: Callable[[Observations], Observations] | None = None,
     to_catalogue: ToCatalogue | None = None,
     method: dict[str, Any] | None = None,
@@ -70,10 +71,12 @@ def identify_and_calibrate(
     ----------
     centroids : Centroids
         Measured stars of all frames.
-    camera : Camera
-        The nominal camera.
+    camera : Camera or None
+        The nominal camera, as for `identify`.
     stars : StarCatalogue
         Catalogue.
+    first : Identification, optional
+        The first identification, where it was made before.
     prepare : callable, optional
         Function that observations pass before they are calibrated, such as making directions apparent.
     to_catalogue : callable, optional
@@ -95,7 +98,7 @@ def identify_and_calibrate(
     from starcal_uq.estimation.calibrate import calibrate
 
     options = identification or {}
-    found = identify(centroids, camera, stars, **options)
+    found = identify(centroids, camera, stars, **options) if first is None else first
     rounds: list[tuple[Identification, Observations, Calibration]] = []
     for number in range(2):
         if not found.n_identified:
@@ -137,7 +140,7 @@ def _again(
         moved = undisplaced(table, obs, known.camera, to_catalogue)
     found = identify(moved, known.camera, stars, calibration=known, **options)
     # What follows is said against the data sheet.
-    found = replace(found, nominal=first.nominal)
+    found = replace(found, nominal=first.nominal, optics=first.optics)
     if found.n_identified:
         found = replace(found, observations=as_measured(found.observations, moved, table))
     return replace(found, parity="mirrored") if flipped else found

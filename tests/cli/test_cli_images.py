@@ -46,6 +46,16 @@ def test_simulated_images_go_through_the_commands_one_by_one(cli, tmp_path):
     # Stars within six sigma of the edge are in the images but not in the table.
     wrong = [pair for pair in zip(found.frame.tolist(), found.star_id.tolist(), strict=True) if pair not in right]
     assert len(wrong) <= 0.03 * found.n_stars
+    # The stars tell the camera as well.
+    status, out, err = cli("identify", "centroids.parquet", "-o", "alone.csv", "--max-mag", 6)
+    assert status == 0, err
+    assert "The stars alone tell the camera" in out
+    alone = sc.load_observations(tmp_path / "alone.csv")
+    pairs = set(zip(alone.frame.tolist(), alone.star_id.tolist(), strict=True))
+    assert len(pairs.intersection(zip(found.frame.tolist(), found.star_id.tolist(), strict=True))) > 0.9 * found.n_stars
+    status, _, err = cli("run", "found.csv", "-o", "run")
+    assert status == 2
+    assert "needs the nominal camera" in err
 
 
 @pytest.mark.usefixtures("centroids_once")
@@ -72,7 +82,8 @@ def test_options_of_the_other_kind_are_refused(cli, frames, tmp_path):
     assert status == 2
     assert "--observer-velocity belongs to tables" in err
     (tmp_path / "obs.csv").write_text("frame,x_px,y_px,ra_deg,dec_deg\n")
-    for option in (("--time", "2026-11-21T00:00:00"), ("--max-mag", 3), ("--gain", 1), ("--engine", "pyramid")):
+    images_only = (("--max-mag", 3), ("--gain", 1), ("--engine", "pyramid"), ("--focal-tolerance", 0.1))
+    for option in (("--time", "2026-11-21T00:00:00"), *images_only):
         status, _, err = cli("run", "obs.csv", "camera.toml", "-o", "run", *option)
         assert status == 2
         assert f"{option[0]} belongs to images" in err
@@ -132,6 +143,7 @@ def test_bad_input_is_one_sentence(cli, tmp_path):
         (("identify", "missing.csv", "camera.toml", "-o", "o.csv"), (2,)),
         (("run", "broken.fits", "camera.toml", "-o", "run"), (2,)),
         (("run", "one.csv", "two.csv", "camera.toml", "-o", "run"), (2,)),
+        (("run", "camera.toml", "-o", "run"), (2,)),
         (("simulate", "camera.toml", "-o", "s.csv", "--sensor", "x.toml"), (2,)),
     ):
         found, out, err = cli(*command)

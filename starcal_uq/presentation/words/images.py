@@ -6,8 +6,9 @@ from collections import Counter
 
 import numpy as np
 
+from starcal_uq.camera.camera import Camera
 from starcal_uq.core.formatting import plural
-from starcal_uq.identification.result import STATUSES, FrameStatus, Identification
+from starcal_uq.identification.result import STATUSES, FoundOptics, FrameStatus, Identification
 from starcal_uq.images.centroids import Centroids
 from starcal_uq.pipeline.record import ImageRecord
 from starcal_uq.pipeline.refine import ImageCalibration, identified_pairs
@@ -61,10 +62,23 @@ def identification_text(identification: Identification) -> str:
     unlike = sum(frame.n_unlike_brightness for frame in identification.frames)
     if unlike:
         words += f" {plural(unlike, 'match', 'matches')} given up, because the brightness is unlike the star's."
-    if identification.n_identified:
+    if identification.optics is not None:
+        words += f" {optics_text(identification.optics, identification.nominal)}"
+    elif identification.n_identified:
         change = 100.0 * (identification.camera.focal_px / identification.nominal.focal_px - 1.0)
         words += f" The focal length is {abs(change):.2f} % {'longer' if change >= 0 else 'shorter'} than nominal."
     return words + _MIRRORED if identification.parity == "mirrored" else words
+
+
+def optics_text(optics: FoundOptics, camera: Camera) -> str:
+    """What the stars alone said of the lens, and how sure that is."""
+    width, height = camera.fov_deg
+    agree = f"{plural(optics.n_frames, 'frame says', 'frames say')} so"
+    return (
+        f"The stars alone tell the camera: a field of {width:.3g} x {height:.3g} degrees, f = {camera.focal_px:.5g} px "
+        f"({camera.focal_mm:.4g} mm if its pixels are {camera.pixel_um:.4g} um wide); {agree}, by chance once in "
+        f"10^{-optics.log10_expected_false:.0f}."
+    )
 
 
 def identification_table(identification: Identification) -> TextTable:

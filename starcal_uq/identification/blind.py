@@ -1,0 +1,402 @@
+"""The focal length of an unknown camera, from the stars alone: patterns that know no scale, as plate solvers use them.
+
+Four stars make a pattern whose shape depends on neither scale nor roll (Lang, Hogg et al. 2010, AJ 139, 1782): the two
+farthest apart define axes, and the places of the other two are the pattern's code. The catalogue's patterns are made of
+the brightest stars of the sky, twice as many on each level as on the one before, each star with the nearest of its
+level; so some level suits any field of view. Like codes give an attitude and a focal length, what else they explain
+among the frame's bright stars ranks them, and a match of all stars (`match`) decides.
+
+All work is counted: so many patterns of so many frames, so many of them matched.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import combinations
+from math import log10, pi
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.identification.match import Match, match_frame, start_state
+from starcal_uq.identification.nearby import NearbyStars
+from starcal_uq.identification.pairs import angle_between
+from starcal_uq.identification.pyramid import SIGMAS, CameraTolerance, FieldGeometry, Hypothesis, axes_of
+from starcal_uq.identification.result import FoundOptics
+from starcal_uq.sky.catalogue import StarCatalogue
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+# Stars of the whole sky on the first level; each next one has twice as many.
+_FIRST_LEVEL = 64
+_LAST_LEVEL = 200_000
+# Levels searched together: those that are made in a second first, then the deeper ones, which only narrow fields need.
+_GROUPS = (20_000, 40_000, 80_000, 160_000)
+# Nearest stars that a star makes patterns with, on levels of up to so many stars.
+_NEAREST = ((10_000, 7), (40_000, 6), (_LAST_LEVEL, 5))
+# Patterns of a frame are made of this many of its brightest stars, each with as many of its nearest.
+_BRIGHTEST, _FRAME_NEAREST = (8, 11, 16, 22, 32), 7
+# Codes differ by less than this, in units of the pattern's longest side: noise, and what an unknown lens bends.
+_CODE_TOLERANCE = 0.012
+# The frame's brightest stars that a pattern's attitude must explain, and how well, as a part of their distance.
+_EXPLAINED, _BEND = 24, 0.008
+# Patterns are flat in narrow fields; those above 30 degrees are seen with these focal lengths, in detector widths.
+_FLAT, _FOCAL_STEPS = 1.7, (1.85, 1.45, 1.15, 0.92, 0.75, 0.61, 0.5)
+_FOCAL_STEP = 1.17
+# Candidates of a frame and parity that are matched with all stars, and the camera tolerances then.
+_MATCHED = 12
+_FOCAL, _CENTRE, _DISTORTION = 0.02, 0.02, 0.004
+# Decimal logarithms of the wrong attitudes expected for a frame to count, and to count alone.
+_COUNTS, _ALONE = -4.0, -9.0
+# Frames that are searched, those of them that must agree where they can, and the stars that one must have.
+_PROBES, _ENOUGH, _LEAST_STARS = 10, 3, 5
+# Frames of one camera agree in their focal length to this.
+AGREEMENT = 0.02
+# Focal lengths of fields of view from 90 to 0.5 degrees, in detector widths.
+FOCAL_RANGE = (0.5, 115.0)
+# The search for a focal length anywhere, instead of within the tolerance of a match.
+_ANYWHERE = log10(np.log(180.0) / (2.0 * _FOCAL))
+
+
+@lru_cache(maxsize=8)
+def _threes(k: int) -> IntArray:
+    return np.array(list(combinations(range(1, k + 1), 3)), dtype=np.int64)
+
+
+def quads_of(neighbours: IntArray) -> IntArray:
+    """Different sets of four (q, 4): a point, first in its row of `neighbours` (n, k + 1), and three of its nearest."""
+    three = _threes(neighbours.shape[1] - 1)
+    own = np.repeat(neighbours[:, 0], len(three))[:, None]
+    quads = np.sort(np.hstack([own, neighbours[:, three].reshape(-1, 3)]), axis=1)
+    # Numbers below 2^15 make one key; larger ones are sorted as rows, which takes longer.
+    n = int(quads.max(initial=0)) + 1
+    keys = (quads[:, 0] * n + quads[:, 1], quads[:, 2] * n + quads[:, 3])
+    order = np.lexsort(keys)
+    new = np.ones(len(quads), dtype=np.bool_)
+    new[1:] = np.any(np.diff(np.column_stack(keys)[order], axis=0) != 0, axis=1)
+    return quads[order[new]]
+
+
+def codes_of(directions: FloatArray, quads: IntArray) -> tuple[FloatArray, IntArray, FloatArray]:
+    """Codes (q, 4), the quads with their points in the code's order (a, b, c, d), and the angles from a to b, rad.
+
+    The points are seen in the plane that touches the sphere at their middle, a at 0 and b at 1 of the complex numbers:
+    the code is c and d, with a the end that they are nearer to, and c before d.
+    """
+    v = directions[quads]
+    frame = axes_of(v, 0, 1)
+    p = np.einsum("qki,qai->qak", v, frame)
+    p = (p[:, 0] + 1j * p[:, 1]) / p[:, 2]
+    pairs = np.array(list(combinations(range(4), 2)))
+    longest = np.argmax(np.abs(p[:, pairs[:, 0]] - p[:, pairs[:, 1]]), axis=1)
+    rows = np.arange(len(quads))[:, None]
+    order = np.hstack([pairs[longest], pairs[::-1][longest]])
+    p = p[rows, order]
+    c = (p[:, 2:] - p[:, :1]) / (p[:, 1:2] - p[:, :1])
+    turn = c.real.sum(axis=1) > 1.0
+    c[turn] = 1.0 - c[turn]
+    order[turn, :2] = order[turn, 1::-1]
+    swap = c[:, 0].real > c[:, 1].real
+    c[swap] = c[swap, ::-1]
+    order[swap, 2:] = order[swap, :1:-1]
+    quads = quads[rows, order]
+    codes = np.column_stack([c[:, 0].real, c[:, 0].imag, c[:, 1].real, c[:, 1].imag])
+    return codes, quads, angle_between(directions[quads[:, 0]], directions[quads[:, 1]])
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """The brightest stars of the sky, (n, 3), and their patterns."""
+
+    directions: FloatArray
+    stars: cKDTree
+    quads: IntArray
+    size_rad: FloatArray
+    codes: cKDTree
+
+
+def make_level(directions: FloatArray) -> Level:
+    """The level of these stars."""
+    from scipy.spatial import cKDTree
+
+    stars = cKDTree(directions)
+    nearest = next((k for most, k in _NEAREST if len(directions) <= most), _NEAREST[-1][1])
+    codes, quads, size = codes_of(directions, quads_of(stars.query(directions, nearest + 1)[1]))
+    return Level(directions, stars, quads, size, cKDTree(codes, balanced_tree=False, compact_nodes=False))
+
+
+class Levels:
+    """The levels of a catalogue, made when they are first asked for."""
+
+    def __init__(self, stars: StarCatalogue) -> None:
+        order = np.argsort(stars.mag, kind="stable")
+        self._directions = np.ascontiguousarray(stars.directions_icrs[order])
+        self._made: dict[int, Level] = {}
+        self.sizes = [n for k in range(20) if (n := _FIRST_LEVEL << k) <= min(len(order), _LAST_LEVEL)]
+
+    def __getitem__(self, n: int) -> Level:
+        if n not in self._made:
+            self._made[n] = make_level(self._directions[:n])
+        return self._made[n]
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Candidates of a frame: attitudes (c, 3, 3), focal lengths (c,), and how unlikely what they explain is, log10."""
+
+    rotation: FloatArray
+    focal_px: FloatArray
+    log10_chance: FloatArray
+
+
+class BlindSearch:
+    """One catalogue and one size of detector, of a camera whose focal length may be anything."""
+
+    def __init__(self, stars: StarCatalogue, width_px: int, height_px: int) -> None:
+        self.levels = _levels_of(stars)
+        self.width, self.height = float(width_px), float(height_px)
+        corner = 0.5 * float(np.hypot(width_px, height_px))
+        self.geometry = FieldGeometry(self.width, self.width, self.height, corner)
+        self.tolerance = CameraTolerance(_FOCAL, _CENTRE * self.width, max(1.0, _DISTORTION * corner))
+        self.sky = NearbyStars(stars.directions_icrs, stars.mag, self.geometry)
+
+    def candidates(self, u: FloatArray, sigma_px: FloatArray, sizes: list[int], focal_px: tuple[float, float]) -> _Seen:
+        """What patterns of a frame, points (n, 2) from the middle, brightest first, have like ones on these levels."""
+        quads = _frame_quads(u)
+        found = [
+            part
+            for focal, low, high in self._focal_steps(focal_px)
+            for part in self._alike(u, quads, sizes, focal, low, high)
+        ]
+        parts = [self._explained(u, sigma_px, *part) for part in found]
+        if not parts:
+            return _Seen(np.empty((0, 3, 3)), np.empty(0), np.empty(0))
+        return _Seen(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+    def _focal_steps(self, focal_px: tuple[float, float]) -> Iterator[tuple[float, float, float]]:
+        """Focal lengths to look with, each with the range of those that it may find."""
+        low, high = focal_px
+        flat = _FLAT * self.width
+        if high > flat:
+            yield 20.0 * self.width, max(low, flat), high
+        for step in _FOCAL_STEPS:
+            focal = step * self.width
+            a, b = max(low, focal / _FOCAL_STEP), min(high, focal * _FOCAL_STEP)
+            if a < b:
+                yield focal, a, b
+
+    def _alike(
+        self, u: FloatArray, quads: IntArray, sizes: list[int], focal: float, low: float, high: float
+    ) -> Iterator[tuple[Level, IntArray, IntArray, FloatArray]]:
+        """For each level, its patterns and the frame's that are alike, and the focal lengths that follow."""
+        rays = _rays(u, np.array([focal]))[0]
+        codes, quads, size = codes_of(rays, quads)
+        faintest = quads.max(axis=1) + 1
+        for n in sizes:
+            # Stars of the level in the field, at the longest and the shortest focal length.
+            least, most = (n * self.width * self.height / (4.0 * pi * f * f) for f in (high, low))
+            use = np.flatnonzero((8.0 * np.maximum(faintest, 12) > least) & (0.3 * faintest < most))
+            if not len(use):
+                continue
+            level = self.levels[n]
+            hits = level.codes.query_ball_point(codes[use], _CODE_TOLERANCE)
+            count = np.array([len(hit) for hit in hits])
+            mine = np.repeat(use, count)
+            theirs = np.array([j for hit in hits for j in hit], dtype=np.int64)
+            f = focal * size[mine] / level.size_rad[theirs]
+            expected = n * self.width * self.height / (4.0 * pi * f * f)
+            ok = (f >= low) & (f <= high)
+            ok &= (expected > 0.3 * faintest[mine]) & (expected < 8.0 * np.maximum(faintest[mine], 12))
+            if ok.any():
+                yield level, quads[mine[ok]], level.quads[theirs[ok]], f[ok]
+
+    def _explained(
+        self, u: FloatArray, sigma_px: FloatArray, level: Level, mine: IntArray, theirs: IntArray, focal: FloatArray
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Attitudes and focal lengths of like patterns, and the odds that they explain other stars by chance."""
+        m = min(len(u), _EXPLAINED)
+        b = _rays(u, focal)
+        rows = np.arange(len(mine))[:, None]
+        rotation = axes_of(b[rows, mine], 0, 1).transpose(0, 2, 1) @ axes_of(level.directions[theirs], 0, 1)
+        sky = b[:, :m] @ rotation
+        corner = u[mine]
+        span = np.hypot(*(corner[:, 1] - corner[:, 0]).T)[:, None]
+        reach = np.hypot(*(u[:m] - corner.mean(axis=1)[:, None]).transpose(2, 0, 1))
+        gate = SIGMAS * sigma_px[:m] + _BEND * (reach + span)
+        distance, _ = level.stars.query(sky.reshape(-1, 3), distance_upper_bound=float((gate / focal[:, None]).max()))
+        own = np.any(np.arange(m)[:, None] == mine[:, None, :], axis=2)
+        near = (distance.reshape(len(mine), m) * focal[:, None] < gate) & ~own
+        density = len(level.directions) / (4.0 * pi * focal**2)
+        chance = np.clip(density[:, None] * pi * gate**2, 1e-9, 1.0)
+        # The sum of the logarithms, less that of the choices among the stars that might have been explained.
+        log10_chance = np.where(near, np.log10(chance * m), 0.0).sum(axis=1)
+        return rotation, focal, log10_chance
+
+    def solve(
+        self, u: FloatArray, sigma_px: FloatArray, sizes: list[int], focal_px: tuple[float, float]
+    ) -> tuple[float, Match] | None:
+        """The best focal length of a frame and its match, where there is one that counts."""
+        from scipy.spatial import cKDTree
+
+        if len(u) < _LEAST_STARS:
+            return None
+        seen = self.candidates(u, sigma_px, sizes, focal_px)
+        best: tuple[float, Match] | None = None
+        tree = cKDTree(u)
+        tried: list[tuple[float, FloatArray]] = []
+        for row in np.argsort(seen.log10_chance, kind="stable"):
+            if len(tried) == _MATCHED or seen.log10_chance[row] >= -1.0:
+                break
+            focal, rotation = float(seen.focal_px[row]), seen.rotation[row]
+            # Patterns of one solution say the same.
+            if any(abs(f / focal - 1.0) < 0.01 and np.abs(r - rotation).max() < 0.01 for f, r in tried):
+                continue
+            tried.append((focal, rotation))
+            match = self._match(u, tree, sigma_px, focal, rotation)
+            if match is not None and (best is None or match.log10_false < best[1].log10_false):
+                best = focal * float(np.exp(match.state.shared[0])), match
+                if match.log10_false + _ANYWHERE < _ALONE:
+                    break
+        return best if best is not None and best[1].log10_false + _ANYWHERE < _COUNTS else None
+
+    def _match(
+        self, u: FloatArray, tree: cKDTree, sigma_px: FloatArray, focal: float, rotation: FloatArray
+    ) -> Match | None:
+        sky = self.sky.seen_by(replace(self.geometry, focal_px=focal))
+        start = start_state(Hypothesis(rotation, 1.0))
+        return match_frame(u, tree, sigma_px, sky, start, self.tolerance, log10_wanted=_COUNTS - _ANYWHERE)
+
+
+def _frame_quads(u: FloatArray) -> IntArray:
+    """Patterns of a frame's brightest stars."""
+    from scipy.spatial import cKDTree
+
+    parts = []
+    for m in sorted({min(m, len(u)) for m in _BRIGHTEST}):
+        parts.append(quads_of(cKDTree(u[:m]).query(u[:m], min(_FRAME_NEAREST + 1, m))[1]))
+    return np.unique(np.concatenate(parts), axis=0)
+
+
+def _rays(u: FloatArray, focal_px: FloatArray) -> FloatArray:
+    """Unit vectors (m, n, 3) of points (n, 2) for focal lengths (m,)."""
+    b = np.empty((len(focal_px), len(u), 3))
+    b[..., :2] = u
+    b[..., 2] = focal_px[:, None]
+    b /= np.sqrt(np.einsum("mni,mni->mn", b, b))[..., None]
+    return b
+
+
+# What was made last: a run asks twice for the same catalogue.
+_recent: dict[int, tuple[StarCatalogue, Levels]] = {}
+
+
+def _levels_of(stars: StarCatalogue) -> Levels:
+    """The levels of a catalogue; those of the last one are kept."""
+    if id(stars) not in _recent:
+        _recent.clear()
+        _recent[id(stars)] = stars, Levels(stars)
+    return _recent[id(stars)][1]
+
+
+@dataclass(frozen=True)
+class _Vote:
+    frame: int
+    focal_px: float
+    mirrored: bool
+    log10_false: float
+    kappa_px: float
+
+
+def find_optics(
+    frames: Sequence[tuple[FloatArray, FloatArray]],
+    stars: StarCatalogue,
+    width_px: int,
+    height_px: int,
+    ranges: Sequence[tuple[float, float]],
+) -> FoundOptics | None:
+    """The focal length that frames agree on; None where there is none.
+
+    Parameters
+    ----------
+    frames
+        Points (n, 2) from the detector's middle, brightest first, and their noise (n,), px.
+    stars
+        Catalogue, as deep as the frames may need.
+    width_px, height_px
+        Detector.
+    ranges
+        Focal lengths to look for, px: first in the first range, then in the next.
+
+    A frame alone counts where chance makes what it shows less than once in 10^9; otherwise two must agree.
+    """
+    search = BlindSearch(stars, width_px, height_px)
+    probes = _probes([len(points) for points, _ in frames])
+    for limits in ranges:
+        for low, high in zip((0, *_GROUPS), (*_GROUPS, _LAST_LEVEL), strict=False):
+            sizes = [n for n in search.levels.sizes if low < n <= high]
+            if not sizes:
+                continue
+            found = _agreed(search, frames, probes, sizes, limits)
+            if found is not None:
+                return found
+    return None
+
+
+def _probes(n_stars: Sequence[int]) -> list[int]:
+    """Frames to be searched: those with most stars, and others of all kinds, because most may be clouds or trees."""
+    order = [k for k in sorted(range(len(n_stars)), key=lambda k: -n_stars[k]) if n_stars[k] >= _LEAST_STARS]
+    half = _PROBES // 2
+    rest = order[half:]
+    return order[:half] + [rest[i * len(rest) // half] for i in range(min(half, len(rest)))]
+
+
+def _agreed(
+    search: BlindSearch,
+    frames: Sequence[tuple[FloatArray, FloatArray]],
+    probes: Sequence[int],
+    sizes: list[int],
+    limits: tuple[float, float],
+) -> FoundOptics | None:
+    """What frames agree on, with the patterns of these levels."""
+    votes: list[_Vote] = []
+    for k in probes:
+        vote = _vote(search, frames[k], k, sizes, limits, (False, True))
+        if vote is None:
+            continue
+        votes.append(vote)
+        near = vote.focal_px * (1.0 - AGREEMENT), vote.focal_px * (1.0 + AGREEMENT)
+        same = [v for v in votes if v.mirrored == vote.mirrored and near[0] < v.focal_px < near[1]]
+        others = [other for other in probes if other not in {v.frame for v in votes}]
+        for other in others:
+            if len(same) >= _ENOUGH:
+                break
+            second = _vote(search, frames[other], other, sizes, near, (vote.mirrored,))
+            same += [] if second is None else [second]
+        if len(same) > 1 or vote.log10_false < _ALONE:
+            # The median of two is one of them, so that it is a focal length that was seen.
+            focal = sorted(v.focal_px for v in same)[(len(same) - 1) // 2]
+            kappa = max(abs(v.kappa_px) for v in same)
+            best = min(v.log10_false for v in same)
+            return FoundOptics(focal, vote.mirrored, len(same), len(probes), kappa, best)
+    return None
+
+
+def _vote(
+    search: BlindSearch,
+    frame: tuple[FloatArray, FloatArray],
+    number: int,
+    sizes: list[int],
+    limits: tuple[float, float],
+    parities: Sequence[bool],
+) -> _Vote | None:
+    points, sigma = frame
+    for mirrored in parities:
+        solved = search.solve(points * [-1.0, 1.0] if mirrored else points, sigma, sizes, limits)
+        if solved is not None:
+            focal, match = solved
+            return _Vote(number, focal, mirrored, match.log10_false + _ANYWHERE, float(match.state.shared[3]))
+    return None
