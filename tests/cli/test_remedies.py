@@ -126,6 +126,9 @@ EXAMPLES = {
         observed.directions(dataclasses.replace(s.obs, meta=meta), s.cal)
         for meta in ({"directions": "undeclared"}, {"directions": "apparent", "observer": "unknown"})
     ],
+    "diagnostics.verdict.observed.screening": lambda s: [
+        observed.screening(s.obs.with_meta(screening={"rejected": 0, "of": 9, "blame": "the model is wrong."}))
+    ],
     "diagnostics.verdict.observed.terms": lambda s: [
         observed.terms(
             dataclasses.replace(

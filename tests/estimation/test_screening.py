@@ -16,9 +16,11 @@ from starcal_uq.estimation.screening.consensus import focal_ratio, pre_screen
 from starcal_uq.estimation.screening.outliers import star_residuals, star_threshold, truncated_variance
 from starcal_uq.estimation.screening.result import COLUMNS, REASONS
 from starcal_uq.estimation.screening.screening import screen
+from starcal_uq.estimation.screening.tails import allowed_near, fit_tails
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.simulation.contamination import contaminate
 from tests.helpers import scenes
+from tests.helpers.outside import campaign
 from tests.helpers.speed import times_as_long
 
 TRUTH = scenes.camera()
@@ -293,11 +295,77 @@ def test_heavy_tails_are_not_called_wrong_stars() -> None:
     noise = 0.05 * np.random.default_rng(5).standard_t(3.0, (2, len(base)))
     obs = replace(base, x_px=base.x_px + noise[0], y_px=base.y_px + noise[1])
     found = screen(obs, uncalibrated())
-    assert any("heavy tails" in warning for warning in found.warnings)
-    assert found.stable
+    assert found.stable and found.model_is_wrong
+    assert "the model is wrong, not the stars" in found.text and "Student t" in found.text
+    assert found.calibration.provenance["settings"]["likelihood"] == "student_t"
+    # Tails of three degrees of freedom reach far; before, nine of these right stars were left out.
+    assert found.n_rejected <= 1
     cut_short = screen(obs, uncalibrated(), max_rounds=1)
-    assert not cut_short.stable
+    assert not cut_short.stable and cut_short.model_is_wrong
     assert any("did not settle" in warning for warning in cut_short.warnings)
+
+
+def poor_camera(seed: int, *, share_wrong: float = 0.0, tails: bool = True):
+    """Ten frames whose centroids are of very unequal noise, through a lens with a bend that no model here has."""
+    rng = np.random.default_rng(seed)
+    by_frame = np.exp(0.4 * rng.standard_normal(10)) if tails else np.ones(10)
+
+    def displaced(d, xy, magnitude, frame):
+        x, y = d / 724.0
+        bend = 2.0 * np.array([x * y, y**2 - 0.3 * x**3]) if tails else 0.0
+        sigma = 0.1 * by_frame[frame] * np.exp(tails * rng.standard_normal(d.shape[1]))
+        return bend + sigma * rng.standard_normal(d.shape)
+
+    c = campaign(rng, n_frames=10, stars_per_frame=40, field_deg=20.0, sigma_px=0.0, displaced=displaced)
+    wrong = rng.random(len(c.columns["frame"])) < share_wrong
+    for name in ("x_px", "y_px"):
+        c.columns[name] = np.where(wrong, rng.uniform(0.0, 1023.0, len(wrong)), c.columns[name])
+    return c, sc.Observations(**c.columns), sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)), wrong
+
+
+def test_screening_does_not_hurt_where_the_model_is_wrong() -> None:
+    """Four to twenty of a hundred right stars, and a whole frame, were left out of these before."""
+    for seed in (0, 2):
+        c, obs, camera, _ = poor_camera(seed)
+        found = screen(obs, camera)
+        assert found.model_is_wrong and found.n_rejected <= 1 and not len(found.dropped_frames)
+        # The bend moves f by itself.
+        assert abs(found.calibration.theta[2] - c.theta[2]) < 3.0 * found.calibration.sigmas[2]
+        assert found.observations.meta["screening"]["blame"] in found.text
+
+
+@pytest.mark.parametrize("share", [0.01, 0.1])
+def test_wrong_stars_are_left_out_whatever_the_model(share: float) -> None:
+    _, obs, camera, wrong = poor_camera(1, share_wrong=share)
+    found = screen(obs, camera)
+    assert not (found.kept & wrong).any()
+    assert np.count_nonzero(~found.kept & ~wrong) <= 1
+    # The control: with a model that holds, the stars are to blame.
+    _, obs, camera, wrong = poor_camera(1, share_wrong=share, tails=False)
+    found = screen(obs, camera)
+    assert not found.model_is_wrong and np.array_equal(found.kept, ~wrong)
+
+
+def test_a_t_is_fitted_to_what_hangs_together() -> None:
+    rng = np.random.default_rng(0)
+    t = np.sum(0.2 * rng.standard_normal((2, 3000)) ** 2, axis=0) / rng.gamma(2.0, 0.5, 3000)
+    tails = fit_tails(np.append(t, [1e6, np.inf]), 1e-5)
+    assert 3.0 < tails.nu < 5.5 and tails.scale2 == pytest.approx(0.2, rel=0.1) and tails.heavy
+    assert np.count_nonzero(~tails.within[:-2]) <= 1 and not tails.within[-2:].any()
+    # The control: Gaussian tails.
+    assert not fit_tails(np.sum(rng.standard_normal((2, 3000)) ** 2, axis=0), 1e-5).heavy
+
+
+def test_how_many_stars_may_be_just_beyond_the_limit() -> None:
+    rng = np.random.default_rng(1)
+    # Wrong stars anywhere within 60 px, at a noise of 0.3 px: 14 of 4000 are near, and are allowed for.
+    wrong = rng.uniform(20.0, 40_000.0, 4000)
+    near, allowed = allowed_near(wrong, np.full(4000, 20.0), 0.05)
+    assert 0 < near <= allowed < 30
+    tail = 20.0 / rng.random(100) ** 0.5
+    near, allowed = allowed_near(tail, np.full(100, 20.0), 0.05)
+    assert near > allowed
+    assert allowed_near(np.array([25.0]), np.array([20.0]), 0.05) == (1, 2)
 
 
 def test_a_poor_model_is_not_hidden_by_screening() -> None:
@@ -313,7 +381,7 @@ def test_a_poor_model_is_not_hidden_by_screening() -> None:
         import pandas as pd
 
         table = pd.DataFrame({"row": rows, "reason": "displaced", "statistic": 1e4, "threshold": 20.0})
-        texts = warnings_about(obs, base.calibration.camera, kept, table, True)
+        texts = warnings_about(obs, base.calibration.camera, kept, table)
         assert any("distortion model" in text for text in texts) == expected
 
 
@@ -329,8 +397,8 @@ def test_per_star_noise_is_respected() -> None:
     assert found.rejected["row"].tolist() == [moved]
     assert found.calibration.sigma_name == "sigma_scale"
     assert found.calibration.sigma == pytest.approx(1.0, abs=0.05)
-    # The control: without the stated noise, the tails of the noisy stars are taken for wrong ones.
-    assert screen(replace(obs, x_px=x, sigma_px=None), uncalibrated()).n_rejected > 1
+    # The control: without the stated noise, the noisy stars are tails that one noise does not explain.
+    assert screen(replace(obs, x_px=x, sigma_px=None), uncalibrated()).model_is_wrong
 
 
 def test_a_thousand_frames_are_fast() -> None:
@@ -379,11 +447,8 @@ def test_real_stars(real_data) -> None:
     with path.open() as stream:
         snr = np.array([float(row["snr"]) for row in csv.DictReader(stream)])
     everything = screen(obs, camera)
-    # A hundredth of the stars, faint ones just beyond the limit: noise that differs from star to star, not other stars.
-    assert 1 <= everything.n_rejected <= 10
-    assert np.all(snr[~everything.kept] < 10.0)
-    assert everything.rejected["residual_px"].max() < 1.0
-    assert any("unequal noise" in warning for warning in everything.warnings)
+    # A hundredth is just beyond the limit, faint stars: their noise differs, they are not other stars.
+    assert everything.model_is_wrong and everything.n_rejected == 0
     # With noise that grows as 1 / SNR stated, hardly any.
     assert screen(replace(obs, sigma_px=np.hypot(0.06, 0.6 / snr)), camera).n_rejected <= 2
     bright = screen(obs.select(snr >= 10), camera)

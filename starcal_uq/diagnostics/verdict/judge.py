@@ -68,6 +68,7 @@ def judge(
         checks += [draws.same_data(post, cal.data_hash_of(obs)), *post.diagnostics.checks]
     used = weighed(obs, cal)
     checks += [observed.directions(used, cal), observed.residual_pattern(used, cal), observed.outliers(used, cal)]
+    checks += [observed.screening(obs)]
     checks += [observed.noise(used, cal), observed.partitions(cal), observed.terms(cal), observed.coverage(used, cal)]
     if diagnosis is not None:
         checks += estimate.model_checks(diagnosis)

@@ -122,6 +122,17 @@ def outliers(obs: Observations, cal: Calibration) -> Check:
     return Check("Outliers", Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, remedy)
 
 
+def screening(obs: Observations) -> Check | None:
+    """Did screening find stars to blame, or the model?"""
+    record = obs.meta.get("screening")
+    if not isinstance(record, dict) or "blame" not in record:
+        return None
+    value = f"{plural(int(record['rejected']), 'star')} of {int(record['of'])} rejected"
+    sentence, remedy = str(record["blame"]), f"{CALIBRATE} --noise model"
+    sentence = sentence[0].upper() + sentence[1:]
+    return Check("Screening", Question.TRUSTWORTHY, Level.WARN, value, "wrong stars alone", sentence, remedy)
+
+
 def noise(obs: Observations, cal: Calibration) -> Check:
     """Is the estimated noise that of star centroids?"""
     scaled = cal.sigma_name == "sigma_scale"

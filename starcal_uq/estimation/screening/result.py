@@ -10,7 +10,7 @@ import numpy as np
 
 from starcal_uq.core.display import Shown
 from starcal_uq.core.files import ensure_new, write_csv
-from starcal_uq.core.formatting import join_words, percent
+from starcal_uq.core.formatting import percent
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
 from starcal_uq.estimation.screening.consensus import MIN_STARS
 from starcal_uq.estimation.screening.outliers import StarResiduals, star_threshold
@@ -108,6 +108,9 @@ class Screening(Shown):
         Whether the last round changed nothing.
     warnings : tuple of str
         Sentences on what a user should look at.
+    model_is_wrong : bool
+        Whether more was to be rejected than noise and wrong stars explain, or the rounds did not settle: then only
+        stars beyond the tails of all others are rejected, and tails that are not Gaussian are fitted as Student's.
     """
 
     kept: BoolArray
@@ -130,6 +133,7 @@ class Screening(Shown):
     n_pre_screened: int
     stable: bool
     warnings: tuple[str, ...]
+    model_is_wrong: bool = False
 
     @property
     def n_rejected(self) -> int:
@@ -244,16 +248,9 @@ def _taste_with(
     return taste, np.asarray(limit, dtype=np.float64)
 
 
-def warnings_about(
-    obs: Observations, camera: Camera, kept: BoolArray, rejected: pd.DataFrame, stable: bool
-) -> tuple[str, ...]:
-    """What the pattern of the rejections says against the model, the noise or the data."""
+def warnings_about(obs: Observations, camera: Camera, kept: BoolArray, rejected: pd.DataFrame) -> tuple[str, ...]:
+    """What the pattern of the rejections says against the model or the data."""
     warnings = []
-    if not stable:
-        warnings.append(
-            "the rejections did not settle: the state with the least noise is reported; look at the rounds, and "
-            "raise max_rounds if they were still on their way."
-        )
     share = 1.0 - np.count_nonzero(kept) / len(kept)
     if share > _MANY_REJECTED:
         warnings.append(
@@ -267,13 +264,6 @@ def warnings_about(
         warnings.append(
             "the displaced stars lie farther from the principal point than the others: the distortion model may be "
             "too poor, so that right stars are rejected; compare models before trusting the screening."
-        )
-    marginal = displaced["statistic"] < MARGINAL * displaced["threshold"]
-    if marginal.mean() > 0.5:
-        causes = ["unequal noise (state sigma_px for each star)", "heavy tails (use the Student-t likelihood)"]
-        warnings.append(
-            f"{int(marginal.sum())} of {len(displaced)} displaced stars are only just beyond the limit, where wrong "
-            f"identifications rarely are: {join_words([*causes, 'a model that does not fit'])} may be the cause."
         )
     return tuple(warnings)
 

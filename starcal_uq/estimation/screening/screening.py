@@ -5,6 +5,10 @@ in use, vote again with the calibrated camera and the noise it shows, reject the
 farther from the prediction of the others than chance explains (`outliers`) or while the frame's TASTE fails, and take
 back stars that pass. The rounds end when they no longer change anything.
 
+Where more stars are rejected just beyond the limit than noise and wrong stars let expect, or the rounds do not settle,
+the model is wrong and not the stars (`tails`): what hangs together with the others is kept, with a Student t where the
+tails ask for it.
+
 Every right star and every right frame takes the same risk of being rejected: with N stars and K frames and an expected
 number E of false rejections, a star is rejected at p < E / (2N) and a frame at p < E / (2K) (Bonferroni's bound).
 """
@@ -38,6 +42,7 @@ from starcal_uq.estimation.screening.result import (
     rejected_table,
     warnings_about,
 )
+from starcal_uq.estimation.screening.tails import Tails, allowed_near, blame_words, fit_tails, mark_beyond
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
@@ -143,12 +148,24 @@ def screen(
         rounds.append(ScreeningRound(int(np.count_nonzero(use)), n_changed, calibration.sigma, calibration.theta))
         states.append((use, calibration, tested))
         use = tested.in_use
-    # Rounds that go in circles have no natural end: the state that fits best is reported, with a warning.
+    # Rounds that go in circles have no natural end: the state that fits best is gone on from.
     use, calibration, tested = states[-1] if n_changed == 0 else min(states, key=lambda state: state[1].sigma)
+    stable, tails, blame = n_changed == 0, None, ""
+    found = star_residuals(frames, calibration.camera.distortion, calibration.theta, use)
+    statistic, dof = found.studentised(rates.shrinkage)
+    out = ~use & np.repeat(found.frame_count > 0, frames.sizes)
+    limit = star_threshold(rates.star, dof)
+    near, allowed = allowed_near(statistic[out], limit[out], 2.0 * rates.star * frames.n_stars)
+    last = options
+    if near > allowed or not stable:
+        use, tails = _all_that_hangs_together(frames, calibration, use, rates)
+        last = _with_tails(options, tails)
+        calibration = calibrate(obs.select(use), camera, throw=False, **last)
+        blame = blame_words(near, allowed, len(rounds), stable, calibration)
     kept = obs.select(use)
     if throw and not calibration.status.ok:
         # For the error alone.
-        calibration = calibrate(kept, camera, **options)
+        calibration = calibrate(kept, camera, **last)
     repeating = repeating_frames(calibration, duplicates)
     if len(repeating):
         again = {"significance": significance, "control": control, "max_rounds": max_rounds, "throw": throw, **options}
@@ -156,13 +173,15 @@ def screen(
     residuals = star_residuals(frames, calibration.camera.distortion, calibration.theta, use)
     table = rejected_table(obs, residuals, rates.star, rates.frame, rates.shrinkage)
     add_dropped_frames(table, obs, calibration.camera, tested.vote_rad, tested.disturbed, rates.frame)
+    if tails is not None:
+        mark_beyond(table, residuals, tails, rates.star)
     n_rejected = int(np.count_nonzero(~use))
-    stable = n_changed == 0
     taste, taste_p = residuals.taste(rates.shrinkage)
     return Screening(
         kept=use,
         observations=kept.with_meta(
             screening={"rejected": n_rejected, "of": obs.n_stars, "significance": significance, "control": control}
+            | ({"blame": blame} if blame else {})
         ),
         rejected=table,
         rounds=tuple(rounds),
@@ -181,13 +200,40 @@ def screen(
         focal_ratio=start.focal_mm / camera.focal_mm,
         n_pre_screened=found_before,
         stable=stable,
-        warnings=warnings_about(obs, calibration.camera, use, table, stable),
+        warnings=(blame,) if blame else warnings_about(obs, calibration.camera, use, table),
+        model_is_wrong=bool(blame),
     )
+
+
+def _all_that_hangs_together(
+    frames: StarFrames, calibration: Calibration, use: BoolArray, rates: _Rates
+) -> tuple[BoolArray, Tails]:
+    """Stars (N,) that lie within the tails of the others, those of frames that were dropped among them."""
+    model, theta = calibration.camera.distortion, calibration.theta
+    found = star_residuals(frames, model, theta, use)
+    # Frames without stars in use get an attitude from those that agree, however roughly.
+    tolerance = np.sqrt(MARGINAL * -2.0 * np.log(rates.star) * found.robust_variance()) / calibration.camera.focal_px
+    weight = 1.0 if frames.weight is None else frames.weight
+    vote = consensus(measured_directions(calibration.camera, frames), frames.r, frames.starts, 4.0 * tolerance / weight)
+    lost = np.repeat(found.frame_count == 0, frames.sizes)
+    found = star_residuals(frames, model, theta, np.where(lost, vote.agree, use))
+    t = np.where(np.isnan(found.t), np.inf, found.t)
+    tails = fit_tails(t, rates.star)
+    return tails.within, tails
+
+
+def _with_tails(options: AnyDict, tails: Tails) -> AnyDict:
+    """Options of the last calibration: Student's tails where the stars have them and nothing else was asked for."""
+    free = options.get("likelihood") is None and not options.get("star_errors")
+    suits = free and options.get("method", "efficient") == "efficient"
+    return options | {"likelihood": "student_t"} if suits and tails.heavy else options
 
 
 def _with_noise_model(obs: Observations, camera: Camera, settings: AnyDict, options: AnyDict) -> Screening:
     """Screen with one noise, fit how it varies, screen with that; what is kept gets a model of its own."""
+    # The noise model is what explains tails.
     plain = {name: value for name, value in options.items() if name not in ("noise", "duplicates")}
+    plain |= {"likelihood": "marginal"}
     first = screen(obs, camera, **settings, **plain)
     model = calibrate(first.observations, camera, throw=settings["throw"], **options).noise_model
     if model is not None and model.varies:
