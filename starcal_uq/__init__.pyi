@@ -34,6 +34,7 @@ from .observations.table import load_observations as load_observations
 from .planning.plan import plan as plan
 from .propagation.coupling import coupling as coupling
 from .propagation.propagate import propagate as propagate
+from .runs.exchange import export as export
 from .runs.report import report as report
 from .runs.run import Run as Run
 from .simulation.frames import simulate as simulate

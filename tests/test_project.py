@@ -129,6 +129,7 @@ def test_every_import_is_a_declared_dependency() -> None:
         "rawpy",
         "tetra3rs",
         "h5py",
+        "yaml",
         "arviz_base",
         "arviz_plots",
         "arviz_stats",

@@ -13,15 +13,18 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from starcal_uq.camera.distortion import get_model, model_names, parameter_names
+from starcal_uq.camera.formats import ENDINGS, read_pinhole
 from starcal_uq.camera.opencv import from_opencv, to_opencv
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CameraError, DistortionError
+from starcal_uq.core.files import reading
 from starcal_uq.core.toml import Key, Section, read_section, unknown_key, write_section
 from starcal_uq.core.types import BoolArray, FloatArray
 
@@ -211,14 +214,29 @@ class Camera(Shown):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Camera:
-        """Read a camera from a TOML file.
+        """Read a camera from a TOML file, or from one of OpenCV, ROS, Kalibr or mrcal by its ending.
 
         Raises
         ------
         CameraError
             If the file cannot be read or its content does not fit; the message names file, key and remedy.
         """
+        if os.fspath(path).endswith((*ENDINGS.values(), ".yml")):
+            return cls._of_others(path)
         return cls(**_checked(read_section(path, "camera", CameraError), f"{path}, section [camera]"))
+
+    @classmethod
+    def _of_others(cls, path: str | os.PathLike[str]) -> Camera:
+        with reading(path, "a camera of OpenCV, ROS, Kalibr or mrcal", "check the file", CameraError):
+            held = read_pinhole(Path(path).read_text(encoding="utf-8"))
+        if held.pixel_um is None:
+            raise CameraError(f"{path}: states no pixel pitch; write it at the top, in micrometres, as # pixel_um: 6.9")
+        try:
+            return cls.from_opencv(
+                held.matrix, held.dist_coeffs, held.width_px, held.height_px, held.pixel_um, name=held.name
+            )
+        except CameraError as error:
+            raise CameraError(f"{path}: {error}") from None
 
     def save(self, path: str | os.PathLike[str], force: bool = False) -> None:
         """Write the camera to a TOML file without loss of digits.

@@ -1,4 +1,4 @@
-"""The steps of a run, one command each: simulate, calibrate, sample, coupling, propagate, report."""
+"""The steps of a run, one command each: simulate, calibrate, sample, coupling, propagate, report, export."""
 
 from __future__ import annotations
 
@@ -47,6 +47,7 @@ from starcal_uq.cli.options import (
     parse_columns,
     parse_velocity,
     read_file,
+    read_path,
     write_path,
 )
 from starcal_uq.cli.settings import EstimationSettings, SamplingSettings, SkySettings, unfolded
@@ -70,6 +71,7 @@ def register(app: typer.Typer) -> None:
     app.command("coupling")(coupling_command)
     app.command("propagate")(propagate_command)
     app.command("report")(report_command)
+    app.command("export")(export_command)
 
 
 def load_table(
@@ -308,3 +310,27 @@ def propagate_command(
 def report_command(run: RunPath, force: Force = False) -> None:
     """Write RUN/report.html, one self-contained file, from whatever the run holds."""
     print(f"Report: {sc.Run(run, tell=note).report(force=force).resolve()}")
+
+
+def export_command(
+    source: Annotated[
+        Path, typer.Argument(metavar="RUN|CAMERA", help="Run folder, or a camera file.", parser=read_path)
+    ],
+    to: Annotated[
+        settings.ExportFormat,
+        typer.Option(
+            "--to",
+            help="The camera for opencv, ros, kalibr, mrcal, tetra3rs, tetra3, as a sip FITS header or asdf; "
+            "covariance (JSON); draws as csv or netcdf; the table of parameters in latex or markdown.",
+        ),
+    ],
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", metavar="FILE", help="File to write; named by default.", parser=write_path),
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Write the calibrated camera, or what is known of it, for another program; say how near that comes."""
+    made = sc.export(source, to, out, force=force)
+    console.print(made.note, highlight=False, soft_wrap=True)
+    print(f"File: {made.path}")

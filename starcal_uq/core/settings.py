@@ -44,6 +44,21 @@ Truth = Literal["fixed", "prior"]
 StudyTemplate = Literal["fov-distortion", "frames-stars", "magnitude-noise", "distortion-models"]
 Convention = Literal["eq14", "eq6"]
 FieldReading = Literal["window", "full"]
+ExportFormat = Literal[
+    "opencv",
+    "ros",
+    "kalibr",
+    "mrcal",
+    "tetra3rs",
+    "tetra3",
+    "sip",
+    "asdf",
+    "covariance",
+    "csv",
+    "netcdf",
+    "latex",
+    "markdown",
+]
 
 
 @dataclass(frozen=True)

@@ -270,6 +270,11 @@ class Posterior(Shown):
         """Posterior mean (p,) of the camera parameters."""
         return np.asarray(self.theta_draws.mean(axis=0))
 
+    @property
+    def calibrated_camera(self) -> Camera:
+        """The camera at the posterior mean."""
+        return self.camera.with_theta(self.mean)
+
     @cached_property
     def covariance(self) -> FloatArray:
         """Posterior covariance (p, p) of the camera parameters."""

@@ -108,6 +108,15 @@ class TextTable:
         body = "".join(line("td", row, mark) for row, mark in zip(self.rows, marks, strict=True))
         return f"{opening}{above}<thead>{line('th', self.heads)}</thead><tbody>{body}</tbody></table>"
 
+    def markdown(self) -> str:
+        """A table of Markdown with pipes, aligned as the columns are."""
+
+        def line(cells: Sequence[str]) -> str:
+            return f"| {' | '.join(cell.replace('|', chr(92) + '|') for cell in cells)} |"
+
+        rule = line([":--" if side == "l" else "--:" for side in self.align])
+        return "\n".join([line(self.heads), rule, *map(line, self.rows)])
+
     def latex(self) -> str:
         """A ``tabular`` with the rules of booktabs; everything is escaped."""
 

@@ -147,7 +147,7 @@ def distortion_curve(
     decentred = any(not c.name.startswith("k") for c in model.coefficients)
     chosen = _AZIMUTHS_DEG if azimuths_deg is None else tuple(azimuths_deg)
     azimuth = np.array(chosen if decentred else (0.0,), dtype=np.float64)
-    camera = post.camera.with_theta(post.mean)
+    camera = post.calibrated_camera
     radius = np.linspace(0.0, _farthest(camera.width_px, camera.height_px, post.mean), n)
     outward = np.column_stack([np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))])
     offsets = (radius[None, :, None] * outward[:, None]).reshape(-1, 2)

@@ -143,7 +143,7 @@ def field_map(post: Posterior, obs: Observations, n: int = 25) -> FieldMap:
     DistortionError
         When the distortion at the posterior mean folds over within the detector.
     """
-    camera = post.camera.with_theta(post.mean)
+    camera = post.calibrated_camera
     x, y = detector_axes(camera, n)
     xy = grid_points(x, y)
     unproject(camera, xy)

@@ -87,6 +87,8 @@ class RunFolder:
         The table that was calibrated on (Parquet).
     camera : Path
         The nominal camera, as it was given (TOML).
+    calibrated : Path
+        The calibrated camera: at the posterior mean, or the estimate where there is no posterior (TOML).
     calibration : Path
         Estimate, covariance, stages, status and provenance (JSON).
     arrays : Path
@@ -121,6 +123,7 @@ class RunFolder:
 
     observations = _File("observations.parquet", _CALIBRATE)
     camera = _File("camera.toml", _CALIBRATE)
+    calibrated = _File("calibrated.toml", _CALIBRATE)
     calibration = _File("calibration.json", _CALIBRATE)
     arrays = _File("calibration.npz", _CALIBRATE)
     posterior = _File("posterior.nc", "starcal-uq sample RUN")

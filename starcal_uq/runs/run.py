@@ -98,7 +98,7 @@ class MissionSky:
         from starcal_uq.sky.catalogue import load_catalogue
 
         stars = load_catalogue(max_mag=self.max_mag, epoch=self.epoch)
-        camera = posterior.camera.with_theta(posterior.mean)
+        camera = posterior.calibrated_camera
         like = obs if posterior.sigma_name == sigma_parameter(True).name else None
         if self.profile is None:
             return mission_frames(
@@ -443,6 +443,7 @@ class Run:
                 obs = weighed(obs, calibration)
                 obs.unweighted.save(files.observations)
             calibration.nominal.save(files.camera)
+            calibration.camera.save(files.calibrated)
             calibration.save(files.calibration)
             if screened is not None:
                 screened.save_rejected(files.rejected)
@@ -487,6 +488,7 @@ class Run:
         posterior = sample(obs, self.calibration, progress=progress, checkpoint=checkpoint, **options)
         with self._step("sample", posterior.provenance["seed"], posterior.provenance["settings"]) as files:
             posterior.save(files.posterior)
+            posterior.calibrated_camera.save(files.calibrated)
         remove_checkpoints(self.folder.path)
         self._forget("coupling", "attitude", "field_map", "spectrum")
         self.posterior = posterior

@@ -27,6 +27,7 @@ VALID = {
     "coupling": "RUN",
     "propagate": "RUN",
     "report": "RUN",
+    "export": "RUN --to covariance",
     "budget": "RUN",
     "compare": "RUN RUN",
     "plan": "CAMERA",

@@ -1,0 +1,294 @@
+"""A camera for other programs: what their own files can hold of it, and how far that is from the camera itself.
+
+Where a format has the same terms, nothing is lost; where not, its terms are fitted to the camera over the detector.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.formats import ENDINGS, KEPT, Pinhole, write_pinhole
+from starcal_uq.camera.projection import fold_radius_px, project, unproject
+from starcal_uq.core.errors import CameraError
+from starcal_uq.core.files import PathLike, atomic_path, ensure_new
+from starcal_uq.core.types import AnyDict, FloatArray
+
+# Points along each side of the detector at which a fit is made, and checked between them.
+_POINTS = 33
+_MOST_ORDERS = 9
+# A polynomial this near needs no further order, px.
+_CLOSE_PX = 1e-4
+# Rounding, px: differences below it are none.
+_EXACT_PX = 1e-6
+
+
+@dataclass(frozen=True)
+class Exported:
+    """A camera in the words of another program.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    error_px : float
+        Largest distance over the detector between what the file and the camera make of the same direction, px; 0 where
+        the format has the camera's own terms.
+    note : str
+        One sentence on what the file holds and how near it is.
+    """
+
+    path: Path
+    error_px: float
+    note: str
+
+
+def export_camera(camera: Camera, to: str, path: PathLike, *, force: bool = False) -> Exported:
+    """Write a camera for another program.
+
+    Parameters
+    ----------
+    camera : Camera
+        The camera; without `Camera.name` the file gets a neutral one.
+    to : str
+        One of `CAMERA_FORMATS`.
+    path : path
+        File to write.
+    force : bool
+        Whether to replace a file.
+
+    Raises
+    ------
+    CameraError
+        For an unknown format, a library that is not installed, or a camera that folds over within its detector.
+    RunFolderError
+        If the file exists and `force` is false.
+    """
+    if to not in CAMERA_FORMATS:
+        raise CameraError(f"{to!r} is no format for a camera: use one of {', '.join(CAMERA_FORMATS)}.")
+    ensure_new(path, force)
+    if fold_radius_px(camera.distortion, camera.theta, camera.corner_radius_px) <= camera.corner_radius_px:
+        raise CameraError("the distortion folds over within the detector: a camera that does has no counterpart.")
+    with atomic_path(Path(path)) as temporary:
+        error, note = CAMERA_FORMATS[to].write(camera, temporary)
+    return Exported(Path(path), error, note)
+
+
+def _grid(camera: Camera, points: int) -> FloatArray:
+    """Pixels (n^2, 2) over the whole detector, edges included."""
+    x, y = (np.linspace(-0.5, size - 0.5, points) for size in (camera.width_px, camera.height_px))
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+def nearest(camera: Camera, distortion: str) -> tuple[Camera, float]:
+    """The camera with this distortion model that differs least over the detector, and by how much at most, px.
+
+    All its parameters are fitted to the directions of a grid of pixels; the axes of the camera stay.
+    """
+    from scipy.optimize import least_squares
+
+    model = get_model(distortion)
+    start = camera.replace(distortion=distortion)
+    pixels = _grid(camera, _POINTS)
+    seen = unproject(camera, pixels)
+    # Parameters of like size: pixels, and displacements at the corner.
+    radius = camera.corner_radius_px
+    scale = np.array([1.0, 1.0, 1.0, *(radius**-c.order for c in model.coefficients)])
+
+    def off(step: FloatArray) -> FloatArray:
+        moved = start.with_theta(start.theta + scale * step)
+        return np.asarray(project(moved, seen) - pixels).ravel()
+
+    step = least_squares(off, np.zeros(len(scale)), x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14).x
+    found = start.with_theta(start.theta + scale * step)
+    between = _grid(camera, 2 * _POINTS + 1)
+    return found, float(np.max(np.linalg.norm(project(found, unproject(camera, between)) - between, axis=1)))
+
+
+def _held(camera: Camera, kept: tuple[str, ...]) -> tuple[Camera, float]:
+    """The camera itself if a format keeps its coefficients, or the nearest one that it can hold."""
+    model = get_model(camera.distortion)
+    used = {c.name for c, value in zip(model.coefficients, camera.coefficients, strict=True) if value != 0.0}
+    if not used or (model.direction == "forward" and used <= set(kept)):
+        return camera, 0.0
+    wanted = "brown3" if model.radial and "k3" in kept else "brown" if model.radial else "brown_tangential"
+    return nearest(camera, wanted)
+
+
+def _said(error: float, what: str) -> str:
+    if error <= _EXACT_PX:
+        return f"{what}: the same camera, to rounding."
+    return f"{what}: fitted, because it lacks this camera's terms; up to {error:.2g} px off over the detector."
+
+
+def _pinhole_file(to: str, what: str) -> Callable[[Camera, Path], tuple[float, str]]:
+    def write(camera: Camera, path: Path) -> tuple[float, str]:
+        held, error = _held(camera, KEPT[to])
+        matrix, coefficients = held.to_opencv() if any(held.coefficients) else _bare(held)
+        plain = Pinhole(held.width_px, held.height_px, matrix, coefficients, held.pixel_um, held.name)
+        path.write_text(write_pinhole(plain, to), encoding="utf-8")
+        return error, _said(error, what)
+
+    return write
+
+
+def _bare(camera: Camera) -> tuple[FloatArray, FloatArray]:
+    """OpenCV's terms of a camera without distortion, of whatever model."""
+    return camera.replace(distortion="none", coefficients=()).to_opencv()
+
+
+def _tetra3rs(camera: Camera, path: Path) -> tuple[float, str]:
+    library = _library("tetra3rs", "tetra3rs")
+    held, error = _held(camera, ("k1", "k2", "k3", "p1", "p2"))
+    terms = dict(zip((c.name for c in get_model(held.distortion).coefficients), held.coefficients, strict=True))
+    centre = np.subtract((held.x0_px, held.y0_px), held.centre_px)
+    distortion = library.RadialDistortion(**terms) if any(terms.values()) else None
+    library.CameraModel(held.focal_px, held.width_px, held.height_px, centre.tolist(), False, distortion).save_to_file(
+        os.fspath(path)
+    )
+    return error, _said(error, "tetra3rs, CameraModel.load_from_file (pixels from the image's centre)")
+
+
+def _tetra3(camera: Camera, path: Path) -> tuple[float, str]:
+    """`fov_estimate` and `distortion` of tetra3 and cedar-solve: r_u = r_d (1 - k (2 r_d / width)^2) / (1 - k).
+
+    They have the centre of the image for a principal point; what a tilt of the attitude takes up is not counted.
+    """
+    from scipy.optimize import least_squares
+
+    pixels = _grid(camera, _POINTS)
+    offsets = pixels - camera.centre_px
+    half = camera.width_px / 2.0
+    fraction = np.sum((offsets / half) ** 2, axis=1, keepdims=True)
+    seen = unproject(camera, pixels)
+
+    def off(p: FloatArray) -> FloatArray:
+        focal, k, x, y = p
+        # A small turn about x and y, which the solver's attitude takes up.
+        turned = seen + np.cross([x, y, 0.0], seen)
+        ideal = focal * camera.focal_px * turned[:, :2] / turned[:, 2:]
+        return np.asarray(ideal - offsets * (1.0 - k * fraction) / (1.0 - k)).ravel()
+
+    tilt = np.subtract((camera.x0_px, camera.y0_px), camera.centre_px) / camera.focal_px
+    found = least_squares(off, [1.0, 0.0, -tilt[1], tilt[0]], x_scale=[1e-3, 1e-2, 1e-3, 1e-3], xtol=1e-14, ftol=1e-14)
+    error = float(np.max(np.linalg.norm(off(found.x).reshape(-1, 2), axis=1)))
+    field = float(np.degrees(2.0 * np.arctan(half / (found.x[0] * camera.focal_px))))
+    path.write_text(json.dumps({"fov_estimate": field, "distortion": float(found.x[1])}, indent=1) + "\n")
+    return error, _said(error, "tetra3 and cedar-solve, arguments of solve_from_centroids")
+
+
+def sip_header(camera: Camera) -> tuple[Any, float]:
+    """FITS header (TAN-SIP) of a camera that looks at right ascension and declination 0, and its largest error, px.
+
+    CRVAL and a rotation of CD make it that of a frame. A and B carry pixels to the tangent plane, AP and BP back; their
+    order is the least that is near enough. Pixels count from 1, as FITS does. Source: Shupe et al. 2005, "The SIP
+    convention for representing distortion in FITS image headers".
+    """
+    from astropy.io import fits
+
+    pixels = _grid(camera, _POINTS)
+    seen = unproject(camera, pixels)
+    measured = pixels - [camera.x0_px, camera.y0_px]
+    ideal = camera.focal_px * seen[:, :2] / seen[:, 2:]
+    scale = camera.corner_radius_px
+    header = fits.Header()
+    header["WCSAXES"], header["IMAGEW"], header["IMAGEH"] = 2, camera.width_px, camera.height_px
+    sides = (("RA---TAN-SIP", camera.x0_px), ("DEC--TAN-SIP", camera.y0_px))
+    for axis, (kind, centre) in enumerate(sides, 1):
+        header[f"CTYPE{axis}"], header[f"CRPIX{axis}"], header[f"CRVAL{axis}"] = kind, centre + 1.0, 0.0
+        header[f"CUNIT{axis}"] = "deg"
+        # x and y of a pixel run against right ascension and declination for who looks at the sky from within.
+        header[f"CD{axis}_{axis}"] = -np.degrees(1.0 / camera.focal_px)
+        header[f"CD{axis}_{3 - axis}"] = 0.0
+    worst = 0.0
+    for names, start, end in ((("A", "B"), measured, ideal), (("AP", "BP"), ideal, measured)):
+        order, coefficients, error = _polynomial(start / scale, (end - start) / scale, scale)
+        worst = max(worst, error)
+        for column, name in enumerate(names):
+            header[f"{name}_ORDER"] = order
+            for (p, q), value in zip(_powers(order), coefficients[:, column], strict=True):
+                if value:
+                    header[f"{name}_{p}_{q}"] = value * scale ** (1 - p - q)
+    return header, worst
+
+
+def _powers(order: int) -> list[tuple[int, int]]:
+    return [(p, n - p) for n in range(2, order + 1) for p in range(n, -1, -1)]
+
+
+def _polynomial(at: FloatArray, shift: FloatArray, scale: float) -> tuple[int, FloatArray, float]:
+    """Least order, coefficients (n, 2) and largest error (px) of polynomials for a displacement."""
+    for order in range(2, _MOST_ORDERS + 1):
+        terms = np.stack([at[:, 0] ** p * at[:, 1] ** q for p, q in _powers(order)], axis=1)
+        found = np.asarray(np.linalg.lstsq(terms, shift, rcond=None)[0], dtype=np.float64)
+        error = scale * float(np.max(np.linalg.norm(terms @ found - shift, axis=1)))
+        if error < _CLOSE_PX:
+            break
+    return order, found, error
+
+
+def _sip(camera: Camera, path: Path) -> tuple[float, str]:
+    header, error = sip_header(camera)
+    path.write_text(header.tostring(sep="\n", endcard=True, padding=False) + "\n", encoding="ascii")
+    return error, (
+        f"FITS header with TAN-SIP polynomials: up to {error:.2g} px off over the detector; set CRVAL and turn CD for "
+        "a frame."
+    )
+
+
+def _asdf(camera: Camera, path: Path) -> tuple[float, str]:
+    library = _library("asdf", "asdf")
+    content: AnyDict = {
+        "camera": camera.to_dict(),
+        "pixel_origin": "centre of the first pixel; x to the right, y down",
+        "parameter_names": list(camera.parameter_names),
+        "theta_px": camera.theta,
+    }
+    library.AsdfFile(content).write_to(path)
+    return 0.0, _said(0.0, "ASDF")
+
+
+def _library(name: str, extra: str) -> Any:
+    """A library that not everybody has."""
+    import importlib
+
+    try:
+        return importlib.import_module(name)
+    except ImportError:
+        raise CameraError(f'{name} is not installed: run `pip install "starcal-uq[{extra}]"` first.') from None
+
+
+@dataclass(frozen=True)
+class CameraFormat:
+    """How a camera is written for another program.
+
+    Attributes
+    ----------
+    ending : str
+        Ending of the file's name.
+    write : callable
+        ``(camera, path) -> (largest error in px, sentence)``.
+    """
+
+    ending: str
+    write: Callable[[Camera, Path], tuple[float, str]]
+
+
+CAMERA_FORMATS = {
+    "opencv": CameraFormat(ENDINGS["opencv"], _pinhole_file("opencv", "OpenCV")),
+    "ros": CameraFormat(ENDINGS["ros"], _pinhole_file("ros", "ROS camera_info")),
+    "kalibr": CameraFormat(ENDINGS["kalibr"], _pinhole_file("kalibr", "Kalibr")),
+    "mrcal": CameraFormat(ENDINGS["mrcal"], _pinhole_file("mrcal", "mrcal")),
+    "tetra3rs": CameraFormat(".bin", _tetra3rs),
+    "tetra3": CameraFormat(".json", _tetra3),
+    "sip": CameraFormat(".hdr", _sip),
+    "asdf": CameraFormat(".asdf", _asdf),
+}

@@ -1,0 +1,141 @@
+"""What a run gives to other programs: its camera in their files, the covariance, the draws, and tables for a text."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from starcal_uq.camera.camera import Camera
+from starcal_uq.camera.distortion import parameters
+from starcal_uq.camera.exchange import CAMERA_FORMATS, Exported, export_camera
+from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.files import PathLike, atomic_write_text, ensure_new, write_csv
+from starcal_uq.core.types import AnyDict
+from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.inference.posterior import Posterior
+from starcal_uq.presentation.tables import TextTable
+from starcal_uq.presentation.words.estimation import calibration_table
+from starcal_uq.presentation.words.inference import posterior_table
+from starcal_uq.runs.run import Run
+
+COVARIANCE = "starcal_uq covariance 1"
+
+
+def export(
+    what: PathLike | Run | Calibration | Posterior | Camera,
+    to: str,
+    path: PathLike | None = None,
+    *,
+    force: bool = False,
+) -> Exported:
+    """Write a calibrated camera, or what is known of it, for another program.
+
+    Parameters
+    ----------
+    what : path, Run, Calibration, Posterior or Camera
+        A run gives the mean of its posterior, or its estimate where there is no posterior. A path is that of a run
+        folder, or of a camera.
+    to : str
+        One of `FORMATS`. ``opencv``, ``ros``, ``kalibr``, ``mrcal``, ``tetra3rs``, ``tetra3``, ``sip`` and ``asdf``
+        hold the camera; ``covariance`` (JSON) parameters and their covariance, ``csv`` and ``netcdf`` the draws,
+        ``latex`` and ``markdown`` the table of the parameters.
+    path : path, optional
+        File to write; by default one in the current folder, named after the run and the format.
+    force : bool
+        Whether to replace a file.
+
+    Returns
+    -------
+    Exported
+        The file, how far it is from the camera (px), and one sentence on it.
+
+    Raises
+    ------
+    CameraError
+        For a camera that the format cannot hold, or a library that is not installed.
+    RunFolderError
+        For an unknown format, a run without what the format holds, or a file that exists.
+    """
+    if to not in FORMATS:
+        raise RunFolderError(f"{to!r} is no format: use one of {', '.join(FORMATS)}.")
+    if isinstance(what, str | os.PathLike):
+        what = Run(what) if os.path.isdir(what) or not os.path.exists(what) else Camera.load(what)
+    name = "camera"
+    if isinstance(what, Run):
+        name, what = what.name, what.best
+    place = Path(f"{name}-{to}{FORMATS[to]}" if path is None else path)
+    if to in CAMERA_FORMATS:
+        return export_camera(what if isinstance(what, Camera) else _camera_of(what), to, place, force=force)
+    if isinstance(what, Camera):
+        raise RunFolderError(f"a camera alone has no {to}: name the folder of a run.")
+    if to in _OF_DRAWS and not isinstance(what, Posterior):
+        raise RunFolderError(f"{name}: has no draws for {to}; run `starcal-uq sample` first, or export covariance.")
+    ensure_new(place, force)
+    return Exported(place, 0.0, _RESULTS[to](what, place))
+
+
+def _camera_of(best: Calibration | Posterior) -> Camera:
+    return best.calibrated_camera if isinstance(best, Posterior) else best.camera
+
+
+def _write_covariance(best: Calibration | Posterior, path: Path) -> str:
+    """Parameters with their units and covariance, px units, as a filter takes them for its state."""
+    posterior = isinstance(best, Posterior)
+    specs = parameters(best.camera.distortion)
+    content: AnyDict = {
+        "format": COVARIANCE,
+        "source": "posterior" if posterior else "estimate",
+        "distortion": best.camera.distortion,
+        "parameter_names": [p.name for p in specs],
+        "units": [p.unit for p in specs],
+        "mean": _camera_of(best).theta.tolist(),
+        "covariance": best.covariance.tolist(),
+        "data_sha256": best.provenance.get("data_sha256"),
+        "versions": best.provenance.get("versions"),
+    }
+    atomic_write_text(path, json.dumps(content, indent=1) + "\n")
+    return f"mean and covariance of {', '.join(p.name for p in specs)}, of the {content['source']}, in px units."
+
+
+def _write_draws(best: Calibration | Posterior, path: Path) -> str:
+    import pandas as pd
+
+    assert isinstance(best, Posterior)
+    names = [f"{p.name} [{p.unit}]" for p in best.parameters]
+    write_csv(pd.DataFrame(best.draws, columns=names), path)
+    return f"{len(best.draws)} draws of {', '.join(best.parameter_names)}, a row each."
+
+
+def _write_netcdf(best: Calibration | Posterior, path: Path) -> str:
+    assert isinstance(best, Posterior)
+    best.save(path)
+    return f"{len(best.draws)} draws, as ArviZ and xarray read them."
+
+
+def _write_table(mark: Callable[[TextTable], str]) -> Callable[[Calibration | Posterior, Path], str]:
+    def write(best: Calibration | Posterior, path: Path) -> str:
+        table = posterior_table(best) if isinstance(best, Posterior) else calibration_table(best)
+        atomic_write_text(path, mark(table) + "\n")
+        return f"the table of {len(table.rows)} parameters."
+
+    return write
+
+
+_OF_DRAWS = ("csv", "netcdf")
+_RESULTS = {
+    "covariance": _write_covariance,
+    "csv": _write_draws,
+    "netcdf": _write_netcdf,
+    "latex": _write_table(TextTable.latex),
+    "markdown": _write_table(TextTable.markdown),
+}
+# Format -> ending of its file.
+FORMATS = {name: form.ending for name, form in CAMERA_FORMATS.items()} | {
+    "covariance": ".json",
+    "csv": ".csv",
+    "netcdf": ".nc",
+    "latex": ".tex",
+    "markdown": ".md",
+}

@@ -1,0 +1,163 @@
+"""Cameras for other programs, read by those programs' own libraries."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.camera.exchange import CAMERA_FORMATS, export_camera
+from starcal_uq.camera.projection import unproject
+from starcal_uq.core.errors import CameraError, RunFolderError
+
+F = 5116.0
+CAMERAS = {
+    "brown": sc.Camera(1024, 768, 6.9, F * 6.9e-3, 517.3, 389.9, "brown", (0.078 / F**2, 1.5 / F**4)),
+    "brown3": sc.Camera(2048, 2048, 5.5, 16.0, 1020, 1030, "brown3", (-3e-8, 1e-15, 2e-22)),
+    "tangential": sc.Camera(2048, 1536, 5.5, 16.0, 1020, 730, "brown_tangential", (-3e-8, 1e-15, 2e-7, -1e-7)),
+    "inverse": sc.Camera(1024, 1024, 15.0, 49.0, 520, 505, "inverse", (2e-8, 1e-15)),
+    "none": sc.Camera(640, 480, 10.0, 25.0, 300, 250, "none"),
+}
+OPENCV_LIKE = ("opencv", "ros", "kalibr", "mrcal")
+
+
+def pixels(camera):
+    x, y = np.meshgrid(np.linspace(0, camera.width_px - 1, 9), np.linspace(0, camera.height_px - 1, 7))
+    return np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def largest(difference):
+    return float(np.max(np.linalg.norm(difference, axis=-1)))
+
+
+@pytest.fixture(params=CAMERAS)
+def camera(request):
+    return CAMERAS[request.param]
+
+
+def test_opencv_reads_its_file_and_projects_alike(camera, tmp_path):
+    cv2 = pytest.importorskip("cv2")
+    made = export_camera(camera, "opencv", tmp_path / "c.yaml")
+    storage = cv2.FileStorage(str(made.path), cv2.FILE_STORAGE_READ)
+    matrix, coefficients = storage.getNode("camera_matrix").mat(), storage.getNode("distortion_coefficients").mat()
+    assert int(storage.getNode("image_width").real()) == camera.width_px
+    seen = unproject(camera, pixels(camera))
+    theirs = cv2.projectPoints(seen, np.zeros(3), np.zeros(3), matrix, coefficients)[0].reshape(-1, 2)
+    assert largest(theirs - pixels(camera)) <= made.error_px + 1e-9
+    # A principal point that counts from the corner of the first pixel would be seen.
+    matrix[0, 2] += 0.5
+    moved = cv2.projectPoints(seen, np.zeros(3), np.zeros(3), matrix, coefficients)[0].reshape(-1, 2)
+    assert largest(moved - pixels(camera)) > 0.4
+
+
+def test_mrcal_reads_its_file_and_unprojects_alike(camera, tmp_path):
+    python = "/usr/bin/python3"
+    if not Path(python).exists() or subprocess.run([python, "-c", "import mrcal"], capture_output=True).returncode:
+        pytest.skip("mrcal is a package of the system, which has none")
+    made = export_camera(camera, "mrcal", tmp_path / "c.cameramodel")
+    np.save(tmp_path / "xy.npy", pixels(camera))
+    code = (
+        "import mrcal, numpy as np; m = mrcal.cameramodel('c.cameramodel'); "
+        "v = mrcal.unproject(np.load('xy.npy'), *m.intrinsics(), normalize=True); np.save('v.npy', v); "
+        "print(*m.imagersize())"
+    )
+    done = subprocess.run([python, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [str(camera.width_px), str(camera.height_px)]
+    off = camera.focal_px * (np.load(tmp_path / "v.npy") - unproject(camera, pixels(camera)))
+    assert largest(off) <= made.error_px + 1e-4
+
+
+def test_tetra3rs_reads_its_file_and_sees_the_same_directions(camera, tmp_path):
+    library = pytest.importorskip("tetra3rs")
+    made = export_camera(camera, "tetra3rs", tmp_path / "c.bin")
+    theirs = library.CameraModel.load_from_file(str(made.path))
+    assert (theirs.image_width, theirs.image_height) == (camera.width_px, camera.height_px)
+    seen = unproject(camera, pixels(camera))
+    plane = [theirs.pixel_to_tanplane(*map(float, xy)) for xy in pixels(camera) - camera.centre_px]
+    assert largest(camera.focal_px * (plane - seen[:, :2] / seen[:, 2:])) <= made.error_px + 1e-5
+
+
+def test_a_header_with_sip_gives_the_angles_between_pixels(camera, tmp_path):
+    from astropy.io.fits import Header
+    from astropy.wcs import WCS
+
+    made = export_camera(camera, "sip", tmp_path / "c.hdr")
+    wcs = WCS(Header.fromtextfile(made.path))
+    ra, dec = np.radians(wcs.all_pix2world(pixels(camera), 0)).T
+    theirs = np.stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)], axis=1)
+    seen = unproject(camera, pixels(camera))
+    # The rotation between them, which must be none of a mirror.
+    u, _, v = np.linalg.svd(theirs.T @ seen)
+    assert np.linalg.det(u @ v) > 0.0
+    assert largest(camera.focal_px * (theirs - seen @ (u @ v).T)) < 2.0 * made.error_px + 1e-6
+    # AP and BP bring directions back to pixels without iteration.
+    back = wcs.sip_foc2pix(camera.focal_px * seen[:, :2] / seen[:, 2:], 1) - 1.0
+    assert largest(back - pixels(camera)) <= made.error_px + 1e-6
+
+
+def test_tetra3_states_the_field_and_distortion_that_it_takes(tmp_path):
+    camera = CAMERAS["brown"].data_sheet().replace(coefficients=(0.078 / F**2, 0.0))
+    made = export_camera(camera, "tetra3", tmp_path / "c.json")
+    stated = json.loads(made.path.read_text())
+    # Its own formula, written again: r_u = r_d (1 - k (2 r_d / w)^2) / (1 - k), and the field of the undistorted width.
+    k, half = stated["distortion"], camera.width_px / 2.0
+    offsets = pixels(camera) - camera.centre_px
+    undone = offsets * (1.0 - k * np.sum((offsets / half) ** 2, axis=1, keepdims=True)) / (1.0 - k)
+    focal = half / np.tan(np.radians(stated["fov_estimate"] / 2.0))
+    seen = unproject(camera, pixels(camera))
+    off = largest(undone - focal * seen[:, :2] / seen[:, 2:])
+    assert off <= made.error_px + 1e-9 < 0.01
+    # Without its distortion the same camera is farther off.
+    assert largest(offsets - focal * seen[:, :2] / seen[:, 2:]) > 10.0 * off
+
+
+def test_asdf_holds_the_camera(camera, tmp_path):
+    asdf = pytest.importorskip("asdf")
+    made = export_camera(camera, "asdf", tmp_path / "c.asdf")
+    with asdf.open(made.path) as content:
+        assert sc.Camera.from_dict(content["camera"]) == camera
+        assert np.array_equal(content["theta_px"], camera.theta)
+
+
+@pytest.mark.parametrize("to", OPENCV_LIKE)
+def test_what_is_written_is_read_again(camera, to, tmp_path):
+    made = export_camera(camera, to, tmp_path / f"c{CAMERA_FORMATS[to].ending}")
+    back = sc.Camera.load(made.path)
+    seen = unproject(camera, pixels(camera))
+    assert largest(sc.camera.project(back, seen) - pixels(camera)) <= made.error_px + 1e-8
+    assert (back.width_px, back.height_px, back.pixel_um) == (camera.width_px, camera.height_px, camera.pixel_um)
+    # Terms that the format has are held; others are said to be fitted.
+    fitted = camera.distortion == "inverse" or (camera.distortion, to) == ("brown3", "kalibr")
+    assert ("fitted" in made.note) == fitted == (made.error_px > 0.0)
+    if (camera.distortion, to) == ("brown3", "kalibr"):
+        assert made.error_px > 0.05
+
+
+def test_no_camera_is_lost_or_made_up(tmp_path):
+    camera = CAMERAS["brown"]
+    path = export_camera(camera, "ros", tmp_path / "c.yaml").path
+    with pytest.raises(RunFolderError, match="exists"):
+        export_camera(camera, "ros", path)
+    with pytest.raises(CameraError, match="no format for a camera"):
+        export_camera(camera, "word", path, force=True)
+    folds = camera.replace(coefficients=(-1e-6, 0.0))
+    with pytest.raises(CameraError, match="folds over"):
+        export_camera(folds, "opencv", path, force=True)
+    assert np.allclose(sc.Camera.load(path).theta, camera.theta, rtol=1e-14)
+    text = path.read_text()
+    for old, new, said in (
+        ("# pixel_um: 6.9\n", "", "states no pixel pitch"),
+        ("plumb_bob", "equidistant", "distortion model is 'equidistant'"),
+        ("camera_matrix", "matrix", "has none of camera_matrix"),
+        ("image_width: 1024", "image_width: wide", "is not a camera of OpenCV"),
+        (text, "", "is empty"),
+        (text, "{'lensmodel': 'LENSMODEL_CAHVOR'}", "CAHVOR"),
+        (text, 2000 * "[", "is not a camera"),
+    ):
+        path.write_text(text.replace(old, new))
+        with pytest.raises(CameraError, match=said):
+            sc.Camera.load(path)

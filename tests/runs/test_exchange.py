@@ -1,0 +1,63 @@
+"""What a run gives to other programs."""
+
+from __future__ import annotations
+
+import json
+from typing import get_args
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.settings import ExportFormat
+from starcal_uq.runs.exchange import FORMATS
+from tests.helpers.scenes import observations
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    made = sc.Run(tmp_path_factory.mktemp("runs") / "run")
+    made.calibrate(observations(n_frames=12), sc.paper.paper_start())
+    made.sample(seed=1, n_ensembles=2, n_walkers=14, n_steps=30, n_burn=10)
+    return made
+
+
+def test_a_run_holds_its_calibrated_camera(run):
+    assert sc.Camera.load(run.folder.calibrated) == run.posterior.calibrated_camera
+    assert np.allclose(run.posterior.calibrated_camera.theta, run.posterior.mean, rtol=1e-14)
+
+
+def test_covariance_draws_and_tables(run, tmp_path):
+    stated = json.loads(sc.export(run, "covariance", tmp_path / "c.json").path.read_text())
+    assert stated["source"] == "posterior"
+    assert stated["parameter_names"] == list(run.posterior.camera_names)
+    assert np.array_equal(stated["covariance"], run.posterior.covariance)
+    draws = pd.read_csv(sc.export(run.path, "csv", tmp_path / "d.csv").path)
+    assert np.array_equal(draws.to_numpy(), run.posterior.draws)
+    assert draws.columns[0] == "x0 [px]"
+    again = sc.Posterior.load(sc.export(run, "netcdf", tmp_path / "d.nc").path)
+    assert np.array_equal(again.draws, run.posterior.draws)
+    lines = sc.export(run, "markdown", tmp_path / "t.md").path.read_text().splitlines()
+    assert len(lines) == 2 + len(run.posterior.parameter_names)
+    assert {line.count("|") for line in lines} == {10}
+    assert sc.export(run, "latex", tmp_path / "t.tex").path.read_text().startswith(r"\begin{tabular}")
+
+
+def test_a_calibration_alone_and_a_camera_alone(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    stated = json.loads(sc.export(run.calibration, "covariance").path.read_text())
+    assert (stated["source"], stated["mean"]) == ("estimate", run.calibration.theta.tolist())
+    with pytest.raises(RunFolderError, match="has no draws for csv"):
+        sc.export(run.calibration, "csv")
+    made = sc.export(run.folder.camera, "opencv")
+    assert (made.path.name, made.error_px) == ("camera-opencv.yaml", 0.0)
+    with pytest.raises(RunFolderError, match="a camera alone has no covariance"):
+        sc.export(run.camera, "covariance")
+    with pytest.raises(RunFolderError, match="'word' is no format"):
+        sc.export(run, "word")
+
+
+def test_the_command_line_has_every_format():
+    assert tuple(FORMATS) == get_args(ExportFormat)
