@@ -12,12 +12,6 @@ from starcal_uq.cli.console import err, print_json, print_table, progress_bar
 from starcal_uq.cli.console import out as console
 from starcal_uq.cli.options import Force, Json, SchedulerAddress, number, write_file, write_path
 from starcal_uq.core import settings
-from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import atomic_write_text, check_new_folder, new_folder
-
-# What a folder of a study holds; one of them is enough to go on with it.
-_MARKS = ("cells", "study.nc")
-_COPY = "study.toml"
 
 
 def register(app: typer.Typer) -> None:
@@ -59,26 +53,33 @@ def study_command(
 ) -> None:
     """Vary camera, sky, noise and observation: what couples, what decouples it, and what it does to attitudes.
 
-    Cells that are there already are not computed again; `--force` begins anew. Status 1 when no cell has numbers.
+    Cells that are there already are not computed again; `--force` computes all anew, and then replaces them. Status 1
+    when no cell has numbers.
     """
     if template is not None:
         sc.studies.write_study_template(template, file, force)
         print(f"Study to fill in: {file}. Next: starcal-uq study {file} -o {out}")
         return
-    definition = sc.studies.StudyDefinition.load(file)
-    _check_folder(out, file, force)
-    copy = new_folder(out) / _COPY
-    if copy.resolve() != file.resolve():
-        atomic_write_text(copy, file.read_text("utf-8-sig"))
+    pages: list[Path] = []
+
+    def page_of(found: sc.studies.Study, folder: Path) -> None:
+        if found.ok.any():
+            from starcal_uq.presentation.pages.write import write_page
+
+            pages.append(out / write_page(found, folder).name)
+
     with progress_bar("cells") as progress:
         found = sc.study(
-            definition, out=out, seed=seed, workers=workers, scheduler=scheduler, force=force, progress=progress
+            file,
+            out=out,
+            seed=seed,
+            workers=workers,
+            scheduler=scheduler,
+            force=force,
+            progress=progress,
+            more=page_of,
         )
-    page = None
-    if found.ok.any():
-        from starcal_uq.presentation.pages.write import write_page
-
-        page = write_page(found, out)
+    page = pages[0] if pages else None
     if json:
         print_json(_summary(found, out, page))
     else:
@@ -87,15 +88,6 @@ def study_command(
         raise KeyboardInterrupt
     if not found.ok.any():
         raise typer.Exit(1)
-
-
-def _check_folder(out: Path, file: Path, force: bool) -> None:
-    """Refuse a folder that holds something other than a study."""
-    if sc.Run(out).has("calibration"):
-        raise RunFolderError(f"{out}: is the folder of a run, whose files would be mixed with these; name another.")
-    if out.is_dir() and (any((out / mark).exists() for mark in _MARKS) or {*out.iterdir()} <= {out / file.name}):
-        return
-    check_new_folder(out, force)
 
 
 def _summary(found: sc.studies.Study, out: Path, page: Path | None) -> dict[str, object]:

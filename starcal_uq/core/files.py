@@ -16,8 +16,9 @@ import sys
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -255,6 +256,19 @@ def check_fits(content: bytes) -> None:
                 if not (value.isdigit() and int(value) <= most):
                     raise ValueError(f"its header states {card[1].decode()} as {value[:20].decode('latin-1')}")
             place = content.find(key, place + 1)
+
+
+def write_netcdf(path: PathLike, fill: Callable[[Any], None]) -> None:
+    """Write a netCDF file with its seal, all or nothing; `fill` gets the open `h5netcdf.File`.
+
+    It is made in memory: on a full disk the HDF5 library ends the process without a word.
+    """
+    import h5netcdf
+
+    content = BytesIO()
+    with h5netcdf.File(content, "w") as file:
+        fill(file)
+    atomic_write_bytes(path, sealed(content.getvalue()))
 
 
 _SEAL = re.compile(rb"\nsha256 ([0-9a-f]{64})\n")

@@ -249,7 +249,7 @@ def making(
     force : bool
         Whether to replace results of before.
     also : sequence of str
-        Patterns of results that functions write without a record.
+        Patterns of results that may be replaced without being recorded, because functions write them one by one.
 
     Raises
     ------
@@ -266,10 +266,9 @@ def making(
             with staged(place) as stage:
                 yield stage
                 made = {name: entry_of(path, command) for name, path in files_in(stage).items()}
-                before = set() if old is None else set(old.files)
-                if old is not None or os.path.exists(place / main):
-                    patterns = also if old is not None else (*also, *made)
-                    before |= {path.relative_to(place).as_posix() for name in patterns for path in place.glob(name)}
+                known = ("*",) if old is None and os.path.exists(place / main) else also
+                before = {name for name in made for pattern in known if PurePath(name).match(pattern)}
+                before |= set() if old is None else set(old.files)
                 if made:
                     record = provenance(None, {}, None)
                     commit(place, Manifest(made, {command: record}, stage=STEP), before)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import os
 import secrets
 import shutil
 from collections.abc import Callable, Sequence
@@ -43,12 +44,6 @@ class Store:
         self.folder, self.schema = None if folder is None else new_folder(folder), schema
         self._tables = [read(path) for path in sorted(self.folder.glob(_PATTERN))] if self.folder is not None else []
 
-    def clear(self) -> None:
-        """Forget all rows."""
-        self._tables = []
-        for path in self.folder.glob(_PATTERN) if self.folder is not None else []:
-            path.unlink()
-
     def keys(self) -> set[str]:
         """Keys of the rows that are there."""
         return {key for table in self._tables for key in table["key"].to_pylist()}
@@ -74,12 +69,25 @@ class Store:
         """One file instead of many parts; until they are gone, rows that stand in both count once."""
         if self.folder is None or len(self._tables) < 2:
             return
-        parts = list(self.folder.glob(_PATTERN))
+        parts = held(self.folder)
         whole = self.table()
         write_part(whole, self.folder / _WHOLE.format(secrets.token_hex(8)))
         for path in parts:
             path.unlink(missing_ok=True)
         self._tables = [whole]
+
+
+def held(folder: PathLike) -> list[Path]:
+    """The parts that a folder holds."""
+    return list(Path(folder).glob(_PATTERN))
+
+
+def take_over(old: PathLike, new: PathLike) -> None:
+    """Put the rows of a folder in the place of another's; stopped anywhere, the first has them still, or the other."""
+    for path in held(old):
+        path.unlink()
+    for path in held(new):
+        os.replace(path, Path(old) / path.name)
 
 
 def write_part(table: pa.Table, path: Path) -> None:

@@ -9,7 +9,6 @@ import json
 import os
 from dataclasses import dataclass
 from functools import cached_property
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -20,7 +19,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import Parameter, parameters, sigma_parameter
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import atomic_write_bytes, check_hdf5, ensure_new, reading, sealed
+from starcal_uq.core.files import check_hdf5, ensure_new, reading, write_netcdf
 from starcal_uq.core.records import Arrays, from_plain, to_plain
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.status import Check, Level, worst
@@ -387,21 +386,19 @@ class Posterior(Shown):
         RunFolderError
             If the file exists and `force` is false, or cannot be written.
         """
-        import h5netcdf
-
         ensure_new(path, force)
         arrays: Arrays = {}
         record = to_plain(self, arrays, _ARRAYS)
         attrs = {"format": _FORMAT, "record": json.dumps({name: record[name] for name in _RECORD})}
+
         # xarray would do it, but loads Dask for a lock, which takes longer than sampling.
-        # In memory first: on a full disk the HDF5 library ends the process without a word.
-        content = BytesIO()
-        with h5netcdf.File(content, "w") as file:
+        def fill(file: Any) -> None:
             _write(file, {name: (_ARRAYS[name], value, {}) for name, value in arrays.items()}, attrs)
             for group, (variables, coords, about) in self._groups().items():
                 dimensions: Variables = {name: ((name,), values, {}) for name, values in coords.items()}
                 _write(file.create_group(group), dimensions | variables, about)
-        atomic_write_bytes(path, sealed(content.getvalue()))
+
+        write_netcdf(path, fill)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Posterior:

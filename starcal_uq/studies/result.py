@@ -14,7 +14,8 @@ import numpy as np
 from starcal_uq.core.constants import AXES as ATTITUDE
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StudyError
-from starcal_uq.core.files import PathLike, atomic_path, check_hdf5, new_folder, reading, sealed
+from starcal_uq.core.files import PathLike, atomic_path, check_hdf5, new_folder, reading, write_netcdf
+from starcal_uq.core.manifest import read_manifest
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.studies.axes import AXES
 from starcal_uq.studies.definition import StudyDefinition
@@ -270,11 +271,11 @@ class Study(Shown):
 
     def save(self, folder: PathLike) -> None:
         """Write ``study.nc`` and ``study.parquet`` into a folder, each all or nothing."""
+        from xarray.backends import H5NetCDFStore
+
         path = new_folder(folder)
-        with atomic_path(path / NETCDF) as temporary:
-            packed = {name: {"zlib": True, "complevel": 1} for name, v in self.data.items() if v.dtype.kind in "fi"}
-            self.data.to_netcdf(temporary, engine="h5netcdf", encoding=packed)
-            temporary.write_bytes(sealed(temporary.read_bytes()))
+        packed = {name: {"zlib": True, "complevel": 1} for name, v in self.data.items() if v.dtype.kind in "fi"}
+        write_netcdf(path / NETCDF, lambda file: self.data.dump_to_store(H5NetCDFStore(file), encoding=packed))
         with atomic_path(path / PARQUET) as temporary:
             self.table().to_parquet(temporary, index=False)
 
@@ -290,7 +291,10 @@ class Study(Shown):
         import xarray as xr
 
         file = Path(path)
-        file = file / NETCDF if file.is_dir() else file
+        if file.is_dir():
+            # Puts results in their places whose writer was stopped.
+            read_manifest(file)
+            file = file / NETCDF
         with reading(file, "a study", "run `starcal-uq study` again"):
             check_hdf5(file)
             with xr.open_dataset(file, engine="h5netcdf", phony_dims="access") as opened:

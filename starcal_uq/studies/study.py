@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 import secrets
+import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,10 +16,12 @@ import numpy as np
 from starcal_uq.camera.distortion import model_names, parameter_names, simpler_models
 from starcal_uq.core.cluster import Scheduler, cluster
 from starcal_uq.core.constants import AXES as ATTITUDE
-from starcal_uq.core.errors import StudyError
-from starcal_uq.core.files import PathLike
+from starcal_uq.core.errors import StarcalError, StudyError
+from starcal_uq.core.files import PathLike, atomic_write_text
+from starcal_uq.core.manifest import NEW, alone, making, read_manifest
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import bounded
+from starcal_uq.core.store import held, take_over
 from starcal_uq.core.tasks import Progress, one_thread, run_tasks
 from starcal_uq.core.types import AnyDict
 from starcal_uq.sky.catalogue import load_catalogue
@@ -25,7 +29,8 @@ from starcal_uq.studies.axes import AXES
 from starcal_uq.studies.cells import FRAME_FACTORS, FisherCells
 from starcal_uq.studies.definition import Cell, StudyDefinition
 from starcal_uq.studies.geometry import Heaven, frames_of, weights_of
-from starcal_uq.studies.result import TEXTS, VARIABLES, Study, frames_for
+from starcal_uq.studies.result import NETCDF, TEXTS, VARIABLES, Study, frames_for
+from starcal_uq.studies.store import FOLDER as CELLS
 from starcal_uq.studies.store import Store, row
 
 if TYPE_CHECKING:
@@ -33,6 +38,9 @@ if TYPE_CHECKING:
 
     from starcal_uq.sky.catalogue import StarCatalogue
 
+_COPY = "study.toml"
+# What a page and its figures may be called.
+_PAGES = ("report.html", "figures/*.png")
 # Guesses of processor time, by which cells are put together: a second's work goes to a process at once.
 _GEOMETRY_S, _CELL_S, _SIMULATED_S, _BATCH_S = 0.01, 0.0015, 0.1, 1.0
 _FEW_BATCHES = 5
@@ -51,6 +59,7 @@ def study(
     scheduler: Scheduler = None,
     force: bool = False,
     progress: Progress | None = None,
+    more: Callable[[Study, Path], object] | None = None,
 ) -> Study:
     """Sweep a camera and its observation, and say what couples with what in every cell.
 
@@ -59,8 +68,9 @@ def study(
     definition : StudyDefinition or path
         What is varied, or a STUDY.toml (`starcal_uq.studies.write_study_template`).
     out : path, optional
-        Folder in which cells are kept as they are made, and at the end the results (``study.nc``, ``study.parquet``).
-        Cells that are there already, by the hash of all that they depend on, are not computed again.
+        Folder in which cells are kept as they are made, and at the end the results (``study.nc``, ``study.parquet``,
+        ``study.toml`` where the definition is a file). Cells that are there already, by the hash of all that they
+        depend on, are not computed again.
     seed : int, optional
         Root seed, instead of that of the definition; it repeats bit for bit.
     stars : StarCatalogue, optional
@@ -70,19 +80,25 @@ def study(
     scheduler : str or distributed.Client, optional
         Dask scheduler whose workers compute the cells; processes of this machine otherwise.
     force : bool
-        Compute all cells anew.
+        Compute all cells anew. Those of before, and their results, stay until the new ones are complete.
     progress : callable, optional
         Called as ``progress(done, total)``, in cells.
+    more : callable, optional
+        Writes what belongs to the results, such as a page: called with the study and the folder in which its files wait
+        to take their places.
 
     Returns
     -------
     Study
-        After Ctrl-C with the cells that were complete; their `status` says of the others that they are missing.
+        After Ctrl-C with the cells that were complete; their `status` says of the others that they are missing. Such a
+        study does not replace a complete one in `out`.
 
     Raises
     ------
     StudyError
         For a definition that makes no sense.
+    RunFolderError
+        If the folder holds something else, or cannot be written.
     KeyboardInterrupt
         If Ctrl-C was pressed before the first cell.
     """
@@ -93,9 +109,68 @@ def study(
     deepest = max(cell.settings["max_mag"] for cell in cells)
     heaven = Heaven(load_catalogue(max_mag=deepest, epoch=wanted.epoch) if stars is None else stars)
     keys = [wanted.key(cell, heaven.hash(cell.settings["max_mag"])) for cell in cells]
-    store = Store(out)
-    if force:
-        store.clear()
+
+    def swept(store: Store) -> tuple[Study, bool]:
+        work = Work(wanted, stars, deepest, heaven.hash(deepest))
+        interrupted = _compute(work, cells, keys, store, workers, scheduler, progress)
+        data = dataset(wanted, cells, keys, store)
+        data.attrs |= {"stars": heaven.stars.source, "stars_sha256": heaven.hash(deepest)}
+        return Study(data, wanted), interrupted
+
+    if out is None:
+        return swept(Store(None))[0]
+    given = None if isinstance(definition, StudyDefinition) else Path(definition)
+    folder, new = Path(out), Path(out) / NEW
+    with alone(folder):
+        with making(folder, "study", NETCDF, force=force or _is_study(folder, given), also=_PAGES) as stage:
+            # Cells that are made anew, by this call or by one that was stopped, stand apart until all are there.
+            anew = bool(held(new / CELLS) or (force and held(folder / CELLS)))
+            store = Store(new if anew else folder)
+            found, interrupted = swept(store)
+            if not interrupted:
+                store.consolidate()
+            if not (interrupted and _is_complete(folder)):
+                found.save(stage)
+                if given is not None:
+                    _keep_definition(given, folder, stage)
+                if more is not None:
+                    more(found, stage)
+        if anew and not interrupted:
+            take_over(folder / CELLS, new / CELLS)
+            shutil.rmtree(new)
+    return found
+
+
+def _is_study(folder: Path, given: Path | None) -> bool:
+    """Whether a folder holds a study, or nothing but its definition."""
+    names = {path.name for path in folder.iterdir()}
+    return bool(names & {CELLS, NETCDF}) or names <= {None if given is None else given.name}
+
+
+def _is_complete(folder: Path) -> bool:
+    try:
+        return Study.load(folder).complete
+    except StarcalError:
+        return False
+
+
+def _keep_definition(given: Path, folder: Path, stage: Path) -> None:
+    """Keep the file of a study with its results, unless it is a file of the user in that place."""
+    copy, record = folder / _COPY, read_manifest(folder)
+    if copy.resolve() != given.resolve() or (record is not None and _COPY in record.files):
+        atomic_write_text(stage / _COPY, given.read_text("utf-8-sig"))
+
+
+def _compute(
+    work: Work,
+    cells: Sequence[Cell],
+    keys: Sequence[str],
+    store: Store,
+    workers: int | None,
+    scheduler: Scheduler,
+    progress: Progress | None,
+) -> bool:
+    """Compute the cells that a store lacks; whether Ctrl-C was pressed before the end."""
     known = store.keys()
     todo = [(key, cell) for key, cell in zip(keys, cells, strict=True) if key not in known]
     done = len(cells) - len(todo)
@@ -107,18 +182,7 @@ def study(
         if progress is not None:
             progress(done, len(cells))
 
-    interrupted = False
-    if todo:
-        work = Work(wanted, stars, deepest, heaven.hash(deepest))
-        interrupted = run_batches(work, batches_of(wanted, todo), keep, workers, scheduler)
-    data = dataset(wanted, cells, keys, store)
-    data.attrs |= {"stars": heaven.stars.source, "stars_sha256": heaven.hash(deepest)}
-    found = Study(data, wanted)
-    if out is not None:
-        if not interrupted:
-            store.consolidate()
-        found.save(out)
-    return found
+    return bool(todo) and run_batches(work, batches_of(work.definition, todo), keep, workers, scheduler)
 
 
 Batch = list[tuple[str, Cell]]

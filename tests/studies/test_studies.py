@@ -10,10 +10,12 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.core.errors import RunFolderError, StudyError
+from starcal_uq.core.manifest import read_manifest
 from starcal_uq.paper import paper_camera
 from starcal_uq.studies import TEMPLATES, Study, StudyDefinition, cells, write_study_template
 from starcal_uq.studies.axes import camera_of
 from starcal_uq.studies.geometry import Geometry, GeometryKey, Heaven, statements, take_frames
+from tests.helpers.crashes import small_files, snapshots
 
 ARCSEC = 648_000.0 / np.pi
 
@@ -283,6 +285,80 @@ def test_only_new_cells_are_computed_and_results_come_back(tmp_path: Path, monke
     assert loaded.data.identical(other.data)
     assert loaded.definition.axes == definition().axes
     assert len(loaded.table()) == 30
+
+
+def same(found: Study, wanted: Study) -> bool:
+    """Equal but for the time that cells took."""
+    names = [name for name in wanted.data.data_vars if name != "seconds"]
+    return bool(found.data[names].equals(wanted.data[names])) and found.complete == wanted.complete
+
+
+def test_a_forced_study_replaces_that_of_before_when_it_is_complete(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At every moment; stopped, it goes on with the cells that it has, and each is computed once."""
+    monkeypatch.setattr("starcal_uq.studies.study._BATCH_S", 1e-9)
+    folder = tmp_path / "work" / "out"
+    old = sc.study(definition(sweep={"frames": (250, 500)}), out=folder, workers=0, more=page)
+    (folder / "notes.txt").write_text("mine")
+    before = results(folder)
+    calls, wanted = counted(monkeypatch), definition(sweep={"frames": (250, 400, 500)}, seed=2)
+
+    def stop(done: int, _total: int) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with snapshots(folder.parent, tmp_path / "states") as states:
+        part = sc.study(wanted, out=folder, workers=0, force=True, progress=stop, more=page)
+        assert not part.complete and part.ok.sum() == 2
+        assert same(Study.load(folder), old)
+        new = sc.study(wanted, out=folder, workers=0, more=page)
+    assert len(calls) == 3 and new.complete
+    assert {path.name for path in folder.iterdir()} == {
+        *("cells", "study.nc", "study.parquet", "report.html", "run.json", "notes.txt")
+    }
+    assert len(list((folder / "cells").iterdir())) == 1
+    after = results(folder)
+    found = [results(state / "out") == after for state in states]
+    assert all(results(state / "out") in (before, after) for state in states)
+    assert found == sorted(found) and 5 < sum(found) < len(found) - 5
+    # Wherever it was stopped, it is the same in the end, and old cells are not taken for new ones.
+    first_new = found.index(True)
+    for state in (states[first_new - 1], states[-2]):
+        assert same(sc.study(wanted, out=state / "out", workers=0, more=page), new)
+        assert len(list((state / "out" / "cells").iterdir())) == 1
+
+
+def page(found: Study, folder: Path) -> None:
+    (folder / "report.html").write_text(f"{found.n_cells} cells of seed {found.definition.seed}")
+
+
+def results(folder: Path) -> list[bytes]:
+    """What a folder holds of a study, once those are in their places whose writer was stopped."""
+    read_manifest(folder)
+    return [(folder / name).read_bytes() for name in ("study.nc", "study.parquet", "report.html")]
+
+
+def test_a_full_disk_leaves_the_study_of_before(tmp_path: Path) -> None:
+    old = sc.study(definition(sweep={"frames": (250, 500)}), out=tmp_path, workers=0)
+    for largest in (3_000, 40_000):
+        with small_files(largest), pytest.raises(RunFolderError, match=r"cannot be written .*free space"):
+            sc.study(definition(seed=2), out=tmp_path, workers=0, force=True)
+        assert same(Study.load(tmp_path), old)
+    assert sc.study(definition(seed=2), out=tmp_path, workers=0).complete
+
+
+def test_a_file_of_the_user_stays(tmp_path: Path) -> None:
+    sheet = definition(sweep={"frames": (250,)})
+    (tmp_path / "study.parquet").write_text("mine")
+    with pytest.raises(RunFolderError, match="not empty"):
+        sc.study(sheet, out=tmp_path, workers=0)
+    with pytest.raises(RunFolderError, match=r"study\.parquet: is in the way of a result"):
+        sc.study(sheet, out=tmp_path, workers=0, force=True)
+    assert (tmp_path / "study.parquet").read_text() == "mine"
+    (tmp_path / "calibration.json").write_text("{}")
+    with pytest.raises(RunFolderError, match="results of another command"):
+        sc.study(sheet, out=tmp_path, workers=0, force=True)
 
 
 def test_an_interrupted_study_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
