@@ -35,7 +35,7 @@ from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 # Temporaries of this many stars stay in the processor's cache.
 _BLOCK = 32_768
 # Below this a rotation about one axis is lost in rounding: the stars span less than about 0.3 arcsec.
-_DEGENERATE = 1e-12
+DEGENERATE = 1e-12
 _NEWTON_STEPS = 60
 
 
@@ -156,7 +156,7 @@ def quest(
             chi2[part] = _squared_residuals(b3, r3, w_rows, local, counts, q)
             loss[part] = 0.5 * chi2[part] / total
 
-    ok = np.isfinite(lambda_max) & (gap > _DEGENERATE)
+    ok = np.isfinite(lambda_max) & (gap > DEGENERATE)
     if not ok.all():
         if on_degenerate == "raise":
             raise DegenerateFrameError(np.flatnonzero(~ok.all(axis=0)))
@@ -175,31 +175,6 @@ def quest(
         covariance=None if covariances is None else _full(covariances)[first],
         taste=None if chi2 is None else chi2[first],
     )
-
-
-def profile_attitudes(profile: FloatArray, counts: IntArray) -> tuple[FloatArray, BoolArray]:
-    """Attitudes of frames from sums over their stars, as `quest` finds them without weights.
-
-    Parameters
-    ----------
-    profile : (3, 3, K) array
-        Sums of ``b r^T`` of every frame.
-    counts : (K,) array of int
-        Their stars.
-
-    Returns
-    -------
-    rotations : (K, 3, 3) array
-        R_cam_icrs; NaN where the stars determine no attitude.
-    ok : (K,) array of bool
-        Where they do.
-    """
-    rows = [[entry[None] for entry in row] for row in profile / counts]
-    with np.errstate(invalid="ignore"):
-        quaternions, lambda_max, gap = _solve(rows)
-    ok = np.isfinite(lambda_max[0]) & (gap[0] > _DEGENERATE)
-    found = np.where(ok, quaternions[:, 0], np.nan).T
-    return quaternion_to_rotation(found), ok
 
 
 def _check_shapes(b: FloatArray, r: FloatArray, starts: IntArray) -> None:

@@ -79,7 +79,7 @@ def assemble(
     if names := undetermined(likelihood, theta, normal.matrix, sigma, nominal, status):
         status = Status.SINGULAR
     efficient, information = scaled_inverse(normal.matrix) * sigma**2, normal.matrix / sigma**2
-    compressed = compress(likelihood, theta, efficient, likelihood.rotations)
+    compressed = compress(likelihood, theta, efficient)
     if refined and status.ok:
         compressed = settled(compressed)
         theta, last = compressed.theta_hat, stages[-1]

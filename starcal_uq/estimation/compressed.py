@@ -348,7 +348,7 @@ def compress(
     covariance : (p, p) array
         Covariance there; sets the whitened coordinates.
     rotations : (K, 3, 3) array, optional
-        Attitudes to start from.
+        Attitudes to start from; otherwise those where the likelihood's own searches start, or QUEST's.
     stars : StarSums, optional
         Stars that bring errors along, nothing added yet.
     ratio : (2 S,) array, optional
@@ -356,6 +356,13 @@ def compress(
     """
     whitening, theta = scaled_cholesky(covariance), np.asarray(theta_hat, dtype=np.float64)
     frames, model_name = likelihood.frames, likelihood.model_name
+    known = likelihood.last_sums
+    if known is not None and not (np.array_equal(known[1].theta, theta) and known[0].turn < ATTITUDE_TOLERANCE_RAD):
+        known = None
+    if rotations is None:
+        # Of use to the NumPy path alone, where sums are known.
+        compiled = likelihood.kernels == "numba"
+        rotations = known[1].rotations if compiled and known is not None else likelihood.rotations
     if rotations is None:
         rotations = likelihood.start_rotations(theta)
     if stars is not None and ratio is not None:
@@ -369,9 +376,6 @@ def compress(
 
         sums = _expanded(frames, model_name, theta, whitening, rotations, add)
         return dataclasses.replace(sums, gram=sums.gram - stars.solved(ratio).correction()).likelihood(theta, whitening)
-    known = likelihood.last_sums
-    if known is not None and not (np.array_equal(known[1].theta, theta) and known[0].turn < ATTITUDE_TOLERANCE_RAD):
-        known = None
     return gram_sums(frames, model_name, theta, whitening, rotations, known).likelihood(theta, whitening)
 
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from starcal_uq.attitude.wahba import DEGENERATE
 from starcal_uq.camera import compiled
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.kernels import Kernel, emit_source
@@ -29,6 +30,7 @@ import numpy as np
 from numba import float64, int64, njit, types
 
 P, STRIDE, CHUNK, GRAM_CHUNK, ROWS, EXPLICIT, WIDTH = {p}, {stride}, {chunk}, 64, {rows}, {explicit}, {width}
+DEGENERATE = {degenerate}
 # Sums in another order and fused products, nothing that changes what is done with NaN and infinity.
 HELPER = dict(no_cpython_wrapper=True, no_cfunc_wrapper=True)
 ORDERED = dict(nogil=True, cache=True, error_model="numpy", fastmath={{"contract"}})
@@ -41,7 +43,7 @@ THETA = types.UniTuple(float64, P)
 STARS = (*[GIVEN] * 6, types.Array(int64, 1, "C", readonly=True), BLOCKS)
 FRAME_SUMS = types.void(THETA, *STARS, TWO, TWO, TWO, THREE, THREE, ONE)
 FRAMED = (*[GIVEN] * 5, types.Array(int64, 1, "C", readonly=True))
-PROFILE_SUMS = types.void(THETA, *FRAMED, THREE)
+ATTITUDES = types.int64(THETA, *FRAMED, THREE)
 PAIR_SUMS = types.float64(THETA, *FRAMED, BLOCKS, TWO, TWO)
 GRAM_SUMS = types.void(THETA, types.UniTuple(float64, P * P), *STARS, TABLE, BLOCKS, BLOCKS, TWO, ONE)
 """
@@ -192,7 +194,15 @@ def frame_sums(theta, x0, y0, r0, r1, r2, weight, starts, rotations, residuals, 
         s0 += m
 '''
 
-_PAIRS = """
+_PAIRS = '''
+@njit(**FAST, **HELPER)
+def last_of_chunk(starts, first):
+    last = first + 1
+    while last < len(starts) - 1 and starts[last + 1] - starts[first] <= CHUNK:
+        last += 1
+    return last
+
+
 @njit(**FAST, **HELPER)
 def fill_backward(theta, x0, y0, s0, m, work, buf):
     for i in range(m):
@@ -201,14 +211,93 @@ def fill_backward(theta, x0, y0, s0, m, work, buf):
         fill_root(theta, work, 3, 0, m)
 
 
-@njit(PROFILE_SUMS, **FAST)
-def profile_sums(theta, x0, y0, r0, r1, r2, starts, profile):
-    work, buf = np.zeros(8 * STRIDE), np.empty(6 * STRIDE)
-    n_frames, first = len(starts) - 1, 0
+@njit(**ORDERED, **HELPER)
+def solve_attitude(profile, n, f, rotations):
+    """QUEST for one frame, as `starcal_uq.attitude.wahba` has it, from its sums of b r^T; 1 if it is determined."""
+    xx, xy, xz = profile[0, 0] / n, profile[0, 1] / n, profile[0, 2] / n
+    yx, yy, yz = profile[1, 0] / n, profile[1, 1] / n, profile[1, 2] / n
+    zx, zy, zz = profile[2, 0] / n, profile[2, 1] / n, profile[2, 2] / n
+    c0, c1, c2 = yy * zz - yz * zy, yz * zx - yx * zz, yx * zy - yy * zx
+    c3, c4, c5 = xz * zy - xy * zz, xx * zz - xz * zx, xy * zx - xx * zy
+    c6, c7, c8 = xy * yz - xz * yy, xz * yx - xx * yz, xx * yy - xy * yx
+    norm2 = xx * xx + xy * xy + xz * xz + yx * yx + yy * yy + yz * yz + zx * zx + zy * zy + zz * zz
+    adjoint2 = c0 * c0 + c1 * c1 + c2 * c2 + c3 * c3 + c4 * c4 + c5 * c5 + c6 * c6 + c7 * c7 + c8 * c8
+    det = xx * c0 + xy * c1 + xz * c2
+    lam, step = 1.0, 1.0
+    for _ in range(60):
+        a = lam * lam - norm2
+        slope = 4.0 * lam * a - 8.0 * det
+        value = max(a * a - 8.0 * lam * det - 4.0 * adjoint2, 0.0)
+        step = min(value / (slope if slope > 0.0 else 1.0), step)
+        lam -= step
+        if not step > 4e-16:
+            break
+    # The largest row of the adjugate of K - lambda I.
+    a00, a11, a22, a33 = xx - yy - zz - lam, yy - xx - zz - lam, zz - xx - yy - lam, xx + yy + zz - lam
+    a01, a02, a12, a03, a13, a23 = xy + yx, xz + zx, yz + zy, zy - yz, xz - zx, yx - xy
+    s0, s1, s2 = a00 * a11 - a01 * a01, a00 * a12 - a01 * a02, a00 * a13 - a01 * a03
+    s3, s4, s5 = a01 * a12 - a11 * a02, a01 * a13 - a11 * a03, a02 * a13 - a12 * a03
+    c5, c4, c3 = a22 * a33 - a23 * a23, a12 * a33 - a13 * a23, a12 * a23 - a13 * a22
+    c2, c1 = a02 * a33 - a03 * a23, a02 * a23 - a03 * a22
+    d00, d11 = a11 * c5 - a12 * c4 + a13 * c3, a00 * c5 - a02 * c2 + a03 * c1
+    d22, d33 = a03 * s4 - a13 * s2 + a33 * s0, a02 * s3 - a12 * s1 + a22 * s0
+    d01, d02, d03 = a02 * c4 - a01 * c5 - a03 * c3, a13 * s5 - a23 * s4 + a33 * s3, a22 * s4 - a12 * s5 - a23 * s3
+    d12, d13, d23 = a23 * s2 - a03 * s5 - a33 * s1, a02 * s5 - a22 * s2 + a23 * s1, a12 * s2 - a02 * s4 - a23 * s0
+    if min(d00, d11) < min(d22, d33):
+        x, y, z, w = (d00, d01, d02, d03) if d00 < d11 else (d01, d11, d12, d13)
+    else:
+        x, y, z, w = (d02, d12, d22, d23) if d22 < d33 else (d03, d13, d23, d33)
+    # One Newton step of Wahba's loss on the rotation vector.
+    norm = np.sqrt(x * x + y * y + z * z + w * w)
+    x, y, z, w = x / norm, y / norm, z / norm, w / norm
+    fill_rotation(x, y, z, w, rotations, f)
+    r = rotations[f]
+    m00, m11 = xx * r[0, 0] + xy * r[0, 1] + xz * r[0, 2], yx * r[1, 0] + yy * r[1, 1] + yz * r[1, 2]
+    m01, m10 = xx * r[1, 0] + xy * r[1, 1] + xz * r[1, 2], yx * r[0, 0] + yy * r[0, 1] + yz * r[0, 2]
+    m02, m20 = xx * r[2, 0] + xy * r[2, 1] + xz * r[2, 2], zx * r[0, 0] + zy * r[0, 1] + zz * r[0, 2]
+    m12, m21 = yx * r[2, 0] + yy * r[2, 1] + yz * r[2, 2], zx * r[1, 0] + zy * r[1, 1] + zz * r[1, 2]
+    m22 = zx * r[2, 0] + zy * r[2, 1] + zz * r[2, 2]
+    gx, gy, gz = m21 - m12, m02 - m20, m10 - m01
+    hxx, hyy, hzz = m11 + m22, m00 + m22, m00 + m11
+    hxy, hxz, hyz = -0.5 * (m01 + m10), -0.5 * (m02 + m20), -0.5 * (m12 + m21)
+    ixx, iyy, izz = hyy * hzz - hyz * hyz, hxx * hzz - hxz * hxz, hxx * hyy - hxy * hxy
+    ixy, ixz, iyz = hxz * hyz - hxy * hzz, hxy * hyz - hxz * hyy, hxy * hxz - hxx * hyz
+    det = hxx * ixx + hxy * ixy + hxz * ixz
+    curvature, minors = 0.0, ixx + iyy + izz
+    if det > 0.0:
+        px = 0.5 * (ixx * gx + ixy * gy + ixz * gz) / det
+        py = 0.5 * (ixy * gx + iyy * gy + iyz * gz) / det
+        pz = 0.5 * (ixz * gx + iyz * gy + izz * gz) / det
+        x, y, z, w = (
+            x + px * w + py * z - pz * y,
+            y - px * z + py * w + pz * x,
+            z + px * y - py * x + pz * w,
+            w - px * x - py * y - pz * z,
+        )
+        norm = np.sqrt(x * x + y * y + z * z + w * w)
+        fill_rotation(x / norm, y / norm, z / norm, w / norm, rotations, f)
+        curvature = det / minors if minors > 0.0 else 0.0
+    if np.isfinite(norm2) and np.isfinite(lam) and min(curvature, np.sqrt(adjoint2 / norm2)) > DEGENERATE:
+        return 1
+    rotations[f] = np.nan
+    return 0
+
+
+@njit(**ORDERED, **HELPER)
+def fill_rotation(x, y, z, w, rotations, f):
+    rotations[f, 0, 0], rotations[f, 0, 1] = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w)
+    rotations[f, 1, 1], rotations[f, 1, 0] = 1.0 - 2.0 * (x * x + z * z), 2.0 * (x * y + z * w)
+    rotations[f, 2, 2], rotations[f, 2, 1] = 1.0 - 2.0 * (x * x + y * y), 2.0 * (y * z + x * w)
+    rotations[f, 0, 2], rotations[f, 1, 2] = 2.0 * (x * z + y * w), 2.0 * (y * z - x * w)
+    rotations[f, 2, 0] = 2.0 * (x * z - y * w)
+
+
+@njit(ATTITUDES, **FAST)
+def attitudes(theta, x0, y0, r0, r1, r2, starts, rotations):
+    work, buf, profile = np.zeros(8 * STRIDE), np.empty(6 * STRIDE), np.zeros((3, 3))
+    n_frames, first, sound = len(starts) - 1, 0, 0
     while first < n_frames:
-        s0, last = starts[first], first + 1
-        while last < n_frames and starts[last + 1] - s0 <= CHUNK:
-            last += 1
+        s0, last = starts[first], last_of_chunk(starts, first)
         m = starts[last] - s0
         fill_backward(theta, x0, y0, s0, m, work, buf)
         for i in range(m):
@@ -216,8 +305,11 @@ def profile_sums(theta, x0, y0, r0, r1, r2, starts, profile):
         for i in range(m):
             buf[3 * STRIDE + i], buf[4 * STRIDE + i], buf[5 * STRIDE + i] = r0[s0 + i], r1[s0 + i], r2[s0 + i]
         for f in range(first, last):
-            pair_profile(buf, starts[f] - s0, starts[f + 1] - s0, profile, f)
+            profile[:] = 0.0
+            pair_profile(buf, starts[f] - s0, starts[f + 1] - s0, profile)
+            sound += solve_attitude(profile, starts[f + 1] - starts[f], f, rotations)
         first = last
+    return sound
 
 
 @njit(PAIR_SUMS, **FAST)
@@ -229,9 +321,7 @@ def pair_sums(theta, x0, y0, r0, r1, r2, starts, rotations, scores, matrix):
     n_frames = len(starts) - 1
     cost, first = 0.0, 0
     while first < n_frames:
-        s0, last = starts[first], first + 1
-        while last < n_frames and starts[last + 1] - s0 <= CHUNK:
-            last += 1
+        s0, last = starts[first], last_of_chunk(starts, first)
         m = starts[last] - s0
         fill_backward(theta, x0, y0, s0, m, work, buf)
         for i in range(m):
@@ -288,7 +378,7 @@ def pair_sums(theta, x0, y0, r0, r1, r2, starts, rotations, scores, matrix):
                 scores[a, f] = score[a]
         first = last
     return cost
-"""
+'''
 
 
 _GRAM = """
@@ -421,10 +511,8 @@ def _normal_sources(rows: int) -> list[str]:
 def _pair_sources(p: int) -> list[str]:
     """Sums over a frame or a chunk for the interstar angles; rows as `pair_sums` fills them."""
     db, r, e, d, bb, eb = 3, 3 + 3 * p, 6 + 3 * p, 9 + 3 * p, 12 + 3 * p, 18 + 3 * p
-    profile: _Sums = [(f"profile[{i}, {k}, f]", [(i, 3 + k)]) for i in range(3) for k in range(3)]
-    sources = [
-        "@njit(**ORDERED, **HELPER)\n" + _sums_source("pair_profile", "buf, j, end, profile, f", "j", "end", profile)
-    ]
+    profile: _Sums = [(f"profile[{i}, {k}]", [(i, 3 + k)]) for i in range(3) for k in range(3)]
+    sources = ["@njit(**ORDERED, **HELPER)\n" + _sums_source("pair_profile", "buf, j, end, profile", "j", "end", profile)]
     # B^T [dB], R'^T [R' E] and E^T [E] of a frame, from stars that hold [dB R' E] each: neighbours fill a register.
     width, first = _width(p), 3 * p
     for x in range(3):
@@ -570,7 +658,7 @@ def source(model_name: str) -> str:
         _star_source(backward_kernel(model_name, True), "backward_kernel", lambda o, n: 3 * o + n),
         _star_source(forward_kernel(model_name, "bent"), "bent_kernel", lambda o, n: bent[o] + n, "x, y, z"),
     ]
-    head = _HEAD.format(p=p, stride=_STRIDE, chunk=_CHUNK, rows=rows, explicit=explicit, width=_width(p))
+    head = _HEAD.format(p=p, stride=_STRIDE, chunk=_CHUNK, rows=rows, explicit=explicit, width=_width(p), degenerate=DEGENERATE)
     inlined = ["@njit(**INLINE)\n" + kernel for kernel in functions]
     parts = [head, *inlined, *_normal_sources(rows), *_pair_sources(p), _LOOPS, _PAIRS]
     parts += [*_expansion_sources(model_name, p), _GRAM]
@@ -590,7 +678,7 @@ def _stars(frames: StarFrames, rotations: FloatArray) -> tuple[Any, ...]:
 def _both(upper: FloatArray) -> FloatArray:
     """A symmetric matrix from its upper triangle, zeros below."""
     whole = upper + upper.T
-    np.fill_diagonal(whole, np.diag(upper))
+    whole.flat[:: len(whole) + 1] = upper.diagonal()
     return whole
 
 
@@ -610,17 +698,17 @@ def frame_loop(
     return _both(gram), shift, response, inverse, volume
 
 
-def profile_loop(frames: StarFrames, model_name: str, theta: FloatArray) -> FloatArray | None:
-    """Sums (3, 3, K) of ``b r^T`` over the stars of each frame, b the directions of their pixels.
+def attitude_loop(frames: StarFrames, model_name: str, theta: FloatArray) -> tuple[FloatArray, bool] | None:
+    """Attitudes (K, 3, 3) by QUEST at theta, without weights, NaN where stars determine none; whether they all do.
 
     None where a frame has more stars than the loops take.
     """
     if int(frames.sizes.max()) > _CHUNK:
         return None
-    profile = np.zeros((3, 3, frames.n_frames))
+    rotations = np.empty((frames.n_frames, 3, 3))
     loops = compiled.load(model_name, source(model_name))
-    loops.profile_sums(tuple(theta.tolist()), *frames.pixel, *frames.r, frames.starts, profile)
-    return profile
+    sound = loops.attitudes(tuple(theta.tolist()), *frames.pixel, *frames.r, frames.starts, rotations)
+    return rotations, sound == frames.n_frames
 
 
 def pair_loop(
@@ -628,7 +716,7 @@ def pair_loop(
 ) -> tuple[float, FloatArray, FloatArray] | None:
     """Cost, Gauss-Newton matrix (p, p) and gradients (p, K) of frames over interstar angles.
 
-    `rotations` (K, 3, 3) turn the catalogue nearly into the camera frame. None as in `profile_loop`.
+    `rotations` (K, 3, 3) turn the catalogue nearly into the camera frame. None as in `attitude_loop`.
     """
     if int(frames.sizes.max()) > _CHUNK:
         return None

@@ -165,11 +165,14 @@ class MarginalLikelihood:
 
     def rotations_at(self, theta: FloatArray) -> FloatArray:
         """Best attitudes (K, 3, 3) at theta."""
-        return self.profile(theta, self._rotations)[0].rotations
+        return self.profile(theta, self.rotations)[0].rotations
 
     @property
     def rotations(self) -> FloatArray | None:
         """Where attitude searches start, (K, 3, 3), if that was said."""
+        if self._rotations is None and self._last is not None:
+            attitudes = self._last[1]
+            self._rotations = attitudes.at(attitudes.theta)
         return self._rotations
 
     def use_rotations(self, rotations: FloatArray) -> None:
@@ -187,7 +190,7 @@ class MarginalLikelihood:
         `sums` and `attitudes` are those of all frames at one point, as `starcal_uq.estimation.sums.frame_sums` gives
         them.
         """
-        self._rotations, self._last = attitudes.at(attitudes.theta), (sums, attitudes)
+        self._rotations, self._last = None, (sums, attitudes)
 
     def log_likelihood(self, theta: FloatArray, sigma: float) -> float:
         """Log likelihood at theta (p,) and sigma (px, or the common factor on stated noise)."""

@@ -13,11 +13,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from starcal_uq.attitude.wahba import profile_attitudes, quest
+from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import backward_kernel, backward_root, unproject_theta
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.estimation.loops import kernels, pair_loop, profile_loop
+from starcal_uq.estimation.loops import attitude_loop, kernels, pair_loop
 from starcal_uq.estimation.solvers import Normal, is_singular
 from starcal_uq.maths.linear import COLUMNS, ROWS, unit_inverse
 from starcal_uq.observations.frames import StarFrames
@@ -109,17 +109,15 @@ class PairObjective:
         if self._turned_at is not None and np.max(np.abs(theta[:3] - self._turned_at)) <= _TURN_AGAIN_PX:
             return self._rotations
         frames = self.frames
-        profile = profile_loop(frames, self.model_name, theta) if self._compiled else None
-        if profile is None:
+        found = attitude_loop(frames, self.model_name, theta) if self._compiled else None
+        if found is None:
             b = unproject_theta(self.model_name, theta, frames.pixel.T)
-            found = quest(b, frames.r.T, frames.starts, covariance=False, on_degenerate="flag")
-            rotations, ok = found.rotations, found.ok
-            self._turned = frames.rotated(rotations)
-        else:
-            rotations, ok = profile_attitudes(profile, frames.sizes)
+            by_quest = quest(b, frames.r.T, frames.starts, covariance=False, on_degenerate="flag")
+            found = by_quest.rotations, bool(by_quest.ok.all())
+            self._turned = frames.rotated(by_quest.rotations)
         # Where the model is not finite there is no reference to keep.
-        self._rotations, self._turned_at = rotations, theta[:3].copy() if ok.all() else None
-        return rotations
+        self._rotations, self._turned_at = found[0], theta[:3].copy() if found[1] else None
+        return self._rotations
 
     def cost(self, theta: FloatArray) -> float:
         """The objective S(theta)."""

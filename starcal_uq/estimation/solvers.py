@@ -22,6 +22,7 @@ _SINGULAR = 1e-13
 _ROUNDING = 1e-10
 # A step this small against the parameters is none, whatever the cost does: data without noise end here.
 _NEGLIGIBLE = 1e-10
+_EPS, _TINY = float(np.finfo(float).eps), float(np.finfo(float).tiny)
 
 
 class Normal(NamedTuple):
@@ -94,10 +95,10 @@ class Constraints:
 
 def _scaled_step(normal: Normal, scale: FloatArray, bound: float) -> tuple[FloatArray, float]:
     """Minimise the Gauss-Newton model within ``|D p| <= bound``; returns the step and More's parameter."""
-    matrix = normal.matrix / np.outer(scale, scale)
+    matrix = normal.matrix / (scale[:, None] * scale)
     values, vectors = np.linalg.eigh(matrix)
     # Rounding can leave a singular direction slightly negative.
-    values = np.maximum(values, np.finfo(float).eps * values[-1])
+    values = np.maximum(values, _EPS * values[-1])
     slope = vectors.T @ (normal.gradient / scale)
 
     def length(damping: float) -> float:
@@ -107,7 +108,7 @@ def _scaled_step(normal: Normal, scale: FloatArray, bound: float) -> tuple[Float
     if values[0] <= _SINGULAR * values[-1] or length(0.0) > 1.1 * bound:
         upper = float(np.linalg.norm(slope)) / bound
         lower = 0.0
-        damping = max(1e-3 * upper, np.finfo(float).tiny)
+        damping = max(1e-3 * upper, _TINY)
         for _ in range(50):
             size = length(damping)
             if abs(size - bound) <= 0.1 * bound or (damping <= _SINGULAR * upper and size < bound):
@@ -225,7 +226,7 @@ def levenberg_marquardt(
 
 def _lengths(matrix: FloatArray) -> FloatArray:
     """Lengths (p,) of the Jacobian's columns; zero where attitudes take one up, but for rounding."""
-    return np.sqrt(np.maximum(np.diag(matrix), 0.0))
+    return np.sqrt(np.maximum(matrix.diagonal(), 0.0))
 
 
 def _newton_length(normal: Normal, scale: FloatArray) -> float:

@@ -15,6 +15,7 @@ from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import monotonic_expression
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray, Shapes
+from starcal_uq.estimation.loops import attitude_loop, kernels
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.pairs import PairObjective
 from starcal_uq.estimation.solvers import Constraints, Last, Normal, Solution, levenberg_marquardt, minpack
@@ -173,7 +174,9 @@ def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> S
     offset = frames.pixel - theta[:2, None]
     direction = np.vstack([offset, np.full(frames.n_stars, f)])
     b = (direction / np.linalg.norm(direction, axis=0)).T
-    rotations = quest(b, frames.r.T, frames.starts, covariance=False).rotations
+    compiled = attitude_loop(frames, "none", theta[:3]) if kernels("none", frames.n_stars) == "numba" else None
+    sound = compiled is not None and compiled[1]
+    rotations = compiled[0] if sound else quest(b, frames.r.T, frames.starts, covariance=False).rotations
     b = frames.rotated(rotations)
     ideal = f * b[:2] / b[2]
     # Every model is linear in its coefficients; forward models act on ideal points, inverse ones on measured points.
@@ -271,8 +274,10 @@ def _descended(
     likelihood: MarginalLikelihood, theta: FloatArray, max_iterations: int, tolerance: float, last: Last = "seen"
 ) -> Solution:
     """The minimum of the likelihood's sum of squares, near whose attitudes its later searches start."""
-    start = likelihood.start_rotations(theta) if likelihood.rotations is None else likelihood.rotations
-    descent = Descent(likelihood.frames, likelihood.model_name, start, likelihood.last_sums)
+    best = likelihood.last_sums
+    start = best[1].rotations if best is not None else likelihood.rotations
+    start = likelihood.start_rotations(theta) if start is None else start
+    descent = Descent(likelihood.frames, likelihood.model_name, start, best)
     solution = levenberg_marquardt(
         descent.evaluate, theta, max_iterations=max_iterations, tolerance=tolerance, last=last
     )
