@@ -18,7 +18,9 @@ from starcal_uq.cli.options import (
     MaxMag,
     OptionalCamera,
     TimeUtc,
+    check_names,
     check_same_sensor,
+    checked,
     number,
     read_file,
     read_path,
@@ -39,6 +41,7 @@ def register(app: typer.Typer) -> None:
     """Add the commands to the command line."""
     app.command("centroid")(centroid_command)
     app.command("identify")(identify_command)
+    app.command("inspect")(inspect_command)
 
 
 def centroid_command(
@@ -177,6 +180,53 @@ def identify_command(
         print(f"{found.text}{f' Table: {out}' if found.n_identified else ''}")
     if not found.n_identified:
         raise typer.Exit(1)
+
+
+def inspect_command(
+    run: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RUN", help="Run folder made by `starcal-uq run IMAGES... CAMERA -o RUN`.", parser=read_path
+        ),
+    ],
+    frames: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[FRAME]...",
+            help="Numbers or names of frames; by default those that tell most.",
+            callback=checked(check_names),
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "-o", "--out", metavar="PAGE", help="Page to write (.html); RUN/frames.html by default.", parser=write_file
+        ),
+    ] = None,
+    most: Annotated[int, number("gallery_frames", "Frames at most, where none is named.")] = 24,
+    images: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="PATH", help="Images, or a folder of them, where they have moved; repeatable.", parser=read_path
+        ),
+    ] = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Look at the frames of a run: their stars identified, rejected, expected and missed, and what to do next."""
+    from starcal_uq.presentation.words.images import frame_text
+
+    if out is not None:
+        ensure_new(out, force)
+    held = sc.Run(run, tell=note)
+    chosen = held.inspect(*(frames or ()), most=most, images=images)
+    page = held.keep_frames(chosen, force=force) if out is None else sc.report(chosen, out)
+    if json:
+        print_json({"page": str(page), "frames": records(chosen.to_dataframe())})
+    else:
+        for frame in chosen if frames else ():
+            print(frame_text(frame))
+        print(f"{chosen.text} Page: {page}")
 
 
 def load_images(

@@ -144,6 +144,13 @@ def _check_text(text: str) -> None:
         raise typer.BadParameter(f"{shown(text)} is no address, such as tcp://10.0.0.1:8786.")
 
 
+def check_names(texts: list[str] | None) -> None:
+    """Refuse what is no name of a file."""
+    for text in texts or ():
+        if not text.strip() or not text.isprintable() or len(text) > _LONGEST_ADDRESS:
+            raise typer.BadParameter(f"{shown(text)} is no frame's number or name, such as 3 or night-003.fits.")
+
+
 def check_word_or_file(text: str) -> None:
     if text not in ("random", "observed"):
         read_file(Path(text))

@@ -167,7 +167,7 @@ def _calibrate(
     with progress_bar("passes over the files") as progress:
         run.calibrate(obs, nominal, progress=progress, **estimation.options())
     if from_images:
-        run.keep_images(centroids, identified)
+        run.keep_images(centroids, identified, inputs)
     if run.screening is not None:
         show_screening(run.screening)
 
@@ -187,6 +187,8 @@ def _after_calibration(
     from starcal_uq.presentation.report.drawing import AFTER_BUDGET, AFTER_CALIBRATION, AFTER_DIAGNOSIS, AFTER_SAMPLING
 
     ahead.draw(run.calibrated, AFTER_CALIBRATION)
+    if run.images is not None:
+        ahead.draw_frames(run.shown_frames)
     if not run.did("sample"):
         sample_run(run, sampling, force=False)
     ahead.draw(run.results, AFTER_SAMPLING)

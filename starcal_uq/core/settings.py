@@ -106,6 +106,7 @@ EPOCH = Limit(1800.0, 2200.0, whole=False)
 LIMITS = {
     "seed": SEED,
     "n_frames": Limit(1, 10**9),
+    "gallery_frames": Limit(1, 1000),
     "partition_frames": Limit(1, 10**7),
     "alignment_frames": Limit(1, 10**6),
     "min_stars": Limit(2, 10**4),

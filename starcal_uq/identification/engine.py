@@ -413,6 +413,7 @@ def _result(
             "source": f"identified in {stars.source}",
             "directions": "apparent" if stars.apparent else "catalogue",
             "epoch": float(stars.epoch),
+            "max_mag": float(stars.mag.max()),
             "parity": parity,
         },
     )

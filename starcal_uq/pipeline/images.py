@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from starcal_uq.pipeline.refine import ImageCalibration
     from starcal_uq.sky.site import Site
 
-CENTROIDS, IDENTIFICATION = "centroids.parquet", "identification.csv"
+CENTROIDS, IDENTIFICATION, MATCHED = "centroids.parquet", "identification.csv", "matched.parquet"
 # Where the embedded catalogue has its stars; images without a time are compared with these.
 _CATALOGUE_EPOCH = 2016.0
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")

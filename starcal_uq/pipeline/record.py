@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -75,12 +77,15 @@ class ImageRecord(Shown):
         Stars left out because the light of a neighbour displaces them.
     parity : str
         "normal" or "mirrored".
+    sources : tuple of str
+        Files and folders that the images came from; empty in runs of versions that did not keep them.
     """
 
     rounds: tuple[RoundRecord, ...]
     rows: tuple[ImageRow, ...]
     n_disturbed: int
     parity: str
+    sources: tuple[str, ...] = ()
 
     @property
     def left_out(self) -> tuple[ImageRow, ...]:
@@ -103,8 +108,8 @@ class ImageRecord(Shown):
         return read_json(cls, path, "a record of images", "run `starcal-uq run IMAGES... CAMERA -o RUN` again")
 
 
-def record_images(centroids: Centroids, images: ImageCalibration) -> ImageRecord:
-    """The record of a bootstrapped run."""
+def record_images(centroids: Centroids, images: ImageCalibration, sources: Sequence[PathLike] = ()) -> ImageRecord:
+    """The record of a bootstrapped run; `sources` are the files and folders that the images came from."""
     first, last = images.rounds[0][0], images.rounds[-1][0]
     counted = {frame.frame: frame.n_identified for frame in first.frames}
     by_frame = {frame.frame: frame for frame in last.frames}
@@ -128,7 +133,8 @@ def record_images(centroids: Centroids, images: ImageCalibration) -> ImageRecord
         rounds.append(_recorded(identification, obs, calibration, before))
         before = identification
     disturbed = images.observations.meta.get("disturbed_stars", 0)
-    return ImageRecord(tuple(rounds), tuple(rows), int(disturbed), last.parity)
+    places = tuple(os.path.abspath(source) for source in sources)
+    return ImageRecord(tuple(rounds), tuple(rows), int(disturbed), last.parity, places)
 
 
 def _recorded(

@@ -29,6 +29,7 @@ from starcal_uq.inference.prior_draws import PriorPredictive
 from starcal_uq.inference.priors import Priors
 from starcal_uq.inference.update import ShiftTest
 from starcal_uq.observations.table import Observations
+from starcal_uq.pipeline.inspection import Frames, InspectedFrame
 from starcal_uq.pipeline.record import ImageRecord
 from starcal_uq.pipeline.refine import ImageCalibration
 from starcal_uq.planning.check import ForecastCheck
@@ -72,6 +73,7 @@ from starcal_uq.presentation.figures.studies import (
 )
 from starcal_uq.presentation.html import card, listed
 from starcal_uq.presentation.pages.budgeting import section_html
+from starcal_uq.presentation.pages.gallery import frames_html
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words import (
     budgeting,
@@ -133,6 +135,8 @@ VIEWS: Mapping[type, View] = {
     Identification: _view("Identification", images.identification_text, images.identification_table),
     ImageCalibration: View(images.image_calibration_text),
     ImageRecord: View(images.image_record_text),
+    Frames: View(images.frames_text, frames_html),
+    InspectedFrame: View(images.frame_text),
     Calibration: _view(
         "Calibration",
         estimation.calibration_text,

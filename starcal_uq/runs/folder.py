@@ -58,8 +58,9 @@ HISTORY = "history.csv"
 CHECKPOINT = "sampling.checkpoint.npz"
 # Step -> steps that rest on its result.
 REST_ON: dict[str, tuple[str, ...]] = {
-    "calibrate": ("images", "sample", "coupling", "propagate", "diagnose", "budget", "report"),
-    "images": ("report",),
+    "calibrate": ("images", "inspect", "sample", "coupling", "propagate", "diagnose", "budget", "report"),
+    "images": ("inspect", "report"),
+    "inspect": (),
     "sample": ("coupling", "propagate", "budget", "report"),
     "coupling": ("report",),
     "propagate": ("budget", "report"),
@@ -70,7 +71,7 @@ REST_ON: dict[str, tuple[str, ...]] = {
 # Files that have no name of their own in a run.
 _OTHERS = {
     **dict.fromkeys(DIAGNOSIS_TABLES.values(), "diagnose"),
-    **dict.fromkeys(("centroids.parquet", "identification.csv", "images.json"), "images"),
+    **dict.fromkeys(("centroids.parquet", "identification.csv", "images.json", "matched.parquet"), "images"),
     HISTORY: "calibrate",
 }
 
@@ -117,6 +118,8 @@ class RunFolder:
         Folder of the figures.
     report : Path
         The report (HTML, self-contained).
+    inspection : Path
+        The images with their stars (HTML, self-contained).
     """
 
     path: Path
@@ -138,6 +141,7 @@ class RunFolder:
     rejected = _File("rejected.csv", f"{_CALIBRATE} --screen")
     figures = _File("figures", "starcal-uq report RUN")
     report = _File("report.html", "starcal-uq report RUN")
+    inspection = _File("frames.html", "starcal-uq inspect RUN")
 
     def __init__(self, path: PathLike) -> None:
         object.__setattr__(self, "path", Path(path))

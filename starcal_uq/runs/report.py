@@ -13,12 +13,13 @@ if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.comparison.result import CameraComparison
     from starcal_uq.core.files import PathLike
+    from starcal_uq.pipeline.inspection import Frames
     from starcal_uq.planning.plan import Plan
     from starcal_uq.studies.result import Study
 
 
 def report(
-    what: PathLike | Run | Plan | CameraComparison | Budget | Study,
+    what: PathLike | Run | Plan | CameraComparison | Budget | Study | Frames,
     to: PathLike | None = None,
     *,
     truth: Camera | None = None,
@@ -27,12 +28,12 @@ def report(
 
     Parameters
     ----------
-    what : path, Run, Plan, CameraComparison, Budget or Study
+    what : path, Run, Plan, CameraComparison, Budget, Study or Frames
         Folder of a run that holds a calibration at least, whose ``report.html`` and ``figures`` are written; what is
         missing beyond that is named in the report together with the command that makes it. Or a result.
     to : path, optional
-        Folder for the page of a plan, a comparison or a study, file for that of a budget, whose ending names the format
-        (``.html``, ``.xlsx``, ``.tex``, ``.csv``); a run has its own place.
+        Folder for the page of a plan, a comparison or a study, file for that of frames (`Run.inspect`) or of a budget,
+        whose ending names the format (``.html``, ``.xlsx``, ``.tex``, ``.csv``); a run has its own place.
     truth : Camera, optional
         The camera of a simulation, shown beside the estimate of a run. Observations made by `starcal_uq.simulate`
         carry it, and it is then taken from them.

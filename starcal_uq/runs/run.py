@@ -5,7 +5,7 @@ A step takes results and gives one, and writes it. `RunFolder` has the rule by w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, wraps
@@ -36,6 +36,9 @@ from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.presentation.report.results import Missing, Results
 from starcal_uq.runs.folder import CHECKPOINT, DIAGNOSIS_TABLES, FILES, HISTORY, REST_ON, RunFolder, remove_checkpoints
 
+# Frames in a report, whose pictures are some hundred kilobytes together.
+REPORT_FRAMES = 12
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -47,6 +50,7 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.screening.result import Screening
     from starcal_uq.images.centroids import Centroids
     from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.pipeline.inspection import Frames
     from starcal_uq.pipeline.record import ImageRecord
     from starcal_uq.pipeline.refine import ImageCalibration
     from starcal_uq.propagation.attitude_error import AttitudeError
@@ -262,6 +266,99 @@ class Run:
         path = self.folder.path / IMAGES
         return ImageRecord.load(path) if path.exists() else None
 
+    @cached_property
+    def frames(self) -> Frames:
+        """The images that the run started from, with what became of their stars.
+
+        Raises
+        ------
+        RunFolderError
+            If the run started from a table, or a file is missing or damaged.
+        """
+        import pandas as pd
+
+        from starcal_uq.images.centroids import Centroids
+        from starcal_uq.pipeline.images import CENTROIDS, IDENTIFICATION, MATCHED
+        from starcal_uq.pipeline.inspection import Frames
+        from starcal_uq.pipeline.record import IMAGES
+
+        obs, record = self.observations, self.images
+        if record is None:
+            raise RunFolderError(
+                f"{self.path}: has no {IMAGES}, because the run did not start from images; to look at some, run "
+                "`starcal-uq run IMAGES... CAMERA -o RUN`."
+            )
+        path = self.folder.path / IDENTIFICATION
+        with reading(path, "a table of identified frames", "run `starcal-uq run IMAGES... CAMERA -o RUN` again"):
+            table = pd.read_csv(path)
+            seconds = dict(zip(table["frame"].tolist(), (1e-3 * table["milliseconds"]).tolist(), strict=True))
+        reasons = {}
+        if self.has("rejected"):
+            path = self.folder.rejected
+            with reading(path, "a table of rejected stars", "run `starcal-uq calibrate` again"):
+                table = pd.read_csv(path)
+                reasons = dict(zip(zip(table["frame"], table["star_id"], strict=True), table["reason"], strict=True))
+        matched, cal = self.folder.path / MATCHED, self.calibration
+        return Frames(
+            str(self.path),
+            record,
+            Centroids.load(self.folder.path / CENTROIDS),
+            # Runs of versions before this one have calibrated stars only.
+            load_observations(matched) if matched.exists() else obs,
+            obs,
+            cal.residuals_px,
+            cal.camera,
+            dict(zip(cal.frame_ids.tolist(), cal.quaternions, strict=True)),
+            reasons,
+            seconds,
+            tuple(Path(source) for source in record.sources),
+        )
+
+    def inspect(self, *which: int | str, most: int = 24, images: Sequence[PathLike] | None = None) -> Frames:
+        """Frames to be looked at: they show themselves in a notebook, and `starcal_uq.report` writes them as a page.
+
+        Parameters
+        ----------
+        *which : int or str
+            Numbers or names of frames; by default those that tell most (`Frames.telling`).
+        most : int
+            How many these are at most.
+        images : sequence of path, optional
+            Files or folders in which the images are, where they have moved.
+
+        Raises
+        ------
+        RunFolderError
+            If the run did not start from images.
+        ImageError
+            If there is no such frame.
+        """
+        frames = self.frames if images is None else replace(self.frames, images=tuple(map(Path, images)))
+        return frames.select(*which, large=True) if which else frames.telling(most)
+
+    @_writing
+    def keep_frames(self, frames: Frames, *, force: bool = False) -> Path:
+        """Write frames as ``RUN/frames.html``, which goes when the run changes.
+
+        Parameters
+        ----------
+        frames : Frames
+            What `inspect` gave.
+        force : bool
+            Whether to replace the page of before.
+        """
+        from starcal_uq.presentation.pages.gallery import write_frames
+
+        self._keep("inspection", force)
+        with self._step("inspect", None, {}) as files:
+            write_frames(frames, files.inspection)
+        return self.path / RunFolder.inspection
+
+    @property
+    def shown_frames(self) -> Frames:
+        """The frames that a report shows: those that tell most."""
+        return self.frames.telling(REPORT_FRAMES)
+
     @property
     def truth(self) -> Camera | None:
         """The camera of a simulation: the one given, or that of the observations."""
@@ -455,16 +552,17 @@ class Run:
         self.camera, self.calibration, self.screening = calibration.nominal, calibration, screened
 
     @_writing
-    def keep_images(self, centroids: Centroids, images: ImageCalibration) -> None:
-        """Keep the centroids and the record of every image that the run started from."""
-        from starcal_uq.pipeline.images import CENTROIDS, IDENTIFICATION
+    def keep_images(self, centroids: Centroids, images: ImageCalibration, sources: Sequence[PathLike] = ()) -> None:
+        """Keep centroids, matches and the record of every image that the run started from, and where these are."""
+        from starcal_uq.pipeline.images import CENTROIDS, IDENTIFICATION, MATCHED
         from starcal_uq.pipeline.record import IMAGES, record_images
 
         with self._step("images", None, {}) as files:
             centroids.save(files.path / CENTROIDS)
-            record_images(centroids, images).save(files.path / IMAGES)
+            images.identification.observations.save(files.path / MATCHED)
+            record_images(centroids, images, sources).save(files.path / IMAGES)
             write_csv(images.identification.to_dataframe(), files.path / IDENTIFICATION)
-        self._forget("images")
+        self._forget("images", "frames")
 
     @_writing
     def sample(self, *, force: bool = False, progress: Progress | None = None, **options: Any) -> Posterior:
@@ -705,12 +803,14 @@ class Run:
             If there is no calibration, or a file cannot be read or is not of this run.
         """
         if force or not self.has("report"):
-            from starcal_uq.presentation.report.drawing import FIGURES, draw_figures
+            from starcal_uq.presentation.report.drawing import FIGURES, GALLERY, draw_figures, draw_gallery
             from starcal_uq.presentation.report.page import render
 
             figures = dict(drawn or {})
             figures |= draw_figures(self.results, [name for name in FIGURES if name not in figures])
-            page = render(self.results, figures)
+            if GALLERY not in figures and self.images is not None:
+                figures |= draw_gallery(self.shown_frames)
+            page = render(self.results, figures, figures.pop(GALLERY, b"").decode())
             with self._step("report", None, {}) as files:
                 new_folder(files.figures)
                 for name, png in figures.items():

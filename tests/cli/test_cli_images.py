@@ -74,6 +74,39 @@ def test_run_from_images_to_report(cli, frames, tmp_path):
     # What centroiding predicted is what the calibration finds.
     assert cal.sigma_name == "sigma_scale"
     assert cal.sigma == pytest.approx(1.0, abs=0.1)
+    _frames_are_shown(cli, run, frames)
+
+
+def _frames_are_shown(cli, run, images):
+    """In the report, with their pixels, and by `inspect`, which says so where the images have moved."""
+    report = run.report.read_text("utf-8")
+    assert report.count("<figcaption>\n<h4>") == 12
+    assert report.count("data:image/webp;base64,") == 12
+    assert "12 frames of 16" in report
+    held = sc.Run(run.path)
+    table = held.frames.to_dataframe()
+    assert table["n_detected"].sum() == sc.images.Centroids.load(run.path / "centroids.parquet").n_stars
+    assert table["n_identified"].sum() == held.observations.n_stars
+    assert table["n_matched"].sum() == sum(row.n_last for row in held.images.rows)
+    # Whatever screening has left out is marked, with its reason.
+    rejected = pd.read_csv(run.rejected)
+    left_out = [frame.detections.query("kind == 'left out'") for frame in held.frames]
+    assert sum(map(len, left_out)) == table["n_matched"].sum() - table["n_identified"].sum()
+    assert set(rejected["star_id"]) <= {star for part in left_out for star in part["star_id"]}
+    status, out, err = cli("inspect", "run")
+    assert (status, err) == (0, "")
+    assert out.startswith("16 frames; 16 of them took part in the calibration. Page: run/frames.html")
+    assert run.inspection.read_text("utf-8").count("data:image/webp") == N_IMAGES
+    assert cli("inspect", "run")[0] == 2
+    name = held.images.rows[3].image
+    status, out, err = cli("inspect", "run", name, "0", "-o", "two.html", "--images", run.path)
+    assert status == 0, err
+    assert f"Frame 3, {name}: calibrated" in out
+    page = (run.path.parent / "two.html").read_text("utf-8")
+    assert "data:image" not in page and "are not where the run found them" in page
+    status, _, err = cli("inspect", "run", "17")
+    assert status == 2
+    assert "17: the run has no frame of this number or name; the last one is 15" in err
 
 
 def test_options_of_the_other_kind_are_refused(cli, frames, tmp_path):

@@ -34,6 +34,7 @@ VALID = {
     "study": "NEW.toml",
     "centroid": "IMAGES -o NEW.csv",
     "identify": "OBS CAMERA -o NEW.csv",
+    "inspect": "RUN 0 -o NEW.html",
     "filter": "OBS CAMERA -o NEW",
     "validate": "CAMERA",
     "diagnose": "RUN",
@@ -138,7 +139,7 @@ def legitimate(parameter, kind, value):
         return (value in ("missing", CONTROLS) and parameter.name in WRITTEN) or (
             value == "folder" and parameter.metavar not in ("CAMERA", "SITE", "CENTROIDS", "TOML", "STUDY")
         )
-    return kind is str and parameter.name in {"scheduler"} and value == "nonsense"
+    return kind is str and parameter.name in {"scheduler", "frames"} and value == "nonsense"
 
 
 ODD = {int: WHOLE, float: FLOATS, str: TEXTS, "choice": TEXTS, Path: PATHS, bool: ("perhaps",)}

@@ -164,6 +164,7 @@ ELSEWHERE = {
     "demo": "tests/cli/test_cli.py",
     "diagnose RUN": "tests/cli/test_cli_statistics.py",
     "diagnose RUN --force": "tests/cli/test_cli_statistics.py",
+    "inspect RUN": "tests/cli/test_cli_images.py",
     "propagate RUN --attitudes PROFILE": "tests/cli/test_cli_mission.py",
     "reproduce": "tests/cli/test_cli_paper.py",
     "run IMAGES... CAMERA -o RUN": "tests/cli/test_cli_images.py",

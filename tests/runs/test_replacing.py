@@ -32,7 +32,7 @@ def one_page(monkeypatch: pytest.MonkeyPatch) -> None:
 def _one_page(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports of one line and one figure: what is in them does not matter here, and takes most of the time."""
     monkeypatch.setattr("starcal_uq.presentation.report.drawing.draw_figures", lambda *_: {"figure": b"png"})
-    monkeypatch.setattr("starcal_uq.presentation.report.page.render", lambda results, _: f"report of {results.name}")
+    monkeypatch.setattr("starcal_uq.presentation.report.page.render", lambda results, *_: f"report of {results.name}")
 
 
 def make(folder: Path, seed: int, *, force: bool = False, stop: str | None = None) -> None:

@@ -8,24 +8,28 @@ from typing import Any
 
 from starcal_uq.budgeting.result import Budget
 from starcal_uq.comparison.result import CameraComparison
+from starcal_uq.pipeline.inspection import Frames
 from starcal_uq.planning.plan import Plan
 from starcal_uq.presentation.pages.budgeting import write_budget
 from starcal_uq.presentation.pages.comparison import write_comparison
+from starcal_uq.presentation.pages.gallery import write_frames
 from starcal_uq.presentation.pages.planning import write_plan
 from starcal_uq.presentation.pages.studies import write_study
 from starcal_uq.studies.result import Study
 
 
-def write_page(what: Plan | CameraComparison | Budget | Study, to: str | os.PathLike[str], **options: Any) -> Path:
+def write_page(
+    what: Plan | CameraComparison | Budget | Study | Frames, to: str | os.PathLike[str], **options: Any
+) -> Path:
     """Write a result for people to read.
 
     Parameters
     ----------
-    what : Plan, CameraComparison, Budget or Study
+    what : Plan, CameraComparison, Budget, Study or Frames
         The result.
     to : path
-        A folder for a plan, a comparison or a study, made if it is missing; a file for a budget, whose ending names
-        the format (``.html``, ``.xlsx``, ``.tex``, ``.csv``). What is there is overwritten.
+        A folder for a plan, a comparison or a study, made if it is missing; a file for frames, and for a budget, whose
+        ending names the format (``.html``, ``.xlsx``, ``.tex``, ``.csv``). What is there is overwritten.
     **options
         For a plan, ``choice`` and ``check``: frames to take, and the forecast against simulation.
 
@@ -49,6 +53,8 @@ def write_page(what: Plan | CameraComparison | Budget | Study, to: str | os.Path
         return write_budget(what, to, **options)
     if isinstance(what, Study):
         return write_study(what, to, **options)
+    if isinstance(what, Frames):
+        return write_frames(what, to, **options)
     raise TypeError(
-        f"there is no page for a {type(what).__name__}: give a Plan, a CameraComparison, a Budget or a Study."
+        f"there is no page for a {type(what).__name__}: give a Plan, a CameraComparison, a Budget, a Study or Frames."
     )

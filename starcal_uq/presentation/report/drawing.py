@@ -6,6 +6,7 @@ from collections.abc import Collection
 from typing import Any
 
 from starcal_uq.core.beside import Beside
+from starcal_uq.pipeline.inspection import Frames
 from starcal_uq.presentation.figures.budgeting import plot_budget
 from starcal_uq.presentation.figures.coupling import plot_correlations, plot_couplings
 from starcal_uq.presentation.figures.diagnostics import plot_diagnosis, plot_residual_profiles
@@ -20,6 +21,8 @@ AFTER_CALIBRATION = ("residuals", "residual_profiles", "convergence")
 AFTER_SAMPLING = ("corner", "prior_posterior", "correlation", "price_of_coupling", "distortion_curve")
 AFTER_DIAGNOSIS = ("misfit", "attitude", "field_map")
 AFTER_BUDGET = ("budget",)
+# The frames of a run from images stand among the figures by this name: a piece of a page, not a picture.
+GALLERY = "gallery"
 FIGURES = (*AFTER_CALIBRATION, *AFTER_SAMPLING, *AFTER_DIAGNOSIS, *AFTER_BUDGET)
 
 
@@ -27,6 +30,13 @@ def draw_figures(results: Results, names: Collection[str] = FIGURES) -> dict[str
     """The figures of these names that the results allow, as PNG."""
     figures = ((name, _figure(results, name)) for name in names)
     return {name: png_bytes(figure) for name, figure in figures if figure is not None}
+
+
+def draw_gallery(frames: Frames) -> dict[str, bytes]:
+    """The frames of a run, with their stars."""
+    from starcal_uq.presentation.pages.gallery import gallery
+
+    return {GALLERY: gallery(frames).encode()}
 
 
 def _figure(results: Results, name: str) -> Any:
@@ -77,6 +87,10 @@ class Ahead:
     def draw(self, results: Results, names: Collection[str]) -> None:
         """Begin to draw the figures of these names, as far as the results allow them."""
         self._beside.call(draw_figures, results, names)
+
+    def draw_frames(self, frames: Frames) -> None:
+        """Begin to draw the frames that the report shows."""
+        self._beside.call(draw_gallery, frames)
 
     def figures(self) -> dict[str, bytes]:
         """What was drawn, by name; a figure that was drawn twice as it was drawn last."""

@@ -27,7 +27,7 @@ from starcal_uq.presentation.words.propagation import (
 _MARKS = {Level.PASS: "✓", Level.WARN: "!", Level.FAIL: "✗"}
 
 
-def render(results: Results, figures: Mapping[str, bytes]) -> str:
+def render(results: Results, figures: Mapping[str, bytes], gallery: str = "") -> str:
     """The report as one HTML document.
 
     Parameters
@@ -36,8 +36,11 @@ def render(results: Results, figures: Mapping[str, bytes]) -> str:
         What to report.
     figures
         PNG images by the names of `starcal_uq.presentation.report.drawing.draw_figures`; a missing one is left out.
+    gallery
+        The frames of a run from images, as a piece of a page.
     """
-    return template_environment().get_template("report.html.j2").render(context(results, figures)) + "\n"
+    filled = context(results, figures) | {"gallery": gallery}
+    return template_environment().get_template("report.html.j2").render(filled) + "\n"
 
 
 def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:

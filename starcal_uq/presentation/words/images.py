@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import dataclass
+from shlex import quote
 
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.core.formatting import plural
+from starcal_uq.core.formatting import count, plural
 from starcal_uq.identification.result import STATUSES, FoundOptics, FrameStatus, Identification
 from starcal_uq.images.centroids import Centroids
+from starcal_uq.pipeline.inspection import IDENTIFIED, Frames, InspectedFrame
 from starcal_uq.pipeline.record import ImageRecord
 from starcal_uq.pipeline.refine import ImageCalibration, identified_pairs
 from starcal_uq.presentation.tables import TextTable
@@ -112,3 +115,69 @@ def image_record_text(record: ImageRecord) -> str:
     if record.n_disturbed:
         words += f" {plural(record.n_disturbed, 'star')} left out, because the light of a neighbour displaces them."
     return words + _MIRRORED if record.parity == "mirrored" else words
+
+
+def frames_text(frames: Frames) -> str:
+    """How many frames of how many, and what they are."""
+    n_run = frames.n_run or len(frames)
+    calibrated = sum(row.frame in frames.rms_px for row in frames.record.rows)
+    words = f"{plural(len(frames), 'frame')}"
+    if len(frames) < n_run:
+        words += f" of {count(n_run)}" if frames.large else f" of {count(n_run)}: some that failed, some that fit worst"
+        words += "" if frames.large else ", and others spread over the run"
+    return f"{words}; {calibrated} of them took part in the calibration."
+
+
+def frames_table(frames: Frames) -> TextTable:
+    """The first frames."""
+    return TextTable.of(frames.to_dataframe().head(MOST_FRAMES))
+
+
+def outcome_words(frame: InspectedFrame) -> str:
+    """What became of a frame, in a few words."""
+    if frame.n(IDENTIFIED):
+        return "calibrated"
+    return f"{frame.row.outcome}, not calibrated" if frame.row.outcome == "identified" else frame.row.outcome
+
+
+def frame_text(frame: InspectedFrame) -> str:
+    """A frame in one sentence."""
+    detections = plural(len(frame.detections), "detection")
+    words = f"Frame {frame.row.frame}, {frame.row.image}: {outcome_words(frame)}; {detections}"
+    if not frame.solved:
+        return f"{words}."
+    missed = f"{frame.n('missed')} of {plural(frame.n('expected'), 'expected star')} missed"
+    return f"{words}, {frame.n(IDENTIFIED)} identified, {missed}; rms {frame.rms_px:.3f} px per axis."
+
+
+@dataclass(frozen=True)
+class Step:
+    """What to do next about a frame, in words, and the command that does it."""
+
+    words: str
+    command: str
+
+
+def next_step(frame: InspectedFrame, run: str) -> Step | None:
+    """What to do about a frame without a part in the calibration; None for others."""
+    if frame.n(IDENTIFIED):
+        return None
+    image = quote(str(frame.path) if frame.path is not None else frame.row.image)
+    run = quote(run)
+    camera, outcome, number = f"{run}/camera.toml", frame.row.outcome, frame.row.frame
+    again = f"starcal-uq identify {run}/centroids.parquet {camera} -o found.csv --calibration {run}"
+    if outcome == "identified":
+        return Step("all of its stars were left out; look at them one by one.", f"starcal-uq inspect {run} {number}")
+    if outcome == "too few stars":
+        return Step(
+            "look for fainter stars, or expose longer.",
+            f"starcal-uq centroid {image} --camera {camera} -o stars.csv --threshold 3.5",
+        )
+    if outcome == "ambiguous":
+        return Step("identify it with what the other frames have told about the camera.", again)
+    if outcome in ("not identified", "not searched"):
+        return Step(
+            "if it shows stars and no clouds, trees or another field of view, search among fainter stars.",
+            f"{again} --max-mag 9",
+        )
+    return Step("hear the whole reason.", f"starcal-uq centroid {image} --camera {camera} -o stars.csv")

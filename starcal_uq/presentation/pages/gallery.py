@@ -1,0 +1,314 @@
+"""Frames with their stars: the image as a small picture, and marks of lines over it that stay sharp and can be read."""
+
+from __future__ import annotations
+
+import base64
+import io
+import os
+from collections.abc import Iterable
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from starcal_uq.core.errors import ImageError
+from starcal_uq.core.files import atomic_write_text
+from starcal_uq.core.formatting import MINUS, count, fixed, plural, significant
+from starcal_uq.core.provenance import installed_version
+from starcal_uq.pipeline.inspection import FAINTER, IDENTIFIED, LEFT_OUT, NOT_MATCHED, Frames, InspectedFrame
+from starcal_uq.presentation.html import template_environment
+from starcal_uq.presentation.words.images import frames_text, next_step, outcome_words
+from starcal_uq.sky.names import short_name
+
+if TYPE_CHECKING:
+    from markupsafe import Markup
+
+    from starcal_uq.camera.camera import Camera
+
+# Width of a picture: sharp on a telephone and half a desk, or on the whole of one.
+_WIDTH_PX, _LARGE_PX = 640, 1400
+_QUALITY = 45
+# Widths of the image that a typical residual's arrow is long.
+_ARROW = 0.02
+# So many marks of a kind have words of their own; beyond, they are one line.
+_TOLD = 400
+_NAMED = 4
+# A notebook shows at most so many frames.
+_NOTEBOOK = 24
+# Name in the page, kind, what it is.
+_LEGEND = (
+    ("i", IDENTIFIED, "identified: a star of the catalogue, calibrated"),
+    ("l", LEFT_OUT, "rejected: has a star, but was left out of the calibration"),
+    ("u", NOT_MATCHED, "rejected: detected, and not matched with a star"),
+    ("e", "expected", "expected: where the calibrated camera puts a star bright enough to be detected"),
+    ("m", "missed", "missed: expected, and not detected"),
+)
+
+
+def gallery(frames: Frames) -> str:
+    """The frames as a piece of a page, with its legend and style; it needs no script and no other file."""
+    shown = list(frames)
+    factor = _factor(frames)
+    context = {
+        "cards": [_card(frame, frames, factor) for frame in shown],
+        "legend": [(key, _symbol(key), words) for key, _, words in _LEGEND],
+        "intro": frames_text(frames),
+        "factor": count(round(factor)) if factor >= 1.0 else significant(factor),
+        "radius": significant(_radius(frames) / factor, 1),
+        "arrows": bool(len(frames.residuals_px)),
+        "command": frames.run,
+        "without": sum(frame.path is None for frame in shown),
+        "large": frames.large,
+        "partial": len(frames) < (frames.n_run or len(frames)),
+    }
+    return template_environment().get_template("gallery.html.j2").render(context)
+
+
+def frames_html(frames: Frames) -> str:
+    """The frames for a notebook: the gallery of those that tell most."""
+    return gallery(frames.telling(_NOTEBOOK))
+
+
+def write_frames(frames: Frames, to: str | os.PathLike[str]) -> Path:
+    """Write the frames as one HTML file."""
+    page = template_environment().get_template("frames.html.j2")
+    atomic_write_text(
+        to,
+        page.render(title=f"Frames of {Path(frames.run).name}", gallery=_markup(gallery(frames)), version=_version())
+        + "\n",
+    )
+    return Path(to)
+
+
+def picture(path: Path, width_px: int, camera: Camera, flat: bool = True) -> bytes:
+    """An image as astronomers look at it: limits by zscale, brightness by asinh, no wider than `width_px`; WebP.
+
+    Parameters
+    ----------
+    path : Path
+        The image.
+    width_px : int
+        Width of the picture, at most.
+    camera : Camera
+        Its detector has the size that the image must have.
+    flat : bool
+        Whether the background is taken out, so that stars show; clouds and the Moon then do not.
+
+    Raises
+    ------
+    ImageError
+        If it cannot be read or is of another size.
+    """
+    from astropy.visualization import AsinhStretch, ZScaleInterval
+    from PIL import Image
+
+    from starcal_uq.images.background import prepare_image
+    from starcal_uq.images.image import read_image
+
+    image = read_image(path, camera)
+    if flat:
+        sky = prepare_image(image, 1.0, None, None)[0].counts
+    else:
+        sky = image.data.astype(np.float32)
+        sky[~np.isfinite(sky)] = np.median(sky[np.isfinite(sky)]) if np.isfinite(sky).any() else 0.0
+    small = Image.fromarray(sky)
+    if small.width > width_px:
+        small = small.resize((width_px, max(1, round(small.height * width_px / small.width))), Image.Resampling.BOX)
+    sky = np.asarray(small)
+    low, high = ZScaleInterval(n_samples=4000).get_limits(sky)
+    # Zscale finds the sky; asinh then leaves stars, which are far brighter, their shapes.
+    floor, span, bend = (0.0, 5.0, 0.06) if flat else (low, 3.0, 0.05)
+    bright = AsinhStretch(bend)(np.clip((sky - floor) / max(span * (high - low), 1e-12), 0.0, 1.0))
+    out = io.BytesIO()
+    Image.fromarray((255.0 * bright).astype(np.uint8)).save(out, "WEBP", quality=_QUALITY, method=2)
+    return out.getvalue()
+
+
+def _card(frame: InspectedFrame, frames: Frames, factor: float) -> dict[str, Any]:
+    row = frame.row
+    counts = [(key, _symbol(key), kind, frame.n(kind)) for key, kind, _ in _LEGEND] if frame.solved else []
+    return {
+        "name": row.image,
+        "number": row.frame,
+        "badge": "pass" if frame.n(IDENTIFIED) else "warning",
+        "outcome": outcome_words(frame),
+        "svg": _markup(_drawing(frame, frames, factor)),
+        "facts": list(_facts(frame)),
+        "counts": counts,
+        "reasons": _reasons(frame),
+        "step": next_step(frame, frames.run),
+        "missing": "" if frame.path is not None else "The image is not where it was; its stars are drawn without it.",
+    }
+
+
+def _facts(frame: InspectedFrame) -> Iterable[tuple[str, str]]:
+    if frame.solved:
+        yield "RA", f"{fixed(frame.ra_deg, 4)}°"
+        yield "Dec", f"{'+' if frame.dec_deg >= 0 else MINUS}{fixed(abs(frame.dec_deg), 4)}°"
+        yield "Roll", f"{fixed(frame.roll_deg, 2)}°"
+    if frame.n(IDENTIFIED):
+        yield "Residual, rms", f"{significant(frame.rms_px)} px per axis"
+        yield "Stars", count(frame.n(IDENTIFIED))
+    else:
+        yield "Detections", count(len(frame.detections))
+    if np.isfinite(frame.limit_mag):
+        yield "Limit", f"G {'≥ ' if frame.at_least else ''}{fixed(frame.limit_mag, 1)}"
+    if np.isfinite(frame.seconds):
+        yield "Identified in" if frame.solved else "Searched for", f"{significant(frame.seconds)} s"
+    yield "Time", f"{frame.row.time_utc.replace('T', ' ')[:19]} UTC" if frame.row.time_utc else "not known"
+
+
+def _reasons(frame: InspectedFrame) -> str:
+    """Why detections were rejected, with their numbers."""
+    found = frame.detections.loc[frame.detections["reason"] != "", ["kind", "reason"]].value_counts()
+    parts = [f"{count(int(n))} {str(reason).replace('_', ' ')}" for (_, reason), n in found.items()]
+    return f"Rejected: {'; '.join(parts)}." if parts else ""
+
+
+def _factor(frames: Frames) -> float:
+    """How much residuals are enlarged: 1, 2 or 5 times a power of ten, for all frames alike."""
+    squares = frames.residuals_px**2
+    typical = float(np.sqrt(np.median(squares.sum(axis=1)))) if len(squares) else 0.0
+    wanted = _ARROW * frames.camera.width_px / max(typical, 1e-6)
+    power = 10.0 ** np.floor(np.log10(wanted))
+    return float(power * max(step for step in (1.0, 2.0, 5.0) if step * power <= wanted))
+
+
+def _radius(frames: Frames) -> float:
+    """Radius of a circle, px of the image."""
+    return frames.camera.width_px / (150.0 if frames.large else 90.0)
+
+
+def _drawing(frame: InspectedFrame, frames: Frames, factor: float) -> str:
+    """The picture with its marks, in px of the image."""
+    width, height = frame.width_px, frame.height_px
+    r = _radius(frames)
+    words = escape(f"{frame.row.image}: {outcome_words(frame)}, {_told(frame)}", quote=True)
+    parts = [
+        f'<svg viewBox="-0.5 -0.5 {width} {height}" role="img" aria-label="{words}" style="--u:{width / 100:g}px">',
+        f'<rect x="-0.5" y="-0.5" width="{width}" height="{height}" class="sky"/>',
+    ]
+    if frame.path is not None:
+        widest = _LARGE_PX if frames.large else _WIDTH_PX
+        try:
+            data = base64.b64encode(picture(frame.path, widest, frames.camera, flat=frame.solved))
+            parts.append(
+                f'<image x="-0.5" y="-0.5" width="{width}" height="{height}" preserveAspectRatio="none" '
+                f'href="data:image/webp;base64,{data.decode("ascii")}"/>'
+            )
+        except ImageError as error:
+            parts.append(f'<text x="{width / 2:g}" y="{height / 2:g}" class="middle">{escape(str(error))}</text>')
+    detections, stars = frame.detections, frame.stars
+    by_kind: dict[str, Any] = {kind: detections[detections["kind"] == kind] for _, kind, _ in _LEGEND[:3]}
+    by_kind |= {"expected": stars, "missed": stars[stars["missed"]]}
+    for key in ("e", "u", "l", "m", "i"):
+        kind = next(kind for letter, kind, _ in _LEGEND if letter == key)
+        parts.append(_marks(key, by_kind[kind], r))
+    parts.append(_arrows(by_kind[IDENTIFIED], factor))
+    parts.append(_names(by_kind[IDENTIFIED], r, width))
+    if frame.solved:
+        parts.append(_compass(frame, r))
+    return "".join([*parts, "</svg>"])
+
+
+def _told(frame: InspectedFrame) -> str:
+    if not frame.solved:
+        return plural(len(frame.detections), "detection")
+    return ", ".join(f"{count(frame.n(kind))} {kind}" for _, kind, _ in _LEGEND)
+
+
+def _shape(key: str, x: float, y: float, r: float) -> str:
+    """The path of a mark; each kind has a shape of its own, so that nothing rests on colour alone."""
+    if key == "i":
+        return f"M{x - r:.1f} {y:.1f}a{r:.1f} {r:.1f} 0 1 0 {2 * r:.1f} 0a{r:.1f} {r:.1f} 0 1 0 {-2 * r:.1f} 0"
+    if key == "l":
+        s = 0.8 * r
+        return f"M{x - s:.1f} {y - s:.1f}l{2 * s:.1f} {2 * s:.1f}m0 {-2 * s:.1f}l{-2 * s:.1f} {2 * s:.1f}"
+    if key == "u":
+        s = 0.6 * r
+        return f"M{x - s:.1f} {y - 0.6 * s:.1f}h{2 * s:.1f}l{-s:.1f} {1.7 * s:.1f}z"
+    if key == "e":
+        s = 0.4 * r
+        return f"M{x - s:.1f} {y:.1f}h{2 * s:.1f}M{x:.1f} {y - s:.1f}v{2 * s:.1f}"
+    return f"M{x - r:.1f} {y - r:.1f}h{2 * r:.1f}v{2 * r:.1f}h{-2 * r:.1f}z"
+
+
+def _symbol(key: str) -> Markup:
+    path = f'<path class="{key}" d="{_shape(key, 0.0, 0.0, 6.0)}"/>'
+    return _markup(f'<svg class="key" viewBox="-8 -8 16 16" aria-hidden="true">{path}</svg>')
+
+
+def _marks(key: str, table: Any, r: float) -> str:
+    """All marks of a kind; those that can be few have their words, which browsers show beside the pointer."""
+    # Stars that nobody has searched for do not need to catch the eye.
+    size = np.where(table["reason"] == FAINTER, 0.6 * r, r) if key == "u" else np.full(len(table), r)
+    paths = [_shape(key, x, y, s) for x, y, s in zip(table["x_px"], table["y_px"], size, strict=True)]
+    if not paths:
+        return ""
+    if key in "eu" or len(paths) > _TOLD:
+        return f'<path class="{key}" d="{"".join(paths)}"/>'
+    told = (
+        f"<path d={path!r}><title>{escape(_words(key, row))}</title></path>"
+        for path, row in zip(paths, table.itertuples(), strict=True)
+    )
+    return f'<g class="{key}">{"".join(told)}</g>'
+
+
+def _words(key: str, row: Any) -> str:
+    said = f"{row.star_id or 'star'}, G {row.mag:.2f}"
+    if key == "i":
+        return f"{said}, residual {row.dx_px:+.3f}, {row.dy_px:+.3f} px".replace("-", MINUS)
+    return f"{said}, {'missed' if key == 'm' else row.reason}"
+
+
+def _arrows(table: Any, factor: float) -> str:
+    """Residuals, enlarged, from the detections outwards."""
+    lines = []
+    for row in table.itertuples():
+        dx, dy = factor * row.dx_px, factor * row.dy_px
+        tip = f"M{row.x_px + dx:.1f} {row.y_px + dy:.1f}"
+        # The barbs point back, 20 degrees to either side.
+        barbs = ((-0.23 * dx + side * 0.085 * dy, -0.23 * dy - side * 0.085 * dx) for side in (1.0, -1.0))
+        head = "".join(f"{tip}l{bx:.1f} {by:.1f}" for bx, by in barbs)
+        lines.append(f"M{row.x_px:.1f} {row.y_px:.1f}l{dx:.1f} {dy:.1f}{head}")
+    return f'<path class="r" d="{"".join(lines)}"/>' if lines else ""
+
+
+def _names(table: Any, r: float, width: int) -> str:
+    """The brightest stars by name."""
+    texts = []
+    for row in table.nsmallest(_NAMED, "mag").itertuples() if len(table) else ():
+        left = row.x_px > 0.75 * width
+        x = row.x_px - 1.3 * r if left else row.x_px + 1.3 * r
+        anchor = ' text-anchor="end"' if left else ""
+        texts.append(
+            f'<text x="{x:.1f}" y="{row.y_px - r:.1f}"{anchor}>{escape(short_name(row.star_id, row.mag))}</text>'
+        )
+    return "".join(texts)
+
+
+def _compass(frame: InspectedFrame, r: float) -> str:
+    """North and east."""
+    length = 4.0 * r
+    x, y = frame.width_px - 2.4 * length, frame.height_px - 2.4 * length
+    north = np.radians(frame.north)
+    east = north + (-0.5 if frame.east_is_left else 0.5) * np.pi
+    parts = []
+    for name, angle in (("N", north), ("E", east)):
+        dx, dy = np.sin(angle), -np.cos(angle)
+        parts.append(f'<path class="c" d="M{x:.1f} {y:.1f}l{length * dx:.1f} {length * dy:.1f}"/>')
+        parts.append(
+            f'<text class="middle" x="{x + 1.5 * length * dx:.1f}" y="{y + 1.5 * length * dy + r:.1f}">{name}</text>'
+        )
+    return "".join(parts)
+
+
+def _markup(html: str) -> Markup:
+    from markupsafe import Markup
+
+    return Markup(html)
+
+
+def _version() -> str:
+    return installed_version("starcal-uq") or ""
