@@ -512,7 +512,8 @@ def _pair_sources(p: int) -> list[str]:
     """Sums over a frame or a chunk for the interstar angles; rows as `pair_sums` fills them."""
     db, r, e, d, bb, eb = 3, 3 + 3 * p, 6 + 3 * p, 9 + 3 * p, 12 + 3 * p, 18 + 3 * p
     profile: _Sums = [(f"profile[{i}, {k}]", [(i, 3 + k)]) for i in range(3) for k in range(3)]
-    sources = ["@njit(**ORDERED, **HELPER)\n" + _sums_source("pair_profile", "buf, j, end, profile", "j", "end", profile)]
+    sums = _sums_source("pair_profile", "buf, j, end, profile", "j", "end", profile)
+    sources = ["@njit(**ORDERED, **HELPER)\n" + sums]
     # B^T [dB], R'^T [R' E] and E^T [E] of a frame, from stars that hold [dB R' E] each: neighbours fill a register.
     width, first = _width(p), 3 * p
     for x in range(3):
@@ -658,7 +659,8 @@ def source(model_name: str) -> str:
         _star_source(backward_kernel(model_name, True), "backward_kernel", lambda o, n: 3 * o + n),
         _star_source(forward_kernel(model_name, "bent"), "bent_kernel", lambda o, n: bent[o] + n, "x, y, z"),
     ]
-    head = _HEAD.format(p=p, stride=_STRIDE, chunk=_CHUNK, rows=rows, explicit=explicit, width=_width(p), degenerate=DEGENERATE)
+    sizes = {"p": p, "stride": _STRIDE, "chunk": _CHUNK, "rows": rows, "width": _width(p)}
+    head = _HEAD.format(**sizes, explicit=explicit, degenerate=DEGENERATE)
     inlined = ["@njit(**INLINE)\n" + kernel for kernel in functions]
     parts = [head, *inlined, *_normal_sources(rows), *_pair_sources(p), _LOOPS, _PAIRS]
     parts += [*_expansion_sources(model_name, p), _GRAM]

@@ -174,9 +174,11 @@ def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> S
     offset = frames.pixel - theta[:2, None]
     direction = np.vstack([offset, np.full(frames.n_stars, f)])
     b = (direction / np.linalg.norm(direction, axis=0)).T
-    compiled = attitude_loop(frames, "none", theta[:3]) if kernels("none", frames.n_stars) == "numba" else None
-    sound = compiled is not None and compiled[1]
-    rotations = compiled[0] if sound else quest(b, frames.r.T, frames.starts, covariance=False).rotations
+    found = attitude_loop(frames, "none", theta[:3]) if kernels("none", frames.n_stars) == "numba" else None
+    if found is not None and found[1]:
+        rotations = found[0]
+    else:
+        rotations = quest(b, frames.r.T, frames.starts, covariance=False).rotations
     b = frames.rotated(rotations)
     ideal = f * b[:2] / b[2]
     # Every model is linear in its coefficients; forward models act on ideal points, inverse ones on measured points.
