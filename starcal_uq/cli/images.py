@@ -29,6 +29,7 @@ from starcal_uq.cli.options import (
 from starcal_uq.cli.settings import ImageSettings, SkySettings
 from starcal_uq.core.files import ensure_new, table_ending
 from starcal_uq.core.settings import EPOCH
+from starcal_uq.observations.files import WRITTEN
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -125,7 +126,7 @@ def identify_command(
     ],
     out: Annotated[
         Path,
-        typer.Option("-o", "--out", metavar="OBS", help="Table to write (.csv, .ecsv, .parquet).", parser=write_file),
+        typer.Option("-o", "--out", metavar="OBS", help=f"Table to write ({', '.join(WRITTEN)}).", parser=write_file),
     ],
     camera: OptionalCamera = None,
     max_mag: MaxMag = 7.0,
@@ -148,7 +149,7 @@ def identify_command(
     from starcal_uq.pipeline.images import epoch_of, of_one_size
     from starcal_uq.presentation.words.images import MOST_FRAMES, identification_table
 
-    table_ending(out)
+    table_ending(out, WRITTEN)
     ensure_new(out, force)
     table = sc.images.Centroids.load(centroids)
     nominal = None if camera is None else sc.Camera.load(camera)
@@ -171,7 +172,7 @@ def identify_command(
             progress=progress,
         )
     if found.n_identified:
-        found.observations.save(out, force=force)
+        found.observations.save(out, force=force, camera=nominal if known is None else known.camera)
     if json:
         print_json({"summary": found.text, "frames": records(found.to_dataframe())})
     else:

@@ -45,6 +45,7 @@ from starcal_uq.cli.settings import (
 )
 from starcal_uq.cli.steps import load_table, sample_run
 from starcal_uq.core.tasks import one_thread
+from starcal_uq.observations.files import READ
 
 if TYPE_CHECKING:
     from starcal_uq.observations.partitions import PartitionedObservations
@@ -123,7 +124,7 @@ def run_command(
         # A mistake in it should not show after the work.
         sc.budgeting.load_budget_file(budget)
     *given, last = inputs
-    table = last.suffix.lower() in (".csv", ".ecsv", ".parquet")
+    table = last.suffix.lower() in READ
     other = bool(given) and last.is_file() and not table and not are_images([last])
     inputs, camera = (given, last) if last.suffix.lower() == ".toml" or other else (inputs, None)
     if not inputs:
@@ -131,8 +132,8 @@ def run_command(
     folder = len(inputs) == 1 and inputs[0].is_dir() and any(inputs[0].glob("*.parquet"))
     from_images = not folder and are_images(inputs)
     refuse_others(from_images, sky, images)
-    if len(inputs) > 1 and not from_images:
-        raise typer.BadParameter(f"{inputs[1]} is no image: give one table of observations, or images only.")
+    if len(inputs) > 1 and not from_images and not all(path.suffix == ".corr" for path in inputs):
+        raise typer.BadParameter(f"{inputs[1]} is no image: give one table, .corr files only, or images only.")
     if camera is None and not from_images:
         raise typer.BadParameter("a table of stars needs the nominal camera (TOML) after it; only images do without.")
     aligning = {"alignment": alignment, "alignment_frames": alignment_frames}
@@ -163,7 +164,7 @@ def _calibrate(
     if from_images:
         obs, nominal, centroids, identified = load_images(inputs, camera, images, sky)
     elif camera is not None:
-        obs, nominal = load_table(inputs[0], camera, sky)
+        obs, nominal = load_table(inputs[0] if len(inputs) == 1 else inputs, camera, sky)
     with progress_bar("passes over the files") as progress:
         run.calibrate(obs, nominal, progress=progress, **estimation.options())
     if from_images:

@@ -75,21 +75,21 @@ def register(app: typer.Typer) -> None:
 
 
 def load_table(
-    path: Path, camera_path: Path, sky: SkySettings
+    path: Path | list[Path], camera_path: Path, sky: SkySettings
 ) -> tuple[Observations | PartitionedObservations, Camera]:
-    """Observations of a table, or of a folder of them, with the nominal camera; and what is worth telling."""
+    """Observations of a table, several, or a folder of them, with the nominal camera; and what is worth telling."""
     from starcal_uq.pipeline.tables import observations_from_table, partitions_from_folder
 
     known, camera = sky.options(), sc.Camera.load(camera_path)
-    obs: Observations | PartitionedObservations = (
-        partitions_from_folder if path.is_dir() else observations_from_table
-    )(
-        path,
-        camera,
-        columns=parse_columns(sky.column),
-        observer_velocity_km_s=parse_velocity(sky.observer_velocity),
-        **known,
-    )
+    known |= {
+        "columns": parse_columns(sky.column),
+        "observer_velocity_km_s": parse_velocity(sky.observer_velocity),
+    }
+    obs: Observations | PartitionedObservations
+    if isinstance(path, Path) and path.is_dir():
+        obs = partitions_from_folder(path, camera, **known)
+    else:
+        obs = observations_from_table(path, camera, **known)
     warn_undeclared(obs, camera)
     return obs, camera
 

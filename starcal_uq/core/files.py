@@ -377,11 +377,11 @@ def reading(path: PathLike, what: str, remedy: str, error: type[StarcalError] = 
 ENDINGS = (".csv", ".ecsv", ".parquet")
 
 
-def table_ending(path: Path) -> str:
+def table_ending(path: Path, endings: tuple[str, ...] = ENDINGS) -> str:
     """The ending of a table's file name, which decides on its format."""
     ending = path.suffix.lower()
-    if ending not in ENDINGS:
-        raise ObservationError(f"{path}: the ending {ending or '(none)'} is unknown; use {', '.join(ENDINGS)}.")
+    if ending not in endings:
+        raise ObservationError(f"{path}: the ending {ending or '(none)'} is unknown; use {', '.join(endings)}.")
     return ending
 
 

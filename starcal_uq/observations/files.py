@@ -1,4 +1,4 @@
-"""File formats of the observations table: CSV, ECSV and Parquet, as plain columns and metadata, in and out.
+"""File formats of the observations table, as plain columns and metadata, in and out.
 
 CSV and ECSV are read cell by cell with the line each row stands on, so that an error can name it.
 """
@@ -19,8 +19,10 @@ import numpy as np
 
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.files import (
+    ENDINGS,
     as_plain,
     atomic_path,
+    atomic_write_bytes,
     atomic_write_text,
     cell_content,
     cell_text,
@@ -41,6 +43,7 @@ from starcal_uq.observations.checks import (
     raise_problems,
 )
 from starcal_uq.observations.columns import COLUMNS
+from starcal_uq.observations.matches import corr_content, fits_content, read_fits, read_json
 
 if TYPE_CHECKING:
     from pyarrow.parquet import ParquetFile
@@ -48,6 +51,9 @@ if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
 
 _META_KEY = b"starcal_uq"
+# What is written, and what is read.
+WRITTEN = (*ENDINGS, ".fits", ".corr")
+READ = (*WRITTEN, ".json")
 
 
 @dataclass(frozen=True)
@@ -120,7 +126,7 @@ def read_table(
             f"{path}: is a directory; name a file of observations, or open a folder of partitions with "
             "sc.observations.open_partitions."
         )
-    ending = table_ending(path)
+    ending = table_ending(path, READ)
     names = {name: mapping.get(name, name) for name in COLUMNS}
     wanted, data = {names[name] for name in only}, _read_bytes(path)
     with reading(path, WHAT, REMEDY, ObservationError):
@@ -140,6 +146,10 @@ def read_table(
 def _read(path: Path, data: bytes, ending: str, wanted: set[str]) -> RawTable:
     if ending == ".parquet":
         return _read_parquet(path, data, wanted)
+    if ending in (".fits", ".corr", ".json"):
+        columns, meta = (read_json if ending == ".json" else read_fits)(path, data)
+        n = len(next(iter(columns.values()), ()))
+        return RawTable(columns, list(columns), np.arange(1, n + 1), "row", meta)
     return _read_text(path, data, ecsv=ending == ".ecsv")
 
 
@@ -441,14 +451,30 @@ def astropy_table(columns: Mapping[str, Any], meta: AnyDict) -> Any:
     return table
 
 
-def write_table(columns: Mapping[str, Any], meta: AnyDict, path: str | os.PathLike[str], force: bool) -> None:
+def write_table(
+    columns: Mapping[str, Any], meta: AnyDict, path: str | os.PathLike[str], force: bool, camera: Camera | None = None
+) -> None:
     """Write columns and metadata; see `starcal_uq.observations.table.Observations.save`."""
-    ending = table_ending(Path(path))
-    ensure_new(path, force)
+    ending = table_ending(Path(path), WRITTEN)
+    files = {Path(path): columns}
+    if ending == ".corr" and len(frames := np.unique(columns["frame"])) > 1:
+        # That format knows one frame.
+        rows = {int(frame): columns["frame"] == frame for frame in frames}
+        files = {
+            Path(path).with_name(f"{Path(path).stem}_{frame}.corr"): {name: v[own] for name, v in columns.items()}
+            for frame, own in rows.items()
+        }
+    for name in files:
+        ensure_new(name, force)
     if ending == ".csv":
         atomic_write_text(path, _csv_text(columns))
         return
     plain = json.loads(json.dumps(meta, default=as_plain))
+    if ending in (".fits", ".corr"):
+        for name, part in files.items():
+            content = fits_content(part, plain) if ending == ".fits" else corr_content(part, plain, camera)
+            atomic_write_bytes(name, content)
+        return
     with atomic_path(path) as temporary:
         if ending == ".ecsv":
             astropy_table(columns, plain).write(temporary, format="ascii.ecsv", delimiter=",")

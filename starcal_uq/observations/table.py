@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -219,10 +219,21 @@ class Observations(FrameRows, Shown):
         """The first `n` rows as a pandas DataFrame."""
         return self.to_dataframe().head(n)
 
-    def save(self, path: str | os.PathLike[str], force: bool = False) -> None:
-        """Write the table without loss of digits; the ending decides: ``.csv``, ``.ecsv`` or ``.parquet``.
+    def save(self, path: str | os.PathLike[str], force: bool = False, camera: Camera | None = None) -> None:
+        """Write the table without loss of digits; the ending decides what as.
 
-        ECSV and Parquet carry `meta`; CSV is plain, so that every spreadsheet opens it, and loses `meta`.
+        ECSV, Parquet and FITS (``.ecsv``, ``.parquet``, ``.fits``) carry `meta`; CSV is plain, so that every
+        spreadsheet opens it, and loses `meta`. A ``.corr`` file is astrometry.net's, with its pixels counted from
+        (1, 1): one for each frame, named after it (``night_3.corr``) where there are several.
+
+        Parameters
+        ----------
+        path
+            The file.
+        force
+            Whether a file may be replaced.
+        camera
+            For ``.corr``: says where each star was expected, ``index_x``, and which direction was seen, ``field_ra``.
 
         Raises
         ------
@@ -231,23 +242,59 @@ class Observations(FrameRows, Shown):
         RunFolderError
             If the file exists and `force` is false, or cannot be written.
         """
-        write_table(self.columns, self.meta, path, force)
+        write_table(self.columns, self.meta, path, force, camera)
+
+    @classmethod
+    def from_matches(
+        cls, solutions: Any, *, camera: Camera | None = None, times: Sequence[str] | None = None
+    ) -> Observations:
+        """Matches that tetra3, cedar-solve or tetra3rs found, one solution for each frame.
+
+        Parameters
+        ----------
+        solutions
+            A solution or a list of them, in which those that failed keep their frame number and have no rows. Of tetra3
+            and cedar-solve, what ``solve_from_centroids(..., return_matches=True)`` returned (rows before columns, from
+            the corner of the image); of tetra3rs a tuple (result, centroids, database).
+        camera
+            The size of its detector says where the middle of the image is, from which tetra3rs counts; by default what
+            the result says.
+        times
+            Middle of the exposure of each frame, UTC.
+
+        Raises
+        ------
+        ObservationError
+            If a solution was found and has no matches, or they are of another form.
+        """
+        from starcal_uq.observations.matches import matched_columns
+
+        size = None if camera is None else (camera.width_px, camera.height_px)
+        columns, meta = matched_columns(solutions, size, times)
+        obs = cls(**columns, meta=meta)
+        obs.check(camera)
+        return obs
 
     def __repr__(self) -> str:
         return f"Observations({self.n_stars} stars, {self.n_frames} frames; {', '.join(self.columns)})"
 
 
 def load_observations(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | Sequence[str | os.PathLike[str]],
     camera: Camera | None = None,
     columns: Mapping[str, str] | None = None,
 ) -> Observations:
-    """Read and check a table of observations (``.csv``, ``.ecsv`` or ``.parquet``).
+    """Read and check a table of observations.
+
+    It is one that `Observations.save` wrote (``.csv``, ``.ecsv``, ``.parquet``, ``.fits``), a ``.corr`` file of
+    astrometry.net, or matches of tetra3 or tetra3rs as JSON (see `Observations.from_matches`). ``index_id`` and
+    ``match_weight`` of astrometry.net are not used: the first counts stars within one of its indexes and names none.
 
     Parameters
     ----------
     path
-        The file. In CSV and ECSV, lines that start with ``#`` are comments.
+        The file, or several, whose frames are then numbered one after the other. In CSV and ECSV, lines that start with
+        ``#`` are comments.
     camera
         If given, every centroid must lie on its detector.
     columns
@@ -260,8 +307,20 @@ def load_observations(
         If the file cannot be read or a row is bad; the message names the first bad row and counts the
         others, and ``problems`` of the error lists them all.
     """
-    values, meta = read_table(path, camera, columns or {})
-    return Observations(**values, meta=meta)
+    if isinstance(path, str | os.PathLike):
+        values, meta = read_table(path, camera, columns or {})
+        return Observations(**values, meta=meta)
+    tables = [load_observations(one, camera, columns) for one in path]
+    if not tables:
+        raise ObservationError("observations: there is no file; give at least one.")
+    common = [name for name in tables[0].columns if all(name in table.columns for table in tables)]
+    first = np.cumsum([0, *(table.n_frames for table in tables)])
+    frames = [np.searchsorted(t.frame_ids, t.frame) + start for t, start in zip(tables, first, strict=False)]
+    joined: AnyDict = {name: np.concatenate([table.columns[name] for table in tables]) for name in common}
+    kinds = {str(table.meta["directions"]) for table in tables}
+    meta = {**tables[0].meta, "source": [str(one) for one in path]}
+    meta["directions"] = kinds.pop() if len(kinds) == 1 else "undeclared"
+    return Observations(**{**joined, "frame": np.concatenate(frames)}, meta=meta)
 
 
 def _array(name: str, values: Any) -> Any:

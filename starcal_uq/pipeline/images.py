@@ -14,6 +14,7 @@ from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.times import julian_year, utc_text
 from starcal_uq.estimation.noise_floor import settle_noise
+from starcal_uq.observations.matches import is_fits_table
 from starcal_uq.sky.apparent import catalogue_directions, make_apparent, without_low_stars
 from starcal_uq.sky.site import check_sky
 
@@ -41,6 +42,8 @@ def are_images(paths: Sequence[Path]) -> bool:
 
     def is_image(path: Path) -> bool:
         name = path.name.lower()
+        if name.endswith(".fits") and is_fits_table(path):
+            return False
         return name.endswith(IMAGE_ENDINGS) or (path.is_dir() and not name.endswith((".csv", ".ecsv", ".parquet")))
 
     return any(is_image(path) for path in paths)

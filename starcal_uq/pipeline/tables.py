@@ -23,7 +23,7 @@ DIRECTIONS = get_args(Directions)
 
 
 def observations_from_table(
-    path: Path,
+    path: Path | Sequence[Path],
     camera: Camera,
     *,
     columns: Mapping[str, str] | None = None,
@@ -36,8 +36,8 @@ def observations_from_table(
 
     Parameters
     ----------
-    path : Path
-        CSV, ECSV or Parquet.
+    path : Path, or several
+        As `load_observations` reads them.
     camera : Camera
         Its detector bounds the pixels.
     columns : mapping, optional
@@ -61,6 +61,7 @@ def observations_from_table(
         For a site together with directions that need none.
     """
     obs = load_observations(path, camera=camera, columns=columns)
+    path = path if isinstance(path, Path) else path[0]
     return _apparent(obs, path, directions, observer_velocity_km_s, site, in_space)
 
 

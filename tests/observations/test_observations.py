@@ -561,7 +561,7 @@ def test_missing_columns(tmp_path):
         ("binary.parquet", b"frame,x_px\n1,2\n", "is not a readable table"),
         ("plain.ecsv", b"frame,x_px\n1,2\n", "line 1: '# %ECSV 1.0' is missing"),
         ("yaml.ecsv", b"# %ECSV 1.0\n# ---\n# a: [\nframe\n1\n", "the ECSV header is not valid YAML"),
-        ("obs.xlsx", b"PK", "the ending .xlsx is unknown; use .csv, .ecsv, .parquet."),
+        ("obs.xlsx", b"PK", "the ending .xlsx is unknown; use .csv, .ecsv, .parquet, .fits, .corr, .json."),
         ("obs", b"frame", "the ending (none) is unknown"),
     ],
 )
@@ -616,7 +616,7 @@ def test_failed_save_leaves_the_old_file_and_nothing_else(tmp_path, ending, monk
 
 
 def test_save_needs_a_known_ending(tmp_path):
-    with pytest.raises(ObservationError, match=r"the ending \.txt is unknown; use \.csv, \.ecsv, \.parquet\."):
+    with pytest.raises(ObservationError, match=r"the ending \.txt is unknown; use .*\.fits, \.corr\."):
         random_table().save(tmp_path / "obs.txt")
     assert list(tmp_path.iterdir()) == []
 
