@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -27,7 +28,7 @@ from starcal_uq.cli.options import (
     write_file,
 )
 from starcal_uq.cli.settings import ImageSettings, SkySettings
-from starcal_uq.core.files import ensure_new, table_ending
+from starcal_uq.core.files import UNFINISHED, ensure_new, table_ending
 from starcal_uq.core.settings import EPOCH
 from starcal_uq.observations.files import WRITTEN
 
@@ -85,7 +86,10 @@ def centroid_command(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Find the stars in images, with a covariance for each; a frame that cannot be used is named and left out."""
+    """Find the stars in images, with a covariance for each; a frame that cannot be used is named and left out.
+
+    An interrupted command over a hundred images or more goes on.
+    """
     from starcal_uq.core.times import utc_text
     from starcal_uq.pipeline.images import counted, with_time
 
@@ -94,6 +98,7 @@ def centroid_command(
     if time is not None:
         time = utc_text(time)
     sensor = None if camera is None else sc.Camera.load(camera)
+    keep = out.with_name(f".{out.name}{UNFINISHED}")
     with progress_bar("images") as progress:
         found = sc.images.extract_centroids(
             images,
@@ -108,9 +113,11 @@ def centroid_command(
             bayer=bayer,
             workers=workers,
             progress=progress,
+            keep=keep,
         )
     found = with_time(found, time)
     found.save(out, force=force)
+    shutil.rmtree(keep, ignore_errors=True)
     if json:
         print_json({"summary": found.text, "frames": records(found.frames_dataframe())})
     else:
@@ -231,9 +238,9 @@ def inspect_command(
 
 
 def load_images(
-    images: list[Path], camera_path: Path | None, settings: ImageSettings, sky: SkySettings
+    images: list[Path], camera_path: Path | None, settings: ImageSettings, sky: SkySettings, keep: Path
 ) -> tuple[Observations, Camera, Centroids, ImageCalibration]:
-    """Observations of images with the nominal camera, and what is worth telling on the way."""
+    """Observations of images with the nominal camera, and what is worth telling; `keep` is a folder to go on from."""
     from starcal_uq.pipeline.images import observations_from_images
 
     known, camera = sky.options(), None if camera_path is None else sc.Camera.load(camera_path)
@@ -251,6 +258,7 @@ def load_images(
             workers=None,
             tell=lambda message: err.print(message, style=_style(message), highlight=False, soft_wrap=True),
             progress=progress,
+            keep=keep,
             **known,
         )
     _say_epoch(centroids, settings.epoch)

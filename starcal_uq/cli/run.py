@@ -44,6 +44,7 @@ from starcal_uq.cli.settings import (
     unfolded,
 )
 from starcal_uq.cli.steps import load_table, sample_run
+from starcal_uq.core.store import finished
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.observations.files import READ
 
@@ -162,13 +163,14 @@ def _calibrate(
     """From the inputs to a calibration, with a bar."""
     obs: Observations | PartitionedObservations
     if from_images:
-        obs, nominal, centroids, identified = load_images(inputs, camera, images, sky)
+        obs, nominal, centroids, identified = load_images(inputs, camera, images, sky, run.folder.path)
     elif camera is not None:
         obs, nominal = load_table(inputs[0] if len(inputs) == 1 else inputs, camera, sky)
     with progress_bar("passes over the files") as progress:
         run.calibrate(obs, nominal, progress=progress, **estimation.options())
     if from_images:
         run.keep_images(centroids, identified, inputs)
+        finished(run.folder.path)
     if run.screening is not None:
         show_screening(run.screening)
 

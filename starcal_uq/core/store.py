@@ -152,6 +152,8 @@ class Kept:
         if kind == "array":
             dtype, shape, data = content
             return np.frombuffer(base64.b64decode(data), dtype=np.dtype(dtype)).reshape(shape).copy()
+        if kind == "bytes":
+            return base64.b64decode(content)
         if kind == "dict":
             return {self._value(key): self._value(value) for key, value in content}
         items = [self._value(item) for item in content]
@@ -164,6 +166,8 @@ def _plain(value: Any) -> Any:
         return {"array": [value.dtype.str, value.shape, base64.b64encode(value.tobytes()).decode()]}
     if isinstance(value, np.generic):
         return value.item()
+    if isinstance(value, bytes):
+        return {"bytes": base64.b64encode(value).decode()}
     if isinstance(value, dict):
         return {"dict": [[_plain(key), _plain(item)] for key, item in value.items()]}
     if is_dataclass(value):

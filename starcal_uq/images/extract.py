@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,6 +17,7 @@ import numpy as np
 from starcal_uq.core.errors import ImageError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.settings import Bayer, bounded
+from starcal_uq.core.store import Kept
 from starcal_uq.core.tasks import Progress, processors, run_tasks
 from starcal_uq.core.types import AnyDict
 from starcal_uq.images.centroids import COLUMNS, FRAME_COLUMNS, Centroids
@@ -57,6 +58,7 @@ def extract_centroids(
     bayer: Bayer | None = None,
     workers: int | None = 0,
     progress: Progress | None = None,
+    keep: str | os.PathLike[str] | None = None,
 ) -> Centroids:
     """Find the stars in images and measure their positions with covariances.
 
@@ -98,6 +100,9 @@ def extract_centroids(
         processors from a hundred images on; fewer are measured before a process has started.
     progress
         Called with (files done, files in all).
+    keep
+        Folder in which the stars of a hundred files and more are kept as they are measured; a later call with the same
+        files and options goes on from them (`starcal_uq.core.store.finished` removes them).
 
     Returns
     -------
@@ -124,6 +129,9 @@ def extract_centroids(
     task = _Measure(sources, camera, options, bayer)
     if workers is None:
         workers = processors() if len(sources) >= _WORTH_PROCESSES else 0
+    kept = None
+    if keep is not None and len(sources) >= _WORTH_PROCESSES:
+        kept = Kept(keep, ["centroids", _files(sources), camera, options, bayer], (_Frame, FrameStars))
     table = _Table(messages=messages)
     frames, interrupted = run_tasks(
         task,
@@ -132,12 +140,26 @@ def extract_centroids(
         chunk=_CHUNK,
         workers=workers,
         progress=progress,
+        kept=kept,
     )
     if interrupted:
         raise KeyboardInterrupt
     for found in frames:
         table.add(found)
     return table.centroids(options, correct_pixel_phase)
+
+
+def _files(sources: Sequence[Source]) -> list[list[str | int]]:
+    """What tells images from others: names, sizes and times of files; hashes of arrays."""
+    found: list[list[str | int]] = []
+    for source in sources:
+        if isinstance(source, Image):
+            found.append([source.name, hashlib.sha256(source.data.tobytes()).hexdigest()])
+            continue
+        path = os.path.abspath(source)
+        state = os.stat(path) if os.path.exists(path) else None
+        found.append([path] if state is None else [path, state.st_size, state.st_mtime_ns])
+    return found
 
 
 @dataclass(frozen=True)

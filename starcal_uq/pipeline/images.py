@@ -94,6 +94,7 @@ def observations_from_images(
     workers: int | None = 0,
     tell: Callable[[str], None] | None = None,
     progress: Progress | None = None,
+    keep: Path | None = None,
 ) -> tuple[Observations, Centroids, ImageCalibration]:
     """Find, identify and calibrate with the nominal camera, then identify again with what was learnt.
 
@@ -131,6 +132,8 @@ def observations_from_images(
         Gets what a user should know of the images, one sentence each, before anything is made of them.
     progress : callable, optional
         Called with (images done, images in all).
+    keep : path, optional
+        Folder in which stars are kept as they are measured, as in `extract_centroids`.
 
     Raises
     ------
@@ -157,6 +160,7 @@ def observations_from_images(
         bayer=bayer,
         workers=workers,
         progress=progress,
+        keep=keep,
     )
     centroids = with_time(centroids, time_utc)
     if camera is None:

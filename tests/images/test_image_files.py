@@ -20,7 +20,8 @@ from scipy.special import ndtr
 
 from starcal_uq.core import files
 from starcal_uq.core.errors import ImageError
-from starcal_uq.images.extract import extract_centroids
+from starcal_uq.images.centroids import COLUMNS, FRAME_COLUMNS
+from starcal_uq.images.extract import _Measure, extract_centroids
 from starcal_uq.images.image import Image, read_image, read_images
 
 
@@ -297,13 +298,47 @@ def test_a_gain_without_a_unit_is_not_believed_and_a_mosaic_is_named(tmp_path):
     assert made(card("GAIN", 120), card("EGAIN", 0.8)).gain_e_per_count == 0.8
 
 
-def test_centroids_do_not_depend_on_the_number_of_processes(tmp_path):
+def eighteen(folder):
+    """Images of a star each, one of them damaged."""
     rng = np.random.default_rng(4)
     for k in range(18):
         counts = rng.normal(100.0, 3.0, (40, 48))
         counts[5 + k, 20:22] += 200.0
-        PIL.Image.fromarray(counts.astype(np.uint16)).save(tmp_path / f"{k:02d}.png")
-    (tmp_path / "07.png").write_bytes(b"cut off")
+        PIL.Image.fromarray(counts.astype(np.uint16)).save(folder / f"{k:02d}.png")
+    (folder / "07.png").write_bytes(b"cut off")
+
+
+def test_interrupted_centroids_go_on_bit_for_bit(tmp_path, monkeypatch):
+    (tmp_path / "img").mkdir()
+    eighteen(tmp_path / "img")
+    monkeypatch.setattr("starcal_uq.images.extract._WORTH_PROCESSES", 18)
+    measured = []
+    measure = _Measure.__call__
+    monkeypatch.setattr(_Measure, "__call__", lambda task, number: measured.append(number) or measure(task, number))
+    whole = extract_centroids(tmp_path / "img", workers=0)
+    measured.clear()
+
+    def stop(done, _total):
+        if done == 11:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        extract_centroids(tmp_path / "img", workers=0, keep=tmp_path, progress=stop)
+    found = extract_centroids(tmp_path / "img", workers=0, keep=tmp_path)
+    assert measured == list(range(18))
+    for name in (*COLUMNS, *FRAME_COLUMNS):
+        one, other = getattr(found, name), getattr(whole, name)
+        assert (one.tobytes(), one.dtype) == (other.tobytes(), other.dtype), name
+    assert (found.messages, found.meta) == (whole.messages, whole.meta)
+    # Other options, or another file, start again.
+    extract_centroids(tmp_path / "img", workers=0, keep=tmp_path, threshold_sigma=6.0)
+    (tmp_path / "img" / "07.png").write_bytes(b"cut")
+    extract_centroids(tmp_path / "img", workers=0, keep=tmp_path)
+    assert len(measured) == 3 * 18
+
+
+def test_centroids_do_not_depend_on_the_number_of_processes(tmp_path):
+    eighteen(tmp_path)
     done = []
     one, two = (
         extract_centroids(tmp_path, workers=workers, progress=lambda n, of: done.append((n, of))) for workers in (0, 2)
