@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import Annotated, Any, get_args
 
 import typer
@@ -11,9 +12,11 @@ from starcal_uq.cli import images as cli_images
 from starcal_uq.cli import mission as cli_mission
 from starcal_uq.cli import paper as cli_paper
 from starcal_uq.cli import run as cli_run
+from starcal_uq.cli import starters as cli_starters
 from starcal_uq.cli import statistics as cli_statistics
 from starcal_uq.cli import steps as cli_steps
 from starcal_uq.cli import study as cli_study
+from starcal_uq.cli.settings import unfolded
 from starcal_uq.core.files import shown
 from starcal_uq.core.settings import wanted
 from starcal_uq.core.types import AnyDict
@@ -22,7 +25,6 @@ app = typer.Typer(
     name="starcal-uq",
     help="Probabilistic calibration of star sensors: from identified stars to a posterior and its attitude error.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="markdown",
     epilog="Start with `starcal-uq demo`: the experiment of Ye & Yang 2017, from a star catalogue to a report.",
@@ -46,8 +48,39 @@ def common(
     """Probabilistic calibration of star sensors: from identified stars to a posterior and its attitude error."""
 
 
-for module in (cli_run, cli_steps, cli_mission, cli_study, cli_images, cli_filter, cli_statistics, cli_paper):
-    module.register(app)
+# What one wants -> the commands, in the order of the help.
+GROUPS: Mapping[str, list[Callable[..., None]]] = {
+    "All at once": [cli_run.demo, cli_run.run_command],
+    "Before there are data": [
+        cli_starters.new_command,
+        cli_mission.plan_command,
+        cli_steps.simulate_command,
+        cli_study.study_command,
+        cli_statistics.validate_command,
+    ],
+    "From images to stars": [cli_images.centroid_command, cli_images.identify_command],
+    "A run, step by step": [
+        cli_steps.calibrate_command,
+        cli_steps.sample_command,
+        cli_steps.coupling_command,
+        cli_steps.propagate_command,
+        cli_statistics.diagnose_command,
+        cli_mission.budget_command,
+        cli_steps.report_command,
+        cli_images.inspect_command,
+        cli_steps.export_command,
+    ],
+    "Several runs, and streams": [
+        cli_mission.compare_command,
+        cli_statistics.merge_command,
+        cli_filter.filter_command,
+    ],
+    "The paper": [cli_paper.reproduce_command, cli_paper.reproduce_field_command],
+}
+for group, commands in GROUPS.items():
+    for command in commands:
+        name = command.__name__.removesuffix("_command").replace("_", "-")
+        app.command(name, rich_help_panel=group)(unfolded(command))
 
 
 def usage_sentence(error: Exception) -> str:

@@ -27,11 +27,6 @@ _FORGETTING = Limit(1e-9, 1.0, whole=False)
 _WALK_PX = Limit(0.0, 1e6, whole=False)
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the command line."""
-    app.command("filter")(filter_command)
-
-
 def filter_command(
     observations: Annotated[
         Path,

@@ -39,13 +39,6 @@ if TYPE_CHECKING:
     from starcal_uq.pipeline.refine import ImageCalibration
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    app.command("centroid")(centroid_command)
-    app.command("identify")(identify_command)
-    app.command("inspect")(inspect_command)
-
-
 def centroid_command(
     images: Annotated[
         list[Path],

@@ -51,13 +51,6 @@ _ARCSEC = Limit(1e-9, 1e6, whole=False)
 _PERCENT = Limit(-30.0, 30.0, whole=False)
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    app.command("budget")(budget_command)
-    app.command("compare")(compare_command)
-    app.command("plan")(plan_command)
-
-
 def check_output(out: Path | None, command: str, force: bool) -> None:
     """Refuse a folder that holds something, and one of another command's results even with `force`."""
     if out is not None:

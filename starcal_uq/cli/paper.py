@@ -21,12 +21,6 @@ Out = Annotated[
 ]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    app.command("reproduce")(reproduce_command)
-    app.command("reproduce-field")(field_command)
-
-
 def reproduce_command(
     out: Out,
     replicates: Annotated[
@@ -69,7 +63,7 @@ def reproduce_command(
         print(f"Report: {found.report.resolve()}")
 
 
-def field_command(
+def reproduce_field_command(
     out: Out,
     frames: Annotated[int, number("n_frames", "Frames identified and solved; as many calibrate.", least=20)] = 200,
     reading: Annotated[

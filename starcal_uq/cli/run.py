@@ -41,7 +41,6 @@ from starcal_uq.cli.settings import (
     SkySettings,
     command_of,
     refuse_others,
-    unfolded,
 )
 from starcal_uq.cli.steps import load_table, sample_run
 from starcal_uq.core.store import finished
@@ -53,12 +52,6 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
     from starcal_uq.presentation.report.drawing import Ahead
     from starcal_uq.runs.run import Run
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    app.command("demo")(demo)
-    app.command("run")(unfolded(run_command))
 
 
 def demo(

@@ -30,13 +30,6 @@ from starcal_uq.core.files import atomic_write_bytes, write_csv
 from starcal_uq.core.manifest import making
 
 
-def register(app: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    app.command("validate")(validate_command)
-    app.command("diagnose")(diagnose_command)
-    app.command("merge")(merge_command)
-
-
 def validate_command(
     camera: CameraFile,
     out: Annotated[

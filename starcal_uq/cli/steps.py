@@ -50,7 +50,7 @@ from starcal_uq.cli.options import (
     read_path,
     write_path,
 )
-from starcal_uq.cli.settings import EstimationSettings, SamplingSettings, SkySettings, unfolded
+from starcal_uq.cli.settings import EstimationSettings, SamplingSettings, SkySettings
 from starcal_uq.core import settings
 from starcal_uq.core.files import check_new_folder, ensure_new, table_ending
 from starcal_uq.core.settings import EPOCH
@@ -61,17 +61,6 @@ if TYPE_CHECKING:
     from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
     from starcal_uq.runs.run import Run
-
-
-def register(app: typer.Typer) -> None:
-    """Add the commands to the command line."""
-    app.command("simulate")(simulate_command)
-    app.command("calibrate")(unfolded(calibrate_command))
-    app.command("sample")(unfolded(sample_command))
-    app.command("coupling")(coupling_command)
-    app.command("propagate")(propagate_command)
-    app.command("report")(report_command)
-    app.command("export")(export_command)
 
 
 def load_table(

@@ -14,11 +14,6 @@ from starcal_uq.cli.options import Force, Json, SchedulerAddress, number, write_
 from starcal_uq.core import settings
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command to the command line."""
-    app.command("study")(study_command)
-
-
 def study_command(
     file: Annotated[
         Path,

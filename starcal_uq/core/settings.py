@@ -44,6 +44,7 @@ Truth = Literal["fixed", "prior"]
 StudyTemplate = Literal["fov-distortion", "frames-stars", "magnitude-noise", "distortion-models"]
 Convention = Literal["eq14", "eq6"]
 FieldReading = Literal["window", "full"]
+Starter = Literal["camera", "site", "budget", "study"]
 ExportFormat = Literal[
     "opencv",
     "ros",

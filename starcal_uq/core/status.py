@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
@@ -95,6 +96,11 @@ class Check:
     bound: str
     sentence: str
     remedy: str = ""
+
+    @property
+    def key(self) -> str:
+        """The name as files have it: small letters, digits and underscores."""
+        return re.sub(r"[^a-z0-9]+", "_", self.name.lower()).strip("_")
 
     @property
     def phrase(self) -> str:

@@ -114,6 +114,8 @@ class RunFolder:
         Tests for misfit, jackknife, comparison of models (JSON).
     rejected : Path
         Rows that screening left out, with their reasons (CSV).
+    verdict : Path
+        Every check with value, bound, level and remedy (JSON).
     figures : Path
         Folder of the figures.
     report : Path
@@ -139,6 +141,7 @@ class RunFolder:
     budget = _File("budget.csv", "starcal-uq budget RUN")
     diagnosis = _File("diagnosis.json", "starcal-uq diagnose RUN")
     rejected = _File("rejected.csv", f"{_CALIBRATE} --screen")
+    verdict = _File("verdict.json", "starcal-uq report RUN")
     figures = _File("figures", "starcal-uq report RUN")
     report = _File("report.html", "starcal-uq report RUN")
     inspection = _File("frames.html", "starcal-uq inspect RUN")

@@ -26,6 +26,7 @@ from starcal_uq.core.files import (
     write_csv,
 )
 from starcal_uq.core.provenance import provenance
+from starcal_uq.core.records import write_json
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import Progress
 from starcal_uq.estimation.calibration import Calibration
@@ -815,6 +816,7 @@ class Run:
                 new_folder(files.figures)
                 for name, png in figures.items():
                     atomic_write_bytes(files.figures / f"{name}.png", png)
+                write_json(self.verdict.to_dict(), files.verdict)
                 atomic_write_text(files.report, page)
         return self.path / RunFolder.report
 

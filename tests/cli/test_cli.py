@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import sys
+from typing import get_args
 
 import numpy as np
 import pytest
 
 import starcal_uq as sc
+from starcal_uq.core.settings import Starter
+from starcal_uq.studies.definition import StudyDefinition
 from tests.helpers.commands import SMALL, files
 from tests.helpers.scenes import observations
 
@@ -26,6 +32,11 @@ def test_run_writes_everything_and_prints_the_tables(painting_cli, inputs, tmp_p
     assert "http://" not in page.replace("http://www.w3.org", "")
     for name in ("corner", "residuals"):
         assert (run.figures / f"{name}.png").stat().st_size > 20_000, "figures are painted"
+    # The same verdict for programs.
+    verdict = json.loads(run.verdict.read_text())
+    assert verdict["headline"] in out
+    assert [check["name"] for check in verdict["checks"]] == [c.name for c in sc.Run(run.path).verdict.checks]
+    assert all(check["remedy"] or check["level"] == "pass" for check in verdict["checks"])
     # The same seed repeats the posterior bit for bit, step by step too.
     painting_cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "again")
     painting_cli("sample", "again", *SMALL)
@@ -293,3 +304,31 @@ def test_folder_of_partitions_from_simulation_to_posterior(cli, inputs):
     ):
         status, _, err = cli(*arguments)
         assert status == 2 and words in err, err
+
+
+@pytest.mark.parametrize("what", get_args(Starter))
+def test_a_starter_file_is_read_as_it_is(what, cli, tmp_path):
+    status, out, _ = cli("new", what)
+    assert status == 0
+    assert f"{what}.toml" in out
+    assert "#" in (tmp_path / f"{what}.toml").read_text()
+    load = {
+        "camera": sc.Camera.load,
+        "site": sc.sky.Site.load,
+        "budget": sc.budgeting.load_budget_file,
+        "study": StudyDefinition.load,
+    }[what]
+    load(tmp_path / f"{what}.toml")
+    status, _, err = cli("new", what)
+    assert status == 2
+    assert "exists already" in err
+
+
+def test_python_runs_the_package_and_shells_complete_its_commands():
+    command = [sys.executable, "-m", "starcal_uq"]
+    told = subprocess.run([*command, "--version"], capture_output=True, text=True, check=True)
+    assert told.stdout.startswith("starcal-uq ")
+    words = {"_STARCAL_UQ_COMPLETE": "complete_bash", "COMP_WORDS": "starcal-uq cal", "COMP_CWORD": "1"}
+    code = "import sys; sys.argv = ['starcal-uq']; from starcal_uq.cli.app import program; program()"
+    told = subprocess.run([sys.executable, "-c", code], env={**os.environ, **words}, capture_output=True, text=True)
+    assert told.stdout.split() == ["calibrate"]

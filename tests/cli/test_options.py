@@ -27,6 +27,7 @@ VALID = {
     "coupling": "RUN",
     "propagate": "RUN",
     "report": "RUN",
+    "new": "camera -o NEW.toml",
     "export": "RUN --to covariance",
     "budget": "RUN",
     "compare": "RUN RUN",

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.status import Check, Level, Question, worst
+from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.verdict import draws, estimate, observed
 from starcal_uq.estimation.noise_model import weighed
 
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import Observations
     from starcal_uq.propagation.attitude_error import AttitudeError
+
+FORMAT = "starcal_uq verdict 1"
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,16 @@ class Verdict:
     def level(self) -> Level:
         """The worst outcome."""
         return worst(self.checks)
+
+    def to_dict(self) -> AnyDict:
+        """The verdict as ``verdict.json`` holds it; `FORMAT` changes when the meaning of a key does."""
+        kept = ("key", "name", "value", "bound", "sentence", "remedy")
+        checks = [
+            {name: getattr(check, name) for name in kept}
+            | {"level": check.level.value, "question": check.question.name.lower()}
+            for check in self.checks
+        ]
+        return {"format": FORMAT, "level": self.level.value, "headline": self.headline, "checks": checks}
 
     def of(self, question: Question) -> tuple[Check, ...]:
         """The checks that answer one question."""

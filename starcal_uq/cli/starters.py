@@ -1,0 +1,38 @@
+"""Starter files: one with comments for each file that people write."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import starcal_uq as sc
+from starcal_uq.cli.options import Force, write_file
+from starcal_uq.core import settings
+
+
+def new_command(
+    what: Annotated[settings.Starter, typer.Argument(metavar="camera|site|budget|study", help="Kind of file.")],
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", metavar="TOML", help="File to write; WHAT.toml by default.", parser=write_file),
+    ] = None,
+    force: Force = False,
+) -> None:
+    """Write a starter file with comments for a camera, a site, an error budget or a coupling study."""
+    path = Path(f"{what}.toml") if out is None else out
+    if what == "camera":
+        sc.paper.paper_start().replace(name="my camera").save(path, force=force)
+        following = f"put in the numbers of your data sheet, then starcal-uq run OBS {path} -o RUN"
+    elif what == "site":
+        site = sc.sky.Site(52.0, 4.4, 10.0, pressure_hpa=1013.0, temperature_c=15.0, relative_humidity=0.5)
+        site.save(path, force=force)
+        following = f"put in where the camera stood, then starcal-uq run OBS CAMERA -o RUN --site {path}"
+    elif what == "budget":
+        sc.budgeting.write_budget_template(path, force=force)
+        following = f"take away the marks before what you know, then starcal-uq budget RUN --file {path}"
+    else:
+        sc.studies.write_study_template("fov-distortion", path, force)
+        following = f"change what is varied, then starcal-uq study {path} -o DIR"
+    print(f"{path}: {following}")
