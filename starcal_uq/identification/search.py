@@ -35,7 +35,6 @@ MIN_STARS = 4
 LEAST_SIGMA_PX = 0.05
 # Above this expectation the search goes on after a first success, to see whether another attitude fits too.
 _BEYOND_DOUBT = 1e-8
-_OTHER_ATTITUDE_RAD = 2e-3
 # Triangles are made of so many centroids first, and then of so many.
 _CENTROIDS = (10, 16)
 _MAX_TRIANGLES = 200
@@ -209,11 +208,10 @@ class Search:
             searched = n_centroids
             if accepted:
                 best = min(accepted, key=lambda match: match.log10_false)
-                turn = best.state.rotation.T
                 # An attitude with far fewer matches is the same one caught on a neighbouring star, or chance.
                 rivals = [m for m in accepted if m.log10_false < 0.5 * best.log10_false]
-                far = any(np.abs(m.state.rotation @ turn - np.eye(3)).max() > _OTHER_ATTITUDE_RAD for m in rivals)
-                return ("ambiguous", None) if far else ("identified", best)
+                differ = any(_other_stars(m, best) for m in rivals)
+                return ("ambiguous", None) if differ else ("identified", best)
         return "not identified", None
 
     def _accepted(self, field: FrameTable, k: int, n_centroids: int, searched: int) -> Iterator[Match]:
@@ -245,6 +243,16 @@ class Search:
         information = np.diag(sd**-2.0) + np.sum([m.information for m in matches], axis=0)
         covariance = scaled_inverse(information)
         return covariance @ np.sum([m.gradient for m in matches], axis=0), covariance
+
+
+def _other_stars(one: Match, other: Match) -> bool:
+    """Whether two matches of a frame say different things: less than half of the smaller one's stars are the other's.
+
+    Attitudes do not tell: that of the same stars moves with the principal point, by degrees where it is hardly known.
+    """
+    pairs = set(zip(one.centroid.tolist(), one.star.tolist(), strict=True))
+    common = pairs.intersection(zip(other.centroid.tolist(), other.star.tolist(), strict=True))
+    return 2 * len(common) < min(len(one), len(other))
 
 
 def field_geometry(camera: Camera) -> FieldGeometry:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,12 +15,15 @@ import starcal_uq as sc
 from starcal_uq.core.errors import IdentificationError
 from starcal_uq.identification.blind import codes_of, quads_of
 from starcal_uq.identification.engine import identify, sheet_of
+from starcal_uq.identification.match import Match
 from starcal_uq.identification.pairs import angle_between
+from starcal_uq.identification.search import Search
 from starcal_uq.images.centroids import Centroids
 from starcal_uq.images.extract import extract_centroids
 from starcal_uq.images.optics import optics_of
 from starcal_uq.sky.catalogue import StarCatalogue
 from starcal_uq.sky.positions import unit_vectors
+from tests.identification.test_identification import random_frames, square_camera, wrong_rows
 
 # Fields of view in degrees, as plate solvers found them: width over two tangents of half of it.
 OPENSTARTRACKER_PX = 1392 / 2 / np.tan(np.radians(6.08 / 2))
@@ -139,3 +144,30 @@ def test_what_files_say_of_the_lens(esa: Centroids) -> None:
     assert not sheet_of(esa)[1]
     with pytest.raises(IdentificationError, match="do not say the size"):
         sheet_of(esa.with_meta(optics={}))
+
+
+def test_same_stars_at_another_principal_point_are_no_rival(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where it is hardly known, attitudes of the same stars differ by degrees; other stars are rivals."""
+    bright = sc.load_catalogue(6.0)
+    table, names, _ = random_frames(bright, square_camera(12.0, 1.0, 60.0), 25, 5, 3, 0.1)
+    kept = np.isin(table.frame, [6, 20])
+    names = names[kept]
+    for column in ("frame", "x_px", "y_px", "flux"):
+        setattr(table, column, getattr(table, column)[kept])
+    # Less than the noise, so that no match is beyond doubt.
+    table.sigma_px, table.frame_ids = np.full(kept.sum(), 0.1), np.array([6, 20])
+    options: dict[str, Any] = {"centre_tolerance_px": 100.0, "distortion_tolerance_px": 10.0, "share_camera": False}
+    found = identify(table, square_camera(12.0), bright, cache_dir=tmp_path, **options)
+    assert [f.status for f in found.frames] == ["identified", "identified"]
+    assert wrong_rows(found, table, names) == 0
+    accepted = Search._accepted
+
+    def with_rival(*arguments: Any) -> Iterator[Match]:
+        for match in accepted(*arguments):
+            yield match
+            yield replace(match, star=match.star + 1)
+
+    monkeypatch.setattr(Search, "_accepted", with_rival)
+    found = identify(table, square_camera(12.0), bright, cache_dir=tmp_path, search_focal=False, **options)
+    assert found.n_identified == 0
+    assert "ambiguous" in {f.status for f in found.frames}
