@@ -14,7 +14,7 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.core.errors import IdentificationError
 from starcal_uq.identification.blind import codes_of, quads_of
-from starcal_uq.identification.engine import identify, sheet_of
+from starcal_uq.identification.engine import _Attempt, identify, sheet_of
 from starcal_uq.identification.match import Match
 from starcal_uq.identification.pairs import angle_between
 from starcal_uq.identification.search import Search
@@ -168,6 +168,7 @@ def test_same_stars_at_another_principal_point_are_no_rival(tmp_path: Path, monk
             yield replace(match, star=match.star + 1)
 
     monkeypatch.setattr(Search, "_accepted", with_rival)
+    # Without further tries of what fails.
+    monkeypatch.setattr(_Attempt, "finish", lambda *_: None)
     found = identify(table, square_camera(12.0), bright, cache_dir=tmp_path, search_focal=False, **options)
-    assert found.n_identified == 0
-    assert "ambiguous" in {f.status for f in found.frames}
+    assert [f.status for f in found.frames] == ["ambiguous", "ambiguous"]
