@@ -1,3 +1,5 @@
+from .air import AirTest as AirTest
+from .air import air_test as air_test
 from .diagnose import Diagnosis as Diagnosis
 from .inflation import with_misfit as with_misfit
 from .jackknife import Jackknife as Jackknife

@@ -21,6 +21,7 @@ from starcal_uq.core.records import read_json, write_json
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import Progress, one_thread
 from starcal_uq.core.types import AnyDict, FloatArray
+from starcal_uq.diagnostics.air import AirTest, air_test
 from starcal_uq.diagnostics.jackknife import Jackknife, jackknife_frames
 from starcal_uq.diagnostics.misfit import Misfit, misfit_tests
 from starcal_uq.diagnostics.models import MODELS, ModelComparison, compare_models, of_all_stars
@@ -98,6 +99,8 @@ class Diagnosis(Shown):
         Seed, settings, versions, time and data hash.
     stars : StarTest or None
         Errors that stars bring along; None in a diagnosis of an earlier version.
+    air : AirTest or None
+        Refraction in the residuals; None where there cannot be any, or in a diagnosis of an earlier version.
     """
 
     misfit: Misfit
@@ -108,6 +111,7 @@ class Diagnosis(Shown):
     theta: tuple[float, ...]
     provenance: AnyDict
     stars: StarTest | None = None
+    air: AirTest | None = None
 
     def is_of(self, cal: Calibration) -> bool:
         """True if this calibration is the one that was diagnosed."""
@@ -188,6 +192,7 @@ def diagnose(
         theta=tuple(whole.theta.tolist()),
         provenance=provenance(seed, settings, whole.data_hash_of(obs)),
         stars=star_test(obs, cal),
+        air=air_test(obs, cal, seed=seed),
     )
 
 

@@ -102,10 +102,14 @@ class Site:
         given = {"pressure": self.pressure_hpa, "temperature": self.temperature_c}
         return tuple(name for name, value in given.items() if value is None)
 
-    def __str__(self) -> str:
+    @property
+    def words(self) -> str:
+        """Latitude and longitude."""
         north, east = self.latitude_deg, (self.longitude_deg + 180.0) % 360.0 - 180.0
-        words = f"{abs(north):.2f}° {'N' if north >= 0 else 'S'}, {abs(east):.2f}° {'E' if east >= 0 else 'W'}"
-        return f"{self.name + ', ' if self.name else ''}{words}, {self.height_m:.0f} m"
+        return f"{abs(north):.2f}° {'N' if north >= 0 else 'S'}, {abs(east):.2f}° {'E' if east >= 0 else 'W'}"
+
+    def __str__(self) -> str:
+        return f"{self.name + ', ' if self.name else ''}{self.words}, {self.height_m:.0f} m"
 
     def to_dict(self) -> AnyDict:
         """Keys and values of a [site] table; what is not given is left out."""

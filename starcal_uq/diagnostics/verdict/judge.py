@@ -80,8 +80,8 @@ def judge(
     if post is not None:
         checks += [draws.same_data(post, cal.data_hash_of(obs)), *post.diagnostics.checks]
     used = weighed(obs, cal)
-    checks += [observed.directions(used, cal), observed.residual_pattern(used, cal), observed.outliers(used, cal)]
-    checks += [observed.screening(obs)]
+    checks += [observed.directions(used, cal, None if diagnosis is None else diagnosis.air)]
+    checks += [observed.residual_pattern(used, cal), observed.outliers(used, cal), observed.screening(obs)]
     checks += [observed.noise(used, cal), observed.partitions(cal), observed.terms(cal), observed.coverage(used, cal)]
     if diagnosis is not None:
         checks += estimate.model_checks(diagnosis)

@@ -16,6 +16,7 @@ from starcal_uq.sky.site import Site
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
+    from starcal_uq.diagnostics.air import AirTest
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
@@ -37,11 +38,14 @@ SCREEN = f"{CALIBRATE} --screen or sc.estimation.screen(obs, camera)"
 AIR_REMEDY = f"{CALIBRATE} --site SITE or {CALIBRATE} --in-space"
 
 
-def directions(obs: Observations, cal: Calibration) -> Check:
+def directions(obs: Observations, cal: Calibration, found: AirTest | None = None) -> Check:
     """Is annual aberration in the directions, and refraction where there is air?"""
     declared = str(obs.meta.get("directions", "undeclared"))
     name, bound = "Catalogue directions", "apparent"
     seen = air(obs)
+    if found is not None and found.is_air:
+        value, remedy = f"refraction, p = {significant(found.p_value)}", f"{CALIBRATE} --site SITE"
+        return Check(name, Question.TRUSTWORTHY, Level.FAIL, value, bound, air_words(obs, found), remedy)
     if declared == "apparent" and seen == "unknown":
         sentence = f"Aberration is in the directions, refraction is not. {conditional_words(cal)} {REMEDY}"
         return Check(name, Question.TRUSTWORTHY, Level.WARN, "without refraction", bound, sentence, AIR_REMEDY)
@@ -58,6 +62,22 @@ def directions(obs: Observations, cal: Calibration) -> Check:
     if seen == "unknown":
         sentence, remedy = f"{sentence} {conditional_words(cal)} {REMEDY}", f"{remedy} or {AIR_REMEDY}"
     return Check(name, Question.TRUSTWORTHY, Level.WARN, declared, bound, sentence, remedy)
+
+
+def air_words(obs: Observations, found: AirTest) -> str:
+    """That refraction is in the residuals, what it does to f, and where the camera would have stood."""
+    first = (
+        "The residuals hold refraction that the directions do not: f is too short by "
+        f"{significant(found.f_px)} px ({significant(found.f_sigma)} sigma)."
+    )
+    if not np.isfinite(found.latitude_deg):
+        return f"{first} State the site (--site) and the times (column time_utc), which the frames do not have."
+    place = Site(found.latitude_deg, found.longitude_deg)
+    errors = (significant(error) for error in (found.latitude_std_deg, found.longitude_std_deg))
+    ends = " and ".join(f"± {error}°" for error in errors)
+    seen = {"corrected": "Check site, pressure and times", "none": "They are declared to hold all there is: check that"}
+    asked = seen.get(air(obs), "State the site (--site)")
+    return f"{first} {asked}; the residuals point to {place.words} ({ends})."
 
 
 def aberration_words(cal: Calibration) -> str:

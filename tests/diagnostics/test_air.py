@@ -1,0 +1,121 @@
+"""Refraction that is missing from the directions is found in the residuals; what looks like it is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import datetime, timedelta
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.core.status import Level
+from starcal_uq.diagnostics.air import air_test
+from starcal_uq.diagnostics.verdict import observed
+from tests.helpers.outside import cap, frame_at
+
+LATITUDE, LONGITUDE = 38.0, -70.0
+
+
+def night(seed: int, *, air=1.0, focal=0.0, skew=0.0, drift=0.0, hours=3.0, above=True, n_frames=10):
+    """Frames of a night, without the package: catalogue directions, pixels as seen through `air` of the standard one.
+
+    `focal` is the relative spread of the focal length over frames, `skew` the error in px of the axes' scale at the
+    corner, `drift` that of the scale over the night; without `above` the camera looks anywhere.
+    """
+    rng = np.random.default_rng(seed)
+    seconds = np.sort(rng.uniform(0.0, 3600.0 * hours, n_frames))
+    # Greenwich mean sidereal time, from 2026-11-13T12 on.
+    sidereal = np.radians(280.46062 + 360.98564737 * (9813.0 + seconds / 86400.0) + LONGITUDE)
+    latitude = np.radians(LATITUDE)
+    up = np.column_stack([np.cos(latitude) * np.cos(sidereal), np.cos(latitude) * np.sin(sidereal)])
+    up = np.column_stack([up, np.full(n_frames, np.sin(latitude))])
+    true_focal, half = 512.0 / np.tan(np.radians(6.0)), 724.0
+    columns = {name: [] for name in ("frame", "x_px", "y_px", "ra_deg", "dec_deg", "time_utc")}
+    for frame, zenith in enumerate(up):
+        level = np.cross(zenith, rng.standard_normal(3))
+        altitude = np.radians(rng.uniform(30.0, 85.0))
+        where = np.sin(altitude) * zenith + np.cos(altitude) * level / np.linalg.norm(level)
+        attitude = frame_at(rng, where if above else rng.standard_normal(3))
+        seen = cap(rng, attitude[2], 9.0, 150)
+        b = seen @ attitude.T
+        f = true_focal * (1.0 + focal * rng.standard_normal())
+        d = f * b[:, :2].T / b[:, 2]
+        d = d * (1.0 + 3.0 / half**3 * np.sum(d**2, axis=0))
+        d = d + skew * np.array([d[0], -d[1]]) / half + drift * (frame / n_frames - 0.5) * d / half
+        xy = d + np.array([[500.0], [530.0]]) + 0.1 * rng.standard_normal(d.shape)
+        inside = np.flatnonzero((xy.min(axis=0) > 0.0) & (xy.max(axis=0) < 1023.0))[:25]
+        seen = seen[inside]
+        sine = seen @ zenith
+        tangent = np.sqrt(1.0 / sine**2 - 1.0)
+        raised = np.radians((58.276 * tangent - 0.0824 * tangent**3) / 3600.0)
+        upwards = zenith - sine[:, None] * seen
+        r = seen - air * np.tan(raised)[:, None] * upwards / np.linalg.norm(upwards, axis=1)[:, None]
+        r /= np.linalg.norm(r, axis=1)[:, None]
+        time = (datetime(2026, 11, 13, 12) + timedelta(seconds=float(seconds[frame]))).isoformat()
+        ra, dec = np.degrees(np.arctan2(r[:, 1], r[:, 0])) % 360.0, np.degrees(np.arcsin(r[:, 2]))
+        values = (np.full(len(inside), frame), *xy[:, inside], ra, dec, np.full(len(inside), time))
+        for column, found in zip(columns.values(), values, strict=True):
+            column.append(found)
+    obs = sc.Observations(**{name: np.concatenate(parts) for name, parts in columns.items()})
+    camera = sc.Camera(1024, 1024, 10.0, 0.0101 * true_focal, 511.5, 511.5)
+    return obs, sc.calibrate(obs, camera, duplicates="keep"), true_focal
+
+
+def test_refraction_and_the_place_it_was_seen_from():
+    obs, cal, focal = night(0)
+    found = air_test(obs, cal)
+    assert found.is_air and found.p_value < 1e-3
+    assert abs(found.latitude_deg - LATITUDE) < 4.0 * found.latitude_std_deg < 20.0
+    assert abs(found.longitude_deg - LONGITUDE) < 4.0 * found.longitude_std_deg
+    # The focal length is where it is known not to be, and comes back.
+    assert found.f_sigma > 3.0 and abs(cal.theta[2] + found.f_px - focal) < 4.0 * cal.sigmas[2]
+    check = observed.directions(obs, cal, found)
+    assert check.level is Level.FAIL and check.remedy.endswith("--site SITE")
+    assert "° N" in check.sentence and "too short" in check.sentence
+
+
+def test_frames_of_a_moment_need_no_times():
+    obs, cal, _ = night(1, hours=0.02)
+    found = air_test(replace(obs, time_utc=None), cal)
+    assert found.is_air and np.isnan(found.latitude_deg)
+    assert "the times" in observed.directions(obs, cal, found).sentence
+
+
+def test_thinner_air_is_air():
+    obs, cal, _ = night(2, air=0.75)
+    assert air_test(obs, cal).is_air
+
+
+@pytest.mark.parametrize("options", [{}, {"focal": 3e-4}, {"skew": 0.5}, {"drift": 0.5}, {"above": False}], ids=str)
+def test_what_is_not_refraction_is_not_named(options):
+    obs, cal, _ = night(3, air=0.0, **options)
+    found = air_test(obs, cal)
+    assert found is None if options == {"above": False} else not found.is_air
+    assert observed.directions(obs, cal, found) == observed.directions(obs, cal)
+
+
+def test_real_frames(real_data):
+    camera = sc.Camera.load(real_data / "esa_tetra3_camera.toml")
+    path = real_data / "esa_tetra3_observations.csv"
+    for columns, is_air in ((None, True), ({"ra_deg": "ra_apparent_deg", "dec_deg": "dec_apparent_deg"}, False)):
+        obs = sc.load_observations(path, camera, columns=columns)
+        obs = replace(obs, time_utc=np.full(obs.n_stars, "2019-07-29T20:47:26"))
+        found = air_test(obs, sc.calibrate(obs, camera))
+        assert found.is_air == is_air
+        if is_air:
+            # A fit of another program says 52.0 degrees, and 2.2 px.
+            assert abs(found.latitude_deg - 52.0) < 2.0 * found.latitude_std_deg
+            assert found.f_px == pytest.approx(2.2, abs=0.1)
+
+
+@pytest.mark.slow
+def test_the_rate_of_false_alarms():
+    p_values = []
+    for seed in range(60):
+        obs, cal, _ = night(1000 + seed, air=0.0, n_frames=6)
+        found = air_test(obs, cal)
+        assert not found.is_air
+        p_values.append(found.p_value)
+    # One in ten of 60, beyond which chance is once in a thousand.
+    assert 1 <= np.count_nonzero(np.array(p_values) < 0.1) <= 15
