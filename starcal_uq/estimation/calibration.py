@@ -157,7 +157,7 @@ class Calibration(Shown):
     @property
     def remedy(self) -> str:
         """What is wrong with a calibration that did not end well, and what helps, in one clause."""
-        return remedy_of(self.status, self.undetermined)
+        return remedy_of(self.status, self.undetermined, self.solver)
 
     @property
     def sigmas(self) -> FloatArray:

@@ -108,6 +108,17 @@ def what_is_missing(names: tuple[str, ...]) -> str:
     return f"{what_is_open(names)}: stars {where} are needed{fewer}"
 
 
-def remedy_of(status: Status, names: tuple[str, ...]) -> str:
+# A filter has no solver to choose and no iterations to raise: it saw the frames one by one.
+_ASTRAY = {
+    Status.OUTSIDE_DETECTOR: "the principal point left the detector",
+    Status.FOLDED: "the distortion folds over inside the field",
+    Status.MAX_ITERATIONS: "its first frames lead to no optimum",
+    Status.SINGULAR: "its frames, one by one, do not determine the optics",
+}
+
+
+def remedy_of(status: Status, names: tuple[str, ...], solver: str = "") -> str:
     """The remedy of a status, in terms of the parameters that the data leave open, where there are some."""
+    if solver == "filter" and status in _ASTRAY and not names:
+        return f"{_ASTRAY[status]}: use method='efficient', which weighs all frames together"
     return what_is_missing(names) if names else status.remedy

@@ -81,6 +81,20 @@ def test_every_sensor_is_calibrated_with_an_honest_sigma(name):
     assert cal.sigma == pytest.approx(SENSORS[name][5], rel=0.2)
 
 
+@pytest.mark.parametrize(
+    ("method", "name", "status"),
+    [
+        ("samaan", "two degrees, one frame", Status.OUTSIDE_DETECTOR),
+        ("griffith", "half a degree, 200 px", Status.SINGULAR),
+    ],
+)
+def test_a_filter_that_went_astray_is_sent_to_what_it_has(method, name, status):
+    c = observed(name, 1)
+    with pytest.raises(CalibrationError, match="use method='efficient', which weighs all frames together") as caught:
+        sc.calibrate(sc.Observations(**c.columns), sheet(c, name), method=method)
+    assert caught.value.status is status
+
+
 @pytest.mark.parametrize("name", ["half a degree, 200 px", "ten degrees", "ninety degrees, 5 mm"])
 def test_stars_whose_noises_differ_by_a_million(name):
     size = SENSORS[name][1]

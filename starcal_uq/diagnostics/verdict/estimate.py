@@ -48,7 +48,8 @@ def estimation(cal: Calibration) -> Check:
         sentence = f"All {plural(len(cal.stages), 'stage')} ended at an optimum, after {plural(steps, 'iteration')}."
     else:
         sentence = f"The estimate is not an optimum: {cal.remedy}."
-    level, remedy = pass_or_fail(cal.status.ok), _REMEDIES.get(cal.status, "")
+    remedies = {} if cal.solver == "filter" else _REMEDIES
+    level, remedy = pass_or_fail(cal.status.ok), remedies.get(cal.status, "")
     return Check("Estimation", Question.CONVERGED, level, words, "converged", sentence, remedy)
 
 

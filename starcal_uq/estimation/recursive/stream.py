@@ -291,7 +291,7 @@ class RecursiveCalibration:
             estimate,
         )
         if throw:
-            raise_unless_good(calibration.status)
+            raise_unless_good(calibration.status, calibration.remedy)
         return calibration
 
     def save(self, path: str | os.PathLike[str]) -> None:
