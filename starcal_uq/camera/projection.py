@@ -285,7 +285,9 @@ def fold_radius_px(model_name: str, theta: FloatArray, max_radius_px: float) -> 
     radius = np.linspace(0.0, max_radius_px, 501)[1:]
     angle = np.zeros(1) if get_model(model_name).radial else np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
     points = np.stack([np.outer(np.cos(angle), radius).ravel(), np.outer(np.sin(angle), radius).ravel()])
-    _, determinant = newton_kernel(model_name)(points.shape[1], theta, points, points)
+    with np.errstate(all="ignore"):
+        # On the fold itself Newton's step, which nobody asks for here, has no length.
+        _, determinant = newton_kernel(model_name)(points.shape[1], theta, points, points)
     # det <= 0 marks a fold; a second crossing can make it positive again, so the first one counts.
     folded = (determinant[0].reshape(angle.size, radius.size) <= 0.0).any(axis=0)
     return float(radius[np.argmax(folded)]) if folded.any() else float("inf")

@@ -470,11 +470,14 @@ def _robust(
         if not all_parameters:
             stage = optics_stage(trusted, camera, solver, max_iterations)
             return [stage if stage.status.ok else focal_stage(trusted, camera, max_iterations)]
-        stages = _pair_stages(PairObjective(trusted, model), camera, solver, max_iterations)
-        if not stages[-1].status.ok:
+        pairs = PairObjective(trusted, model)
+        stages = _pair_stages(pairs, camera, solver, max_iterations)
+        if _strayed(stages[-1], camera):
             own = MarginalLikelihood(trusted, model)
             direct = direct_stage(own, camera, min(max_iterations, _DIRECT_ITERATIONS))
-            stages[-1] = replace(direct, name=stages[-1].name) if direct.status.ok else stages[-1]
+            noise = _noise_at(pairs, MarginalLikelihood(trusted, model), stages[-1].theta)
+            if direct.status.ok and not (stages[-1].status.ok and noise < noise_px(own, direct.theta)):
+                stages[-1] = replace(direct, name=stages[-1].name)
         return stages
 
     try:

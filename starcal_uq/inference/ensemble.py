@@ -233,7 +233,9 @@ class _Store:
                 n_walkers, dim = self._u.shape[2:]
                 shapes |= {"coords": (n_walkers, dim), "log_prob": (n_walkers,), "place": (2,), "rest": (2,)}
                 for name, shape in (shapes | {"gauss": ()}).items():
-                    if content[name].shape != shape or not np.isfinite(content[name]).all():
+                    kinds = "iu" if name in ("place", "rest", "accepted") else "f"
+                    found = content[name]
+                    if found.shape != shape or found.dtype.kind not in kinds or not np.isfinite(found).all():
                         raise ValueError(f"{name} does not hold what it should")
                 position, has_gauss = (int(v) for v in content["rest"])
                 random_state = ("MT19937", content["key"], position, has_gauss, float(content["gauss"]))

@@ -20,7 +20,8 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
-from starcal_uq.core.errors import PlanningError
+from starcal_uq.camera.projection import unproject
+from starcal_uq.core.errors import DistortionError, PlanningError
 from starcal_uq.core.types import FloatArray
 from starcal_uq.planning.forecast import SCOPES, Forecaster
 from starcal_uq.planning.information import FrameSet, Noise, random_frames
@@ -33,6 +34,8 @@ _BARREL = (1.0, 0.8, 0.5)
 _NODES, _GEOMETRIES, _CAMPAIGNS, AFTER_FRAMES = 5, 1000, 64, 1000
 # A displacement beyond this folds the distortion, or is no camera's.
 _LARGEST_PERCENT = 30.0
+# Share of the displacement that folds at the corner, up to which stars there can still be placed.
+_NEAR_FOLD = 0.9
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,7 +88,8 @@ def open_range(camera: Camera, given: tuple[float, float] | None, calibrated: bo
     camera : Camera
         The sheet; coefficients that are not all zero are known.
     given : (float, float), optional
-        Range that the user states; by default barrel distortion up to that of an f-theta lens, and as much pincushion.
+        Range that the user states; by default barrel distortion up to that of an f-theta lens, and as much
+        pincushion, as far as neither folds on the detector.
     calibrated : bool
         Whether the camera was calibrated.
 
@@ -96,8 +100,10 @@ def open_range(camera: Camera, given: tuple[float, float] | None, calibrated: bo
     """
     stated = calibrated or not camera.coefficients or any(camera.coefficients)
     if given is None:
+        if stated:
+            return None
         end = min(-f_theta_percent(camera), _LARGEST_PERCENT)
-        return None if stated else (-end, end)
+        return _unfolded(camera, -end), _unfolded(camera, end)
     low, high = given
     if stated:
         raise PlanningError(
@@ -109,7 +115,26 @@ def open_range(camera: Camera, given: tuple[float, float] | None, calibrated: bo
             f"distortion_percent is {low:g} to {high:g}: give the least and the largest displacement of the corner in "
             f"per cent, within {_LARGEST_PERCENT:g} either way."
         )
+    for end in (low, high):
+        if (most := _unfolded(camera, end)) != end:
+            raise PlanningError(
+                f"distortion_percent is {low:g} to {high:g}: one coefficient that displaces the corner by {end:g} per "
+                f"cent folds inside this detector; stay within {most:.3g}."
+            )
     return low, high
+
+
+def _unfolded(camera: Camera, percent: float) -> float:
+    """As much of a displacement of the corner as one coefficient can give without a fold on the detector, per cent."""
+    x, y = np.array([-0.5, camera.width_px - 0.5]), np.array([-0.5, camera.height_px - 0.5])
+    corners = np.array([(a, b) for a in x for b in y])
+    for share in np.linspace(1.0, 0.02, 50):
+        try:
+            unproject(with_distortion(camera, percent * share / _NEAR_FOLD), corners)
+        except DistortionError:
+            continue
+        return float(percent * share)
+    return 0.0
 
 
 def f_theta_percent(camera: Camera) -> float:

@@ -103,8 +103,8 @@ def plan(
     distortion_percent : (float, float), optional
         Least and largest displacement of the corner by the distortion, per cent of its distance from the centre (barrel
         is negative), that a sheet with zero coefficients leaves open: frames and errors are forecast over this range.
-        By default from the barrel distortion of an f-theta lens to as much pincushion distortion, at most 30 %;
-        coefficients that are not zero are known, and nothing is open.
+        By default from the barrel distortion of an f-theta lens to as much pincushion distortion, at most 30 % and
+        short of a fold; coefficients that are not zero are known, and nothing is open.
     sweeps : bool
         Also forecast 1000 frames with other magnitude limits, noise, and parts of the detector.
     n_geometries : int

@@ -245,6 +245,8 @@ ONCE = [
     ("study.nc", _hdf5(lambda f: f.pop("status")), r"\(status is missing\); run `starcal-uq study` again\.$"),
     ("study.nc", _hdf5(lambda f: f.pop("max_mag")), r"\(max_mag is missing\)"),
     ("study.nc", _hdf5(_one_for_another), r"\(n_frames is not along cell\)"),
+    ("checkpoint.npz", lambda d: _members(d, place=_npy(np.zeros(2) + 1j)), "the draws are made again"),
+    ("checkpoint.npz", lambda d: _members(d, place=_npy(np.zeros(2, "M8[s]"))), "the draws are made again"),
     ("checkpoint.npz", lambda d: _members(d, key=None), "the draws are made again"),
     ("run.json", lambda d: d.replace(b'"gone": []', b'"gone": ["../kept.csv"]'), "of the run names a file elsewhere"),
     ("run.json", lambda d: d.replace(b'"stage": ""', b'"stage": "/tmp"'), "of the run names a file elsewhere"),

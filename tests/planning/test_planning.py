@@ -11,7 +11,7 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.budgeting.shapes import two_axis_radius
-from starcal_uq.core.errors import PlanningError, SettingError
+from starcal_uq.core.errors import DistortionError, PlanningError, SettingError
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import NoiseModel
 from starcal_uq.maths.circular import mixture_radius
@@ -414,6 +414,22 @@ def test_the_inverse_model_bends_the_same_way():
 def test_ranges_that_make_no_sense_are_refused(camera_, given, words):
     with pytest.raises(PlanningError, match=words):
         plan(camera_, sky(5.0), distortion_percent=given, **SMALL)
+
+
+@pytest.mark.parametrize(("width_deg", "offset_px"), [(60.0, 0.0), (120.0, 0.0), (90.0, 400.0)])
+def test_distortion_of_a_wide_field_is_left_open_as_far_as_it_does_not_fold(width_deg, offset_px):
+    focal_px = 1024.0 / np.tan(np.radians(0.5 * width_deg))
+    wide = sc.Camera(2048, 2048, 10.0, 0.01 * focal_px, 1023.5 + offset_px, 1023.5)
+    low, high = open_distortion.open_range(wide, None, False)
+    assert -15.0 < low < -5.0 and 15.0 < high <= 30.0
+    corners = np.array([(x, y) for x in (-0.5, 2047.5) for y in (-0.5, 2047.5)])
+    for end in (low, high):
+        assert np.isfinite(sc.camera.unproject(with_distortion(wide, end), corners)).all()
+    # The control: a little more, and the corner has no direction.
+    with pytest.raises(DistortionError):
+        sc.camera.unproject(with_distortion(wide, 1.2 * low), corners)
+    with pytest.raises(PlanningError, match=r"distortion_percent is -20 to 0: one coefficient .* stay within -\d"):
+        open_distortion.open_range(wide, (-20.0, 0.0), False)
 
 
 @pytest.mark.slow
