@@ -180,7 +180,13 @@ def _after_calibration(
     **aligning: Any,
 ) -> None:
     """Sample, couple, propagate, question the model, budget, report: what is not done yet."""
-    from starcal_uq.presentation.report.drawing import AFTER_BUDGET, AFTER_CALIBRATION, AFTER_DIAGNOSIS, AFTER_SAMPLING
+    from starcal_uq.presentation.report.drawing import (
+        AFTER_BUDGET,
+        AFTER_CALIBRATION,
+        AFTER_DIAGNOSIS,
+        AFTER_PROPAGATION,
+        AFTER_SAMPLING,
+    )
 
     ahead.draw(run.calibrated, AFTER_CALIBRATION)
     if run.images is not None:
@@ -192,6 +198,7 @@ def _after_calibration(
         run.couple()
     if not run.did("propagate"):
         run.propagate(n_draws=draws, seed=sampling.seed, **aligning)
+    ahead.draw(run.results, AFTER_PROPAGATION)
     if show:
         show_posterior(run.posterior)
     if not run.did("diagnose"):
@@ -205,7 +212,7 @@ def _after_calibration(
     if show:
         show_budget(run.error_budget)
     ahead.draw(run.results, AFTER_BUDGET)
-    run.report(ahead.figures())
+    run.report(ahead.figures)
 
 
 def _conclude(run: Run) -> None:

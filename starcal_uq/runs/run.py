@@ -786,15 +786,16 @@ class Run:
         self.error_budget = made
         return made
 
-    def report(self, drawn: Mapping[str, bytes] | None = None, *, force: bool = False) -> Path:
+    def report(self, drawn: Callable[[], Mapping[str, bytes]] | None = None, *, force: bool = False) -> Path:
         """Write ``RUN/report.html`` of whatever the run holds, and the figures in ``RUN/figures``.
 
         A report follows from the rest of the run, and goes when that changes: one that is there is left as it is.
 
         Parameters
         ----------
-        drawn : mapping, optional
-            Figures of these results that were drawn before, as PNG by name; the others are drawn now.
+        drawn : callable, optional
+            Figures of these results that are drawn elsewhere, as PNG by name, asked for when all else is ready; the
+            others are drawn now.
         force : bool
             Whether to write it again.
 
@@ -805,19 +806,20 @@ class Run:
         """
         if force or not self.has("report"):
             from starcal_uq.presentation.report.drawing import FIGURES, GALLERY, draw_figures, draw_gallery
-            from starcal_uq.presentation.report.page import render
+            from starcal_uq.presentation.report.page import prepared
 
-            figures = dict(drawn or {})
+            page = prepared(self.results)
+            figures = {} if drawn is None else dict(drawn())
             figures |= draw_figures(self.results, [name for name in FIGURES if name not in figures])
             if GALLERY not in figures and self.images is not None:
                 figures |= draw_gallery(self.shown_frames)
-            page = render(self.results, figures, figures.pop(GALLERY, b"").decode())
+            html = page(figures, figures.pop(GALLERY, b"").decode())
             with self._step("report", None, {}) as files:
                 new_folder(files.figures)
                 for name, png in figures.items():
                     atomic_write_bytes(files.figures / f"{name}.png", png)
                 write_json(self.verdict.to_dict(), files.verdict)
-                atomic_write_text(files.report, page)
+                atomic_write_text(files.report, html)
         return self.path / RunFolder.report
 
     @property

@@ -80,7 +80,7 @@ def test_every_reader_shows_the_same_checks(short, disputed, monkeypatch, tmp_pa
     assert not disputed.diagnostics.ok and disputed.diagnostics.level.exit_status == 1
     verdict = judge(obs, cal, disputed)
     assert set(disputed.diagnostics.checks) <= set(verdict.checks)
-    page = context(Results(name="run", observations=obs, calibration=cal, posterior=disputed), {})
+    page = context(Results(name="run", observations=obs, calibration=cal, posterior=disputed))
     assert page["verdict"] == verdict
     html = disputed._repr_html_()
     recorded = Console(record=True, width=1000)

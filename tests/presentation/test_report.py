@@ -289,7 +289,7 @@ def test_a_report_that_fails_leaves_the_old_one(run, monkeypatch):
     before = run.report.read_bytes()
     figures = {path: path.stat().st_mtime_ns for path in run.figures.iterdir()}
     monkeypatch.setattr("starcal_uq.presentation.report.drawing.draw_figures", lambda *_: {"corner": b"new"})
-    monkeypatch.setattr("starcal_uq.presentation.report.page.render", lambda *_: 1 / 0)
+    monkeypatch.setattr("starcal_uq.presentation.report.page.prepared", lambda *_: lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         sc.Run(run.path).report(force=True)
     assert run.report.read_bytes() == before
@@ -314,7 +314,7 @@ def test_a_report_takes_figures_that_are_drawn(run, monkeypatch):
     monkeypatch.setattr(
         "starcal_uq.presentation.report.drawing.draw_figures", lambda _, names: asked.extend(names) or {}
     )
-    sc.Run(run.path).report({"corner": ahead}, force=True)
+    sc.Run(run.path).report(lambda: {"corner": ahead}, force=True)
     assert sorted([*asked, "corner"]) == sorted(FIGURES)
     assert (run.figures / "corner.png").read_bytes() == ahead
 

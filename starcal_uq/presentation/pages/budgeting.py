@@ -51,7 +51,7 @@ def write_tex(budget: Budget, path: str | os.PathLike[str]) -> None:
 def section_html(budget: Budget) -> str:
     """The section of the report by itself, without a page around it."""
     template = template_environment().get_template("budget_section.html.j2")
-    return template.render(**budget_context(budget))
+    return template.render(**budget_context(budget), images=_images(budget))
 
 
 def write_html(budget: Budget, path: str | os.PathLike[str]) -> None:
@@ -62,6 +62,7 @@ def write_html(budget: Budget, path: str | os.PathLike[str]) -> None:
         .get_template("budget.html.j2")
         .render(
             **budget_context(budget),
+            images=_images(budget),
             created=provenance.get("created_utc", ""),
             version=provenance.get("versions", {}).get("starcal_uq") or "",
             data_sha256=provenance.get("data_sha256") or "",
@@ -262,8 +263,10 @@ def write_budget(budget: Budget, path: str | os.PathLike[str]) -> Path:
     return Path(path)
 
 
-def budget_context(budget: Budget | None, png: bytes | None = None) -> dict[str, Any]:
-    """What the template ``budget_section.html.j2`` shows, under the one name ``budget``; None where there is none."""
-    if budget is None:
-        return {"budget": None}
-    return {"budget": {**tables(budget), "image": embedded_image(png or png_bytes(plot_budget(budget)))}}
+def budget_context(budget: Budget | None) -> dict[str, Any]:
+    """What ``budget_section.html.j2`` shows beside the figure, under the name ``budget``; None where there is none."""
+    return {"budget": None if budget is None else tables(budget)}
+
+
+def _images(budget: Budget) -> dict[str, Any]:
+    return {"budget": embedded_image(png_bytes(plot_budget(budget)))}

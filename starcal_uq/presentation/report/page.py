@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from starcal_uq.camera.distortion import get_model, parameters
@@ -39,12 +39,22 @@ def render(results: Results, figures: Mapping[str, bytes], gallery: str = "") ->
     gallery
         The frames of a run from images, as a piece of a page.
     """
-    filled = context(results, figures) | {"gallery": gallery}
-    return template_environment().get_template("report.html.j2").render(filled) + "\n"
+    return prepared(results)(figures, gallery)
 
 
-def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
-    """What the template shows."""
+def prepared(results: Results) -> Callable[[Mapping[str, bytes], str], str]:
+    """The report as a function of figures and gallery, for whoever waits for these: everything else is done."""
+    template, words = template_environment().get_template("report.html.j2"), context(results)
+
+    def document(figures: Mapping[str, bytes], gallery: str) -> str:
+        images = {name: embedded_image(png) for name, png in figures.items()}
+        return template.render(words, images=images, gallery=gallery) + "\n"
+
+    return document
+
+
+def context(results: Results) -> dict[str, Any]:
+    """What the template shows beside the figures."""
     cal, post, obs = results.calibration, results.posterior, results.observations
     verdict = results.verdict
     converged = verdict.of(Question.CONVERGED)
@@ -83,7 +93,7 @@ def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
         "derived_table": None if post is None else model_tables.derived_table(post),
         **model_tables.diagnosis_context(results.diagnosis, cal),
         **image_tables.image_context(results.images, cal),
-        **budget_tables.budget_context(results.budget, figures.get("budget")),
+        **budget_tables.budget_context(results.budget),
         "stage_rows": tables.stage_rows(results),
         "pair_table": tables.pair_table(cal),
         "noise_table": tables.noise_table(cal),
@@ -96,7 +106,6 @@ def context(results: Results, figures: Mapping[str, bytes]) -> dict[str, Any]:
         **_distortion(results),
         "degrees_of_freedom": count(cal.dof),
         "provenance_rows": words.provenance_rows(results),
-        "images": {name: embedded_image(png) for name, png in figures.items() if name != "budget"},
     }
 
 
