@@ -38,9 +38,9 @@ if TYPE_CHECKING:
 IDENTIFIED, LEFT_OUT, NOT_MATCHED = "identified", "left out", "not matched"
 NO_STAR, FAINTER = "at no star of the catalogue", "fainter than the stars searched for"
 # Stars so much fainter than those that were searched for are looked at, if the embedded catalogue has them.
-_FAINTER, _FAINTEST = 1.5, 10.0
+_FAINTER, FAINTEST = 1.5, 10.0
 # What leaves a star out, if it is not screening.
-_LEFT_OUT = "displaced by a neighbour, or low above the horizon"
+_LEFT_OUT, _WHOLE = "displaced by a neighbour, or low above the horizon", "in a frame that keeps too few"
 # A detection so near to a star's place is that star's, px, widths of a star image, and scatter of the frame's stars.
 _NEAR_PX, _NEAR_PSF, _NEAR_RMS = 3.0, 2.5, 5.0
 # Frames of a gallery that are shown because nothing is known of them, or because they fit worst.
@@ -283,8 +283,8 @@ class Frames(Shown):
         return places
 
     @cached_property
-    def _searched(self) -> float:
-        """Magnitude to which stars were searched for."""
+    def searched_mag(self) -> float:
+        """Magnitude (Gaia G) to which stars were searched for."""
         stated = self.matched.meta.get("max_mag")
         mags = self.matched.mag if self.matched.mag is not None else np.empty(0)
         return float(stated) if stated is not None else float(np.max(mags, initial=-np.inf))
@@ -292,9 +292,9 @@ class Frames(Shown):
     @property
     def _catalogue(self) -> StarCatalogue | None:
         """Stars to some magnitudes beyond those that were searched for; None where the run names no stars."""
-        if not np.isfinite(self._searched) or self.used.star_id is None:
+        if not np.isfinite(self.searched_mag) or self.used.star_id is None:
             return None
-        limit = max(self._searched, min(self._searched + _FAINTER, _FAINTEST))
+        limit = max(self.searched_mag, min(self.searched_mag + _FAINTER, FAINTEST))
         return _stars(limit, float(self.matched.meta.get("epoch", 2016.0)))
 
     def _apparent(self, directions: FloatArray, row: ImageRow) -> FloatArray:
@@ -325,7 +325,7 @@ class Frames(Shown):
             if obs is not matched:
                 moved[place] = self.residuals_px[rows]
         for k in np.flatnonzero(kind == LEFT_OUT).tolist():
-            reason[k] = self.reasons.get((number, str(star[k])), _LEFT_OUT)
+            reason[k] = self.reasons.get((number, str(star[k])), _LEFT_OUT if len(used) else _WHOLE)
         quaternion = self._attitude(row, matched)
         rms = self.rms_px.get(number, float("nan"))
         width = float(table.psf_sigma_px[0]) if len(table.psf_sigma_px) else np.nan
@@ -388,7 +388,7 @@ class Frames(Shown):
         """Why a detection of an identified frame is not matched: by the magnitude of the star that is there, if any."""
         if mag is None:
             return NO_STAR
-        return FAINTER if mag > self._searched else "not sure which star"
+        return FAINTER if mag > self.searched_mag else "not sure which star"
 
     def _attitude(self, row: ImageRow, matched: Observations) -> FloatArray | None:
         """R_cam_icrs (3, 3); of a frame that was identified and not calibrated that of its stars."""

@@ -171,7 +171,9 @@ def test_the_page_shows_every_frame_with_its_reason_and_what_to_do(frames: Frame
         assert counts == [frame.n(kind) for kind in kinds]
         assert f"{frame.ra_deg:.4f}°" in shown
     assert "starcal-uq centroid dark.png --camera run/camera.toml -o stars.csv --threshold" in page
-    assert "starcal-uq identify run/centroids.parquet run/camera.toml -o found.csv --calibration run" in page
+    assert (
+        "starcal-uq identify run/centroids.parquet run/camera.toml -o found.csv --calibration run --max-mag 7<" in page
+    )
     # A star's name, and a mark of each kind with a shape of its own.
     star = frames[0].detections["star_id"].iloc[0]
     assert f"<title>{star}, G " in page

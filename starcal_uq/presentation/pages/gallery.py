@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 # Width of a picture: sharp on a telephone and half a desk, or on the whole of one.
 _WIDTH_PX, _LARGE_PX = 640, 1400
 _QUALITY = 45
+# Black above the sky and the length of the scale, in limits of zscale, and where asinh bends.
+_BLACK, _SPAN, _BEND = 0.2, 4.0, 0.06
 # Widths of the image that a typical residual's arrow is long.
 _ARROW = 0.02
 # So many marks of a kind have words of their own; beyond, they are one line.
@@ -111,15 +113,16 @@ def picture(path: Path, width_px: int, camera: Camera, flat: bool = True) -> byt
         sky = prepare_image(image, 1.0, None, None)[0].counts
     else:
         sky = image.data.astype(np.float32)
-        sky[~np.isfinite(sky)] = np.median(sky[np.isfinite(sky)]) if np.isfinite(sky).any() else 0.0
+        sky -= np.median(sky[np.isfinite(sky)]) if np.isfinite(sky).any() else 0.0
+        sky[~np.isfinite(sky)] = 0.0
     small = Image.fromarray(sky)
     if small.width > width_px:
         small = small.resize((width_px, max(1, round(small.height * width_px / small.width))), Image.Resampling.BOX)
     sky = np.asarray(small)
     low, high = ZScaleInterval(n_samples=4000).get_limits(sky)
-    # Zscale finds the sky; asinh then leaves stars, which are far brighter, their shapes.
-    floor, span, bend = (0.0, 5.0, 0.06) if flat else (low, 3.0, 0.05)
-    bright = AsinhStretch(bend)(np.clip((sky - floor) / max(span * (high - low), 1e-12), 0.0, 1.0))
+    # Black is a little above the sky, and the scale so long that asinh leaves stars their shapes.
+    floor, span = -_BLACK * low, max(_SPAN * (high - low), 1e-12)
+    bright = AsinhStretch(_BEND)(np.clip((sky - floor) / span, 0.0, 1.0))
     out = io.BytesIO()
     Image.fromarray((255.0 * bright).astype(np.uint8)).save(out, "WEBP", quality=_QUALITY, method=2)
     return out.getvalue()
@@ -137,7 +140,7 @@ def _card(frame: InspectedFrame, frames: Frames, factor: float) -> dict[str, Any
         "facts": list(_facts(frame)),
         "counts": counts,
         "reasons": _reasons(frame),
-        "step": next_step(frame, frames.run),
+        "step": next_step(frame, frames),
         "missing": "" if frame.path is not None else "The image is not where it was; its stars are drawn without it.",
     }
 
@@ -229,8 +232,10 @@ def _shape(key: str, x: float, y: float, r: float) -> str:
         s = 0.6 * r
         return f"M{x - s:.1f} {y - 0.6 * s:.1f}h{2 * s:.1f}l{-s:.1f} {1.7 * s:.1f}z"
     if key == "e":
-        s = 0.4 * r
-        return f"M{x - s:.1f} {y:.1f}h{2 * s:.1f}M{x:.1f} {y - s:.1f}v{2 * s:.1f}"
+        # Open in the middle, where the star is.
+        gap, tick = 0.3 * r, 0.35 * r
+        ends = ((1, 0), (-1, 0), (0, 1), (0, -1))
+        return "".join(f"M{x + gap * i:.1f} {y + gap * j:.1f}l{tick * i:.1f} {tick * j:.1f}" for i, j in ends)
     return f"M{x - r:.1f} {y - r:.1f}h{2 * r:.1f}v{2 * r:.1f}h{-2 * r:.1f}z"
 
 
@@ -279,12 +284,10 @@ def _names(table: Any, r: float, width: int) -> str:
     """The brightest stars by name."""
     texts = []
     for row in table.nsmallest(_NAMED, "mag").itertuples() if len(table) else ():
-        left = row.x_px > 0.75 * width
-        x = row.x_px - 1.3 * r if left else row.x_px + 1.3 * r
-        anchor = ' text-anchor="end"' if left else ""
-        texts.append(
-            f'<text x="{x:.1f}" y="{row.y_px - r:.1f}"{anchor}>{escape(short_name(row.star_id, row.mag))}</text>'
-        )
+        side, anchor = (-1.3 * r, ' text-anchor="end"') if row.x_px > 0.75 * width else (1.3 * r, "")
+        # Not above the picture.
+        place = f'x="{row.x_px + side:.1f}" y="{row.y_px + (-r if row.y_px > 5.0 * r else 3.5 * r):.1f}"'
+        texts.append(f"<text {place}{anchor}>{escape(short_name(row.star_id, row.mag))}</text>")
     return "".join(texts)
 
 

@@ -12,7 +12,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.core.formatting import count, plural
 from starcal_uq.identification.result import STATUSES, FoundOptics, FrameStatus, Identification
 from starcal_uq.images.centroids import Centroids
-from starcal_uq.pipeline.inspection import IDENTIFIED, Frames, InspectedFrame
+from starcal_uq.pipeline.inspection import FAINTEST, IDENTIFIED, Frames, InspectedFrame
 from starcal_uq.pipeline.record import ImageRecord
 from starcal_uq.pipeline.refine import ImageCalibration, identified_pairs
 from starcal_uq.presentation.tables import TextTable
@@ -158,26 +158,25 @@ class Step:
     command: str
 
 
-def next_step(frame: InspectedFrame, run: str) -> Step | None:
+def next_step(frame: InspectedFrame, frames: Frames) -> Step | None:
     """What to do about a frame without a part in the calibration; None for others."""
     if frame.n(IDENTIFIED):
         return None
     image = quote(str(frame.path) if frame.path is not None else frame.row.image)
-    run = quote(run)
-    camera, outcome, number = f"{run}/camera.toml", frame.row.outcome, frame.row.frame
-    again = f"starcal-uq identify {run}/centroids.parquet {camera} -o found.csv --calibration {run}"
+    run, outcome = quote(frames.run), frame.row.outcome
+    # Much fainter ones are not detected, and take longer to be told apart.
+    deeper = f"--max-mag {min(np.ceil(frames.searched_mag + 1.0), FAINTEST):g}" if frames.searched_mag > 0.0 else ""
+    again = f"starcal-uq identify {run}/centroids.parquet {run}/camera.toml -o found.csv --calibration {run}"
+    centroid = f"starcal-uq centroid {image} --camera {run}/camera.toml -o stars.csv"
     if outcome == "identified":
-        return Step("all of its stars were left out; look at them one by one.", f"starcal-uq inspect {run} {number}")
+        images = " ".join(quote(str(source)) for source in frames.images) or "IMAGES"
+        command = f"starcal-uq run {images} {run}/camera.toml -o {quote(frames.run + '-deeper')} {deeper}".rstrip()
+        return Step("too few of its stars can be calibrated; search among fainter ones.", command)
     if outcome == "too few stars":
-        return Step(
-            "look for fainter stars, or expose longer.",
-            f"starcal-uq centroid {image} --camera {camera} -o stars.csv --threshold 3.5",
-        )
+        return Step("look for fainter stars, or expose longer.", f"{centroid} --threshold 3.5")
     if outcome == "ambiguous":
         return Step("identify it with what the other frames have told about the camera.", again)
     if outcome in ("not identified", "not searched"):
-        return Step(
-            "if it shows stars and no clouds, trees or another field of view, search among fainter stars.",
-            f"{again} --max-mag 9",
-        )
-    return Step("hear the whole reason.", f"starcal-uq centroid {image} --camera {camera} -o stars.csv")
+        words = "if it shows stars, and no clouds, trees or other field of view, search among fainter ones."
+        return Step(words, f"{again} {deeper}".rstrip())
+    return Step("hear the whole reason.", centroid)
