@@ -23,7 +23,7 @@ from starcal_uq.core.types import AnyDict
 from starcal_uq.images.centroids import COLUMNS, FRAME_COLUMNS, Centroids
 from starcal_uq.images.detection import DetectionOptions, FrameStars, find_stars
 from starcal_uq.images.image import IMAGE_ENDINGS, Image, read_images
-from starcal_uq.images.optics import common_optics, optics_of, other_sizes
+from starcal_uq.images.optics import common_optics, common_place, optics_of, other_sizes, place_of
 from starcal_uq.images.pixel_phase import phase_error, without_phase_error
 
 if TYPE_CHECKING:
@@ -207,6 +207,7 @@ class _Measure:
         entry = _entry(name, image.time_utc or "")
         entry.update(background=found.background, noise=found.noise, psf_sigma_px=found.psf_sigma_px)
         entry["optics"] = optics_of(image.header, image.width_px, image.height_px)
+        entry["place"] = place_of(image.header)
         messages = [*image.messages, *(f"{name}: {text}" for text in found.messages)]
         return _Frame(entry, messages, sha256.digest(), found)
 
@@ -292,6 +293,7 @@ class _Table:
             "images_sha256": self.digest.hexdigest(),
             "optics": optics,
             "other_sizes": other_sizes(said, optics),
+            "place": common_place([entry.get("place", {}) for entry in self.frames]),
         }
         if known and len(known) < len(self.gains):
             per_star = np.repeat([g or 1.0 for g in self.gains], [len(s.columns["x_px"]) for s in self.stars])

@@ -1,7 +1,8 @@
-"""What image files say of the lens and the detector: pixel pitch and focal length, where they do."""
+"""What image files say of lens, detector and place: pixel pitch, focal length and site, where they do."""
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -21,6 +22,11 @@ EXIF = {
 # Micrometres of Exif's units of resolution: inch, centimetre, millimetre, micrometre.
 _UNIT_UM = {2.0: 25400.0, 3.0: 10000.0, 4.0: 1000.0, 5.0: 1.0}
 _DIAGONAL_35_MM = 43.27
+_PLACES = (
+    ("OBSGEO-B", "OBSGEO-L", "OBSGEO-H"),
+    ("SITELAT", "SITELONG", "SITEELEV"),
+    ("LAT-OBS", "LONG-OBS", "ALT-OBS"),
+)
 # Values beyond are no sensor's and no lens's.
 _PIXEL_UM, _FOCAL_MM = (0.3, 200.0), (0.5, 50_000.0)
 
@@ -51,6 +57,54 @@ def optics_of(header: Mapping[str, Any], width_px: int, height_px: int) -> AnyDi
         if value is not None:
             found[name] = float(value)
     return found
+
+
+def place_of(header: Mapping[str, Any]) -> AnyDict:
+    """Latitude and longitude (degrees, north and east positive), height (m) and the keys that say so, or nothing.
+
+    Of FITS: OBSGEO-B, -L, -H or OBSGEO-X, -Y, -Z (m), SITELAT and SITELONG, LAT-OBS and LONG-OBS with ALT-OBS; degrees
+    as a number or as "52 13 04.5".
+    """
+    xyz = [_number(header, f"OBSGEO-{axis}") for axis in "XYZ"]
+    for north, east, up in _PLACES:
+        latitude, longitude = _angle(header, north), _angle(header, east)
+        if latitude is not None and longitude is not None and abs(latitude) <= 90.0 and abs(longitude) <= 360.0:
+            return _place(latitude, longitude, _number(header, up) or 0.0, f"{north}, {east}")
+    if all(value is not None for value in xyz) and 6.3e6 < float(np.linalg.norm(np.array(xyz, dtype=float))) < 6.4e6:
+        import erfa
+
+        longitude, latitude, height = (float(value) for value in erfa.gc2gd(1, np.array(xyz, dtype=float)))
+        return _place(float(np.degrees(latitude)), float(np.degrees(longitude)), height, "OBSGEO-X, -Y, -Z")
+    return {}
+
+
+def _place(latitude: float, longitude: float, height: float, keys: str) -> AnyDict:
+    if latitude == longitude == 0.0 or not -500.0 <= height <= 9000.0:
+        # What programs write that do not know.
+        return {}
+    longitude = (longitude + 180.0) % 360.0 - 180.0
+    return {"latitude_deg": latitude, "longitude_deg": longitude, "height_m": height, "keys": keys}
+
+
+def _angle(header: Mapping[str, Any], key: str) -> float | None:
+    """Degrees, of a number or of degrees, minutes and seconds in a text."""
+    if (value := _number(header, key)) is not None:
+        return value
+    words = re.findall(r"\d+(?:\.\d+)?", str(header.get(key, "")))
+    if not 2 <= len(words) <= 3 or any(float(word) >= 60.0 for word in words[1:]):
+        return None
+    size = sum(float(word) / 60.0**power for power, word in enumerate(words))
+    text = str(header[key]).strip().upper()
+    return -size if text.startswith("-") or text.endswith(("S", "W")) else size
+
+
+def common_place(places: Sequence[AnyDict]) -> AnyDict:
+    """The place that all images state which state one; nothing where they differ by more than a kilometre."""
+    said = [place for place in places if place]
+    if not said:
+        return {}
+    ends = np.array([[place["latitude_deg"], place["longitude_deg"]] for place in said])
+    return said[0] if np.all(np.ptp(ends, axis=0) < 0.01) else {}
 
 
 def other_sizes(optics: Mapping[int, AnyDict], common: AnyDict) -> dict[str, list[int]]:

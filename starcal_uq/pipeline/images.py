@@ -169,8 +169,11 @@ def observations_from_images(
         for message in counted(centroids.messages):
             tell(f"note: {message}")
         tell(centroids.text)
+    stated = None
     if site is not None:
         _check_times(centroids)
+    elif directions in (None, "catalogue") and not in_space:
+        stated = stated_site(centroids)
     year = epoch_of(centroids) if epoch is None else epoch
     stars = load_catalogue(max_mag=max_mag, epoch=year)
     # A neighbour need not be bright enough to be identified to displace a star.
@@ -184,6 +187,7 @@ def observations_from_images(
     psf_sigma_px = float(np.median(width)) if len(width) else 1.0
 
     def prepare(obs: Observations) -> Observations:
+        nonlocal site, stated
         obs = without_disturbed(obs, neighbours, first.nominal, psf_sigma_px)
         if in_space or rendered:
             obs = obs.with_meta(observer="space" if in_space else "rendered")
@@ -191,6 +195,21 @@ def observations_from_images(
         if not motion or (directions is None and not timed):
             return obs.with_meta(directions=directions or "undeclared")
         obs = obs.with_meta(directions="catalogue")
+        if stated is not None:
+            # What a header says of the place is believed as long as the stars are above its horizon.
+            said, stated = stated, None
+            try:
+                low = without_low_stars(obs, said)
+            except ObservationError as error:
+                words = f"was not used: {error}"
+            else:
+                site, words = (
+                    said,
+                    f"was used for refraction; {plural(int(low.meta['low_stars']), 'low star')} left out.",
+                )
+            if tell is not None:
+                keys = centroids.meta["place"]["keys"]
+                tell(f"note: The site in the headers ({keys}: {said}) {words} Another: --site SITE, none: --in-space.")
         return make_apparent(obs if site is None else without_low_stars(obs, site), site=site)
 
     def to_catalogue(apparent: FloatArray, times: StrArray) -> FloatArray:
@@ -208,6 +227,17 @@ def observations_from_images(
         identification=options,
     )
     return settle_noise(found.observations, found.calibration), centroids, found
+
+
+def stated_site(centroids: Centroids) -> Site | None:
+    """The site that the headers of the images state, where all frames with stars have times."""
+    from starcal_uq.sky.site import Site
+
+    place = centroids.meta.get("place")
+    used = (centroids.problem == "") & (centroids.stars_per_frame > 0)
+    if not place or (centroids.time_utc[used] == "").any():
+        return None
+    return Site(place["latitude_deg"], place["longitude_deg"], place["height_m"])
 
 
 def with_time(centroids: Centroids, time_utc: str | None) -> Centroids:

@@ -17,6 +17,7 @@ from starcal_uq.core.errors import ObservationError, SiteError
 from starcal_uq.core.times import utc_text
 from starcal_uq.diagnostics.verdict.observed import corrected_words
 from starcal_uq.images.image import read_image, time_in_name
+from starcal_uq.images.optics import common_place, place_of
 from starcal_uq.pipeline.displacement import as_measured, mirrored, undisplaced
 from starcal_uq.pipeline.images import observations_from_images, with_time
 from starcal_uq.pipeline.refine import identify_and_calibrate
@@ -507,6 +508,71 @@ def test_report_states_site_air_and_what_refraction_does(stars):
 )
 def test_times_in_names_of_files(name, time):
     assert time_in_name(name) == time
+
+
+def earth_fixed(latitude, longitude, height):
+    """Geocentric place in metres, WGS 84."""
+    lat, lon, flat = np.radians(latitude), np.radians(longitude), 1.0 / 298.257223563
+    e2 = flat * (2.0 - flat)
+    n = 6378137.0 / np.sqrt(1.0 - e2 * np.sin(lat) ** 2)
+    level = (n + height) * np.cos(lat)
+    return level * np.cos(lon), level * np.sin(lon), (n * (1.0 - e2) + height) * np.sin(lat)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        {"SITELAT": "52 13 12", "SITELONG": "4 25 12", "SITEELEV": 10},
+        {"SITELAT": 52.22, "SITELONG": 4.42, "SITEELEV": "10"},
+        {"SITELAT": "+52:13:12.0", "SITELONG": "-355:34:48", "SITEELEV": 10.0},
+        {"SITELAT": "52d13m12s N", "SITELONG": "04d25m12s E", "SITEELEV": 10.0},
+        {"LAT-OBS": 52.22, "LONG-OBS": 4.42, "ALT-OBS": 10.0},
+        dict(zip(("OBSGEO-X", "OBSGEO-Y", "OBSGEO-Z"), earth_fixed(52.22, 4.42, 10.0), strict=True)),
+    ],
+)
+def test_a_place_in_a_header(header):
+    place = place_of(header)
+    assert (place["latitude_deg"], place["longitude_deg"]) == pytest.approx((52.22, 4.42), abs=1e-6)
+    assert place["height_m"] == pytest.approx(10.0, abs=1e-3)
+    west = place_of({"SITELAT": "-24 36 00", "SITELONG": "70 24 00 W"})
+    assert (west["latitude_deg"], west["longitude_deg"]) == pytest.approx((-24.6, -70.4))
+    assert common_place([{}, place]) == place
+    assert common_place([west, place]) == common_place([{}]) == {}
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        {},
+        {"SITELAT": 0.0, "SITELONG": 0.0},
+        {"SITELAT": "unknown", "SITELONG": "4 25 12"},
+        {"SITELAT": 95.0, "SITELONG": 4.0},
+        {"SITELAT": "52 77 12", "SITELONG": "4 25 12"},
+        {"OBSGEO-X": 1.0, "OBSGEO-Y": 2.0, "OBSGEO-Z": 3.0},
+        {"SITELAT": 52.0, "SITELONG": 4.0, "SITEELEV": 400_000.0},
+    ],
+    ids=str,
+)
+def test_no_place_in_a_header(header):
+    assert place_of(header) == {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("longitude", "used"), [("4 25 12", True), ("184 25 12", False)])
+def test_the_place_in_headers_is_used_where_the_stars_are_above_its_horizon(tmp_path, real_data, longitude, used):
+    from astropy.io import fits
+
+    for path in sorted((real_data / "esa-tetra3").glob("*Alt60*.tiff")):
+        frame = fits.PrimaryHDU(read_image(path).data)
+        frame.header["DATE-OBS"], frame.header["EXPTIME"] = "2019-07-29T20:47:26", 0.001
+        frame.header["SITELAT"], frame.header["SITELONG"] = "52 13 12", longitude
+        frame.writeto(tmp_path / f"{path.stem}.fits")
+    told = []
+    camera = sc.Camera.load(real_data / "esa_tetra3_camera.toml")
+    obs, _, _ = observations_from_images([tmp_path], camera, max_mag=7.0, tell=told.append)
+    note = next(text for text in told if "site in the headers" in text)
+    assert "SITELAT, SITELONG: 52.22° N" in note and ("was used" in note) is used
+    assert obs.meta["observer"] == "ground" if used else "site" not in obs.meta
 
 
 def test_an_images_own_time_wins(tmp_path):
