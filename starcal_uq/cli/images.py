@@ -12,11 +12,11 @@ import typer
 import starcal_uq as sc
 from starcal_uq.cli.console import err, note, print_json, print_table, progress_bar, records, warn_undeclared
 from starcal_uq.cli.options import (
+    MAGNITUDES,
     BayerMosaic,
     Engine,
     Force,
     Json,
-    MaxMag,
     OptionalCamera,
     TimeUtc,
     check_names,
@@ -129,7 +129,9 @@ def identify_command(
         typer.Option("-o", "--out", metavar="OBS", help=f"Table to write ({', '.join(WRITTEN)}).", parser=write_file),
     ],
     camera: OptionalCamera = None,
-    max_mag: MaxMag = 7.0,
+    max_mag: Annotated[
+        float | None, number(MAGNITUDES, "Magnitude limit, Gaia G; as deep as the frames need by default.")
+    ] = None,
     epoch: Annotated[
         float | None, number(EPOCH, "Julian year of the star positions; the images' own by default.")
     ] = None,
@@ -146,6 +148,7 @@ def identify_command(
     json: Json = False,
 ) -> None:
     """Identify the stars of every frame without knowing where the camera pointed; frames that do not fit are named."""
+    from starcal_uq.pipeline.depth import depth_text, identify_to_depth
     from starcal_uq.pipeline.images import epoch_of, of_one_size
     from starcal_uq.presentation.words.images import MOST_FRAMES, identification_table
 
@@ -158,21 +161,24 @@ def identify_command(
     known = None if calibration is None else sc.Run(calibration).best
     if calibration is not None and known is not None and nominal is not None and camera is not None:
         check_same_sensor(known.camera, calibration, nominal, camera)
-    stars = sc.load_catalogue(max_mag=max_mag, epoch=epoch_of(table) if epoch is None else epoch)
+    year = epoch_of(table) if epoch is None else epoch
     _say_epoch(table, epoch)
     with progress_bar("frames") as progress:
-        found = sc.identification.identify(
+        stars, found = identify_to_depth(
             table,
             nominal,
-            stars,
+            year,
+            max_mag,
             calibration=known,
             focal_tolerance=focal_tolerance,
             centre_tolerance_px=centre_tolerance,
             engine=engine,
             progress=progress,
         )
+    if max_mag is None:
+        _say((depth_text(stars, found),))
     if found.n_identified:
-        found.observations.save(out, force=force, camera=nominal if known is None else known.camera)
+        found.observations.save(out, force=force, camera=found.nominal if known is None else known.camera)
     if json:
         print_json({"summary": found.text, "frames": records(found.to_dataframe())})
     else:
@@ -241,7 +247,7 @@ def load_images(
         obs, centroids, found = observations_from_images(
             images,
             camera,
-            max_mag=7.0 if settings.max_mag is None else settings.max_mag,
+            max_mag=settings.max_mag,
             epoch=settings.epoch,
             gain_e_per_count=settings.gain,
             time_utc=settings.time,

@@ -143,7 +143,8 @@ class ImageSettings:
     """What belongs to images alone; None where nothing was said."""
 
     max_mag: Annotated[
-        float | None, number(MAGNITUDES, "Images: magnitude limit of the catalogue, Gaia G; 7 by default.")
+        float | None,
+        number(MAGNITUDES, "Images: magnitude limit, Gaia G; as the frames need it by default."),
     ] = None
     epoch: Annotated[
         float | None, number(EPOCH, "Images: Julian year of the star positions; the images' own by default.")

@@ -81,7 +81,7 @@ def observations_from_images(
     images: Sequence[Path],
     camera: Camera | None,
     *,
-    max_mag: float,
+    max_mag: float | None = None,
     focal_tolerance: float = 0.03,
     epoch: float | None = None,
     gain_e_per_count: float | None = None,
@@ -104,8 +104,8 @@ def observations_from_images(
         Image files or folders of them.
     camera : Camera or None
         The nominal camera. Without one, it is what the images say of it, and the focal length is found from the stars.
-    max_mag : float
-        Magnitude limit of the embedded catalogue, Gaia G.
+    max_mag : float, optional
+        Magnitude limit of the embedded catalogue, Gaia G; chosen by default (`depth_for`).
     focal_tolerance : float
         Relative error of the focal length that is looked for first.
     epoch : float, optional
@@ -144,8 +144,8 @@ def observations_from_images(
     CatalogueError
         When the time is not readable.
     """
-    from starcal_uq.identification.engine import identify
     from starcal_uq.images.extract import extract_centroids
+    from starcal_uq.pipeline.depth import depth_text, identify_to_depth
     from starcal_uq.pipeline.refine import identify_and_calibrate
     from starcal_uq.sky.catalogue import load_catalogue
     from starcal_uq.sky.neighbours import without_disturbed
@@ -175,12 +175,14 @@ def observations_from_images(
     elif directions in (None, "catalogue") and not in_space:
         stated = stated_site(centroids)
     year = epoch_of(centroids) if epoch is None else epoch
-    stars = load_catalogue(max_mag=max_mag, epoch=year)
-    # A neighbour need not be bright enough to be identified to displace a star.
-    neighbours = load_catalogue(max_mag=max(max_mag, min(max_mag + _FAINTER_NEIGHBOURS, _FAINTEST)), epoch=year)
-
     options: dict[str, Any] = {"engine": engine, "focal_tolerance": focal_tolerance}
-    first = identify(centroids, camera, stars, **options)
+    stars, first = identify_to_depth(centroids, camera, year, max_mag, **options)
+    if tell is not None and max_mag is None:
+        tell(depth_text(stars, first))
+    limit = float(stars.mag.max())
+    # A neighbour need not be bright enough to be identified to displace a star.
+    neighbours = load_catalogue(max_mag=max(limit, min(limit + _FAINTER_NEIGHBOURS, _FAINTEST)), epoch=year)
+
     rendered = _rendered(images)
     motion = directions in (None, "catalogue")
     width = centroids.psf_sigma_px[np.isfinite(centroids.psf_sigma_px)]
