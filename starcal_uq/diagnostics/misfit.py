@@ -21,7 +21,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.display import Shown
 from starcal_uq.core.formatting import significant
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.diagnostics.pattern import Fit, Pattern, frame_covariance
 from starcal_uq.diagnostics.shapes import FRAME_BY_FRAME, MAX_CELLS, Shape, View, frame_shapes, run_clock, shapes
 from starcal_uq.estimation.marginal import MarginalLikelihood
@@ -242,9 +242,81 @@ def _detectable(test: MisfitTest, level: float) -> float:
     return float(np.sqrt(ncfdtrinc(test.dof, test.dof_residual, 1.0 - POWER, limit)))
 
 
-def _frame_products(frames: StarFrames, few: Sequence[FloatArray], many: FloatArray) -> FloatArray:
-    """Products (i, q, K) of few columns (2, n) with many (q, 2, n) over the stars of each frame."""
-    return np.stack([frames.sum(np.einsum("xn,qxn->qn", column, many)) for column in few])
+@dataclass(frozen=True)
+class _Columns:
+    """Columns of some stars, the last of them the two axes of cells of the field, which are sums and no columns.
+
+    `dense` (q, 2, n) are the others; `cell` (n,) is of `n_cells`.
+    """
+
+    frames: StarFrames
+    dense: FloatArray
+    cell: IntArray
+    n_cells: int
+
+    @classmethod
+    def of(cls, families: Sequence[Shape], view: View) -> _Columns:
+        *others, last = families
+        frames = view.part.frames
+        dense = np.concatenate([family.columns(view) for family in others])
+        if frames.weight is not None:
+            dense *= frames.weight
+        assert last.cell is not None
+        return cls(frames, dense, last.cell(view), last.size // 2)
+
+    def all(self) -> FloatArray:
+        """Every column (q, 2, n)."""
+        star, cells = np.arange(len(self.cell)), np.zeros((self.n_cells, 2, 2, len(self.cell)))
+        cells[self.cell, 0, 0, star] = cells[self.cell, 1, 1, star] = self._weight(1.0)
+        return np.concatenate([self.dense, cells.reshape(2 * self.n_cells, 2, -1)])
+
+    def _weight(self, values: Any) -> Any:
+        return values if self.frames.weight is None else values * self.frames.weight
+
+    def inner(self) -> FloatArray:
+        """Products among themselves."""
+        d, q = len(self.dense), len(self.dense) + 2 * self.n_cells
+        found, cells = np.zeros((q, q)), np.arange(d, q)
+        flat = self.dense.reshape(d, -1)
+        found[:d, :d] = flat @ flat.T
+        found[d:, :d] = self._by_cell(self.dense)
+        found[:d, d:] = found[d:, :d].T
+        unit = self._weight(self._weight(np.ones(len(self.cell))))
+        found[cells, cells] = np.repeat(np.bincount(self.cell, unit, self.n_cells), 2)
+        return found
+
+    def across(self, columns: FloatArray) -> FloatArray:
+        """Products (q, m) with columns (m, 2, n)."""
+        flat = self.dense.reshape(len(self.dense), -1)
+        return np.concatenate([flat @ columns.reshape(len(columns), -1).T, self._by_cell(columns)])
+
+    def _by_cell(self, columns: FloatArray) -> FloatArray:
+        """Sums (2 c, m) over the stars of each cell of columns (m, 2, n)."""
+        order = np.argsort(self.cell, kind="stable")
+        present, first = np.unique(self.cell[order], return_index=True)
+        sums = np.zeros((self.n_cells, 2, len(columns)))
+        sums[present] = np.add.reduceat(np.take(self._weight(columns), order, axis=-1), first, axis=-1).T
+        return sums.reshape(2 * self.n_cells, -1)
+
+    def by_frame(self, few: FloatArray) -> FloatArray:
+        """Products (i, q, K) with few columns (i, 2, n) over the stars of each frame."""
+        k = self.frames.n_frames
+        place = np.repeat(np.arange(k), self.frames.sizes) * self.n_cells + self.cell
+        found = np.empty((len(few), len(self.dense) + 2 * self.n_cells, k))
+        for column, into in zip(few, found, strict=True):
+            into[: len(self.dense)] = _frame_products(self.frames, column, self.dense)
+            cells = into[len(self.dense) :].reshape(self.n_cells, 2, k)
+            for axis in range(2):
+                sums = np.bincount(place, self._weight(column[axis]), k * self.n_cells)
+                cells[:, axis] = sums.reshape(k, self.n_cells).T
+        return found
+
+
+def _frame_products(frames: StarFrames, column: FloatArray, many: FloatArray) -> FloatArray:
+    """Products (q, K) of a column (2, n) with many (q, 2, n) over the stars of each frame."""
+    product = many[:, 0] * column[0]
+    product += many[:, 1] * column[1]
+    return frames.sum(product)
 
 
 @dataclass
@@ -300,7 +372,7 @@ class _Sums:
             rows = slice(int(starts[first]), int(starts[last]))
             fitted, columns, view = found._add(part, state, theta, rows)
             if stars is not None:
-                stars.add(part, state, np.concatenate([fitted, part.project_out(state, columns)]), rows)
+                stars.add(part, state, np.concatenate([fitted, part.project_out(state, columns.all())]), rows)
                 fitted[p] = cal.residuals_px[rows].T * (1.0 if part.frames.weight is None else part.frames.weight)
             h, e = fitted[:p], fitted[p]
             flat = fitted.reshape(p + 1, -1)
@@ -316,24 +388,22 @@ class _Sums:
 
     def _add(
         self, part: MarginalLikelihood, state: Any, theta: FloatArray, rows: slice
-    ) -> tuple[FloatArray, FloatArray, View]:
+    ) -> tuple[FloatArray, _Columns, View]:
         """Add some frames: parameters and residuals, attitudes projected out, and all columns, as they are.
 
         A product of columns after projection is that before, less the products of what rotations of the frames make of
         both: nothing of the size of the many columns is written for it.
         """
         view, weight = View.of(part, state, theta, rows), part.frames.weight
-        columns = np.concatenate([family.columns(view) for family in self.families])
-        if weight is not None:
-            columns *= weight
+        columns = _Columns.of(self.families, view)
         h = view.parameter_columns if weight is None else view.parameter_columns * weight
         own = np.concatenate([h, state.e[None]])
         fitted = part.project_out(state, own)
-        n, flat, many = len(own), fitted.reshape(len(own), -1), columns.reshape(len(columns), -1)
-        inner, across = many @ many.T, many @ flat.T
+        n, flat = len(own), fitted.reshape(len(own), -1)
+        inner, across = columns.inner(), columns.across(fitted)
         self.raw[:n] += np.sum(own**2, axis=(1, 2))
         self.raw[n:] += np.diag(inner)
-        turned = _frame_products(part.frames, state.attitude, columns)
+        turned = columns.by_frame(state.attitude)
         answer = sum(turned[i][:, None] * state.inverse[i] for i in range(3))
         self.gram[:n, :n] += flat @ flat.T
         self.gram[n:, :n] += across
@@ -342,7 +412,7 @@ class _Sums:
         return fitted, columns, view
 
     def _add_blocks(
-        self, part: MarginalLikelihood, state: Any, view: View, fitted: FloatArray, others: FloatArray
+        self, part: MarginalLikelihood, state: Any, view: View, fitted: FloatArray, others: _Columns
     ) -> None:
         """Scale and quadrupole of every frame by itself: three columns per frame, which no other frame sees."""
         frames = part.frames
@@ -356,7 +426,8 @@ class _Sums:
         kept = values > _ABSORBED
         root = vectors * np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)[:, None, :]
         # Attitudes are out of these, and so out of their products with anything.
-        with_all = np.concatenate([_frame_products(frames, list(columns), some) for some in (fitted, others)], axis=1)
+        with_fitted = np.stack([_frame_products(frames, column, fitted) for column in columns])
+        with_all = np.concatenate([with_fitted, others.by_frame(columns)], axis=1)
         explained = np.einsum("kab,ajk->kbj", root, with_all).reshape(-1, with_all.shape[1])
         self.blocks += explained.T @ explained
         self.block_rank += int(np.count_nonzero(kept))

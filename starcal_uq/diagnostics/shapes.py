@@ -81,6 +81,8 @@ class Shape:
         Name and unit of each column's amplitude, where amplitudes mean something by themselves.
     per_amplitude : tuple of float
         Amplitude in that unit of a column as it stands.
+    cell : callable, optional
+        ``View -> (n,)`` cell of every star, where the columns are shifts of those in one cell along each axis.
     """
 
     name: str
@@ -89,6 +91,7 @@ class Shape:
     columns: Callable[[View], FloatArray]
     labels: tuple[tuple[str, str], ...] = ()
     per_amplitude: tuple[float, ...] = ()
+    cell: Callable[[View], IntArray] | None = None
 
 
 def shapes(
@@ -348,14 +351,18 @@ def _cells(obs: Observations, camera: Camera, max_cells: int) -> Shape:
     cell = longer / int(np.clip(np.sqrt(per_area), 2, max_cells))
     nx, ny = (int(np.ceil(side / cell - 1e-9)) for side in (camera.width_px, camera.height_px))
 
-    def columns(view: View) -> FloatArray:
+    def cell_of(view: View) -> IntArray:
         x, y = view.part.frames.pixel - view.part.frames.in_pixels(view.state.e)
-        column = np.clip(((x + 0.5) / cell).astype(int), 0, nx - 1)
-        row = np.clip(((y + 0.5) / cell).astype(int), 0, ny - 1)
-        inside = (row * nx + column)[None] == np.arange(nx * ny)[:, None]
-        found = np.zeros((nx * ny, 2, 2, len(x)))
-        found[:, 0, 0] = inside
-        found[:, 1, 1] = inside
-        return found.reshape(2 * nx * ny, 2, len(x))
+        column = np.clip(((x + 0.5) / cell).astype(np.int64), 0, nx - 1)
+        row = np.clip(((y + 0.5) / cell).astype(np.int64), 0, ny - 1)
+        return np.asarray(row * nx + column)
 
-    return Shape(f"mean shift in {nx} × {ny} cells of the field", "field cells", 2 * nx * ny, columns)
+    def columns(view: View) -> FloatArray:
+        place = cell_of(view)
+        star = np.arange(len(place))
+        found = np.zeros((nx * ny, 2, 2, len(place)))
+        found[place, 0, 0, star] = found[place, 1, 1, star] = 1.0
+        return found.reshape(2 * nx * ny, 2, len(place))
+
+    name = f"mean shift in {nx} × {ny} cells of the field"
+    return Shape(name, "field cells", 2 * nx * ny, columns, cell=cell_of)

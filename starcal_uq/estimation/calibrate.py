@@ -350,7 +350,7 @@ def fit(obs: Observations, camera: Camera, *, method: str = "efficient") -> Fit:
     likelihood = MarginalLikelihood(obs, camera.distortion)
     check_count(likelihood, camera)
     pairs = PairObjective(likelihood.frames, camera.distortion)
-    stages, status = _stages(pairs, camera, likelihood, method, "lm", _ITERATIONS)
+    stages, status = _stages(pairs, camera, likelihood, method, "lm", _ITERATIONS, pairs_read=method != "efficient")
     return _fitted(likelihood, camera, stages[-1].theta, status)
 
 
@@ -371,7 +371,7 @@ def refit(obs: Observations, cal: Calibration, model: str) -> Fit:
         known = dict(list(known.items())[:3])
     likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
     theta = np.array([known.get(name, 0.0) for name in start.parameter_names])
-    stage = refinement_stage(likelihood, theta, _ITERATIONS)
+    stage = refinement_stage(likelihood, theta, _ITERATIONS, _gain(likelihood, _LAST_STEP), "unseen")
     try:
         return _fitted(likelihood, start, stage.theta, stage.status)
     except CalibrationError:
@@ -399,11 +399,16 @@ def _stages(
     max_iterations: int,
     tolerance: float = REFINEMENT_TOLERANCE,
     last: Last = "seen",
+    pairs_read: bool = True,
 ) -> tuple[list[Stage], Status]:
-    """All stages of a Gaussian fit, and how they ended; `tolerance` and `last` are those of the refinement."""
+    """All stages of a Gaussian fit, and how they ended; `tolerance` and `last` are those of the refinement.
+
+    Where nobody reads the estimate from interstar angles, it need only lead to the refinement.
+    """
     sampled = method == "efficient" and solver == "lm"
     stages = _sampled_stages(pairs, camera, max_iterations, _gain(likelihood, _LAST_PAIR_STEP)) if sampled else []
-    stages = stages or _pair_stages(pairs, camera, solver, max_iterations)
+    ending: tuple[float, Last] = (PAIR_TOLERANCE, "seen") if pairs_read else (_SAMPLE_TOLERANCE, "unseen")
+    stages = stages or _pair_stages(pairs, camera, solver, max_iterations, *ending)
     most = IMPLAUSIBLE_NOISE * camera.width_px
     noise = _noise_at(pairs, likelihood, stages[-1].theta)
     if _strayed(stages[-1], camera) or noise > most:
@@ -412,9 +417,10 @@ def _stages(
         own = MarginalLikelihood(likelihood.frames, camera.distortion)
         direct = direct_stage(own, camera, min(max_iterations, _DIRECT_ITERATIONS))
         if direct.status.ok:
-            again = joint_stage(pairs, camera, direct.theta, solver, max_iterations)
-            stages[-1] = min(stages[-1], again, key=_badness)
-            noise = _noise_at(pairs, likelihood, stages[-1].theta)
+            if pairs_read or noise_px(own, direct.theta) > noise:
+                again = joint_stage(pairs, camera, direct.theta, solver, max_iterations, *ending)
+                stages[-1] = min(stages[-1], again, key=_badness)
+                noise = _noise_at(pairs, likelihood, stages[-1].theta)
             if method == "efficient" and noise_px(own, direct.theta) <= min(noise, most):
                 likelihood.use_sums(*own.sums(direct.theta))
                 return [*stages, direct], direct.status
