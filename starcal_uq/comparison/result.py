@@ -164,9 +164,9 @@ class CameraComparison(Shown):
             for axis, value, sigma in zip(AXES, self.rotation_arcsec, self.rotation_sigma_arcsec, strict=True)
         ]
         rows.append(("map, rms", "arcsec", self.rms_arcsec, self.expected_rms_arcsec, self.p_map))
-        worst = self.worst_ratio * float(self.sigma_arcsec[self._worst_index])
+        sigma = float(self.sigma_arcsec[self._worst_index])
         rows.append(
-            ("map, where it stands out most", "arcsec", worst, worst / self.worst_ratio, self.p_worst)
+            ("map, where it stands out most", "arcsec", self.worst_ratio * sigma, sigma, self.p_worst)
             if self.tested
             else ("map, largest", "arcsec", self.largest_arcsec, np.nan, np.nan)
         )

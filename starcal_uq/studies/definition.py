@@ -18,7 +18,7 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import COEFFICIENTS, PARAMETERS, parameter_names
 from starcal_uq.core.errors import CameraError, PriorError, StudyError
-from starcal_uq.core.files import PathLike, atomic_write_text, ensure_new
+from starcal_uq.core.files import PathLike, atomic_write_text, ensure_new, shown
 from starcal_uq.core.settings import StudyTemplate
 from starcal_uq.core.toml import Key, Section, read_toml, unknown_key
 from starcal_uq.core.types import AnyDict
@@ -168,6 +168,11 @@ class StudyDefinition:
         given = _observation(content.get("observation", {}), f"{where}, section [observation]")
         priors = {name: _prior(name, table, where) for name, table in content.get("priors", {}).items()}
         seeds = study.pop("seeds", 1)
+        if isinstance(seeds, int) and seeds > MAX_CELLS:
+            raise StudyError(
+                f"{where}, section [study]: seeds is {shown(seeds)}; write a number of repetitions of at most "
+                f"{MAX_CELLS}."
+            )
         study["seeds"] = tuple(range(seeds)) if isinstance(seeds, int) else tuple(seeds)
         made = cls(camera=camera, sweep=sweep, observation=given, latin=latin, latin_n=latin_n, priors=priors, **study)
         made.check(where)

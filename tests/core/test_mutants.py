@@ -97,6 +97,12 @@ def _members(data: bytes, **changed: bytes | None) -> bytes:
     return stream.getvalue()
 
 
+def _document(data: bytes, old: str, new: str) -> bytes:
+    text = str(np.load(io.BytesIO(data))["document"])
+    assert old in text
+    return _members(data, document=_npy(np.array(text.replace(old, new))))
+
+
 def _npy(array: Any) -> bytes:
     stream = io.BytesIO()
     np.save(stream, array, allow_pickle=True)
@@ -245,6 +251,18 @@ ONCE = [
     ("study.nc", _hdf5(lambda f: f.pop("status")), r"\(status is missing\); run `starcal-uq study` again\.$"),
     ("study.nc", _hdf5(lambda f: f.pop("max_mag")), r"\(max_mag is missing\)"),
     ("study.nc", _hdf5(_one_for_another), r"\(n_frames is not along cell\)"),
+    ("study.toml", lambda d: d.replace(b"k1 = 2.0e-10", b"k1 = 1e300"), None),
+    (
+        "study.toml",
+        lambda d: re.sub(rb"seeds = .*", b"seeds = " + b"9" * 30, d),
+        r"section \[study\]: seeds is 9+; write a number of repetitions of at most 1000000\.$",
+    ),
+    (
+        "validation.npz",
+        lambda d: _document(d, '"n_ranked": ', '"n_ranked": -'),
+        r"\(n_ranked is -\d+, no number of draws\); run `starcal-uq validate CAMERA`",
+    ),
+    ("comparison.json", lambda d: re.sub(rb'"worst_ratio": [^,}]*', b'"worst_ratio": 0', d), None),
     ("checkpoint.npz", lambda d: _members(d, place=_npy(np.zeros(2) + 1j)), "the draws are made again"),
     ("checkpoint.npz", lambda d: _members(d, place=_npy(np.zeros(2, "M8[s]"))), "the draws are made again"),
     ("checkpoint.npz", lambda d: _members(d, key=None), "the draws are made again"),

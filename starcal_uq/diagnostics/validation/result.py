@@ -117,6 +117,10 @@ class Validation(Shown):
         **dict.fromkeys(("ranks", "covered", "error", "sd"), ("n", "q")),
     }
 
+    def __post_init__(self) -> None:
+        if self.n_ranked < 1:
+            raise ValueError(f"n_ranked is {self.n_ranked}, no number of draws")
+
     @property
     def n_replicates(self) -> int:
         """Replicates with a result."""
