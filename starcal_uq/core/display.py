@@ -7,7 +7,7 @@ class, when somebody asks.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from functools import partial
 from typing import Any
 
@@ -75,6 +75,12 @@ class Figures:
 class Shown:
     """What every result can do once somebody above has said how."""
 
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        # That of a dataclass would print every array.
+        if "__repr__" not in vars(cls):
+            cls.__repr__ = _short  # type: ignore[method-assign]
+
     @property
     def plot(self) -> Figures:
         """The figures of this result, by name: ``result.plot.<name>()``."""
@@ -84,8 +90,25 @@ class Shown:
     def text(self) -> str:
         """This result in a few sentences."""
         text = view_of(type(self)).text
-        return repr(self) if text is None else text(self)
+        return type(self).__name__ if text is None else text(self)
 
     def _repr_html_(self) -> str | None:
         html = view_of(type(self)).html
         return None if html is None else html(self)
+
+
+_MOST = 300
+
+
+def _short(result: Any) -> str:
+    """A result for the prompt: its fields where they are few, what it says otherwise."""
+    name = type(result).__name__
+    if is_dataclass(result):
+        plain = f"{name}({', '.join(f'{f.name}={getattr(result, f.name)!r:.{_MOST}}' for f in fields(result))})"
+        if len(plain) <= _MOST and "\n" not in plain:
+            return plain
+    try:
+        return f"{name}: {result.text}"
+    except Exception:
+        # A prompt and an error message show results of which something is wrong, too.
+        return f"{name}(...)"

@@ -87,3 +87,12 @@ def test_no_module_below_writes_html() -> None:
     for path in (path for wing in (*wings, "inference") for path in (root / wing).rglob("*.py")):
         text = path.read_text(encoding="utf-8")
         assert not any(mark in text for mark in ("<table", "<p>", "_repr_html_", "presentation")), path
+
+
+def test_at_the_prompt_a_result_fits_the_screen(paper_calibration: sc.Calibration) -> None:
+    couplings = sc.coupling(paper_calibration)
+    for result in (*results(paper_calibration), couplings):
+        assert len(repr(result)) < 1000
+    assert repr(couplings) == f"Coupling: {couplings.text}"
+    # What has few fields is printed as it is.
+    assert repr(paper_calibration.camera).startswith("Camera(width_px=1024, ")
