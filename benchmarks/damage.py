@@ -31,6 +31,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
+from benchmarks.pages import put  # noqa: E402
 from tests.helpers.mutants import LAST, SAMPLES, Bench, Outcome, Sample, write_samples  # noqa: E402
 
 OUT = ROOT / ".bench" / "damage"
@@ -220,9 +221,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             for seed, kind, detail in result["bad"]:
                 print(f"{name} seed {seed}: {kind}: {detail}")
     if options.write:
-        head, _, rest = PAGE.read_text("utf-8").partition("<!-- damage -->\n")
-        _, _, tail = rest.partition("<!-- end of damage -->\n")
-        PAGE.write_text(f"{head}<!-- damage -->\n\n{made}\n\n<!-- end of damage -->\n{tail}", "utf-8")
+        put(PAGE, "damage", made)
 
 
 if __name__ == "__main__":

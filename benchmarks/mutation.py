@@ -558,9 +558,9 @@ def main(arguments: list[str] | None = None) -> None:
     made = table(results)
     print(made)
     if options.write:
-        head, _, rest = PAGE.read_text("utf-8").partition("<!-- mutation -->\n")
-        _, _, tail = rest.partition("<!-- end of mutation -->\n")
-        PAGE.write_text(f"{head}<!-- mutation -->\n\n{made}\n\n<!-- end of mutation -->\n{tail}", "utf-8")
+        from benchmarks.pages import put
+
+        put(PAGE, "mutation", made)
 
 
 if __name__ == "__main__":

@@ -29,6 +29,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 
 import starcal_uq as sc  # noqa: E402
+from benchmarks.pages import between, put  # noqa: E402
 from starcal_uq.core.status import Level  # noqa: E402
 from starcal_uq.core.tasks import processors, run_tasks  # noqa: E402
 from starcal_uq.diagnostics.verdict.judge import judge  # noqa: E402
@@ -333,8 +334,8 @@ def page(name: str) -> tuple[Path, str]:
 def stored(name: str) -> list[dict[str, str]]:
     """Rows of the table that a page has."""
     path, word = page(name)
-    between = path.read_text(encoding="utf-8").partition(f"<!-- {word} -->")[2].partition(f"<!-- /{word} -->")[0]
-    lines = [[c.strip() for c in line.strip("|").split("|")] for line in between.splitlines() if line.startswith("|")]
+    rows = [line for line in between(path, word).splitlines() if line.startswith("|")]
+    lines = [[c.strip() for c in line.strip("|").split("|")] for line in rows]
     return [dict(zip(lines[0], line, strict=True)) for line in lines[2:]]
 
 
@@ -343,13 +344,8 @@ def write(name: str, rows: Sequence[Mapping[str, str]], seed: int) -> None:
     path, word = page(name)
     merged = {row["Regime"]: row for row in [*stored(name), *rows]}
     ordered = [merged[r.name] for r in REGIMES if r.name in merged]
-    text = path.read_text(encoding="utf-8")
-    before, found, rest = text.partition(f"<!-- {word} -->")
-    if not found or f"<!-- /{word} -->" not in rest:
-        raise SystemExit(f"{path} has no markers <!-- {word} --> and <!-- /{word} -->")
-    after = rest.partition(f"<!-- /{word} -->")[2]
     made = f"Made by `python benchmarks/regimes.py --seed {seed} --write`; do not edit.{_together(ordered)}"
-    path.write_text(f"{before}{found}\n\n{made}\n\n{markdown(ordered)}\n\n<!-- /{word} -->{after}", encoding="utf-8")
+    put(path, word, f"{made}\n\n{markdown(ordered)}")
 
 
 def _together(rows: Sequence[Mapping[str, str]]) -> str:

@@ -47,6 +47,7 @@ from benchmarks.harness import (  # noqa: E402
     spread,
     take_turns,
 )
+from benchmarks.pages import put  # noqa: E402
 
 CACHE = ROOT / ".bench"
 RESULTS = ROOT / "benchmarks" / "results.json"
@@ -740,15 +741,9 @@ def write(made: Sequence[dict[str, Any]]) -> None:
     merged = {r["name"]: r for r in [*kept, *made]}
     ordered = [merged[row.name] for row in rows() if row.name in merged]
     RESULTS.write_text(json.dumps(ordered, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
-    text = PAGE.read_text(encoding="utf-8")
     machines = "; ".join(sorted({r["machine"] for r in ordered}))
-    for word, between in (("targets", targets(ordered)), ("benchmarks", f"Machine: {machines}.\n\n{table(ordered)}")):
-        before, found, rest = text.partition(f"<!-- {word} -->")
-        _, end, after = rest.partition(f"<!-- /{word} -->")
-        if not found or not end:
-            raise SystemExit(f"{PAGE} has no markers <!-- {word} --> and <!-- /{word} -->")
-        text = f"{before}{found}\n\n{between}\n\n{end}{after}"
-    PAGE.write_text(text, encoding="utf-8")
+    put(PAGE, "targets", targets(ordered))
+    put(PAGE, "benchmarks", f"Machine: {machines}.\n\n{table(ordered)}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
