@@ -29,6 +29,7 @@ from starcal_uq.budgeting.shapes import HALF_WIDTHS, RAYLEIGH_MEAN
 from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.files import atomic_write_text, ensure_new
+from starcal_uq.core.settings import PROBABILITY
 from starcal_uq.core.toml import read_toml, unknown_key
 from starcal_uq.core.types import FloatArray
 
@@ -209,7 +210,7 @@ class _Table:
 
 def checked_confidence(value: float, where: str) -> float:
     """A confidence between 0 and 1, or a `BudgetError`."""
-    if not 0.0 < value < 1.0:
+    if not PROBABILITY.holds(value):
         hint = f"; write {value / 100:g} for {value:g} %" if 1.0 < value < 100.0 else ""
         raise BudgetError(f"{where} is {value!r}, but a confidence lies between 0 and 1, such as 0.997{hint}.")
     return value

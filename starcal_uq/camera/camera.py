@@ -25,6 +25,7 @@ from starcal_uq.camera.opencv import from_opencv, to_opencv
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CameraError, DistortionError
 from starcal_uq.core.files import reading
+from starcal_uq.core.settings import KEYS
 from starcal_uq.core.toml import Key, Section, read_section, unknown_key, write_section
 from starcal_uq.core.types import BoolArray, FloatArray
 
@@ -347,13 +348,16 @@ _DIRECTION = {
     "inverse": "# distortion maps distorted (measured) points to ideal (pinhole) points.\n",
 }
 
+_WORDS = {
+    "width_px": "the width of the detector in pixels",
+    "height_px": "the height of the detector in pixels",
+    "pixel_um": "the pitch of the square pixels in micrometres",
+    "focal_mm": "the focal length in millimetres",
+    "x0_px": "the principal point along x in pixels",
+    "y0_px": "the principal point along y in pixels",
+}
 _KEYS = {
-    "width_px": Key(int, "the width of the detector in pixels, a whole number above 0", required=True, gt=0),
-    "height_px": Key(int, "the height of the detector in pixels, a whole number above 0", required=True, gt=0),
-    "pixel_um": Key(float, "the pitch of the square pixels in micrometres, a number above 0", required=True, gt=0),
-    "focal_mm": Key(float, "the focal length in millimetres, a number above 0", required=True, gt=0),
-    "x0_px": Key(float, "the principal point along x in pixels, a finite number", required=True),
-    "y0_px": Key(float, "the principal point along y in pixels, a finite number", required=True),
+    **{name: Key.number(KEYS[name], words, required=True) for name, words in _WORDS.items()},
     "distortion": Key(str, "the name of the distortion model, one of " + ", ".join(model_names())),
     "name": Key(str, "a name in quotes"),
 }
@@ -378,7 +382,7 @@ class _CameraSection(Section):
 
 @lru_cache
 def _section(distortion: str) -> Section:
-    own = {c.name: Key(float, "a finite number") for c in get_model(distortion).coefficients}
+    own = {c.name: Key.number(KEYS["coefficient"], "the coefficient") for c in get_model(distortion).coefficients}
     return _CameraSection({**_KEYS, **own}, CameraError, distortion)
 
 

@@ -12,7 +12,6 @@ import typer
 import starcal_uq as sc
 from starcal_uq.cli.console import err, note, print_json, print_table, progress_bar, records, warn_undeclared
 from starcal_uq.cli.options import (
-    MAGNITUDES,
     BayerMosaic,
     Engine,
     Force,
@@ -29,7 +28,7 @@ from starcal_uq.cli.options import (
 )
 from starcal_uq.cli.settings import ImageSettings, SkySettings
 from starcal_uq.core.files import UNFINISHED, ensure_new, table_ending
-from starcal_uq.core.settings import EPOCH
+from starcal_uq.core.settings import EPOCH, MAGNITUDES
 from starcal_uq.observations.files import WRITTEN
 
 if TYPE_CHECKING:

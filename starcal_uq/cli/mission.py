@@ -12,8 +12,6 @@ from starcal_uq.cli.console import err, note, print_json, print_table, progress_
 from starcal_uq.cli.console import out as console
 from starcal_uq.cli.options import (
     LEAST_SIGMA_PX,
-    MAGNITUDES,
-    PROBABILITY,
     CameraFile,
     Epoch,
     Force,
@@ -33,7 +31,7 @@ from starcal_uq.cli.options import (
 from starcal_uq.core import settings
 from starcal_uq.core.files import check_new_folder, ensure_new
 from starcal_uq.core.manifest import refuse_others
-from starcal_uq.core.settings import Limit
+from starcal_uq.core.settings import ARCSEC, MAGNITUDES, PROBABILITY, Limit
 
 if TYPE_CHECKING:
     from starcal_uq.budgeting.result import Budget
@@ -46,7 +44,6 @@ if TYPE_CHECKING:
 
 
 _CHOSEN = Limit(1, 10**6)
-_ARCSEC = Limit(1e-9, 1e6, whole=False)
 # The displacement of the corner by a distortion that still folds nowhere stays far within.
 _PERCENT = Limit(-30.0, 30.0, whole=False)
 
@@ -209,7 +206,7 @@ def plan_command(
     camera: CameraFile,
     target: Annotated[
         float | None,
-        number(_ARCSEC, "Two-axis error across the boresight to keep.", "--target-arcsec", metavar="T"),
+        number(ARCSEC, "Two-axis error across the boresight to keep.", "--target-arcsec", metavar="T"),
     ] = None,
     confidence: Annotated[float, number(PROBABILITY, "Probability of keeping it (0.997, not 99.7).")] = 0.997,
     scope: Annotated[

@@ -13,14 +13,12 @@ import typer
 from starcal_uq.core import settings
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.files import shown
-from starcal_uq.core.settings import EPOCH, LIMITS, Limit
+from starcal_uq.core.settings import EPOCH, LIMITS, MAGNITUDES, Limit
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
 
 # Gaia G; no star is brighter than the first, and the embedded catalogue ends at the last.
-MAGNITUDES = Limit(-2.0, 10.0, whole=False)
-PROBABILITY = Limit(1e-9, 1.0 - 1e-9, whole=False)
 # A noise that is given, and not simulated, is above zero.
 LEAST_SIGMA_PX = 1e-6
 _VELOCITY = Limit(-1e5, 1e5, whole=False)

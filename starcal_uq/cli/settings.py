@@ -14,7 +14,6 @@ import typer
 import starcal_uq as sc
 from starcal_uq.cli.options import (
     LEAST_SIGMA_PX,
-    MAGNITUDES,
     BayerMosaic,
     Columns,
     Duplicates,
@@ -28,7 +27,7 @@ from starcal_uq.cli.options import (
     read_file,
 )
 from starcal_uq.core import settings
-from starcal_uq.core.settings import EPOCH
+from starcal_uq.core.settings import EPOCH, MAGNITUDES
 from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:

@@ -26,7 +26,6 @@ from starcal_uq.cli.console import (
 )
 from starcal_uq.cli.console import out as console
 from starcal_uq.cli.options import (
-    MAGNITUDES,
     Alignment,
     AlignmentFrames,
     CameraFile,
@@ -53,7 +52,7 @@ from starcal_uq.cli.options import (
 from starcal_uq.cli.settings import EstimationSettings, SamplingSettings, SkySettings
 from starcal_uq.core import settings
 from starcal_uq.core.files import check_new_folder, ensure_new, table_ending
-from starcal_uq.core.settings import EPOCH
+from starcal_uq.core.settings import EPOCH, MAGNITUDES
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera

@@ -91,9 +91,9 @@ class Limit:
         return not isinstance(value, Integral if self.whole else Real) or bool(self.low <= value <= self.high)  # type: ignore[operator]
 
 
-def wanted(low: float, high: float, whole: bool) -> str:
+def wanted(low: float, high: float, whole: bool, verb: str = "give") -> str:
     """What to give for a number within limits."""
-    return f"give a {'whole ' if whole else ''}number from {_written(low)} to {_written(high)}"
+    return f"{verb} a {'whole ' if whole else ''}number from {_written(low)} to {_written(high)}"
 
 
 def _written(number: float) -> str:
@@ -104,6 +104,10 @@ def _written(number: float) -> str:
 SEED = Limit(0, 2**64 - 1)
 SIGMA_PX = Limit(0.0, 100.0, whole=False)
 EPOCH = Limit(1800.0, 2200.0, whole=False)
+MAGNITUDES = Limit(-2.0, 10.0, whole=False)
+PROBABILITY = Limit(1e-9, 1.0 - 1e-9, whole=False)
+# Of an error that is aimed at.
+ARCSEC = Limit(1e-9, 1e6, whole=False)
 LIMITS = {
     "seed": SEED,
     "n_frames": Limit(1, 10**9),
@@ -134,6 +138,39 @@ LIMITS = {
     "focal_tolerance": Limit(1e-9, 0.3, whole=False),
     "centre_tolerance_px": Limit(1e-3, 1e5, whole=False),
     "distortion_tolerance_px": Limit(0.0, 1e5, whole=False),
+}
+
+
+# The same for keys of files and axes of studies that are no parameters of functions, or have limits of their own there.
+KEYS = {
+    "width_px": Limit(1, 10**6),
+    "height_px": Limit(1, 10**6),
+    "pixel_um": Limit(0.01, 1e4, whole=False),
+    "focal_mm": Limit(1e-3, 1e7, whole=False),
+    "x0_px": Limit(-1e6, 1e6, whole=False),
+    "y0_px": Limit(-1e6, 1e6, whole=False),
+    "coefficient": Limit(-1.0, 1.0, whole=False),
+    "fov_deg": Limit(0.1, 120.0, whole=False),
+    "pixels": Limit(16, 10**5),
+    "x0_offset_px": Limit(-1e5, 1e5, whole=False),
+    "y0_offset_px": Limit(-1e5, 1e5, whole=False),
+    "distortion_px": Limit(-1e5, 1e5, whole=False),
+    "max_mag": Limit(-1.0, 10.0, whole=False),
+    "stars": Limit(3, 10**5),
+    "frames": Limit(1, 10**7),
+    "min_stars": Limit(3, 10**4),
+    "sigma_px": Limit(1e-6, 20.0, whole=False),
+    "noise_per_mag": Limit(0.0, 1.0, whole=False),
+    "noise_mag": Limit(-30.0, 60.0, whole=False),
+    "noise_floor_px": Limit(0.0, 20.0, whole=False),
+    "direction_mas": Limit(0.0, 1e6, whole=False),
+    "seeds": Limit(1, 10**6),
+    "target_arcsec": ARCSEC,
+    "target_sigma": Limit(1e-9, 1e6, whole=False),
+    "epoch": EPOCH,
+    "geometries": Limit(20, 10**5),
+    "draws": Limit(100, 10**6),
+    "values": Limit(1, 10**6),
 }
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.files import PathLike, atomic_write_text, ensure_new, shown
+from starcal_uq.core.settings import Limit
 from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
@@ -92,6 +93,12 @@ class Key:
 
     def __init__(self, kind: Any, wanted: str, *, required: bool = False, **bounds: Any) -> None:
         self.kind, self.wanted, self.required, self.bounds = kind, wanted, required, bounds
+
+    @classmethod
+    def number(cls, limit: Limit, words: str, *, required: bool = False) -> Key:
+        """A number within limits, which is `words`."""
+        kind, range_ = (int if limit.whole else float), limit.wanted().removeprefix("give ")
+        return cls(kind, f"{words}, {range_}", required=required, ge=limit.low, le=limit.high)
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,8 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import COEFFICIENTS, get_model, model_names
 from starcal_uq.camera.projection import fold_radius_px
 from starcal_uq.core.errors import StudyError
+from starcal_uq.core.files import shown
+from starcal_uq.core.settings import KEYS, Limit
 from starcal_uq.core.types import AnyDict
 from starcal_uq.estimation.calibrate import METHODS
 from starcal_uq.inference.named import LIKELIHOODS
@@ -19,8 +21,6 @@ from starcal_uq.simulation.pointing import POINTINGS
 FLAT = "flat"
 # Terms of a distortion that cancel to less than this share of their sum have no size that could be scaled.
 _CANCELLED = 0.02
-# Stands for zero where that itself makes no sense.
-_TINY = 1e-6
 
 
 @dataclass(frozen=True)
@@ -35,10 +35,8 @@ class Axis:
         Description, for labels.
     unit : str
         Unit; empty for names and counts.
-    kind : {"number", "whole", "name"}
-        Values that it takes.
-    low, high : float
-        Bounds, both allowed.
+    limit : Limit or None
+        Numbers that it takes; None for an axis of names.
     choices : tuple of str
         Names that it takes; empty where any will do.
     base : float, int, str or None
@@ -48,9 +46,7 @@ class Axis:
     name: str
     words: str
     unit: str = ""
-    kind: str = "number"
-    low: float = -math.inf
-    high: float = math.inf
+    limit: Limit | None = None
     choices: tuple[str, ...] = ()
     base: Any = None
 
@@ -58,52 +54,58 @@ class Axis:
         """The value in its own type; `StudyError` with `where` in front if it does not fit."""
         if self.kind == "name":
             if not isinstance(value, str) or (self.choices and value not in self.choices):
-                raise StudyError(f"{where}: {self.name} is {value!r}; {self.wanted}.")
+                raise StudyError(f"{where}: {self.name} is {shown(value)}; {self.wanted}.")
             return value
-        number = isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-        if not number or (self.kind == "whole" and value != int(value)) or not self.low <= value <= self.high:
-            raise StudyError(f"{where}: {self.name} is {value!r}; {self.wanted}.")
-        return int(value) if self.kind == "whole" else float(value)
+        number = isinstance(value, (int, float)) and not isinstance(value, bool)
+        # Whole numbers may come as floats.
+        value = int(value) if self.kind == "whole" and number and math.isfinite(value) and value % 1 == 0 else value
+        if not number or self.limit is None or not self.limit.holds(value):
+            raise StudyError(f"{where}: {self.name} is {shown(value)}; {self.wanted}.")
+        return value if self.kind == "whole" else float(value)
+
+    @property
+    def kind(self) -> str:
+        """Values that it takes: ``number``, ``whole`` or ``name``."""
+        return "name" if self.limit is None else "whole" if self.limit.whole else "number"
 
     @property
     def wanted(self) -> str:
         """What to write, as an order."""
-        if self.kind == "name":
+        if self.limit is None:
             return f"write one of {', '.join(self.choices)}" if self.choices else "write a name in quotes"
-        noun = "a whole number" if self.kind == "whole" else "a number"
-        if self.low == -math.inf:
-            return f"write {noun}"
-        above = "above 0" if self.low == _TINY else f"of at least {self.low:g}"
-        bounds = above if self.high == math.inf else f"{above} and at most {self.high:g}"
-        return f"write {noun} {bounds}"
+        return self.limit.wanted().replace("give", "write", 1)
+
+
+def _number(name: str, words: str, unit: str = "", base: Any = None, key: str = "") -> Axis:
+    return Axis(name, words, unit, KEYS[key or name], base=base)
 
 
 AXES = {
     axis.name: axis
     for axis in (
-        Axis("fov_deg", "field of view, full width", "deg", low=0.1, high=120.0),
-        Axis("focal_mm", "focal length", "mm", low=_TINY),
-        Axis("pixels", "width and height of the detector", "px", "whole", 16, 100_000),
-        Axis("pixel_um", "pixel pitch", "um", low=_TINY),
-        Axis("x0_offset_px", "offset of the principal point along x", "px"),
-        Axis("y0_offset_px", "offset of the principal point along y", "px"),
-        Axis("distortion", "distortion model", "", "name", choices=model_names()),
-        Axis("distortion_px", "displacement of the corner by the distortion", "px"),
-        *(Axis(name, c.description, c.unit) for name, c in COEFFICIENTS.items()),
-        Axis("max_mag", "magnitude limit", "mag", high=10.0, low=-1.0, base=6.0),
-        Axis("stars", "brightest stars of a frame that are used", "", "whole", 3, 100_000),
-        Axis("frames", "frames", "", "whole", 1, 10_000_000, base=200),
-        Axis("min_stars", "least stars in a frame", "", "whole", 3, 10_000, base=5),
-        Axis("pointing", "pointing pattern", "", "name", choices=POINTINGS, base="random"),
-        Axis("sigma_px", "centroid noise per axis", "px", low=_TINY, high=20.0, base=0.05),
+        _number("fov_deg", "field of view, full width", "deg"),
+        _number("focal_mm", "focal length", "mm"),
+        _number("pixels", "width and height of the detector", "px"),
+        _number("pixel_um", "pixel pitch", "um"),
+        _number("x0_offset_px", "offset of the principal point along x", "px"),
+        _number("y0_offset_px", "offset of the principal point along y", "px"),
+        Axis("distortion", "distortion model", "", choices=model_names()),
+        _number("distortion_px", "displacement of the corner by the distortion", "px"),
+        *(_number(name, c.description, c.unit, key="coefficient") for name, c in COEFFICIENTS.items()),
+        _number("max_mag", "magnitude limit", "mag", base=6.0),
+        _number("stars", "brightest stars of a frame that are used", ""),
+        _number("frames", "frames", "", base=200),
+        _number("min_stars", "least stars in a frame", "", base=5),
+        Axis("pointing", "pointing pattern", "", choices=POINTINGS, base="random"),
+        _number("sigma_px", "centroid noise per axis", "px", base=0.05),
         # Photon noise grows by 0.2, noise of the background by 0.4.
-        Axis("noise_per_mag", "growth of the noise per magnitude", "dex", low=0.0, high=1.0, base=0.0),
-        Axis("noise_mag", "magnitude at which the noise is as stated", "mag", base=6.0),
-        Axis("noise_floor_px", "noise that even bright stars have", "px", low=0.0, high=20.0, base=0.0),
-        Axis("direction_mas", "error of the catalogue's directions per axis", "mas", low=0.0, high=1e6, base=0.0),
-        Axis("prior", "prior", "", "name", base=FLAT),
-        Axis("method", "method of calibration", "", "name", choices=METHODS, base="efficient"),
-        Axis("likelihood", "likelihood", "", "name", choices=LIKELIHOODS, base="marginal"),
+        _number("noise_per_mag", "growth of the noise per magnitude", "dex", base=0.0),
+        _number("noise_mag", "magnitude at which the noise is as stated", "mag", base=6.0),
+        _number("noise_floor_px", "noise that even bright stars have", "px", base=0.0),
+        _number("direction_mas", "error of the catalogue's directions per axis", "mas", base=0.0),
+        Axis("prior", "prior", base=FLAT),
+        Axis("method", "method of calibration", "", choices=METHODS, base="efficient"),
+        Axis("likelihood", "likelihood", "", choices=LIKELIHOODS, base="marginal"),
     )
 }  # fmt: skip
 # Axes that make another camera.

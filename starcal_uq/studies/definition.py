@@ -19,7 +19,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import COEFFICIENTS, PARAMETERS, parameter_names
 from starcal_uq.core.errors import CameraError, PriorError, StudyError
 from starcal_uq.core.files import PathLike, atomic_write_text, ensure_new, shown
-from starcal_uq.core.settings import StudyTemplate
+from starcal_uq.core.settings import KEYS, SEED, StudyTemplate
 from starcal_uq.core.toml import Key, Section, read_toml, unknown_key
 from starcal_uq.core.types import AnyDict
 from starcal_uq.inference.priors import PRIORS
@@ -29,7 +29,7 @@ MODES = ("fisher", "simulate")
 POSTERIORS = ("importance", "ensemble", "none")
 # One of each, in the order in which a reader would try them.
 TEMPLATES = get_args(StudyTemplate)
-MAX_CELLS = 1_000_000
+MAX_CELLS = int(KEYS["values"].high)
 # Changes whenever the same settings would give other numbers: results from before are then computed anew.
 VERSION = 1
 _SECTIONS = ("study", "camera", "observation", "sweep", "priors")
@@ -41,21 +41,21 @@ _STUDY = Section(
         "question": Key(str, "the question that the study answers, in quotes"),
         "mode": Key(str, f"one of {', '.join(MODES)}, in quotes"),
         "seeds": Key(int | list[int], "a number of repetitions of at least 1, or a list of whole numbers"),
-        "seed": Key(int, "a whole number of at least 0", ge=0),
-        "target_arcsec": Key(float, "an error above zero in arcsec", gt=0.0),
+        "seed": Key.number(SEED, "the root of all that is random"),
+        "target_arcsec": Key.number(KEYS["target_arcsec"], "an error in arcsec"),
         "target_sigma": Key(dict[str, float], "a table of errors above zero by parameter, such as {f = 0.05}"),
         "camera": Key(str, "the path of a camera file in quotes"),
-        "epoch": Key(float, "a Julian year such as 2026.9", ge=1800.0, le=2200.0),
-        "geometries": Key(int, "a number of frames from 20 to 100000", ge=20, le=100_000),
+        "epoch": Key.number(KEYS["epoch"], "a Julian year such as 2026.9"),
+        "geometries": Key.number(KEYS["geometries"], "a number of frames"),
         "posterior": Key(str, f"one of {', '.join(POSTERIORS)}, in quotes"),
-        "draws": Key(int, "a number of draws from 100 to 1000000", ge=100, le=1_000_000),
+        "draws": Key.number(KEYS["draws"], "a number of draws"),
     },
     StudyError,
 )
 _SPAN = {
     "start": Key(float, "a number", required=True),
     "stop": Key(float, "a number", required=True),
-    "n": Key(int, "a number of values of at least 1", required=True, ge=1, le=MAX_CELLS),
+    "n": Key.number(KEYS["values"], "a number of values", required=True),
     "spacing": Key(str, "linear or log, in quotes"),
 }
 _RANGE = {name: key for name, key in _SPAN.items() if name != "n"}
@@ -168,11 +168,9 @@ class StudyDefinition:
         given = _observation(content.get("observation", {}), f"{where}, section [observation]")
         priors = {name: _prior(name, table, where) for name, table in content.get("priors", {}).items()}
         seeds = study.pop("seeds", 1)
-        if isinstance(seeds, int) and seeds > MAX_CELLS:
-            raise StudyError(
-                f"{where}, section [study]: seeds is {shown(seeds)}; write a number of repetitions of at most "
-                f"{MAX_CELLS}."
-            )
+        if isinstance(seeds, int) and not KEYS["seeds"].holds(seeds):
+            wanted = KEYS["seeds"].wanted().replace("give", "write", 1)
+            raise StudyError(f"{where}, section [study]: key seeds is {shown(seeds)}; {wanted}, or a list of them.")
         study["seeds"] = tuple(range(seeds)) if isinstance(seeds, int) else tuple(seeds)
         made = cls(camera=camera, sweep=sweep, observation=given, latin=latin, latin_n=latin_n, priors=priors, **study)
         made.check(where)
@@ -201,8 +199,8 @@ class StudyDefinition:
                 f"posterior is {self.posterior!r}; write one of {', '.join(POSTERIORS)}",
             ),
             (
-                len(self.seeds) > 0 and len(set(self.seeds)) == len(self.seeds) and min(self.seeds) >= 0,
-                "seeds holds no number, one below 0 or one twice; write how many repetitions you want",
+                len(self.seeds) > 0 and len(set(self.seeds)) == len(self.seeds) and SEED.holds(self.seeds),
+                "seeds holds no number, one twice, below 0 or beyond 64 bits; write how many repetitions you want",
             ),
         ):
             if not good:
@@ -219,9 +217,10 @@ class StudyDefinition:
         every = {**self.observation, **self.sweep, **self.latin}
         self._check_names(every, where)
         for name in self.target_sigma:
-            if name not in self.parameter_names or not self.target_sigma[name] > 0.0:
+            if name not in self.parameter_names or not KEYS["target_sigma"].holds(self.target_sigma[name]):
+                low, high = KEYS["target_sigma"].low, KEYS["target_sigma"].high
                 raise StudyError(
-                    f"{where}, section [study]: target_sigma of {name} is no error above zero of one of "
+                    f"{where}, section [study]: target_sigma of {name} is no error from {low:g} to {high:g} of one of "
                     f"{', '.join(self.parameter_names)}; correct it."
                 )
         if not self.sweep and not self.latin:
@@ -381,8 +380,8 @@ def _swept(table: AnyDict, where: str) -> tuple[dict[str, tuple[Any, ...]], dict
     if not isinstance(latin, Mapping):
         raise StudyError(f"{where}: latin is no section; write [sweep.latin] above its keys.")
     n = latin.get("n")
-    if not isinstance(n, int) or isinstance(n, bool) or n < 1 or len(latin) < 2:
-        raise StudyError(f"{inside}: write n, a number of points of at least 1, and at least one axis.")
+    if not isinstance(n, int) or isinstance(n, bool) or not KEYS["values"].holds(n) or len(latin) < 2:
+        raise StudyError(f"{inside}: write n, a number of points from 1 to {MAX_CELLS}, and at least one axis.")
     ranges = {}
     for name, span in latin.items():
         if name == "n":
@@ -425,7 +424,7 @@ def _span(axis: Any, span: Mapping[str, Any], keys: dict[str, Key], where: str) 
     for end in ("start", "stop"):
         if axis.kind != "whole":
             axis.check(checked[end], f"{inside}, {end}")
-        elif not axis.low <= checked[end] <= axis.high:
+        elif not axis.limit.low <= checked[end] <= axis.limit.high:
             raise StudyError(f"{inside}, {end}: {axis.name} is {checked[end]:g}; {axis.wanted}.")
     if checked.get("spacing") == "log" and min(checked["start"], checked["stop"]) <= 0.0:
         raise StudyError(f"{inside}: a range with spacing 'log' starts and stops above zero; correct it.")

@@ -158,7 +158,7 @@ def test_file_by_hand(tmp_path):
         (file_text(focal_mm=None), "section [camera]: key focal_mm is missing; add the focal length in millimetres"),
         (
             file_text(focal_mm=None, x0_px=None),
-            "key focal_mm is missing; add the focal length in millimetres, a number above 0 (1 more bad key).",
+            "key focal_mm is missing; add the focal length in millimetres, a number from 0.001 to 10000000 (1 more bad",
         ),
         (file_text(colour=1, focal_mm=None, x0_px=None), "(2 more bad keys)."),
         (file_text(focal_m=1), "key focal_m is unknown; did you mean focal_mm?"),
@@ -172,8 +172,11 @@ def test_file_by_hand(tmp_path):
         (file_text(width_px=0), "key width_px is 0; write"),
         (file_text(focal_mm="long"), "key focal_mm is 'long'; write the focal length in millimetres"),
         (file_text(pixel_um="true").replace("'true'", "true"), "key pixel_um is True; write"),
-        (file_text(x0_px=math.inf), "key x0_px is inf; write the principal point along x in pixels, a finite number."),
-        (file_text(k1=math.nan), "key k1 is nan; write a finite number."),
+        (
+            file_text(x0_px=math.inf),
+            "key x0_px is inf; write the principal point along x in pixels, a number from -1",
+        ),
+        (file_text(k1=math.nan), "key k1 is nan; write the coefficient, a number from -1 to 1."),
         (file_text(distortion="fisheye"), "key distortion: distortion model 'fisheye' is unknown: use one of none, k1"),
         (file_text(distortion=3), "key distortion is 3; write the name of the distortion model, one of none"),
         (file_text().replace("[camera]\n", ""), "section [camera] is missing; write [camera] above"),

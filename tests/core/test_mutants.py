@@ -255,7 +255,7 @@ ONCE = [
     (
         "study.toml",
         lambda d: re.sub(rb"seeds = .*", b"seeds = " + b"9" * 30, d),
-        r"section \[study\]: seeds is 9+; write a number of repetitions of at most 1000000\.$",
+        r"section \[study\]: key seeds is 9+; write a whole number from 1 to 1000000, or a list of them\.$",
     ),
     (
         "validation.npz",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib
 import inspect
 import re
@@ -10,11 +11,16 @@ from typing import get_args
 
 import numpy as np
 import pytest
+import tomli_w
 
 import starcal_uq as sc
+from starcal_uq.budgeting.file import BUDGET_KEYS, CONTRIBUTOR_KEYS, REQUIREMENT_KEYS, load_budget_file
 from starcal_uq.core import settings
 from starcal_uq.core.errors import SettingError, StarcalError
 from starcal_uq.core.settings import LIMITS, Limit, bounded
+from starcal_uq.studies import StudyDefinition
+from starcal_uq.studies.axes import AXES
+from starcal_uq.studies.definition import _STUDY
 
 PACKAGE = Path(sc.__file__).parent
 
@@ -90,3 +96,97 @@ def test_words_with_explanations_are_those_of_the_lists():
     assert tuple(SCOPES) == get_args(settings.Scope)
     assert tuple(CONVENTIONS) == get_args(settings.Convention)
     assert tuple(READINGS) == get_args(settings.FieldReading)
+
+
+ODD = (-1, 0, 10**30, -1.0, 0.0, float("nan"), float("inf"), -float("inf"), 1e-300, 1e300)
+STUDY = {"study": {"geometries": 20}, "observation": {"frames": 20}, "sweep": {"noise_mag": [6.0]}}
+
+
+def study_files():
+    """A study with an odd number under each key that holds one, wherever that may stand; with its name."""
+    camera = sc.paper.paper_camera().to_dict()
+
+    def file(**tables):
+        return {**STUDY, "camera": camera} | tables
+
+    numbers = [name for name, axis in AXES.items() if axis.kind != "name"]
+    keys = [name for name, key in _STUDY.keys.items() if {"ge", "le"} <= set(key.bounds)]
+    for odd in ODD:
+        for name in numbers:
+            yield name, odd, file(observation={"frames": 20} | {name: odd}, sweep={"direction_mas": [1.0]})
+            yield name, odd, file(sweep={name: [odd]})
+            for spacing in ("linear", "log"):
+                for end in ("start", "stop"):
+                    span = {"start": 3, "stop": 5, "spacing": spacing} | {end: odd}
+                    yield name, odd, file(sweep={name: span | {"n": 2}})
+                    yield name, odd, file(sweep={"latin": {"n": 2, name: span}})
+        for name in (*keys, "seeds", "target_sigma"):
+            yield name, odd, file(study={name: {"f": odd} if name == "target_sigma" else odd})
+        for name in ("width_px", "height_px", "pixel_um", "focal_mm", "x0_px", "y0_px", "k1", "k2"):
+            yield name, odd, file(camera=camera | {name: odd})
+        yield "seeds", odd, file(study={"seeds": [odd]})
+        yield "n", odd, file(sweep={"sigma_px": {"start": 0.1, "stop": 0.2, "n": odd}})
+        yield "n", odd, file(sweep={"latin": {"n": odd, "sigma_px": {"start": 0.1, "stop": 0.2}}})
+
+
+def test_odd_numbers_in_a_study_are_refused_in_a_sentence_or_make_sense():
+    """Every key and axis that is declared; what is let through gives cells that are whole numbers apart finite."""
+    refused, taken = set(), []
+    for name, odd, content in study_files():
+        try:
+            made = StudyDefinition.from_dict(content)
+        except StarcalError as error:
+            assert re.match(r"study[:,] .*[.?]$", str(error)) and "\n" not in str(error), (name, odd, str(error))
+            assert len(str(error)) < 400
+            refused.add((name, odd))
+        else:
+            taken.append((name, odd))
+            assert len(made.axes) > 0 and made.n_cells < 10**7
+    assert {name for name, odd in refused if odd == 1e300} == {name for name, _ in refused}
+    assert {odd for name, odd in refused if name == "frames"} >= {-1, 0, 10**30, 1e300}
+    assert len(refused) > 200 and len(taken) > 50
+
+
+@pytest.mark.parametrize("name", [name for name, axis in AXES.items() if axis.kind != "name"])
+def test_cells_at_the_limits_of_an_axis_have_numbers_or_a_reason(name):
+    """Warnings are errors here: nothing overflows on the way."""
+    limit = AXES[name].limit
+    content = {**STUDY, "camera": sc.paper.paper_camera().to_dict(), "sweep": {name: [limit.low]}}
+    if name not in ("frames", "max_mag"):
+        content["sweep"][name].append(limit.high)
+    if name in ("k3", "p1", "p2"):
+        content["camera"]["distortion"] = "brown3" if name == "k3" else "brown_tangential"
+    found = sc.study(StudyDefinition.from_dict(content), workers=0)
+    assert found.ok.sum() + sum(found.problems.values()) == found.n_cells
+    assert not found.ok.any() or np.isfinite(found.values("sigma", parameter="f")[found.ok]).all()
+
+
+def test_odd_numbers_in_a_budget_are_refused_in_a_sentence_or_make_sense(tmp_path):
+    rows = {
+        "budget": {"confidence": 0.9},
+        "contributor": [{"name": "a", "ecss_class": "BIAS", "axis": "X", "mean_arcsec": 1.0, "sigma_arcsec": 1.0}],
+        "requirement": [{"name": "r", "axis": "X", "limit_arcsec": 1.0, "confidence": 0.9}],
+    }
+    own = {"interpretation": "mixed", "absorbed_by_alignment": "no", "provenance": "p"}
+    rows["contributor"][0] |= own
+    keys = {"budget": BUDGET_KEYS, "contributor": CONTRIBUTOR_KEYS, "requirement": REQUIREMENT_KEYS}
+    path, refused = tmp_path / "budget.toml", set()
+    floats = [(table, key) for table, known in keys.items() for key, kind in known.items() if kind is float]
+    for table, key in floats:
+        for odd in ODD:
+            content = copy.deepcopy(rows)
+            row = content[table] if table == "budget" else content[table][0]
+            if key == "half_width_arcsec":
+                del row["sigma_arcsec"]
+                row["distribution"] = "uniform"
+            row[key] = odd
+            path.write_text(tomli_w.dumps(content))
+            try:
+                made = load_budget_file(path)
+            except StarcalError as error:
+                assert re.match(rf"{path}, .*: key {key} is .*\.$", str(error)) and "\n" not in str(error)
+                refused.add((key, odd))
+            else:
+                assert all(abs(r.mean_arcsec) + r.sigma_arcsec < 1e7 for r in made.contributors)
+    assert {key for key, odd in refused if odd == 1e300} == {key for _, key in floats}
+    assert ("confidence", 1e-300) in refused

@@ -416,7 +416,7 @@ CAMERA = paper_camera().to_dict()
         ({"sweep": {"frames": 10}}, r"frames is 10; write a list, or \{start"),
         (
             {"sweep": {"sigma_px": {"start": 0, "stop": 1, "n": 3}}},
-            "sigma_px, start: sigma_px is 0.0; write a number above 0 and at most 20",
+            "sigma_px, start: sigma_px is 0.0; write a number from 1e-06 to 20",
         ),
         ({"sweep": {"fov_deg": {"start": 5, "stop": 9}}}, "fov_deg: key n is missing"),
         ({"sweep": {"pointing": ["up"]}}, "pointing is 'up'; write one of random, stare"),
@@ -430,7 +430,7 @@ CAMERA = paper_camera().to_dict()
         ({"sweep": {"sigma_px": {"start": 1, "stop": 2, "n": 2000000}}}, "key n is 2000000"),
         ({"study": {"mode": "guess"}}, r"section \[study\]: mode is 'guess'; write one of fisher, simulate"),
         ({"study": {"colour": 1}}, "key colour is unknown"),
-        ({"study": {"seeds": 0}}, "seeds holds no number"),
+        ({"study": {"seeds": 0}}, "key seeds is 0; write a whole number from 1 to"),
         ({"study": {"target_sigma": {"k9": 1.0}}}, "target_sigma of k9"),
         ({"studies": {}}, r"section studies is unknown; did you mean study\?"),
         ({"camera": {**CAMERA, "k1": -1e-5}}, r"section \[camera\]: the distortion folds over inside the field"),
