@@ -1,2 +1,4 @@
+from .inspection import Frames as Frames
+from .inspection import InspectedFrame as InspectedFrame
 from .refine import ImageCalibration as ImageCalibration
 from .refine import identify_and_calibrate as identify_and_calibrate

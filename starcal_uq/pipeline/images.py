@@ -33,7 +33,7 @@ CENTROIDS, IDENTIFICATION, MATCHED = "centroids.parquet", "identification.csv", 
 _CATALOGUE_EPOCH = 2016.0
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 # Magnitudes; the embedded catalogue ends at the second.
-_FAINTER_NEIGHBOURS, _FAINTEST = 1.5, 10.0
+FAINTER_NEIGHBOURS, FAINTEST = 1.5, 10.0
 
 
 def are_images(paths: Sequence[Path]) -> bool:
@@ -181,7 +181,7 @@ def observations_from_images(
         tell(depth_text(stars, first))
     limit = float(stars.mag.max())
     # A neighbour need not be bright enough to be identified to displace a star.
-    neighbours = load_catalogue(max_mag=max(limit, min(limit + _FAINTER_NEIGHBOURS, _FAINTEST)), epoch=year)
+    neighbours = load_catalogue(max_mag=max(limit, min(limit + FAINTER_NEIGHBOURS, FAINTEST)), epoch=year)
 
     rendered = _rendered(images)
     motion = directions in (None, "catalogue")

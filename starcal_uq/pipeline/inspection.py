@@ -25,6 +25,7 @@ from starcal_uq.core.errors import DistortionError, ImageError
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.images.centroids import Centroids
 from starcal_uq.observations.table import Observations
+from starcal_uq.pipeline.images import FAINTER_NEIGHBOURS, FAINTEST
 from starcal_uq.pipeline.record import ImageRecord, ImageRow
 from starcal_uq.sky.apparent import apparent_directions
 from starcal_uq.sky.positions import ra_dec_deg
@@ -37,8 +38,6 @@ if TYPE_CHECKING:
 
 IDENTIFIED, LEFT_OUT, NOT_MATCHED = "identified", "left out", "not matched"
 NO_STAR, FAINTER = "at no star of the catalogue", "fainter than the stars searched for"
-# Stars so much fainter than those that were searched for are looked at, if the embedded catalogue has them.
-_FAINTER, FAINTEST = 1.5, 10.0
 # What leaves a star out, if it is not screening.
 _LEFT_OUT, _WHOLE = "displaced by a neighbour, or low above the horizon", "in a frame that keeps too few"
 # A detection so near to a star's place is that star's, px, widths of a star image, and scatter of the frame's stars.
@@ -294,7 +293,7 @@ class Frames(Shown):
         """Stars to some magnitudes beyond those that were searched for; None where the run names no stars."""
         if not np.isfinite(self.searched_mag) or self.used.star_id is None:
             return None
-        limit = max(self.searched_mag, min(self.searched_mag + _FAINTER, FAINTEST))
+        limit = max(self.searched_mag, min(self.searched_mag + FAINTER_NEIGHBOURS, FAINTEST))
         return _stars(limit, float(self.matched.meta.get("epoch", 2016.0)))
 
     def _apparent(self, directions: FloatArray, row: ImageRow) -> FloatArray:

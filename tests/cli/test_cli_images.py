@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import html
 import json
+import re
+import shlex
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from PIL import Image
 from scipy.spatial import cKDTree
 
 import starcal_uq as sc
@@ -275,8 +279,18 @@ def test_real_frames_from_images_to_the_report(cli, tmp_path):
     assert "Noordwijk" in report
     assert "8 of 8 images used" in report
     # The control: without the site f is too short, and the report neither believes nor hides it.
-    status, _, err = cli("run", ESA, camera, "-o", "bare", "--screen", "--steps", 200)
+    # A frame without stars, of an odd name, is shown with its reason and the next command, which can be given.
+    dark, name = tmp_path / "night", "dark & <cold>.png"
+    dark.mkdir()
+    Image.fromarray(np.random.default_rng(1).normal(100.0, 5.0, (768, 1024)).astype(np.uint8)).save(dark / name)
+    status, _, err = cli("run", ESA, dark, camera, "-o", "bare", "--screen", "--steps", 200)
     assert status == 1
     assert "conditional on refraction" in err
+    failed = sc.Run(tmp_path / "bare").frames[name]
+    assert (failed.row.outcome, failed.solved) == ("too few stars", False)
+    shown = (tmp_path / "bare" / "report.html").read_text("utf-8").partition("<b>dark &amp; &lt;cold&gt;.png</b>")[2]
+    command = html.unescape(re.search("<b>Next:</b>.*?<code>(.*?)</code>", shown)[1])
+    status, _, err = cli(*shlex.split(command)[1:])
+    assert status in (0, 1), (command, err)
     bare = sc.Calibration.load(sc.runs.RunFolder(tmp_path / "bare").calibration)
     assert (bare.theta[2] - 5116.54) / np.hypot(bare.sigmas[2], 0.28) < -5.0

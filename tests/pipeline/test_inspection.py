@@ -177,7 +177,7 @@ def test_the_page_shows_every_frame_with_its_reason_and_what_to_do(frames: Frame
     # A star's name, and a mark of each kind with a shape of its own.
     star = frames[0].detections["star_id"].iloc[0]
     assert f"<title>{star}, G " in page
-    legend = page.partition('<ul class="legend">')[2].partition("</ul>")[0]
+    legend = page.partition('<ul class="marks">')[2].partition("</ul>")[0]
     assert len(set(re.findall(r'<path class="[iluem]" d="([^"]+)"/></svg>', legend))) == 5
     # One of the images is there; the others are said not to be.
     assert page.count("data:image/webp") == 1

@@ -31,6 +31,7 @@ _WIDTH_PX, _LARGE_PX = 640, 1400
 _QUALITY = 45
 # Black above the sky and the length of the scale, in limits of zscale, and where asinh bends.
 _BLACK, _SPAN, _BEND = 0.2, 4.0, 0.06
+_BLUR_PX = 0.7
 # Widths of the image that a typical residual's arrow is long.
 _ARROW = 0.02
 # So many marks of a kind have words of their own; beyond, they are one line.
@@ -104,6 +105,7 @@ def picture(path: Path, width_px: int, camera: Camera, flat: bool = True) -> byt
     """
     from astropy.visualization import AsinhStretch, ZScaleInterval
     from PIL import Image
+    from scipy.ndimage import gaussian_filter
 
     from starcal_uq.images.background import prepare_image
     from starcal_uq.images.image import read_image
@@ -118,7 +120,8 @@ def picture(path: Path, width_px: int, camera: Camera, flat: bool = True) -> byt
     small = Image.fromarray(sky)
     if small.width > width_px:
         small = small.resize((width_px, max(1, round(small.height * width_px / small.width))), Image.Resampling.BOX)
-    sky = np.asarray(small)
+    # Stars are wider than pixels, and noise is not.
+    sky = gaussian_filter(np.asarray(small), _BLUR_PX)
     low, high = ZScaleInterval(n_samples=4000).get_limits(sky)
     # Black is a little above the sky, and the scale so long that asinh leaves stars their shapes.
     floor, span = -_BLACK * low, max(_SPAN * (high - low), 1e-12)

@@ -12,7 +12,8 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.core.formatting import count, plural
 from starcal_uq.identification.result import STATUSES, FoundOptics, FrameStatus, Identification
 from starcal_uq.images.centroids import Centroids
-from starcal_uq.pipeline.inspection import FAINTEST, IDENTIFIED, Frames, InspectedFrame
+from starcal_uq.pipeline.images import FAINTEST
+from starcal_uq.pipeline.inspection import IDENTIFIED, Frames, InspectedFrame
 from starcal_uq.pipeline.record import ImageRecord
 from starcal_uq.pipeline.refine import ImageCalibration, identified_pairs
 from starcal_uq.presentation.tables import TextTable
