@@ -251,7 +251,11 @@ ONCE = [
     ("study.nc", _hdf5(lambda f: f.pop("status")), r"\(status is missing\); run `starcal-uq study` again\.$"),
     ("study.nc", _hdf5(lambda f: f.pop("max_mag")), r"\(max_mag is missing\)"),
     ("study.nc", _hdf5(_one_for_another), r"\(n_frames is not along cell\)"),
-    ("study.toml", lambda d: d.replace(b"k1 = 2.0e-10", b"k1 = 1e300"), None),
+    (
+        "study.toml",
+        lambda d: d.replace(b"k1 = 2.0e-10", b"k1 = 1e300"),
+        r"key k1 is 1e\+300; write the coefficient, a ",
+    ),
     (
         "study.toml",
         lambda d: re.sub(rb"seeds = .*", b"seeds = " + b"9" * 30, d),
