@@ -545,19 +545,19 @@ def _read_picture(path: Path, data: bytes, camera: Camera | None, every: bool) -
             pages = [_grey([np.ascontiguousarray(page[..., k]) for k in range(3)], 65535.0) for page in deep]
             n_pages = len(pages)
         else:
-            n_pages = int(getattr(picture, "n_frames", 1))
-            for number in range(n_pages if every else 1):
-                try:
+            declared = 0
+            try:  # decoders raise whatever the broken bytes lead to
+                n_pages = int(getattr(picture, "n_frames", 1))
+                for number in range(n_pages if every else 1):
                     picture.seek(number)
-                except EOFError:
-                    break
-                except Exception as error:  # decoders raise whatever the broken bytes lead to
-                    raise _broken(path) from error
-                _check_declared(path, picture.width * picture.height * _PIXEL_BYTES.get(picture.mode, 4), len(data))
-                try:
+                    # Pages may share their bytes.
+                    declared += picture.width * picture.height * _PIXEL_BYTES.get(picture.mode, 4)
+                    _check_declared(path, declared, len(data))
                     pages.append(_page(picture))
-                except Exception as error:
-                    raise _broken(path) from error
+            except ImageError:
+                raise
+            except Exception as error:
+                raise _broken(path) from error
     size = None if camera is None else (camera.height_px, camera.width_px)
     sizes = [pixels.shape for pixels, _, _ in pages]
     best = max(sizes, key=lambda shape: (shape == size, np.prod(shape)))

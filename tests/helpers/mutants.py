@@ -142,6 +142,7 @@ def _partitions(path: Path) -> Any:
 
 def _image(path: Path) -> Any:
     image = sc.images.read_image(path)
+    assert len(sc.images.read_images(path)) > 0
     return [image, sc.images.extract_centroids(image)]
 
 
@@ -156,7 +157,7 @@ IMAGES = (
     "image.bmp",
 )
 SAMPLES = (
-    *(Sample(name, _image, ("images.read_image",)) for name in IMAGES),
+    *(Sample(name, _image, ("images.read_image", "images.read_images")) for name in IMAGES),
     Sample("camera.toml", sc.Camera.load, ("Camera.load",)),
     Sample("sensor.toml", sc.simulation.Sensor.load, ("simulation.Sensor.load",)),
     Sample("site.toml", sc.sky.Site.load, ("sky.Site.load",)),
