@@ -20,7 +20,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import left_error
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import AttitudeProfileError, CatalogueError
-from starcal_uq.core.files import read_parquet, reading, shown, table_ending
+from starcal_uq.core.files import listed, read_parquet, reading, shown, table_ending
 from starcal_uq.core.formatting import plural, significant
 from starcal_uq.core.settings import Scalar, Sense, bounded
 from starcal_uq.core.times import julian_days
@@ -266,7 +266,7 @@ def _components(path: Path, columns: dict[str, Any], scalar: str | None) -> tupl
     missing = [name for name in NAMED if name not in columns]
     raise AttitudeProfileError(
         f"{path}: column {missing[0]} is missing; give {', '.join(NAMED)} beside time_s or time_utc (the file has "
-        f"{', '.join(columns) or 'no columns'})."
+        f"{listed(list(columns)) or 'no columns'})."
     )
 
 

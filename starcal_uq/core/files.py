@@ -16,7 +16,7 @@ import sys
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
@@ -312,6 +312,14 @@ def shown(value: Any) -> str:
         return "a number of thousands of digits"
 
 
+def listed(names: Sequence[str]) -> str:
+    """Columns of a file for a message, where they are not what they should be: the first ones, none too long."""
+    first = [name if len(name) <= _LONGEST_NAME else f"{name[:_LONGEST_NAME]}..." for name in names[:_MOST_NAMES]]
+    rest = f" and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    return ", ".join(first) + rest
+
+
+_MOST_NAMES, _LONGEST_NAME = 10, 20
 _SHORT = reprlib.Repr()
 _SHORT.maxstring = _SHORT.maxother = _SHORT.maxlong = 60
 _SHORT.maxlevel = 3

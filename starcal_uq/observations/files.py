@@ -29,6 +29,7 @@ from starcal_uq.core.files import (
     check_parquet,
     check_size,
     ensure_new,
+    listed,
     reading,
     table_ending,
 )
@@ -161,7 +162,7 @@ def check_names(path: Path, raw: RawTable, names: Mapping[str, str], mapping: Ma
         others = f" (so are {', '.join(names[c] for c in missing[1:])})" if missing[1:] else ""
         raise ObservationError(
             f"{path}: column {wanted} is missing{others}; add it, or map it from one of the file's columns "
-            f"({', '.join(raw.names)}).",
+            f"({listed(raw.names)}).",
             column=wanted,
             problems=[f"{path}: column {names[c]} is missing." for c in missing],
         )

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.errors import ObservationError
-from starcal_uq.core.files import PathLike
+from starcal_uq.core.files import PathLike, listed
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import AnyDict, IntArray
 from starcal_uq.observations.checks import check_mapping
@@ -251,7 +251,7 @@ def _check_alike(
         if own not in summary.names and (COLUMNS[name].required or name in reader.columns):
             raise ObservationError(
                 f"{path}: column {own} is missing; add it, or map it from one of the file's columns "
-                f"({', '.join(summary.names)}).",
+                f"({listed(summary.names)}).",
                 column=own,
             )
         if (own in summary.names) != (own in first.names):

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from starcal_uq.core.errors import CatalogueError
-from starcal_uq.core.files import check_fits, reading, unpack
+from starcal_uq.core.files import check_fits, listed, reading, unpack
 from starcal_uq.core.types import FloatArray, IntArray, StrArray
 from starcal_uq.sky.catalogue import StarCatalogue, check_epoch, prepare
 from starcal_uq.sky.cds import CdsFormat, read_cds
@@ -238,7 +238,7 @@ def _load_table(path: Path, kind: Format) -> Any:
 
 def _find_columns(path: Path, present: list[str], given: dict[str, str]) -> dict[str, str]:
     """Names of this package to names in the file."""
-    listing = ", ".join(present) or "none"
+    listing = listed(present) or "none"
     for name, column in given.items():
         if name not in _GUESSES:
             raise CatalogueError(f"{path}: columns names {name!r}, which is none of {', '.join(_GUESSES)}.")

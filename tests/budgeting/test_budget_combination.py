@@ -19,7 +19,7 @@ from starcal_uq.budgeting.shapes import (
     one_axis_factor,
     two_axis_radius,
 )
-from starcal_uq.budgeting.totals import Total, covariance, draw, grouped_sigma, total
+from starcal_uq.budgeting.totals import Total, _heaviest, _one_of_many, covariance, draw, grouped_sigma, total
 from starcal_uq.presentation.words.budgeting import outcome_text
 
 
@@ -371,6 +371,16 @@ def test_a_quantile_beyond_the_samples_is_not_known() -> None:
     assert abs(resolved.sampled_arcsec - 6.6 * half_width("gaussian", 0.9999, 3.9)) < 4.0 * resolved.sampled_se_arcsec
     # What has no spread needs no samples.
     assert combined([row("shift", 0.0, mean_arcsec=2.0)], confidence=0.9999999).sampled_arcsec == 2.0
+
+
+def test_one_case_of_many_is_the_quantile_itself() -> None:
+    assert _one_of_many(np.arange(1000.0)[None], np.zeros((1, 1000)), 0.997) == 996.0
+
+
+def test_the_heaviest_tail_weighs_its_size() -> None:
+    large, long = row("large", 10.0, tail_997=3.5), row("long", 0.1, tail_997=4.5)
+    assert _heaviest([long, large]) is large
+    assert _heaviest([row("noise", 10.0, tail_997=GAUSSIAN_997)]) is None
 
 
 @pytest.mark.parametrize("confidence", [0.9999999, 1.0 - 1e-12])

@@ -40,6 +40,7 @@ def test_parts_add_up_wherever_they_are_cut():
     grams = [gram_sums(frames.part(a, b), "brown", theta, whitening, attitudes.rotations[a:b]) for a, b in cuts]
     total = sum_of(parts)
     assert total.cost == pytest.approx(whole.cost, rel=1e-12)
+    assert total.turn == max(part.turn for part in parts) > min(part.turn for part in parts)
     assert np.allclose(_scaled(total.matrix, whole.matrix), _scaled(whole.matrix, whole.matrix), rtol=0, atol=1e-12)
     assert (total.n_stars, total.n_frames) == (frames.n_stars, 60)
     added = grams[0] + grams[1] + grams[2]
@@ -109,6 +110,11 @@ def test_attitudes_follow_the_parameters_in_one_pass():
     sigma = np.sqrt(np.diag(np.linalg.inv(_scaled(first.matrix, first.matrix)))) / np.sqrt(np.diag(first.matrix)) * 0.05
     moved = theta + 3.0 * sigma
     followed, exact = descent.evaluate(moved), likelihood.evaluate(moved)
+    # The best point is the best, whichever came first.
+    back = Descent(frames, "brown", likelihood.start_rotations(theta))
+    costs = {cost: point for point in (moved, theta) for cost in [back.evaluate(point).cost]}
+    for found in (back, descent):
+        assert np.array_equal(found.best[1].theta, costs[min(costs)])
     assert followed.cost == pytest.approx(exact.cost, rel=1e-9)
     # Attitudes that stay where they were are far from the best: what the sums say is then no evaluation of the model.
     stayed = likelihood.frames.pixel - _predicted(frames, moved, descent.best[1].rotations)

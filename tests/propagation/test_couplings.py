@@ -52,6 +52,8 @@ def test_contraction_is_the_share_of_the_prior_variance_that_went(calibrated, fo
     contracted = sc.coupling(SimpleNamespace(priors=priors, **{name: getattr(calibrated, name) for name in names}))
     assert np.allclose(contracted.contraction, 8.0 / 9.0, rtol=1e-12)
     assert np.array_equal(contracted.covariance, found.covariance)
+    assert np.array_equal(contracted.to_dataframe()["contraction"], contracted.contraction)
+    assert "contraction" not in found.to_dataframe()
 
 
 def test_principal_point_and_boresight_are_one_near_gauge(found):

@@ -108,6 +108,8 @@ def test_shows_itself() -> None:
     table = found.to_dataframe()
     assert list(table.columns[:4]) == ["azimuth_deg", "radius_px", "mean_px", "sd_px"]
     assert len(table) == 41
+    for name in ("mean", "sd"):
+        np.testing.assert_allclose(table[f"{name}_arcsec"], table[f"{name}_px"] * found.arcsec_per_px, rtol=1e-12)
     assert 600 < found.star_radius_px < 745
     assert np.isnan(distortion_curve(gaussian_posterior(), n=3, n_draws=50).star_radius_px)
     decentred = distortion_curve(gaussian_posterior("brown_tangential", DECENTRED), n=11, n_draws=100)

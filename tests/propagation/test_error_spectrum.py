@@ -16,7 +16,7 @@ from starcal_uq.core.errors import AttitudeProfileError, RunFolderError, Samplin
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.observations.table import Observations
 from starcal_uq.propagation.propagate import propagate
-from starcal_uq.propagation.spectrum import ErrorSpectrum, error_spectrum
+from starcal_uq.propagation.spectrum import ErrorSpectrum, _neighbours, error_spectrum
 from starcal_uq.simulation.mission import profile_frames
 from starcal_uq.sky.catalogue import load_catalogue
 from tests.helpers.gaussian_camera import gaussian_posterior
@@ -147,6 +147,12 @@ def test_averages_are_those_of_the_series() -> None:
             found.averaged_arcsec(seconds)
 
 
+def test_gaps_are_filled_in_proportion() -> None:
+    before, weight = _neighbours(np.array([0, 4, 5]), 6)
+    assert before.tolist() == [0, 0, 0, 0, 1, 1]
+    assert weight.tolist() == [0.0, 0.25, 0.5, 0.75, 0.0, 1.0]
+
+
 def test_gaps_are_bridged_and_said() -> None:
     obs, whole = frames(), spectrum()
     kept = np.random.default_rng(4).random(obs.n_frames) > 0.05
@@ -164,6 +170,10 @@ def test_gaps_are_bridged_and_said() -> None:
     late = dataclasses.replace(part, frame=part.frame + 7)
     again = error_spectrum(posterior(), late, 1e3 + np.flatnonzero(kept), n_draws=5)
     np.testing.assert_allclose(again.psd_arcsec2_hz, found.psd_arcsec2_hz, rtol=1e-12)
+    # Half the rate, over the same time.
+    thin = obs.select(obs.frame % 2 == 0)
+    half = error_spectrum(posterior(), thin, np.arange(0.0, 601.0, 2.0), n_draws=5)
+    assert half.longest_average_s == pytest.approx(whole.longest_average_s, rel=0.01)
 
 
 def test_times_that_are_no_series_are_refused() -> None:

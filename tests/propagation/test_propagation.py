@@ -332,6 +332,9 @@ def test_what_the_model_misses_is_added_to_the_calibration() -> None:
     share = (1.5 * 0.5) ** 2 / (1.5**2 * 0.5**2 + 0.6**2)
     for widths, quantile, own in zip(found.half_widths_with_misfit_found_arcsec, quantiles, (p95, p997), strict=True):
         np.testing.assert_allclose(widths[[0, 4]], own[[0, 4]], rtol=1e-6)
+        # Of all of the total, that part is the model's own tail, whatever the noise has.
+        share_of_both = (1.5 * sigma[3, 0] / both[0]) ** 2
+        np.testing.assert_allclose(widths[3, 0], quantile[0] * (1.0 + 0.2 * share_of_both) * both[0], rtol=1e-6)
         np.testing.assert_allclose(widths[1, :3], quantile[:3] * common, rtol=1e-6)
         np.testing.assert_allclose(widths[2, 0], quantile[0] * (1.0 + 0.2 * share) * rest[0], rtol=1e-6)
         np.testing.assert_allclose(widths[2, 3], quantile[3] * (1.0 + 0.2 * share) * rest[0], rtol=1e-6)
@@ -356,6 +359,14 @@ def test_table_has_one_row_per_contributor_and_axis() -> None:
     assert list(table["contributor"].unique()) == list(CONTRIBUTORS)
     absorbed = table.groupby("contributor", sort=False)["absorbed_by_alignment"].first()
     assert list(absorbed) == ["no", "yes", "no", "in part", "no"]
+    linear = (
+        table.set_index(["contributor", "axis"])["first_order_arcsec"].unstack().loc[list(CONTRIBUTORS), list(AXES)]
+    )
+    parts = (found.analytic_common_arcsec, found.analytic_rest_arcsec)
+    np.testing.assert_allclose(linear.to_numpy()[1:3], parts, rtol=1e-12)
+    np.testing.assert_allclose(linear.to_numpy()[3], found.analytic_total_arcsec, rtol=1e-12)
+    before = dataclasses.replace(found, analytic_total_arcsec=None).to_dataframe()
+    np.testing.assert_allclose(before["first_order_arcsec"][12:15], np.hypot(*parts), rtol=1e-12)
     rows = table.set_index(["contributor", "axis"])["if_model_holds_arcsec"]
     assert rows["calibration, common rotation", "yaw"] == found.common_arcsec[1]
     across = np.sqrt(np.mean(found.nea_arcsec[:2] ** 2))
