@@ -23,7 +23,7 @@ def gaussian_posterior(model: str = "brown", covariance: np.ndarray = COVARIANCE
         draws = cam.theta + np.random.default_rng(seed).standard_normal((n, len(sd))) @ root.T
         return np.column_stack([draws, np.full(n, 0.05)])
 
-    return SimpleNamespace(camera=cam, mean=cam.theta, covariance=covariance, thin=thin)
+    return SimpleNamespace(camera=cam, calibrated_camera=cam, mean=cam.theta, covariance=covariance, thin=thin)
 
 
 DECENTRED = np.diag([0.15, 0.15, 0.028, 1e-10, 1e-16, 1e-9, 1e-9]) ** 2

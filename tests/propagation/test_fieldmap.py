@@ -22,7 +22,7 @@ ARCSEC = 648_000.0 / np.pi
 
 def posterior(covariance: np.ndarray = COVARIANCE, **changes: object) -> SimpleNamespace:
     cam = camera("brown", **changes)
-    return SimpleNamespace(camera=cam, mean=cam.theta, covariance=covariance)
+    return SimpleNamespace(camera=cam, calibrated_camera=cam, mean=cam.theta, covariance=covariance)
 
 
 @lru_cache
