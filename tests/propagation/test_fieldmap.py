@@ -134,7 +134,7 @@ def test_what_cannot_be_mapped_is_said() -> None:
     with pytest.raises(ValueError, match="at least 2 grid points"):
         field_map(posterior(), observations(), n=1)
     folded = posterior()
-    folded.mean = folded.mean * np.array([1, 1, 1, -1e4, 1])
+    folded.calibrated_camera = folded.camera.with_theta(folded.mean * np.array([1, 1, 1, -1e4, 1]))
     with pytest.raises(DistortionError, match="folds over"):
         field_map(folded, observations())
 
