@@ -26,7 +26,7 @@ from starcal_uq.cli.options import (
     read_path,
     write_file,
 )
-from starcal_uq.cli.settings import ImageSettings, SkySettings
+from starcal_uq.cli.settings import ImageSettings, PlaceSettings, SkySettings
 from starcal_uq.core.files import UNFINISHED, ensure_new, table_ending
 from starcal_uq.core.settings import EPOCH, MAGNITUDES
 from starcal_uq.observations.files import WRITTEN
@@ -143,47 +143,66 @@ def identify_command(
         float, number("centre_tolerance_px", "Error of the nominal principal point, px.")
     ] = 20.0,
     engine: Engine = "pyramid",
+    *,
+    place: PlaceSettings,
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """Identify the stars of every frame without knowing where the camera pointed; frames that do not fit are named."""
-    from starcal_uq.pipeline.depth import depth_text, identify_to_depth
-    from starcal_uq.pipeline.images import epoch_of, of_one_size
+    """Identify the stars of every frame without knowing where the camera pointed; frames that do not fit are named.
+
+    The stars are identified with the nominal camera and again with what they tell of it, as `run` does.
+    """
+    from starcal_uq.pipeline.images import observations_from_centroids, of_one_size
     from starcal_uq.presentation.words.images import MOST_FRAMES, identification_table
 
     table_ending(out, WRITTEN)
     ensure_new(out, force)
+    sheet = out.with_suffix(".toml")
     table = sc.images.Centroids.load(centroids)
     nominal = None if camera is None else sc.Camera.load(camera)
     if nominal is None:
         table = of_one_size(table)
+        ensure_new(sheet, force)
     known = None if calibration is None else sc.Run(calibration).best
     if calibration is not None and known is not None and nominal is not None and camera is not None:
         check_same_sensor(known.camera, calibration, nominal, camera)
-    year = epoch_of(table) if epoch is None else epoch
     _say_epoch(table, epoch)
     with progress_bar("frames") as progress:
-        stars, found = identify_to_depth(
+        obs, found, images = observations_from_centroids(
             table,
             nominal,
-            year,
-            max_mag,
-            calibration=known,
-            focal_tolerance=focal_tolerance,
-            centre_tolerance_px=centre_tolerance,
-            engine=engine,
-            progress=progress,
+            max_mag=max_mag,
+            epoch=epoch,
+            identification={
+                "engine": engine,
+                "focal_tolerance": focal_tolerance,
+                "centre_tolerance_px": centre_tolerance,
+                "progress": progress,
+            },
+            known=known,
+            lenient=True,
+            tell=lambda message: err.print(message, style=_style(message), highlight=False, soft_wrap=True),
+            **place.options(),
         )
-    if max_mag is None:
-        _say((depth_text(stars, found),))
-    if found.n_identified:
-        found.observations.save(out, force=force, camera=found.nominal if known is None else known.camera)
+    if obs is not None:
+        _say_disturbed(obs)
+        best = images.calibration if images is not None else known
+        obs.save(out, force=force, camera=found.nominal if best is None else best.camera)
+        if images is None and known is None:
+            note("the stars do not determine the camera, so they were identified once: give more frames.")
+        kind = obs.meta["directions"]
+        if out.suffix == ".csv" and obs.directions_declared:
+            note(f"{out} does not say that its directions are {kind}: calibrate it with --directions {kind}.")
+        start = found.nominal if images is None else images.rounds[0][0].nominal
+        if start is not nominal and known is None:
+            start.save(sheet, force=force)
+            note(f"the camera to calibrate these stars with is {sheet}.")
     if json:
         print_json({"summary": found.text, "frames": records(found.to_dataframe())})
     else:
         if len(found.frames) <= MOST_FRAMES:
             print_table(identification_table(found))
-        print(f"{found.text}{f' Table: {out}' if found.n_identified else ''}")
+        print(f"{found.text}{f' Table: {out}' if obs is not None else ''}")
     if not found.n_identified:
         raise typer.Exit(1)
 
@@ -262,9 +281,7 @@ def load_images(
     _say_epoch(centroids, settings.epoch)
     for words in (found.identification.text, found.text):
         err.print(words, highlight=False, soft_wrap=True)
-    left_out = obs.meta.get("disturbed_stars", 0)
-    if left_out:
-        err.print(f"{left_out} stars left out, because the light of a neighbour displaces them.", highlight=False)
+    _say_disturbed(obs)
     # Of mirrored images x is counted from the right edge, and so is this camera's.
     nominal = found.rounds[0][0].nominal
     warn_undeclared(obs, nominal)
@@ -274,6 +291,11 @@ def load_images(
 def _say_epoch(centroids: Centroids, epoch: float | None) -> None:
     if epoch is None and not (centroids.time_utc != "").any():
         _say(("the images have no time: the stars are taken where they were in 2016; --epoch says when it was.",))
+
+
+def _say_disturbed(obs: Observations) -> None:
+    if left_out := obs.meta.get("disturbed_stars", 0):
+        err.print(f"{left_out} stars left out, because the light of a neighbour displaces them.", highlight=False)
 
 
 def _style(message: str) -> str | None:

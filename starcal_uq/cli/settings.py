@@ -94,24 +94,14 @@ class EstimationSettings:
 
 
 @dataclass(frozen=True)
-class SkySettings:
-    """What is known of the directions, and how the observer moved."""
+class PlaceSettings:
+    """What the directions are, and where the observer was."""
 
-    column: Columns = None
     directions: Annotated[
         settings.Directions | None,
         typer.Option(
             help="What ra_deg and dec_deg are: apparent (as seen by the moving sensor), catalogue (aberration is then "
             "applied at time_utc), or undeclared.",
-        ),
-    ] = None
-    observer_velocity: Annotated[
-        str | None,
-        typer.Option(
-            "--observer-velocity",
-            metavar="VX,VY,VZ",
-            help="Velocity relative to the Earth's centre, km/s, ICRS axes.",
-            callback=checked(parse_velocity),
         ),
     ] = None
     site: Annotated[
@@ -135,6 +125,22 @@ class SkySettings:
             "site": None if self.site is None else sc.sky.Site.load(self.site),
             "in_space": self.in_space,
         }
+
+
+@dataclass(frozen=True)
+class SkySettings(PlaceSettings):
+    """What is known of the directions, and how the observer moved."""
+
+    column: Columns = None
+    observer_velocity: Annotated[
+        str | None,
+        typer.Option(
+            "--observer-velocity",
+            metavar="VX,VY,VZ",
+            help="Velocity relative to the Earth's centre, km/s, ICRS axes.",
+            callback=checked(parse_velocity),
+        ),
+    ] = None
 
 
 @dataclass(frozen=True)

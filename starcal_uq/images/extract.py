@@ -206,6 +206,7 @@ class _Measure:
             return _left_out(error, name, None, image.time_utc or "", sha256.digest())
         entry = _entry(name, image.time_utc or "")
         entry.update(background=found.background, noise=found.noise, psf_sigma_px=found.psf_sigma_px)
+        entry["rendered"] = str(image.header.get("CREATOR", "")).startswith("starcal-uq")
         entry["optics"] = optics_of(image.header, image.width_px, image.height_px)
         entry["place"] = place_of(image.header)
         messages = [*image.messages, *(f"{name}: {text}" for text in found.messages)]
@@ -291,6 +292,8 @@ class _Table:
             "flux_unit": "electrons" if known and len(known) == len(self.gains) else "counts",
             "pixel_phase_px": list(amplitudes),
             "images_sha256": self.digest.hexdigest(),
+            # Whether all come from `render_frames`, whose stars shine through no air.
+            "rendered": all(frame.get("rendered", bool(frame["problem"])) for frame in self.frames),
             "optics": optics,
             "other_sizes": other_sizes(said, optics),
             "place": common_place([entry.get("place", {}) for entry in self.frames]),

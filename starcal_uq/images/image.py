@@ -51,8 +51,6 @@ _ONE_OF = re.compile(r"(.+)\[(\d+(?:,\d+)?)\]")
 _SIZES = re.compile(rb"NAXIS[1-9] *= *(\d{1,20})")
 # Bytes of a pixel by Pillow's modes; four for all others.
 _PIXEL_BYTES = {"1": 1, "L": 1, "P": 1, "I;16": 2, "I;16B": 2}
-# Ten blocks, of 36 cards each.
-_HEADER_BYTES = 28800
 # ISO 8601 as far as names of files allow it: colons are left out or replaced.
 _TIME_IN_NAME = re.compile(
     r"(?<!\d)(\d{4})-?(\d\d)-?(\d\d)T(\d\d)[-:_.]?(\d\d)[-:_.]?(\d\d)(?:[.,](\d{1,6})(?!\d))?(?!\d)", re.ASCII
@@ -240,17 +238,6 @@ def _with_named_time(image: Image) -> Image:
 
 def _few(names: list[str]) -> list[str]:
     return names if len(names) < 5 else [*names[:2], "...", names[-1]]
-
-
-def is_rendered(path: str | os.PathLike[str]) -> bool:
-    """Whether a file is a FITS image that this package rendered."""
-    if not Path(path).name.lower().endswith(FITS_ENDINGS):
-        return False
-    try:
-        with open(path, "rb") as file:
-            return b"CREATOR = 'starcal-uq" in file.read(_HEADER_BYTES)
-    except OSError:
-        return False
 
 
 def time_in_name(name: str) -> str | None:

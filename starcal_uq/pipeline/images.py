@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.core.errors import ObservationError
+from starcal_uq.core.errors import CalibrationError, IdentificationError, ObservationError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.times import julian_year, utc_text
 from starcal_uq.estimation.noise_floor import settle_noise
@@ -23,7 +23,10 @@ if TYPE_CHECKING:
     from starcal_uq.core.settings import Bayer, Engine
     from starcal_uq.core.tasks import Progress
     from starcal_uq.core.types import FloatArray, StrArray
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.identification.result import Identification
     from starcal_uq.images.centroids import Centroids
+    from starcal_uq.inference.posterior import Posterior
     from starcal_uq.observations.table import Observations
     from starcal_uq.pipeline.refine import ImageCalibration
     from starcal_uq.sky.site import Site
@@ -145,10 +148,6 @@ def observations_from_images(
         When the time is not readable.
     """
     from starcal_uq.images.extract import extract_centroids
-    from starcal_uq.pipeline.depth import depth_text, identify_to_depth
-    from starcal_uq.pipeline.refine import identify_and_calibrate
-    from starcal_uq.sky.catalogue import load_catalogue
-    from starcal_uq.sky.neighbours import without_disturbed
 
     check_sky(directions, site, in_space)
     if time_utc is not None:
@@ -169,21 +168,77 @@ def observations_from_images(
         for message in counted(centroids.messages):
             tell(f"note: {message}")
         tell(centroids.text)
+    obs, identification, found = observations_from_centroids(
+        centroids,
+        camera,
+        max_mag=max_mag,
+        epoch=epoch,
+        directions=directions,
+        site=site,
+        in_space=in_space,
+        identification={"engine": engine, "focal_tolerance": focal_tolerance},
+        tell=tell,
+    )
+    if obs is None or found is None:
+        raise IdentificationError(f"no frame is identified: {identification.text}")
+    return obs, centroids, found
+
+
+def observations_from_centroids(
+    centroids: Centroids,
+    camera: Camera | None,
+    *,
+    max_mag: float | None = None,
+    epoch: float | None = None,
+    directions: str | None = None,
+    site: Site | None = None,
+    in_space: bool = False,
+    identification: dict[str, Any] | None = None,
+    known: Calibration | Posterior | None = None,
+    lenient: bool = False,
+    tell: Callable[[str], None] | None = None,
+) -> tuple[Observations | None, Identification, ImageCalibration | None]:
+    """What `observations_from_images` does with the centroids of its images.
+
+    Parameters
+    ----------
+    centroids : Centroids
+        Stars of all images.
+    camera, max_mag, epoch, directions, site, in_space, tell
+        As in `observations_from_images`.
+    identification : dict, optional
+        Options of `identify`.
+    known : Calibration or Posterior, optional
+        What is known of this camera, with which the stars are identified once.
+    lenient : bool
+        Whether stars that do not determine the camera are taken as they were identified first, and none is no error.
+
+    Returns
+    -------
+    Observations, Identification, ImageCalibration
+        The last identification; the first is None where no star was identified, the third where they were identified
+        once.
+    """
+    from starcal_uq.pipeline.depth import depth_text, identify_to_depth
+    from starcal_uq.pipeline.refine import identify_and_calibrate
+    from starcal_uq.sky.catalogue import load_catalogue
+    from starcal_uq.sky.neighbours import without_disturbed
+
+    check_sky(directions, site, in_space)
     stated = None
     if site is not None:
         _check_times(centroids)
     elif directions in (None, "catalogue") and not in_space:
         stated = stated_site(centroids)
     year = epoch_of(centroids) if epoch is None else epoch
-    options: dict[str, Any] = {"engine": engine, "focal_tolerance": focal_tolerance}
-    stars, first = identify_to_depth(centroids, camera, year, max_mag, **options)
+    options = dict(identification or {})
+    progress = options.pop("progress", None)
+    stars, first = identify_to_depth(centroids, camera, year, max_mag, calibration=known, progress=progress, **options)
     if tell is not None and max_mag is None:
         tell(depth_text(stars, first))
     limit = float(stars.mag.max())
     # A neighbour need not be bright enough to be identified to displace a star.
     neighbours = load_catalogue(max_mag=max(limit, min(limit + FAINTER_NEIGHBOURS, FAINTEST)), epoch=year)
-
-    rendered = _rendered(images)
     motion = directions in (None, "catalogue")
     width = centroids.psf_sigma_px[np.isfinite(centroids.psf_sigma_px)]
     psf_sigma_px = float(np.median(width)) if len(width) else 1.0
@@ -191,6 +246,7 @@ def observations_from_images(
     def prepare(obs: Observations) -> Observations:
         nonlocal site, stated
         obs = without_disturbed(obs, neighbours, first.nominal, psf_sigma_px)
+        rendered = bool(centroids.meta.get("rendered"))
         if in_space or rendered:
             obs = obs.with_meta(observer="space" if in_space else "rendered")
         timed = obs.time_utc is not None and bool((obs.time_utc != "").all())
@@ -217,18 +273,27 @@ def observations_from_images(
     def to_catalogue(apparent: FloatArray, times: StrArray) -> FloatArray:
         return catalogue_directions(apparent, times, site=site)
 
-    found = identify_and_calibrate(
-        centroids,
-        camera,
-        stars,
-        first=first,
-        prepare=prepare,
-        to_catalogue=to_catalogue if motion else None,
-        # The calibration of the run will ask which frames repeat others.
-        method={"duplicates": "keep"},
-        identification=options,
-    )
-    return settle_noise(found.observations, found.calibration), centroids, found
+    if lenient and not first.n_identified:
+        return None, first, None
+    if known is not None:
+        return prepare(first.observations), first, None
+    try:
+        found = identify_and_calibrate(
+            centroids,
+            camera,
+            stars,
+            first=first,
+            prepare=prepare,
+            to_catalogue=to_catalogue if motion else None,
+            # The calibration of the run will ask which frames repeat others.
+            method={"duplicates": "keep"},
+            identification=options,
+        )
+    except CalibrationError:
+        if lenient:
+            return prepare(first.observations), first, None
+        raise
+    return settle_noise(found.observations, found.calibration), found.identification, found
 
 
 def stated_site(centroids: Centroids) -> Site | None:
@@ -294,15 +359,6 @@ def of_one_size(centroids: Centroids) -> Centroids:
     names = centroids.image[np.isin(centroids.frame_ids, odd)]
     said = [f"{n}: the image was left out, because it is not of the size of most; run it by itself." for n in names]
     return replace(kept, problem=np.array(problem, dtype=np.str_), messages=(*kept.messages, *said))
-
-
-def _rendered(images: Sequence[Path]) -> bool:
-    """Whether all images come from `render_frames`, whose stars shine through no air."""
-    from starcal_uq.images.image import IMAGE_ENDINGS, is_rendered
-
-    paths = [p for path in images for p in (sorted(path.iterdir()) if path.is_dir() else [path])]
-    paths = [path for path in paths if path.name.lower().endswith(IMAGE_ENDINGS)]
-    return bool(paths) and all(is_rendered(path) for path in paths)
 
 
 def _check_times(centroids: Centroids) -> None:

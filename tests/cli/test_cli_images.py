@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from astropy.io import fits
 from PIL import Image
 from scipy.spatial import cKDTree
 
@@ -60,6 +61,37 @@ def test_simulated_images_go_through_the_commands_one_by_one(cli, tmp_path):
     status, _, err = cli("run", "found.csv", "-o", "run")
     assert status == 2
     assert "needs the nominal camera" in err
+
+
+@pytest.mark.usefixtures("centroids_once")
+@pytest.mark.parametrize("timed", [True, False])
+def test_the_commands_one_by_one_give_what_run_gives(cli, frames, tmp_path, timed):
+    """To the last bit: centroid, identify and calibrate beside the steps of `run` up to its calibration."""
+    from starcal_uq.cli.images import load_images
+    from starcal_uq.cli.settings import ImageSettings, SkySettings
+
+    sc.paper.paper_start().save(tmp_path / "camera.toml")
+    if not timed:
+        for path in sorted(frames.glob("*.fits")):
+            with fits.open(path) as hdus:
+                for key in [key for key in hdus[0].header if key.startswith("DATE")]:
+                    del hdus[0].header[key]
+                hdus.writeto(tmp_path / path.name)
+    images = frames if timed else tmp_path
+    known = {"directions": "apparent"} if timed else {}
+    obs, nominal, _, _ = load_images(
+        [images], tmp_path / "camera.toml", ImageSettings(max_mag=6.0), SkySettings(**known)
+    )
+    at_once = sc.Run(tmp_path / "at_once").calibrate(obs, nominal)
+    told = ("--directions", "apparent") if timed else ()
+    assert cli("centroid", images, "-o", "c.csv", "--camera", "camera.toml")[0] == 0
+    assert cli("identify", "c.csv", "camera.toml", "-o", "o.ecsv", "--max-mag", 6, *told)[0] == 0
+    assert cli("calibrate", "o.ecsv", "camera.toml", "-o", "steps")[0] == 0
+    one_by_one = sc.Run(tmp_path / "steps").calibration
+    assert one_by_one.data_hash_of(obs) == obs.data_hash
+    np.testing.assert_array_equal(one_by_one.theta, at_once.theta)
+    np.testing.assert_array_equal(one_by_one.covariance, at_once.covariance)
+    assert sc.load_observations(tmp_path / "o.ecsv").meta["directions"] == ("apparent" if timed else "undeclared")
 
 
 @pytest.mark.usefixtures("centroids_once")
