@@ -16,7 +16,7 @@ from PIL import Image
 from scipy.spatial import cKDTree
 
 import starcal_uq as sc
-from starcal_uq.pipeline.images import counted, epoch_of
+from starcal_uq.pipeline.images import counted, epoch_of, observations_from_images
 from starcal_uq.pipeline.refine import identify_and_calibrate
 from starcal_uq.sky.neighbours import disturbed_stars, without_disturbed
 
@@ -67,9 +67,6 @@ def test_simulated_images_go_through_the_commands_one_by_one(cli, tmp_path):
 @pytest.mark.parametrize("timed", [True, False])
 def test_the_commands_one_by_one_give_what_run_gives(cli, frames, tmp_path, timed):
     """To the last bit: centroid, identify and calibrate beside the steps of `run` up to its calibration."""
-    from starcal_uq.cli.images import load_images
-    from starcal_uq.cli.settings import ImageSettings, SkySettings
-
     sc.paper.paper_start().save(tmp_path / "camera.toml")
     if not timed:
         for path in sorted(frames.glob("*.fits")):
@@ -79,19 +76,19 @@ def test_the_commands_one_by_one_give_what_run_gives(cli, frames, tmp_path, time
                 hdus.writeto(tmp_path / path.name)
     images = frames if timed else tmp_path
     known = {"directions": "apparent"} if timed else {}
-    obs, nominal, _, _ = load_images(
-        [images], tmp_path / "camera.toml", ImageSettings(max_mag=6.0), SkySettings(**known)
-    )
-    at_once = sc.Run(tmp_path / "at_once").calibrate(obs, nominal)
+    camera = sc.Camera.load(tmp_path / "camera.toml")
+    obs, _, found = observations_from_images([images], camera, max_mag=6.0, **known)
+    at_once = sc.Run(tmp_path / "at_once").calibrate(obs, found.rounds[0][0].nominal)
     told = ("--directions", "apparent") if timed else ()
     assert cli("centroid", images, "-o", "c.csv", "--camera", "camera.toml")[0] == 0
     assert cli("identify", "c.csv", "camera.toml", "-o", "o.ecsv", "--max-mag", 6, *told)[0] == 0
     assert cli("calibrate", "o.ecsv", "camera.toml", "-o", "steps")[0] == 0
     one_by_one = sc.Run(tmp_path / "steps").calibration
-    assert one_by_one.data_hash_of(obs) == obs.data_hash
+    stars = sc.load_observations(tmp_path / "o.ecsv")
+    assert stars.data_hash == obs.data_hash
     np.testing.assert_array_equal(one_by_one.theta, at_once.theta)
     np.testing.assert_array_equal(one_by_one.covariance, at_once.covariance)
-    assert sc.load_observations(tmp_path / "o.ecsv").meta["directions"] == ("apparent" if timed else "undeclared")
+    assert stars.meta["directions"] == ("apparent" if timed else "undeclared")
 
 
 @pytest.mark.usefixtures("centroids_once")
