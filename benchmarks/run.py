@@ -55,6 +55,7 @@ PAGE = ROOT / "docs" / "explanation" / "benchmarks.md"
 BEFORE = "0e7b0a1afa4eb04b62df08dc31eeebd4d9d66f9b"
 SEED = 2017
 IMAGES = Path(os.environ.get("STARCAL_IMAGES", ROOT.parent / "shared" / "data" / "esa-tetra3"))
+SHORT = IMAGES.parent / "openstartracker"
 CLOCKS = ("processor", "wall")
 PARTITIONS = ("--frames", "200000", "--partition-frames", "10000")
 # Mode, frames, fields of view; ten distortions, five noises and ten seeds make the rest.
@@ -542,6 +543,31 @@ def commands(ours: str, before: str) -> list[Row]:
             amount=lambda result: float(result["frames"]),
             repeats=3,
             targets=(Target("3 times as fast as before", before, 3.0),),
+        ),
+        *(
+            Row(
+                name=f"identify-{name}",
+                what=f"Identification of {whose} frames without a camera sheet, per frame",
+                contestants=(
+                    Contestant(ours, "ours:identify_unknown", options=options),
+                    Contestant("cedar-solve, 10 to 30 degrees", "images_cedar:identify_unknown", "cedar", options),
+                    Contestant("tetra3rs, 5 to 30 degrees", "images_tetra3rs:identify_unknown", "rivals", options),
+                ),
+                same=lambda mine, rival: Agreement(
+                    f"{rival['found']} frames, {rival['wrong']} wrong; ours {mine['found']} and {mine['wrong']}", True
+                ),
+                unit="for a frame",
+                amount=lambda result: float(result["frames"]),
+                repeats=3,
+            )
+            for name, whose, options in (
+                ("unknown", "ESA's night-sky", {"images": str(IMAGES), "field": 11.42}),
+                (
+                    "unknown-short",
+                    "openstartracker's",
+                    {"images": str(IMAGES.parent / "openstartracker"), "field": 6.08},
+                ),
+            )
         ),
     ]
 

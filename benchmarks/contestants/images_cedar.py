@@ -14,7 +14,7 @@ Result = dict[str, Any]
 
 
 def _images(folder: str) -> list[Any]:
-    loaded = [Image.open(path) for path in sorted(Path(folder).glob("*.tif*"))]
+    loaded = [Image.open(path) for ending in ("tif*", "png") for path in sorted(Path(folder).glob(f"*.{ending}"))]
     if not loaded:
         raise Missing(f"{folder} is not on this machine")
     for image in loaded:
@@ -44,5 +44,19 @@ def identify(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
             solver.solve_from_centroids(p, size, fov_estimate=field, fov_max_error=0.03 * field) for p, size in points
         ]
         return {"frames": len(loaded), "found": sum(f["RA"] is not None for f in found)}
+
+    return run
+
+
+def identify_unknown(folder: Path, *, images: str, field: float) -> Callable[[], Result]:
+    """`solve_from_centroids` of its own centroids with its own database, for fields of 10 to 30 degrees."""
+    loaded = [image.convert("L") if image.mode == "RGB" else image for image in _images(images)]
+    points = [(tetra3.get_centroids_from_image(image), (image.height, image.width)) for image in loaded]
+    solver = tetra3.Tetra3("default_database")
+
+    def run() -> Result:
+        done = [solver.solve_from_centroids(p, size) for p, size in points]
+        fields = [f["FOV"] for f in done if f["FOV"] is not None]
+        return {"frames": len(loaded), "found": len(fields), "wrong": sum(abs(f / field - 1.0) > 0.02 for f in fields)}
 
     return run

@@ -15,7 +15,7 @@ Result = dict[str, Any]
 
 
 def _images(folder: Path) -> list[np.ndarray]:
-    paths = sorted(Path(folder).glob("*.tif*"))
+    paths = [path for ending in ("tif*", "png") for path in sorted(Path(folder).glob(f"*.{ending}"))]
     if not paths:
         raise Missing(f"{folder} is not on this machine")
     return [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in paths]
@@ -50,5 +50,25 @@ def identify(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
             for p in points
         ]
         return {"frames": len(loaded), "found": sum(bool(f) for f in found)}
+
+    return run
+
+
+def identify_unknown(folder: Path, *, images: str, field: float) -> Callable[[], Result]:
+    """`solve_from_centroids` of its own centroids with one guess, and patterns for fields of 5 to 30 degrees."""
+    grey = [image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in _images(images)]
+    database = tetra3rs.SolverDatabase.generate_from_gaia(
+        max_fov_deg=30.0, min_fov_deg=5.0, epoch_proper_motion_year=2019.6
+    )
+    points = [tetra3rs.extract_centroids(image, threads=1).centroids for image in grey]
+    height, width = grey[0].shape
+
+    def run() -> Result:
+        done = [
+            database.solve_from_centroids(p, fov_estimate_deg=12.0, image_width=width, image_height=height)
+            for p in points
+        ]
+        fields = [float(f.fov_deg) for f in done if f]
+        return {"frames": len(grey), "found": len(fields), "wrong": sum(abs(f / field - 1.0) > 0.02 for f in fields)}
 
     return run

@@ -194,6 +194,21 @@ def centroids(folder: Path, *, images: str) -> Callable[[], Result]:
     return run
 
 
+def identify_unknown(folder: Path, *, images: str, field: float) -> Callable[[], Result]:
+    """Stars of images of a camera without a sheet, for fields of 0.5 to 90 degrees."""
+    if not Path(images).is_dir():
+        raise Missing(f"{images} is not on this machine")
+    table = sc.images.extract_centroids(images)
+    stars = sc.load_catalogue(max_mag=7.0, epoch=2019.6)
+
+    def run() -> Result:
+        done = sc.identification.identify(table, None, stars, cache=False)
+        wrong = done.n_identified * (abs(done.camera.fov_deg[0] / field - 1.0) > 0.02)
+        return {"frames": len(done.frames), "found": done.n_identified, "wrong": wrong}
+
+    return run
+
+
 def identify(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
     """Stars of images identified from their centroids."""
     if not Path(images).is_dir():

@@ -11,6 +11,7 @@ All work is counted: so many patterns of so many frames, so many of them matched
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -129,19 +130,29 @@ def make_level(directions: FloatArray) -> Level:
     return Level(directions, stars, quads, size, cKDTree(codes, balanced_tree=False, compact_nodes=False))
 
 
+# Levels of before: catalogues of any depth share those of the bright stars.
+_KEPT_LEVELS = 13
+_made: dict[bytes, Level] = {}
+
+
 class Levels:
     """The levels of a catalogue, made when they are first asked for."""
 
     def __init__(self, stars: StarCatalogue) -> None:
         order = np.argsort(stars.mag, kind="stable")
-        self._directions = np.ascontiguousarray(stars.directions_icrs[order])
-        self._made: dict[int, Level] = {}
+        self._directions = np.ascontiguousarray(stars.directions_icrs[order[:_LAST_LEVEL]])
         self.sizes = [n for k in range(20) if (n := _FIRST_LEVEL << k) <= min(len(order), _LAST_LEVEL)]
 
     def __getitem__(self, n: int) -> Level:
-        if n not in self._made:
-            self._made[n] = make_level(self._directions[:n])
-        return self._made[n]
+        bright = self._directions[:n]
+        key = hashlib.sha256(bright.tobytes()).digest()
+        level = _made.pop(key, None)
+        if level is None:
+            level = make_level(bright)
+            while len(_made) >= _KEPT_LEVELS:
+                del _made[next(iter(_made))]
+        _made[key] = level
+        return level
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,7 +168,7 @@ class BlindSearch:
     """One catalogue and one size of detector, of a camera whose focal length may be anything."""
 
     def __init__(self, stars: StarCatalogue, width_px: int, height_px: int) -> None:
-        self.levels = _levels_of(stars)
+        self.levels = Levels(stars)
         self.width, self.height = float(width_px), float(height_px)
         corner = 0.5 * float(np.hypot(width_px, height_px))
         self.geometry = FieldGeometry(self.width, self.width, self.height, corner)
@@ -288,18 +299,6 @@ def _rays(u: FloatArray, focal_px: FloatArray) -> FloatArray:
     b[..., 2] = focal_px[:, None]
     b /= np.sqrt(np.einsum("mni,mni->mn", b, b))[..., None]
     return b
-
-
-# What was made last: a run asks twice for the same catalogue.
-_recent: dict[int, tuple[StarCatalogue, Levels]] = {}
-
-
-def _levels_of(stars: StarCatalogue) -> Levels:
-    """The levels of a catalogue; those of the last one are kept."""
-    if id(stars) not in _recent:
-        _recent.clear()
-        _recent[id(stars)] = stars, Levels(stars)
-    return _recent[id(stars)][1]
 
 
 @dataclass(frozen=True)
