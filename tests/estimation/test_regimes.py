@@ -90,6 +90,39 @@ def test_student_t_leaves_the_minimum_that_interstar_angles_stray_into(name):
     assert cal.sigma < SENSORS[name][5]
 
 
+def filtered(c, sheet):
+    options = sc.estimation.RecursionOptions(parameters="all")
+    return sc.calibrate(sc.Observations(**c.columns), sheet, method="griffith", recursion=options)
+
+
+def merged(c, sheet):
+    obs = sc.Observations(**c.columns)
+    return sc.estimation.merge([sc.calibrate(obs.select_frames(obs.frame_ids[i::2]), sheet) for i in range(2)])
+
+
+def with_errors_of_stars(c, sheet):
+    return sc.calibrate(sc.Observations(**c.columns), sheet, star_errors=True)
+
+
+@pytest.mark.parametrize(
+    ("way", "name"),
+    [
+        *((filtered, name) for name in ("half a degree, 200 px", "two degrees, one frame", "ninety degrees, 5 mm")),
+        *((merged, name) for name in ("half a degree, 64 px", "one degree, two frames", "ninety degrees, 10 m")),
+        *((with_errors_of_stars, name) for name in ("half a degree, 64 px", "ten degrees", "ninety degrees, 10 m")),
+    ],
+)
+def test_every_way_to_an_estimate_has_an_honest_sigma(way, name):
+    _, _, _, stars, _, noise, _, _ = SENSORS[name]
+    patch = {"patch_stars": max(3 * stars, 40), "star_sigma_px": 2.0 * noise} if way is with_errors_of_stars else {}
+    c = observed(name, 1, **patch)
+    cal = way(c, sheet(c, name))
+    assert squared_error(cal, c.theta) < UNLIKELY
+    # The control: a twentieth of what is stated would be seen.
+    assert squared_error(cal, c.theta, claim=0.05) > UNLIKELY
+    assert cal.sigma == pytest.approx(noise, rel=0.2)
+
+
 @pytest.mark.parametrize(
     ("method", "name", "status"),
     [
