@@ -231,7 +231,7 @@ class Camera(Shown):
         with reading(path, "a camera of OpenCV, ROS, Kalibr or mrcal", "check the file", CameraError):
             held = read_pinhole(Path(path).read_text(encoding="utf-8"))
         if held.pixel_um is None:
-            raise CameraError(f"{path}: states no pixel pitch; write it at the top, in micrometres, as # pixel_um: 6.9")
+            raise CameraError(f"{path}: states no pixel pitch; write # pixel_um: 6.9 at its top (micrometres).")
         try:
             return cls.from_opencv(
                 held.matrix, held.dist_coeffs, held.width_px, held.height_px, held.pixel_um, name=held.name

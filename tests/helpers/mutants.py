@@ -156,9 +156,11 @@ IMAGES = (
     "image.jpg",
     "image.bmp",
 )
+# Format of another program, by the file.
+CAMERAS = {"opencv.yaml": "opencv", "ros.yml": "ros", "kalibr.yaml": "kalibr", "mrcal.cameramodel": "mrcal"}
 SAMPLES = (
     *(Sample(name, _image, ("images.read_image", "images.read_images")) for name in IMAGES),
-    Sample("camera.toml", sc.Camera.load, ("Camera.load",)),
+    *(Sample(name, sc.Camera.load, ("Camera.load",)) for name in ("camera.toml", *CAMERAS)),
     Sample("sensor.toml", sc.simulation.Sensor.load, ("simulation.Sensor.load",)),
     Sample("site.toml", sc.sky.Site.load, ("sky.Site.load",)),
     Sample(
@@ -347,6 +349,8 @@ def _write_results(folder: Path) -> None:
     from starcal_uq.studies.store import row, rows_table
     from tests.helpers.studies import made_study
 
+    for name, to in CAMERAS.items():
+        sc.export(_camera(), to, folder / name)
     (folder / "priors.toml").write_text(PRIORS)
     (folder / "chain.toml").write_text('[priors]\nprior_from = "earlier"\ninflation = 2.0\n')
     (folder / "budget.toml").write_text(BUDGET)
