@@ -135,30 +135,29 @@ def forward_kernel(model_name: str, order: str) -> Kernel:
     ----------
     model_name : str
         Registry name.
-    order : {"value", "attitude", "first", "second", "bent"}
+    order : {"value", "attitude", "first", "bent"}
         Outputs: value (2,); with ``attitude`` also d/dphi (3, 2); with ``first`` also d/dtheta (p, 2) before it; with
-        ``second`` also the unique second derivatives over (theta, phi), ((p + 3)(p + 4) / 2, 2); with ``bent`` only
-        those of `bent_index`.
+        ``bent`` also the second derivatives over (theta, phi) of `bent_index`, (n, 2).
     """
     import casadi as ca
 
     s = _symbols(model_name)
     p = s.theta.numel()
-    with_second = order in ("second", "bent")
-    xy = forward_expression(model_name, s, newton_steps=2 if with_second else 1)
+    bent = order == "bent"
+    xy = forward_expression(model_name, s, newton_steps=2 if bent else 1)
     outputs: list[Any] = [xy]
     shapes: list[tuple[int, ...]] = [(2,)]
-    if order == "first" or with_second:
+    if order == "first" or bent:
         # casadi.vec is column-major, so the Jacobian (2, p) becomes rows of (p, 2).
         outputs.append(ca.jacobian(xy, s.theta))
         shapes.append((p, 2))
     if order != "value":
         outputs.append(ca.jacobian(xy, s.phi))
         shapes.append((3, 2))
-    if with_second:
+    if bent:
         variables = ca.vertcat(s.theta, s.phi)
         hessians = [ca.hessian(xy[axis], variables)[0] for axis in range(2)]
-        rows, columns = second_index(p + 3) if order == "second" else bent_index(model_name)
+        rows, columns = bent_index(model_name)
         entries = [hessians[axis][int(i), int(j)] for i, j in zip(rows, columns, strict=True) for axis in range(2)]
         outputs.append(ca.vertcat(*entries))
         shapes.append((len(rows), 2))

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 _START_FOCAL, _START_CENTRE = 0.05, 0.1
 _SAME_SIGMA, _BETTER = 0.1, 1e-6
 # Stars and frames that fits from other starts need, and how far chance puts their optimum from that of all.
-_START_STARS, _FEWEST_FRAMES, _NEAR_SIGMA = 5000, 200, 6.0
+_START_STARS, _FEWEST_FRAMES, _NEAR_SIGMA = 3000, 200, 6.0
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ same statistics of the measured residuals at the same draw are set against them.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.display import Shown
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import FloatArray
-from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.marginal import MarginalLikelihood, Profile
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.star_errors import StarLikelihood
 from starcal_uq.maths.linear import scaled_cholesky
@@ -123,11 +123,14 @@ def predictive_check(
     theta, sigma = _draws(cal, post, n_draws, rng)
     summary = _Summary(part, cal)
     measured, replicated = [], []
+    turns, flat = _turns(part, state), h.reshape(len(h), -1)
     for shift, noise in zip(theta - cal.theta, sigma, strict=True):
-        measured.append(summary((e - np.tensordot(shift, h, axes=1)) / noise))
+        measured.append(summary((e - (shift @ flat).reshape(e.shape)) / noise))
         fresh = rng.standard_normal((1, 2, frames.n_stars))
         if stars is None:
-            replicated.append(summary(part.project_out(state, fresh)[0]))
+            fresh = fresh.ravel()
+            fresh -= turns @ (turns.T @ fresh)
+            replicated.append(summary(fresh.reshape(e.shape)))
         else:
             replicated.append(summary(stars.conditioned(state, fresh + stars.random_shifts(state, rng))[0][0]))
     data, fake = np.array(measured), np.array(replicated)
@@ -139,6 +142,21 @@ def predictive_check(
         # Every frame's sum of squares went into the factor of its own noise.
         statistics = tuple(s for s in statistics if not s.name.startswith("worst frame"))
     return PredictiveCheck(statistics, len(sigma), some.n_frames, obs.n_frames)
+
+
+def _turns(part: MarginalLikelihood, state: Profile) -> Any:
+    """Orthonormal columns (2 N, 3 K) that span what rotations of the frames make of residuals (2, N), sparse."""
+    from scipy.sparse import csr_array
+
+    frames = part.frames
+    factor: FloatArray = np.asarray(np.linalg.cholesky(np.moveaxis(state.inverse, 2, 0)), dtype=np.float64)
+    root = frames.spread(np.moveaxis(factor, 0, 2))
+    # Star by star and axis by axis: A times the root of (A^T A)^-1.
+    values = np.einsum("axn,abn->xnb", state.attitude, root, optimize=True)
+    columns = 3 * np.repeat(np.arange(frames.n_frames), frames.sizes)[:, None] + np.arange(3)
+    n = frames.n_stars
+    place = np.broadcast_to(columns, (2, n, 3)).ravel()
+    return csr_array((values.ravel(), place, 3 * np.arange(2 * n + 1)), shape=(2 * n, 3 * frames.n_frames))
 
 
 def _draws(

@@ -13,7 +13,7 @@ import starcal_uq as sc
 from benchmarks import regimes
 from benchmarks.misfit_power import SCENARIOS, main, power
 from starcal_uq.core.records import from_plain, to_plain
-from starcal_uq.diagnostics.misfit import ALPHA, Misfit, misfit_tests
+from starcal_uq.diagnostics.misfit import ALPHA, Misfit, _Columns, misfit_tests
 from starcal_uq.diagnostics.shapes import View, shapes
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.maths.intervals import holm
@@ -45,6 +45,23 @@ def null():
     ]
     names = [test.name for test in found[0].tests]
     return names, np.array([[t.p_value for t in f.tests] for f in found]), np.array([f.p_value for f in found])
+
+
+@pytest.mark.parametrize("stated", [False, True])
+def test_cells_are_summed_as_columns_would_be(stated):
+    obs = with_sigmas(observations("brown", n_frames=6)) if stated else observations("brown", n_frames=6)
+    part = MarginalLikelihood(obs, "brown")
+    theta = camera("brown").theta
+    state, _ = part.profile(theta)
+    columns = _Columns.of(shapes(obs, camera("brown")), View.of(part, state, theta, slice(0, obs.n_stars)))
+    many, few = columns.all(), state.attitude
+    flat, by_star = many.reshape(len(many), -1), np.einsum("ixn,qxn->iqn", few, many)
+    for ours, theirs in (
+        (columns.inner(), flat @ flat.T),
+        (columns.across(few), flat @ few.reshape(3, -1).T),
+        (columns.by_frame(few), part.frames.sum(by_star)),
+    ):
+        assert np.allclose(ours, theirs, rtol=0.0, atol=1e-12 * np.max(np.abs(theirs)))
 
 
 def test_false_alarms_are_nominal_after_refitting():

@@ -15,7 +15,7 @@ from starcal_uq.attitude.rotations import left_error
 from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.errors import CatalogueError, PriorError, RunFolderError, SamplingError, SettingError
-from starcal_uq.diagnostics.validation.replicates import LOG_LIKELIHOOD, Study, run_replicate
+from starcal_uq.diagnostics.validation.replicates import LOG_LIKELIHOOD, Replication, run_replicate
 from starcal_uq.diagnostics.validation.result import Validation
 from starcal_uq.diagnostics.validation.validate import narrow_priors, validate, validate_study
 from starcal_uq.maths.intervals import binomial_interval
@@ -34,7 +34,7 @@ QUANTITIES = ("x0", "y0", "f", "k1", "k2", "sigma", "log_likelihood", "pitch", "
 def study(model="brown", n_frames=12, seed=5, sigma_px=0.05, **options):
     truth = camera(model)
     start = nominal(truth)
-    return Study(
+    return Replication(
         truth,
         start,
         sc.Priors.default(start),
@@ -272,7 +272,7 @@ def test_failed_replicates_are_counted_and_explained(good):
 
 
 def test_when_nothing_works_the_reason_is_given(stars, monkeypatch):
-    def fail(*_):
+    def fail(*_, **__):
         raise sc.errors.CalibrationError("the stars do not suffice: add some.")
 
     monkeypatch.setattr("starcal_uq.diagnostics.validation.replicates.calibrate", fail)
@@ -285,11 +285,11 @@ def test_when_nothing_works_the_reason_is_given(stars, monkeypatch):
 def test_some_failures_leave_the_other_replicates(stars, monkeypatch):
     calls = []
 
-    def fail_once(*arguments):
+    def fail_once(*arguments, **options):
         calls.append(0)
         if len(calls) == 2:
             raise sc.errors.CalibrationError("the stars do not suffice: add some.")
-        return sc.calibrate(*arguments)
+        return sc.calibrate(*arguments, **options)
 
     monkeypatch.setattr("starcal_uq.diagnostics.validation.replicates.calibrate", fail_once)
     found = validate_study(study(), stars, 4, workers=0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.diagnostics.validation.replicates import Study
+from starcal_uq.diagnostics.validation.replicates import Replication
 from starcal_uq.diagnostics.validation.validate import validate, validate_study
 from starcal_uq.simulation.frames import Campaign
 from tests.helpers import validation_controls as controls
@@ -59,7 +59,7 @@ def test_ranks_of_truths_from_the_prior():
 def few_frames(**options):
     truth = sc.paper.paper_camera()
     start = truth.replace(x0_px=511.5, y0_px=511.5, coefficients=(0.0, 0.0))
-    return Study(truth, start, sc.Priors.default(start), "fixed", Campaign(12), 1, **options)
+    return Replication(truth, start, sc.Priors.default(start), "fixed", Campaign(12), 1, **options)
 
 
 def excess(found):

@@ -43,7 +43,7 @@ _MAX_TRUTHS = 1000
 
 
 @dataclass(frozen=True)
-class Study:
+class Replication:
     """What all replicates share; sent once to every process.
 
     Attributes
@@ -116,7 +116,7 @@ class TrialOutcome(NamedTuple):
     truth : (p+1,) array
         Camera parameters and noise.
     ranks : (Q,) array of int
-        Draws below the truth, of `Study.n_ranked`.
+        Draws below the truth, of `Replication.n_ranked`.
     covered : (Q,) array of bool
         The truth lies between the 2.5 % and 97.5 % quantiles of all draws.
     error : (Q,) array
@@ -146,7 +146,7 @@ class TrialOutcome(NamedTuple):
     dof: int
 
 
-def run_replicate(study: Study, stars: StarCatalogue, index: int) -> TrialOutcome:
+def run_replicate(study: Replication, stars: StarCatalogue, index: int) -> TrialOutcome:
     """Replicate number `index`; a calibration or posterior that fails is an outcome, a sky without stars an error."""
     truths, noise, sampler = np.random.SeedSequence(study.seed, spawn_key=(index,)).spawn(3)
     camera, sigma_px = _truth(study, np.random.default_rng(truths))
@@ -163,7 +163,7 @@ def run_replicate(study: Study, stars: StarCatalogue, index: int) -> TrialOutcom
     return _compare(study, obs, cal, draws, likelihood, truth, index)
 
 
-def _truth(study: Study, rng: np.random.Generator) -> tuple[Camera, float]:
+def _truth(study: Replication, rng: np.random.Generator) -> tuple[Camera, float]:
     """A camera and its noise; draws that are not cameras are drawn again.
 
     The prior is then cut off where no camera is; so is the posterior in effect, because stars that were seen leave no
@@ -187,7 +187,7 @@ def _truth(study: Study, rng: np.random.Generator) -> tuple[Camera, float]:
 
 
 def _sample(
-    study: Study, obs: Observations, cal: Calibration, seed: np.random.SeedSequence
+    study: Replication, obs: Observations, cal: Calibration, seed: np.random.SeedSequence
 ) -> tuple[FloatArray, LogLikelihood]:
     """Draws (n_steps, n_walkers, p+1) and the likelihood that they are of."""
     made = study.likelihood if isinstance(study.likelihood, str) else study.likelihood(obs, cal)
@@ -215,7 +215,7 @@ def _sample(
 
 
 def _compare(
-    study: Study,
+    study: Replication,
     obs: Observations,
     cal: Calibration,
     draws: FloatArray,
@@ -253,7 +253,7 @@ def _compare(
     )
 
 
-def _no_result(study: Study, truth: FloatArray, index: int, reason: str) -> TrialOutcome:
+def _no_result(study: Replication, truth: FloatArray, index: int, reason: str) -> TrialOutcome:
     q = len(study.quantities)
     nothing, nowhere = np.full(q, np.nan), np.zeros(q, dtype=np.int64)
     return TrialOutcome(index, reason, truth, nowhere, nowhere > 0, nothing, nothing, np.nan, np.nan, np.nan, 0)

@@ -30,7 +30,13 @@ from starcal_uq.core.settings import Truth, bounded
 from starcal_uq.core.store import Kept
 from starcal_uq.core.tasks import Progress, one_thread, run_tasks
 from starcal_uq.core.types import AnyDict
-from starcal_uq.diagnostics.validation.replicates import MARGINAL, LikelihoodMaker, Study, TrialOutcome, run_replicate
+from starcal_uq.diagnostics.validation.replicates import (
+    MARGINAL,
+    LikelihoodMaker,
+    Replication,
+    TrialOutcome,
+    run_replicate,
+)
 from starcal_uq.diagnostics.validation.result import Validation
 from starcal_uq.inference.priors import Priors
 from starcal_uq.simulation.frames import Campaign
@@ -124,7 +130,7 @@ def validate(
     if priors is None:
         priors = narrow_priors(camera, sigma_px) if truth == "prior" else Priors.default(nominal)
     campaign = Campaign(n_frames, min_stars, sigma_px, max_mag)
-    study = Study(camera, nominal, priors, truth, campaign, seed, assumed_sigma_px, likelihood)
+    study = Replication(camera, nominal, priors, truth, campaign, seed, assumed_sigma_px, likelihood)
     _check(study, n_replicates, workers)
     settings: AnyDict = {
         "truth": truth,
@@ -143,7 +149,7 @@ def validate(
 
 
 def validate_study(
-    study: Study,
+    study: Replication,
     stars: StarCatalogue,
     n_replicates: int,
     *,
@@ -204,7 +210,7 @@ def narrow_priors(camera: Camera, sigma_px: float) -> Priors:
     )
 
 
-def _check(study: Study, n_replicates: int, workers: int | None) -> None:
+def _check(study: Replication, n_replicates: int, workers: int | None) -> None:
     assumed = study.assumed_sigma_px
     for good, text in (
         (study.truth in TRUTHS, f"truth {study.truth!r} is unknown: use one of {', '.join(TRUTHS)}."),
@@ -235,7 +241,7 @@ _CHUNK = 8
 
 
 def run_replicates(
-    study: Study,
+    study: Replication,
     stars: StarCatalogue,
     n_replicates: int,
     workers: int | None,
