@@ -8,9 +8,10 @@ ask for. Nothing is blamed while the table as it is does nearly as well.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import wraps
+from itertools import islice
 from typing import ParamSpec, TypeVar
 
 import numpy as np
@@ -19,7 +20,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.status import Status
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.estimation.screening.consensus import consensus, focal_ratio, measured_directions
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.table import Observations
@@ -28,6 +29,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 _FRAMES, _STARS = 16, 30
+# Frames of a stream, of which those are chosen.
+_HEAD = 64
 # Width of the field from which a focal length is looked for: angles are nearly proportional to it.
 _FIELD_RAD = np.radians(20.0)
 # Stars farther from their attitude's place than this fraction of the detector do not agree with it.
@@ -86,16 +89,37 @@ def explained(function: Callable[P, R]) -> Callable[P, R]:
             raise
         except CalibrationError as error:
             given = dict(zip(names, args, strict=False)) | kwargs
-            obs, camera, status = given["obs"], given["camera"], error.status
-            if status is None or not isinstance(obs, Observations) or not isinstance(camera, Camera):
+            found = explanation(error, given["obs"], given["camera"], screened=function.__name__ == "screen")
+            if found is None:
                 raise
-            sentence = find_reason(obs, camera, status, screened=function.__name__ == "screen")
-            if sentence is None:
-                raise
-            head = str(error).partition(":")[0]
-            raise CalibrationError(f"{head}: {sentence}.", status) from error
+            raise found from error
 
     return calibrated
+
+
+def explanation(error: CalibrationError, obs: object, camera: object, *, screened: bool = False) -> Exception | None:
+    """The error of a calibration with what is wrong with its stars, where that can be told; a stream by its head."""
+    if error.status is None or not isinstance(camera, Camera):
+        return None
+    if not isinstance(obs, Observations):
+        obs = _head(obs)
+    sentence = None if obs is None else find_reason(obs, camera, error.status, screened=screened)
+    return None if sentence is None else CalibrationError(f"{str(error).partition(':')[0]}: {sentence}.", error.status)
+
+
+def _head(stream: object) -> Observations | None:
+    """The first frames of a stream that can be read again, numbered anew."""
+    if not isinstance(stream, Iterable) or isinstance(stream, Iterator | str):
+        return None
+    parts = list(islice(stream, _HEAD))
+    if not parts or not all(isinstance(part, Observations) for part in parts):
+        return None
+    columns: AnyDict = {
+        n: np.concatenate([getattr(part, n) for part in parts]) for n in ("x_px", "y_px", "ra_deg", "dec_deg")
+    }
+    # Frames of one part need not be those of another, whatever their numbers.
+    sizes = np.concatenate([np.diff(part.frame_starts) for part in parts])
+    return Observations(frame=np.repeat(np.arange(len(sizes)), sizes), **columns)
 
 
 def find_reason(obs: Observations, camera: Camera, status: Status, *, screened: bool = False) -> str | None:
@@ -112,9 +136,14 @@ def find_reason(obs: Observations, camera: Camera, status: Status, *, screened: 
         centred = camera.replace(x0_px=0.5 * (camera.width_px - 1), y0_px=0.5 * (camera.height_px - 1))
         tried.append((_fit(table, centred), _off_centre(camera)))
         tried += _regrouped(obs, camera)
-        good = [one for one in tried if one[0].cost < min(_EXPLAINED, _CLEARLY * plain.cost)]
+        enough = min(_EXPLAINED, _CLEARLY * plain.cost)
+        if all(fit.cost >= enough for fit, _ in tried):
+            tried = [(_fit(other, camera), text) for text, other in _two_slips(table, camera)]
+        good = [one for one in tried if one[0].cost < enough]
         if good:
-            return min(good, key=lambda one: one[0].badness(camera))[1]
+            fit, text = min(good, key=lambda one: one[0].badness(camera))
+            focal = _wrong_focal(fit, camera)
+            return text if focal is None else f"{text}; and {focal}"
         if _far_apart(table, camera):
             return _far_apart_words(obs, camera)
     if plain.share < 1.0 - _FEW_WRONG and plain.scatter_px > _NOISY * _tolerance_px(camera):
@@ -165,7 +194,22 @@ def _fit(table: _Table, camera: Camera, wider: float = 1.0) -> _Fit:
 
 def _slips(table: _Table, camera: Camera) -> Iterator[tuple[str, _Table]]:
     """Slips that the numbers allow, each as a clause with its remedy, and the table without it."""
-    x, y = table.pixel
+    yield from _units(table)
+    yield _mirrored(table, camera)
+
+
+def _two_slips(table: _Table, camera: Camera) -> Iterator[tuple[str, _Table]]:
+    """Two of them at once."""
+    for text, other in _units(table):
+        second, both = _mirrored(other, camera)
+        yield f"{text}; and {second}", both
+        for more, again in _units(table):
+            if other.dec is table.dec and again.ra is table.ra:
+                second = more.replace(", ra_deg does not", "")
+                yield f"{text}; and {second}", _Table(table.pixel, other.ra, again.dec, table.starts)
+
+
+def _units(table: _Table) -> Iterator[tuple[str, _Table]]:
     ra, dec, starts = table.ra, table.dec, table.starts
     in_degrees = np.degrees
     if ra.max() <= 24.0:
@@ -182,11 +226,15 @@ def _slips(table: _Table, camera: Camera) -> Iterator[tuple[str, _Table]]:
         yield text, _Table(table.pixel, ra, in_degrees(dec), starts)
     if ra.max() <= 90.0:
         yield "ra_deg and dec_deg look swapped: exchange the two columns", _Table(table.pixel, dec % 360.0, ra, starts)
+
+
+def _mirrored(table: _Table, camera: Camera) -> tuple[str, _Table]:
+    x, y = table.pixel
     ways = f"count x_px from the right edge ({camera.width_px - 1} - x_px), or y_px from the bottom"
     if x.max() <= camera.height_px - 0.5 and y.max() <= camera.width_px - 0.5:
         ways += ", or exchange x_px and y_px"
     text = f"the image is mirrored: {ways}; a wrong sign of ra_deg or dec_deg looks the same"
-    yield text, _Table(np.array([camera.width_px - 1.0 - x, y]), ra, dec, starts)
+    return text, _Table(np.array([camera.width_px - 1.0 - x, y]), table.ra, table.dec, table.starts)
 
 
 def _off_centre(camera: Camera) -> str:

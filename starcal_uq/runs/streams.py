@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcal_uq.camera.distortion import parameters
+from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.files import atomic_write_text, check_new_folder
 from starcal_uq.core.records import to_plain
 from starcal_uq.core.tasks import interrupt_between_steps
 from starcal_uq.core.types import AnyDict
+from starcal_uq.estimation.plausibility import explanation
 from starcal_uq.estimation.recursive.start import RecursionOptions
 from starcal_uq.estimation.recursive.stream import RecursiveCalibration
 from starcal_uq.observations.streams import FrameStream, stream_frames
@@ -109,7 +111,13 @@ def _filter_run(
         filtering.save(state)
 
     _feed(filtering, stream, keep)
-    calibration = filtering.result()
+    try:
+        calibration = filtering.result()
+    except CalibrationError as error:
+        found = explanation(error, stream, camera)
+        if found is None:
+            raise
+        raise found from error
     run.write(calibration, None, history=history(calibration))
     for name in (STATE, SOURCE):
         (run.path / name).unlink(missing_ok=True)

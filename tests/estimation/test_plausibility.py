@@ -12,6 +12,7 @@ import starcal_uq as sc
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.estimation import plausibility
+from starcal_uq.runs.streams import filter_run
 from tests.helpers.outside import campaign
 
 FIELDS = (8.0, 45.0)
@@ -94,6 +95,39 @@ def slipped(slip, field):
 def test_a_slip_is_named(slip, field):
     obs, camera, words = slipped(slip, field)
     assert re.search(words, plausibility.find_reason(obs, camera, Status.MAX_ITERATIONS) or "")
+
+
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [("hours", "x and y"), ("radians", "y"), ("hours", "dec in radians"), ("hours", "micrometres"), ("x", "another")],
+)
+def test_two_slips_at_once_are_both_named(one, other, field):
+    c = seen(field)
+    (first, said), (second, more) = ((TABLES | CAMERAS)[slip] for slip in (one, other))
+    columns, camera = c.columns | first(c.columns), sheet(c)
+    if other in TABLES:
+        columns |= second(columns)
+    else:
+        camera = sheet(c, **second(camera.focal_mm))
+    reason = plausibility.find_reason(sc.Observations(**columns), camera, Status.MAX_ITERATIONS) or ""
+    assert re.search(f"{said}.*; and .*{more.replace(', ra_deg does not', '')}", reason), reason
+
+
+def test_a_stream_is_explained_by_its_first_frames(tmp_path):
+    c = seen(8.0)
+    obs = sc.Observations(**(c.columns | TABLES["hours"][0](c.columns)))
+    obs.save(tmp_path / "obs.parquet")
+    frames = [obs.select_frames([number]) for number in obs.frame_ids]
+    for fails in (
+        lambda: sc.calibrate(frames, sheet(c), method="griffith"),
+        lambda: filter_run(tmp_path / "obs.parquet", sheet(c), tmp_path / "run"),
+    ):
+        with pytest.raises(CalibrationError, match=TABLES["hours"][1]):
+            fails()
+    # What has been read and is gone is not asked for again.
+    with pytest.raises(CalibrationError, match="far worse than centroid noise"):
+        sc.calibrate(iter(frames), sheet(c), method="griffith")
 
 
 def refuse(slip, field):
