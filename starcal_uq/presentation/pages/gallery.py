@@ -115,14 +115,15 @@ def picture(path: Path, width_px: int, camera: Camera, flat: bool = True) -> byt
         sky = prepare_image(image, 1.0, None, None)[0].counts
     else:
         sky = image.data.astype(np.float32)
-        sky -= np.median(sky[np.isfinite(sky)]) if np.isfinite(sky).any() else 0.0
-        sky[~np.isfinite(sky)] = 0.0
+        known = np.isfinite(sky)
+        sky[~known] = np.median(sky[known]) if known.any() else 0.0
     small = Image.fromarray(sky)
     if small.width > width_px:
         small = small.resize((width_px, max(1, round(small.height * width_px / small.width))), Image.Resampling.BOX)
     # Stars are wider than pixels, and noise is not.
     sky = gaussian_filter(np.asarray(small), _BLUR_PX)
-    low, high = ZScaleInterval(n_samples=4000).get_limits(sky)
+    sky -= np.median(sky)
+    low, high = ZScaleInterval().get_limits(sky)
     # Black is a little above the sky, and the scale so long that asinh leaves stars their shapes.
     floor, span = -_BLACK * low, max(_SPAN * (high - low), 1e-12)
     bright = AsinhStretch(_BEND)(np.clip((sky - floor) / span, 0.0, 1.0))
