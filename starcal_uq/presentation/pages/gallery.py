@@ -8,6 +8,7 @@ import os
 from collections.abc import Iterable
 from html import escape
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -60,7 +61,7 @@ def gallery(frames: Frames) -> str:
         "factor": count(round(factor)) if factor >= 1.0 else significant(factor),
         "radius": significant(_radius(frames) / factor, 1),
         "arrows": bool(len(frames.residuals_px)),
-        "command": frames.run,
+        "command": quote(frames.run),
         "without": sum(frame.path is None for frame in shown),
         "large": frames.large,
         "partial": len(frames) < (frames.n_run or len(frames)),
