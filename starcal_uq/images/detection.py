@@ -138,7 +138,9 @@ def _detect(frame: PreparedImage, name: str, sigma: float, options: DetectionOpt
         left *= _mosaic_noise(line)
     filtered = _filtered(frame.counts, (line / line.sum()).astype(np.float32))
     threshold = np.float32(options.threshold_sigma * left)
-    n_above = np.count_nonzero(filtered > threshold * frame.noise)
+    # Whatever is found is among these, rounding included.
+    above = np.flatnonzero(filtered > np.float32(0.9999) * threshold * frame.noise)
+    n_above = len(above)
 
     def extract(image: Any, noise: Any, levels: int) -> tuple[Any, Any]:
         # sep prepares a list for all pixels that it may have to keep, which takes longer than a small image.
@@ -159,14 +161,14 @@ def _detect(frame: PreparedImage, name: str, sigma: float, options: DetectionOpt
         return found
 
     try:
-        objects, labels = _taken_apart(filtered, frame.noise, *extract(filtered, frame.noise, 1), extract)
+        objects, labels = _taken_apart(filtered, frame.noise, *extract(filtered, frame.noise, 1), extract, above)
     except Exception as error:  # sep raises bare exceptions when its buffers are full
         raise ImageError(
             f"{name}: there are too many bright pixels to tell stars apart; raise the threshold, or leave the image "
             "out."
         ) from error
     labels = labels.ravel()
-    inside = np.flatnonzero(labels != 0)
+    inside = above[labels[above] != 0]
     objects["flux"] = np.bincount(labels[inside], frame.counts.ravel()[inside], minlength=len(objects) + 1)[1:]
     objects = objects[np.isfinite(objects["x"]) & np.isfinite(objects["y"])]
     return objects[np.argsort(-objects["cflux"], kind="stable")][:_MAX_DETECTIONS]
@@ -192,16 +194,21 @@ _LEVELS = 32
 
 
 def _taken_apart(
-    image: Any, noise: Any, objects: Any, labels: Any, extract: Callable[[Any, Any, int], tuple[Any, Any]]
+    image: Any,
+    noise: Any,
+    objects: Any,
+    labels: Any,
+    extract: Callable[[Any, Any, int], tuple[Any, Any]],
+    above: IntArray,
 ) -> tuple[Any, Any]:
-    """Objects and their map of numbers with those taken apart that have several peaks.
+    """Objects and their map of numbers, zero but in pixels `above`, with those taken apart that have several peaks.
 
     No other can fall apart, and to look for it in all takes as long as all the rest.
     """
     import sep
 
     height, width = image.shape
-    inside = np.flatnonzero(labels.ravel() != 0)
+    inside = above[labels.ravel()[above] != 0]
     row, column = np.divmod(inside, width)
     rows = [(row + step).clip(0, height - 1) * width for step in (-1, 0, 1)]
     columns = [(column + step).clip(0, width - 1) for step in (-1, 0, 1)]

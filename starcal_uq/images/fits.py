@@ -294,7 +294,7 @@ def _to_their_end(step: FloatArray, last: FloatArray, moving: IntArray) -> Float
     """
     before = last[:, moving]
     ratio = _ratio(np.einsum("qk,qk->k", step, before), np.einsum("qk,qk->k", before, before))
-    last[:, moving] = longer = step / (1.0 - ratio.clip(-1.0, 0.5))
+    last[:, moving] = longer = step / (1.0 - np.minimum(np.maximum(ratio, -1.0), 0.5))
     return longer
 
 
