@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import stat
 from collections.abc import Callable
 from pathlib import Path
@@ -116,6 +117,17 @@ def parse_velocity(text: str | None) -> tuple[float, float, float] | None:
     if not _VELOCITY.holds([x, y, z]):
         raise typer.BadParameter(f"{shown(text)} is no velocity in km/s: {_VELOCITY.wanted()}.")
     return x, y, z
+
+
+def parse_frames(text: str | None) -> list[tuple[int, int]] | None:
+    """``0-4,7`` as first and last number of each stretch of frames."""
+    if text is None:
+        return None
+    found = [re.fullmatch(r"(\d{1,15})(?:-(\d{1,15}))?", part.strip()) for part in text.split(",")]
+    ends = [(int(match[1]), int(match[2] or match[1])) for match in found if match is not None]
+    if len(ends) < len(found) or any(last < first for first, last in ends):
+        raise typer.BadParameter(f"{shown(text)} is no list of frame numbers, such as 0-4,7.")
+    return ends
 
 
 def parse_labels(text: str | None) -> tuple[str, str] | None:

@@ -23,6 +23,7 @@ from starcal_uq.cli.options import (
     TimeUtc,
     checked,
     number,
+    parse_frames,
     parse_velocity,
     read_file,
 )
@@ -132,6 +133,12 @@ class SkySettings(PlaceSettings):
     """What is known of the directions, and how the observer moved."""
 
     column: Columns = None
+    frames: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LIST", help="Frames of the table to take, such as 0-4,7.", callback=checked(parse_frames)
+        ),
+    ] = None
     observer_velocity: Annotated[
         str | None,
         typer.Option(
@@ -216,7 +223,7 @@ class SamplingSettings:
 def refuse_others(images: bool, sky: SkySettings, of_images: ImageSettings) -> None:
     """An option that would be ignored is a mistake of the user's that should show."""
     if images:
-        given: AnyDict = {"column": sky.column, "observer_velocity": sky.observer_velocity}
+        given: AnyDict = {"column": sky.column, "frames": sky.frames, "observer_velocity": sky.observer_velocity}
         kind = "tables of stars, not to images"
     else:
         given = {field.name: value for field, value in zip(fields(of_images), astuple(of_images), strict=True)}

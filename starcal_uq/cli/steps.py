@@ -44,6 +44,7 @@ from starcal_uq.cli.options import (
     checked,
     number,
     parse_columns,
+    parse_frames,
     parse_velocity,
     read_file,
     read_path,
@@ -74,10 +75,15 @@ def load_table(
         "observer_velocity_km_s": parse_velocity(sky.observer_velocity),
     }
     obs: Observations | PartitionedObservations
+    chosen = parse_frames(sky.frames)
     if isinstance(path, Path) and path.is_dir():
+        if chosen is not None:
+            raise typer.BadParameter("--frames belongs to one table: leave files out of the folder instead.")
         obs = partitions_from_folder(path, camera, **known)
     else:
         obs = observations_from_table(path, camera, **known)
+        if chosen is not None:
+            obs = obs.in_ranges(chosen)
     warn_undeclared(obs, camera)
     return obs, camera
 

@@ -29,6 +29,7 @@ from starcal_uq.diagnostics.predictive import PredictiveCheck, predictive_check
 from starcal_uq.diagnostics.stars import StarTest, star_test
 from starcal_uq.estimation.calibrate import METHODS, calibrate, fit
 from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.estimation.cameras import MixedCameras
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.observations.splits import frame_sample
@@ -101,6 +102,8 @@ class Diagnosis(Shown):
         Errors that stars bring along; None in a diagnosis of an earlier version.
     air : AirTest or None
         Refraction in the residuals; None where there cannot be any, or in a diagnosis of an earlier version.
+    cameras : MixedCameras or None
+        Several cameras, where the frames' own focal lengths ask for them.
     """
 
     misfit: Misfit
@@ -112,6 +115,7 @@ class Diagnosis(Shown):
     provenance: AnyDict
     stars: StarTest | None = None
     air: AirTest | None = None
+    cameras: MixedCameras | None = None
 
     def is_of(self, cal: Calibration) -> bool:
         """True if this calibration is the one that was diagnosed."""
@@ -193,6 +197,7 @@ def diagnose(
         provenance=provenance(seed, settings, whole.data_hash_of(obs)),
         stars=star_test(obs, cal),
         air=air_test(obs, cal, seed=seed),
+        cameras=MixedCameras.of(obs, cal.camera),
     )
 
 

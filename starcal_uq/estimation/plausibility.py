@@ -21,6 +21,7 @@ from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
+from starcal_uq.estimation.cameras import frame_focals
 from starcal_uq.estimation.screening.consensus import consensus, focal_ratio, measured_directions
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.table import Observations
@@ -146,6 +147,9 @@ def find_reason(obs: Observations, camera: Camera, status: Status, *, screened: 
             return text if focal is None else f"{text}; and {focal}"
         if _far_apart(table, camera):
             return _far_apart_words(obs, camera)
+    focals = frame_focals(obs, camera)
+    if focals.n_groups > 1:
+        return focals.words(camera)
     if plain.share < 1.0 - _FEW_WRONG and plain.scatter_px > _NOISY * _tolerance_px(camera):
         # Stars that noise throws beyond the tolerance are not wrong ones.
         wider = (_fit(table, camera, by) for by in (3.0, 9.0))

@@ -188,6 +188,22 @@ class Observations(FrameRows, Shown):
         wanted = self._frame_numbers(ids, "observations")
         return self.select(np.isin(self.frame, wanted))
 
+    def in_ranges(self, ranges: Sequence[tuple[int, int]]) -> Observations:
+        """The rows of the frames with numbers in these ranges, from first to last.
+
+        Raises
+        ------
+        ObservationError
+            If a range holds no frame of the table.
+        """
+        ids = self.frame_ids
+        inside = [ids[(ids >= first) & (ids <= last)] for first, last in ranges]
+        for (first, last), found in zip(ranges, inside, strict=True):
+            if not len(found):
+                asked = str(first) if first == last else f"{first}-{last}"
+                raise ObservationError(f"there is no frame {asked}: the table has {ids[0]} to {ids[-1]}.")
+        return self.select_frames(np.unique(np.concatenate(inside)))
+
     def with_meta(self, **entries: Any) -> Observations:
         """The same table with entries of `meta` added or changed, such as ``directions="apparent"``."""
         return replace(self, meta={**self.meta, **entries})

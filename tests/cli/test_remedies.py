@@ -16,6 +16,7 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.core.status import Level, Status
 from starcal_uq.diagnostics.verdict import draws, estimate, observed
+from starcal_uq.estimation.cameras import MixedCameras
 from starcal_uq.inference import checks
 from starcal_uq.runs.folder import FILES
 from tests.helpers.ground_scenes import NOMINAL, SITE, ground_frames
@@ -109,6 +110,9 @@ EXAMPLES = {
                 provenance={"fallback": {"model": "brown3", "used": "brown", "because": "the stars are too few"}},
             )
         )
+    ],
+    "diagnostics.verdict.estimate.one_camera": lambda s: [
+        estimate.one_camera(MixedCameras(2, "the frames are of 2 cameras", "0-5,8"))
     ],
     "diagnostics.verdict.estimate.comparison": lambda s: [
         estimate.comparison(sc.diagnostics.compare_models(s.bent, sc.calibrate(s.bent, s.sheet, model="none")))

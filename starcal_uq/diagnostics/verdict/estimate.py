@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from starcal_uq.diagnostics.predictive import PredictiveCheck
     from starcal_uq.diagnostics.stars import StarTest
     from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.cameras import MixedCameras
     from starcal_uq.inference.posterior import Posterior
 
 # False alarms by design. A run whose model holds is warned of in at most 5 % of cases and failed in at most 1 %: the
@@ -124,10 +125,18 @@ _LIKE_NOISE = ("pixel phase in x", "pixel phase in y")
 def model_checks(diagnosis: Diagnosis) -> list[Check]:
     """Every check that a diagnosis allows."""
     checks = [misfit(diagnosis.misfit), even_noise(diagnosis.misfit)]
+    checks += [] if diagnosis.cameras is None else [one_camera(diagnosis.cameras)]
     checks += [] if diagnosis.jackknife is None else [jackknife(diagnosis.jackknife)]
     checks += [] if diagnosis.stars is None else [stars(diagnosis.stars)]
     checks += [] if diagnosis.comparison is None else [comparison(diagnosis.comparison)]
     return [*checks, predictive(diagnosis.predictive)]
+
+
+def one_camera(found: MixedCameras) -> Check:
+    """Do the frames' own focal lengths ask for several cameras?"""
+    remedy = f"{CALIBRATE} --frames {found.frames}"
+    sentence = f"{found.words[0].upper()}{found.words[1:]}."
+    return Check("One camera", Question.TRUSTWORTHY, Level.FAIL, f"{found.n} cameras", "1", sentence, remedy)
 
 
 def misfit(found: Misfit) -> Check:
