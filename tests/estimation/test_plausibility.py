@@ -181,7 +181,7 @@ def test_wrong_stars_and_noise_are_told_apart(field):
         assert sc.calibrate(sc.Observations(**noisy.columns), sheet(noisy)).sigma == pytest.approx(5.0, rel=0.1)
     else:
         with pytest.raises(CalibrationError, match=r"the data do not determine x0: more frames"):
-            sc.calibrate(sc.Observations(**noisy.columns), sheet(noisy))
+            sc.calibrate(sc.Observations(**noisy.columns), sheet(noisy), model="brown")
 
 
 def test_swapped_directions_near_the_equinox_are_named():
@@ -254,5 +254,5 @@ def test_nothing_is_looked_for_while_all_is_well(monkeypatch):
 def test_a_model_that_the_stars_do_not_determine_keeps_its_remedy():
     c = seen(8.0, n_frames=1, stars_per_frame=4)
     with pytest.raises(CalibrationError) as caught:
-        sc.calibrate(sc.Observations(**c.columns), sheet(c))
+        sc.calibrate(sc.Observations(**c.columns), sheet(c), model="brown")
     assert not [words for words in BLAMES if words in str(caught.value)]
