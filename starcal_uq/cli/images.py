@@ -202,7 +202,9 @@ def identify_command(
     else:
         if len(found.frames) <= MOST_FRAMES:
             print_table(identification_table(found))
-        print(f"{found.text}{f' Table: {out}' if obs is not None else ''}")
+        several = out.suffix == ".corr" and obs is not None and obs.n_frames > 1
+        table_name = out.with_name(f"{out.stem}_*.corr") if several else out
+        print(f"{found.text}{f' Table: {table_name}' if obs is not None else ''}")
     if not found.n_identified:
         raise typer.Exit(1)
 

@@ -130,6 +130,8 @@ class Image:
         """The image with the mosaic that the user declares, "none" for none; as it is where that is None."""
         if bayer is None:
             return self
+        if any(message.endswith(COLOURS_WORDS) for message in self.messages):
+            raise ImageError(f"{self._label}: the colours of its mosaic were put together before; leave out bayer.")
         return replace(self, mosaic="" if bayer == "none" else bayer)
 
     def check_size(self, camera: Camera) -> None:

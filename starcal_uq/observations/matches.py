@@ -31,6 +31,7 @@ _NAME, _META = "OBSERVATIONS", "SCMETA"
 _UNITS = {"pix": "pixel", "deg_C": ""}
 # Ours to those of a .corr file, which has no column for the others.
 _CORR = {"x_px": "field_x", "y_px": "field_y", "ra_deg": "index_ra", "dec_deg": "index_dec"}
+_CORR_NAMES = (*_CORR.values(), "field_ra", "field_dec", "index_x", "index_y", "index_id", "field_id", "match_weight")
 _OTHERS = tuple(name for name in COLUMNS if name not in _CORR and name != "frame")
 
 
@@ -136,6 +137,7 @@ def read_fits(path: Path, data: bytes) -> tuple[dict[str, Any], AnyDict]:
             if other in columns:
                 columns[own] = columns[other] - (_FITS_PIXEL if own in ("x_px", "y_px") else 0.0)
         columns["frame"] = np.full(len(rows), frame, dtype=np.int64)
+        columns = {name: values for name, values in columns.items() if name not in _CORR_NAMES}
     return columns, meta
 
 

@@ -159,6 +159,8 @@ def test_colours_of_16_bits_keep_their_depth(tmp_path, ending):
     expected[1, 2] = 65_535.0
     np.testing.assert_allclose(image.data, expected, rtol=1e-6)
     assert image.saturation == 65_535.0 and "luminance" in image.messages[0]
+    found = extract_centroids(tmp_path / f"deep.{ending}", bayer="RGGB")
+    assert found.problem[0] == "the colours of its mosaic were put together before"
 
 
 def test_planes_pages_and_extensions_are_frames(tmp_path):

@@ -99,7 +99,7 @@ def test_corr_files_come_back(tmp_path, obs):
     back = load_observations(paths, CAMERA)
     assert back.frame_ids.tolist() == [0, 1] and back.meta["directions"] == "apparent"
     same(Observations(**{**obs.columns, "frame": np.repeat([0, 1], 12)}), back, 1e-12)
-    assert load_observations(paths[1]).frame_ids.tolist() == [7]
+    assert load_observations(paths[1]).frame_ids.tolist() == [7] and back.meta["ignored_columns"] == []
     # One of another program: its own columns alone, in capital letters or not.
     columns = {"FIELD_X": [1.0, 2.5, 3.0], "FIELD_Y": [1.0, 4.0, 9.0], "index_ra": [10.0, 10.1, 10.2]}
     Table(columns | {"index_dec": [1.0, 1.1, 1.0], "index_id": [5, 6, 7]}).write(tmp_path / "a.corr", format="fits")
