@@ -10,6 +10,8 @@ import sys
 import tracemalloc
 import warnings
 import zlib
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import numpy as np
 import PIL.Image
@@ -272,6 +274,25 @@ def test_the_mosaic_of_a_header_counts_from_the_row_that_is_stored_first(tmp_pat
     order = card("ROWORDER", "'BOTTOM-UP'")
     assert pattern() == "RGGB" and pattern(card("XBAYROFF", 1)) == "GRBG" and pattern(card("YBAYROFF", 1)) == "GBRG"
     assert pattern(order) == "GBRG" and pattern(order, rows=5) == "RGGB"
+
+
+def test_what_rawpy_says_is_taken_over(tmp_path, monkeypatch):
+    """By a stand-in for the library, which is an extra: the test after this one has the library itself."""
+    counts = np.arange(24, dtype=np.uint16).reshape(4, 6)
+
+    class StandInForRawpy:
+        raw_image_visible, raw_pattern, color_desc, white_level = counts, np.array([[2, 3], [1, 0]]), b"RGBG", 4095
+        raw_colors_visible = np.tile(raw_pattern, (2, 3))
+        other = SimpleNamespace(shutter_speed=0.5, focal_length=0.0)
+
+    monkeypatch.setitem(sys.modules, "rawpy", SimpleNamespace(imread=lambda file: nullcontext(StandInForRawpy)))
+    (tmp_path / "a.NEF").write_bytes(b"any")
+    image = read_image(tmp_path / "a.NEF")
+    np.testing.assert_array_equal(image.data, counts)
+    assert (image.mosaic, image.saturation, image.exposure_s, image.header) == ("BGGR", 4095.0, 0.5, {"EXPTIME": 0.5})
+    StandInForRawpy.raw_pattern = np.zeros((6, 6), dtype=int)
+    with pytest.raises(ImageError, match="is not red, green, green and blue"):
+        read_image(tmp_path / "a.NEF")
 
 
 def test_raw_files_are_read_as_the_detector_gave_them(tmp_path):
