@@ -378,8 +378,9 @@ def test_one_case_of_many_is_the_quantile_itself() -> None:
 
 
 def test_the_heaviest_tail_weighs_its_size() -> None:
-    large, long = row("large", 10.0, tail_997=3.5), row("long", 0.1, tail_997=4.5)
-    assert _heaviest([long, large]) is large
+    large, long = row("large", 10.0, tail_997=3.2), row("long", 8.0, tail_997=4.5)
+    assert _heaviest([large, long]) is long
+    assert _heaviest([large, row("small", 0.1, tail_997=4.5)]) is large
     assert _heaviest([row("noise", 10.0, tail_997=GAUSSIAN_997)]) is None
 
 

@@ -133,6 +133,7 @@ def test_stars_that_cannot_be_in_the_field_say_nothing() -> None:
     with_far.rotations = without.rotations
     state = with_far.state(theta, 0.05, 4.0)
     assert list(np.flatnonzero(~state.seen)) == [5]
+    assert not state.e[:, 5].any()
     assert state.value == pytest.approx(without.log_likelihood(theta, 0.05, 4.0), abs=1e-6)
 
 
