@@ -52,8 +52,8 @@ _STARS_AT_ONCE = 1_000_000
 _SAMPLES = 400_000
 # Draws that are given noise as well: the interaction is averaged over frames, and its size is what counts.
 _NOISY_DRAWS = 40
-# Frames that go through QUEST, of more.
-_SAMPLED_FRAMES = 300
+# Frames that go through QUEST, of more: so many, or fewer that hold so many stars, but not fewer than the last.
+_SAMPLED_FRAMES, _SAMPLED_STARS, _FEWEST_FRAMES = 300, 20_000, 30
 # Half a pixel: the map is so smooth that the central difference errs by (h / f)^2, while rounding stays below 1e-12.
 _STEP_PX = 0.5
 
@@ -207,16 +207,22 @@ class _Sampled:
         return every
 
 
+def _few(obs: Observations, seed: int) -> tuple[Observations, IntArray]:
+    """Frames that draws are taken through, and their places: fewer of those with very many stars, which are alike."""
+    limit = int(np.clip(_SAMPLED_STARS * obs.n_frames // obs.n_stars, _FEWEST_FRAMES, _SAMPLED_FRAMES))
+    return frame_sample(obs, limit, seed)
+
+
 def _sampled(
     post: Posterior, every: FrameGeometry, every_aligned: FrameGeometry, draws: FloatArray, seed: int
 ) -> _Sampled:
     """Take draws (D, p) through QUEST on some of the frames and of those of the alignment."""
-    some, places = frame_sample(every.obs, _SAMPLED_FRAMES, seed)
+    some, places = _few(every.obs, seed)
     frames = every if some is every.obs else FrameGeometry.of(post, some)
     if every_aligned is every:
         aligned = frames
     else:
-        aligning, _ = frame_sample(every_aligned.obs, _SAMPLED_FRAMES, seed)
+        aligning, _ = _few(every_aligned.obs, seed)
         aligned = every_aligned if aligning is every_aligned.obs else FrameGeometry.of(post, aligning)
     weights, _ = alignment_weights(aligned.noise_covariance)
     common, constant = np.empty((len(draws), 3)), np.empty((len(draws), 3))
