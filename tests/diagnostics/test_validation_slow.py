@@ -68,20 +68,26 @@ def excess(found):
 
 
 def test_biased_moves_are_found():
-    """emcee's DESnookerMove at weight 0.2: variances of 0.92, squared errors of 1.09."""
-    sizes = {"n_walkers": 32, "n_steps": 200, "n_burn": 100, "thin": 20}
+    """emcee's DESnookerMove: as half of the moves it makes squared errors 1.23 times too large, as a fifth 1.10.
+
+    A validation sees the first among two hundred replicates. The second, a popular mixture, shows in half as many where
+    the draws are held against the calibration of the same data, which takes away the luck of these data.
+    """
+    sizes = {"n_walkers": 64, "n_steps": 100, "n_burn": 60, "thin": 10}
     stars = sc.load_catalogue(max_mag=6.0)
-    found = validate_study(few_frames(moves=controls.snooker, **sizes), stars, 1000)
+    found = validate_study(few_frames(moves=controls.snooker_half, **sizes), stars, 200)
     show("DESnookerMove", found)
     assert not found.ok
-    assert found.nees_ratio > 1.03
+    assert found.nees_ratio > 1.1
     assert found.nees_p_value < 1e-3
-    # The calibration on the same data is right, and so are the moves without it, but for the 2 % of few draws.
-    assert 0.95 < calibration_ratio(found) < 1.05
-    without = validate_study(few_frames(moves=controls.evolution, **sizes), stars, 150)
-    print(f"excess with {excess(found):.3f}, without {excess(without):.3f}")
+    assert excess(found) > 1.15
+    # The moves without it are right, but for the 2 % of few draws.
+    popular, without = (
+        validate_study(few_frames(moves=moves, **sizes), stars, 100) for moves in (controls.snooker, controls.evolution)
+    )
+    print(f"excess of a fifth {excess(popular):.3f}, without {excess(without):.3f}")
     assert excess(without) < 1.05
-    assert excess(found) > 1.08
+    assert excess(popular) > 1.07
 
 
 def test_noise_understated_by_a_tenth_is_found_by_coverage():

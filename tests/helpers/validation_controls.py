@@ -11,11 +11,16 @@ def forgets_attitudes(obs: Any, cal: Any) -> Any:
     return dataclasses.replace(cal.compressed, dof=2 * obs.n_stars)
 
 
-def snooker() -> list[tuple[Any, float]]:
-    """A popular mixture whose second part is biased (emcee 3.1.6)."""
+def snooker(weight: float = 0.2) -> list[tuple[Any, float]]:
+    """A mixture whose second part is biased (emcee 3.1.6); a fifth of it is popular."""
     import emcee
 
-    return [(emcee.moves.DEMove(), 0.8), (emcee.moves.DESnookerMove(), 0.2)]
+    return [(emcee.moves.DEMove(), 1.0 - weight), (emcee.moves.DESnookerMove(), weight)]
+
+
+def snooker_half() -> list[tuple[Any, float]]:
+    """Half of the moves biased."""
+    return snooker(0.5)
 
 
 def evolution() -> list[tuple[Any, float]]:

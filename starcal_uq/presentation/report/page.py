@@ -13,8 +13,6 @@ from starcal_uq.presentation.html import embedded_image, template_environment
 from starcal_uq.presentation.pages import budgeting as budget_tables
 from starcal_uq.presentation.report import diagnostics as model_tables
 from starcal_uq.presentation.report import tables, words
-from starcal_uq.presentation.report import tables as image_tables
-from starcal_uq.presentation.report import words as field_words
 from starcal_uq.presentation.report.results import Results
 from starcal_uq.presentation.words.propagation import (
     alignment_sentence,
@@ -44,11 +42,11 @@ def render(results: Results, figures: Mapping[str, bytes], gallery: str = "") ->
 
 def prepared(results: Results) -> Callable[[Mapping[str, bytes], str], str]:
     """The report as a function of figures and gallery, for whoever waits for these: everything else is done."""
-    template, words = template_environment().get_template("report.html.j2"), context(results)
+    template, known = template_environment().get_template("report.html.j2"), context(results)
 
     def document(figures: Mapping[str, bytes], gallery: str) -> str:
         images = {name: embedded_image(png) for name, png in figures.items()}
-        return template.render(words, images=images, gallery=gallery) + "\n"
+        return template.render(known, images=images, gallery=gallery) + "\n"
 
     return document
 
@@ -82,7 +80,7 @@ def context(results: Results) -> dict[str, Any]:
         "misfit_attitude_sentence": "" if results.attitude is None else misfit_sentence(results.attitude),
         "attitude_sentence": words.attitude_sentence(results),
         "corner_sentence": "" if results.distortion_curve is None else corner_sentence(results.distortion_curve),
-        "equivalent_sentence": field_words.equivalent_sentence(results.field_map),
+        "equivalent_sentence": words.equivalent_sentence(results.field_map),
         "coupling_table": None
         if results.coupling is None
         else coupling_table(results.coupling, parameters(cal.camera.distortion)),
@@ -92,7 +90,7 @@ def context(results: Results) -> dict[str, Any]:
         "methods_rows": tables.methods_rows(results),
         "derived_table": None if post is None else model_tables.derived_table(post),
         **model_tables.diagnosis_context(results.diagnosis, cal),
-        **image_tables.image_context(results.images, cal),
+        **tables.image_context(results.images, cal),
         **budget_tables.budget_context(results.budget),
         "stage_rows": tables.stage_rows(results),
         "pair_table": tables.pair_table(cal),
