@@ -318,7 +318,7 @@ def test_real_frames_from_images_to_the_report(cli, tmp_path):
     failed = sc.Run(tmp_path / "bare").frames[name]
     assert (failed.row.outcome, failed.solved) == ("too few stars", False)
     shown = (tmp_path / "bare" / "report.html").read_text("utf-8").partition("<b>dark &amp; &lt;cold&gt;.png</b>")[2]
-    command = html.unescape(re.search("<b>Next:</b>.*?<code>(.*?)</code>", shown)[1])
+    command = html.unescape(re.search("<b>Next:</b>.*?<code class=.next.>(.*?)</code>", shown)[1])
     status, _, err = cli(*shlex.split(command)[1:])
     assert status in (0, 1), (command, err)
     bare = sc.Calibration.load(sc.runs.RunFolder(tmp_path / "bare").calibration)

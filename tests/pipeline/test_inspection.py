@@ -199,6 +199,16 @@ def test_pictures_are_small_and_of_this_image_only(frames: Frames, tmp_path: Pat
     assert 'class="i"' in page
 
 
+def test_a_frame_of_which_nothing_is_calibrated_says_so(frames: Frames) -> None:
+    used = frames.used.select(frames.used.frame != 0)
+    frame = replace(frames, used=used, residuals_px=frames.residuals_px[frames.used.frame != 0])[0]
+    assert frame.solved and frame.n(IDENTIFIED) == 0 and frame.n(LEFT_OUT) == frame.row.n_last
+    assert "identified, not calibrated" in frame.text
+    assert "nan" not in frame.text
+    # The attitude is then that of its stars.
+    assert frame.ra_deg == pytest.approx(frames[0].ra_deg, abs=1e-3)
+
+
 def test_bright_stars_have_names() -> None:
     stars = sc.load_catalogue(max_mag=1.0)
     named = dict(zip(map(proper_name, stars.star_id.tolist()), stars.ra_deg.tolist(), strict=True))

@@ -148,7 +148,8 @@ def frame_text(frame: InspectedFrame) -> str:
     if not frame.solved:
         return f"{words}."
     missed = f"{frame.n('missed')} of {plural(frame.n('expected'), 'expected star')} missed"
-    return f"{words}, {frame.n(IDENTIFIED)} identified, {missed}; rms {frame.rms_px:.3f} px per axis."
+    rms = f"; rms {frame.rms_px:.3f} px per axis" if frame.n(IDENTIFIED) else ""
+    return f"{words}, {frame.n(IDENTIFIED)} identified, {missed}{rms}."
 
 
 @dataclass(frozen=True)
