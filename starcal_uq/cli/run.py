@@ -48,6 +48,7 @@ from starcal_uq.core.tasks import one_thread
 from starcal_uq.observations.files import READ
 
 if TYPE_CHECKING:
+    from starcal_uq.core.types import AnyDict
     from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
     from starcal_uq.presentation.report.drawing import Ahead
@@ -137,7 +138,9 @@ def run_command(
     command = command_of("run", settings | aligning | {"budget": budget}, files)
     with run.making(command, force=force), Ahead() as ahead:
         if not (run.did("calibrate") and (run.did("images") or not from_images)):
-            _calibrate(run, inputs, camera, from_images, estimation, sky, images)
+            # Priors may determine what the data leave open.
+            options = estimation.options() | ({"undetermined": True} if sampling.priors is not None else {})
+            _calibrate(run, inputs, camera, from_images, options, sky, images)
         show_calibration(run.calibration, run.truth)
         warn_air(run.observations, run.calibration)
         _after_calibration(run, ahead, sampling, draws, budget, show=True, **aligning)
@@ -149,7 +152,7 @@ def _calibrate(
     inputs: list[Path],
     camera: Path | None,
     from_images: bool,
-    estimation: EstimationSettings,
+    options: AnyDict,
     sky: SkySettings,
     images: ImageSettings,
 ) -> None:
@@ -160,7 +163,7 @@ def _calibrate(
     elif camera is not None:
         obs, nominal = load_table(inputs[0] if len(inputs) == 1 else inputs, camera, sky)
     with progress_bar("passes over the files") as progress:
-        run.calibrate(obs, nominal, progress=progress, **estimation.options())
+        run.calibrate(obs, nominal, progress=progress, **options)
     if from_images:
         run.keep_images(centroids, identified, inputs)
         finished(run.folder.path)

@@ -14,12 +14,15 @@ import numpy as np
 
 from starcal_uq.camera.distortion import parameters, sigma_parameter
 from starcal_uq.core.errors import SamplingError
+from starcal_uq.core.formatting import join_words
 from starcal_uq.core.provenance import data_hashes, provenance
 from starcal_uq.core.records import to_plain
 from starcal_uq.core.settings import Evaluation, LikelihoodName, bounded, check_memory
+from starcal_uq.core.status import Status
 from starcal_uq.core.tasks import Progress, one_thread
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.noise_model import weighed
+from starcal_uq.estimation.undetermined import open_parameters
 from starcal_uq.inference.checks import CompressionCheck, chain_order, check_compression, check_draws, measure
 from starcal_uq.inference.ensemble import PROPOSAL_DF, Chains, EnsembleSettings, Moves, run_ensembles
 from starcal_uq.inference.named import Source, check_names, find_source, label_of, resolved_dof
@@ -132,12 +135,14 @@ def sample(
     label = label_of(likelihood)
     dof = resolved_dof(cal, dof) if likelihood == "student_t" else None
     per_star = cal.sigma_name == SIGMA_NAMES[1]
+    stated = priors is not None
     priors = Priors.default(cal.nominal, per_star) if priors is None else priors
     if priors.names != (*cal.parameter_names, cal.sigma_name):
         raise SamplingError(
             f"the priors are on {', '.join(priors.names)}, but the calibration has {', '.join(cal.parameter_names)} "
             f"and {cal.sigma_name}: make the priors with Priors.default of the calibrated camera."
         )
+    _check_determined(cal, priors if stated else None)
     check_chain(priors, cal.nominal, data_hashes(cal.provenance))
     seed = secrets.randbits(63) if seed is None else seed
     chosen: AnyDict = {
@@ -338,6 +343,18 @@ def _without_extra(outcome: _Outcome) -> tuple[FloatArray, Chains, Laplace, Floa
     return outcome.draws[..., :-1], replace(chains, u=chains.u[..., :-1]), inner, outcome.draws[..., -1]
 
 
+def _check_determined(cal: Calibration, stated: Priors | None) -> None:
+    """Refuse a calibration that did not end well, unless it only leaves open what priors that were stated determine."""
+    if cal.status.ok:
+        return
+    if cal.status is Status.SINGULAR and cal.undetermined and stated is not None:
+        matrix = cal.information + stated.precision(cal.parameter_names)
+        if not open_parameters(matrix, 1.0, cal.nominal):
+            return
+    asked = f", or priors that determine {join_words(cal.undetermined)}" if cal.undetermined else ""
+    raise SamplingError(f"the calibration did not converge ({cal.status.name}): {cal.remedy}{asked}.")
+
+
 def _settings(
     n_ensembles: int,
     n_walkers: int,
@@ -365,6 +382,4 @@ def _settings(
         f"n_ensembles={n_ensembles}, n_walkers={n_walkers}, n_steps={n_steps}",
         8.0 * dim * n_ensembles * n_walkers * (n_steps + n_burn),
     )
-    if not cal.status.ok:
-        raise SamplingError(f"the calibration did not converge ({cal.status.name}): {cal.remedy}.")
     return EnsembleSettings(n_walkers, n_steps, n_burn, moves)

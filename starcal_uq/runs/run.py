@@ -471,6 +471,7 @@ class Run:
         camera: Camera,
         *,
         screening: bool = False,
+        undetermined: bool = False,
         force: bool = False,
         progress: Progress | None = None,
         **options: Any,
@@ -486,6 +487,8 @@ class Run:
         screening : bool
             Whether to leave out wrong identifications first. The run then holds the kept rows, ``rejected.csv`` the
             others with their reasons, and `screening` of this object all about it.
+        undetermined : bool
+            Whether to write an estimate that leaves parameters open, to be sampled with priors that determine them.
         force : bool
             Whether to replace what the folder holds.
         progress, **options
@@ -499,6 +502,7 @@ class Run:
             If the data do not determine the camera.
         """
         screened: Screening | None = None
+        options |= {"throw": False} if undetermined else {}
         if screening:
             from starcal_uq.estimation.screening.screening import screen
 
@@ -519,6 +523,9 @@ class Run:
                 obs = obs.sample()
             elif calibration.n_frames < obs.n_frames:
                 obs = obs.select_frames(calibration.frame_ids)
+        if undetermined and not calibration.status.ok and not calibration.undetermined:
+            status = calibration.status
+            raise CalibrationError(f"the calibration did not end well ({status.name}): {calibration.remedy}.", status)
         if not self._making:
             check_new_folder(self.path, force)
         self.write(calibration, obs, screened)

@@ -15,6 +15,7 @@ import starcal_uq as sc
 from starcal_uq.core.settings import Starter
 from starcal_uq.studies.definition import StudyDefinition
 from tests.helpers.commands import SMALL, files
+from tests.helpers.outside import campaign
 from tests.helpers.scenes import observations
 
 
@@ -332,3 +333,19 @@ def test_python_runs_the_package_and_shells_complete_its_commands():
     code = "import sys; sys.argv = ['starcal-uq']; from starcal_uq.cli.app import program; program()"
     told = subprocess.run([sys.executable, "-c", code], env={**os.environ, **words}, capture_output=True, text=True)
     assert told.stdout.split() == ["calibrate"]
+
+
+@pytest.mark.slow
+def test_a_run_with_priors_goes_to_the_end(tmp_path, cli):
+    c = campaign(np.random.default_rng(0), n_frames=3, stars_per_frame=4, field_deg=2.0, sigma_px=0.2)
+    obs, camera = sc.Observations(**c.columns), sc.Camera(**c.camera_toml()).replace(distortion="none")
+    obs.save(tmp_path / "obs.csv")
+    camera.save(tmp_path / "camera.toml")
+    (tmp_path / "priors.toml").write_text("[priors]\nprincipal_point_px = 10.0\n")
+    command = ["run", tmp_path / "obs.csv", tmp_path / "camera.toml", "-o", tmp_path / "run", "--in-space"]
+    sampling = ["--ensembles", "2", "--walkers", "14", "--steps", "40"]
+    status, _, err = cli(*command, *sampling)
+    assert status == 2 and "do not determine" in err and not (tmp_path / "run" / "calibration.json").exists()
+    status, out, err = cli(*command, *sampling, "--priors", tmp_path / "priors.toml")
+    assert status in (0, 1), err
+    assert "there the posterior is that of the priors" in out and (tmp_path / "run" / "report.html").exists()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
-from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.errors import CalibrationError, SamplingError
 from starcal_uq.core.status import Level, Status
 from starcal_uq.diagnostics.verdict import estimate
 from starcal_uq.estimation.fallback import fallback_words
@@ -84,6 +84,25 @@ def test_wrong_stars_are_not_blamed_on_the_model():
     obs, camera = given(c)
     with pytest.raises(CalibrationError, match="fit no common attitude"):
         sc.calibrate(obs, camera)
+
+
+def test_priors_determine_what_the_data_leave_open():
+    """A narrow field does not tell where the principal point is; a data sheet may."""
+    c = few_stars(0, n_frames=1, stars_per_frame=8, offset_px=(6.0, -9.0))
+    obs, camera = given(c, "none")
+    cal = sc.calibrate(obs, camera, throw=False)
+    assert cal.status is Status.SINGULAR and cal.undetermined == ("x0", "y0")
+    short = {"seed": 0, "n_ensembles": 2, "n_walkers": 14, "n_steps": 60}
+    priors = sc.Priors.default(cal.nominal)
+    with pytest.raises(SamplingError, match="or priors that determine x0 and y0"):
+        sc.sample(obs, cal, **short)
+    with pytest.raises(SamplingError, match="or priors that determine x0 and y0"):
+        sc.sample(obs, cal, priors=priors.replace(principal_point_px=1000.0), **short)
+    post = sc.sample(obs, cal, priors=priors.replace(principal_point_px=10.0), **short)
+    assert np.all(np.abs(post.mean[:3] - c.theta[:3]) < 4.0 * post.sd[:3])
+    # Of the point it knows what the priors say, of f what the stars do.
+    assert post.sd[:2] == pytest.approx([10.0, 10.0], rel=0.2) and post.sd[2] < 5.0
+    assert estimate.estimation(cal, post).level is Level.WARN and estimate.estimation(cal).level is Level.FAIL
 
 
 @pytest.mark.slow

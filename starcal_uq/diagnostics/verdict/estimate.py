@@ -13,6 +13,7 @@ from starcal_uq.core.types import BoolArray
 from starcal_uq.diagnostics.misfit import ALPHA
 from starcal_uq.diagnostics.verdict.observed import CALIBRATE, SCREEN
 from starcal_uq.estimation.fallback import fallback_words
+from starcal_uq.estimation.undetermined import what_is_open
 from starcal_uq.maths.intervals import student_quantile
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ _REMEDIES = {
 }
 
 
-def estimation(cal: Calibration) -> Check:
+def estimation(cal: Calibration, post: Posterior | None = None) -> Check:
     """Did the optimiser reach an optimum in every stage?"""
     steps = sum(len(stage.trajectory) - 1 for stage in cal.stages)
     words = cal.status.name.lower().replace("_", " ")
@@ -51,6 +52,10 @@ def estimation(cal: Calibration) -> Check:
         sentence = f"The estimate is not an optimum: {cal.remedy}."
     remedies = {} if cal.solver == "filter" else _REMEDIES
     level, remedy = pass_or_fail(cal.status.ok), remedies.get(cal.status, "")
+    if post is not None and cal.undetermined:
+        # Sampling refuses priors that do not determine what the data leave open.
+        level, said = Level.WARN, what_is_open(cal.undetermined)
+        sentence = f"{said[0].upper()}{said[1:]}: there the posterior is that of the priors."
     return Check("Estimation", Question.CONVERGED, level, words, "converged", sentence, remedy)
 
 

@@ -74,7 +74,8 @@ def judge(
     diagnosis: Diagnosis | None = None,
 ) -> Verdict:
     """Check a run: everything that is known of it; `truth` is the camera of a simulation."""
-    checks: list[Check | None] = [estimate.estimation(cal), estimate.determined(cal), estimate.estimators_agree(cal)]
+    checks: list[Check | None] = [estimate.estimation(cal, post), estimate.determined(cal)]
+    checks += [estimate.estimators_agree(cal)]
     if diagnosis is not None and diagnosis.starts is not None:
         checks += [estimate.starts(diagnosis.starts)]
     if post is not None:
