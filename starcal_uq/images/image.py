@@ -340,7 +340,7 @@ def _read_fits(path: Path, data: bytes, camera: Camera | None, every: bool) -> l
             raise error if isinstance(error, ImageError) else _broken(path) from error
     if not taken:
         raise ImageError(f"{path}: the FITS file holds no image; leave it out.")
-    if not all(pixels.size for _, pixels, _, _ in taken):
+    if not all(pixels.size and pixels.ndim > 1 for _, pixels, _, _ in taken):
         raise ImageError(f"{path}: the image has no pixels; leave it out.")
     shape = taken[0][1].shape
     size = f"{shape[-1]} x {shape[-2]} px"
