@@ -48,6 +48,8 @@ _WORSE_LENS = 4.0
 _PROBES = 10
 # Frames with fewer stars say nothing about the common camera.
 _CAMERA_STARS = 7
+# After a search at any focal length in vain, of frames with so many stars, the other frames get so many triangles.
+_RICH_STARS, _FEW_TRIANGLES = 8, 40
 # A focal length is looked for within this factor of the camera's before it is looked for anywhere.
 _NEAR = 2.0
 # Where images say neither: the pixel pitch, without which the focal length has no millimetres, and a focal length in
@@ -151,7 +153,8 @@ def identify(
             if other.n_solved > attempt.n_solved:
                 attempt = other
     if told or optics is not None:
-        attempt.finish(progress)
+        rich = max(map(len, attempt.field.xy), default=0) >= _RICH_STARS
+        attempt.finish(progress, hopeless=searching and rich and optics is None and not attempt.good)
     return attempt.result(share_camera, optics)
 
 
@@ -207,11 +210,16 @@ class _Attempt:
                 if progress is not None:
                     progress(len(self.results), n)
 
-    def finish(self, progress: Callable[[int, int], None] | None) -> None:
-        """Search what is left, as mirror images and with a worse lens where most frames fail."""
+    def finish(self, progress: Callable[[int, int], None] | None, hopeless: bool = False) -> None:
+        """Search what is left, as mirror images and with a worse lens where most frames fail.
+
+        Where a search at any focal length, mirror images included, was in vain, the frames left get a short look each.
+        """
+        if hopeless and not self.n_solved:
+            self.search.triangles = min(self.search.triangles, _FEW_TRIANGLES)
         self.run(progress, False)
         failed = self._failed()
-        if len(failed) > self.n_solved and self.parity == "normal":
+        if len(failed) > self.n_solved and self.parity == "normal" and not hopeless:
             # Every frame of a camera has one handedness: the one that more frames have.
             flipped = FrameTable(self.centroids, self.camera, mirrored=True)
             mirror = Search(flipped.camera, self.stars, self.tolerance, self.search.proposer)

@@ -244,7 +244,8 @@ def test_real_frames_from_images_to_observations(cli, tmp_path):
         if here.any():
             n += 1
             off = np.hypot((found.ra_deg[here][0] - ra) * np.cos(np.radians(dec)), found.dec_deg[here][0] - dec)
-            assert off * 3600.0 < 20.0, "a wrong identification"
+            # Aberration, 20.5 arcsec at most, is in the one and not in the other.
+            assert off * 3600.0 < 25.0, "a wrong identification"
     assert n > 400
     assert found.n_stars / 8 >= 30
 

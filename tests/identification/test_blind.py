@@ -17,13 +17,13 @@ from starcal_uq.identification.blind import codes_of, quads_of
 from starcal_uq.identification.engine import _Attempt, identify, sheet_of
 from starcal_uq.identification.match import Match
 from starcal_uq.identification.pairs import angle_between
-from starcal_uq.identification.search import Search
+from starcal_uq.identification.search import NOT_SEARCHED, Search
 from starcal_uq.images.centroids import Centroids
 from starcal_uq.images.extract import extract_centroids
 from starcal_uq.images.optics import optics_of
 from starcal_uq.sky.catalogue import StarCatalogue
 from starcal_uq.sky.positions import unit_vectors
-from tests.identification.test_identification import random_frames, square_camera, wrong_rows
+from tests.identification.test_identification import centroid_table, random_frames, square_camera, wrong_rows
 
 # Fields of view in degrees, as plate solvers found them: width over two tangents of half of it.
 OPENSTARTRACKER_PX = 1392 / 2 / np.tan(np.radians(6.08 / 2))
@@ -169,6 +169,24 @@ def test_same_stars_at_another_principal_point_are_no_rival(tmp_path: Path, monk
 
     monkeypatch.setattr(Search, "_accepted", with_rival)
     # Without further tries of what fails.
-    monkeypatch.setattr(_Attempt, "finish", lambda *_: None)
+    monkeypatch.setattr(_Attempt, "finish", lambda *_, **__: None)
     found = identify(table, square_camera(12.0), bright, cache_dir=tmp_path, search_focal=False, **options)
     assert [f.status for f in found.frames] == ["ambiguous", "ambiguous"]
+
+
+def test_failure_is_bounded_in_count(stars: StarCatalogue, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames that nothing explains: all triangles of ten frames, few of the others, and no further round for all."""
+    n, looks = 40, []
+    table = centroid_table([(np.random.default_rng(k).random((12, 2)) * 700.0, np.ones(12)) for k in range(n)])
+
+    def look(self: Search, field: Any, k: int) -> Any:
+        looks.append((k, self.triangles))
+        return NOT_SEARCHED
+
+    monkeypatch.setattr(Search, "frame", look)
+    monkeypatch.setattr("starcal_uq.identification.engine.find_optics", lambda *_: None)
+    found = identify(table, square_camera(20.0), stars, cache=False)
+    assert found.n_identified == 0
+    # The last ten are with a worse lens.
+    assert [triangles for _, triangles in looks] == [200] * 10 + [40] * 30 + [60] * 10
+    assert {k for k, _ in looks} == set(range(n))
