@@ -9,8 +9,10 @@ import re
 import warnings
 import zlib
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime, timedelta
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -499,12 +501,27 @@ COLOURS_WORDS = (
 )
 
 
+@cache
+def _silence_libtiff() -> None:
+    """Pillow raises what is wrong with a TIFF file; its library also prints it, into the words of a command."""
+    import ctypes
+
+    from PIL import _imaging
+
+    with suppress(AttributeError, OSError):
+        # The library that Pillow has loaded; where it is part of Pillow, it has no such name.
+        set_handler = ctypes.CDLL(_imaging.__file__).TIFFSetErrorHandler
+        set_handler.argtypes, set_handler.restype = [ctypes.c_void_p], ctypes.c_void_p
+        set_handler(None)
+
+
 def _read_picture(path: Path, data: bytes, camera: Camera | None, every: bool) -> list[Image]:
     import PIL.Image
 
     # Otherwise Pillow loads all that it can read before it knows a TIFF file.
     import PIL.TiffImagePlugin
 
+    _silence_libtiff()
     pages: list[tuple[Any, float | None, list[str]]] = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")

@@ -118,6 +118,18 @@ def test_a_small_packed_file_takes_no_memory(tmp_path, monkeypatch):
         assert peak < 2e7
 
 
+def test_a_damaged_tiff_is_one_sentence_and_nothing_more(tmp_path, capfd):
+    """The library that reads it prints for itself, to the terminal of the command."""
+    counts = np.random.default_rng(1).integers(0, 60_000, (64, 64)).astype(np.uint16)
+    PIL.Image.fromarray(counts).save(tmp_path / "a.tif", compression="tiff_adobe_deflate")
+    content = bytearray((tmp_path / "a.tif").read_bytes())
+    content[200:500] = bytes(byte ^ 0x5A for byte in content[200:500])
+    (tmp_path / "a.tif").write_bytes(content)
+    with pytest.raises(ImageError, match="the file is truncated or damaged"):
+        read_image(tmp_path / "a.tif")
+    assert capfd.readouterr() == ("", "")
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs named pipes")
 def test_a_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "pipe.fits")
