@@ -70,6 +70,10 @@ def deep_colours(path: Path, data: bytes, check_declared: Callable[[Path, int, i
             "as a grey TIFF or PNG."
         ) from None
     content = np.frombuffer(data, dtype=np.uint8)
+    # What is wrong with a file is said in one sentence, and not by the library too.
+    logging = cv2.utils.logging
+    level = logging.getLogLevel()
+    logging.setLogLevel(logging.LOG_LEVEL_SILENT)
     try:
         if is_png:
             pages: Any = [cv2.imdecode(content, cv2.IMREAD_UNCHANGED)]
@@ -77,6 +81,8 @@ def deep_colours(path: Path, data: bytes, check_declared: Callable[[Path, int, i
             pages = cv2.imdecodemulti(content, cv2.IMREAD_UNCHANGED)[1]
     except cv2.error:
         return None
+    finally:
+        logging.setLogLevel(level)
     if not len(pages) or any(page is None or page.dtype != np.uint16 or page.ndim != 3 for page in pages):
         return None
     # OpenCV has blue first, and perhaps transparency last.
