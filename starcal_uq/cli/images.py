@@ -212,9 +212,7 @@ def identify_command(
 def inspect_command(
     run: Annotated[
         Path,
-        typer.Argument(
-            metavar="RUN", help="Run folder made by `starcal-uq run IMAGES... CAMERA -o RUN`.", parser=read_path
-        ),
+        typer.Argument(metavar="RUN", help="Run folder made by `starcal-uq run IMAGES... -o RUN`.", parser=read_path),
     ],
     frames: Annotated[
         list[str] | None,

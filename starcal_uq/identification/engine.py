@@ -271,7 +271,7 @@ def sheet_of(centroids: CentroidTable) -> tuple[Camera, bool]:
     if pixel is None:
         pixel = 1000.0 * focal_mm / focal_px if focal_mm and focal_px else ASSUMED_PIXEL_UM
     focal = focal_px if focal_px else _ASSUMED_FOCAL * width
-    name = "as its images describe it" + ("" if pixel in said.values() else "; the pixel pitch is assumed")
+    name = "camera of the images" + ("" if pixel in said.values() else ", pixel pitch assumed")
     centre = (width - 1) / 2.0, (height - 1) / 2.0
     camera = Camera(width, height, pixel, focal * pixel / 1000.0, *centre, name=name)
     return camera, bool(focal_px)
@@ -293,8 +293,8 @@ def _with(sheet: Camera, tolerance: CameraTolerance, optics: FoundOptics, told: 
         camera = sheet
     else:
         focal_mm = optics.focal_px * sheet.pixel_um / 1000.0
-        name = f"{sheet.name}; " if sheet.name else ""
-        camera = sheet.replace(focal_mm=focal_mm, name=f"{name}focal length found from the stars")
+        name = f"{sheet.name}, " if sheet.name else ""
+        camera = sheet.replace(focal_mm=focal_mm, name=f"{name}focal length from the stars")
         tolerance = replace(tolerance, focal=min(tolerance.focal, AGREEMENT))
     if told:
         return camera, tolerance

@@ -131,15 +131,17 @@ def find_star_pairs(
     star = order[brighter < per_field].astype(np.int64)
     chosen = np.ascontiguousarray(directions[star])
     pairs = cKDTree(chosen).query_pairs(_chord(max_angle_rad), output_type="ndarray").reshape(-1, 2).astype(np.int64)
+    # In an order of their own first, which decides between equal angles and does not depend on the library's.
+    pairs = pairs[np.argsort(pairs[:, 0] * len(star) + pairs[:, 1])]
     angle = angle_between(chosen[pairs[:, 0]], chosen[pairs[:, 1]])
-    # Ties are broken by the stars' numbers, so that the order does not depend on the library's.
-    rank = np.lexsort((pairs[:, 1], pairs[:, 0], angle))
-    first, second, angle = pairs[rank, 0], pairs[rank, 1], angle[rank]
-    star_of = np.concatenate([first, second])
-    by_star = np.lexsort((np.concatenate([angle, angle]), star_of))
-    start = np.concatenate([[0], np.cumsum(np.bincount(star_of, minlength=len(star)))]).astype(np.int64)
-    neighbour = np.concatenate([second, first])[by_star]
-    return StarPairs(star, chosen, first, second, angle, neighbour, np.concatenate([angle, angle])[by_star], start)
+    rank = np.argsort(angle, kind="stable")
+    pairs, angle = pairs[rank], angle[rank]
+    # Each pair twice, in the order of angles, which sorting by one star and then the other keeps.
+    by_star = np.argsort(pairs.ravel(), kind="stable")
+    start = np.concatenate([[0], np.cumsum(np.bincount(pairs.ravel(), minlength=len(star)))]).astype(np.int64)
+    neighbour = pairs[:, ::-1].ravel()[by_star]
+    first, second = np.ascontiguousarray(pairs.T)
+    return StarPairs(star, chosen, first, second, angle, neighbour, np.repeat(angle, 2)[by_star], start)
 
 
 def angle_between(a: FloatArray, b: FloatArray) -> FloatArray:

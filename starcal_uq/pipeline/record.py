@@ -105,7 +105,7 @@ class ImageRecord(Shown):
         RunFolderError
             If the file cannot be read or is something else.
         """
-        return read_json(cls, path, "a record of images", "run `starcal-uq run IMAGES... CAMERA -o RUN` again")
+        return read_json(cls, path, "a record of images", "run `starcal-uq run IMAGES... -o RUN` again")
 
 
 def record_images(centroids: Centroids, images: ImageCalibration, sources: Sequence[PathLike] = ()) -> ImageRecord:

@@ -71,7 +71,7 @@ def export(
     if isinstance(what, Camera):
         raise RunFolderError(f"a camera alone has no {to}: name the folder of a run.")
     if to in _OF_DRAWS and not isinstance(what, Posterior):
-        raise RunFolderError(f"{name}: has no draws for {to}; run `starcal-uq sample` first, or export covariance.")
+        raise RunFolderError(f"{name}: has no draws for {to}; run `starcal-uq sample RUN` first, or export covariance.")
     ensure_new(place, force)
     return Exported(place, 0.0, _RESULTS[to](what, place))
 

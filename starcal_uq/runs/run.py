@@ -287,10 +287,10 @@ class Run:
         if record is None:
             raise RunFolderError(
                 f"{self.path}: has no {IMAGES}, because the run did not start from images; to look at some, run "
-                "`starcal-uq run IMAGES... CAMERA -o RUN`."
+                "`starcal-uq run IMAGES... -o RUN`."
             )
         path = self.folder.path / IDENTIFICATION
-        with reading(path, "a table of identified frames", "run `starcal-uq run IMAGES... CAMERA -o RUN` again"):
+        with reading(path, "a table of identified frames", "run `starcal-uq run IMAGES... -o RUN` again"):
             table = pd.read_csv(path)
             seconds = dict(zip(table["frame"].tolist(), (1e-3 * table["milliseconds"]).tolist(), strict=True))
         reasons = {}

@@ -171,7 +171,7 @@ ELSEWHERE = {
     "inspect RUN": "tests/cli/test_cli_images.py",
     "propagate RUN --attitudes PROFILE": "tests/cli/test_cli_mission.py",
     "reproduce": "tests/cli/test_cli_paper.py",
-    "run IMAGES... CAMERA -o RUN": "tests/cli/test_cli_images.py",
+    "run IMAGES... -o RUN": "tests/cli/test_cli_images.py",
     "study": "tests/cli/test_cli_study.py",
     "study --template fov-distortion": "tests/cli/test_cli_study.py",
     "validate CAMERA": "tests/cli/test_cli_statistics.py",
