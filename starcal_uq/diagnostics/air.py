@@ -16,6 +16,7 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.errors import StarcalError
+from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.shapes import View, frame_shapes
 from starcal_uq.estimation.marginal import MarginalLikelihood
@@ -75,6 +76,7 @@ class AirTest:
     n_frames: int
 
 
+@bounded
 def air_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> AirTest | None:
     """Look for refraction in the residuals of a calibration.
 

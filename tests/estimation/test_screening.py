@@ -402,14 +402,14 @@ def test_per_star_noise_is_respected() -> None:
 
 
 def test_a_thousand_frames_are_fast() -> None:
-    """Some four calibrations of clean stars."""
+    """Some ten calibrations of clean stars: three, the search for frames that agree, and every star left out once."""
     obs = scenes.observations(n_frames=1000, seed=1)
     dirty = contaminate(obs, deep_catalogue(), TRUTH, 0.1, "neighbour", seed=1)
     screen(dirty.observations.select_frames(np.arange(20)), uncalibrated())
     ratio = times_as_long(
         lambda: screen(dirty.observations, uncalibrated()), lambda: sc.calibrate(obs, uncalibrated()), repeats=2
     )
-    assert ratio < 10.0
+    assert ratio < 16.0
 
 
 # --- contamination ----------------------------------------------------------------------------------------------------

@@ -59,6 +59,7 @@ def gaussian_calibration(dof: int = 25_000, sigma: float = 0.05, **changes: Any)
         "provenance": {"data_sha256": "0" * 64},
         "star_errors": None,
         "noise_model": None,
+        "undetermined": (),
     }
     values |= changes
     return SimpleNamespace(**values, remedy=values["status"].value)
@@ -71,13 +72,15 @@ def gaussian_posterior(cal: Calibration, n: int = 4000, scale: float = 1.0, seed
     root = np.linalg.cholesky(cal.covariance / np.outer(sd, sd))
     theta = cal.theta + scale * sd * (rng.standard_normal((n, len(sd))) @ root.T)
     draws = np.column_stack((theta, cal.sigma + cal.sigma_std * rng.standard_normal(n)))
+    mean = theta.mean(axis=0)
     return SimpleNamespace(
         camera=cal.camera,
+        calibrated_camera=cal.camera.with_theta(mean),
         draws=draws,
         theta_draws=theta,
         sigma_draws=draws[:, -1],
         sigma_name=cal.sigma_name,
-        mean=theta.mean(axis=0),
+        mean=mean,
         covariance=np.cov(theta, rowvar=False),
         rotation_per_theta=cal.rotation_per_theta,
         attitude_noise=cal.attitude_noise,
