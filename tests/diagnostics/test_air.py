@@ -119,3 +119,27 @@ def test_the_rate_of_false_alarms():
         p_values.append(found.p_value)
     # One in ten of 60, beyond which chance is once in a thousand.
     assert 1 <= np.count_nonzero(np.array(p_values) < 0.1) <= 15
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("options", [{"focal": 3e-4}, {"skew": 0.5}, {"drift": 0.5}], ids=str)
+def test_many_nights_that_look_like_air(options):
+    nights = [night(5000 + seed, air=0.0, **options)[:2] for seed in range(50)]
+    assert not any(air_test(obs, cal).is_air for obs, cal in nights)
+
+
+@pytest.mark.slow
+def test_many_nights_with_air():
+    apart, left, named = [], [], 0
+    for seed in range(30):
+        obs, cal, focal = night(6000 + seed)
+        found = air_test(obs, cal)
+        named += found.is_air
+        if found.is_air:
+            apart.append((found.latitude_deg - LATITUDE) / found.latitude_std_deg)
+            apart.append((found.longitude_deg - LONGITUDE) / found.longitude_std_deg)
+            left.append((cal.theta[2] + found.f_px - focal) / cal.sigmas[2])
+    assert named >= 28
+    # Places within their errors, and the focal length where it belongs.
+    assert 0.5 < np.sqrt(np.mean(np.square(apart))) < 1.3
+    assert abs(np.mean(left)) < 0.6
