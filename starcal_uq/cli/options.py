@@ -149,15 +149,20 @@ def _check_time(text: str) -> None:
         raise typer.BadParameter(str(error).removeprefix("The time ")) from None
 
 
+def _is_name(text: str) -> bool:
+    """Whether a text may name something: not empty, printable, and of a length that names have."""
+    return bool(text.strip()) and text.isprintable() and len(text) <= _LONGEST_ADDRESS
+
+
 def _check_text(text: str) -> None:
-    if not text.strip() or not text.isprintable() or len(text) > _LONGEST_ADDRESS:
+    if not _is_name(text):
         raise typer.BadParameter(f"{shown(text)} is no address, such as tcp://10.0.0.1:8786.")
 
 
 def check_names(texts: list[str] | None) -> None:
     """Refuse what is no name of a file."""
     for text in texts or ():
-        if not text.strip() or not text.isprintable() or len(text) > _LONGEST_ADDRESS:
+        if not _is_name(text):
             raise typer.BadParameter(f"{shown(text)} is no frame's number or name, such as 3 or night-003.fits.")
 
 

@@ -48,6 +48,7 @@ from starcal_uq.cli.options import (
     parse_velocity,
     read_file,
     read_path,
+    write_file,
     write_path,
 )
 from starcal_uq.cli.settings import EstimationSettings, SamplingSettings, SkySettings
@@ -320,7 +321,7 @@ def export_command(
     ],
     out: Annotated[
         Path | None,
-        typer.Option("-o", "--out", metavar="FILE", help="File to write; named by default.", parser=write_path),
+        typer.Option("-o", "--out", metavar="FILE", help="File to write; named by default.", parser=write_file),
     ] = None,
     force: Force = False,
 ) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import gzip
 import hashlib
-import io
 import json
 import os
 import re
@@ -202,7 +201,7 @@ def unpack(packed: bytes) -> Iterator[bytes]:
         yield packed
         return
     size = 0
-    with gzip.GzipFile(fileobj=io.BytesIO(packed)) as content:
+    with gzip.GzipFile(fileobj=BytesIO(packed)) as content:
         while piece := content.read(2**22):
             size += len(piece)
             check_size(size, len(packed))

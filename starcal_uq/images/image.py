@@ -338,8 +338,10 @@ def _read_fits(path: Path, data: bytes, camera: Camera | None, every: bool) -> l
                         # Exposures of several images say in the first header what is common to them.
                         header = _plain(hdus[0].header) | header
                     taken.append((place, pixels, header, unit))
+        except ImageError:
+            raise
         except Exception as error:  # astropy raises whatever the broken bytes lead to
-            raise error if isinstance(error, ImageError) else _broken(path) from error
+            raise _broken(path) from error
     if not taken:
         raise ImageError(f"{path}: the FITS file holds no image; leave it out.")
     if not all(pixels.size and pixels.ndim > 1 for _, pixels, _, _ in taken):

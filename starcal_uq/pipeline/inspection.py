@@ -426,7 +426,7 @@ class Frames(Shown):
             nan = float("nan")
             return nan, nan, nan, nan
         camera = self.camera
-        centre = np.array([0.5 * (camera.width_px - 1), 0.5 * (camera.height_px - 1)])
+        centre = np.array(camera.centre_px)
         middle, above = unproject(camera, np.array([centre, centre - [0.0, 1.0]])) @ rotation
         ra, dec = ra_dec_deg(middle[None])
         east = np.cross([0.0, 0.0, 1.0], middle)

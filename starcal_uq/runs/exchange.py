@@ -110,7 +110,8 @@ def _write_draws(best: Calibration | Posterior, path: Path) -> str:
 
 def _write_netcdf(best: Calibration | Posterior, path: Path) -> str:
     assert isinstance(best, Posterior)
-    best.save(path)
+    # Whether it may be replaced was asked before.
+    best.save(path, force=True)
     return f"{len(best.draws)} draws, as ArviZ and xarray read them."
 
 

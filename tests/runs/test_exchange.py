@@ -39,6 +39,8 @@ def test_covariance_draws_and_tables(run, tmp_path):
     assert draws.columns[0] == "x0 [px]"
     again = sc.Posterior.load(sc.export(run, "netcdf", tmp_path / "d.nc").path)
     assert np.array_equal(again.draws, run.posterior.draws)
+    for to, name in (("netcdf", "d.nc"), ("csv", "d.csv"), ("covariance", "c.json")):
+        sc.export(run, to, tmp_path / name, force=True)
     lines = sc.export(run, "markdown", tmp_path / "t.md").path.read_text().splitlines()
     assert len(lines) == 2 + len(run.posterior.parameter_names)
     assert {line.count("|") for line in lines} == {10}
