@@ -23,7 +23,16 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.diagnostics.pattern import Fit, Pattern, frame_covariance
-from starcal_uq.diagnostics.shapes import FRAME_BY_FRAME, MAX_CELLS, Shape, View, frame_shapes, run_clock, shapes
+from starcal_uq.diagnostics.shapes import (
+    FRAME_BY_FRAME,
+    MAX_CELLS,
+    Shape,
+    View,
+    cell_columns,
+    frame_shapes,
+    run_clock,
+    shapes,
+)
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import NoiseModel, fit_noise, sigma_ratios, weighed
 from starcal_uq.estimation.star_errors import StarModel
@@ -266,9 +275,7 @@ class _Columns:
 
     def all(self) -> FloatArray:
         """Every column (q, 2, n)."""
-        star, cells = np.arange(len(self.cell)), np.zeros((self.n_cells, 2, 2, len(self.cell)))
-        cells[self.cell, 0, 0, star] = cells[self.cell, 1, 1, star] = self._weight(1.0)
-        return np.concatenate([self.dense, cells.reshape(2 * self.n_cells, 2, -1)])
+        return np.concatenate([self.dense, self._weight(cell_columns(self.cell, self.n_cells))])
 
     def _weight(self, values: Any) -> Any:
         return values if self.frames.weight is None else values * self.frames.weight

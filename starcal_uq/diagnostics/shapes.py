@@ -345,6 +345,14 @@ def _over_time(clock: FloatArray, called: str) -> Shape:
     return Shape(f"smooth change of x0, y0 and f over the {called}", called, 3 * _TIME_DEGREE, columns)
 
 
+def cell_columns(cell: IntArray, n_cells: int) -> FloatArray:
+    """Shifts (2 c, 2, n) of the stars in each cell along each axis; `cell` (n,) tells where a star is."""
+    star = np.arange(len(cell))
+    found = np.zeros((n_cells, 2, 2, len(cell)))
+    found[cell, 0, 0, star] = found[cell, 1, 1, star] = 1.0
+    return found.reshape(2 * n_cells, 2, len(cell))
+
+
 def _cells(obs: Observations, camera: Camera, max_cells: int) -> Shape:
     longer = max(camera.width_px, camera.height_px)
     per_area = obs.n_stars / _STARS_PER_CELL * longer / min(camera.width_px, camera.height_px)
@@ -357,12 +365,5 @@ def _cells(obs: Observations, camera: Camera, max_cells: int) -> Shape:
         row = np.clip(((y + 0.5) / cell).astype(np.int64), 0, ny - 1)
         return np.asarray(row * nx + column)
 
-    def columns(view: View) -> FloatArray:
-        place = cell_of(view)
-        star = np.arange(len(place))
-        found = np.zeros((nx * ny, 2, 2, len(place)))
-        found[place, 0, 0, star] = found[place, 1, 1, star] = 1.0
-        return found.reshape(2 * nx * ny, 2, len(place))
-
     name = f"mean shift in {nx} × {ny} cells of the field"
-    return Shape(name, "field cells", 2 * nx * ny, columns, cell=cell_of)
+    return Shape(name, "field cells", 2 * nx * ny, lambda view: cell_columns(cell_of(view), nx * ny), cell=cell_of)
