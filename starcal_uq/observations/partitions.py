@@ -17,6 +17,7 @@ import numpy as np
 
 from starcal_uq.core.errors import ObservationError
 from starcal_uq.core.files import PathLike, listed
+from starcal_uq.core.manifest import read_manifest
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import AnyDict, IntArray
 from starcal_uq.observations.checks import check_mapping
@@ -207,6 +208,8 @@ def open_partitions(
     folder = Path(folder)
     if not folder.is_dir():
         raise ObservationError(f"{folder}: is no directory; name one that holds .parquet files.")
+    # Files of a simulation that was stopped while they took their places do so now.
+    read_manifest(folder)
     paths = sorted(path.resolve() for path in folder.iterdir() if path.suffix.lower() == ".parquet")
     if not paths:
         raise ObservationError(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +13,8 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.cluster import Scheduler, cluster
 from starcal_uq.core.errors import ObservationError, RunFolderError
-from starcal_uq.core.files import PathLike
-from starcal_uq.core.manifest import alone
+from starcal_uq.core.files import UNFINISHED, PathLike, new_folder
+from starcal_uq.core.manifest import alone, making, read_manifest
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import AnyDict
 from starcal_uq.observations.files import parquet_summary, write_partition
@@ -47,8 +48,8 @@ def simulate_partitions(
 ) -> PartitionedObservations:
     """Simulate identified stars, as `simulate` does, into a folder of Parquet files.
 
-    A file depends on the seed and its number alone; files that are there already and were made by the same call stay,
-    so that an interrupted call goes on.
+    A file depends on the seed and its number alone. The files take their places when all are made: an interrupted call
+    goes on, and until its end the folder holds what it held before. What the same call has made stays.
 
     Parameters
     ----------
@@ -63,7 +64,7 @@ def simulate_partitions(
     seed : int
         Seed; each file is drawn from it and its number.
     force : bool
-        Whether to replace what the folder holds.
+        Whether to replace what another call has made there.
     scheduler : str or distributed.Client, optional
         Dask scheduler whose workers make the files; processes of this machine otherwise.
     workers : int, optional
@@ -91,15 +92,27 @@ def simulate_partitions(
     folder = Path(folder).resolve()
     known = {"min_stars": min_stars, "stars": stars.source, "n_stars": len(stars), "epoch": stars.epoch}
     meta = simulated_meta(camera, sigma_px, seed) | known
-    make = _Maker(stars, camera, folder, n_frames, partition_frames, min_stars, sigma_px, seed, meta)
-    numbers = range(-(-n_frames // partition_frames))
+    unfinished = folder / UNFINISHED
+    make = _Maker(stars, camera, unfinished, n_frames, partition_frames, min_stars, sigma_px, seed, meta)
+    names = [_NAME.format(number) for number in range(-(-n_frames // partition_frames))]
     with alone(folder):
-        _check_folder(folder, [make.path(number) for number in numbers], force)
-        missing = [number for number in numbers if force or not make.is_made(number)]
-        # Starting processes takes as long as making a few files.
-        few = workers is None and scheduler is None and len(missing) * partition_frames < _FRAMES_WORTH_PROCESSES
-        with cluster(scheduler, workers=0 if few else workers, caller="simulate_partitions") as processes:
-            processes.map(make, missing, progress=progress)
+        others = _others(folder, names)
+        if not force and not others and all(make.is_made(folder, number) for number in range(len(names))):
+            return open_partitions(folder)
+        with making(folder, "simulate", names[0], force=force) as stage:
+            if others:
+                raise RunFolderError(
+                    f"{others[0]}: the folder holds {len(others)} other files that would mix with the new ones; choose "
+                    "an empty folder or remove them."
+                )
+            new_folder(unfinished)
+            missing = [number for number in range(len(names)) if not make.is_made(unfinished, number)]
+            # Starting processes takes as long as making a few files.
+            few = workers is None and scheduler is None and len(missing) * partition_frames < _FRAMES_WORTH_PROCESSES
+            with cluster(scheduler, workers=0 if few else workers, caller="simulate_partitions") as processes:
+                processes.map(make, missing, progress=progress)
+            for name in names:
+                os.replace(unfinished / name, stage / name)
     return open_partitions(folder)
 
 
@@ -117,26 +130,16 @@ class _Maker:
     seed: int
     meta: AnyDict
 
-    def path(self, number: int) -> Path:
-        return self.folder / _NAME.format(number)
-
     def _meta(self, number: int) -> AnyDict:
         first = number * self.partition_frames
         return {**self.meta, "first_frame": first, "frames": min(self.partition_frames, self.n_frames - first)}
 
-    def is_made(self, number: int) -> bool:
-        path = self.path(number)
-        if not path.exists():
-            return False
+    def is_made(self, folder: Path, number: int) -> bool:
+        """Whether a folder holds the file as this would make it."""
         try:
-            found = parquet_summary(path, "frame").meta
+            return parquet_summary(folder / _NAME.format(number), "frame").meta == self._meta(number)
         except ObservationError:
-            found = {}
-        if found != self._meta(number):
-            raise RunFolderError(
-                f"{path}: is there already and was made with other settings; give --force, or another folder."
-            )
-        return True
+            return False
 
     def __call__(self, number: int) -> None:
         stars, meta = self.stars, self._meta(number)
@@ -151,17 +154,11 @@ class _Maker:
             "dec_deg": stars.dec_deg[star],
             "mag": stars.mag[star],
         }
-        write_partition(columns, {"star_id": (star, stars.star_id)}, meta, self.path(number))
+        write_partition(columns, {"star_id": (star, stars.star_id)}, meta, self.folder / _NAME.format(number))
 
 
-def _check_folder(folder: Path, paths: list[Path], force: bool) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        others = sorted({path for path in folder.iterdir() if path.suffix == ".parquet"} - set(paths))
-    except OSError as error:
-        raise RunFolderError(f"{folder}: the folder cannot be made ({error.strerror}); choose another.") from error
-    if others:
-        raise RunFolderError(
-            f"{others[0]}: the folder holds {len(others)} other files that would mix with the new ones; choose an "
-            "empty folder or remove them."
-        )
+def _others(folder: Path, names: list[str]) -> list[Path]:
+    """Files in a folder that would be read with those of these names, and that no call before has made."""
+    record = read_manifest(folder)
+    own = {*names, *(record.files if record else ())}
+    return sorted(path for path in folder.iterdir() if path.suffix == ".parquet" and path.name not in own)

@@ -301,7 +301,7 @@ def test_folder_of_partitions_from_simulation_to_posterior(cli, inputs):
         ("give --partition-frames", (*made, "--workers", "2", "--force")),
         ("leave them out", ("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "no", "--workers", "2")),
         ("cannot be screened", ("calibrate", "frames", inputs / "camera.toml", "-o", "no", "--screen")),
-        ("other settings", (*made, "--partition-frames", "20", "--seed", "9")),
+        ("not empty; name another", (*made, "--partition-frames", "20", "--seed", "9")),
     ):
         status, _, err = cli(*arguments)
         assert status == 2 and words in err, err

@@ -9,9 +9,11 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.attitude.rotations import random_rotations
-from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.errors import ObservationError, RunFolderError
+from starcal_uq.core.store import UNFINISHED
 from starcal_uq.simulation.frames import Sky
 from starcal_uq.simulation.partitions import simulate_partitions
+from tests.helpers.crashes import snapshots
 
 
 @pytest.fixture(scope="module")
@@ -46,15 +48,35 @@ def test_interrupted_simulation_goes_on(sky, tmp_path: Path) -> None:
 
     with pytest.raises(KeyboardInterrupt):
         simulate_partitions(stars, camera, tmp_path, progress=stop, **options)
-    kept = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    with pytest.raises(ObservationError, match=r"holds no \.parquet file"):
+        sc.observations.open_partitions(tmp_path)
+    kept = {path.name: path.stat().st_mtime_ns for path in (tmp_path / UNFINISHED).iterdir()}
     assert len(kept) == 2
     made = simulate_partitions(stars, camera, tmp_path, **options)
     assert made.n_frames == 60
-    assert {name: (tmp_path / name).stat().st_mtime_ns for name in kept} == kept
-    with pytest.raises(RunFolderError, match=r"part-000000.parquet: .* other settings"):
+    whole = {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.parquet")}
+    assert whole | kept == whole and not (tmp_path / UNFINISHED).exists()
+    simulate_partitions(stars, camera, tmp_path, **options)
+    assert {path.name: path.stat().st_mtime_ns for path in tmp_path.glob("*.parquet")} == whole
+    with pytest.raises(RunFolderError, match=r"not empty; .* --force"):
         simulate_partitions(stars, camera, tmp_path, seed=1, **options)
+
+
+def test_files_of_another_call_are_replaced_at_once(sky, tmp_path: Path) -> None:
+    stars, camera = sky
+    folder = tmp_path / "work" / "parts"
+    options = {"partition_frames": 10, "workers": 0}
+    old = simulate_partitions(stars, camera, folder, n_frames=40, **options).data_hash
+    with snapshots(folder.parent, tmp_path / "states") as states:
+        new = simulate_partitions(stars, camera, folder, n_frames=20, seed=1, force=True, **options)
+    assert new.n_frames == 20 and len(list(folder.glob("*.parquet"))) == 2
+    found = [sc.observations.open_partitions(state / "parts").data_hash for state in states]
+    assert set(found) == {old, new.data_hash} and found == sorted(found, key=[old, new.data_hash].index)
+    # What nobody has recorded would be read with the new ones.
+    (folder / "mine.parquet").write_bytes((folder / "part-000000.parquet").read_bytes())
     with pytest.raises(RunFolderError, match="1 other files that would mix"):
-        simulate_partitions(stars, camera, tmp_path, n_frames=40, partition_frames=20, workers=0)
+        simulate_partitions(stars, camera, folder, n_frames=20, force=True, **options)
+    assert (folder / "mine.parquet").exists() and not (folder / UNFINISHED).exists()
 
 
 def test_tree_finds_the_stars_that_a_look_at_all_finds(sky, monkeypatch: pytest.MonkeyPatch) -> None:
