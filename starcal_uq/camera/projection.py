@@ -10,6 +10,7 @@ Arrays inside have the star axis last (structure of arrays), the layout in which
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -20,7 +21,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.kernels import Kernel, build_kernel
 from starcal_uq.core.errors import DistortionError
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 
 _NEWTON_STEPS = 60
 # After a last step of this size the error is its square times what the distortion bends per px, below rounding; the
@@ -204,9 +205,7 @@ def newton_kernel(model_name: str) -> Kernel:
     return build_kernel(f"newton_{model_name}", [s.theta, s.pixel, s.root], [point, determinant], [(2,), (1,)])
 
 
-def solve_displacement(
-    model_name: str, theta: FloatArray, target: FloatArray, start: FloatArray | None = None
-) -> FloatArray:
+def solve_displacement(model_name: str, theta: FloatArray, target: FloatArray) -> FloatArray:
     """Solve ``point + displacement(point) = target``.
 
     Parameters
@@ -216,19 +215,16 @@ def solve_displacement(
     theta : (p,) array
         Parameters x0, y0, f, k... in px units.
     target : (2, n) array
-        Offsets from the principal point, px.
-    start : (2, n) array, optional
-        Start; the target itself by default, from which Newton's method converges monotonically for radial
+        Offsets from the principal point, px: the start, from which Newton's method converges monotonically for radial
         distortion that does not fold.
 
     Returns
     -------
     (2, n) array
-        Offsets in px; not finite where there is no solution before the distortion folds over.
+        Offsets in px; not finite where Newton's method meets a fold, but it may step over one (`before_fold`).
     """
     kernel = newton_kernel(model_name)
-    n = target.shape[1]
-    point = target if start is None else start
+    n, point = target.shape[1], target
     if not get_model(model_name).coefficients or n == 0 or not np.any(theta[3:]):
         return np.array(target)
     with np.errstate(all="ignore"):
@@ -259,20 +255,61 @@ def backward_root(model_name: str, theta: FloatArray, pixel: FloatArray) -> Floa
     return solve_displacement(model_name, theta, pixel - centre)
 
 
+def before_fold(model_name: str, theta: FloatArray, point: FloatArray) -> BoolArray:
+    """Whether the displacement does not fold over between the principal point and each point (2, n); of NaN it is True.
+
+    `theta` is (p,), or a column (p, n) each.
+    """
+    coefficients = get_model(model_name).coefficients
+    before = np.ones(point.shape[1], dtype=bool)
+
+    def bends(radius: FloatArray, k: Iterable[FloatArray]) -> FloatArray:
+        # A radial term k r^m bends by m k r^(m - 1) px per px at most, a decentring one (even m) by three times that;
+        # while all together stay below one, nothing folds.
+        steep = [(1.0 if c.order % 2 else 3.0) * c.order * radius ** (c.order - 1) for c in coefficients]
+        return sum((a * b for a, b in zip(steep, k, strict=True)), np.zeros(1))
+
+    with np.errstate(all="ignore"):
+        square, size = point[0] ** 2 + point[1] ** 2, np.abs(theta[3:])
+        if not bends(np.sqrt(np.fmax.reduce(square, initial=0.0)), [np.max(k) for k in size]) > 1.0:
+            return before
+        bend = bends(np.sqrt(square), size)
+        far = np.flatnonzero((bend > 1.0) & np.isfinite(bend))
+        if far.size:
+            own = theta if theta.ndim == 1 else theta[:, far]
+            safe = bend[far] ** (1.0 / (1 - min(c.order for c in coefficients)))
+            # From there on in steps of 4 % at most, each point on its own way.
+            for step in np.geomspace(1.0, safe, 2 + int(-np.log(safe.min()) / 0.04)):
+                at = step * point[:, far]
+                before[far] &= newton_kernel(model_name)(far.size, own, at, at)[1][0] > 0.0
+    return before
+
+
 def unproject_theta(model_name: str, theta: FloatArray, xy: FloatArray) -> FloatArray:
-    """Unit vectors (N, 3) in the camera frame of pixels xy (N, 2) for parameters theta (p,), or a column each."""
-    pixel = np.ascontiguousarray(np.asarray(xy, dtype=np.float64).T)
-    theta = np.asarray(theta, dtype=np.float64)
-    (b,) = backward_kernel(model_name, False)(pixel.shape[1], theta, pixel, backward_root(model_name, theta, pixel))
-    return b.T
+    """Unit vectors (N, 3) in the camera frame of pixels xy (N, 2) for parameters theta (p,), or a column each.
+
+    Not finite where a pixel has no ideal point before the distortion folds over.
+    """
+    return _unprojected(model_name, theta, xy, derivatives=False)[0].T
 
 
 def unproject_jacobian(model_name: str, theta: FloatArray, xy: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unit vectors b (N, 3) of pixels xy (N, 2), and their derivatives db/dtheta (N, 3, p)."""
+    """Unit vectors b (N, 3) of pixels xy (N, 2), as by `unproject_theta`, and their derivatives db/dtheta (N, 3, p)."""
+    b, db = _unprojected(model_name, theta, xy, derivatives=True)
+    return b.T, db.transpose(2, 1, 0)
+
+
+def _unprojected(model_name: str, theta: FloatArray, xy: FloatArray, derivatives: bool) -> tuple[FloatArray, ...]:
     pixel = np.ascontiguousarray(np.asarray(xy, dtype=np.float64).T)
     theta = np.asarray(theta, dtype=np.float64)
-    b, db = backward_kernel(model_name, True)(pixel.shape[1], theta, pixel, backward_root(model_name, theta, pixel))
-    return b.T, db.transpose(2, 1, 0)
+    root = backward_root(model_name, theta, pixel)
+    outputs = backward_kernel(model_name, derivatives)(pixel.shape[1], theta, pixel, root)
+    # The displacement acts on ideal points (forward) or on measured ones (inverse).
+    point = root if root.ndim == 2 else pixel - (theta[:2] if theta.ndim == 2 else theta[:2, None])
+    before = before_fold(model_name, theta, point)
+    if not before.all():
+        outputs[0][:, ~before] = np.nan
+    return outputs
 
 
 def fold_radius_px(model_name: str, theta: FloatArray, max_radius_px: float) -> float:
@@ -361,13 +398,6 @@ def unproject(camera: Camera, xy_px: FloatArray) -> FloatArray:
     b = unproject_theta(camera.distortion, theta, xy)
     if not np.isfinite(b).all():
         raise _no_inverse(camera)
-    if np.any(theta[3:]) and len(xy):
-        # The registry's displacement acts on ideal points (forward) or on measured ones (inverse).
-        forward = get_model(camera.distortion).direction == "forward"
-        points = theta[2] * b[:, :2] / b[:, 2:] if forward else xy - theta[:2]
-        radius = float(np.max(np.hypot(*points.T)))
-        if fold_radius_px(camera.distortion, theta, radius) <= radius:
-            raise _no_inverse(camera)
     return b
 
 

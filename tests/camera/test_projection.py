@@ -157,6 +157,36 @@ def test_folding_distortion_is_an_error_and_not_a_number(model):
     assert np.allclose(projection.project(cam, projection.unproject(cam, inside)), inside, atol=1e-10)
 
 
+@pytest.mark.parametrize(
+    ("model", "k"),
+    [
+        ("k1", (-1e-4,)),
+        ("brown", (-1e-5, 1e-11)),
+        ("brown3", (2e-6, -5e-11, 1e-16)),
+        ("brown_tangential", (-1e-5, 0.0, 1e-5, 0.0)),
+        ("inverse", (-1e-5, 1e-11)),
+    ],
+)
+def test_no_direction_beyond_a_fold(model, k):
+    """Radii of radial models against roots of the polynomial; Newton's method steps over such folds."""
+    theta, xy = np.array([500.0, 530.0, 4000.0, *k]), RNG.uniform(0, 1023, (2000, 2))
+    b = projection.unproject_theta(model, theta, xy)
+    seen = np.isfinite(b).all(axis=1)
+    assert 0.003 < seen.mean() < 0.9
+    np.testing.assert_array_equal(projection.unproject_theta(model, np.tile(theta[:, None], 2000), xy), b)
+    np.testing.assert_array_equal(projection.unproject_jacobian(model, theta, xy)[0], b)
+    if model == "brown_tangential":
+        fold = projection.fold_radius_px(model, theta, 2000.0)
+        assert np.hypot(*(theta[2] * b[seen, :2] / b[seen, 2:]).T).max() < 1.1 * fold
+        return
+    terms = np.array([1.0, *(k[j] * (2 * j + 3) for j in range(len(k)))])
+    roots = np.roots(terms[::-1])
+    fold = np.sqrt(min(root.real for root in roots if abs(root.imag) < 1e-12 * abs(root) and root.real > 0))
+    rim = fold * np.polyval(np.array([1.0, *k])[::-1], fold**2)
+    radius = np.hypot(*(xy - theta[:2]).T)
+    np.testing.assert_array_equal(seen, radius < (fold if model == "inverse" else rim))
+
+
 def test_a_direction_behind_the_camera_has_no_image():
     xy = projection.project(camera(), np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]))
     assert np.isnan(xy[0]).all()
