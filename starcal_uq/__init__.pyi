@@ -31,6 +31,7 @@ from .inference.priors import Priors as Priors
 from .inference.sample import sample as sample
 from .observations.table import Observations as Observations
 from .observations.table import load_observations as load_observations
+from .pipeline.examples import example_data as example_data
 from .planning.plan import plan as plan
 from .propagation.coupling import coupling as coupling
 from .propagation.propagate import propagate as propagate

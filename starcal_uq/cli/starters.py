@@ -1,4 +1,4 @@
-"""Starter files: one with comments for each file that people write."""
+"""Starter files: one with comments for each file that people write, and an example to try everything on."""
 
 from __future__ import annotations
 
@@ -8,19 +8,32 @@ from typing import Annotated
 import typer
 
 import starcal_uq as sc
-from starcal_uq.cli.options import Force, write_file
+from starcal_uq.cli.options import Force, write_path
 from starcal_uq.core import settings
 
 
 def new_command(
-    what: Annotated[settings.Starter, typer.Argument(metavar="camera|site|budget|study", help="Kind of file.")],
+    what: Annotated[settings.Starter, typer.Argument(metavar="camera|site|budget|study|example", help="Kind of file.")],
     out: Annotated[
         Path | None,
-        typer.Option("-o", "--out", metavar="TOML", help="File to write; WHAT.toml by default.", parser=write_file),
+        typer.Option(
+            "-o",
+            "--out",
+            metavar="TOML|DIR",
+            help="File to write, WHAT.toml by default; of an example its folder, esa by default.",
+            parser=write_path,
+        ),
     ] = None,
     force: Force = False,
 ) -> None:
-    """Write a starter file with comments for a camera, a site, an error budget or a coupling study."""
+    """Write a starter file with comments (camera, site, budget, study), or real data to try everything on."""
+    if what == "example":
+        folder = Path("esa") if out is None else out
+        sc.example_data("esa").save(folder, force=force)
+        print(
+            f"{folder}: starcal-uq run {folder / 'stars.ecsv'} {folder / 'camera.toml'} -o RUN; whose data, in NOTICE"
+        )
+        return
     path = Path(f"{what}.toml") if out is None else out
     if what == "camera":
         sc.paper.paper_start().replace(name="my camera").save(path, force=force)

@@ -44,7 +44,8 @@ Truth = Literal["fixed", "prior"]
 StudyTemplate = Literal["fov-distortion", "frames-stars", "magnitude-noise", "distortion-models"]
 Convention = Literal["eq14", "eq6"]
 FieldReading = Literal["window", "full"]
-Starter = Literal["camera", "site", "budget", "study"]
+Starter = Literal["camera", "site", "budget", "study", "example"]
+ExampleName = Literal["esa"]
 ExportFormat = Literal[
     "opencv",
     "ros",

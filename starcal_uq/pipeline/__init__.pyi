@@ -1,3 +1,4 @@
+from .examples import ExampleData as ExampleData
 from .inspection import Frames as Frames
 from .inspection import InspectedFrame as InspectedFrame
 from .refine import ImageCalibration as ImageCalibration

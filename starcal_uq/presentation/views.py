@@ -29,6 +29,7 @@ from starcal_uq.inference.prior_draws import PriorPredictive
 from starcal_uq.inference.priors import Priors
 from starcal_uq.inference.update import ShiftTest
 from starcal_uq.observations.table import Observations
+from starcal_uq.pipeline.examples import ExampleData
 from starcal_uq.pipeline.inspection import Frames, InspectedFrame
 from starcal_uq.pipeline.record import ImageRecord
 from starcal_uq.pipeline.refine import ImageCalibration
@@ -130,6 +131,7 @@ VIEWS: Mapping[type, View] = {
     Camera: _view("Camera", inputs.camera_text, inputs.camera_table),
     AttitudeProfile: _view("Attitude profile", inputs.profile_text, lambda profile: None, _messages),
     Observations: _view("Observations", inputs.observations_text, inputs.observations_table),
+    ExampleData: _view("Example data", inputs.example_text, lambda example: None),
     StarCatalogue: _view("Star catalogue", inputs.catalogue_text, inputs.catalogue_table),
     Centroids: _view("Centroids", images.centroids_text, images.centroids_table, _messages),
     Identification: _view("Identification", images.identification_text, images.identification_table),

@@ -307,7 +307,7 @@ def test_folder_of_partitions_from_simulation_to_posterior(cli, inputs):
         assert status == 2 and words in err, err
 
 
-@pytest.mark.parametrize("what", get_args(Starter))
+@pytest.mark.parametrize("what", sorted({*get_args(Starter)} - {"example"}))
 def test_a_starter_file_is_read_as_it_is(what, cli, tmp_path):
     status, out, _ = cli("new", what)
     assert status == 0
@@ -323,6 +323,14 @@ def test_a_starter_file_is_read_as_it_is(what, cli, tmp_path):
     status, _, err = cli("new", what)
     assert status == 2
     assert "exists already" in err
+
+
+def test_the_example_is_written_into_a_folder(cli, tmp_path):
+    status, out, _ = cli("new", "example")
+    assert status == 0 and "starcal-uq run esa/stars.ecsv esa/camera.toml -o RUN" in out
+    assert {path.name for path in (tmp_path / "esa").iterdir()} == {"NOTICE", "camera.toml", "site.toml", "stars.ecsv"}
+    status, _, err = cli("new", "example")
+    assert status == 2 and "exists already" in err
 
 
 def test_python_runs_the_package_and_shells_complete_its_commands():

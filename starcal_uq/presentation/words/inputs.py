@@ -11,6 +11,7 @@ from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.formatting import pretty_unit, significant
 from starcal_uq.observations.columns import COLUMNS
 from starcal_uq.observations.table import Observations
+from starcal_uq.pipeline.examples import ExampleData
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.sky.catalogue import StarCatalogue
 
@@ -40,6 +41,15 @@ def camera_table(camera: Camera) -> TextTable:
 def observations_text(obs: Observations) -> str:
     """How much there is, and what its directions are."""
     return f"{obs.n_stars} stars in {obs.n_frames} frames, directions {obs.meta['directions']}."
+
+
+def example_text(example: ExampleData) -> str:
+    """What there is, and whose it is."""
+    obs = example.observations
+    return (
+        f"{example.name}: {obs.n_stars} stars in {obs.n_frames} frames; {obs.meta['attribution']}, "
+        f"{obs.meta['licence']}. Site: {example.site}."
+    )
 
 
 def observations_table(obs: Observations) -> TextTable:
