@@ -166,6 +166,15 @@ class StudentLikelihood:
         """Log likelihood at one point."""
         return self.state(theta, sigma, nu).value
 
+    def by_frame(self, theta: FloatArray, sigma: float, nu: float) -> FloatArray:
+        """Log likelihood (K,) of every frame at one point; their sum is `log_likelihood`."""
+        state = self.state(theta, sigma, nu)
+        loss = np.log1p(np.sum(state.e * state.e, axis=0) / (nu * sigma**2))
+        dof = 2.0 * self.frames.sum(state.seen.astype(np.float64)) - 3.0 * (state.inverse[0, 0] > 0.0)
+        sign, log_volume = np.linalg.slogdet(np.moveaxis(state.inverse, 2, 0))
+        values: FloatArray = -0.5 * (nu + 2.0) * self.frames.sum(np.where(state.seen, loss, 0.0)) - dof * np.log(sigma)
+        return np.where(np.isfinite(state.value), values + 0.5 * np.where(sign > 0.0, log_volume, 0.0), -np.inf)
+
     def many(self, theta: FloatArray, sigma: FloatArray, nu: FloatArray) -> FloatArray:
         """Log likelihood (n,) at theta (n, p), sigma (n,) and nu (n,)."""
         points = zip(theta, sigma, nu, strict=True)

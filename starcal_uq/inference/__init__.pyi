@@ -1,3 +1,4 @@
+from .groups import arviz_data as arviz_data
 from .named import NaivePairsWarning as NaivePairsWarning
 from .power_scaling import prior_sensitivity as prior_sensitivity
 from .prior_draws import prior_predictive as prior_predictive

@@ -203,6 +203,18 @@ class Run:
 
         return Posterior.load(self.folder.require("posterior"))
 
+    def arviz(self, **options: Any) -> Any:
+        """The posterior with all of ArviZ's groups, as ``InferenceData`` (0.23) or ``DataTree`` (1.x); made each time.
+
+        Parameters
+        ----------
+        **options
+            Those of `starcal_uq.inference.arviz_data`.
+        """
+        from starcal_uq.inference.groups import arviz_data
+
+        return arviz_data(self.posterior, self.observations, **options)
+
     @property
     def best(self) -> Calibration | Posterior:
         """What the run knows of the camera: the posterior, or the calibration where there is no posterior yet."""
