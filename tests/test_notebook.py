@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import nbformat
@@ -38,3 +39,24 @@ def test_it_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     words = sum("text/html" in data or "text/markdown" in data for data in shown)
     assert words >= 4, "results show themselves as tables or in words"
     assert sum("image/png" in data for data in shown) >= 3, "figures are drawn"
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # of ArviZ 0.23 beside newer libraries
+def test_the_page_on_own_tools_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On either generation of ArviZ: `make test-other` runs it on the second one, `make docs` on the first."""
+    for name in ("corner", "seaborn"):
+        pytest.importorskip(name)
+    import matplotlib.pyplot as plt
+
+    page = (NOTEBOOKS.parent / "docs" / "how-to" / "own-tools.md").read_text(encoding="utf-8")
+    cells = re.findall(r"^```{code-cell} python\n((?:^:[^\n]*\n)*)(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    assert len(cells) >= 8
+    place: dict[str, object] = {}
+    drawn = 0
+    for tags, cell in cells:
+        exec(compile(cell, cell.splitlines()[0], "exec"), place)
+        assert tags or not plt.get_fignums(), "a figure of another library may come with warnings"
+        drawn += bool(plt.get_fignums())
+        plt.close("all")
+    assert drawn == 5
