@@ -630,8 +630,8 @@ def run_row(row: Row, repeats: int | None = None, tell: Callable[[str], None] = 
 
 
 def moments(path: str) -> list[list[float]]:
-    """Means, standard deviations and effective numbers of draws (chains, draws, parameters), for everybody alike."""
-    from starcal_uq.maths.chains import convergence
+    """Means, standard deviations and effective numbers of draws (chains, draws, parameters), by ArviZ for everybody."""
+    from starcal_uq.inference.arviz import ess_bulk
 
     draws = np.load(path)
     flat = draws.reshape(-1, draws.shape[2])
@@ -639,7 +639,7 @@ def moments(path: str) -> list[list[float]]:
     return [
         mean.tolist(),
         sd.tolist(),
-        [convergence(column).ess_bulk for column in np.moveaxis((draws - mean) / sd, 2, 0)],
+        [ess_bulk(column) for column in np.moveaxis((draws - mean) / sd, 2, 0)],
     ]
 
 

@@ -27,7 +27,7 @@ from starcal_uq.estimation.calibrate import refit
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import FrameNormals
-from starcal_uq.maths.chains import psis
+from starcal_uq.inference.arviz import psis
 from starcal_uq.maths.intervals import student_quantile
 from starcal_uq.observations.splits import one_of_each
 

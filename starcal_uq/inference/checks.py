@@ -23,7 +23,6 @@ from starcal_uq.inference.ensemble import Chains, autocorrelation
 from starcal_uq.inference.named import LIKELIHOODS
 from starcal_uq.inference.posterior import Diagnostics, Laplace, Posterior
 from starcal_uq.inference.target import ImportanceCheck, LogLikelihood, Target
-from starcal_uq.maths.chains import convergence, psis
 
 if TYPE_CHECKING:
     from starcal_uq.inference.exact import FrameSample
@@ -120,6 +119,8 @@ def check_compression(
     sample : FrameSample, optional
         Where there are too many frames for `exact`.
     """
+    from starcal_uq.inference.arviz import psis
+
     mode = target.natural(np.zeros((1, target.dim)))
     frames = (0, 0) if sample is None else (sample.n_frames, sample.of_frames)
 
@@ -193,11 +194,13 @@ def measure(
     n_evaluations: int,
 ) -> Diagnostics:
     """Compute the numbers that `check_draws` judges of draws (n_ensembles, n_draws, p+1), px units, in chain order."""
+    from starcal_uq.inference import arviz as arviz_compat
+
     n_sampled = chains.u.shape[-1]
     n_steps, n_walkers = chains.u.shape[1:3]
     scale = np.array([parameter.scale for parameter in shown])
     scaled = draws[..., :n_sampled] / scale[:n_sampled]
-    found = [convergence(np.ascontiguousarray(scaled[..., i])) for i in range(n_sampled)]
+    columns = [np.ascontiguousarray(scaled[..., i]) for i in range(n_sampled)]
 
     def padded(values: Sequence[float] | FloatArray) -> FloatArray:
         return np.concatenate([values, np.full(len(shown) - n_sampled, np.nan)])
@@ -206,10 +209,10 @@ def measure(
     mean, sd = flat.mean(axis=0), flat.std(axis=0, ddof=1)
     psis_mean, psis_sd = padded(importance.mean[:n_sampled]), padded(importance.sd[:n_sampled])
     return Diagnostics(
-        rhat=padded([c.rhat for c in found]),
-        ess_bulk=padded([c.ess_bulk for c in found]),
-        ess_tail=padded([c.ess_tail for c in found]),
-        mcse=padded([c.mcse for c in found]) * scale,
+        rhat=padded([arviz_compat.rhat(c) for c in columns]),
+        ess_bulk=padded([arviz_compat.ess_bulk(c) for c in columns]),
+        ess_tail=padded([arviz_compat.ess_tail(c) for c in columns]),
+        mcse=padded([arviz_compat.mcse_mean(c) for c in columns]) * scale,
         acceptance=chains.accepted / (n_steps * n_walkers),
         autocorrelation=padded(autocorrelation(step_order(scaled, n_steps, n_walkers))),
         n_evaluations=n_evaluations,
@@ -316,13 +319,14 @@ def _digits(post: Posterior) -> Check:
 
 def _degrees_of_freedom(post: Posterior) -> Check | None:
     """Did the degrees of freedom of a Student-t likelihood converge, where they were free?"""
+    from starcal_uq.inference import arviz as arviz_compat
+
     if post.dof_draws is None:
         return None
     values = post.dof_draws.reshape(post.n_ensembles, -1)
-    found = convergence(values)
     low, middle, high = np.quantile(values, (0.025, 0.5, 0.975))
     sentence = f"dof has the median {middle:.3g} and the 95 % interval {low:.3g} to {high:.3g}."
-    return _converged(post, "Degrees of freedom", found.rhat, found.ess_bulk, sentence)
+    return _converged(post, "Degrees of freedom", arviz_compat.rhat(values), arviz_compat.ess_bulk(values), sentence)
 
 
 def _bounds(post: Posterior) -> Check:

@@ -14,7 +14,7 @@ import numpy as np
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.types import FloatArray
-from starcal_uq.maths.chains import convergence
+from starcal_uq.inference import arviz as arviz_compat
 
 if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
@@ -69,14 +69,14 @@ def corner_displacement_px(post: Posterior) -> FloatArray:
 def _diagnosed(post: Posterior, name: str, unit: str, values: FloatArray) -> Derived:
     mean, sd = float(np.mean(values)), float(np.std(values, ddof=1))
     # In standard units: tiny ranges mislead the diagnostics.
-    found = convergence(((values - mean) / (sd or 1.0)).reshape(post.n_ensembles, -1))
+    chains = ((values - mean) / (sd or 1.0)).reshape(post.n_ensembles, -1)
     return Derived(
         name=name,
         unit=unit,
         mean=mean,
         sd=sd,
-        mcse=found.mcse * sd,
-        rhat=found.rhat,
-        ess_bulk=found.ess_bulk,
-        ess_tail=found.ess_tail,
+        mcse=float(arviz_compat.mcse_mean(chains)) * sd,
+        rhat=arviz_compat.rhat(chains),
+        ess_bulk=arviz_compat.ess_bulk(chains),
+        ess_tail=arviz_compat.ess_tail(chains),
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,27 +63,6 @@ class Chains:
     accepted: IntArray
 
 
-def _emcee() -> Any:
-    """emcee without all of `scipy.stats`, which takes a second to load, for the one function of its one `KDEMove`."""
-    if "emcee" in sys.modules or "scipy.stats" in sys.modules:
-        import emcee
-    else:
-        # What cannot be imported is None to emcee.
-        sys.modules["scipy.stats"] = None  # type: ignore[assignment]
-        try:
-            import emcee
-        finally:
-            del sys.modules["scipy.stats"]
-        emcee.moves.kde.gaussian_kde = _gaussian_kde
-    return emcee
-
-
-def _gaussian_kde(*arguments: Any, **options: Any) -> Any:
-    from scipy.stats import gaussian_kde
-
-    return gaussian_kde(*arguments, **options)
-
-
 def student_t_proposal(df: float) -> Callable[[FloatArray, Any], tuple[FloatArray, FloatArray]]:
     """An independence proposal for `emcee.moves.MHMove`: a standard multivariate t, whatever the present point."""
 
@@ -99,7 +77,8 @@ def student_t_proposal(df: float) -> Callable[[FloatArray, Any], tuple[FloatArra
 
 def make_moves(moves: Moves) -> list[tuple[Any, float]]:
     """The weighted emcee moves of a name."""
-    emcee = _emcee()
+    import emcee
+
     if moves == "stretch":
         return [(emcee.moves.StretchMove(), 1.0)]
     return [
@@ -130,7 +109,8 @@ def run_ensembles(
     SamplingError
         If a start is not finite.
     """
-    emcee = _emcee()
+    import emcee
+
     weighted = make_moves(settings.moves) if moves is None else moves
     store = _Store(len(seeds), settings, dim, checkpoint, fingerprint)
     per_ensemble = settings.n_burn + settings.n_steps
@@ -156,11 +136,14 @@ def run_ensembles(
 
 def autocorrelation(values: FloatArray) -> FloatArray:
     """Integrated autocorrelation times (d,) in steps of draws (ensemble, step, walker, d), averaged over ensembles."""
-    integrated_time = _emcee().autocorr.integrated_time
+    from emcee.autocorr import integrated_time
+
     return np.asarray(np.mean([integrated_time(chain, tol=0, quiet=True) for chain in values], axis=0))
 
 
 def _start(density: Density, dim: int, seed: np.random.SeedSequence, n_walkers: int) -> Any:
+    import emcee
+
     random = np.random.RandomState(seed.generate_state(8))
     u = random.standard_normal((n_walkers, dim))
     # emcee accepts walkers of zero density and never moves them.
@@ -170,7 +153,7 @@ def _start(density: Density, dim: int, seed: np.random.SeedSequence, n_walkers: 
             f"{bad} of {n_walkers} start points drawn around the calibrated camera have no posterior density: check "
             "that the calibration converged, or use more stars."
         )
-    return _emcee().State(u, random_state=random.get_state())
+    return emcee.State(u, random_state=random.get_state())
 
 
 def _chunks(done: int, settings: EnsembleSettings, size: int) -> Iterator[tuple[int, int]]:
@@ -239,6 +222,8 @@ class _Store:
             )
 
     def _read(self, path: str | os.PathLike[str]) -> None:
+        import emcee
+
         try:
             with reading(path, "a checkpoint of sampling", "delete it", SamplingError):
                 content = read_arrays(path)
@@ -258,7 +243,7 @@ class _Store:
         except SamplingError:
             # What cannot be gone on with is made again.
             return
-        self.state = _emcee().State(content["coords"], log_prob=content["log_prob"], random_state=random_state)
+        self.state = emcee.State(content["coords"], log_prob=content["log_prob"], random_state=random_state)
         self._u, self._log_density = content["u"], content["log_density"]
         self._accepted = content["accepted"]
         self.ensemble, self.step = (int(v) for v in content["place"])

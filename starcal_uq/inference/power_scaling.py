@@ -17,7 +17,6 @@ import numpy as np
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PriorError
 from starcal_uq.core.types import FloatArray
-from starcal_uq.maths.chains import psis
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -149,6 +148,8 @@ class _Component:
 
 def _component(log_density: FloatArray, columns: Mapping[str, FloatArray]) -> _Component:
     """Sensitivity to one factor of the posterior, whose logarithm at the draws is given."""
+    from starcal_uq.inference.arviz import psis
+
     shift = log_density - log_density.mean()
     powers = (1.0 / (1.0 + _DELTA), 1.0 + _DELTA)
     weights = [np.exp(psis((power - 1.0) * shift)[0]) for power in powers]

@@ -17,7 +17,6 @@ from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.types import FloatArray
 from starcal_uq.inference.posterior import Laplace
 from starcal_uq.inference.priors import Priors
-from starcal_uq.maths.chains import psis
 from starcal_uq.maths.linear import scaled_cholesky, symmetric_inverse
 
 # Half width of the finite differences in standard deviations: the density is so near to a parabola over it that
@@ -265,6 +264,8 @@ def importance_check(target: Target, n: int, df: float, rng: np.random.Generator
 
     `target` is one that `laplace_approximation` has centred and whitened; `df` are the proposal's degrees of freedom.
     """
+    from starcal_uq.inference.arviz import psis
+
     u = rng.standard_normal((n, target.dim)) / np.sqrt(rng.chisquare(df, (n, 1)) / df)
     log_weights, khat = psis(target.log_density(u) - student_t_log_density(u, df))
     weights = np.exp(log_weights)

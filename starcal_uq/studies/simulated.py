@@ -21,7 +21,6 @@ from starcal_uq.inference.named import NaivePairsWarning, find_source
 from starcal_uq.inference.priors import GaussianPriors, Priors
 from starcal_uq.inference.surrogate import fit_polynomial
 from starcal_uq.inference.target import Target, laplace_approximation, start_target, student_t_log_density
-from starcal_uq.maths.chains import psis
 from starcal_uq.maths.intervals import student_quantile
 from starcal_uq.maths.linear import correlation_of, scaled_inverse
 from starcal_uq.observations.table import Observations
@@ -272,6 +271,8 @@ def embedded(name: str, value: Any, own: tuple[str, ...], names: tuple[str, ...]
 
 def importance_draws(target: Target, n: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray, float]:
     """Draws (n, d) of a multivariate t around the mode, their smoothed weights (n,), and the weights' Pareto shape."""
+    from starcal_uq.inference.arviz import psis
+
     u = rng.standard_normal((n, target.dim)) / np.sqrt(rng.chisquare(PROPOSAL_DF, (n, 1)) / PROPOSAL_DF)
     log_weights, khat = psis(target.log_density(u) - student_t_log_density(u, PROPOSAL_DF))
     return target.natural(u), np.exp(log_weights), float(khat)
