@@ -69,7 +69,7 @@ lint-style:
 docs: .venv/.installed-docs ## the documentation, into docs/_build/html; a warning is an error
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --fresh-env docs docs/_build/html
 
-bench: .venv/.installed ## the package beside its rivals, and with BENCH="--large --write" the tables of the documentation
+bench: .venv/.installed-test ## the package beside its rivals, and with BENCH="--large --write" the tables of the documentation
 	$(BIN)/python benchmarks/run.py $(BENCH)
 
 bench-rivals: .bench/.installed ## an environment for the rivals that are not in ours; mrcal comes with the system

@@ -17,16 +17,16 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "licences.md"
-EXTRAS = ("compiled", "tetra3rs")
+EXTRAS = ("cluster", "compiled", "excel", "images", "tetra3rs")
 HEAD = """# Licences
 
 `starcal_uq` is under the MIT licence, but for one table: the example data (`stars.ecsv`) were measured in images by the
 European Space Agency and stand under CC BY-SA 3.0 IGO, as those do (`starcal_uq/pipeline/data/esa/NOTICE`).
 
 This is what comes with it, as a dependency or a dependency's dependency, in any of the supported versions of
-Python, and what the extras *compiled* and *tetra3rs* add, as the packages' own metadata say it (`make supply`
-makes this table). None of it is part of our files: each is installed as its authors publish it, and those under
-the LGPL (*casadi*, *sep*) can be replaced by the user.
+Python, and what the extras but *asdf* and *raw* add, as the packages' own metadata say it (`make supply` makes this
+table). None of it is part of our files: each is installed as its authors publish it, and those under the LGPL
+(*casadi*, *sep*) can be replaced by the user.
 
 | Package | Licence |
 |---|---|

@@ -137,7 +137,7 @@ def main() -> None:
         tested(built, source, ("tests/test_project.py", "tests/test_benchmarks.py", "tests/observations"))
         say(f"lowest versions, Python {version}")
         lowest = work / "lowest.txt"
-        extras = ("--extra", "compiled", "--extra", "tetra3rs")
+        extras = [f"--extra={name}" for name in ("cluster", "compiled", "excel", "images", "tetra3rs")]
         run("uv", "pip", "compile", "--quiet", "--resolution", "lowest-direct", "--python", python, *extras,
             "pyproject.toml", "--output-file", lowest)  # fmt: skip
         low = environment(work / "lowest", python, f"{archives['wheel']}[test]", lowest)

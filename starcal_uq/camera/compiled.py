@@ -23,6 +23,7 @@ from types import ModuleType
 from typing import Any
 
 from starcal_uq.core.errors import StarcalError
+from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_path
 from starcal_uq.core.provenance import installed_version
 
@@ -39,7 +40,9 @@ def use(choice: str) -> None:
     Raises
     ------
     StarcalError
-        For another word, or for ``numba`` where it is not installed.
+        For another word.
+    MissingExtraError
+        For ``numba`` where it is not installed.
     """
     _check(choice)
     os.environ[SWITCH] = choice
@@ -63,7 +66,8 @@ def _check(choice: str) -> None:
     if choice not in CHOICES:
         raise StarcalError(f"kernels {choice!r} are unknown: set {SWITCH} to one of {', '.join(CHOICES)}.")
     if choice == "numba" and not installed():
-        raise StarcalError(f'Numba is not installed: pip install "starcal-uq[compiled]", or set {SWITCH}=numpy.')
+        with extra("compiled", "compiled kernels", f"set {SWITCH}=numpy"):
+            raise ModuleNotFoundError(name="numba")
 
 
 def installed() -> bool:

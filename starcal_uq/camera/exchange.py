@@ -19,6 +19,7 @@ from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.formats import ENDINGS, KEPT, Pinhole, write_pinhole
 from starcal_uq.camera.projection import fold_radius_px, project, unproject
 from starcal_uq.core.errors import CameraError
+from starcal_uq.core.extras import extra
 from starcal_uq.core.files import PathLike, atomic_path, ensure_new
 from starcal_uq.core.types import AnyDict, FloatArray
 
@@ -68,7 +69,9 @@ def export_camera(camera: Camera, to: str, path: PathLike, *, force: bool = Fals
     Raises
     ------
     CameraError
-        For an unknown format, a library that is not installed, or a camera that folds over within its detector.
+        For an unknown format or a camera that folds over within its detector.
+    MissingExtraError
+        If the format's library is not installed.
     RunFolderError
         If the file exists and `force` is false.
     """
@@ -146,9 +149,11 @@ def _bare(camera: Camera) -> tuple[FloatArray, FloatArray]:
 
 
 def _tetra3rs(camera: Camera, path: Path) -> tuple[float, str]:
-    library = _library("tetra3rs", "tetra3rs")
+    with extra("tetra3rs", "cameras for tetra3rs"):
+        import tetra3rs as library
     held, error = _held(camera, ("k1", "k2", "k3", "p1", "p2"))
-    terms = dict(zip((c.name for c in get_model(held.distortion).coefficients), held.coefficients, strict=True))
+    names = [c.name for c in get_model(held.distortion).coefficients]
+    terms: dict[str, Any] = dict(zip(names, held.coefficients, strict=True))
     centre = np.subtract((held.x0_px, held.y0_px), held.centre_px)
     distortion = library.RadialDistortion(**terms) if any(terms.values()) else None
     library.CameraModel(held.focal_px, held.width_px, held.height_px, centre.tolist(), False, distortion).save_to_file(
@@ -192,7 +197,8 @@ def sip_header(camera: Camera) -> tuple[Any, float]:
     order is the least that is near enough. Pixels count from 1, as FITS does. Source: Shupe et al. 2005, "The SIP
     convention for representing distortion in FITS image headers".
     """
-    from astropy.io import fits
+    with extra("images", "FITS headers"):
+        from astropy.io import fits
 
     pixels = _grid(camera, _POINTS)
     seen = unproject(camera, pixels)
@@ -245,7 +251,8 @@ def _sip(camera: Camera, path: Path) -> tuple[float, str]:
 
 
 def _asdf(camera: Camera, path: Path) -> tuple[float, str]:
-    library = _library("asdf", "asdf")
+    with extra("asdf", "ASDF files"):
+        import asdf as library
     content: AnyDict = {
         "camera": camera.to_dict(),
         "pixel_origin": "centre of the first pixel; x to the right, y down",
@@ -254,16 +261,6 @@ def _asdf(camera: Camera, path: Path) -> tuple[float, str]:
     }
     library.AsdfFile(content).write_to(path)
     return 0.0, _said(0.0, "ASDF")
-
-
-def _library(name: str, extra: str) -> Any:
-    """A library that not everybody has."""
-    import importlib
-
-    try:
-        return importlib.import_module(name)
-    except ImportError:
-        raise CameraError(f'{name} is not installed: run `pip install "starcal-uq[{extra}]"` first.') from None
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from starcal_uq.core.errors import ClusterError
+from starcal_uq.core.extras import extra
 from starcal_uq.core.tasks import Progress, interrupt_between_steps, processors
 
 if TYPE_CHECKING:
@@ -118,7 +120,7 @@ def cluster(scheduler: Scheduler = None, *, workers: int | None = None, caller: 
     scheduler : str, Client or None
         Address of a Dask scheduler, or a client of one, whose workers then do all; None for processes of this machine.
     workers : int, optional
-        Processes of this machine: as many as processors by default; 0 or 1 stays in this one.
+        Processes of this machine: as many as processors by default (one without Dask); 0 or 1 stays in this one.
     caller : str
         Function that users call, for messages.
 
@@ -128,13 +130,15 @@ def cluster(scheduler: Scheduler = None, *, workers: int | None = None, caller: 
         When no scheduler answers, or processes cannot be started.
     """
     if scheduler is None:
-        workers = processors() if workers is None else workers
+        if workers is None:  # the results are the same, and one process needs no Dask
+            workers = processors() if find_spec("distributed") else 1
         if workers <= 1:
             yield Cluster()
             return
         import logging
 
-        from distributed import Client, LocalCluster
+        with extra("cluster", "several processes over one set of files", "use workers=0"):
+            from distributed import Client, LocalCluster
 
         # What its log warns of, such as a slow end, is Dask's to mend. Its page of numbers takes whatever port is free.
         try:
@@ -149,7 +153,8 @@ def cluster(scheduler: Scheduler = None, *, workers: int | None = None, caller: 
         with local, Client(local) as client:
             yield Cluster(client)
     elif isinstance(scheduler, str):
-        from distributed import Client
+        with extra("cluster", "Dask schedulers", "leave the scheduler out"):
+            from distributed import Client
 
         try:
             client = Client(scheduler, timeout=_CONNECT_S)

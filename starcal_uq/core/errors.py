@@ -45,6 +45,10 @@ class SettingError(StarcalError, ValueError):
     """A setting lies outside its limits."""
 
 
+class MissingExtraError(StarcalError, ImportError):
+    """A library that only some users need is not installed; the message has the command that installs it."""
+
+
 class CameraError(StarcalError):
     """A camera description is incomplete, inconsistent or unreadable."""
 

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.core.errors import ObservationError, RunFolderError, StarcalError
+from starcal_uq.core.errors import MissingExtraError, ObservationError, RunFolderError, StarcalError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -366,6 +366,8 @@ def reading(path: PathLike, what: str, remedy: str, error: type[StarcalError] = 
     """
     try:
         yield
+    except MissingExtraError:
+        raise
     except Exception as problem:
         if isinstance(problem, StarcalError) and str(problem).startswith(os.fspath(path)):
             if isinstance(problem, error):

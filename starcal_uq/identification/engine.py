@@ -131,8 +131,9 @@ def identify(
     Raises
     ------
     IdentificationError
-        A centroid is not finite or off the detector, the catalogue is too small, or the
-        engine is not installed.
+        A centroid is not finite or off the detector, or the catalogue is too small.
+    MissingExtraError
+        If the engine is not installed.
     """
     sheet, told = (camera, True) if camera is not None else sheet_of(centroids)
     _check(centroids, sheet, stars)

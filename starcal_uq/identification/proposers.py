@@ -12,6 +12,7 @@ from typing import Any, TypeAlias, get_args
 import numpy as np
 
 from starcal_uq.core.errors import IdentificationError
+from starcal_uq.core.extras import extra
 from starcal_uq.core.settings import Engine
 from starcal_uq.core.types import FloatArray
 from starcal_uq.identification.pairs import StarPairs, prepared_star_pairs
@@ -36,7 +37,7 @@ def prepare_engine(
     cache: bool,
     cache_dir: str | PathLike[str] | None,
 ) -> Proposer:
-    """The catalogue prepared for one of `ENGINES`; `IdentificationError` where its package is not installed."""
+    """The catalogue prepared for one of `ENGINES`; `MissingExtraError` where its package is not installed."""
     if engine == "tetra3rs":
         return PlateSolver(stars, geometry, tolerance).hypotheses
     if engine != "pyramid":
@@ -124,10 +125,6 @@ def _field_deg(geometry: FieldGeometry) -> float:
 
 
 def _package() -> Any:
-    try:
+    with extra("tetra3rs", "attitudes by the engine tetra3rs", 'use engine="pyramid"'):
         import tetra3rs
-    except ImportError as error:
-        raise IdentificationError(
-            'the engine tetra3rs is not installed: run `pip install "starcal-uq[tetra3rs]"` or use engine="pyramid".'
-        ) from error
     return tetra3rs

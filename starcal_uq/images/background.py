@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.core.errors import ImageError
+from starcal_uq.core.extras import extra
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.images.image import LARGEST_COUNTS, Image
 
@@ -67,7 +68,8 @@ def prepare_image(
     ImageError
         If no pixel has a value, all are equal, or too many are saturated.
     """
-    import sep
+    with extra("images", "star images"):
+        import sep
 
     name = image.name or "image"
     parity, shape = image.green_parity, image.data.shape

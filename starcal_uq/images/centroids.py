@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import ObservationError
+from starcal_uq.core.extras import extra
 from starcal_uq.core.files import as_plain, atomic_path, ensure_new, read_parquet, reading, table_ending
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, StrArray
 from starcal_uq.observations.rows import FrameRows, locked
@@ -227,7 +228,8 @@ class Centroids(FrameRows, Shown):
                 parquet.write_table(arrow.replace_schema_metadata(metadata), temporary, compression="zstd")
 
     def _table(self, text: str) -> Any:
-        from astropy.table import Table
+        with extra("images", "ECSV tables"):
+            from astropy.table import Table
 
         table = Table({name: getattr(self, name) for name in COLUMNS}, meta={_KEY: text})
         for name, (_, description) in COLUMNS.items():
@@ -300,7 +302,8 @@ def _read_csv(path: Path) -> tuple[Mapping[str, Any], str | None]:
 
 
 def _read_ecsv(path: Path) -> tuple[Mapping[str, Any], str | None]:
-    from astropy.table import Table
+    with extra("images", "ECSV tables"):
+        from astropy.table import Table
 
     table = Table.read(path, format="ascii.ecsv")
     return {name: np.asarray(table[name]) for name in table.colnames}, table.meta.get(_KEY)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from starcal_uq.core.errors import ImageError
+from starcal_uq.core.extras import extra
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.types import AnyDict, BoolArray, IntArray
 from starcal_uq.images.background import PreparedImage, prepare_image
@@ -128,7 +129,8 @@ def find_stars(image: Image, options: DetectionOptions) -> FrameStars:
 
 def _detect(frame: PreparedImage, name: str, sigma: float, options: DetectionOptions) -> Any:
     """SExtractor's detections in the image filtered by the PSF, the brightest first."""
-    import sep
+    with extra("images", "star images"):
+        import sep
 
     half = int(np.clip(np.ceil(_KERNEL_HALF_SIGMAS * sigma), 1, _KERNEL_HALF_MAX))
     line = np.exp(-0.5 * (np.arange(-half, half + 1) / sigma) ** 2)
@@ -205,7 +207,8 @@ def _taken_apart(
 
     No other can fall apart, and to look for it in all takes as long as all the rest.
     """
-    import sep
+    with extra("images", "star images"):
+        import sep
 
     height, width = image.shape
     inside = above[labels.ravel()[above] != 0]

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from starcal_uq.core.errors import ImageError
+from starcal_uq.core.extras import extra
 from starcal_uq.core.files import check_fits, check_size, unpack
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.settings import Bayer, Mosaic
@@ -173,8 +174,9 @@ def read_image(path: str | os.PathLike[str], camera: Camera | None = None) -> Im
     Raises
     ------
     ImageError
-        If the file is missing, truncated, no image, of the wrong size, declares more pixels than it can hold, or needs
-        a library that is not installed (raw files, colours of 16 bits).
+        If the file is missing, truncated, no image, of the wrong size, or declares more pixels than it can hold.
+    MissingExtraError
+        If the library for its format is not installed.
     """
     path = Path(path)
     part = _ONE_OF.fullmatch(path.name)
@@ -313,7 +315,8 @@ def _unpacked(path: Path, data: bytes) -> bytes:
 
 
 def _read_fits(path: Path, data: bytes, camera: Camera | None, every: bool) -> list[Image]:
-    from astropy.io import fits
+    with extra("images", f"{path}: FITS images"):
+        from astropy.io import fits
 
     stored = len(data)
     if data.startswith(b"\x1f\x8b"):

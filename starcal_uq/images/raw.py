@@ -11,9 +11,9 @@ from typing import Any, get_args
 import numpy as np
 
 from starcal_uq.core.errors import ImageError
+from starcal_uq.core.extras import extra
 from starcal_uq.core.settings import Mosaic
 
-_EXTRA = 'pip install "starcal-uq[raw]"'
 _SIZE_TAGS = 256, 257
 
 
@@ -33,13 +33,8 @@ def read_raw(path: Path, data: bytes) -> RawFrame:
 
     Its clock is the camera's own, of no stated zone, and is not taken for a time.
     """
-    try:
+    with extra("raw", f"{path}: raw files of cameras", "save the image as FITS without turning it into colours"):
         import rawpy
-    except ImportError:
-        raise ImageError(
-            f"{path}: raw files of cameras need the library rawpy; {_EXTRA}, or save the image as FITS without "
-            "turning it into colours."
-        ) from None
     try:
         with rawpy.imread(io.BytesIO(data)) as raw:
             pixels = np.array(raw.raw_image_visible)
@@ -62,13 +57,8 @@ def deep_colours(path: Path, data: bytes, check_declared: Callable[[Path, int, i
     is_png = data.startswith(b"\x89PNG")
     if not is_png and not _is_deep_tiff(path, data, check_declared):
         return None
-    try:
+    with extra("raw", f"{path}: colours of 16 bits", "save the image as FITS, or as a grey TIFF or PNG"):
         import cv2
-    except ImportError:
-        raise ImageError(
-            f"{path}: the colours have 16 bits, which need the library OpenCV; {_EXTRA}, or save the image as FITS, or "
-            "as a grey TIFF or PNG."
-        ) from None
     content = np.frombuffer(data, dtype=np.uint8)
     # What is wrong with a file is said in one sentence, and not by the library too.
     logging = cv2.utils.logging

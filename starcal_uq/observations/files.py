@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.errors import ObservationError
+from starcal_uq.core.extras import extra
 from starcal_uq.core.files import (
     ENDINGS,
     as_plain,
@@ -211,7 +212,8 @@ def _to_unit(path: Path, name: str, values: FloatArray, unit: str) -> FloatArray
     wanted = COLUMNS[name].unit
     if unit in ("", wanted) or name == "mag":
         return values
-    from astropy import units as u
+    with extra("images", f"{path}: columns in other units", f"give {name} in {wanted}"):
+        from astropy import units as u
 
     try:
         converted: FloatArray = u.Unit(unit).to(u.Unit(wanted), values, equivalencies=u.temperature())
@@ -298,8 +300,13 @@ def _ecsv_header(path: Path, text: str) -> AnyDict:
             f"{path}, line 1: '# %ECSV 1.0' is missing; name a plain table .csv, or write it with astropy.",
             row=1,
         )
-    from astropy.table import meta
+    import yaml
 
+    class Header(yaml.SafeLoader):  # type: ignore[misc]
+        """Astropy's own kinds of values, of which none is used here, are None."""
+
+    for kind in ("!", "tag:yaml.org,2002:python/"):
+        Header.add_multi_constructor(kind, lambda *_: None)
     lines = []
     for line in text.splitlines()[1:]:
         if not line.startswith("#"):
@@ -307,8 +314,8 @@ def _ecsv_header(path: Path, text: str) -> AnyDict:
         if not line.startswith("##"):
             lines.append(line[2:])
     try:
-        header: Any = meta.get_header_from_yaml(lines)
-    except meta.YamlParseError:
+        header: Any = yaml.load("\n".join(lines), Loader=Header)
+    except (yaml.YAMLError, ValueError, RecursionError):
         header = None
     columns = header.get("datatype") if isinstance(header, dict) else None
     if not isinstance(columns, list) or not all(isinstance(column, dict) and "name" in column for column in columns):
@@ -443,7 +450,8 @@ def arrow_values(column: Any) -> Any:
 
 def astropy_table(columns: Mapping[str, Any], meta: AnyDict) -> Any:
     """The columns as an astropy Table with units and descriptions."""
-    from astropy.table import Table
+    with extra("images", "ECSV tables"):
+        from astropy.table import Table
 
     table = Table(dict(columns), meta=dict(meta))
     for name in columns:

@@ -18,6 +18,7 @@ import numpy as np
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.projection import project, unproject
 from starcal_uq.core.errors import ObservationError
+from starcal_uq.core.extras import extra
 from starcal_uq.core.files import as_plain, check_fits, check_size
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.observations.columns import COLUMNS
@@ -77,7 +78,8 @@ def corr_content(columns: Mapping[str, Any], meta: AnyDict, camera: Camera | Non
 
 
 def _written(columns: Mapping[str, tuple[Any, str]], meta: AnyDict, **cards: Any) -> bytes:
-    from astropy.io import fits
+    with extra("images", "FITS tables"):
+        from astropy.io import fits
 
     kinds = {"f": "D", "i": "J"}
     made = []
@@ -114,7 +116,8 @@ def is_fits_table(path: Path) -> bool:
 
 def read_fits(path: Path, data: bytes) -> tuple[dict[str, Any], AnyDict]:
     """Columns under our names, and metadata, of a FITS table or ``.corr`` file: texts as lists, numbers as arrays."""
-    from astropy.io import fits
+    with extra("images", "FITS tables"):
+        from astropy.io import fits
 
     check_fits(data)
     with fits.open(io.BytesIO(data), memmap=False) as hdus:

@@ -54,7 +54,9 @@ def export(
     Raises
     ------
     CameraError
-        For a camera that the format cannot hold, or a library that is not installed.
+        For a camera that the format cannot hold.
+    MissingExtraError
+        If the format's library is not installed.
     RunFolderError
         For an unknown format, a run without what the format holds, or a file that exists.
     """

@@ -17,6 +17,7 @@ from starcal_uq.attitude.rotations import quaternion_to_rotation, rotation_to_qu
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.errors import ImageError, SensorError, StarcalError
+from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_write_bytes, ensure_new
 from starcal_uq.core.provenance import installed_version
 from starcal_uq.core.types import FloatArray, StrArray
@@ -179,7 +180,8 @@ def write_frame(frame: RenderedFrame, path: str | os.PathLike[str], force: bool 
     RunFolderError
         If the file exists and `force` is false, or cannot be written.
     """
-    from astropy.io import fits
+    with extra("images", "FITS images"):
+        from astropy.io import fits
 
     ensure_new(path, force)
     image = fits.PrimaryHDU(frame.data)
@@ -242,7 +244,8 @@ def read_truth(path: str | os.PathLike[str]) -> FrameTruth:
     ImageError
         If the file cannot be read, or does not carry a truth.
     """
-    from astropy.io import fits
+    with extra("images", "FITS images"):
+        from astropy.io import fits
 
     try:
         with warnings.catch_warnings():

@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from starcal_uq.core.errors import CatalogueError
+from starcal_uq.core.extras import extra
 from starcal_uq.core.files import reading, unpack
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.sky.catalogue import StarCatalogue
@@ -229,7 +230,8 @@ class _Rows:
 
 def _parse(rows: _Rows, description: list[str], lines: list[str]) -> dict[str, Any]:
     """The needed columns through astropy's reader, named by the labels of the layout."""
-    from astropy.io import ascii
+    with extra("images", "catalogue files"):
+        from astropy.io import ascii
 
     # A list is read with the description at its head, whatever the file is called and however it is compressed.
     reader = ascii.get_reader(ascii.Cds)

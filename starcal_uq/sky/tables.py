@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from starcal_uq.core.errors import CatalogueError
+from starcal_uq.core.extras import extra
 from starcal_uq.core.files import check_fits, listed, reading, unpack
 from starcal_uq.core.types import FloatArray, IntArray, StrArray
 from starcal_uq.sky.catalogue import StarCatalogue, check_epoch, prepare
@@ -164,7 +165,8 @@ class _Source:
         unit, wanted = getattr(column, "unit", None), _UNITS.get(name)
         if unit is None or wanted is None or name == "epoch":
             return values
-        from astropy.units import Unit, UnitsError
+        with extra("images", "catalogue files"):
+            from astropy.units import Unit, UnitsError
 
         try:
             return np.asarray(Unit(unit).to(Unit(wanted), values), dtype=np.float64)
@@ -217,8 +219,9 @@ def _checked_cds(path: Path, kind: CdsFormat, readme: Path | None, band: str | N
 
 
 def _load_table(path: Path, kind: Format) -> Any:
-    from astropy.table import Table
-    from astropy.utils.exceptions import AstropyWarning
+    with extra("images", "catalogue files"):
+        from astropy.table import Table
+        from astropy.utils.exceptions import AstropyWarning
 
     options: dict[str, Any] = {
         "csv": {"format": "ascii.csv", "comment": "#"},
@@ -348,7 +351,8 @@ def _format_of(path: Path) -> Format:
 
 def _text_line(path: Path, row: int) -> int:
     """Line, from 1, of a data row of a CSV or ECSV file: comments and empty lines count, the header is one line."""
-    from astropy.utils.data import get_readable_fileobj
+    with extra("images", "catalogue files"):
+        from astropy.utils.data import get_readable_fileobj
 
     with get_readable_fileobj(path) as file:
         lines: IntArray = np.array(

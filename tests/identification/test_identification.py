@@ -17,7 +17,7 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.attitude.rotations import quaternion_to_rotation, random_rotations
 from starcal_uq.camera.projection import unproject
-from starcal_uq.core.errors import IdentificationError, SettingError
+from starcal_uq.core.errors import IdentificationError, MissingExtraError, SettingError
 from starcal_uq.identification import match as matching
 from starcal_uq.identification import search
 from starcal_uq.identification.brightness import instrumental_mag, unlike_brightness
@@ -417,7 +417,7 @@ def test_engines_agree(stars: Any, folder: Path, fov_deg: float, focal: float, s
 def test_engine_that_is_not_there(stars: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "tetra3rs", None)
     table, *_ = random_frames(stars, square_camera(12.0), 1, 12)
-    with pytest.raises(IdentificationError, match=r"pip install .starcal-uq\[tetra3rs\]"):
+    with pytest.raises(MissingExtraError, match=r"pip install .starcal-uq\[tetra3rs\]"):
         identify(table, square_camera(12.0), stars, engine="tetra3rs")
     engine: Any = "astrometry"
     with pytest.raises(IdentificationError, match="no engine 'astrometry'"):

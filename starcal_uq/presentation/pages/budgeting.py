@@ -12,6 +12,7 @@ from starcal_uq.budgeting.result import Budget
 from starcal_uq.budgeting.rows import AXIS_LABELS, Contributor, confidence_text
 from starcal_uq.budgeting.totals import Total
 from starcal_uq.core.errors import BudgetError
+from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_path, atomic_write_text, cell_text
 from starcal_uq.presentation.figures.budgeting import plot_budget
 from starcal_uq.presentation.figures.style import png_bytes
@@ -73,7 +74,8 @@ def write_html(budget: Budget, path: str | os.PathLike[str]) -> None:
 
 def write_xlsx(budget: Budget, path: str | os.PathLike[str]) -> None:
     """A workbook with the sheets Contributors, Totals, Requirements (if any) and Notes; numbers are numbers."""
-    from openpyxl import Workbook
+    with extra("excel", "Excel workbooks", "write .csv or .html"):
+        from openpyxl import Workbook
 
     book = Workbook()
     sheet = book.active

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.core.errors import ImageError
+from starcal_uq.core.errors import ImageError, MissingExtraError
+from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_write_text
 from starcal_uq.core.formatting import MINUS, count, fixed, plural, significant
 from starcal_uq.core.provenance import installed_version
@@ -104,7 +105,8 @@ def picture(path: Path, width_px: int, camera: Camera, flat: bool = True) -> byt
     ImageError
         If it cannot be read or is of another size.
     """
-    from astropy.visualization import AsinhStretch, ZScaleInterval
+    with extra("images", "pictures of frames"):
+        from astropy.visualization import AsinhStretch, ZScaleInterval
     from PIL import Image
     from scipy.ndimage import gaussian_filter
 
@@ -205,7 +207,7 @@ def _drawing(frame: InspectedFrame, frames: Frames, factor: float) -> str:
                 f'<image x="-0.5" y="-0.5" width="{width}" height="{height}" preserveAspectRatio="none" '
                 f'href="data:image/webp;base64,{data.decode("ascii")}"/>'
             )
-        except ImageError as error:
+        except (ImageError, MissingExtraError) as error:
             parts.append(f'<text x="{width / 2:g}" y="{height / 2:g}" class="middle">{escape(str(error))}</text>')
     detections, stars = frame.detections, frame.stars
     by_kind: dict[str, Any] = {kind: detections[detections["kind"] == kind] for _, kind, _ in _LEGEND[:3]}

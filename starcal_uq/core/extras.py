@@ -1,0 +1,34 @@
+"""Libraries that only some users need: extras of the package, imported where they are used."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from starcal_uq.core.errors import MissingExtraError
+
+
+@contextmanager
+def extra(name: str, what: str, instead: str = "") -> Iterator[None]:
+    """For a block of imports: a library that is missing is named with the command that installs it.
+
+    Parameters
+    ----------
+    name : str
+        Extra of ``pyproject.toml`` that brings the library.
+    what : str
+        What needs it, in the plural, such as "FITS images".
+    instead : str
+        Another way out, an order, where there is one.
+
+    Raises
+    ------
+    MissingExtraError
+        If a library is not installed.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        library = (error.name or str(error)).partition(".")[0]
+        otherwise = f", or {instead}" if instead else ""
+        raise MissingExtraError(f'{what} need {library}: run `pip install "starcal-uq[{name}]"`{otherwise}.') from None
