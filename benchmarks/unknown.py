@@ -168,18 +168,21 @@ def render_camera(rng: np.random.Generator, stars: Any, n: int, fields: tuple[fl
             data[trees] = 70.0 + 40.0 * rng.random(int(trees.sum()))
         images.append(sc.images.Image(np.clip(data, 0, 4095).astype(np.uint16), f"frame {k}", saturation=4095.0))
         rotations.append(rotation)
-        truths.append(rendered.truth)
+        # Stars just outside, which are not in the truth of the image, give their light to its edge.
+        b = depth.directions_icrs @ rotation.T
+        ahead = np.flatnonzero(b[:, 2] > np.cos(np.arctan(1.1 * corner / true.focal_px)))
+        truths.append((depth.star_id[ahead], sc.camera.project(true, b[ahead])))
     table = sc.images.extract_centroids(images)
     names, counts = {}, []
     for k, truth in enumerate(truths):
         rows = np.flatnonzero(table.frame == k)
-        place = np.column_stack([truth.x_px, truth.y_px])
+        star_id, place = truth
         n_true = 0
         for order, row in enumerate(rows):
             apart = np.hypot(*(place - [table.x_px[row], table.y_px[row]]).T)
             near = np.flatnonzero(apart < 3.0 * max(psf, 1.0))
             # Of two stars in one image either name is right.
-            names[k, float(table.x_px[row])] = " or ".join(str(truth.star_id[i]) for i in near)
+            names[k, float(table.x_px[row])] = " or ".join(str(star_id[i]) for i in near)
             n_true += bool(len(near)) and order < BRIGHTEST
         counts.append(n_true >= LEAST)
     return Made(camera, table, rotations, names, counts)

@@ -140,8 +140,12 @@ def identify_command(
     ] = None,
     focal_tolerance: Annotated[float, number("focal_tolerance", "Relative error of the nominal focal length.")] = 0.03,
     centre_tolerance: Annotated[
-        float, number("centre_tolerance_px", "Error of the nominal principal point, px.")
-    ] = 20.0,
+        float | None,
+        number(
+            "centre_tolerance_px",
+            "Error of the nominal principal point, px; by default 2 % of the width, but not more than 20.",
+        ),
+    ] = None,
     engine: Engine = "pyramid",
     *,
     place: PlaceSettings,

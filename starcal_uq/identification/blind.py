@@ -12,10 +12,10 @@ All work is counted: so many patterns of so many frames, so many of them matched
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import combinations
+from itertools import chain, combinations, pairwise
 from math import log10, pi
 from typing import TYPE_CHECKING
 
@@ -34,11 +34,13 @@ if TYPE_CHECKING:
 
 # Stars of the whole sky on the first level; each next one has twice as many.
 _FIRST_LEVEL = 64
-_LAST_LEVEL = 200_000
+LEVELS = [_FIRST_LEVEL << k for k in range(12)]
 # Levels searched together: those that are made in a second first, then the deeper ones, which only narrow fields need.
 _GROUPS = (20_000, 40_000, 80_000, 160_000)
+# Stars of a level that a field holds, at the least and at the most, for each star down to a pattern's faintest.
+_LEAST_IN_FIELD, _MOST_IN_FIELD = 0.3, 8.0
 # Nearest stars that a star makes patterns with, on levels of up to so many stars.
-_NEAREST = ((10_000, 7), (40_000, 6), (_LAST_LEVEL, 5))
+_NEAREST = ((10_000, 7), (40_000, 6), (200_000, 5))
 # Patterns of a frame are made of this many of its brightest stars, each with as many of its nearest.
 _BRIGHTEST, _FRAME_NEAREST = (8, 11, 16, 22, 32), 7
 # Codes differ by less than this, in units of the pattern's longest side: noise, and what an unknown lens bends.
@@ -140,8 +142,7 @@ class Levels:
 
     def __init__(self, stars: StarCatalogue) -> None:
         order = np.argsort(stars.mag, kind="stable")
-        self._directions = np.ascontiguousarray(stars.directions_icrs[order[:_LAST_LEVEL]])
-        self.sizes = [n for k in range(20) if (n := _FIRST_LEVEL << k) <= min(len(order), _LAST_LEVEL)]
+        self._directions = np.ascontiguousarray(stars.directions_icrs[order[: LEVELS[-1]]])
 
     def __getitem__(self, n: int) -> Level:
         bright = self._directions[:n]
@@ -168,6 +169,7 @@ class BlindSearch:
     """One catalogue and one size of detector, of a camera whose focal length may be anything."""
 
     def __init__(self, stars: StarCatalogue, width_px: int, height_px: int) -> None:
+        self.stars = stars
         self.levels = Levels(stars)
         self.width, self.height = float(width_px), float(height_px)
         corner = 0.5 * float(np.hypot(width_px, height_px))
@@ -210,18 +212,22 @@ class BlindSearch:
         for n in sizes:
             # Stars of the level in the field, at the longest and the shortest focal length.
             least, most = (n * self.width * self.height / (4.0 * pi * f * f) for f in (high, low))
-            use = np.flatnonzero((8.0 * np.maximum(faintest, 12) > least) & (0.3 * faintest < most))
+            use = np.flatnonzero(
+                (_MOST_IN_FIELD * np.maximum(faintest, 12) > least) & (_LEAST_IN_FIELD * faintest < most)
+            )
             if not len(use):
                 continue
             level = self.levels[n]
             hits = level.codes.query_ball_point(codes[use], _CODE_TOLERANCE)
-            count = np.array([len(hit) for hit in hits])
-            mine = np.repeat(use, count)
-            theirs = np.array([j for hit in hits for j in hit], dtype=np.int64)
+            # Most lists are empty, which an array of them tells sooner than a loop.
+            some = np.flatnonzero(hits.astype(np.bool_))
+            mine = np.repeat(use[some], [len(hit) for hit in hits[some]])
+            theirs = np.fromiter(chain.from_iterable(hits[some]), dtype=np.int64)
             f = focal * size[mine] / level.size_rad[theirs]
             expected = n * self.width * self.height / (4.0 * pi * f * f)
             ok = (f >= low) & (f <= high)
-            ok &= (expected > 0.3 * faintest[mine]) & (expected < 8.0 * np.maximum(faintest[mine], 12))
+            ok &= expected > _LEAST_IN_FIELD * faintest[mine]
+            ok &= expected < _MOST_IN_FIELD * np.maximum(faintest[mine], 12)
             if ok.any():
                 yield level, quads[mine[ok]], level.quads[theirs[ok]], f[ok]
 
@@ -312,7 +318,7 @@ class _Vote:
 
 def find_optics(
     frames: Sequence[tuple[FloatArray, FloatArray]],
-    stars: StarCatalogue,
+    stars: Callable[[int], StarCatalogue],
     width_px: int,
     height_px: int,
     ranges: Sequence[tuple[float, float]],
@@ -324,25 +330,38 @@ def find_optics(
     frames
         Points (n, 2) from the detector's middle, brightest first, and their noise (n,), px.
     stars
-        Catalogue, as deep as the frames may need.
+        Catalogue of at least so many stars of the whole sky, or of all that there are.
     width_px, height_px
         Detector.
     ranges
-        Focal lengths to look for, px: first in the first range, then in the next.
+        Focal lengths to look for, px: first in the first range, then in the next. No level of the catalogue is searched
+        twice for one range.
 
     A frame alone counts where chance makes what it shows less than once in 10^9; otherwise two must agree.
     """
-    search = BlindSearch(stars, width_px, height_px)
     probes = _probes([len(points) for points, _ in frames])
+    if not probes:
+        return None
+    search: BlindSearch | None = None
     for limits in ranges:
-        for low, high in zip((0, *_GROUPS), (*_GROUPS, _LAST_LEVEL), strict=False):
-            sizes = [n for n in search.levels.sizes if low < n <= high]
+        for low, high in pairwise((0, *_GROUPS)):
+            sizes = [n for n in LEVELS if low < n <= high and _useful(n, width_px * height_px, limits)]
             if not sizes:
                 continue
+            catalogue = stars(sizes[-1])
+            if search is None or catalogue is not search.stars:
+                search = BlindSearch(catalogue, width_px, height_px)
+            sizes = [n for n in sizes if n <= len(catalogue)]
             found = _agreed(search, frames, probes, sizes, limits)
             if found is not None:
                 return found
     return None
+
+
+def _useful(n: int, detector_px2: float, focal_px: tuple[float, float]) -> bool:
+    """Whether a field shows so many of a level's stars, at some focal length, that a pattern may be among them."""
+    least, most = (n * detector_px2 / (4.0 * pi * f * f) for f in reversed(focal_px))
+    return least < _MOST_IN_FIELD * _BRIGHTEST[-1] and most > 4.0 * _LEAST_IN_FIELD
 
 
 def _probes(n_stars: Sequence[int]) -> list[int]:

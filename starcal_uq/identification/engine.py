@@ -8,7 +8,7 @@ say together about the camera narrows the tolerances for a second pass over all 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from os import PathLike
 from typing import Protocol
@@ -52,9 +52,34 @@ _CAMERA_STARS = 7
 _RICH_STARS, _FEW_TRIANGLES = 8, 40
 # A focal length is looked for within this factor of the camera's before it is looked for anywhere.
 _NEAR = 2.0
+# Error of the principal point that is allowed for: a part of the detector's width, but not more than so many pixels.
+_CENTRE, _LARGEST_CENTRE_PX = 0.02, 20.0
 # Where images say neither: the pixel pitch, without which the focal length has no millimetres, and a focal length in
 # detector widths to begin with.
 ASSUMED_PIXEL_UM, _ASSUMED_FOCAL = 5.0, 5.0
+
+
+class StarsByDepth(Protocol):
+    """A catalogue that is as deep as it needs to be."""
+
+    def for_camera(self, camera: Camera) -> StarCatalogue:
+        """The stars that frames of this camera are compared with."""
+
+    def for_level(self, n: int) -> StarCatalogue:
+        """At least the brightest n of the sky, if there are so many."""
+
+
+@dataclass(frozen=True)
+class OneDepth:
+    """A catalogue that was given."""
+
+    stars: StarCatalogue
+
+    def for_camera(self, camera: Camera) -> StarCatalogue:
+        return self.stars
+
+    def for_level(self, n: int) -> StarCatalogue:
+        return self.stars
 
 
 class CalibratedCamera(Protocol):
@@ -70,11 +95,11 @@ class CalibratedCamera(Protocol):
 def identify(
     centroids: CentroidTable,
     camera: Camera | None,
-    stars: StarCatalogue,
+    stars: StarCatalogue | StarsByDepth,
     *,
     calibration: CalibratedCamera | None = None,
     focal_tolerance: float = 0.03,
-    centre_tolerance_px: float = 20.0,
+    centre_tolerance_px: float | None = None,
     distortion_tolerance_px: float = 1.0,
     search_focal: bool = True,
     engine: Engine = "pyramid",
@@ -103,7 +128,7 @@ def identify(
     focal_tolerance
         Relative error of the focal length; 0.03 is three per cent.
     centre_tolerance_px
-        Error of the principal point per axis, px.
+        Error of the principal point per axis, px; by default 2 % of the detector's width, but not more than 20.
     distortion_tolerance_px
         Displacement at the detector's corner by distortion that the nominal camera does not have, px. Where less than
         half of the frames are found, the others are tried with four times as much, and as mirror images.
@@ -136,20 +161,23 @@ def identify(
         If the engine is not installed.
     """
     sheet, told = (camera, True) if camera is not None else sheet_of(centroids)
-    _check(centroids, sheet, stars)
+    catalogue = OneDepth(stars) if isinstance(stars, StarCatalogue) else stars
+    if centre_tolerance_px is None:
+        centre_tolerance_px = min(_CENTRE * sheet.width_px, _LARGEST_CENTRE_PX)
     tolerance = CameraTolerance(focal_tolerance, centre_tolerance_px, distortion_tolerance_px)
     if calibration is not None:
         sheet, tolerance = calibration.camera, calibrated_tolerance(calibration, tolerance)
-    prepare = partial(prepare_engine, engine, stars, cache=cache, cache_dir=cache_dir)
-    attempt = _Attempt(centroids, stars, sheet, tolerance, prepare)
+    prepare = partial(prepare_engine, engine, cache=cache, cache_dir=cache_dir)
+    attempt = _Attempt(centroids, catalogue, sheet, tolerance, prepare)
+    _check(centroids, sheet, attempt.stars)
     searching = search_focal and calibration is None
     if told:
         attempt.run(progress, searching)
     optics = None
     if searching and not attempt.good:
-        optics = _found_optics(attempt.field, stars, sheet, told)
+        optics = _found_optics(attempt.field, catalogue, sheet, told)
         if optics is not None:
-            other = _Attempt(centroids, stars, *_with(sheet, tolerance, optics, told), prepare, optics.mirrored)
+            other = _Attempt(centroids, catalogue, *_with(sheet, tolerance, optics, told), prepare, optics.mirrored)
             other.run(progress, False)
             if other.n_solved > attempt.n_solved:
                 attempt = other
@@ -165,14 +193,14 @@ class _Attempt:
     def __init__(
         self,
         centroids: CentroidTable,
-        stars: StarCatalogue,
+        catalogue: StarsByDepth,
         camera: Camera,
         tolerance: CameraTolerance,
         prepare: Callable[..., Proposer],
         mirrored: bool = False,
     ) -> None:
-        self.centroids, self.stars, self.camera, self.prepare = centroids, stars, camera, prepare
-        self.tolerance = tolerance
+        self.centroids, self.camera, self.prepare = centroids, camera, prepare
+        self.stars, self.tolerance = catalogue.for_camera(camera), tolerance
         self.parity: Parity = "mirrored" if mirrored else "normal"
         self.field = FrameTable(centroids, camera, mirrored)
         self.results: dict[int, Found] = {}
@@ -182,7 +210,7 @@ class _Attempt:
     def search(self) -> Search:
         """The catalogue prepared for the camera, when it is first needed."""
         if self._search is None:
-            proposer = self.prepare(field_geometry(self.field.camera), self.tolerance)
+            proposer = self.prepare(self.stars, field_geometry(self.field.camera), self.tolerance)
             self._search = Search(self.field.camera, self.stars, self.tolerance, proposer)
         return self._search
 
@@ -278,14 +306,17 @@ def sheet_of(centroids: CentroidTable) -> tuple[Camera, bool]:
     return camera, bool(focal_px)
 
 
-def _found_optics(field: FrameTable, stars: StarCatalogue, sheet: Camera, told: bool) -> FoundOptics | None:
+def _found_optics(field: FrameTable, catalogue: StarsByDepth, sheet: Camera, told: bool) -> FoundOptics | None:
     """What the stars alone say of the lens."""
     frames = []
     for xy, sigma in zip(field.xy, field.sigma, strict=True):
         frames.append((xy - np.array(sheet.centre_px), sigma))
-    everything = FOCAL_RANGE[0] * sheet.width_px, FOCAL_RANGE[1] * sheet.width_px
-    near = [(sheet.focal_px / _NEAR, sheet.focal_px * _NEAR)] if told else []
-    return find_optics(frames, stars, sheet.width_px, sheet.height_px, [*near, everything])
+    shortest, longest = FOCAL_RANGE[0] * sheet.width_px, FOCAL_RANGE[1] * sheet.width_px
+    ranges = [(shortest, longest)]
+    if told:
+        low, high = sheet.focal_px / _NEAR, sheet.focal_px * _NEAR
+        ranges = [(low, high), *((a, b) for a, b in ((shortest, low), (high, longest)) if a < b)]
+    return find_optics(frames, catalogue.for_level, sheet.width_px, sheet.height_px, ranges)
 
 
 def _with(sheet: Camera, tolerance: CameraTolerance, optics: FoundOptics, told: bool) -> tuple[Camera, CameraTolerance]:
@@ -301,7 +332,7 @@ def _with(sheet: Camera, tolerance: CameraTolerance, optics: FoundOptics, told: 
         return camera, tolerance
     return camera, replace(
         tolerance,
-        centre_px=max(tolerance.centre_px, AGREEMENT * sheet.width_px),
+        centre_px=max(tolerance.centre_px, _CENTRE * sheet.width_px),
         distortion_px=max(tolerance.distortion_px, 1.5 * optics.distortion_px),
     )
 

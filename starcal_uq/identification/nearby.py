@@ -13,6 +13,8 @@ from starcal_uq.identification.pyramid import FieldGeometry
 
 # Centroids are compared with the catalogue down to where a field holds this many stars for each, and some more.
 _STARS_PER_CENTROID, _STARS_MORE = 2.0, 20
+# Below so many stars no tree is made.
+_FEW = 20_000
 
 
 class NearbyStars:
@@ -42,6 +44,9 @@ class NearbyStars:
         """Stars, by brightness rank, within an angle of a direction."""
         from scipy.spatial import cKDTree
 
+        if depth < _FEW:
+            # All of few stars are looked at sooner than a tree gives its list.
+            return np.flatnonzero(self.directions[:depth] @ boresight > np.cos(radius_rad))
         if depth not in self._trees:
             self._trees[depth] = cKDTree(self.directions[:depth])
         chord = 2.0 * np.sin(0.5 * min(radius_rad, pi))

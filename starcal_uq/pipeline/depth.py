@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,8 +19,10 @@ _LIMITS = tuple(COUNTS)
 _ENOUGH = 25
 # Frames show other stars than the brightest of the catalogue's band, and fields differ.
 _MARGIN = 1.5
-# Limits for a camera about which nothing is known, and the least stars of a frame worth a search.
-_UNKNOWN, _LEAST_STARS = (7.0, 8.5, 10.0), 5
+# The least stars of a frame worth a search.
+_LEAST_STARS = 5
+# Magnitude limits of a search at any focal length: what a catalogue of so many stars is enough for.
+_SEARCHED = {20_000: 7.0, 40_000: 8.5, 500_000: 10.0}
 
 
 def stars_in_field(camera: Camera, max_mag: float) -> float:
@@ -45,6 +46,9 @@ def identify_to_depth(
 ) -> tuple[StarCatalogue, Identification]:
     """Identify with the embedded catalogue to the depth that the frames need.
 
+    A search at any focal length looks at each level of brightness once, and loads fainter stars only where brighter
+    ones are no answer.
+
     Parameters
     ----------
     centroids, camera
@@ -61,33 +65,39 @@ def identify_to_depth(
     StarCatalogue, Identification
         The stars that were searched for, and the result.
     """
-    from starcal_uq.identification.engine import identify, sheet_of
+    from starcal_uq.identification.engine import identify
     from starcal_uq.sky.catalogue import load_catalogue
 
     if max_mag is not None:
         stars = load_catalogue(max_mag=max_mag, epoch=year)
         return stars, identify(centroids, camera, stars, **options)
-    sheet, told = (camera, True) if camera is not None else sheet_of(centroids)
-    wanted = depth_for(centroids, sheet) if told else _UNKNOWN[0]
-    limits = [wanted, *(limit for limit in _UNKNOWN if limit > wanted)]
-    found_at: list[tuple[StarCatalogue, Identification]] = []
-    enough = int(np.count_nonzero(centroids.stars_per_frame >= _LEAST_STARS))
-    for limit in limits:
-        stars = load_catalogue(max_mag=limit, epoch=year)
-        found = identify(centroids, camera, stars, **options)
-        found_at.append((stars, found))
-        if 2 * found.n_identified >= enough:
-            break
-    stars, found = max(found_at, key=lambda one: one[1].n_identified)
-    if found.n_identified and found.optics is not None:
-        # Now that the field is known.
-        limit = depth_for(centroids, found.nominal)
-        if limit > stars.mag.max() + 0.1 and found.parity == "normal":
-            deep = load_catalogue(max_mag=limit, epoch=year)
-            again = identify(centroids, found.nominal, deep, **options)
-            if again.n_identified >= found.n_identified:
-                return deep, replace(again, optics=found.optics)
-    return stars, found
+    embedded = Embedded(centroids, year)
+    found = identify(centroids, camera, embedded, **options)
+    return embedded.for_camera(found.nominal), found
+
+
+class Embedded:
+    """The embedded catalogue, as deep as frames need it, each depth loaded once."""
+
+    def __init__(self, centroids: Centroids, year: float) -> None:
+        self._centroids, self._year = centroids, year
+        self._loaded: dict[float, StarCatalogue] = {}
+
+    def to(self, limit: float) -> StarCatalogue:
+        """All stars to a magnitude limit."""
+        from starcal_uq.sky.catalogue import load_catalogue
+
+        if limit not in self._loaded:
+            self._loaded[limit] = load_catalogue(max_mag=limit, epoch=self._year)
+        return self._loaded[limit]
+
+    def for_camera(self, camera: Camera) -> StarCatalogue:
+        """The stars that frames of this camera are compared with."""
+        return self.to(depth_for(self._centroids, camera))
+
+    def for_level(self, n: int) -> StarCatalogue:
+        """The brightest n of the sky, and what verifies their patterns."""
+        return self.to(next(limit for most, limit in _SEARCHED.items() if n <= most))
 
 
 def depth_text(stars: StarCatalogue, identification: Identification) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
+from starcal_uq.identification.blind import LEVELS, BlindSearch
 from starcal_uq.identification.engine import identify
 from starcal_uq.pipeline.depth import COUNTS, depth_for, identify_to_depth, stars_in_field
 from tests.identification.test_identification import random_frames, square_camera, wrong_rows
@@ -26,6 +28,57 @@ def test_counts_are_the_catalogue_s() -> None:
 def test_narrow_fields_ask_for_fainter_stars(fov_deg: float, limit: float) -> None:
     table: Any = SimpleNamespace(stars_per_frame=np.array([12, 2, 11, 13]))
     assert depth_for(table, square_camera(fov_deg)) == limit
+
+
+def small_wide(n: int) -> tuple[Any, Any]:
+    """Frames of a camera of 256 px and 60 degrees, whose principal point is off by 1 % of the width."""
+    focal, off = 128.0 / np.tan(np.radians(30.0)), np.array([2.5, -2.0])
+    camera = sc.Camera(256, 256, 5.0, focal * 5e-3, 127.5 + off[0], 127.5 + off[1])
+    table, names, _ = random_frames(sc.load_catalogue(3.8), camera, n, 5, missing=0.6)
+    table.stars_per_frame = np.bincount(table.frame, minlength=n)
+    table.meta = {"optics": {"width_px": 256, "height_px": 256}}
+    return table, names
+
+
+@pytest.mark.parametrize("sheet", [False, True])
+def test_a_wide_field_on_a_small_detector(sheet: bool) -> None:
+    """20 px is 5 degrees there: what is allowed for the principal point is a part of the width."""
+    table, names = small_wide(3)
+    camera = sc.Camera(256, 256, 5.0, 128.0 / np.tan(np.radians(30.0)) * 5e-3, 127.5, 127.5)
+    _, found = identify_to_depth(table, camera if sheet else None, 2016.0, cache=False)
+    assert found.n_identified == 3
+    assert wrong_rows(found, table, names) == 0
+
+
+def test_a_failed_search_is_not_repeated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stars at random places: however deep the catalogue, each level is compared with a frame and its mirror once."""
+    n, rng = 2, np.random.default_rng(3)
+    table, _ = small_wide(n)
+    table.x_px, table.y_px = rng.uniform(1.0, 254.0, (2, len(table.frame)))
+    searched: list[tuple[Any, ...]] = []
+    matches = []
+
+    def solve(self: BlindSearch, u: Any, sigma: Any, sizes: list[int], focal_px: tuple[float, float]) -> None:
+        searched.extend((u.tobytes(), size, focal_px) for size in sizes)
+
+    monkeypatch.setattr(BlindSearch, "solve", solve)
+    # Loaded sooner than what deep levels ask for.
+    monkeypatch.setattr("starcal_uq.pipeline.depth._SEARCHED", {20_000: 7.0, 500_000: 7.5})
+    monkeypatch.setattr("starcal_uq.identification.search.match_frame", lambda *_, **__: matches.append(1))
+    _, found = identify_to_depth(table, None, 2016.0, cache=False)
+    assert found.n_identified == 0
+    assert len(searched) == len(set(searched)) == 2 * n * sum(size <= COUNTS[7.5] for size in LEVELS)
+    assert not matches
+    # With a sheet the range near its focal length comes first, and is left out of the rest.
+    camera = sc.Camera(256, 256, 5.0, 400 * 5e-3, 127.5, 127.5)
+    searched.clear()
+    identify_to_depth(table, camera, 2016.0, cache=False)
+    assert len(searched) == len(set(searched))
+    ranges = sorted({focal for _, _, focal in searched})
+    assert len(ranges) == 3
+    assert all(a[1] == b[0] for a, b in pairwise(ranges))
+    # Every triangle gives six matches at most, of 200 at first and 60 with a worse lens.
+    assert 0 < len(matches) <= n * 6 * (200 + 60)
 
 
 @pytest.mark.slow
