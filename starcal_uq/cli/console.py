@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -32,8 +33,10 @@ if TYPE_CHECKING:
     from starcal_uq.propagation.attitude_error import AttitudeError
     from starcal_uq.propagation.coupling import Coupling
 
+# `!starcal-uq` of a notebook has a terminal of 80 columns, which keeps every state of a bar.
+_IN_NOTEBOOK = "JPY_PARENT_PID" in os.environ
 # Where the output is not a terminal it has no width of its own; tables then get the room they need.
-_WIDTH = None if sys.stdout.isatty() else 110
+_WIDTH = None if sys.stdout.isatty() and not _IN_NOTEBOOK else 110
 _STYLES = {Level.PASS: "green", Level.WARN: "yellow", Level.FAIL: "red"}
 # Names of files, runs and requirements may hold square brackets, which are no markup.
 out = Console(width=_WIDTH, markup=False)
@@ -184,7 +187,7 @@ def progress_bar(label: str) -> Iterator[Progress | None]:
     """Yield a function ``(done, total)`` that moves a bar; None where nobody would see it."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    if not err.is_terminal:
+    if not err.is_terminal or _IN_NOTEBOOK:
         yield None
         return
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

@@ -75,6 +75,8 @@ from starcal_uq.presentation.figures.studies import (
 from starcal_uq.presentation.html import card, listed
 from starcal_uq.presentation.pages.budgeting import section_html
 from starcal_uq.presentation.pages.gallery import frames_html
+from starcal_uq.presentation.report.results import Results
+from starcal_uq.presentation.report.words import run_html, run_text
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words import (
     budgeting,
@@ -208,6 +210,7 @@ VIEWS: Mapping[type, View] = {
         spectrum=plot_spectrum,
         time_series=plot_error_series,
     ),
+    Results: View(run_text, run_html),
     Study: _view(
         "Study",
         studies.study_text,

@@ -9,12 +9,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, wraps
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import sigma_parameter
-from starcal_uq.core.errors import CalibrationError, RunFolderError
+from starcal_uq.core.errors import CalibrationError, RunFolderError, StarcalError
 from starcal_uq.core.files import (
     PathLike,
     atomic_write_bytes,
@@ -158,7 +159,25 @@ class Run:
         self.screening: Screening | None = None
 
     def __repr__(self) -> str:
+        try:
+            return f"{self._name}: {self._as_it_is.text}"
+        except StarcalError:
+            return self._name
+
+    def _repr_html_(self) -> str:
+        try:
+            return str(self._as_it_is._repr_html_())
+        except StarcalError as error:
+            return f"<p><b>{escape(self._name)}</b>: {escape(str(error))}</p>"
+
+    @property
+    def _name(self) -> str:
         return f"Run({str(self.path)!r})"
+
+    @property
+    def _as_it_is(self) -> Results:
+        """What the folder holds now, without a trace in this object."""
+        return Run(self.path, self._truth).results
 
     @property
     def name(self) -> str:

@@ -96,6 +96,24 @@ def test_steps_give_what_they_write_and_remove_what_is_stale(tmp_path: Path) -> 
         _ = run.error_budget
 
 
+def test_a_run_shows_what_its_folder_holds_now(tmp_path: Path) -> None:
+    run = sc.Run(tmp_path / "run")
+    assert repr(run) == f"Run({str(run.path)!r})"
+    assert "the run folder does not exist" in run._repr_html_()
+    # Another process adds to the folder while this object lives.
+    sc.Run(run.path).calibrate(observations(), sc.paper.paper_start())
+    assert "The posterior: not there yet (`starcal-uq sample " in repr(run)
+    assert "Calibration" in run._repr_html_()
+    sc.Run(run.path).sample(n_steps=20, seed=1)
+    shown = repr(run)
+    assert run.verdict.headline in shown
+    assert "The posterior" not in shown
+    assert len(shown.splitlines()) < 10
+    assert "R-hat" in run._repr_html_()
+    arviz = sc.Run(run.path).arviz(groups=["prior"], n_draws=8)
+    assert arviz["prior"].sizes["draw"] == arviz["posterior"].sizes["draw"] * 4 == 8
+
+
 @pytest.mark.parametrize("step", ["sample", "diagnose", "report"])
 def test_data_of_another_calibration_are_refused_with_one_sentence(step: str, tmp_path: Path) -> None:
     sc.Run(tmp_path).calibrate(observations(), sc.paper.paper_start())

@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from starcal_uq.camera.camera import Camera
+from starcal_uq.core.display import Shown
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.observations.table import Observations
 
@@ -30,8 +31,8 @@ class Missing:
     command: str
 
 
-@dataclass(frozen=True)
-class Results:
+@dataclass(frozen=True, eq=False)
+class Results(Shown):
     """Everything that a report is made from; None for what the run does not hold.
 
     The couplings are those of the posterior if there is one, else of the estimate; `truth` is the camera of a

@@ -9,10 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.formatting import count, fixed, percent, plural, significant
+from starcal_uq.core.status import Level
 from starcal_uq.diagnostics.verdict.draws import propagation_difference
 from starcal_uq.diagnostics.verdict.observed import air, conditional_words, corrected_words
-from starcal_uq.presentation.words.estimation import noise_kind
-from starcal_uq.presentation.words.propagation import equivalent_shift
+from starcal_uq.presentation.html import card, listed
+from starcal_uq.presentation.words.estimation import calibration_table, noise_kind
+from starcal_uq.presentation.words.inference import posterior_table
+from starcal_uq.presentation.words.propagation import equivalent_shift, one_number_sentence
 
 if TYPE_CHECKING:
     from starcal_uq.diagnostics.verdict.judge import Verdict
@@ -25,6 +28,24 @@ _DIRECTIONS = {
     "catalogue": "directions straight from a catalogue (aberration not included)",
     "undeclared": "directions not declared as apparent or as straight from a catalogue",
 }
+
+
+def run_text(results: Results) -> str:
+    """A run in a few lines: the verdict, what it rests on, the attitude error, and what it lacks."""
+    obs, error = results.observations, results.attitude
+    lines = [results.verdict.headline, f"{plural(obs.n_stars, 'star')} in {plural(obs.n_frames, 'frame')}."]
+    if error is not None:
+        lines.append(one_number_sentence(error))
+    lines += [f"{missing.what}: not there yet (`{missing.command}`)." for missing in results.missing]
+    return "\n".join(lines)
+
+
+def run_html(results: Results) -> str:
+    """The same for a notebook, with the table of the parameters and the checks that did not pass."""
+    post, cal = results.posterior, results.calibration
+    table = calibration_table(cal, results.truth) if post is None else posterior_table(post)
+    doubts = (str(check) for check in results.verdict.checks if check.level is not Level.PASS)
+    return card(f"Run {results.name}", run_text(results), table) + listed(doubts)
 
 
 def data_sentence(results: Results) -> str:
