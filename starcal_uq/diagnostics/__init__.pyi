@@ -12,4 +12,6 @@ from .models import compare_models as compare_models
 from .predictive import predictive_check as predictive_check
 from .stars import StarTest as StarTest
 from .stars import star_test as star_test
+from .times import TimeTest as TimeTest
+from .times import time_test as time_test
 from .validation.result import Validation as Validation

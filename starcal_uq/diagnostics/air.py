@@ -92,9 +92,7 @@ def air_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> AirTest |
     AirTest or None
         None where from no place all stars were above the horizon.
     """
-    chosen = one_of_each(obs.n_frames, min(_FRAMES, max(_STARS * obs.n_frames // obs.n_stars, 3)), seed)
-    some = obs if len(chosen) == obs.n_frames else obs.select_frames(obs.frame_ids[chosen])
-    air = _Air(some, cal, quaternion_to_rotation(cal.quaternions[chosen]))
+    air = _Air(obs, cal, seed)
     places = air.possible(_sphere(_PLACES))
     if not len(places):
         return None
@@ -128,28 +126,60 @@ def air_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> AirTest |
         found |= {"latitude_deg": float(np.degrees(latitude)), "longitude_deg": float(np.degrees(longitude))}
         found |= {"latitude_std_deg": float(std[0]), "longitude_std_deg": float(std[1] / max(np.cos(latitude), 1e-3))}
     size, error = float(z[best] * air.sigma / length[best]), float(air.sigma / length[best])
-    return AirTest(p_value, size, error, is_air, n_frames=some.n_frames, **found)
+    return AirTest(p_value, size, error, is_air, n_frames=air.obs.n_frames, **found)
 
 
-class _Air:
-    """Refraction of some frames from any place, with what attitudes and parameters take up of it removed."""
+class Remainder:
+    """Residuals of some frames, and of what displaces stars that part which attitudes and parameters cannot take up.
 
-    def __init__(self, obs: Observations, cal: Calibration, rotations: FloatArray) -> None:
-        self._camera = cal.camera
-        self._likelihood = MarginalLikelihood(obs, cal.camera.distortion)
-        self._state, _ = self._likelihood.profile(cal.theta, rotations)
-        slopes = self._likelihood.project_out(self._state, self._likelihood.derivatives(cal.theta, self._state))
-        self._basis, self._triangle = np.linalg.qr(slopes.reshape(len(slopes), -1).T)
-        self._axes, self.timed = _earth(obs)
-        e = self._likelihood.project_out(self._state, self._state.e[None]).reshape(-1)
-        self.residuals: FloatArray = e - self._basis @ (self._basis.T @ e)
-        self.dof = max(self._likelihood.dof - len(cal.theta), 1)
+    Attributes
+    ----------
+    obs : Observations
+        The frames.
+    residuals : (2 N,) array
+        Whitened residuals, x of all stars before y.
+    dof : int
+        Their degrees of freedom.
+    sigma : float
+        Their scatter.
+    """
+
+    def __init__(self, obs: Observations, cal: Calibration, seed: int) -> None:
+        chosen = one_of_each(obs.n_frames, min(_FRAMES, max(_STARS * obs.n_frames // obs.n_stars, 3)), seed)
+        self.obs = obs if len(chosen) == obs.n_frames else obs.select_frames(obs.frame_ids[chosen])
+        self.likelihood = MarginalLikelihood(self.obs, cal.camera.distortion)
+        self.state, _ = self.likelihood.profile(cal.theta, quaternion_to_rotation(cal.quaternions[chosen]))
+        slopes = self.likelihood.project_out(self.state, self.likelihood.derivatives(cal.theta, self.state))
+        self.basis, self._triangle = np.linalg.qr(slopes.reshape(len(slopes), -1).T)
+        e = self.likelihood.project_out(self.state, self.state.e[None]).reshape(-1)
+        self.residuals: FloatArray = e - self.basis @ (self.basis.T @ e)
+        self.dof = max(self.likelihood.dof - len(cal.theta), 1)
         self.sigma = float(np.sqrt(self.residuals @ self.residuals / self.dof))
+
+    def shift(self, moved: FloatArray) -> FloatArray:
+        """Whitened shifts (2, N) of images by small moves (3, N) of the stars, camera frame, rad."""
+        shifts: FloatArray = np.einsum("ixn,in->xn", self.state.attitude, np.cross(self.state.b, moved, axis=0))
+        return shifts
+
+    def left(self, shifts: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """What is left (g, 2 N) of shifts (g, 2, N), and what parameters took up (g, p)."""
+        flat = self.likelihood.project_out(self.state, shifts).reshape(len(shifts), -1)
+        along = flat @ self.basis
+        return flat - along @ self.basis.T, np.linalg.solve(self._triangle, along.T).T
+
+
+class _Air(Remainder):
+    """Refraction of some frames from any place."""
+
+    def __init__(self, obs: Observations, cal: Calibration, seed: int) -> None:
+        super().__init__(obs, cal, seed)
+        self._camera = cal.camera
+        self._axes, self.timed = _earth(self.obs)
         self._constants = refraction_constants(Site(45.0, 0.0))
 
     def possible(self, places: FloatArray) -> FloatArray:
         """Those places (g, 3) from which all stars were above the horizon."""
-        frames = self._likelihood.frames
+        frames = self.likelihood.frames
         turned = [frames.spread(np.ascontiguousarray(self._axes[:, axis].T)) for axis in range(3)]
         seen = np.stack([np.sum(axis * frames.r, axis=0) for axis in turned])
         found: FloatArray = places[np.min(places @ seen, axis=1) > _LOWEST]
@@ -158,31 +188,28 @@ class _Air:
     def columns(self, places: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Whitened shifts (g, 2 N) by standard air as seen from places (g, 3), and what parameters took up (g, p)."""
         a, b = self._constants
-        frames, state = self._likelihood.frames, self._state
+        frames, state = self.likelihood.frames, self.state
         shifts = np.empty((len(places), 2, frames.n_stars))
         for number, place in enumerate(places):
             zenith = np.einsum("kij,akj,a->ik", state.rotations, self._axes.transpose(1, 0, 2), place)
             up = frames.spread(np.ascontiguousarray(zenith))
             sine = np.maximum(np.sum(up * state.b, axis=0), _LOWEST)
-            raised = np.cross(state.b, up, axis=0) * ((a + b * (1.0 / sine**2 - 1.0)) / sine)
-            shifts[number] = np.einsum("ixn,in->xn", state.attitude, raised)
-        flat = self._likelihood.project_out(state, shifts).reshape(len(places), -1)
-        along = flat @ self._basis
-        return flat - along @ self._basis.T, np.linalg.solve(self._triangle, along.T).T
+            shifts[number] = self.shift(up * ((a + b * (1.0 / sine**2 - 1.0)) / sine))
+        return self.left(shifts)
 
     def left_by_frame(self, place: FloatArray, density: float) -> float:
         """Probability that frames by themselves, without that air, differ so much in scale and shape by noise."""
         from scipy.special import fdtrc
 
-        frames, theta = self._likelihood.frames, self._camera.theta
-        view = View.of(self._likelihood, self._state, theta, slice(0, frames.n_stars))
+        frames, theta = self.likelihood.frames, self._camera.theta
+        view = View.of(self.likelihood, self.state, theta, slice(0, frames.n_stars))
         weight = 1.0 if frames.weight is None else frames.weight
-        own = self._likelihood.project_out(self._state, frame_shapes(self._camera).columns(view) * weight)
+        own = self.likelihood.project_out(self.state, frame_shapes(self._camera).columns(view) * weight)
         number = np.repeat(np.arange(frames.n_frames), frames.sizes)
         spread = np.zeros((3, frames.n_frames, 2, frames.n_stars))
         spread[:, number, :, np.arange(frames.n_stars)] = own.transpose(2, 0, 1)
         flat = spread.reshape(3 * frames.n_frames, -1)
-        flat -= (flat @ self._basis) @ self._basis.T
+        flat -= (flat @ self.basis) @ self.basis.T
         left = self.residuals - self.columns(place[None])[0][0] * density
         values, vectors = np.linalg.eigh(flat @ flat.T)
         kept = values > 1e-8 * values[-1]

@@ -27,6 +27,7 @@ from starcal_uq.diagnostics.misfit import Misfit, misfit_tests
 from starcal_uq.diagnostics.models import MODELS, ModelComparison, compare_models, of_all_stars
 from starcal_uq.diagnostics.predictive import PredictiveCheck, predictive_check
 from starcal_uq.diagnostics.stars import StarTest, star_test
+from starcal_uq.diagnostics.times import TimeTest, time_test
 from starcal_uq.estimation.calibrate import METHODS, calibrate, fit
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.cameras import MixedCameras
@@ -104,6 +105,8 @@ class Diagnosis(Shown):
         Refraction in the residuals; None where there cannot be any, or in a diagnosis of an earlier version.
     cameras : MixedCameras or None
         Several cameras, where the frames' own focal lengths ask for them.
+    times : TimeTest or None
+        Another time or epoch, where the residuals ask for one.
     """
 
     misfit: Misfit
@@ -116,6 +119,7 @@ class Diagnosis(Shown):
     stars: StarTest | None = None
     air: AirTest | None = None
     cameras: MixedCameras | None = None
+    times: TimeTest | None = None
 
     def is_of(self, cal: Calibration) -> bool:
         """True if this calibration is the one that was diagnosed."""
@@ -198,6 +202,7 @@ def diagnose(
         stars=star_test(obs, cal),
         air=air_test(obs, cal, seed=seed),
         cameras=MixedCameras.of(obs, cal.camera),
+        times=time_test(obs, cal, seed=seed),
     )
 
 

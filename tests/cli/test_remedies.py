@@ -15,6 +15,7 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.core.status import Level, Status
+from starcal_uq.diagnostics.times import TimeTest
 from starcal_uq.diagnostics.verdict import draws, estimate, observed
 from starcal_uq.estimation.cameras import MixedCameras
 from starcal_uq.inference import checks
@@ -126,10 +127,13 @@ EXAMPLES = {
     "diagnostics.verdict.estimate.stars": lambda s: [
         estimate.stars(sc.diagnostics.star_test(s.patch, sc.calibrate(s.patch, s.sheet)))
     ],
-    "diagnostics.verdict.observed.directions": lambda s: [
-        observed.directions(dataclasses.replace(s.obs, meta=meta), s.cal)
-        for meta in ({"directions": "undeclared"}, {"directions": "apparent", "observer": "unknown"})
-    ],
+    "diagnostics.verdict.observed.directions": lambda s: (
+        [
+            observed.directions(dataclasses.replace(s.obs, meta=meta), s.cal)
+            for meta in ({"directions": "undeclared"}, {"directions": "apparent", "observer": "unknown"})
+        ]
+        + [observed.directions(s.obs, s.cal, None, TimeTest("aberration twice", *(4 * [1.0]), "f", 2.0))]
+    ),
     "diagnostics.verdict.observed.screening": lambda s: [
         observed.screening(s.obs.with_meta(screening={"rejected": 0, "of": 9, "blame": "the model is wrong."}))
     ],

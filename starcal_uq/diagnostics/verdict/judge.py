@@ -81,7 +81,8 @@ def judge(
     if post is not None:
         checks += [draws.same_data(post, cal.data_hash_of(obs)), *post.diagnostics.checks]
     used = weighed(obs, cal)
-    checks += [observed.directions(used, cal, None if diagnosis is None else diagnosis.air)]
+    asked = (None, None) if diagnosis is None else (diagnosis.air, diagnosis.times)
+    checks += [observed.directions(used, cal, *asked)]
     checks += [observed.residual_pattern(used, cal), observed.outliers(used, cal), observed.screening(obs)]
     checks += [observed.noise(used, cal), observed.partitions(cal), observed.terms(cal), observed.coverage(used, cal)]
     if diagnosis is not None:

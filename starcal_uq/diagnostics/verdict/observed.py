@@ -17,6 +17,7 @@ from starcal_uq.sky.site import Site
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.diagnostics.air import AirTest
+    from starcal_uq.diagnostics.times import TimeTest
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
@@ -32,20 +33,34 @@ COVERED_SHARE = 0.85
 _FAR_BELOW, _MAGNITUDES = 0.2, (1.5, 20.0)
 _SAME_UNIT = 1.3
 MIN_FRAMES = 5
+# By which a place turns among the stars in an hour.
+_HOUR_DEG = 15.041
+# What a wrong time may move parameters by and the numbers be used.
+_SMALL_SIGMA = 1.0
 # Commands and calls that checks give as remedies.
 CALIBRATE = "starcal-uq calibrate OBS CAMERA -o RUN --force"
 SCREEN = f"{CALIBRATE} --screen or sc.estimation.screen(obs, camera)"
 AIR_REMEDY = f"{CALIBRATE} --site SITE or {CALIBRATE} --in-space"
 
 
-def directions(obs: Observations, cal: Calibration, found: AirTest | None = None) -> Check:
+def directions(
+    obs: Observations, cal: Calibration, found: AirTest | None = None, times: TimeTest | None = None
+) -> Check:
     """Is annual aberration in the directions, and refraction where there is air?"""
     declared = str(obs.meta.get("directions", "undeclared"))
     name, bound = "Catalogue directions", "apparent"
     seen = air(obs)
+    wrong = [] if times is None else [_time_words(obs, times)]
     if found is not None and found.is_air:
-        value, remedy = f"refraction, p = {significant(found.p_value)}", f"{CALIBRATE} --site SITE"
-        return Check(name, Question.TRUSTWORTHY, Level.FAIL, value, bound, air_words(obs, found), remedy)
+        wrong.append(
+            (f"refraction, p = {significant(found.p_value)}", air_words(obs, found), f"{CALIBRATE} --site SITE")
+        )
+    if wrong:
+        values, sentences, remedies = zip(*wrong, strict=True)
+        remedy = next(filter(None, remedies), "")
+        small = times is not None and len(wrong) == 1 and times.moves_sigma < _SMALL_SIGMA
+        level = Level.WARN if small else Level.FAIL
+        return Check(name, Question.TRUSTWORTHY, level, "; ".join(values), bound, " ".join(sentences), remedy)
     if declared == "apparent" and seen == "unknown":
         sentence = f"Aberration is in the directions, refraction is not. {conditional_words(cal)} {REMEDY}"
         return Check(name, Question.TRUSTWORTHY, Level.WARN, "without refraction", bound, sentence, AIR_REMEDY)
@@ -78,6 +93,31 @@ def air_words(obs: Observations, found: AirTest) -> str:
     seen = {"corrected": "Check site, pressure and times", "none": "They are declared to hold all there is: check that"}
     asked = seen.get(air(obs), "State the site (--site)")
     return f"{first} {asked}; the residuals point to {place.words} ({ends})."
+
+
+def _time_words(obs: Observations, found: TimeTest) -> tuple[str, str, str]:
+    """Value, sentence and remedy of a time, or an epoch, that is not that of the stars."""
+    effect = f"it moves {found.moves} by {significant(found.moves_sigma)} sigma"
+    unit = {"epoch": "years", "date": "days", "hour": "hours"}.get(found.cause, "")
+    later = f"{significant(abs(found.later))} ± {significant(found.later_std)} {unit}"
+    later += " later" if found.later > 0.0 else " earlier"
+    if found.cause == "epoch":
+        sentence = f"By proper motion the stars are those of an epoch {later} than that of the directions: {effect}."
+        return f"epoch {later}", f"{sentence} Correct the times, or give directions of the epoch of the images.", ""
+    if found.cause == "no aberration":
+        sentence = f"The residuals hold annual aberration that the directions do not: {effect}."
+        if obs.time_utc is None:
+            return "no aberration", f"{sentence} Give the times (column time_utc).", ""
+        return "no aberration", sentence, f"{CALIBRATE} --directions catalogue"
+    if found.cause == "aberration twice":
+        sentence = f"The directions hold annual aberration twice: {effect}."
+        return "aberration twice", sentence, f"{CALIBRATE} --directions apparent"
+    what, other = "Annual aberration", ""
+    if found.cause == "hour":
+        east = _HOUR_DEG * found.later
+        what, other = "Refraction", f", or a site {significant(abs(east))}° further {'east' if east > 0.0 else 'west'}"
+    sentence = f"{what} in the residuals is that of times {later} than stated{other}: {effect}."
+    return f"times {later}", f"{sentence} Correct the times, which are UTC (column time_utc).", ""
 
 
 def aberration_words(cal: Calibration) -> str:

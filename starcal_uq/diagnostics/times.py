@@ -1,0 +1,227 @@
+"""Do the residuals ask for another time, or for an epoch other than that of the directions?
+
+A wrong time moves the stars of a table in ways that are known. Proper motion: by years. Annual aberration: by the
+Earth's velocity of another day, or by all of it where it is missing or was applied twice. Refraction at a site: towards
+the zenith of another hour. Each is tried; what attitudes and parameters cannot take up of it is fitted to the residuals
+with a factor that has to be one, and whose scatter from star to star and from frame to frame, and not only the noise,
+says how well it is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal, TypeAlias
+
+import numpy as np
+
+from starcal_uq.core.constants import ARCSEC, LIGHT_SPEED_KM_S
+from starcal_uq.core.settings import bounded
+from starcal_uq.core.times import FIRST_YEAR, LAST_YEAR
+from starcal_uq.core.types import FloatArray, IntArray, StrArray
+from starcal_uq.diagnostics.air import Remainder
+from starcal_uq.estimation.star_errors import star_numbers
+from starcal_uq.sky.apparent import earth_velocity_km_s
+from starcal_uq.sky.catalogue import load_catalogue
+from starcal_uq.sky.refraction import refraction_constants, site_among_stars
+from starcal_uq.sky.site import Site
+
+if TYPE_CHECKING:
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.observations.table import Observations
+
+Cause: TypeAlias = Literal["epoch", "no aberration", "aberration twice", "date", "hour"]
+
+# A factor is significant from so many of its errors on, and one within so many.
+_SIGNIFICANT, _ONE = 6.0, 3.5
+_MAX_MAG, _SAME_STAR_RAD = 8.0, 60.0 / ARCSEC
+_LONGEST_YEARS = 250.0
+# Other dates and hours, in days and hours.
+_DATES = np.arange(-180.0, 181.0, 4.0)
+_HOURS = np.arange(-14.0, 14.1, 0.25)
+_HOUR_DEG = 15.041
+_LOWEST = np.sin(np.radians(5.0))
+
+
+@dataclass(frozen=True)
+class TimeTest:
+    """What a wrong time has done to the directions.
+
+    Attributes
+    ----------
+    cause : {"epoch", "no aberration", "aberration twice", "date", "hour"}
+        Proper motion to another epoch, annual aberration that is missing, applied twice or of another date, or
+        refraction of another hour.
+    later, later_std : float
+        How much later the stars were seen than the directions are for, and its standard error: years of an epoch, days
+        of a date, hours of an hour; NaN for the others.
+    factor, factor_std : float
+        The effect of that, fitted, in units of itself (of an epoch: of one year), and its standard error.
+    moves : str
+        The parameter that it moves most.
+    moves_sigma : float
+        By how many of its standard deviations.
+    """
+
+    cause: Cause
+    later: float
+    later_std: float
+    factor: float
+    factor_std: float
+    moves: str
+    moves_sigma: float
+
+
+@dataclass(frozen=True)
+class _Moved:
+    """A cause with the moves of the stars for each offset: shifts (g, 2, N) of images, offsets (g,)."""
+
+    cause: Cause
+    shifts: FloatArray
+    later: FloatArray
+
+
+@bounded
+def time_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> TimeTest | None:
+    """Look for a wrong time in the residuals of a calibration.
+
+    Parameters
+    ----------
+    obs, cal
+        The data and the estimate made from them.
+    seed : int
+        Seed of the choice of frames, where there are many.
+
+    Returns
+    -------
+    TimeTest or None
+        The slip that explains most; None where none is seen.
+    """
+    rest = Remainder(obs, cal, seed)
+    numbers = star_numbers(rest.obs, cal.camera.focal_px)
+    frames = np.repeat(np.arange(rest.obs.n_frames), rest.likelihood.frames.sizes)
+    best, most = None, 0.0
+    for moved in _causes(rest):
+        columns, absorbed = rest.left(moved.shifts)
+        size = np.einsum("gi,gi->g", columns, columns)
+        along = columns @ rest.residuals
+        with np.errstate(all="ignore"):
+            gain = np.nan_to_num(along**2 / size if moved.cause == "epoch" else 2.0 * along - size)
+        i = int(np.argmax(gain))
+        if gain[i] <= most:
+            continue
+        factor, std = _fitted(columns[i], rest, (numbers, frames))
+        later, later_std = float(moved.later[i]), np.nan
+        if moved.cause == "epoch":
+            later, later_std = factor, std
+            good = abs(factor) < _LONGEST_YEARS
+        else:
+            good = abs(factor - 1.0) < _ONE * std
+            if moved.cause in ("date", "hour"):
+                a, b = max(i - 1, 0), min(i + 1, len(size) - 1)
+                slope = (columns[b] - columns[a]) / (moved.later[b] - moved.later[a])
+                step, later_std = _fitted(slope, rest, (numbers, frames), rest.residuals - columns[i])
+                later += step
+        if good and abs(factor) > _SIGNIFICANT * std:
+            shift = np.abs(absorbed[i] * (factor if moved.cause == "epoch" else 1.0)) / cal.sigmas
+            worst = int(np.argmax(shift))
+            name, size_sigma = cal.parameter_names[worst], float(shift[worst])
+            best = TimeTest(moved.cause, later, later_std, factor, std, name, size_sigma)
+            most = float(gain[i])
+    return best
+
+
+def _fitted(
+    column: FloatArray, rest: Remainder, groups: tuple[IntArray, ...], residuals: FloatArray | None = None
+) -> tuple[float, float]:
+    """The factor of a column, and the largest of its errors: by noise, and left out star by star or frame by frame."""
+    residuals = rest.residuals if residuals is None else residuals
+    size = float(column @ column)
+    if not size > 0.0:
+        return 0.0, np.inf
+    factor = float(column @ residuals) / size
+    errors = [rest.sigma / np.sqrt(size)]
+    left = (column * (residuals - factor * column)).reshape(2, -1).sum(axis=0)
+    own = (column**2).reshape(2, -1).sum(axis=0)
+    for group in groups:
+        share = np.minimum(np.bincount(group, own) / size, 1.0 - 1e-12)
+        errors.append(float(np.linalg.norm(np.bincount(group, left) / (1.0 - share))) / size)
+    return factor, float(max(errors))
+
+
+def _causes(rest: Remainder) -> Iterator[_Moved]:
+    obs = rest.obs
+    frames = rest.likelihood.frames
+
+    def seen(moves: FloatArray) -> FloatArray:
+        """Shifts of images by moves (3, N), ICRS axes."""
+        turned = rest.state.rotations[np.repeat(np.arange(frames.n_frames), frames.sizes)]
+        return rest.shift(np.einsum("nij,jn->in", turned, moves))
+
+    yield _Moved("epoch", seen(_proper_motion(obs))[None], np.zeros(1))
+    # One and the same for all stars of a frame, so that three columns hold the velocities of all candidates.
+    basis = np.stack([seen(np.repeat(np.eye(3)[:, i : i + 1], frames.n_stars, axis=1)) for i in range(3)])
+
+    def aberrated(cause: Cause, velocities: FloatArray, later: FloatArray) -> _Moved:
+        """By velocities (g, K, 3), km/s."""
+        spread = np.repeat(velocities / LIGHT_SPEED_KM_S, frames.sizes, axis=1)
+        return _Moved(cause, np.einsum("gni,ixn->gxn", spread, basis), later)
+
+    apparent = obs.meta.get("directions") == "apparent"
+    first = obs.frame_starts[:-1]
+    stated = np.full(len(first), "") if obs.time_utc is None else obs.time_utc[first]
+    timed = bool((stated != "").all())
+    times = (stated if timed else np.full(len(first), "2026-01-01")).astype("datetime64[m]")
+    velocities = _velocities(times, _DATES)
+    nothing = np.full(len(_DATES), np.nan)
+    # Without times any date may be that of all frames.
+    now = velocities[np.flatnonzero(_DATES == 0.0)] if timed else velocities
+    yield aberrated("no aberration", now, nothing[: len(now)])
+    if apparent:
+        yield aberrated("aberration twice", -now, nothing[: len(now)])
+    if apparent and timed:
+        yield aberrated("date", velocities - now, _DATES)
+    if "site" in obs.meta and apparent and timed:
+        yield from _other_hours(rest, Site.from_dict(obs.meta["site"]), stated)
+
+
+def _proper_motion(obs: Observations) -> FloatArray:
+    """Proper motion (3, N) of the stars that the embedded catalogue has, rad a year."""
+    from scipy.spatial import cKDTree
+
+    stars = load_catalogue(max_mag=_MAX_MAG)
+    distance, place = cKDTree(stars.directions_icrs).query(obs.directions_icrs)
+    near = stars.select(place)
+    ahead = stars.select(place).at_epoch(stars.epoch + 1.0).directions_icrs - near.directions_icrs
+    return np.where(distance < _SAME_STAR_RAD, ahead.T, 0.0)
+
+
+def _velocities(times: np.ndarray, days: FloatArray) -> FloatArray:
+    """Velocity of the Earth (g, K, 3), km/s, so many days after some times."""
+    day, first, last = np.timedelta64(1, "D"), *(np.datetime64(f"{year}-01-01") for year in (FIRST_YEAR, LAST_YEAR))
+    start = max(times.min() - 200 * day, first)
+    known = np.arange(0.0, (min(times.max() + 200 * day, last) - start) / day)
+    table = earth_velocity_km_s(start + known.astype("timedelta64[D]"))
+    at = (times - start) / day + days[:, None]
+    return np.stack([np.interp(at, known, axis) for axis in table.T], axis=-1)
+
+
+def _other_hours(rest: Remainder, site: Site, times: StrArray) -> Iterator[_Moved]:
+    """Refraction towards the zenith of other hours, in the place of that of the stated ones."""
+    frames, state = rest.likelihood.frames, rest.state
+    constants = refraction_constants(site)
+
+    def raised(hours: float) -> FloatArray | None:
+        east = (site.longitude_deg + _HOUR_DEG * hours + 180.0) % 360.0 - 180.0
+        zenith = site_among_stars(replace(site, longitude_deg=east), times)[0]
+        up = frames.spread(np.ascontiguousarray(np.einsum("kij,kj->ik", state.rotations, zenith)))
+        sine = np.sum(up * state.b, axis=0)
+        if sine.min() < _LOWEST:
+            return None
+        a, b = constants
+        return rest.shift(up * ((a + b * (1.0 / sine**2 - 1.0)) / sine))
+
+    stated = raised(0.0)
+    found = [] if stated is None else [(h, s - stated) for h in _HOURS if (s := raised(h)) is not None]
+    if found:
+        yield _Moved("hour", np.stack([shift for _, shift in found]), np.array([hours for hours, _ in found]))

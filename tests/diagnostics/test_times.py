@@ -1,0 +1,161 @@
+"""A wrong time is named by what it does to the directions; good tables, however hard, are not blamed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import datetime, timedelta
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+import starcal_uq as sc
+from starcal_uq.core.status import Level
+from starcal_uq.diagnostics import time_test
+from starcal_uq.diagnostics.verdict import observed
+from starcal_uq.sky.apparent import make_apparent
+from tests.helpers.outside import frame_at
+
+DAYS, LATITUDE, LONGITUDE, EPOCH = 9813.0, 38.0, -70.0, 2026.87
+SITE = sc.sky.Site(LATITUDE, LONGITUDE)
+CATALOGUE = sc.load_catalogue(max_mag=7.0)
+
+
+def earth(days):
+    """The Earth's velocity (km/s) from its elliptical orbit, days since J2000."""
+    anomaly = np.radians(357.528 + 0.9856003 * days)
+    longitude = np.radians(280.46 + 0.9856474 * days + 1.915 * np.sin(anomaly))
+    perihelion, tilt = np.radians(282.9), np.radians(23.439)
+    along = 29.785 * np.array(
+        [np.sin(longitude) + 0.0167 * np.sin(perihelion), -np.cos(longitude) - 0.0167 * np.cos(perihelion)]
+    )
+    return np.array([along[0], along[1] * np.cos(tilt), along[1] * np.sin(tilt)])
+
+
+@lru_cache(maxsize=4)
+def seen(seed, *, n_frames=30, field_deg=12.0, sigma_px=0.05, years=0.0, air=0.0):
+    """A table of catalogue directions and true times, pixels as a moving observer saw them; the proper motion alone is
+    of the package's catalogue."""
+    rng = np.random.default_rng(seed)
+    focal, half = 512.0 / np.tan(np.radians(0.5 * field_deg)), 724.0
+    table, now = (CATALOGUE.at_epoch(EPOCH + late).directions_icrs for late in (0.0, years))
+    rows = []
+    while len(rows) < n_frames:
+        days = DAYS + 0.125 * len(rows) / n_frames
+        sidereal, latitude = np.radians(280.46062 + 360.98564737 * days + LONGITUDE), np.radians(LATITUDE)
+        zenith = np.array([*(np.cos(latitude) * np.array([np.cos(sidereal), np.sin(sidereal)])), np.sin(latitude)])
+        where = rng.standard_normal(3)
+        where /= np.linalg.norm(where)
+        if air and where @ zenith < 0.5:
+            continue
+        attitude = frame_at(rng, where)
+        near = np.flatnonzero(now @ where > np.cos(np.radians(0.72 * field_deg)))
+        b = now[near] + earth(days) / 299792.458
+        b /= np.linalg.norm(b, axis=1)[:, None]
+        if air:
+            sine = b @ zenith
+            level = zenith - sine[:, None] * b
+            cosine = np.linalg.norm(level, axis=1)
+            tangent = cosine / sine
+            for _ in range(3):
+                raised = np.radians((58.276 * tangent - 0.0824 * tangent**3) / 3600.0)
+                tangent = np.tan(np.arctan2(cosine, sine) - raised)
+            b = b * np.cos(raised)[:, None] + level / cosine[:, None] * np.sin(raised)[:, None]
+        b = b @ attitude.T
+        d = focal * b[:, :2].T / b[:, 2]
+        xy = d * (1.0 + 3.0 / half**3 * np.sum(d**2, axis=0)) + np.array([[500.0], [530.0]])
+        xy += sigma_px * rng.standard_normal(xy.shape)
+        inside = np.flatnonzero((xy.min(axis=0) > 0.0) & (xy.max(axis=0) < 1023.0))[:20]
+        if len(inside) > 5:
+            r = table[near[inside]].T
+            ra, dec = np.degrees(np.arctan2(r[1], r[0])) % 360.0, np.degrees(np.arcsin(r[2]))
+            time = (datetime(2000, 1, 1, 12) + timedelta(days=days)).isoformat(timespec="seconds")
+            rows.append((np.full(len(inside), len(rows)), *xy[:, inside], ra, dec, np.full(len(inside), time)))
+    names = ("frame", "x_px", "y_px", "ra_deg", "dec_deg", "time_utc")
+    obs = sc.Observations(**dict(zip(names, map(np.concatenate, zip(*rows, strict=True)), strict=True)))
+    return obs, sc.Camera(1024, 1024, 10.0, 0.0101 * focal, 511.5, 511.5)
+
+
+def stated(obs, hours):
+    """The table with times that are so much too early."""
+    times = obs.time_utc.astype("datetime64[s]") - np.timedelta64(round(3600 * hours), "s")
+    return replace(obs, time_utc=times.astype(str))
+
+
+SLIPS = {
+    "date": ({}, lambda obs: make_apparent(stated(obs, 24 * 60)), "date", 60.0),
+    "hour": ({"air": 1.0}, lambda obs: make_apparent(stated(obs, 1.0), site=SITE), "hour", 1.0),
+    "J2000": ({"years": 26.9}, make_apparent, "epoch", 26.9),
+    "a century": ({"years": -100.0}, make_apparent, "epoch", -100.0),
+    "undeclared": ({}, lambda obs: replace(obs, time_utc=None), "no aberration", None),
+    "wrongly declared": ({}, lambda obs: obs.with_meta(directions="apparent"), "no aberration", None),
+    "twice": (
+        {},
+        lambda obs: make_apparent(make_apparent(obs).with_meta(directions="catalogue")),
+        "aberration twice",
+        None,
+    ),
+}
+
+
+@pytest.mark.parametrize("slip", SLIPS)
+def test_a_wrong_time_is_named(slip):
+    sky, change, cause, later = SLIPS[slip]
+    obs, camera = seen(1, **sky)
+    obs = change(obs)
+    cal = sc.calibrate(obs, camera)
+    found = time_test(obs, cal)
+    assert found.cause == cause
+    if later is not None:
+        # Years are half a century's rate at the ends of a century.
+        assert abs(found.later - later) < 3.5 * found.later_std < 0.6 * abs(later)
+    check = observed.directions(obs, cal, None, found)
+    assert check.level is (Level.FAIL if found.moves_sigma > 1.0 else Level.WARN)
+    words = {"date": "days later than stated", "hour": "further east", "epoch": "By proper motion"}
+    assert words.get(cause, "annual aberration") in check.sentence
+
+
+def hard(obs, kind, rng):
+    """The table with what looks like something else."""
+    u, v = (obs.x_px - 512.0) / 512.0, (obs.y_px - 512.0) / 512.0
+    n, frame = len(u), obs.frame
+    dx, dy, d_dec = np.zeros((3, n))
+    if kind == "focal":
+        dx, dy = 0.15 * rng.standard_normal(frame.max() + 1)[frame] * np.array([u, v])
+    elif kind == "drift":
+        dx, dy = 0.5 * (frame / (frame.max() + 1) - 0.5) * np.array([u, v])
+    elif kind == "shape":
+        dx, dy = 0.3 * np.sin(6.0 * u), 0.3 * np.cos(5.0 * v)
+    elif kind == "stars":
+        own = np.unique(np.round(obs.directions_icrs, 7), axis=0, return_inverse=True)[1].ravel()
+        d_dec = rng.standard_normal(own.max() + 1)[own] / 3600.0
+    elif kind == "wrong":
+        dx = np.where(rng.random(n) < 0.03, rng.normal(0.0, 5.0, n), 0.0)
+    elif kind == "tails":
+        dx, dy = 0.1 * rng.standard_t(2.5, (2, n))
+    x, y = (np.clip(a, 0.0, 1023.0) for a in (obs.x_px + dx, obs.y_px + dy))
+    return replace(obs, x_px=x, y_px=y, dec_deg=obs.dec_deg + d_dec)
+
+
+HARD = ("", "focal", "drift", "shape", "stars", "wrong", "tails")
+
+
+def blamed(seed, kind, **conditions):
+    obs, camera = seen(seed, **conditions)
+    obs = hard(make_apparent(obs, site=SITE if conditions.get("air") else None), kind, np.random.default_rng(seed))
+    return time_test(obs, sc.calibrate(obs, camera, duplicates="keep"))
+
+
+@pytest.mark.parametrize("kind", ["", "focal", "shape", "stars"])
+def test_control_a_right_time_is_not_blamed(kind):
+    assert blamed(2, kind, n_frames=10, air=1.0) is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", HARD)
+def test_control_no_good_table_is_blamed(kind):
+    for seed in range(10, 18):
+        rng = np.random.default_rng(seed)
+        field, noise, n = rng.choice([5.0, 12.0, 25.0]), rng.choice([0.02, 0.1, 0.3]), int(rng.choice([3, 8, 25]))
+        found = blamed(seed, kind, n_frames=n, field_deg=field, sigma_px=noise, air=float(seed % 2))
+        assert found is None, found
