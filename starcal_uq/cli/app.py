@@ -42,10 +42,12 @@ def _main() -> None:
     from typer import Abort, Exit
     from typer.exceptions import TyperException
 
+    from starcal_uq.cli.answers import begin
     from starcal_uq.cli.commands import app, usage_sentence
     from starcal_uq.core.errors import StarcalError
     from starcal_uq.core.tasks import caught_signal, interrupt
 
+    begin()
     caught_signal()
     _catch(interrupt)
     # Imports and figures make a million objects that live as long as the command; to look through them every 700 new
@@ -100,8 +102,11 @@ def _again(unraisable: Any) -> None:
 
 
 def _fail(message: str, status: int) -> None:
+    from starcal_uq.cli.answers import deliver_error
     from starcal_uq.core.errors import printable
 
     # Names of files may hold anything, and a message is one line.
-    print(f"error: {printable(message.strip())}", file=sys.stderr)
+    sentence = printable(message.strip())
+    print(f"error: {sentence}", file=sys.stderr)
+    deliver_error(sentence, status)
     sys.exit(status)

@@ -12,10 +12,12 @@ from starcal_uq.cli import images as cli_images
 from starcal_uq.cli import mission as cli_mission
 from starcal_uq.cli import paper as cli_paper
 from starcal_uq.cli import run as cli_run
+from starcal_uq.cli import schema as cli_schema
 from starcal_uq.cli import starters as cli_starters
 from starcal_uq.cli import statistics as cli_statistics
 from starcal_uq.cli import steps as cli_steps
 from starcal_uq.cli import study as cli_study
+from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.settings import unfolded
 from starcal_uq.core.files import shown
 from starcal_uq.core.settings import wanted
@@ -49,7 +51,7 @@ def common(
 
 
 # What one wants -> the commands, in the order of the help.
-GROUPS: Mapping[str, list[Callable[..., None]]] = {
+GROUPS: Mapping[str, list[Callable[..., Answer]]] = {
     "All at once": [cli_run.demo, cli_run.run_command],
     "Before there are data": [
         cli_starters.new_command,
@@ -76,11 +78,12 @@ GROUPS: Mapping[str, list[Callable[..., None]]] = {
         cli_filter.filter_command,
     ],
     "The paper": [cli_paper.reproduce_command, cli_paper.reproduce_field_command],
+    "For programs": [cli_schema.schema_command],
 }
 for group, commands in GROUPS.items():
     for command in commands:
         name = command.__name__.removesuffix("_command").replace("_", "-")
-        app.command(name, rich_help_panel=group)(unfolded(command))
+        app.command(name, rich_help_panel=group)(unfolded(name, command))
 
 
 def usage_sentence(error: Exception) -> str:

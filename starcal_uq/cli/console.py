@@ -1,16 +1,13 @@
-"""Results as tables in the terminal and as JSON."""
+"""Results as tables and sentences in the terminal."""
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-import numpy as np
-import typer
 from rich.console import Console
 from rich.table import Table
 
@@ -18,7 +15,6 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.core.formatting import plural, significant
 from starcal_uq.core.status import Level
 from starcal_uq.core.tasks import Progress
-from starcal_uq.core.types import AnyDict
 from starcal_uq.presentation.tables import TextTable
 
 if TYPE_CHECKING:
@@ -38,35 +34,30 @@ _IN_NOTEBOOK = "JPY_PARENT_PID" in os.environ
 # Where the output is not a terminal it has no width of its own; tables then get the room they need.
 _WIDTH = None if sys.stdout.isatty() and not _IN_NOTEBOOK else 110
 _STYLES = {Level.PASS: "green", Level.WARN: "yellow", Level.FAIL: "red"}
-# Names of files, runs and requirements may hold square brackets, which are no markup.
-out = Console(width=_WIDTH, markup=False)
-err = Console(stderr=True, markup=False)
+# Names of files, runs and requirements may hold square brackets and colons, which are no markup.
+out = Console(width=_WIDTH, markup=False, emoji=False, highlight=False)
+err = Console(stderr=True, markup=False, emoji=False, highlight=False)
 
 
-def print_json(value: Any) -> None:
-    """Plain JSON on standard output, nothing else."""
-    print(json.dumps(_plain(value), indent=1, allow_nan=False))
+def say(words: str, style: str | None = None) -> None:
+    """A sentence, or a few lines, of the answer: on standard output."""
+    out.print(words, style=style, soft_wrap=True)
 
 
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [_plain(v) for v in value]
-    if isinstance(value, (float, np.floating)):
-        # JSON has no NaN or infinity; null says "not known" to every reader.
-        return float(value) if np.isfinite(value) else None
-    if isinstance(value, np.integer):
-        return int(value)
-    if isinstance(value, np.bool_):
-        return bool(value)
-    return value
+def tell(words: str) -> None:
+    """What a user should know beside the answer: on standard error; notes and warnings in colour."""
+    kind = words.partition(":")[0]
+    err.print(words, style={"note": "yellow", "warning": "yellow", "violated": "red"}.get(kind), soft_wrap=True)
 
 
-def records(frame: pd.DataFrame) -> list[AnyDict]:
-    """A data frame as a list of rows."""
-    rows: list[AnyDict] = frame.to_dict(orient="records")
-    return rows
+@contextmanager
+def quiet(wanted: bool) -> Iterator[None]:
+    """Keep standard output free for a document."""
+    out.quiet = wanted
+    try:
+        yield
+    finally:
+        out.quiet = False
 
 
 def show_calibration(calibration: Calibration, truth: Camera | None = None) -> None:
@@ -75,9 +66,9 @@ def show_calibration(calibration: Calibration, truth: Camera | None = None) -> N
     from starcal_uq.presentation.words.estimation import calibration_table, fitted_noise_text, focal_length
 
     print_table(calibration_table(calibration, truth))
-    out.print(f"Focal length {focal_length(calibration)}. Status: {calibration.status.name.lower()}.")
+    say(f"Focal length {focal_length(calibration)}. Status: {calibration.status.name.lower()}.")
     for words in filter(None, (fitted_noise_text(calibration).strip(), fallback_words(calibration))):
-        out.print(words, highlight=False, soft_wrap=True)
+        say(words)
 
 
 def show_posterior(posterior: Posterior) -> None:
@@ -87,12 +78,12 @@ def show_posterior(posterior: Posterior) -> None:
     print_table(posterior_table(posterior))
     diagnostics = posterior.diagnostics
     for check in diagnostics.checks:
-        out.print(f"- {check}", style=_STYLES[check.level], highlight=False, soft_wrap=True)
+        say(f"- {check}", style=_STYLES[check.level])
 
 
 def note(message: str) -> None:
     """Tell what a user should know, on standard error."""
-    err.print(f"note: {message}", style="yellow", highlight=False, soft_wrap=True)
+    tell(f"note: {message}")
 
 
 def print_table(table: TextTable) -> None:
@@ -114,7 +105,7 @@ def show_coupling(coupling: Coupling) -> None:
     print_table(coupling_table(coupling))
     print_table(correlation_table(coupling))
     for direction in coupling.weak_directions:
-        out.print(f"- {direction.words}", highlight=False, soft_wrap=True)
+        say(f"- {direction.words}")
 
 
 def show_attitude(error: AttitudeError) -> None:
@@ -131,22 +122,16 @@ def show_table(frame: pd.DataFrame, title: str, columns: Sequence[str] | None = 
 
 def show_screening(screening: Screening) -> None:
     """What was left out, by reason, and what a user should look at."""
-    out.print(screening.text, highlight=False, soft_wrap=True)
+    say(screening.text)
 
 
 def show_verdict(verdict: Verdict) -> None:
     """The headline, and every check that did not pass."""
     style = _STYLES[verdict.level]
-    out.print(f"Verdict ({verdict.level.value}): {verdict.headline}", style=style, highlight=False, soft_wrap=True)
+    say(f"Verdict ({verdict.level.value}): {verdict.headline}", style=style)
     for check in verdict.checks:
         if check.level is not Level.PASS:
-            out.print(f"- {check}", highlight=False, soft_wrap=True)
-
-
-def end_with(level: Level) -> None:
-    """End the command with the exit status of a level, where that is not 0."""
-    if level.exit_status:
-        raise typer.Exit(level.exit_status)
+            say(f"- {check}")
 
 
 def warn_air(obs: Observations | PartitionedObservations, cal: Calibration) -> None:
@@ -154,7 +139,7 @@ def warn_air(obs: Observations | PartitionedObservations, cal: Calibration) -> N
     from starcal_uq.diagnostics.verdict.observed import REMEDY, air, conditional_words
 
     if air(obs) == "unknown":
-        err.print(f"warning: {conditional_words(cal)} {REMEDY}", style="yellow", highlight=False, soft_wrap=True)
+        tell(f"warning: {conditional_words(cal)} {REMEDY}")
 
 
 def warn_undeclared(obs: Observations | PartitionedObservations, camera: Camera) -> None:
@@ -166,20 +151,20 @@ def warn_undeclared(obs: Observations | PartitionedObservations, camera: Camera)
             f"warning: Neither time nor observer velocity was declared: annual aberration {aberration_size(camera)}. "
             "Declare --directions apparent, or --directions catalogue with a time_utc column."
         )
-        err.print(words, style="yellow", highlight=False, soft_wrap=True)
+        tell(words)
     floor = obs.meta.get("noise_floor_px")
     if floor:
         words = (
             f"note: even bright stars scatter by {significant(floor)} px; this was added to the noise of every star."
         )
-        err.print(words, highlight=False, soft_wrap=True)
+        tell(words)
     low = obs.meta.get("low_stars", 0)
     if low:
         words = f"note: {plural(int(low), 'star')} left out, because they stood lower than 10 degrees."
-        err.print(words, highlight=False, soft_wrap=True)
+        tell(words)
     ignored = obs.meta.get("ignored_columns")
     if ignored:
-        err.print(f"note: columns not used: {', '.join(ignored)}", highlight=False, soft_wrap=True)
+        tell(f"note: columns not used: {', '.join(ignored)}")
 
 
 @contextmanager

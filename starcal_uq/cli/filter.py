@@ -8,13 +8,13 @@ from typing import Annotated
 import typer
 
 import starcal_uq as sc
-from starcal_uq.cli.console import print_json, records, show_calibration
+from starcal_uq.cli.answers import Answer
+from starcal_uq.cli.console import say, show_calibration
 from starcal_uq.cli.options import (
     LEAST_SIGMA_PX,
     CameraFile,
     Columns,
     Force,
-    Json,
     NewRun,
     number,
     parse_columns,
@@ -61,8 +61,7 @@ def filter_command(
     ] = None,
     column: Columns = None,
     force: Force = False,
-    json: Json = False,
-) -> None:
+) -> Answer:
     """Calibrate frame by frame, with an estimate after each; stars may exceed memory, an interrupted call goes on."""
     from starcal_uq.runs.folder import HISTORY
     from starcal_uq.runs.streams import filter_run
@@ -83,8 +82,6 @@ def filter_command(
         columns=parse_columns(column),
         force=force,
     )
-    if json:
-        print_json({"status": calibration.status.name, "parameters": records(calibration.to_dataframe())})
-    else:
-        show_calibration(calibration, None)
-        print(f"Run folder: {out}; estimates after every frame: {out / HISTORY}. Next: starcal-uq sample {out}")
+    show_calibration(calibration, None)
+    say(f"Run folder: {out}; estimates after every frame: {out / HISTORY}. Next: starcal-uq sample {out}")
+    return Answer({"run": out, "history": out / HISTORY, "calibration": calibration})

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 import starcal_uq as sc
-from starcal_uq.cli.console import err, note, print_json, print_table, progress_bar, records, warn_undeclared
+from starcal_uq.cli.answers import Answer
+from starcal_uq.cli.console import note, print_table, progress_bar, say, tell, warn_undeclared
 from starcal_uq.cli.options import (
     BayerMosaic,
     Engine,
     Force,
-    Json,
     OptionalCamera,
     TimeUtc,
     check_names,
@@ -76,8 +75,7 @@ def centroid_command(
         int | None, number("workers", "Processes; as many as processors from a hundred images on, 0 for this one.")
     ] = None,
     force: Force = False,
-    json: Json = False,
-) -> None:
+) -> Answer:
     """Find the stars in images, with a covariance for each; a frame that cannot be used is named and left out.
 
     An interrupted command over a hundred images or more goes on.
@@ -110,13 +108,11 @@ def centroid_command(
     found = with_time(found, time)
     found.save(out, force=force)
     shutil.rmtree(keep, ignore_errors=True)
-    if json:
-        print_json({"summary": found.text, "frames": records(found.frames_dataframe())})
-    else:
-        _say(counted(found.messages))
-        print(f"{found.text} Table: {out}")
-    if found.n_left_out == found.n_frames:
-        raise typer.Exit(1)
+    for message in counted(found.messages):
+        note(message)
+    say(f"{found.text} Table: {out}")
+    results = {"table": out, "frames": found.frames_dataframe(), "text": found.text}
+    return Answer(results, int(found.n_left_out == found.n_frames))
 
 
 def identify_command(
@@ -150,8 +146,7 @@ def identify_command(
     *,
     place: PlaceSettings,
     force: Force = False,
-    json: Json = False,
-) -> None:
+) -> Answer:
     """Identify the stars of every frame without knowing where the camera pointed; frames that do not fit are named.
 
     The stars are identified with the nominal camera and again with what they tell of it, as `run` does.
@@ -185,7 +180,7 @@ def identify_command(
             },
             known=known,
             lenient=True,
-            tell=lambda message: err.print(message, style=_style(message), highlight=False, soft_wrap=True),
+            tell=tell,
             **place.options(),
         )
     if obs is not None:
@@ -201,16 +196,12 @@ def identify_command(
         if start is not nominal and known is None:
             start.save(sheet, force=force)
             note(f"the camera to calibrate these stars with is {sheet}.")
-    if json:
-        print_json({"summary": found.text, "frames": records(found.to_dataframe())})
-    else:
-        if len(found.frames) <= MOST_FRAMES:
-            print_table(identification_table(found))
-        several = out.suffix == ".corr" and obs is not None and obs.n_frames > 1
-        table_name = out.with_name(f"{out.stem}_*.corr") if several else out
-        print(f"{found.text}{f' Table: {table_name}' if obs is not None else ''}")
-    if not found.n_identified:
-        raise typer.Exit(1)
+    if len(found.frames) <= MOST_FRAMES:
+        print_table(identification_table(found))
+    several = out.suffix == ".corr" and obs is not None and obs.n_frames > 1
+    written = None if obs is None else out.with_name(f"{out.stem}_*.corr") if several else out
+    say(f"{found.text}{'' if written is None else f' Table: {written}'}")
+    return Answer({"table": written, "frames": found.frames, "text": found.text}, int(not found.n_identified))
 
 
 def inspect_command(
@@ -240,8 +231,7 @@ def inspect_command(
         ),
     ] = None,
     force: Force = False,
-    json: Json = False,
-) -> None:
+) -> Answer:
     """Look at the frames of a run: their stars identified, rejected, expected and missed, and what to do next."""
     from starcal_uq.presentation.words.images import frame_text
 
@@ -250,12 +240,10 @@ def inspect_command(
     held = sc.Run(run, tell=note)
     chosen = held.inspect(*(frames or ()), most=most, images=images)
     page = held.keep_frames(chosen, force=force) if out is None else sc.report(chosen, out)
-    if json:
-        print_json({"page": str(page), "frames": records(chosen.to_dataframe())})
-    else:
-        for frame in chosen if frames else ():
-            print(frame_text(frame))
-        print(f"{chosen.text} Page: {page}")
+    for frame in chosen if frames else ():
+        say(frame_text(frame))
+    say(f"{chosen.text} Page: {page}")
+    return Answer({"run": run, "page": page, "frames": chosen.to_dataframe(), "text": chosen.text})
 
 
 def load_images(
@@ -277,14 +265,14 @@ def load_images(
             focal_tolerance=0.03 if settings.focal_tolerance is None else settings.focal_tolerance,
             engine=settings.engine or "pyramid",
             workers=None,
-            tell=lambda message: err.print(message, style=_style(message), highlight=False, soft_wrap=True),
+            tell=tell,
             progress=progress,
             keep=keep,
             **known,
         )
     _say_epoch(centroids, settings.epoch)
     for words in (found.identification.text, found.text):
-        err.print(words, highlight=False, soft_wrap=True)
+        tell(words)
     _say_disturbed(obs)
     # Of mirrored images x is counted from the right edge, and so is this camera's.
     nominal = found.rounds[0][0].nominal
@@ -294,18 +282,9 @@ def load_images(
 
 def _say_epoch(centroids: Centroids, epoch: float | None) -> None:
     if epoch is None and not (centroids.time_utc != "").any():
-        _say(("the images have no time: the stars are taken where they were in 2016; --epoch says when it was.",))
+        note("the images have no time: the stars are taken where they were in 2016; --epoch says when it was.")
 
 
 def _say_disturbed(obs: Observations) -> None:
     if left_out := obs.meta.get("disturbed_stars", 0):
-        err.print(f"{left_out} stars left out, because the light of a neighbour displaces them.", highlight=False)
-
-
-def _style(message: str) -> str | None:
-    return "yellow" if message.startswith("note:") else None
-
-
-def _say(messages: Sequence[str]) -> None:
-    for message in messages:
-        note(message)
+        tell(f"{left_out} stars left out, because the light of a neighbour displaces them.")

@@ -8,14 +8,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import starcal_uq as sc
-from starcal_uq.cli.console import err, note, print_json, print_table, progress_bar, records
-from starcal_uq.cli.console import out as console
+from starcal_uq.cli.answers import Answer
+from starcal_uq.cli.console import note, print_table, progress_bar, say, tell
 from starcal_uq.cli.options import (
     LEAST_SIGMA_PX,
     CameraFile,
     Epoch,
     Force,
-    Json,
     MaxMag,
     RunPath,
     Seed,
@@ -89,8 +88,7 @@ def budget_command(
     ] = None,
     seed: Seed = 0,
     force: Force = False,
-    json: Json = False,
-) -> None:
+) -> Answer:
     """Attitude error budget in the terms of ECSS; status 1 when a requirement is violated."""
     from starcal_uq.presentation.pages.budgeting import FORMATS
     from starcal_uq.presentation.pages.write import write_page
@@ -105,8 +103,8 @@ def budget_command(
     if template is not None:
         rows = sc.budget(opened.posterior, opened.observations, opened.attitude, seed=seed).rows
         sc.budgeting.write_budget_template(template, rows, force=force)
-        print(f"Budget file to fill in: {template}. Next: starcal-uq budget {run} --file {template}")
-        return
+        say(f"Budget file to fill in: {template}. Next: starcal-uq budget {run} --file {template}")
+        return Answer({"run": run, "files": [], "template": template, "budget": None})
     # Without a question of its own, the call shows what is there.
     if opened.has("budget") and file is None and confidence is None and not force:
         found = opened.error_budget
@@ -114,12 +112,10 @@ def budget_command(
         found = opened.budget(file=file, confidence=confidence, seed=seed, force=force)
     for path in out or []:
         write_page(found, path)
-    if json:
-        print_json(found.to_dict())
-    else:
-        show_budget(found)
-        print(f"Budget: {', '.join(str(path) for path in (run / 'budget.csv', *(out or [])))}")
-    fail_if_violated(found)
+    show_budget(found)
+    files = [run / "budget.csv", *(out or [])]
+    say(f"Budget: {', '.join(map(str, files))}")
+    return Answer({"run": run, "files": files, "template": None, "budget": found}, tell_violations(found))
 
 
 def show_budget(found: Budget) -> None:
@@ -129,20 +125,18 @@ def show_budget(found: Budget) -> None:
     print_table(contributors_table(found))
     print_table(totals_table(found))
     for sentence in (*explanations(found), *found.notes):
-        console.print(sentence, highlight=False, soft_wrap=True)
+        say(sentence)
     for outcome in found.outcomes:
         style = {"violated": "red", "met": "green"}.get(outcome.verdict, "yellow")
-        console.print(outcome.text, style=style, highlight=False, soft_wrap=True)
-    console.print(found.text, highlight=False, soft_wrap=True)
+        say(outcome.text, style=style)
+    say(found.text)
 
 
-def fail_if_violated(found: Budget) -> None:
-    """Status 1, with the violated lines on standard error."""
-
+def tell_violations(found: Budget) -> int:
+    """Say which requirements are violated; exit status 1 where any is."""
     for outcome in found.violations:
-        err.print(f"violated: {outcome.text}", style="red", highlight=False, soft_wrap=True)
-    if found.violations:
-        raise typer.Exit(1)
+        tell(f"violated: {outcome.text}")
+    return int(bool(found.violations))
 
 
 def compare_command(
@@ -173,8 +167,7 @@ def compare_command(
     level: Annotated[float, number(PROBABILITY, "Probability of a verdict 'differ' when nothing does.")] = 0.01,
     seed: Seed = 0,
     force: Force = False,
-    json: Json = False,
-) -> None:
+) -> Answer:
     """Do two calibrations differ by more than chance? The rotation between them is taken out and stated."""
     from starcal_uq.presentation.pages.write import write_page
     from starcal_uq.presentation.words.comparison import comparison_table
@@ -193,13 +186,12 @@ def compare_command(
     else:
         found = sc.runs.compare_split(runs[0], split, **(options if names is None else options | {"labels": names}))
     page = None if out is None else write_page(found, out)
-    if json:
-        print_json(found.to_dict())
-        return
     print_table(comparison_table(found))
-    console.print(found.text, highlight=False, soft_wrap=True)
+    say(found.text)
     if page is not None:
-        print(f"Page: {page.resolve()}")
+        say(f"Page: {page.resolve()}")
+    own = {"page": page, "differences": found.to_dataframe(), "text": found.text, "agree": found.agree}
+    return Answer({**found.to_dict(), **own, "rotation_sigma_arcsec": found.rotation_sigma_arcsec})
 
 
 def plan_command(
@@ -258,11 +250,9 @@ def plan_command(
     epoch: Epoch = 2026.9,
     seed: Seed = 0,
     force: Force = False,
-    json: Json = False,
-) -> None:
+) -> Answer:
     """What a calibration of this camera will give, and the frames it needs, before any data."""
     from starcal_uq.planning.forecast import N_FRAMES
-    from starcal_uq.presentation.pages.planning import plan_record
     from starcal_uq.presentation.pages.write import write_page
 
     check_output(out, "plan", force)
@@ -318,33 +308,29 @@ def plan_command(
                 progress=progress,
             )
     page = None if out is None else write_page(found, out, choice=choice, check=simulated)
-    if json:
-        document = plan_record(found)
-        if choice is not None:
-            document |= {"choice": {"verdict": choice.text, "frames": records(choice.to_dataframe())}}
-        if simulated is not None:
-            document |= {"check": {"verdict": simulated.text, "table": records(simulated.to_dataframe())}}
-        print_json(document)
-    else:
-        _show_plan(found, choice, simulated)
-        if page is not None:
-            print(f"Page: {page.resolve()}")
-    if target is not None and found.frames_needed is None:
-        raise typer.Exit(1)
+    notes = _show_plan(found, choice, simulated)
+    if page is not None:
+        say(f"Page: {page.resolve()}")
+    results = {"page": page, "plan": found, "choice": choice, "check": simulated, "notes": notes}
+    return Answer(results, int(target is not None and found.frames_needed is None))
 
 
-def _show_plan(found: Plan, choice: FrameChoice | None, simulated: ForecastCheck | None) -> None:
+def _show_plan(found: Plan, choice: FrameChoice | None, simulated: ForecastCheck | None) -> list[str]:
+    """Show the plan; the sentences beside its own text."""
     from starcal_uq.presentation.words.planning import choice_table, distortion_sentence, need_sentence, plan_table
 
     print_table(plan_table(found))
-    words = [found.text, distortion_sentence(found), *(need_sentence(found, need) for need in found.needs)]
+    notes = [distortion_sentence(found), *(need_sentence(found, need) for need in found.needs)]
+    notes = [sentence for sentence in notes if sentence]
+    words = [found.text, *notes]
     if choice is not None:
         print_table(choice_table(choice))
         words.append(choice.text)
     if simulated is not None:
         words.append(simulated.text)
-    for sentence in filter(None, words):
-        console.print(sentence, highlight=False, soft_wrap=True)
+    for sentence in words:
+        say(sentence)
+    return notes
 
 
 def _known(run: Path, sheet: Camera, path: Path) -> tuple[Calibration, float | NoiseModel]:

@@ -213,7 +213,7 @@ RunPath = Annotated[
 ]
 NewRun = Annotated[Path, typer.Option("-o", "--out", metavar="RUN", help="Folder for the results.", parser=write_path)]
 Force = Annotated[bool, typer.Option("--force", help="Replace results that exist.")]
-Json = Annotated[bool, typer.Option("--json", help="Print the table as JSON.")]
+Json = Annotated[bool, typer.Option("--json", help="Answer with one JSON document: see `starcal-uq schema`.")]
 Seed = Annotated[int, number("seed", "Seed; the same seed repeats the result bit for bit.")]
 Columns = Annotated[
     list[str] | None,

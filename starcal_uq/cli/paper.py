@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from starcal_uq.cli.console import progress_bar
-from starcal_uq.cli.options import Force, Json, Seed, Workers, number, write_path
+from starcal_uq.cli.answers import Answer
+from starcal_uq.cli.console import progress_bar, say, show_table
+from starcal_uq.cli.options import Force, Seed, Workers, number, write_path
 from starcal_uq.core import settings
 
 if TYPE_CHECKING:
@@ -35,11 +36,8 @@ def reproduce_command(
     workers: Workers = None,
     seed: Seed = 2017,
     force: Force = False,
-    json: Json = False,
-) -> None:
+) -> Answer:
     """Run Ye & Yang 2017 again: each of its numbers beside ours, with the uncertainty that they lack."""
-    from starcal_uq.cli.console import out as console
-    from starcal_uq.cli.console import print_json, records, show_table
     from starcal_uq.paper.reproduction import reproduce
 
     with progress_bar("reproduction") as progress:
@@ -55,12 +53,10 @@ def reproduce_command(
             force=force,
         )
     published = found.published()
-    if json:
-        print_json({"verdict": found.text, "published": records(published)})
-    else:
-        show_table(_readable(published), "What the paper prints, and what comes out over seeds")
-        console.print(found.text, highlight=False, soft_wrap=True)
-        print(f"Report: {found.report.resolve()}")
+    show_table(_readable(published), "What the paper prints, and what comes out over seeds")
+    say(found.text)
+    say(f"Report: {found.report.resolve()}")
+    return Answer({"report": found.report, "published": published, "text": found.text})
 
 
 def reproduce_field_command(
@@ -74,11 +70,8 @@ def reproduce_field_command(
     workers: Workers = None,
     seed: Seed = 2017,
     force: Force = False,
-    json: Json = False,
-) -> None:
+) -> Answer:
     """The paper's Table 3 from rendered frames: identification and attitude with four cameras, and why they differ."""
-    from starcal_uq.cli.console import out as console
-    from starcal_uq.cli.console import print_json, records, show_table
     from starcal_uq.paper.field.experiment import field_experiment
 
     with progress_bar("field experiment") as progress:
@@ -94,12 +87,10 @@ def reproduce_field_command(
             force=force,
         )
     table = found.table_3()
-    if json:
-        print_json({"verdict": found.text, "table_3": records(table)})
-    else:
-        show_table(_readable_table_3(table), "Table 3: rates in %, errors in arcsec, with 95 % ranges")
-        console.print(found.text, highlight=False, soft_wrap=True)
-        print(f"Report: {found.report.resolve()}")
+    show_table(_readable_table_3(table), "Table 3: rates in %, errors in arcsec, with 95 % ranges")
+    say(found.text)
+    say(f"Report: {found.report.resolve()}")
+    return Answer({"report": found.report, "table_3": table, "text": found.text})
 
 
 def _readable(published: pd.DataFrame) -> pd.DataFrame:

@@ -8,20 +8,21 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import starcal_uq as sc
+from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.console import (
-    end_with,
-    err,
     note,
     progress_bar,
+    say,
     show_attitude,
     show_calibration,
     show_posterior,
     show_screening,
     show_verdict,
+    tell,
     warn_air,
 )
 from starcal_uq.cli.images import load_images
-from starcal_uq.cli.mission import fail_if_violated, show_budget
+from starcal_uq.cli.mission import show_budget, tell_violations
 from starcal_uq.cli.options import (
     Alignment,
     AlignmentFrames,
@@ -62,7 +63,7 @@ def demo(
     frames: Annotated[int, number("n_frames", "Number of frames.", least=20)] = 1000,
     seed: Seed = 2017,
     force: Force = False,
-) -> None:
+) -> Answer:
     """The experiment of Ye & Yang 2017, end to end, ending in DIR/report.html."""
     from starcal_uq.presentation.report.drawing import Ahead
 
@@ -70,15 +71,15 @@ def demo(
     with run.making({"command": "demo", "frames": frames, "seed": seed}, force=force), Ahead() as ahead:
         truth = sc.paper.paper_camera()
         if not run.did("calibrate"):
-            err.print(f"Simulating {frames} frames of the paper's sensor (Gaia G <= 6, 0.05 px noise, seed {seed}) ...")
+            tell(f"Simulating {frames} frames of the paper's sensor (Gaia G <= 6, 0.05 px noise, seed {seed}) ...")
             stars = sc.load_catalogue(max_mag=6.0, epoch=2026.9)
             obs = sc.simulate(stars, truth, n_frames=frames, min_stars=10, sigma_px=0.05, seed=seed)
-            err.print("Calibrating from f = 72 mm and the detector's centre ...")
+            tell("Calibrating from f = 72 mm and the detector's centre ...")
             run.calibrate(obs, sc.paper.paper_start())
         show_calibration(run.calibration, truth)
-        err.print("Sampling the posterior, couplings, attitude error, then questioning the model ...")
+        tell("Sampling the posterior, couplings, attitude error, then questioning the model ...")
         _after_calibration(run, ahead, SamplingSettings(seed=seed))
-    _conclude(run)
+    return _conclude(run)
 
 
 def run_command(
@@ -109,7 +110,7 @@ def run_command(
         ),
     ] = None,
     force: Force = False,
-) -> None:
+) -> Answer:
     """Calibrate, sample, couple, propagate, budget and report: all from stars or images to RUN/report.html."""
     from starcal_uq.pipeline.images import are_images
     from starcal_uq.presentation.report.drawing import Ahead
@@ -144,7 +145,7 @@ def run_command(
         show_calibration(run.calibration, run.truth)
         warn_air(run.observations, run.calibration)
         _after_calibration(run, ahead, sampling, draws, budget, show=True, **aligning)
-    _conclude(run)
+    return _conclude(run)
 
 
 def _calibrate(
@@ -218,9 +219,20 @@ def _after_calibration(
     run.report(ahead.figures)
 
 
-def _conclude(run: Run) -> None:
+def _conclude(run: Run) -> Answer:
     """Verdict and place of the report; status 1 when a check or a requirement failed."""
     show_verdict(run.verdict)
-    print(f"Report: {run.report().resolve()}")
-    fail_if_violated(run.error_budget)
-    end_with(run.verdict.level)
+    page = run.report()
+    say(f"Report: {page.resolve()}")
+    results = {
+        "run": run.path,
+        "report": page,
+        "verdict": run.verdict,
+        "calibration": (run.calibration, run.truth),
+        "screening": run.screening,
+        "posterior": run.posterior,
+        "coupling": run.coupling,
+        "attitude": run.attitude,
+        "budget": run.error_budget,
+    }
+    return Answer(results, max(tell_violations(run.error_budget), run.verdict.level.exit_status))

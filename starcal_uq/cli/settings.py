@@ -12,12 +12,15 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import typer
 
 import starcal_uq as sc
+from starcal_uq.cli.answers import Answer, deliver
+from starcal_uq.cli.console import quiet
 from starcal_uq.cli.options import (
     LEAST_SIGMA_PX,
     BayerMosaic,
     Columns,
     Duplicates,
     FileWorkers,
+    Json,
     SchedulerAddress,
     Seed,
     TimeUtc,
@@ -247,8 +250,8 @@ def command_of(name: str, settings: Mapping[str, Any], files: Mapping[str, Path]
     return {"command": name, "settings": told, "inputs": identity(files)}
 
 
-def unfolded(command: Callable[..., None]) -> Callable[..., None]:
-    """A command whose parameters that are records of settings are options, one for each field."""
+def unfolded(name: str, command: Callable[..., Answer]) -> Callable[..., None]:
+    """What is called by the name of a command: one option for each field of its records, and --json."""
     parameters: list[inspect.Parameter] = []
     records: dict[str, Any] = {}
     for parameter in inspect.signature(command, eval_str=True).parameters.values():
@@ -262,14 +265,17 @@ def unfolded(command: Callable[..., None]) -> Callable[..., None]:
             inspect.Parameter(f.name, parameter.KEYWORD_ONLY, default=f.default, annotation=hints[f.name])
             for f in fields(record)
         ]
+    parameters.append(inspect.Parameter("json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Json))
 
     @wraps(command)
-    def run(**given: Any) -> None:
+    def run(json: bool, **given: Any) -> None:
         settings = {
             name: record(**{field.name: given.pop(field.name) for field in fields(record)})
             for name, record in records.items()
         }
-        command(**given, **settings)
+        with quiet(json):
+            answer = command(**given, **settings)
+        deliver(name, answer, json)
 
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     return run

@@ -8,6 +8,8 @@ from typing import Annotated
 import typer
 
 import starcal_uq as sc
+from starcal_uq.cli.answers import Answer
+from starcal_uq.cli.console import say
 from starcal_uq.cli.options import Force, write_path
 from starcal_uq.core import settings
 
@@ -25,17 +27,13 @@ def new_command(
         ),
     ] = None,
     force: Force = False,
-) -> None:
+) -> Answer:
     """Write a starter file with comments (camera, site, budget, study), or real data to try everything on."""
+    path = Path("esa" if what == "example" else f"{what}.toml") if out is None else out
     if what == "example":
-        folder = Path("esa") if out is None else out
-        sc.example_data("esa").save(folder, force=force)
-        print(
-            f"{folder}: starcal-uq run {folder / 'stars.ecsv'} {folder / 'camera.toml'} -o RUN; whose data, in NOTICE"
-        )
-        return
-    path = Path(f"{what}.toml") if out is None else out
-    if what == "camera":
+        sc.example_data("esa").save(path, force=force)
+        following = f"starcal-uq run {path / 'stars.ecsv'} {path / 'camera.toml'} -o RUN; whose data, in NOTICE"
+    elif what == "camera":
         sc.paper.paper_start().replace(name="my camera").save(path, force=force)
         following = f"put in the numbers of your data sheet, then starcal-uq run OBS {path} -o RUN"
     elif what == "site":
@@ -48,4 +46,5 @@ def new_command(
     else:
         sc.studies.write_study_template("fov-distortion", path, force)
         following = f"change what is varied, then starcal-uq study {path} -o DIR"
-    print(f"{path}: {following}")
+    say(f"{path}: {following}")
+    return Answer({"file": path, "text": following})

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 import starcal_uq as sc
-from starcal_uq.cli.console import note, print_json, print_table, progress_bar, records, show_calibration
-from starcal_uq.cli.console import out as console
+from starcal_uq.cli.answers import Answer
+from starcal_uq.cli.console import note, print_table, progress_bar, say, show_calibration
 from starcal_uq.cli.options import (
     LEAST_SIGMA_PX,
     CameraFile,
     Duplicates,
     Force,
-    Json,
     MaxMag,
     NewRun,
     RunPath,
@@ -33,8 +33,16 @@ from starcal_uq.core.manifest import making
 def validate_command(
     camera: CameraFile,
     out: Annotated[
-        Path, typer.Option("-o", "--out", metavar="DIR", help="Folder for figure and table.", parser=write_path)
-    ] = Path("validation"),
+        Path | None,
+        typer.Option(
+            "-o",
+            "--out",
+            metavar="DIR",
+            help="Folder for figure and table, in which an interrupted command goes on; without one, nothing is "
+            "written.",
+            parser=write_path,
+        ),
+    ] = None,
     replicates: Annotated[int, number("n_replicates", "Data sets to simulate, calibrate and sample.", least=20)] = 1000,
     frames: Annotated[int, number("n_frames", "Frames in each.", least=2)] = 50,
     min_stars: Annotated[int, number("min_stars", "Least stars in a frame.", least=3)] = 10,
@@ -47,14 +55,15 @@ def validate_command(
     workers: Workers = None,
     seed: Seed = 0,
     force: Force = False,
-    json: Json = False,
-) -> None:
+) -> Answer:
     """Show that the intervals are right for this sensor and this volume of data, by simulation-based calibration.
 
-    Replicates are kept as they are made: an interrupted command goes on, also with more of them.
+    With `-o`, replicates are kept as they are made: an interrupted command goes on, also with more of them.
     """
+    from starcal_uq.presentation.words.diagnostics import validation_table
+
     sensor = sc.Camera.load(camera)
-    with making(out, "validate", "validation.npz", force=force) as stage:
+    with nullcontext() if out is None else making(out, "validate", "validation.npz", force=force) as stage:
         with progress_bar("replicates") as progress:
             found = sc.validate(
                 sensor,
@@ -71,21 +80,19 @@ def validate_command(
             )
         if found.interrupted:
             raise KeyboardInterrupt
-        from starcal_uq.presentation.figures.style import png_bytes
-        from starcal_uq.presentation.words.diagnostics import validation_table
-
-        found.save(stage / "validation.npz")
         table = found.to_dataframe()
-        write_csv(table, stage / "validation.csv")
-        atomic_write_bytes(stage / "validation.png", png_bytes(found.plot.ranks()))
-    if json:
-        print_json({"ok": found.ok, "verdict": found.text, "quantities": records(table)})
-    else:
-        print_table(validation_table(found))
-        console.print(found.text, style="green" if found.ok else "red", highlight=False, soft_wrap=True)
-        print(f"Figure: {(out / 'validation.png').resolve()}")
-    if not found.ok:
-        raise typer.Exit(1)
+        if stage is not None:
+            from starcal_uq.presentation.figures.style import png_bytes
+
+            found.save(stage / "validation.npz")
+            write_csv(table, stage / "validation.csv")
+            atomic_write_bytes(stage / "validation.png", png_bytes(found.plot.ranks()))
+    print_table(validation_table(found))
+    say(found.text, style="green" if found.ok else "red")
+    if out is not None:
+        say(f"Figure: {(out / 'validation.png').resolve()}")
+    results = {"folder": out, "ok": found.ok, "quantities": table, "text": found.text}
+    return Answer(results, int(not found.ok))
 
 
 def diagnose_command(
@@ -93,8 +100,7 @@ def diagnose_command(
     starts: Annotated[int, number("n_starts", "Fits from other starts.")] = 5,
     seed: Seed = 0,
     force: Force = False,
-    json: Json = False,
-) -> None:
+) -> Answer:
     """Question the model: misfit, jackknife, other distortion models, predictive checks, other starts."""
     from starcal_uq.presentation.words.diagnostics import (
         jackknife_table,
@@ -106,17 +112,6 @@ def diagnose_command(
 
     with progress_bar("diagnosis") as progress:
         found = sc.Run(run, tell=note).diagnose(n_starts=starts, seed=seed, force=force, progress=progress)
-    parts = {
-        "Misfit": found.misfit,
-        "Jackknife over frames": found.jackknife,
-        "Errors of the stars": found.stars,
-        "Distortion models": found.comparison,
-        "Predictive checks": found.predictive,
-    }
-    tables = {title: part.to_dataframe() for title, part in parts.items() if part is not None}
-    if json:
-        print_json({title: records(table) for title, table in tables.items()})
-        return
     print_table(misfit_table(found.misfit))
     if found.jackknife is not None:
         print_table(jackknife_table(found.jackknife))
@@ -125,10 +120,10 @@ def diagnose_command(
     if found.comparison is not None:
         print_table(models_table(found.comparison))
     print_table(predictive_table(found.predictive))
-    if found.comparison is not None:
-        print(found.comparison.text)
-    if found.stars is not None:
-        print(found.stars.text)
+    for part in (found.comparison, found.stars):
+        if part is not None:
+            say(part.text)
+    return Answer({"run": run, "diagnosis": found})
 
 
 def merge_command(
@@ -148,7 +143,7 @@ def merge_command(
     ] = False,
     duplicates: Duplicates = "refuse",
     force: Force = False,
-) -> None:
+) -> Answer:
     """Combine the likelihoods of several runs into one, without going back to the stars; tests that they agree."""
     from starcal_uq.presentation.words.estimation import consistency_table
 
@@ -159,6 +154,7 @@ def merge_command(
     if agreement is not None:
         print_table(consistency_table(agreement))
         words = agreement.messages or ("The runs agree.",)
-        console.print(f"{' '.join(words)} (p = {agreement.p_value:.2g})", highlight=False, soft_wrap=True)
+        say(f"{' '.join(words)} (p = {agreement.p_value:.2g})")
     show_calibration(merged)
-    print(f"Run folder: {out}. Next: starcal-uq sample {out}")
+    say(f"Run folder: {out}. Next: starcal-uq sample {out}")
+    return Answer({"run": out, "calibration": merged, "consistency": agreement})

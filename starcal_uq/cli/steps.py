@@ -9,22 +9,20 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import starcal_uq as sc
+from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.console import (
-    end_with,
-    err,
     note,
-    print_json,
     progress_bar,
-    records,
+    say,
     show_attitude,
     show_calibration,
     show_coupling,
     show_posterior,
     show_screening,
+    tell,
     warn_air,
     warn_undeclared,
 )
-from starcal_uq.cli.console import out as console
 from starcal_uq.cli.options import (
     Alignment,
     AlignmentFrames,
@@ -33,7 +31,6 @@ from starcal_uq.cli.options import (
     Epoch,
     FileWorkers,
     Force,
-    Json,
     MaxMag,
     NewRun,
     ObsFile,
@@ -130,7 +127,7 @@ def simulate_command(
     workers: FileWorkers = None,
     seed: Seed = 0,
     force: Force = False,
-) -> None:
+) -> Answer:
     """Simulate identified stars with the embedded catalogue; directions are written as the sensor saw them."""
     if partition_frames is None:
         if not (scheduler is None and workers is None):
@@ -158,9 +155,11 @@ def simulate_command(
                 workers=workers,
                 progress=progress,
             )
-        print(f"{made.n_stars} stars in {frames} frames, {len(made.parts)} files: {out}")
-        return
+        say(f"{made.n_stars} stars in {frames} frames, {len(made.parts)} files: {out}")
+        sizes = {"n_stars": made.n_stars, "n_frames": frames, "n_files": len(made.parts)}
+        return Answer({"table": out, **sizes, "images": None, "n_images": 0})
     obs = sc.simulate(stars, truth, n_frames=frames, min_stars=min_stars, sigma_px=sigma, seed=seed)
+    paths: list[Path] = []
     if images is not None:
         with progress_bar("images") as progress:
             paths = sc.simulation.render_frames(
@@ -175,11 +174,13 @@ def simulate_command(
                 force=force,
                 progress=progress,
             )
-        print(f"{len(paths)} images: {images}")
+        say(f"{len(paths)} images: {images}")
     obs.save(out, force=force)
-    print(f"{obs.n_stars} stars in {obs.n_frames} frames: {out}")
+    say(f"{obs.n_stars} stars in {obs.n_frames} frames: {out}")
     if out.suffix.lower() == ".csv":
-        print("CSV holds no metadata: say --directions apparent when you calibrate it (.ecsv and .parquet know).")
+        say("CSV holds no metadata: say --directions apparent when you calibrate it (.ecsv and .parquet know).")
+    sizes = {"n_stars": obs.n_stars, "n_frames": obs.n_frames, "n_files": 1}
+    return Answer({"table": out, **sizes, "images": images, "n_images": len(paths)})
 
 
 def calibrate_command(
@@ -189,8 +190,7 @@ def calibrate_command(
     estimation: EstimationSettings,
     sky: SkySettings,
     force: Force = False,
-    json: Json = False,
-) -> None:
+) -> Answer:
     """Estimate optics and distortion: three stages and refinement, with covariance."""
     run = sc.Run(out, tell=note)
     check_new_folder(out, force)
@@ -200,21 +200,16 @@ def calibrate_command(
     if run.screening is not None:
         show_screening(run.screening)
     warn_air(obs, calibration)
-    if json:
-        print_json({"status": calibration.status.name, "parameters": records(calibration.to_dataframe())})
-    else:
-        show_calibration(calibration, run.truth)
-        print(f"Run folder: {out}. Next: starcal-uq sample {out}")
+    show_calibration(calibration, run.truth)
+    say(f"Run folder: {out}. Next: starcal-uq sample {out}")
+    return Answer({"run": out, "calibration": (calibration, run.truth), "screening": run.screening})
 
 
-def sample_command(run: RunPath, sampling: SamplingSettings, force: Force = False, json: Json = False) -> None:
+def sample_command(run: RunPath, sampling: SamplingSettings, force: Force = False) -> Answer:
     """Sample the posterior with emcee from the calibration; an interrupted command goes on where it stopped."""
     posterior = sample_run(sc.Run(run, tell=note), sampling, force=force)
-    if json:
-        print_json({"ok": posterior.diagnostics.ok, "parameters": records(posterior.summary())})
-    else:
-        show_posterior(posterior)
-    end_with(posterior.diagnostics.level)
+    show_posterior(posterior)
+    return Answer({"run": run, "posterior": posterior}, posterior.diagnostics.level.exit_status)
 
 
 def sample_run(run: Run, sampling: SamplingSettings, *, force: bool) -> Posterior:
@@ -224,18 +219,15 @@ def sample_run(run: Run, sampling: SamplingSettings, *, force: bool) -> Posterio
         warnings.simplefilter("always", sc.inference.NaivePairsWarning)
         posterior = run.sample(force=force, progress=progress, **options)
     for warning in caught:
-        err.print(f"warning: {warning.message}", style="yellow", highlight=False, soft_wrap=True)
+        tell(f"warning: {warning.message}")
     return posterior
 
 
-def coupling_command(run: RunPath, force: Force = False, json: Json = False) -> None:
+def coupling_command(run: RunPath, force: Force = False) -> Answer:
     """Correlations, variance inflation, weak directions and the principal point's near-gauge with the boresight."""
     coupling = sc.Run(run, tell=note).couple(force=force)
-    if json:
-        words = [direction.words for direction in coupling.weak_directions]
-        print_json({"parameters": records(coupling.to_dataframe()), "directions": words})
-    else:
-        show_coupling(coupling)
+    show_coupling(coupling)
+    return Answer({"run": run, "coupling": coupling})
 
 
 def propagate_command(
@@ -267,8 +259,7 @@ def propagate_command(
     draws: Draws = 300,
     seed: Seed = 0,
     force: Force = False,
-    json: Json = False,
-) -> None:
+) -> Answer:
     """Attitude error that the calibration contributes, through QUEST: common rotation, the rest, and centroid noise."""
     sky = None
     if attitudes != "observed":
@@ -288,23 +279,18 @@ def propagate_command(
     error, _, spectrum = sc.Run(run, tell=note).propagate(
         n_draws=draws, seed=seed, sky=sky, alignment=alignment, alignment_frames=alignment_frames, force=force
     )
-    if json:
-        document = {
-            "frames": error.frames,
-            "alignment": error.alignment,
-            "attitude_error": records(error.to_written()),
-        }
-        print_json(document if spectrum is None else document | {"spectrum": spectrum.text})
-        return
     show_attitude(error)
-    console.print(error.text, highlight=False, soft_wrap=True)
+    say(error.text)
     if spectrum is not None:
-        console.print(spectrum.text, highlight=False, soft_wrap=True)
+        say(spectrum.text)
+    return Answer({"run": run, "attitude": error, "spectrum": None if spectrum is None else spectrum.text})
 
 
-def report_command(run: RunPath, force: Force = False) -> None:
+def report_command(run: RunPath, force: Force = False) -> Answer:
     """Write RUN/report.html, one self-contained file, from whatever the run holds."""
-    print(f"Report: {sc.Run(run, tell=note).report(force=force).resolve()}")
+    page = sc.Run(run, tell=note).report(force=force)
+    say(f"Report: {page.resolve()}")
+    return Answer({"run": run, "report": page})
 
 
 def export_command(
@@ -324,8 +310,9 @@ def export_command(
         typer.Option("-o", "--out", metavar="FILE", help="File to write; named by default.", parser=write_file),
     ] = None,
     force: Force = False,
-) -> None:
+) -> Answer:
     """Write the calibrated camera, or what is known of it, for another program; say how near that comes."""
     made = sc.export(source, to, out, force=force)
-    console.print(made.note, highlight=False, soft_wrap=True)
-    print(f"File: {made.path}")
+    say(made.note)
+    say(f"File: {made.path}")
+    return Answer({"file": made.path, "to": to, "error_px": made.error_px, "text": made.note})

@@ -8,9 +8,9 @@ from typing import Annotated
 import typer
 
 import starcal_uq as sc
-from starcal_uq.cli.console import err, print_json, print_table, progress_bar
-from starcal_uq.cli.console import out as console
-from starcal_uq.cli.options import Force, Json, SchedulerAddress, number, write_file, write_path
+from starcal_uq.cli.answers import INTERRUPTED, Answer
+from starcal_uq.cli.console import note, print_table, progress_bar, say
+from starcal_uq.cli.options import Force, SchedulerAddress, number, write_file, write_path
 from starcal_uq.core import settings
 
 
@@ -44,8 +44,7 @@ def study_command(
     scheduler: SchedulerAddress = None,
     seed: Annotated[int | None, number("seed", "Root seed, instead of that of STUDY.")] = None,
     force: Force = False,
-    json: Json = False,
-) -> None:
+) -> Answer:
     """Vary camera, sky, noise and observation: what couples, what decouples it, and what it does to attitudes.
 
     Cells that are there already are not computed again; `--force` computes all anew, and then replaces them. Status 1
@@ -53,8 +52,8 @@ def study_command(
     """
     if template is not None:
         sc.studies.write_study_template(template, file, force)
-        print(f"Study to fill in: {file}. Next: starcal-uq study {file} -o {out}")
-        return
+        say(f"Study to fill in: {file}. Next: starcal-uq study {file} -o {out}")
+        return Answer({"template": file, "study": None})
     pages: list[Path] = []
 
     def page_of(found: sc.studies.Study, folder: Path) -> None:
@@ -75,35 +74,9 @@ def study_command(
             more=page_of,
         )
     page = pages[0] if pages else None
-    if json:
-        print_json(_summary(found, out, page))
-    else:
-        _show(found, page)
-    if not found.complete:
-        raise KeyboardInterrupt
-    if not found.ok.any():
-        raise typer.Exit(1)
-
-
-def _summary(found: sc.studies.Study, out: Path, page: Path | None) -> dict[str, object]:
-    from starcal_uq.presentation.words.studies import study_answer, study_limits
-    from starcal_uq.presentation.words.study_advice import study_advice
-
-    numbers = found.ok.any()
-    return {
-        "name": found.definition.name,
-        "question": found.definition.question,
-        "cells": found.n_cells,
-        "cells_ok": int(found.ok.sum()),
-        "complete": found.complete,
-        "problems": found.problems,
-        "answer": study_answer(found) if numbers else [],
-        "advice": study_advice(found) if numbers else [],
-        "limits": study_limits(found),
-        "data": str(out / "study.nc"),
-        "table": str(out / "study.parquet"),
-        "page": None if page is None else str(page),
-    }
+    _show(found, page)
+    status = INTERRUPTED if not found.complete else int(not found.ok.any())
+    return Answer({"template": None, "study": (found, out, page)}, status)
 
 
 def _show(found: sc.studies.Study, page: Path | None) -> None:
@@ -114,8 +87,8 @@ def _show(found: sc.studies.Study, page: Path | None) -> None:
     if table is not None:
         print_table(table)
     for sentence in (*study_answer(found), *study_advice(found)):
-        console.print(sentence, highlight=False, soft_wrap=True)
+        say(sentence)
     for problem, n in found.problems.items():
-        err.print(f"{n} of {found.n_cells} cells: {problem}", style="yellow", highlight=False, soft_wrap=True)
+        note(f"{n} of {found.n_cells} cells: {problem}")
     if page is not None:
-        print(f"Page: {page.resolve()}")
+        say(f"Page: {page.resolve()}")

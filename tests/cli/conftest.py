@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 import sys
 
+import jsonschema
 import pytest
 
 import starcal_uq as sc
 from starcal_uq.cli.app import main
+from starcal_uq.cli.schemas import PREFIX, json_schema
 from tests.helpers.scenes import observations
 
 
@@ -22,6 +25,18 @@ def one_process(monkeypatch):
     monkeypatch.setattr("starcal_uq.core.tasks._spread", stay)
 
 
+def check_document(text, status):
+    """A document, alone, with the numbers that JSON has, as its schema says."""
+
+    def refuse(word):
+        raise AssertionError(f"{word} is no JSON")
+
+    document = json.loads(text, parse_constant=refuse)
+    jsonschema.validate(document, json_schema(document["schema"].removeprefix(PREFIX)))
+    assert document["exit_status"] == status
+    return document
+
+
 @pytest.fixture
 def painting_cli(one_process, monkeypatch, capsys, tmp_path):
     """Run a command in an empty folder; returns (status, standard output, standard error)."""
@@ -32,8 +47,10 @@ def painting_cli(one_process, monkeypatch, capsys, tmp_path):
         with pytest.raises(SystemExit) as stop:
             main()
         captured = capsys.readouterr()
-        code = stop.value.code
-        return (0 if code is None else code), captured.out, captured.err
+        code = stop.value.code or 0
+        if "--json" in arguments:
+            check_document(captured.out, code)
+        return code, captured.out, captured.err
 
     return call
 

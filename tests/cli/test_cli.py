@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
+from starcal_uq.cli.schemas import document
 from starcal_uq.core.settings import Starter
 from starcal_uq.studies.definition import StudyDefinition
+from tests.cli.conftest import check_document
 from tests.helpers.commands import SMALL, files
 from tests.helpers.outside import campaign
 from tests.helpers.scenes import observations
@@ -34,7 +36,9 @@ def test_run_writes_everything_and_prints_the_tables(painting_cli, inputs, tmp_p
     for name in ("corner", "residuals"):
         assert (run.figures / f"{name}.png").stat().st_size > 20_000, "figures are painted"
     # The same verdict for programs.
-    verdict = json.loads(run.verdict.read_text())
+    verdict = check_document(run.verdict.read_text("utf-8"), status)
+    found = sc.Run(run.path).verdict
+    assert verdict == document("verdict", {"level": found.level, **vars(found)}, status)
     assert verdict["headline"] in out
     assert [check["name"] for check in verdict["checks"]] == [c.name for c in sc.Run(run.path).verdict.checks]
     assert all(check["remedy"] or check["level"] == "pass" for check in verdict["checks"])
@@ -48,7 +52,7 @@ def test_run_writes_everything_and_prints_the_tables(painting_cli, inputs, tmp_p
 def test_steps_one_by_one_with_json(cli, inputs):
     status, out, _ = cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--json")
     assert status == 0
-    table = json.loads(out)
+    table = json.loads(out)["calibration"]
     assert table["status"] == "CONVERGED"
     assert [row["parameter"] for row in table["parameters"]] == ["x0", "y0", "f", "k1", "k2", "sigma"]
     status, out, _ = cli("coupling", "run")
@@ -56,16 +60,16 @@ def test_steps_one_by_one_with_json(cli, inputs):
     assert "variance inflation" in out
     status, out, _ = cli("sample", "run", "--json", "--seed", "3", *SMALL)
     assert status in (0, 1)
-    assert len(json.loads(out)["parameters"]) == 6
+    assert len(json.loads(out)["posterior"]["parameters"]) == 6
     status, out, _ = cli("coupling", "run", "--json")
     assert status == 0
-    assert "contraction" in json.loads(out)["parameters"][0]
+    assert 0.9 < json.loads(out)["coupling"]["parameters"][0]["contraction"] <= 1.0
     status, out, _ = cli("propagate", "run", "--json", "--draws", "60")
     assert status == 0
-    assert {row["axis"] for row in json.loads(out)["attitude_error"]} >= {"pitch", "yaw", "roll"}
-    status, out, _ = cli("report", "run")
+    assert {row["axis"] for row in json.loads(out)["attitude"]["contributors"]} >= {"pitch", "yaw", "roll"}
+    status, out, _ = cli("report", "run", "--json")
     assert status == 0
-    assert "report.html" in out
+    assert json.loads(out)["report"] == "run/report.html"
 
 
 def test_new_sampling_removes_what_the_old_one_led_to(cli, inputs, tmp_path):
@@ -97,10 +101,11 @@ def test_simulate_writes_a_table_that_calibrates(cli, inputs, tmp_path):
 
 
 def test_demo_ends_with_the_table_of_truth_and_the_report(cli, tmp_path):
-    status, out, _ = cli("demo", "--out", "demo", "--frames", 60)
+    status, out, _ = cli("demo", "--out", "demo", "--frames", 60, "--json")
     assert status == 0
-    assert "truth" in out
-    assert out.rstrip().endswith("report.html")
+    found = json.loads(out)
+    assert found["calibration"]["parameters"][2]["truth"] == sc.paper.paper_camera().focal_px
+    assert found["verdict"]["level"] != "fail" and found["report"] == "demo/report.html"
     assert (tmp_path / "demo" / "report.html").exists()
 
 

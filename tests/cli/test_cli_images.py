@@ -80,7 +80,7 @@ def test_the_commands_one_by_one_give_what_run_gives(cli, frames, tmp_path, time
     obs, _, found = observations_from_images([images], camera, max_mag=6.0, **known)
     at_once = sc.Run(tmp_path / "at_once").calibrate(obs, found.rounds[0][0].nominal)
     told = ("--directions", "apparent") if timed else ()
-    assert cli("centroid", images, "-o", "c.csv", "--camera", "camera.toml")[0] == 0
+    assert cli("centroid", images, "-o", "c.csv", "--camera", "camera.toml", "--json")[0] == 0
     assert cli("identify", "c.csv", "camera.toml", "-o", "o.ecsv", "--max-mag", 6, *told)[0] == 0
     assert cli("calibrate", "o.ecsv", "camera.toml", "-o", "steps")[0] == 0
     one_by_one = sc.Run(tmp_path / "steps").calibration
@@ -126,9 +126,10 @@ def _frames_are_shown(cli, run, images):
     left_out = [frame.detections.query("kind == 'left out'") for frame in held.frames]
     assert sum(map(len, left_out)) == table["n_matched"].sum() - table["n_identified"].sum()
     assert set(rejected["star_id"]) <= {star for part in left_out for star in part["star_id"]}
-    status, out, err = cli("inspect", "run")
+    status, out, err = cli("inspect", "run", "--json")
     assert (status, err) == (0, "")
-    assert out.startswith("16 frames; 16 of them took part in the calibration. Page: run/frames.html")
+    found = json.loads(out)
+    assert (found["text"], found["page"]) == ("16 frames; 16 of them took part in the calibration.", "run/frames.html")
     assert run.inspection.read_text("utf-8").count("data:image/webp") == N_IMAGES
     assert cli("inspect", "run")[0] == 2
     name = held.images.rows[3].image

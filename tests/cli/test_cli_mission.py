@@ -88,7 +88,7 @@ def test_violated_requirement_is_named_and_ends_with_status_1(cli, run, tmp_path
     assert "budget.csv: exists already; make it again with --force" in err
     status, out, err = cli("budget", "run", "--file", "kind.toml", "--json", "--force")
     assert status == 0
-    assert json.loads(out)["requirements"]
+    assert [row["verdict"] for row in json.loads(out)["budget"]["requirements"]] == ["open", "open"]
     # The report of the run now has the section, and its figure.
     status, _, _ = cli("report", "run")
     assert status == 0
@@ -121,7 +121,7 @@ def test_mission_sky_takes_the_place_of_the_observed_frames(cli, run):
     options = ("--attitudes", "random", "--max-mag", 6.5, "--frames", 200, "--draws", 60, "--json", "--force")
     status, out, _ = cli("propagate", "run", *options)
     assert status == 0
-    assert "random attitudes" in json.loads(out)["frames"]
+    assert "random attitudes" in json.loads(out)["attitude"]["frames"]
     mission = sc.propagation.AttitudeError.load(run / "attitude.csv")
     # More stars, less noise; and what rested on the old numbers is gone.
     assert mission.nea_arcsec[0] < observed.nea_arcsec[0]
@@ -186,7 +186,7 @@ def test_plan_before_any_data(cli, run, tmp_path, small_plans):
     for after in ((), ("--after", "run")):
         status, out, _ = cli("plan", "calibrated.toml", *options, *after)
         assert status == 0
-        needs.append(json.loads(out)["needs"][0]["frames"])
+        needs.append(json.loads(out)["plan"]["needs"][0]["frames"])
     assert needs[0] - needs[1] == pytest.approx(60, abs=30)
     # Centroid noise alone is more than this.
     status, out, _ = cli("plan", "camera.toml", "--target-arcsec", 0.1, "--scope", "total", "--frames", 30)
@@ -238,7 +238,7 @@ def test_plan_after_a_run_of_another_sensor_is_refused(cli, run, tmp_path, small
     for sigma in ((), ("--sigma", 0.5)):
         status, out, _ = cli("plan", "camera.toml", "--after", "run", "--frames", 100, "--json", *sigma)
         assert status == 0
-        found.append(json.loads(out)["sigma_px"])
+        found.append(json.loads(out)["plan"]["sigma_px"])
     assert found[0] == pytest.approx(0.05, rel=0.1)
     assert found[1] == 0.5
 
@@ -262,8 +262,8 @@ def test_plan_refuses_what_it_cannot_mean(cli, run, tmp_path, small_plans):
     document = json.loads(out)
     assert status == 1
     assert len(document["choice"]["frames"]) == 3
-    assert document["check"]["table"]
-    assert "only the rest counts: more than ten million" in document["verdict"]
+    assert document["check"]["rows"]
+    assert "only the rest counts: more than ten million" in document["plan"]["text"]
 
 
 def test_a_gap_in_a_profile_is_told(cli, run, tmp_path):

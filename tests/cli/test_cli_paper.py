@@ -16,7 +16,7 @@ def test_reproduce_writes_a_report_and_tables(cli, tmp_path, monkeypatch):
 
     assert status == 0
     document = json.loads(out)
-    assert "The proposed method" in document["verdict"]
+    assert "The proposed method" in document["text"]
     assert len(document["published"]) == len(pd.read_csv(tmp_path / "paper" / "published.csv"))
     assert (tmp_path / "paper" / "reproduction.html").exists()
 
@@ -36,9 +36,9 @@ def test_reproduce_refuses_nonsense(cli, tmp_path):
 @pytest.mark.slow
 def test_reproduce_field_writes_a_page_and_tables(cli, tmp_path):
     size = ("--replicates", 20, "--frames", 20, "--workers", 1)
-    status, out, _ = cli("reproduce-field", "-o", "field", *size)
+    status, out, _ = cli("reproduce-field", "-o", "field", *size, "--json")
     assert status == 0
-    assert "after alignment" in out and "come out" in out
+    assert "come out" in json.loads(out)["text"] and len(json.loads(out)["table_3"]) == 16
     assert len(pd.read_csv(tmp_path / "field" / "table_3.csv")) == 16
     assert (tmp_path / "field" / "field.html").exists()
     status, _, err = cli("reproduce-field", "-o", "field", *size)
@@ -63,7 +63,7 @@ def test_filter_then_sample(cli, inputs, tmp_path):
     assert len(pd.read_csv(tmp_path / "run" / "history.csv")) == 31
     status, out, _ = cli("sample", "run", "--steps", 40, "--json")
     assert status in (0, 1)
-    assert [row["parameter"] for row in json.loads(out)["parameters"]][:3] == ["x0", "y0", "f"]
+    assert [row["parameter"] for row in json.loads(out)["posterior"]["parameters"]][:3] == ["x0", "y0", "f"]
     status, _, err = cli("propagate", "run")
     assert status == 2
     assert "holds no observations" in err

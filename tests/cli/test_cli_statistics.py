@@ -33,10 +33,11 @@ def test_validate_writes_figure_table_and_verdict(cli, inputs, tmp_path):
 
 def test_diagnose_stores_its_tables_and_the_report_shows_them(cli, inputs, tmp_path):
     cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", "--directions", "apparent")
-    status, out, _ = cli("diagnose", "run", "--starts", 2)
+    status, out, _ = cli("diagnose", "run", "--starts", 2, "--json")
     assert status == 0
-    for heading in ("Misfit", "Jackknife over frames", "Distortion models", "Predictive checks"):
-        assert heading in out
+    diagnosis = json.loads(out)["diagnosis"]
+    assert all(diagnosis[part] for part in ("misfit", "jackknife", "models", "predictive"))
+    assert diagnosis["starts"]["n"] == 2
     for name in ("diagnosis.json", "misfit.csv", "jackknife.csv", "comparison.csv", "predictive.csv"):
         assert (tmp_path / "run" / name).exists()
     cli("report", "run")
@@ -95,7 +96,7 @@ def test_other_likelihoods_from_the_command_line(cli, inputs, tmp_path, likeliho
     cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run")
     status, out, _ = cli("sample", "run", "--likelihood", likelihood, "--json", *SMALL)
     assert status in (0, 1)
-    assert json.loads(out)["parameters"][0]["parameter"] == "x0"
+    assert json.loads(out)["posterior"]["parameters"][0]["parameter"] == "x0"
 
 
 def test_unknown_likelihood_is_named(cli, inputs):

@@ -42,6 +42,7 @@ VALID = {
     "merge": "RUN RUN -o NEW",
     "reproduce": "-o NEW",
     "reproduce-field": "-o NEW",
+    "schema": "coupling",
 }
 LONG = 100_000 * "x"
 CONTROLS = "\x1b[31mred\x07\nline"

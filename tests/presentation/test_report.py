@@ -365,10 +365,10 @@ def both_figures(error) -> dict[str, list[str]]:
 def stated_everywhere(run, capsys) -> dict[str, dict[str, list[str]]]:
     """The same from every place of a run that states it, by place."""
     import csv
-    import json
     import re
 
-    from starcal_uq.cli.console import out, print_json, records, show_attitude
+    from starcal_uq.cli.console import out, show_attitude
+    from starcal_uq.cli.schemas import document
     from starcal_uq.presentation.words.budgeting import contributors_table
 
     opened = sc.Run(run.path)
@@ -393,9 +393,10 @@ def stated_everywhere(run, capsys) -> dict[str, dict[str, list[str]]]:
         found["budget.csv"] = of_rows(rows, rest)
         counted = [significant(float(row["sigma_arcsec"])) for row in rows if row["name"] == rest]
         assert counted == found["budget.csv"]["with the misfit found"]
-    print_json({"attitude_error": records(opened.attitude.to_written())})
-    found["JSON"] = of_rows(json.loads(capsys.readouterr().out)["attitude_error"], rest)
-    found["JSON of the budget"] = of_rows(opened.error_budget.to_dict()["contributors"], rest)
+    results = {"run": run.path, "attitude": opened.attitude, "spectrum": None}
+    found["JSON"] = of_rows(document("propagate", results, 0)["attitude"]["contributors"], rest)
+    results = {"run": run.path, "files": [], "template": None, "budget": opened.error_budget}
+    found["JSON of the budget"] = of_rows(document("budget", results, 0)["budget"]["contributors"], rest)
     out.width = 150
     show_attitude(opened.attitude)
     found["terminal"] = of_text(capsys.readouterr().out)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
     from starcal_uq.propagation.attitude_error import AttitudeError
 
-FORMAT = "starcal_uq verdict 1"
+SCHEMA, VERSION = "starcal-uq/verdict", 1
 
 
 @dataclass(frozen=True)
@@ -47,14 +47,15 @@ class Verdict:
         return worst(self.checks)
 
     def to_dict(self) -> AnyDict:
-        """The verdict as ``verdict.json`` holds it; `FORMAT` changes when the meaning of a key does."""
+        """The verdict as ``verdict.json`` holds it; `VERSION` rises when a key goes or changes its meaning."""
         kept = ("key", "name", "value", "bound", "sentence", "remedy")
         checks = [
             {name: getattr(check, name) for name in kept}
             | {"level": check.level.value, "question": check.question.name.lower()}
             for check in self.checks
         ]
-        return {"format": FORMAT, "level": self.level.value, "headline": self.headline, "checks": checks}
+        head = {"schema": SCHEMA, "version": VERSION, "exit_status": self.level.exit_status}
+        return {**head, "level": self.level.value, "headline": self.headline, "checks": checks}
 
     def of(self, question: Question) -> tuple[Check, ...]:
         """The checks that answer one question."""
