@@ -13,7 +13,7 @@ from tests.helpers.commands import SMALL, files
 from tests.helpers.scenes import camera, observations
 
 
-def test_validate_writes_figure_table_and_verdict(cli, inputs, tmp_path):
+def test_validate_writes_figure_table_and_verdict(cli, inputs, tmp_path, monkeypatch):
     camera().save(tmp_path / "truth.toml")
     status, out, _ = cli(
         "validate", "truth.toml", "-o", "val", "--replicates", 20, "--frames", 12, "--workers", 1, "--json"
@@ -28,6 +28,12 @@ def test_validate_writes_figure_table_and_verdict(cli, inputs, tmp_path):
     status, _, err = cli("validate", "truth.toml", "-o", "val")
     assert status == 2
     assert "--force" in err
+    assert files(tmp_path) == before
+    # Without a folder nothing is written, neither results nor replicates to go on from.
+    kept = sc.diagnostics.Validation.load(tmp_path / "val" / "validation.npz")
+    monkeypatch.setattr(sc, "validate", lambda *_, keep, **__: kept if keep is None else None)
+    status, out, _ = cli("validate", "truth.toml", "--json")
+    assert (json.loads(out)["folder"], status) == (None, int(not kept.ok))
     assert files(tmp_path) == before
 
 
