@@ -33,7 +33,9 @@ if TYPE_CHECKING:
 Cause: TypeAlias = Literal["epoch", "no aberration", "aberration twice", "date", "hour"]
 
 # A factor is significant from so many of its errors on, and one within so many.
-_SIGNIFICANT, _ONE = 6.0, 3.5
+_SIGNIFICANT, _ONE = 5.0, 3.5
+_FAR = 1e-4
+_LARGEST_SHARE, _ROUNDS = 0.05, 30
 _MAX_MAG, _SAME_STAR_RAD = 8.0, 60.0 / ARCSEC
 _LONGEST_YEARS = 250.0
 # Other dates and hours, in days and hours.
@@ -110,7 +112,7 @@ def time_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> TimeTest
         i = int(np.argmax(gain))
         if gain[i] <= most:
             continue
-        factor, std = _fitted(columns[i], rest, (numbers, frames))
+        factor, std, sure = _fitted(columns[i], rest, (numbers, frames))
         later, later_std = float(moved.later[i]), np.nan
         if moved.cause == "epoch":
             later, later_std = factor, std
@@ -120,9 +122,9 @@ def time_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> TimeTest
             if moved.cause in ("date", "hour"):
                 a, b = max(i - 1, 0), min(i + 1, len(size) - 1)
                 slope = (columns[b] - columns[a]) / (moved.later[b] - moved.later[a])
-                step, later_std = _fitted(slope, rest, (numbers, frames), rest.residuals - columns[i])
+                step, later_std, _ = _fitted(slope, rest, (numbers, frames), rest.residuals - columns[i])
                 later += step
-        if good and abs(factor) > _SIGNIFICANT * std:
+        if good and sure > _SIGNIFICANT:
             shift = np.abs(absorbed[i] * (factor if moved.cause == "epoch" else 1.0)) / cal.sigmas
             worst = int(np.argmax(shift))
             name, size_sigma = cal.parameter_names[worst], float(shift[worst])
@@ -133,20 +135,34 @@ def time_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> TimeTest
 
 def _fitted(
     column: FloatArray, rest: Remainder, groups: tuple[IntArray, ...], residuals: FloatArray | None = None
-) -> tuple[float, float]:
-    """The factor of a column, and the largest of its errors: by noise, and left out star by star or frame by frame."""
+) -> tuple[float, float, float]:
+    """The factor of a column, its error and how many errors it is.
+
+    The error is the largest of that by noise and those by leaving out star by star, frame by frame; that of few groups
+    counts as what Student's t of as many makes of it, far out. No star has more than a twentieth of the say, as one of
+    large proper motion would have.
+    """
+    from scipy.special import stdtrit
+
     residuals = rest.residuals if residuals is None else residuals
-    size = float(column @ column)
-    if not size > 0.0:
-        return 0.0, np.inf
-    factor = float(column @ residuals) / size
-    errors = [rest.sigma / np.sqrt(size)]
-    left = (column * (residuals - factor * column)).reshape(2, -1).sum(axis=0)
     own = (column**2).reshape(2, -1).sum(axis=0)
+    by_star = np.bincount(groups[0], own)
+    most = float(by_star.sum())
+    if not most > 0.0:
+        return 0.0, np.inf, 0.0
+    for _ in range(_ROUNDS):
+        most = float(np.minimum(by_star, most).sum()) * _LARGEST_SHARE
+    weight = np.minimum(1.0, most / np.maximum(by_star, 1e-300))[groups[0]]
+    weighted = column * np.tile(weight, 2)
+    size = float(weighted @ column)
+    factor = float(weighted @ residuals) / size
+    errors, few = [rest.sigma * float(np.linalg.norm(weighted)) / size], [1.0]
+    left = (weighted * (residuals - factor * column)).reshape(2, -1).sum(axis=0)
     for group in groups:
-        share = np.minimum(np.bincount(group, own) / size, 1.0 - 1e-12)
+        share = np.minimum(np.bincount(group, weight * own) / size, 1.0 - 1e-12)
         errors.append(float(np.linalg.norm(np.bincount(group, left) / (1.0 - share))) / size)
-    return factor, float(max(errors))
+        few.append(stdtrit(max(1.0 / float(share @ share) - 1.0, 0.1), _FAR) / stdtrit(np.inf, _FAR))
+    return factor, max(errors), abs(factor) / float(np.max(np.multiply(errors, few)))
 
 
 def _causes(rest: Remainder) -> Iterator[_Moved]:
