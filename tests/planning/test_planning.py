@@ -26,7 +26,7 @@ from starcal_uq.planning.plan import Plan, plan
 from starcal_uq.presentation.pages.planning import render_plan, write_plan
 from starcal_uq.presentation.words.planning import distortion_sentence
 from starcal_uq.presentation.words.planning import frames as frames_words
-from tests.helpers.outside import campaign
+from tests.helpers.outside import attitude_errors, campaign
 from tests.helpers.scenes import COEFFICIENTS, camera, observations
 
 ARCSEC = 648_000.0 / np.pi
@@ -247,6 +247,44 @@ def test_forecast_against_simulation_from_10_to_3000_frames():
     # The forecast itself is right about the errors, not only about what is stated.
     found, low, high = check.nees_ratio(of_forecast=True)
     assert np.all((found > low - 0.15) & (found < high + 0.15))
+
+
+@pytest.mark.slow
+def test_a_plan_is_what_calibrations_of_a_second_make_scatter_by():
+    """Errors of parameters and of the common rotation in simulated campaigns, in units of the forecast."""
+    errors = []
+    for field, corner_px, sigma_px in ((8.0, (3.0, -1.0), 0.1), (15.0, (-4.0, 1.0), 0.05), (40.0, (20.0, -5.0), 0.2)):
+        conditions = {"stars_per_frame": 20, "field_deg": field, "corner_px": corner_px}
+        clear = campaign(np.random.default_rng(0), n_frames=12, sigma_px=0.0, **conditions)
+        x0, y0, _, k1, k2 = clear.theta
+        sheet = sc.Camera(**(clear.camera_toml(0.0) | {"x0_px": x0, "y0_px": y0}), coefficients=(k1, k2))
+        half = np.sin(np.radians(0.5 * field)) ** 2
+        stars = even_sky(round(20 * np.pi / np.arcsin(half)))
+        options = {"min_stars": 3, "sweeps": False, "n_geometries": 400, "n_campaigns": 40}
+        forecast = plan(sheet, stars, sigma_px=sigma_px, n_frames=[20], **options).forecast
+        common = [forecast.of(f"common_{axis}_arcsec")[0] for axis in ("pitch", "yaw")]
+        for seed in range(70):
+            c = campaign(np.random.default_rng([17, seed]), n_frames=20, sigma_px=sigma_px, **conditions)
+            nominal = sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
+            theta = sc.calibrate(sc.Observations(**c.columns), nominal, model="brown").theta
+            turn = attitude_errors(clear, theta).mean(axis=0)[:2]
+            errors.append([*((theta - c.theta) / forecast.sigma[0, :5]), *(turn / common)])
+    z2 = np.square(errors).reshape(3, 70, 7).mean(axis=1)
+    # One of 21 spreads from 70 campaigns is known to 8 %, and all of them to 3 %.
+    assert np.all((np.sqrt(z2) > 0.73) & (np.sqrt(z2) < 1.27)), np.sqrt(z2)
+    assert z2.mean() == pytest.approx(1.0, abs=0.18)
+    # Control: a forecast from a fifth less noise.
+    assert z2.mean() / 0.8**2 > 1.3
+
+
+def even_sky(n: int) -> sc.StarCatalogue:
+    """Stars all over the sky."""
+    rng = np.random.default_rng(1)
+    ra, dec = rng.uniform(0.0, 360.0, n), np.degrees(np.arcsin(rng.uniform(-1.0, 1.0, n)))
+    names, still = np.array([f"S{i}" for i in range(n)]), np.zeros(n)
+    return sc.StarCatalogue(
+        names, ra, dec, rng.uniform(2.0, 6.0, n), still, still, still > 1, 2026.9, "G", False, "even"
+    )
 
 
 # --- frames for a target ---------------------------------------------------------------------------------------------
