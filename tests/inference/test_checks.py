@@ -1,0 +1,149 @@
+"""Each check of a posterior at both sides of its bound, with what it says and advises."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+
+from starcal_uq.core.status import Level
+from starcal_uq.inference import checks
+from starcal_uq.inference.derived import Derived, derived_quantities
+from starcal_uq.inference.posterior import Posterior
+from starcal_uq.inference.sample import sample
+from tests.helpers.gaussian_camera import gaussian_calibration
+
+N_STEPS = 60
+
+
+@pytest.fixture(scope="module")
+def post() -> Posterior:
+    return sample(None, gaussian_calibration(), n_walkers=16, n_steps=N_STEPS, seed=3, evaluation="compressed")
+
+
+def changed(post: Posterior, **changes: object) -> Posterior:
+    return dataclasses.replace(post, diagnostics=dataclasses.replace(post.diagnostics, **changes))
+
+
+def times_longer(check: checks.Check) -> float:
+    """How many times as many steps the remedy takes."""
+    (command,) = re.findall(r"--steps (\d+) ", check.remedy)
+    assert f"n_steps={command}" in check.remedy
+    return int(command) / N_STEPS
+
+
+def test_ensembles_that_agree_and_that_do_not(post: Posterior) -> None:
+    rhat = np.full(6, 1.005)
+    good = checks._rhat(changed(post, rhat=rhat))
+    assert good.level is Level.PASS and good.remedy == "" and good.value == "1.0050"
+    rhat[2] = 1.02
+    bad = checks._rhat(changed(post, rhat=rhat))
+    assert bad.level is Level.FAIL and "disagree in f:" in bad.sentence and times_longer(bad) == 2.0
+
+
+def test_too_few_effective_draws_take_as_many_more_steps(post: Posterior) -> None:
+    many = np.full(6, 5000.0)
+    assert checks._effective_draws(changed(post, ess_bulk=many, ess_tail=many)).level is Level.PASS
+    few = many.copy()
+    few[4] = 100.0
+    for names in ({"ess_bulk": few, "ess_tail": many}, {"ess_bulk": many, "ess_tail": few}):
+        check = checks._effective_draws(changed(post, **names))
+        assert check.level is Level.FAIL and "of k2 for" in check.sentence
+        # A fifth in reserve; at most 20 times as many, and twice at least.
+        assert times_longer(check) == np.ceil(1.2 * checks.ESS_BOUND / 100.0)
+    least = checks._effective_draws(changed(post, ess_bulk=many, ess_tail=np.full(6, 1.0)))
+    assert times_longer(least) == 20.0
+
+
+@pytest.mark.parametrize("late", ["rhat", "ess_bulk", "ess_tail", None])
+def test_what_follows_from_the_parameters_converges_too(post, late, monkeypatch) -> None:
+    good = Derived("focal length", "mm", 1.0, 1.0, 0.01, 1.001, 9000.0, 9000.0)
+    numbers = {"rhat": 1.2, "ess_bulk": 200.0, "ess_tail": 200.0}
+    other = dataclasses.replace(good, name="common rotation", **({} if late is None else {late: numbers[late]}))
+    monkeypatch.setattr(checks, "derived_quantities", lambda post: [good, other])
+    check = checks._derived(post)
+    if late is None:
+        assert check.level is Level.PASS and "have converged too" in check.sentence and check.remedy == ""
+        return
+    assert check.level is Level.FAIL and check.sentence.startswith("Common rotation has not converged")
+    asked = 2.0 if late == "rhat" else np.ceil(1.2 * checks.ESS_BOUND / 200.0)
+    assert times_longer(check) == max(asked, 2.0)
+
+
+def test_derived_quantities_have_the_moments_of_their_draws(post: Posterior) -> None:
+    mm = next(found for found in derived_quantities(post) if found.unit == "mm")
+    draws = post.theta_draws[:, 2] * post.camera.pixel_um * 1e-3
+    assert mm.mean == pytest.approx(draws.mean(), rel=1e-12)
+    assert mm.sd == pytest.approx(draws.std(ddof=1), rel=1e-9)
+
+
+def test_degrees_of_freedom_are_stated_by_their_quantiles(post: Posterior) -> None:
+    drawn = np.random.default_rng(0).permutation(np.linspace(4.0, 6.0, len(post.draws)))
+    check = checks._degrees_of_freedom(dataclasses.replace(post, dof_draws=drawn))
+    assert check.sentence == "dof has the median 5 and the 95 % interval 4.05 to 5.95."
+    assert check.level is Level.PASS
+    drifting = checks._degrees_of_freedom(dataclasses.replace(post, dof_draws=np.sort(drawn)))
+    assert drifting.level is Level.FAIL and times_longer(drifting) == 20.0
+
+
+def test_importance_sampling_agrees_or_not(post: Posterior) -> None:
+    alike = {"agreement_mean": 0.01, "agreement_sd": 0.01, "psis_khat": 0.1, "psis_ess": 4000.0}
+    good = checks._independent(changed(post, **alike))
+    assert good.level is Level.PASS and good.remedy == "" and "gives the same" in good.sentence
+    for name in ("agreement_mean", "agreement_sd"):
+        bad = checks._independent(changed(post, **(alike | {name: 1.0})))
+        assert bad.level is Level.FAIL and "gives other" in bad.sentence and times_longer(bad) == 2.0
+    heavy = checks._independent(changed(post, **(alike | {"psis_khat": 0.9, "agreement_sd": 1.0})))
+    assert heavy.level is Level.FAIL and "says nothing" in heavy.sentence and heavy.remedy == ""
+
+
+def test_how_the_likelihood_was_evaluated(post: Posterior) -> None:
+    def said(used: str, difference: float, khat: float = 0.0, frames: tuple[int, int] = (0, 0)) -> checks.Check | None:
+        words = {"compressed_khat": khat, "compressed_frames": frames}
+        return checks._evaluation(changed(post, likelihood_used=used, compressed_max_difference=difference, **words))
+
+    assert said("exact", np.nan) is None
+    tried = said("exact", 3.0)
+    assert tried.level is Level.PASS and tried.value == "exact" and "departs from it by 3.0 nat" in tried.sentence
+    unchecked = said("compressed", np.nan)
+    assert unchecked.level is Level.WARN and unchecked.remedy == "sc.sample(obs, cal)"
+    good = said("compressed", 0.01)
+    assert good.level is Level.PASS and good.remedy == "" and good.sentence.endswith("wherever the posterior is.")
+    assert "as 1000 of 5000 frames tell" in said("compressed", 0.01, frames=(1000, 5000)).sentence.replace("\u202f", "")
+    for bad in (said("compressed", 5.0), said("compressed", 0.01, khat=0.9)):
+        assert bad.level is Level.FAIL and "--evaluation exact" in bad.remedy
+    whole = checks.CompressionCheck(0.1, 0.2)
+    assert whole.good and (whole.n_frames, whole.of_frames) == (0, 0)
+
+
+def test_points_around_the_mode_are_three_standard_deviations_out() -> None:
+    points = checks._surface(5)
+    assert points.shape == (20, 5)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 3.0)
+    # Both ways along each axis, and two different bases.
+    np.testing.assert_allclose(points[:10] + points[10:], 0.0, atol=1e-12)
+    np.testing.assert_allclose(points[:5] @ points[:5].T, 9.0 * np.eye(5), atol=1e-12)
+    assert np.abs(points[:5] @ points[5:10].T).max() < 8.99
+
+
+def test_a_likelihood_that_is_known_to_be_wrong(post: Posterior) -> None:
+    assert checks._likelihood(changed(post, likelihood="marginal"), ()) is None
+    pairs = checks._likelihood(changed(post, likelihood="pairs"), ("Godambe.",))
+    assert pairs.level is Level.PASS and pairs.remedy == ""
+    assert pairs.sentence == "The posterior is that of the likelihood 'pairs'. Godambe."
+    naive = checks._likelihood(changed(post, likelihood="pairs_naive"), ())
+    assert naive.level is Level.FAIL and "which they are not" in naive.sentence and "likelihood='pairs'" in naive.remedy
+
+
+def test_sampling_again_keeps_the_settings(post: Posterior) -> None:
+    default = checks.resample(post, n_steps=900)
+    assert default == "starcal-uq sample RUN --force --walkers 16 --steps 900 --evaluation compressed or " + (
+        "sc.sample(obs, cal, n_walkers=16, n_steps=900, evaluation='compressed')"
+    )
+    # An object of one's own is evaluated as it is, and no command takes it.
+    assert (
+        checks.resample(post, likelihood="gaussian")
+        == "sc.sample(obs, cal, n_walkers=16, n_steps=60, likelihood=likelihood)"
+    )
