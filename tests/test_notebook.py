@@ -9,6 +9,11 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
+import starcal_uq as sc
+from starcal_uq.core.errors import RunFolderError
+from starcal_uq.presentation.pages.notebook import executed, write_cells
+from tests.helpers.scenes import observations
+
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
 
 
@@ -39,6 +44,42 @@ def test_it_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     words = sum("text/html" in data or "text/markdown" in data for data in shown)
     assert words >= 4, "results show themselves as tables or in words"
     assert sum("image/png" in data for data in shown) >= 3, "figures are drawn"
+
+
+def test_cells_of_a_run_are_those_of_what_it_holds() -> None:
+    cells = list(write_cells("night", ["observations", "calibration"], "/data/night"))
+    assert cells[1] == ("parameters", "folder = '/data/night'")
+    source = "\n".join(text for _, text in cells)
+    assert "run.calibration" in source
+    assert not {"posterior", "attitude", "budget", "images"} & set(re.findall(r"run\.(?:error_|shown_)?(\w+)", source))
+    for kind, text in cells:
+        if kind != "markdown":
+            compile(text, "cell", "exec")
+
+
+@pytest.mark.slow
+def test_a_run_becomes_a_notebook_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(NOTEBOOKS.parent))
+    monkeypatch.setenv("MPLBACKEND", "Agg")  # the kernel draws inline all the same
+    run = sc.Run(tmp_path / "run")
+    run.calibrate(observations(n_frames=30), sc.paper.paper_start())
+    run.sample(n_steps=50, seed=1)
+    with pytest.raises(RunFolderError, match=r"ZeroDivisionError: division by zero"):
+        executed(iter([("code", "1 / 0")]), tmp_path)
+    path = run.notebook()
+    assert path == run.path / "report.ipynb"
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    first, *others = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert (first.source, first.metadata["tags"], first.outputs) == ("folder = '.'", ["parameters"], [])
+    outputs = [output for cell in others for output in cell.outputs]
+    assert all(len(cell.outputs) == 1 for cell in others), "every cell shows one thing, and no stream"
+    assert sum("image/png" in output.data for output in outputs) == 5
+    assert run.verdict.headline in outputs[0].data["text/plain"]
+    with pytest.raises(RunFolderError, match=r"report\.ipynb: the file exists already"):
+        run.notebook()
+    run.sample(n_steps=20, seed=2, force=True)
+    assert not path.exists(), "it is of a posterior that is gone"
 
 
 @pytest.mark.slow

@@ -566,7 +566,7 @@ class Report(Part):
     """A report."""
 
     run: str = says("Run folder")
-    report: str = says("The page")
+    report: str = says("The page, or with --notebook the notebook")
 
 
 class Inspect(Part):

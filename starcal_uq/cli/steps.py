@@ -286,10 +286,26 @@ def propagate_command(
     return Answer({"run": run, "attitude": error, "spectrum": None if spectrum is None else spectrum.text})
 
 
-def report_command(run: RunPath, force: Force = False) -> Answer:
-    """Write RUN/report.html, one self-contained file, from whatever the run holds."""
-    page = sc.Run(run, tell=note).report(force=force)
-    say(f"Report: {page.resolve()}")
+def report_command(
+    run: RunPath,
+    notebook: Annotated[
+        bool, typer.Option("--notebook", help="Write an executed Jupyter notebook, RUN/report.ipynb, in its place.")
+    ] = False,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="FILE", help="Another notebook to write.", parser=write_file)
+    ] = None,
+    force: Force = False,
+) -> Answer:
+    """Write RUN/report.html, one self-contained file, from whatever the run holds; or a notebook."""
+    held = sc.Run(run, tell=note)
+    if out is not None and not notebook:
+        raise typer.BadParameter("--out names a notebook: add --notebook; the report has its place in RUN.")
+    if notebook:
+        with progress_bar("notebook") as bar:
+            page = held.notebook(out, force=force, progress=bar)
+    else:
+        page = held.report(force=force)
+    say(f"{'Notebook' if notebook else 'Report'}: {page.resolve()}")
     return Answer({"run": run, "report": page})
 
 

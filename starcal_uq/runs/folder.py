@@ -58,15 +58,16 @@ HISTORY = "history.csv"
 CHECKPOINT = "sampling.checkpoint.npz"
 # Step -> steps that rest on its result.
 REST_ON: dict[str, tuple[str, ...]] = {
-    "calibrate": ("images", "inspect", "sample", "coupling", "propagate", "diagnose", "budget", "report"),
-    "images": ("inspect", "report"),
+    "calibrate": ("images", "inspect", "sample", "coupling", "propagate", "diagnose", "budget", "report", "notebook"),
+    "images": ("inspect", "report", "notebook"),
     "inspect": (),
-    "sample": ("coupling", "propagate", "budget", "report"),
-    "coupling": ("report",),
-    "propagate": ("budget", "report"),
-    "diagnose": ("budget", "report"),
-    "budget": ("report",),
+    "sample": ("coupling", "propagate", "budget", "report", "notebook"),
+    "coupling": ("report", "notebook"),
+    "propagate": ("budget", "report", "notebook"),
+    "diagnose": ("budget", "report", "notebook"),
+    "budget": ("report", "notebook"),
     "report": (),
+    "notebook": (),
 }
 # Files that have no name of their own in a run.
 _OTHERS = {
@@ -122,6 +123,8 @@ class RunFolder:
         The report (HTML, self-contained).
     inspection : Path
         The images with their stars (HTML, self-contained).
+    notebook : Path
+        The results as an executed notebook.
     """
 
     path: Path
@@ -145,6 +148,7 @@ class RunFolder:
     figures = _File("figures", "starcal-uq report RUN")
     report = _File("report.html", "starcal-uq report RUN")
     inspection = _File("frames.html", "starcal-uq inspect RUN")
+    notebook = _File("report.ipynb", "starcal-uq report RUN --notebook")
 
     def __init__(self, path: PathLike) -> None:
         object.__setattr__(self, "path", Path(path))

@@ -21,6 +21,7 @@ from starcal_uq.core.files import (
     atomic_write_bytes,
     atomic_write_text,
     check_new_folder,
+    ensure_new,
     new_folder,
     read_parquet,
     reading,
@@ -859,6 +860,45 @@ class Run:
                 write_json(self.verdict.to_dict(), files.verdict)
                 atomic_write_text(files.report, html)
         return self.path / RunFolder.report
+
+    @_writing
+    def notebook(self, to: PathLike | None = None, *, force: bool = False, progress: Progress | None = None) -> Path:
+        """Write an executed notebook of whatever the run holds, ``RUN/report.ipynb``, to go on from.
+
+        It is of the run as it is now, and goes when that changes, if it is in the folder.
+
+        Parameters
+        ----------
+        to : path, optional
+            Another file.
+        force : bool
+            Whether to replace a file.
+        progress : callable, optional
+            Called as ``progress(cells_done, cells_total)``.
+
+        Raises
+        ------
+        RunFolderError
+            If there is no calibration, a file cannot be read or is in the way, or a cell fails.
+        MissingExtraError
+            If nbformat, nbclient or ipykernel is not installed.
+        """
+        from starcal_uq.presentation.pages.notebook import executed, write_cells
+
+        place = self.path / RunFolder.notebook if to is None else Path(to)
+        ensure_new(place, force)
+        # What is wrong with the run is told here, and not by a cell.
+        _ = self.results
+        parts = [name for name in FILES if self.has(name)] + ["images"] * (self.images is not None)
+        # A folder that moves takes its notebook along.
+        folder = "." if to is None else str(self.path.resolve())
+        content = executed(write_cells(self.name, parts, folder), place.resolve().parent, progress)
+        if to is not None:
+            atomic_write_text(place, content)
+            return place
+        with self._step("notebook", None, {}) as files:
+            atomic_write_text(files.notebook, content)
+        return place
 
     @property
     def _keeps_observations(self) -> bool:

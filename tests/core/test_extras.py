@@ -20,6 +20,7 @@ from starcal_uq.core.errors import MissingExtraError
 from starcal_uq.images.detection import DetectionOptions, find_stars
 from starcal_uq.images.image import Image
 from starcal_uq.presentation.pages.budgeting import write_xlsx
+from starcal_uq.presentation.pages.notebook import executed
 
 PREVIOUS = Path(__file__).parents[1] / "runs" / "data" / "previous"
 
@@ -65,6 +66,7 @@ NEEDS: dict[str, tuple[str, str, Callable[[Path], Any]]] = {
     "cameras for tetra3rs": ("tetra3rs", "tetra3rs", partial(export, "tetra3rs")),
     "compiled kernels": ("numba", "compiled", lambda _: compiled.use("numba")),
     "Dask schedulers": ("distributed", "cluster", lambda _: on_processes(scheduler="tcp://127.0.0.1:1")),
+    "executed notebooks": ("nbclient", "notebook", partial(executed, iter([]))),
     "several processes over one set of files": ("distributed", "cluster", lambda _: on_processes(workers=2)),
 }
 

@@ -1,0 +1,142 @@
+"""A run as an executed notebook: its results in the order of a report, to go on from."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.extras import extra
+from starcal_uq.core.tasks import Progress
+
+# File of the run that a part needs, heading, sentence, and cells.
+_PARTS = (
+    ("observations", "What it rests on", "", ["run.observations"]),
+    ("images", "The images", "Frames that tell most.", ["run.shown_frames"]),
+    (
+        "calibration",
+        "The estimate",
+        "Every stage on its way to the optimum, and what the model leaves of each star.",
+        ["run.calibration", "run.calibration.plot.convergence()", "run.calibration.plot.residuals(run.observations)"],
+    ),
+    (
+        "posterior",
+        "What is known of the parameters",
+        "Where prior and posterior are alike, the data have said nothing.",
+        ["run.posterior", "run.posterior.plot.corner()", "run.posterior.plot.prior_posterior()"],
+    ),
+    (
+        "calibration",
+        "Which parameters lean on each other",
+        "An error of one is made good by those that it is coupled to.",
+        ["run.coupling", "run.coupling.plot.correlation();"],
+    ),
+    (
+        "attitude",
+        "What it does to attitude",
+        "The common rotation is one constant, which an alignment calibration with the same parameters absorbs; the "
+        "rest changes from frame to frame.",
+        ["run.attitude", "run.attitude.plot.contributors();"],
+    ),
+    ("field_map", "Where on the detector", "", ["run.field_map.plot.maps()"]),
+    ("diagnosis", "Does the model hold?", "", ["run.diagnosis", "run.diagnosis.plot.diagnosis()"]),
+    ("budget", "The error budget", "", ["run.error_budget", "run.error_budget.plot.contributors()"]),
+    (
+        "calibration",
+        "May it be used?",
+        "Every check, with its bound; the remedy of each stands in `run.verdict.checks`.",
+        [
+            "import pandas as pd\n\n"
+            'pd.DataFrame(run.verdict.to_dict()["checks"])[["level", "name", "value", "bound"]].set_index("name")'
+        ],
+    ),
+    (
+        "posterior",
+        "Go on",
+        "`run.posterior.to_dataframe()` has the draws, `run.arviz()` all groups of ArviZ, `run.calibration.camera` and "
+        "`sc.export(run, ...)` the camera for other programs.",
+        ["run.posterior.summary()"],
+    ),
+)
+
+
+def write_cells(name: str, parts: Collection[str], folder: str) -> Iterator[tuple[str, str]]:
+    """Kind (``markdown``, ``code``, or ``parameters``) and source of each cell of the notebook on a run in `folder`.
+
+    `parts` are names of the files that the run holds, such as ``posterior``.
+    """
+    yield (
+        "markdown",
+        f"# Calibration `{name}`\n\nWritten by `starcal-uq report RUN --notebook`. The folder below is all that it "
+        "depends on: name another run there, and run all cells.",
+    )
+    yield "parameters", f"folder = {folder!r}"
+    yield "code", "import starcal_uq as sc\n\nrun = sc.Run(folder)\nrun"
+    for needs, heading, sentence, cells in _PARTS:
+        if needs in parts:
+            yield "markdown", f"## {heading}\n\n{sentence}".strip()
+            yield from (("code", cell) for cell in cells)
+
+
+def executed(cells: Iterator[tuple[str, str]], place: Path, progress: Progress | None = None) -> str:
+    """A notebook of these cells, as its file holds it, executed by this Python in the folder `place`.
+
+    Raises
+    ------
+    MissingExtraError
+        If a library is not installed.
+    RunFolderError
+        If a cell fails.
+    """
+    with extra("notebook", "executed notebooks"):
+        import ipykernel  # noqa: F401
+        import nbformat.v4
+        from jupyter_client.kernelspec import KernelSpec
+        from jupyter_client.manager import AsyncKernelManager
+        from nbclient import NotebookClient
+        from nbclient.exceptions import CellExecutionError
+
+    class ThisPython(AsyncKernelManager):
+        """Whatever kernels are installed, this interpreter has the package."""
+
+        @property
+        def kernel_spec(self) -> KernelSpec:
+            command = [sys.executable, "-m", "ipykernel_launcher", "-f", "{connection_file}"]
+            return KernelSpec(argv=command, display_name="Python 3", language="python")
+
+    make: Any = nbformat.v4
+    write: Any = nbformat.writes
+    made = []
+    for number, (kind, source) in enumerate(cells):
+        cell = make.new_markdown_cell(source) if kind == "markdown" else make.new_code_cell(source)
+        # The same for the same run; as a rule they are random.
+        cell["id"] = f"cell-{number}"
+        if kind == "parameters":
+            cell["metadata"]["tags"] = ["parameters"]
+        made.append(cell)
+    kernel = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
+    notebook = make.new_notebook(cells=made, metadata=kernel)
+    with TemporaryDirectory(prefix="starcal-uq-") as own:
+        # The kernel draws inline, whatever this process draws with.
+        env = {name: value for name, value in os.environ.items() if name != "MPLBACKEND"} | {"IPYTHONDIR": own}
+        client = NotebookClient(
+            notebook,
+            kernel_manager_class=ThisPython,
+            timeout=600,
+            resources={"metadata": {"path": str(place)}},
+            record_timing=False,
+            on_cell_complete=lambda cell, cell_index: progress(cell_index + 1, len(made)) if progress else None,
+        )
+        try:
+            client.execute(env=env, stderr=subprocess.DEVNULL)
+        except CellExecutionError as error:
+            said = f"{error.ename}: {error.evalue}".splitlines()[0]
+            raise RunFolderError(
+                f"a cell of the notebook failed ({said}): look at `starcal-uq report` first."
+            ) from None
+    return str(write(notebook)) + "\n"
