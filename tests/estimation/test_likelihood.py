@@ -14,6 +14,7 @@ from starcal_uq.camera.projection import project
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.estimation.compressed import (
     CompressedLikelihood,
+    _derivatives,
     _Expansion,
     combined,
     compress,
@@ -231,3 +232,20 @@ def test_scaling_the_stated_noise_only_rescales_sigma():
     assert np.allclose(a.theta, b.theta, rtol=1e-9)
     assert np.allclose(a.covariance, b.covariance, rtol=1e-6)
     assert 0.8 < a.sigma < 1.2
+
+
+def test_derivatives_of_the_compressed_sum_of_squares():
+    """Of any expansion: that of an estimate has next to no slope, and bends by second derivatives alone."""
+    rng = np.random.default_rng(4)
+    root = rng.standard_normal((30, 21))
+    compressed = CompressedLikelihood(np.zeros(5), np.eye(5), root.T @ root, 0.0, np.zeros(5), 100, 50, 5)
+    slope, hessian = _derivatives(compressed)
+    unit = 1e-3 * np.eye(5)
+
+    def value(z):
+        return compressed.sum_of_squares(np.atleast_2d(z))[0]
+
+    steps = [(value(e) - value(-e)) / 2e-3 for e in unit]
+    bends = [[(value(a + b) - value(a - b) - value(b - a) + value(-a - b)) / 4e-6 for a in unit] for b in unit]
+    np.testing.assert_allclose(slope, steps, rtol=1e-4, atol=1e-3)
+    np.testing.assert_allclose(hessian, bends, rtol=1e-3, atol=1e-2)

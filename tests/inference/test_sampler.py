@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import inspect
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,10 @@ from scipy import integrate, stats
 from starcal_uq.core.errors import SamplingError, SettingError
 from starcal_uq.core.status import Level, Status
 from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.estimation.student import DEFAULT_DOF
+from starcal_uq.inference import named
 from starcal_uq.inference.checks import _OPTIONS, check_compression
+from starcal_uq.inference.exact import ExactMarginal, FrameSample
 from starcal_uq.inference.priors import Priors
 from starcal_uq.inference.sample import sample
 from starcal_uq.inference.target import importance_check, laplace_approximation, start_target
@@ -445,3 +449,38 @@ def test_every_distortion_model_and_stated_noise(model: str) -> None:
     assert post.diagnostics.likelihood_used == "compressed"
     assert np.max(np.abs(post.mean - cal.theta) / cal.sigmas) < 0.3
     assert np.allclose(post.sd[:-1], cal.sigmas, rtol=0.2)
+
+
+def test_frames_in_batches_say_what_the_expansion_leaves_out() -> None:
+    """Where as many frames are in each batch, what they leave out is what all of them do."""
+    obs = observations(n_frames=20)
+    cal = calibrate(obs, nominal(camera()))
+    theta = cal.theta + 3.0 * cal.sigmas * np.random.default_rng(1).standard_normal((4, 5))
+    sigma = np.full(4, 1.1 * cal.sigma)
+    batches = FrameSample(obs, cal)
+    assert (batches.n_frames, batches.of_frames) == (20, 20)
+    exact = ExactMarginal(obs, cal).log_likelihood(theta, sigma)
+    compressed = cal.compressed.log_likelihood(theta, sigma)
+    assert np.abs(np.diff(exact - compressed)).max() > 0.01
+    left = batches.log_likelihood(theta, sigma) - exact
+    assert np.abs(left - left[0]).max() < 0.02 * np.abs(exact - compressed - (exact - compressed)[0]).max() + 1e-3
+    assert batches.left_out(theta, sigma).shape == (10, 4)
+    # Of frames that stand for more, the expansion is that of all, and what is left out grows with them.
+    more = FrameSample(obs, cal, of_frames=40)
+    np.testing.assert_allclose(more.left_out(theta, sigma), 2.0 * batches.left_out(theta, sigma))
+
+
+def test_degrees_of_freedom_are_the_callers_or_the_calibrations() -> None:
+    student = SimpleNamespace(provenance={"settings": {"likelihood": "student_t", "dof": 7.0}})
+    other = SimpleNamespace(provenance={"settings": {"likelihood": "marginal"}})
+    assert named.resolved_dof(student, None) == 7.0 and named.resolved_dof(student, 3.0) == 3.0
+    assert named.resolved_dof(student, "free") == "free" and named.resolved_dof(other, 3.0) == 3.0
+    assert named.resolved_dof(other, None) == DEFAULT_DOF
+
+
+def test_a_stream_of_samaans_has_no_likelihood_to_sample() -> None:
+    cal = SimpleNamespace(provenance={"settings": {"stream": True, "method": "samaan"}}, star_errors=1)
+    with pytest.raises(SamplingError, match="a stream leaves only the quadratic likelihood"):
+        named._named_source("pairs", None, cal, None)
+    with pytest.raises(SamplingError, match="holds errors of the stars"):
+        named._named_source("pairs", observations(n_frames=3), cal, None)
