@@ -20,7 +20,6 @@ from starcal_uq.presentation.tables import TextTable
 if TYPE_CHECKING:
     import pandas as pd
 
-    from starcal_uq.diagnostics.verdict.judge import Verdict
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.estimation.screening.result import Screening
     from starcal_uq.inference.posterior import Posterior
@@ -28,6 +27,7 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
     from starcal_uq.propagation.attitude_error import AttitudeError
     from starcal_uq.propagation.coupling import Coupling
+    from starcal_uq.runs.run import Run
 
 # `!starcal-uq` of a notebook has a terminal of 80 columns, which keeps every state of a bar.
 _IN_NOTEBOOK = "JPY_PARENT_PID" in os.environ
@@ -125,13 +125,16 @@ def show_screening(screening: Screening) -> None:
     say(screening.text)
 
 
-def show_verdict(verdict: Verdict) -> None:
-    """The headline, and every check that did not pass."""
-    style = _STYLES[verdict.level]
-    say(f"Verdict ({verdict.level.value}): {verdict.headline}", style=style)
-    for check in verdict.checks:
-        if check.level is not Level.PASS:
-            say(f"- {check}")
+def show_summary(run: Run) -> None:
+    """The run in a screen of 80 columns, with what to try, the place of the report, and the verdict last."""
+    from starcal_uq.presentation.report.summary import terminal_summary, verdict_lines
+
+    results = run.results
+    for line in ("", *terminal_summary(results), f"Report: {run.report().resolve()}"):
+        say(line)
+    style = _STYLES[results.verdict.level]
+    for line in verdict_lines(results.verdict):
+        say(line, style=style)
 
 
 def warn_air(obs: Observations | PartitionedObservations, cal: Calibration) -> None:

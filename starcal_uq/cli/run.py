@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,12 +13,11 @@ from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.console import (
     note,
     progress_bar,
-    say,
     show_attitude,
     show_calibration,
     show_posterior,
     show_screening,
-    show_verdict,
+    show_summary,
     tell,
     warn_air,
 )
@@ -68,7 +68,8 @@ def demo(
     from starcal_uq.presentation.report.drawing import Ahead
 
     run = sc.Run(out, tell=note)
-    with run.making({"command": "demo", "frames": frames, "seed": seed}, force=force), Ahead() as ahead:
+    command = {"command": "demo", "frames": frames, "seed": seed}
+    with run.making(command, force=force, words=sys.argv[1:]), Ahead() as ahead:
         truth = sc.paper.paper_camera()
         if not run.did("calibrate"):
             tell(f"Simulating {frames} frames of the paper's sensor (Gaia G <= 6, 0.05 px noise, seed {seed}) ...")
@@ -137,7 +138,7 @@ def run_command(
     files = {f"input {number}": path for number, path in enumerate(inputs)}
     files |= {} if camera is None else {"camera": camera}
     command = command_of("run", settings | aligning | {"budget": budget}, files)
-    with run.making(command, force=force), Ahead() as ahead:
+    with run.making(command, force=force, words=sys.argv[1:]), Ahead() as ahead:
         if not (run.did("calibrate") and (run.did("images") or not from_images)):
             # Priors may determine what the data leave open.
             options = estimation.options() | ({"undetermined": True} if sampling.priors is not None else {})
@@ -220,13 +221,11 @@ def _after_calibration(
 
 
 def _conclude(run: Run) -> Answer:
-    """Verdict and place of the report; status 1 when a check or a requirement failed."""
-    show_verdict(run.verdict)
-    page = run.report()
-    say(f"Report: {page.resolve()}")
+    """The summary; status 1 when a check or a requirement failed."""
+    show_summary(run)
     results = {
         "run": run.path,
-        "report": page,
+        "report": run.report(),
         "verdict": run.verdict,
         "calibration": (run.calibration, run.truth),
         "screening": run.screening,

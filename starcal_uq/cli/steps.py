@@ -19,6 +19,7 @@ from starcal_uq.cli.console import (
     show_coupling,
     show_posterior,
     show_screening,
+    show_summary,
     tell,
     warn_air,
     warn_undeclared,
@@ -303,9 +304,10 @@ def report_command(
     if notebook:
         with progress_bar("notebook") as bar:
             page = held.notebook(out, force=force, progress=bar)
+        say(f"Notebook: {page.resolve()}")
     else:
         page = held.report(force=force)
-    say(f"{'Notebook' if notebook else 'Report'}: {page.resolve()}")
+        show_summary(held)
     return Answer({"run": run, "report": page})
 
 

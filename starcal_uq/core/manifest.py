@@ -73,6 +73,8 @@ class Manifest:
         Provenance of each step that is done: time, seed, settings, versions.
     command : dict or None
         What the whole run is made of, of one that a single command makes: settings and hashes of the inputs.
+    words : tuple of str
+        That command as it was typed, without the program's name.
     complete : bool
         False while that command is under way, or was interrupted.
     stage : str
@@ -84,6 +86,7 @@ class Manifest:
     files: dict[str, Entry] = field(default_factory=dict)
     steps: dict[str, AnyDict] = field(default_factory=dict)
     command: AnyDict | None = None
+    words: tuple[str, ...] = ()
     complete: bool = True
     stage: str = ""
     gone: tuple[str, ...] = ()

@@ -98,6 +98,11 @@ class Check:
     remedy: str = ""
 
     @property
+    def remedies(self) -> tuple[str, ...]:
+        """The commands and calls of the remedy, each by itself; a name of a file may hold any word."""
+        return tuple(filter(None, re.split(r" or (?=starcal-uq |sc\.)", self.remedy)))
+
+    @property
     def key(self) -> str:
         """The name as files have it: small letters, digits and underscores."""
         return re.sub(r"[^a-z0-9]+", "_", self.name.lower()).strip("_")

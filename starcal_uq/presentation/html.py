@@ -5,9 +5,9 @@ from __future__ import annotations
 import base64
 import io
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from starcal_uq.presentation.tables import TextTable
 
@@ -63,14 +63,26 @@ def template_environment() -> Environment:
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
-    environment.filters |= {"symbol": symbol, "table": on_page}
+    environment.filters |= {"symbol": symbol, "table": on_page, "picture": picture}
     return environment
 
 
-def embedded_image(png: bytes) -> dict[str, Any]:
-    """An image and its width on the page, 100 px an inch: half as fine again, so that it is sharp on paper too."""
-    from PIL import Image
+def picture(images: Mapping[str, bytes], name: str, alt: str) -> Markup:
+    """A figure (SVG or PNG) inside the page, an inch of it 100 px wide; nothing where there is none of that name."""
+    from markupsafe import Markup
 
-    picture = Image.open(io.BytesIO(png))
-    width = round(picture.width * 100.0 / picture.info["dpi"][0])
-    return {"data": base64.b64encode(png).decode("ascii"), "width": width}
+    if name not in images:
+        return Markup("")
+    if images[name].startswith(b"\x89PNG"):
+        from PIL import Image
+
+        shown = Image.open(io.BytesIO(images[name]))
+        width = shown.width * 100.0 / shown.info["dpi"][0]
+        data = "image/png;base64," + base64.b64encode(images[name]).decode("ascii")
+    else:
+        text = images[name].decode().strip()
+        points = re.match(r'<svg[^>]*? width="([\d.]+)pt"', text)
+        width = 0.0 if points is None else float(points[1]) * 100.0 / 72.0
+        # What an attribute in quotation marks, and an address, cannot hold.
+        data = "image/svg+xml," + text.replace("%", "%25").replace("#", "%23").replace('"', "'").replace("&", "%26")
+    return Markup(f'<img class="drawn" src="data:{data}" alt="{escape(alt)}" width="{round(width)}">')

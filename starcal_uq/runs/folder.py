@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -203,7 +203,7 @@ class RunFolder:
         if not (os.path.exists(self.calibration) or os.path.exists(self.posterior)):
             return Manifest()
         steps = {file.name: file.step for file in FILES.values()} | _OTHERS
-        steps |= {path.relative_to(self.path).as_posix(): "report" for path in self.figures.glob("*.png")}
+        steps |= {path.relative_to(self.path).as_posix(): "report" for path in self.figures.glob("*.[ps][nv]g")}
         files = {name: entry_of(self.path / name, steps[name]) for name in steps if (self.path / name).is_file()}
         return Manifest(files, {entry.step: {} for entry in files.values()})
 
@@ -254,11 +254,12 @@ class RunFolder:
             steps = {name: content for name, content in old.steps.items() if name not in stale} | {step: record}
             new = replace(old, files=kept | made, steps=steps, stage=STEP)
             if not making:
-                new = replace(new, command=None, complete=True)
+                words = () if step == "calibrate" else new.words
+                new = replace(new, command=None, words=words, complete=True)
             commit(self.path, new, old.files)
 
     @contextmanager
-    def making(self, command: Mapping[str, object], force: bool) -> Iterator[RunFolder]:
+    def making(self, command: Mapping[str, object], force: bool, words: Sequence[str] = ()) -> Iterator[RunFolder]:
         """Yield the folder in which one command makes a whole run, which goes on where it was interrupted.
 
         That is this folder. Where it holds another run, it is a hidden one inside, whose files take their places all at
@@ -270,6 +271,8 @@ class RunFolder:
             All that the run depends on; an unfinished one of something else is not gone on with.
         force : bool
             Whether to replace a run that is complete.
+        words : sequence of str
+            The command as it was typed, which remedies repeat.
         """
         wanted = json.loads(json.dumps(command, default=as_plain, sort_keys=True))
         with self.writing(make=True):
@@ -292,7 +295,7 @@ class RunFolder:
                 if not place.manifest.steps:
                     _unmake(place.path)
                 raise
-            done = replace(place.manifest, complete=True)
+            done = replace(place.manifest, words=tuple(words), complete=True)
             if place == self:
                 write_manifest(self.path, done)
             else:

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from starcal_uq.budgeting.result import Budget
     from starcal_uq.core.settings import Scalar, Sense
     from starcal_uq.diagnostics.diagnose import Diagnosis
-    from starcal_uq.diagnostics.verdict.judge import Verdict
+    from starcal_uq.diagnostics.verdict.judge import Place, Verdict
     from starcal_uq.estimation.screening.result import Screening
     from starcal_uq.images.centroids import Centroids
     from starcal_uq.inference.posterior import Posterior
@@ -157,6 +157,7 @@ class Run:
     ) -> None:
         self.path, self.folder = Path(path), RunFolder(path)
         self._truth, self._tell, self._making = truth, tell, False
+        self._words: tuple[str, ...] = ()
         self.screening: Screening | None = None
 
     def __repr__(self) -> str:
@@ -419,12 +420,19 @@ class Run:
         return tuple(Missing(what, f"starcal-uq {command} {self.path}") for command, what, there in parts if not there)
 
     @property
+    def place(self) -> Place:
+        """What the commands of remedies name."""
+        from starcal_uq.diagnostics.verdict.judge import Place
+
+        return Place(str(self.path), self._words or self.folder.manifest.words, self.has("observations"))
+
+    @property
     def calibrated(self) -> Results:
         """Data and estimate alone, for what is shown while the rest is not there yet."""
         truth, calibration = self.truth, self.calibration
         if truth is not None and truth.parameter_names != calibration.parameter_names:
             truth = None
-        return Results(self.name, self.observations, calibration, truth=truth)
+        return Results(self.name, self.observations, calibration, truth=truth, place=self.place)
 
     @cached_property
     def results(self) -> Results:
@@ -462,7 +470,9 @@ class Run:
         return step in self.folder.manifest.steps
 
     @contextmanager
-    def making(self, command: Mapping[str, object], *, force: bool = False) -> Iterator[None]:
+    def making(
+        self, command: Mapping[str, object], *, force: bool = False, words: Sequence[str] = ()
+    ) -> Iterator[None]:
         """All steps within the block make one run, which replaces that of before when it is complete, and not sooner.
 
         An interrupted one goes on where it was: steps that are done, `did`, need not be done again.
@@ -473,12 +483,14 @@ class Run:
             All that the run depends on; an unfinished one of something else starts again.
         force : bool
             Whether to replace a run that is complete.
+        words : sequence of str
+            The command as it was typed, without the program's name: remedies repeat it.
         """
         record = {**command, "versions": provenance(None, {}, None)["versions"]}
         here = self.folder
         try:
-            with here.making(record, force) as self.folder:
-                self._making = True
+            with here.making(record, force, words) as self.folder:
+                self._making, self._words = True, tuple(words)
                 if self.folder == here:
                     self._forget(*_LOADED)
                 yield
@@ -833,7 +845,7 @@ class Run:
         Parameters
         ----------
         drawn : callable, optional
-            Figures of these results that are drawn elsewhere, as PNG by name, asked for when all else is ready; the
+            Figures of these results that are drawn elsewhere, as SVG by name, asked for when all else is ready; the
             others are drawn now.
         force : bool
             Whether to write it again.
@@ -855,8 +867,8 @@ class Run:
             html = page(figures, figures.pop(GALLERY, b"").decode())
             with self._step("report", None, {}) as files:
                 new_folder(files.figures)
-                for name, png in figures.items():
-                    atomic_write_bytes(files.figures / f"{name}.png", png)
+                for name, svg in figures.items():
+                    atomic_write_bytes(files.figures / f"{name}.svg", svg)
                 write_json(self.verdict.to_dict(), files.verdict)
                 atomic_write_text(files.report, html)
         return self.path / RunFolder.report

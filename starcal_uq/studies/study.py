@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 _COPY = "study.toml"
 # What a page and its figures may be called.
-_PAGES = ("report.html", "figures/*.png")
+_PAGES = ("report.html", "figures/*.png", "figures/*.svg")
 # Guesses of processor time, by which cells are put together: a second's work goes to a process at once.
 _GEOMETRY_S, _CELL_S, _SIMULATED_S, _BATCH_S = 0.01, 0.0015, 0.1, 1.0
 _FEW_BATCHES = 5

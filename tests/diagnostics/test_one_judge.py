@@ -86,7 +86,6 @@ def test_every_reader_shows_the_same_checks(short, disputed, monkeypatch, tmp_pa
     recorded = Console(record=True, width=1000)
     monkeypatch.setattr(console, "out", recorded)
     console.show_posterior(disputed)
-    console.show_verdict(verdict)
     terminal = recorded.export_text()
     for check in disputed.diagnostics.checks:
         assert check.sentence in terminal and check.value in terminal

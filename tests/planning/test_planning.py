@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from functools import lru_cache
 
@@ -536,12 +537,12 @@ def test_folder_of_a_plan(tmp_path):
     found = made(target_arcsec=5.0)
     page = write_plan(found, tmp_path / "plan")
     text = page.read_text(encoding="utf-8")
-    assert "http" not in text.replace("http-equiv", "")
-    assert text.count("data:image/png") == 2
+    assert "http" not in re.sub(r"data:image/svg\+xml,[^\"]*", "", text)
+    assert text.count("data:image/svg") == 2
     assert found.text.split(".")[0] in text
     written = {path.relative_to(page.parent).as_posix() for path in page.parent.rglob("*") if path.is_file()}
     assert written == {
-        *("plan.html", "plan.csv", "sweeps.csv", "plan.json", "figures/forecast.png", "figures/sweeps.png", "run.json")
+        *("plan.html", "plan.csv", "sweeps.csv", "plan.json", "figures/forecast.svg", "figures/sweeps.svg", "run.json")
     }
     record = json.loads((page.parent / "plan.json").read_text())
     assert record["needs"][0]["frames"] == found.frames_needed
@@ -561,7 +562,7 @@ def test_a_page_with_choice_and_check(tmp_path):
     choice = choose_frames(camera(), sky(), n_frames=5, candidates=200, n_geometries=100)
     page = write_plan(made(sweeps=False), tmp_path / "plan", choice=choice, check=small_check())
     text = page.read_text(encoding="utf-8")
-    assert text.count("data:image/png") == 3
+    assert text.count("data:image/svg") == 3
     assert "Frames to take" in text
     assert "Forecast against simulation" in text
     assert {"frames.csv", "check.csv"} < {path.name for path in page.parent.iterdir()}

@@ -114,7 +114,7 @@ def test_page_holds_answer_advice_and_provenance(decoupled: Study, tmp_path: Pat
     assert len(page) < 2_000_000 and "A study &lt;made&gt; by hand" in page and "<script" not in page
     for words in (study_text(decoupled), "go to a field of 20°", "too few stars", "study: seeds"):
         assert words in page
-    assert len(list((tmp_path / "study" / "figures").glob("*.png"))) == page.count("data:image/png") == 7
+    assert len(list((tmp_path / "study" / "figures").glob("*.svg"))) == page.count("data:image/svg") == 7
     table = study_table(decoupled)
     assert table is not None and len(table.rows) == 6 and "1000" in [row[1] for row in table.rows]
 

@@ -6,13 +6,15 @@ may be used by someone who has read it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import shlex
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.status import Check, Level, Question, worst
 from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.verdict import draws, estimate, observed
+from starcal_uq.diagnostics.verdict.observed import CALIBRATE
 from starcal_uq.estimation.noise_model import weighed
 
 if TYPE_CHECKING:
@@ -66,6 +68,44 @@ class Verdict:
         return tuple(check for check in self.checks if check.level is level)
 
 
+@dataclass(frozen=True)
+class Place:
+    """Where a run is and what made it, so that remedies can be commands to copy.
+
+    Attributes
+    ----------
+    run : str
+        The folder.
+    words : tuple of str
+        Command line that made all of it, without the program; empty where it was made step by step.
+    observations : bool
+        Whether the folder holds observations.
+    """
+
+    run: str
+    words: tuple[str, ...] = ()
+    observations: bool = True
+
+    def exact(self, check: Check) -> Check:
+        """A check whose commands name the files of this run."""
+        remedy = " or ".join(self.command(one) for one in check.remedies)
+        return check if remedy == check.remedy else replace(check, remedy=remedy)
+
+    def command(self, text: str) -> str:
+        """A command with the files of this run in place of OBS, CAMERA, SITE and RUN; a call in Python as it is."""
+        if not text.startswith("starcal-uq"):
+            return text
+        if text.startswith(CALIBRATE) and self.words[:1] == ("run",):
+            # Everything that was asked for then, and this; of an option that is given twice the last one holds.
+            kept = [word for word in self.words if word != "--force"]
+            text = f"starcal-uq {shlex.join(kept)}{text.removeprefix(CALIBRATE)} --force"
+        elif text.startswith(CALIBRATE) and self.observations:
+            given = [f"{self.run}/observations.parquet", f"{self.run}/camera.toml", "-o", f"{self.run}-2"]
+            text = f"starcal-uq run {shlex.join(given)}{text.removeprefix(CALIBRATE)}"
+        files = {"RUN": shlex.quote(self.run), "SITE": "site.toml"}
+        return " ".join(files.get(word, word) for word in text.split(" "))
+
+
 def judge(
     obs: Observations,
     cal: Calibration,
@@ -73,8 +113,12 @@ def judge(
     truth: Camera | None = None,
     attitude: AttitudeError | None = None,
     diagnosis: Diagnosis | None = None,
+    place: Place | None = None,
 ) -> Verdict:
-    """Check a run: everything that is known of it; `truth` is the camera of a simulation."""
+    """Check a run: everything that is known of it; `truth` is the camera of a simulation.
+
+    With its place, remedies are commands that name its files.
+    """
     checks: list[Check | None] = [estimate.estimation(cal, post), estimate.determined(cal)]
     checks += [estimate.estimators_agree(cal)]
     if diagnosis is not None and diagnosis.starts is not None:
@@ -92,7 +136,7 @@ def judge(
         checks += [draws.propagation(attitude)]
     if truth is not None and truth.parameter_names == cal.parameter_names:
         checks += [estimate.against_truth(cal, truth, post)]
-    found = tuple(check for check in checks if check is not None)
+    found = tuple(check if place is None else place.exact(check) for check in checks if check is not None)
     return Verdict(found, _headline(found, post is not None))
 
 

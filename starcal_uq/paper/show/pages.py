@@ -14,7 +14,7 @@ from starcal_uq.paper.field.published import MORE_THAN_STARS, N_CHOSEN, N_TAKEN,
 from starcal_uq.paper.published import N_FRAMES
 from starcal_uq.paper.show import field, tables
 from starcal_uq.presentation.figures.style import DPI, png_bytes
-from starcal_uq.presentation.html import embedded_image, template_environment
+from starcal_uq.presentation.html import template_environment
 from starcal_uq.presentation.tables import TextTable
 
 if TYPE_CHECKING:
@@ -171,6 +171,6 @@ def _page(
         "warning": warning,
         "created": record["created_utc"],
         "version": record["versions"].get("starcal_uq") or "",
-        "images": {name: embedded_image(png) for name, png in figures.items()},
+        "images": figures,
     }
     return template_environment().get_template("sections.html.j2").render(context) + "\n"

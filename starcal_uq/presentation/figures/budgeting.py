@@ -11,7 +11,7 @@ from starcal_uq.budgeting.rows import SCOPES, Contributor, confidence_text
 from starcal_uq.budgeting.shapes import one_axis_factor, two_axis_radius
 from starcal_uq.budgeting.totals import covariance
 from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
-from starcal_uq.core.formatting import significant
+from starcal_uq.core.formatting import plural, significant
 from starcal_uq.presentation.figures import style
 from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, WITH_MISFIT_FOUND
 
@@ -29,15 +29,17 @@ _TALL = 0.31
 def plot_budget(budget: Budget) -> Figure:
     """What each contributor reaches at the budget's confidence, and the totals (mixed interpretation), in two panels.
 
-    Contributors that nobody assessed stand in the figure by name: an empty place is not a zero. Limits are drawn of
+    Contributors that nobody assessed are counted below, for nothing drawn would read as zero. Limits are drawn of
     requirements that the totals may be held against: at the budget's confidence, and mixed.
     """
-    names = list(dict.fromkeys(row.name for row in budget.rows))
+    names = list(dict.fromkeys(row.name for row in budget.rows if row.assessed))
+    without = len({row.name for row in budget.rows} - set(names))
+    missing = f"\n{plural(without, 'contributor')} without a row: not assessed" if without else ""
     figure = style.new_figure(11.5, 1.6 + _TALL * (len(names) + 3))
     panels = figure.subplots(1, 2, sharey=True)
     for ax, (axis, title) in zip(panels, _PANELS, strict=True):
         _panel(ax, budget, names, axis)
-        style.label(ax, title, f"|mean| + n sigma at {confidence_text(budget.confidence)} [arcsec]")
+        style.label(ax, title, f"|mean| + n sigma at {confidence_text(budget.confidence)} [arcsec]{missing}")
     style.legend_above(figure, _handles(budget))
     return figure
 

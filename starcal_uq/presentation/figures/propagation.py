@@ -10,6 +10,7 @@ import numpy as np
 from starcal_uq.core.formatting import percent, significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.figures import style
+from starcal_uq.presentation.figures.estimation import plot_residual_map
 from starcal_uq.presentation.figures.scales import round_levels, ticks_at_levels
 from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND
 
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.observations.table import Observations
     from starcal_uq.propagation.attitude_error import AttitudeError
     from starcal_uq.propagation.distortion import DistortionCurve
     from starcal_uq.propagation.field import FieldMap
@@ -106,6 +109,25 @@ def plot_field_map(field: FieldMap) -> Figure:
         ax, bar = (style.place(figure, left + x, 0.5, wide, down) for x, wide in ((0.0, across), (across + 0.14, 0.18)))
         _panel(ax, bar, field, sigma, covariance, title)
         style.label_distance(ax, x_in=0.27, y_in=0.42)
+    return figure
+
+
+def plot_glance(error: AttitudeError, cal: Calibration, obs: Observations, field: FieldMap) -> Figure:
+    """A run at a glance: attitude error, mean residuals, and what of a direction no rotation takes away."""
+    figure = style.new_figure(11.0, 3.3)
+    shape = cal.camera.height_px / cal.camera.width_px
+    wide, tall = min(2.15, 2.15 / shape), min(2.15, 2.15 * shape)
+    bars = plot_attitude(error, style.place(figure, 0.66, 0.75, 4.0, 2.15))
+    style.legend(bars, loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=3, columnspacing=0.8, handlelength=1.2)
+    stars = plot_residual_map(cal, obs, style.place(figure, 5.3, 0.75, wide, tall))
+    ax, bar = style.place(figure, 8.15, 0.75, wide, tall), style.place(figure, 8.25 + wide, 0.75, 0.14, tall)
+    _panel(ax, bar, field, field.sigma_compensated_arcsec, None, "Rest of directions [arcsec]")
+    bar.set_ylabel("")
+    # The page says what else there is to say.
+    bars.set_xlabel(bars.get_xlabel().partition("\n")[0])
+    stars.set_xlabel("x [px]")
+    for panel, aside in ((bars, 0.46), (stars, 0.42), (ax, 0.42)):
+        style.label_distance(panel, x_in=0.25, y_in=aside)
     return figure
 
 

@@ -15,8 +15,8 @@ from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_path, atomic_write_text, cell_text
 from starcal_uq.presentation.figures.budgeting import plot_budget
-from starcal_uq.presentation.figures.style import png_bytes
-from starcal_uq.presentation.html import embedded_image, template_environment
+from starcal_uq.presentation.figures.style import svg_bytes
+from starcal_uq.presentation.html import template_environment
 from starcal_uq.presentation.tables import tex
 from starcal_uq.presentation.words.budgeting import NOT_RESOLVED, axis_label, headline, outcome_text, tables
 from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND
@@ -270,5 +270,5 @@ def budget_context(budget: Budget | None) -> dict[str, Any]:
     return {"budget": None if budget is None else tables(budget)}
 
 
-def _images(budget: Budget) -> dict[str, Any]:
-    return {"budget": embedded_image(png_bytes(plot_budget(budget)))}
+def _images(budget: Budget) -> dict[str, bytes]:
+    return {"budget": svg_bytes(plot_budget(budget))}

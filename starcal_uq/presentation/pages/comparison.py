@@ -13,8 +13,8 @@ from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, write_c
 from starcal_uq.core.formatting import fixed, percent, pretty_unit, significant, with_sigma
 from starcal_uq.core.manifest import making
 from starcal_uq.presentation.figures.comparison import plot_camera_comparison
-from starcal_uq.presentation.figures.style import png_bytes
-from starcal_uq.presentation.html import embedded_image, template_environment
+from starcal_uq.presentation.figures.style import svg_bytes
+from starcal_uq.presentation.html import template_environment
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.comparison import headline, p_words, rotation_words
 
@@ -43,18 +43,18 @@ def write_comparison(comparison: CameraComparison, folder: str | os.PathLike[str
     RunFolderError
         If the folder cannot be made or written to.
     """
-    image = png_bytes(plot_camera_comparison(comparison))
+    image = svg_bytes(plot_camera_comparison(comparison))
     with making(folder, "compare", _PAGE, force=True) as path:
         comparison.save(path / "comparison.json")
         write_csv(comparison.to_dataframe(), path / "difference.csv")
         write_csv(comparison.field_dataframe(), path / "difference_map.csv")
-        atomic_write_bytes(path / "difference_map.png", image)
+        atomic_write_bytes(path / "difference_map.svg", image)
         atomic_write_text(path / _PAGE, render_comparison(comparison, image))
     return Path(folder) / _PAGE
 
 
 def render_comparison(comparison: CameraComparison, image: bytes) -> str:
-    """The page as one HTML document; `image` is the figure as PNG."""
+    """The page as one HTML document; `image` is the figure as SVG."""
     environment = template_environment()
     context = {
         "found": comparison,
@@ -67,7 +67,7 @@ def render_comparison(comparison: CameraComparison, image: bytes) -> str:
         "test_table": _test_table(comparison),
         "parameter_table": _parameter_table(comparison),
         "source_table": _source_table(comparison),
-        "image": embedded_image(image),
+        "images": {"difference": image},
     }
     return environment.get_template("comparison.html.j2").render(context) + "\n"
 

@@ -24,8 +24,8 @@ from starcal_uq.presentation.figures.planning import (
     plot_frame_choice,
     plot_plan_sweeps,
 )
-from starcal_uq.presentation.figures.style import png_bytes
-from starcal_uq.presentation.html import embedded_image, template_environment
+from starcal_uq.presentation.figures.style import svg_bytes
+from starcal_uq.presentation.html import template_environment
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.planning import (
     SCOPE_NAMES,
@@ -87,8 +87,8 @@ def write_plan(
     }
     with making(folder, "plan", PAGE, force=True) as path:
         figures = new_folder(path / "figures")
-        for name, png in images.items():
-            atomic_write_bytes(figures / f"{name}.png", png)
+        for name, svg in images.items():
+            atomic_write_bytes(figures / f"{name}.svg", svg)
         for name, table in tables.items():
             if table is None:
                 continue
@@ -141,7 +141,7 @@ def _finite(value: Any) -> Any:
 
 
 def plan_figures(plan: Plan, choice: FrameChoice | None = None, check: ForecastCheck | None = None) -> dict[str, bytes]:
-    """Every figure as PNG, by name."""
+    """Every figure as SVG, by name."""
     figures = {"forecast": plot_forecast(plan)}
     if plan.sweeps is not None:
         figures["sweeps"] = plot_plan_sweeps(plan)
@@ -149,7 +149,7 @@ def plan_figures(plan: Plan, choice: FrameChoice | None = None, check: ForecastC
         figures["choice"] = plot_frame_choice(choice)
     if check is not None:
         figures["check"] = plot_forecast_check(check)
-    return {name: png_bytes(figure) for name, figure in figures.items()}
+    return {name: svg_bytes(figure) for name, figure in figures.items()}
 
 
 def render_plan(
@@ -158,7 +158,7 @@ def render_plan(
     choice: FrameChoice | None = None,
     check: ForecastCheck | None = None,
 ) -> str:
-    """The page; `images` are PNG by the names of `plan_figures`."""
+    """The page; `images` are SVG by the names of `plan_figures`."""
     context = _context(plan, images)
     context |= {"choice": None if choice is None else choice_text(choice)}
     context |= {"check": None if check is None else check_text(check)}
@@ -240,5 +240,5 @@ def _context(plan: Plan, images: Mapping[str, bytes]) -> dict[str, Any]:
         and not bool(np.isfinite(plan.sweeps["frames_needed"]).all()),
         "seed": plan.seed,
         "provenance": plan.provenance["settings"],
-        "images": {name: embedded_image(png) for name, png in images.items()},
+        "images": images,
     }

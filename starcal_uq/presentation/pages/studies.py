@@ -22,8 +22,8 @@ from starcal_uq.presentation.figures.studies import (
     plot_study_maps,
     plot_weakest,
 )
-from starcal_uq.presentation.figures.style import png_bytes
-from starcal_uq.presentation.html import embedded_image, template_environment
+from starcal_uq.presentation.figures.style import svg_bytes
+from starcal_uq.presentation.html import template_environment
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.axes import axis_label, value_words
 from starcal_uq.presentation.words.studies import (
@@ -98,14 +98,14 @@ def write_study(study: Study, folder: str | os.PathLike[str]) -> Path:
     images = study_figures(study)
     page = render_study(study, images)
     figures = new_folder(path / "figures")
-    for name, png in images.items():
-        atomic_write_bytes(figures / f"{name}.png", png)
+    for name, svg in images.items():
+        atomic_write_bytes(figures / f"{name}.svg", svg)
     atomic_write_text(path / PAGE, page)
     return path / PAGE
 
 
 def study_figures(study: Study) -> dict[str, bytes]:
-    """Every figure that the study has something for, as PNG, by name."""
+    """Every figure that the study has something for, as SVG, by name."""
     sweep = study.sweep
     if not sweep.axes or not sweep.ok.any():
         return {}
@@ -122,11 +122,11 @@ def study_figures(study: Study) -> dict[str, bytes]:
         drawn["simpler"] = plot_simpler(study)
     if "covered_95" in study.data:
         drawn["coverage"] = plot_coverage(study)
-    return {name: png_bytes(figure) for name, figure in drawn.items()}
+    return {name: svg_bytes(figure) for name, figure in drawn.items()}
 
 
 def render_study(study: Study, images: Mapping[str, bytes]) -> str:
-    """The page; `images` are PNG by the names of `study_figures`."""
+    """The page; `images` are SVG by the names of `study_figures`."""
     definition, data = study.definition, study.data
     band = "Bands: range over what else was drawn." if study.sweep.drawn else "Bands: range over seeds."
     figures = []
@@ -150,7 +150,7 @@ def render_study(study: Study, images: Mapping[str, bytes]) -> str:
         "cells": cells_table(study, _CELLS_SHOWN),
         "cells_words": f"{plural(min(_CELLS_SHOWN, len(study.sweep.ok)), 'cell')} of {count(len(study.sweep.ok))}",
         "provenance": _provenance(study),
-        "images": {name: embedded_image(png) for name, png in images.items()},
+        "images": images,
     }
     return template_environment().get_template(_TEMPLATE).render(context) + "\n"
 

@@ -13,15 +13,20 @@ from starcal_uq.presentation.figures.coupling import plot_correlations, plot_cou
 from starcal_uq.presentation.figures.diagnostics import plot_diagnosis, plot_residual_profiles
 from starcal_uq.presentation.figures.estimation import plot_convergence, plot_residuals
 from starcal_uq.presentation.figures.inference import plot_corner, plot_prior_posterior
-from starcal_uq.presentation.figures.propagation import plot_attitude, plot_distortion_curve, plot_field_map
-from starcal_uq.presentation.figures.style import figure_of, label, new_axes, png_bytes
+from starcal_uq.presentation.figures.propagation import (
+    plot_attitude,
+    plot_distortion_curve,
+    plot_field_map,
+    plot_glance,
+)
+from starcal_uq.presentation.figures.style import figure_of, label, new_axes, svg_bytes
 from starcal_uq.presentation.report.results import Results
 
 # Figures by the step after which they can be drawn.
 AFTER_CALIBRATION = ("residuals", "residual_profiles", "convergence")
 AFTER_SAMPLING = ("corner", "prior_posterior", "correlation", "price_of_coupling", "distortion_curve")
 AFTER_PROPAGATION = ("field_map",)
-AFTER_DIAGNOSIS = ("misfit", "attitude")
+AFTER_DIAGNOSIS = ("glance", "misfit", "attitude")
 AFTER_BUDGET = ("budget",)
 # The frames of a run from images stand among the figures by this name: a piece of a page, not a picture.
 GALLERY = "gallery"
@@ -29,9 +34,9 @@ FIGURES = (*AFTER_CALIBRATION, *AFTER_SAMPLING, *AFTER_PROPAGATION, *AFTER_DIAGN
 
 
 def draw_figures(results: Results, names: Collection[str] = FIGURES) -> dict[str, bytes]:
-    """The figures of these names that the results allow, as PNG."""
+    """The figures of these names that the results allow, as SVG."""
     figures = ((name, _figure(results, name)) for name in names)
-    return {name: png_bytes(figure) for name, figure in figures if figure is not None}
+    return {name: svg_bytes(figure) for name, figure in figures if figure is not None}
 
 
 def draw_gallery(frames: Frames) -> dict[str, bytes]:
@@ -44,6 +49,8 @@ def draw_gallery(frames: Frames) -> dict[str, bytes]:
 def _figure(results: Results, name: str) -> Any:
     """One figure; None where the results lack what it shows."""
     cal, obs, truth = results.calibration, results.observations, results.truth
+    if name == "glance" and results.attitude is not None and results.field_map is not None and len(cal.residuals_px):
+        return plot_glance(results.attitude, cal, obs, results.field_map)
     if name == "residuals":
         return plot_residuals(cal, obs)
     if name == "residual_profiles":
@@ -109,4 +116,4 @@ def _load() -> None:
     gc.disable()
     ax = new_axes(1.0, 1.0)
     label(ax, "", "x")
-    png_bytes(figure_of(ax))
+    svg_bytes(figure_of(ax))

@@ -9,10 +9,10 @@ from starcal_uq.camera.distortion import get_model, parameters
 from starcal_uq.core.formatting import count, join_words
 from starcal_uq.core.status import Check, Level, Question, worst
 from starcal_uq.diagnostics.verdict.limits import limits
-from starcal_uq.presentation.html import embedded_image, template_environment
+from starcal_uq.presentation.html import template_environment
 from starcal_uq.presentation.pages import budgeting as budget_tables
 from starcal_uq.presentation.report import diagnostics as model_tables
-from starcal_uq.presentation.report import tables, words
+from starcal_uq.presentation.report import summary, tables, words
 from starcal_uq.presentation.report.results import Results
 from starcal_uq.presentation.words.propagation import (
     alignment_sentence,
@@ -33,7 +33,7 @@ def render(results: Results, figures: Mapping[str, bytes], gallery: str = "") ->
     results
         What to report.
     figures
-        PNG images by the names of `starcal_uq.presentation.report.drawing.draw_figures`; a missing one is left out.
+        SVG images by the names of `starcal_uq.presentation.report.drawing.draw_figures`; a missing one is left out.
     gallery
         The frames of a run from images, as a piece of a page.
     """
@@ -45,8 +45,7 @@ def prepared(results: Results) -> Callable[[Mapping[str, bytes], str], str]:
     template, known = template_environment().get_template("report.html.j2"), context(results)
 
     def document(figures: Mapping[str, bytes], gallery: str) -> str:
-        images = {name: embedded_image(png) for name, png in figures.items()}
-        return template.render(known, images=images, gallery=gallery) + "\n"
+        return template.render(known, images=figures, gallery=gallery) + "\n"
 
     return document
 
@@ -57,11 +56,24 @@ def context(results: Results) -> dict[str, Any]:
     verdict = results.verdict
     converged = verdict.of(Question.CONVERGED)
     trust = verdict.of(Question.TRUSTWORTHY)
+    usable, unusable = summary.uses(results)
+    version = (post or cal).provenance.get("versions", {}).get("starcal_uq") or ""
     return {
         "title": (results.truth or cal.nominal).name or results.name,
         "run_name": results.name,
         "created": (post or cal).provenance.get("created_utc", ""),
-        "version": (post or cal).provenance.get("versions", {}).get("starcal_uq") or "",
+        "version": version,
+        "usable": usable,
+        "unusable": unusable,
+        "attitude_summary": None if results.attitude is None else summary.attitude_summary(results.attitude),
+        "budget_summary": None if results.budget is None else summary.budget_summary(results.budget),
+        "glance_caption": summary.glance_caption(results),
+        "methods_paragraph": summary.methods_paragraph(results),
+        "citations": [line.format(version=version) for line in summary.CITATIONS],
+        "diagnose": "starcal-uq diagnose RUN"
+        if results.place is None
+        else results.place.command("starcal-uq diagnose RUN"),
+        "template_command": _template_command(results),
         "verdict": verdict,
         "marks": _MARKS,
         "Level": Level,
@@ -77,7 +89,9 @@ def context(results: Results) -> dict[str, Any]:
         "attitude_rows": [] if results.attitude is None else tables.attitude_rows(results.attitude),
         "alignment_sentence": "" if results.attitude is None else alignment_sentence(results.attitude),
         "one_number_sentence": "" if results.attitude is None else one_number_sentence(results.attitude),
-        "misfit_attitude_sentence": "" if results.attitude is None else misfit_sentence(results.attitude),
+        "misfit_attitude_sentence": ""
+        if results.attitude is None
+        else results.located(misfit_sentence(results.attitude)),
         "attitude_sentence": words.attitude_sentence(results),
         "corner_sentence": "" if results.distortion_curve is None else corner_sentence(results.distortion_curve),
         "equivalent_sentence": words.equivalent_sentence(results.field_map),
@@ -105,6 +119,13 @@ def context(results: Results) -> dict[str, Any]:
         "degrees_of_freedom": count(cal.dof),
         "provenance_rows": words.provenance_rows(results),
     }
+
+
+def _template_command(results: Results) -> str:
+    """The command that writes a file for what of the budget is not assessed."""
+    if results.budget is None or not results.budget.not_assessed:
+        return ""
+    return results.command("starcal-uq budget RUN --template budget.toml")
 
 
 def _distortion(results: Results) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -14,7 +15,7 @@ from starcal_uq.observations.table import Observations
 if TYPE_CHECKING:
     from starcal_uq.budgeting.result import Budget
     from starcal_uq.diagnostics.diagnose import Diagnosis
-    from starcal_uq.diagnostics.verdict.judge import Verdict
+    from starcal_uq.diagnostics.verdict.judge import Place, Verdict
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.pipeline.record import ImageRecord
     from starcal_uq.propagation.attitude_error import AttitudeError
@@ -36,7 +37,7 @@ class Results(Shown):
     """Everything that a report is made from; None for what the run does not hold.
 
     The couplings are those of the posterior if there is one, else of the estimate; `truth` is the camera of a
-    simulation.
+    simulation, `place` where the run is.
     """
 
     name: str
@@ -51,15 +52,23 @@ class Results(Shown):
     images: ImageRecord | None = None
     budget: Budget | None = None
     missing: tuple[Missing, ...] = ()
+    place: Place | None = None
 
     @cached_property
     def verdict(self) -> Verdict:
         """Every check of the run, judged once."""
         from starcal_uq.diagnostics.verdict.judge import judge
 
-        return judge(
-            self.observations, self.calibration, self.posterior, self.truth, self.attitude, diagnosis=self.diagnosis
-        )
+        known = (self.observations, self.calibration, self.posterior, self.truth, self.attitude)
+        return judge(*known, diagnosis=self.diagnosis, place=self.place)
+
+    def command(self, text: str) -> str:
+        """A command with the files of this run in place of its words in capitals."""
+        return text if self.place is None else self.place.command(text)
+
+    def located(self, text: str) -> str:
+        """A sentence whose commands name the files of this run."""
+        return re.sub(r"`(.*?)`", lambda found: f"`{self.command(found[1])}`", text)
 
     @cached_property
     def distortion_curve(self) -> DistortionCurve | None:

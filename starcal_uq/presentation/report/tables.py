@@ -84,6 +84,7 @@ def _parameter_row(
         else:
             prior_text = f"{with_sigma(prior[0] / scale, prior[1] / scale)} ± {significant(prior[1] / scale)}"
     return {
+        "name": parameter.name,
         "symbol": symbol(parameter.name),
         "description": parameter.description,
         "unit": pretty_unit(unit),
