@@ -424,7 +424,7 @@ class Run:
         """What the commands of remedies name."""
         from starcal_uq.diagnostics.verdict.judge import Place
 
-        return Place(str(self.path), self._words or self.folder.manifest.words, self.has("observations"))
+        return Place(str(self.path.resolve()), self._words or self.folder.manifest.words, self.has("observations"))
 
     @property
     def calibrated(self) -> Results:

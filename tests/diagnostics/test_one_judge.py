@@ -13,7 +13,8 @@ import starcal_uq as sc
 from starcal_uq.cli import console
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.status import Check, Level, Question, worst
-from starcal_uq.diagnostics.verdict.judge import judge
+from starcal_uq.diagnostics.verdict.judge import Place, judge
+from starcal_uq.diagnostics.verdict.observed import SCREEN
 from starcal_uq.inference.checks import check_draws
 from starcal_uq.presentation.report.page import context
 from starcal_uq.presentation.report.results import Results
@@ -114,3 +115,19 @@ def test_numbers_are_judged_with_their_monte_carlo_error(short):
         other = dataclasses.replace(post, diagnostics=dataclasses.replace(d, agreement_sd=(0.05 + slack) * factor))
         (check,) = (check for check in check_draws(other) if check.name == "Independent posterior")
         assert check.level is level
+
+
+def test_remedies_name_the_files_of_the_run():
+    """By the command that made the run where there was one, else by what the run holds; calls in Python stay."""
+    check = Check("Outliers", Question.TRUSTWORTHY, Level.WARN, "9", "0", "Wrong stars.", SCREEN)
+    made = Place("/a b/run", ("run", "/data/obs.csv", "/data/camera.toml", "--noise", "model")).exact(check)
+    assert made.remedies == (
+        "starcal-uq run /data/obs.csv /data/camera.toml --noise model -o '/a b/run' --screen --force",
+        "sc.estimation.screen(obs, camera)",
+    )
+    steps = Place("/run or that").exact(check)
+    files = "'/run or that/observations.parquet' '/run or that/camera.toml' -o '/run or that-2'"
+    assert steps.remedies[0] == f"starcal-uq run {files} --screen"
+    assert Place("r").command("starcal-uq sample RUN --force --steps 400") == "starcal-uq sample r --force --steps 400"
+    # Without stars there is nothing to calibrate on.
+    assert Place("r", observations=False).exact(check).remedies[0].startswith("starcal-uq calibrate OBS CAMERA -o r")

@@ -77,7 +77,7 @@ class Place:
     run : str
         The folder.
     words : tuple of str
-        Command line that made all of it, without the program; empty where it was made step by step.
+        Command line that made all of it, without the program and the folder; empty where it was made step by step.
     observations : bool
         Whether the folder holds observations.
     """
@@ -97,8 +97,8 @@ class Place:
             return text
         if text.startswith(CALIBRATE) and self.words[:1] == ("run",):
             # Everything that was asked for then, and this; of an option that is given twice the last one holds.
-            kept = [word for word in self.words if word != "--force"]
-            text = f"starcal-uq {shlex.join(kept)}{text.removeprefix(CALIBRATE)} --force"
+            made = shlex.join([*self.words, "-o", self.run])
+            text = f"starcal-uq {made}{text.removeprefix(CALIBRATE)} --force"
         elif text.startswith(CALIBRATE) and self.observations:
             given = [f"{self.run}/observations.parquet", f"{self.run}/camera.toml", "-o", f"{self.run}-2"]
             text = f"starcal-uq run {shlex.join(given)}{text.removeprefix(CALIBRATE)}"
