@@ -262,18 +262,11 @@ def before_fold(model_name: str, theta: FloatArray, point: FloatArray) -> BoolAr
     """
     coefficients = get_model(model_name).coefficients
     before = np.ones(point.shape[1], dtype=bool)
-
-    def bends(radius: FloatArray, k: Iterable[FloatArray]) -> FloatArray:
-        # A radial term k r^m bends by m k r^(m - 1) px per px at most, a decentring one (even m) by three times that;
-        # while all together stay below one, nothing folds.
-        steep = [(1.0 if c.order % 2 else 3.0) * c.order * radius ** (c.order - 1) for c in coefficients]
-        return sum((a * b for a, b in zip(steep, k, strict=True)), np.zeros(1))
-
     with np.errstate(all="ignore"):
         square, size = point[0] ** 2 + point[1] ** 2, np.abs(theta[3:])
-        if not bends(np.sqrt(np.fmax.reduce(square, initial=0.0)), [np.max(k) for k in size]) > 1.0:
+        if not _bend(model_name, np.sqrt(np.fmax.reduce(square, initial=0.0)), [np.max(k) for k in size]) > 1.0:
             return before
-        bend = bends(np.sqrt(square), size)
+        bend = _bend(model_name, np.sqrt(square), size)
         far = np.flatnonzero((bend > 1.0) & np.isfinite(bend))
         if far.size:
             own = theta if theta.ndim == 1 else theta[:, far]
@@ -283,6 +276,24 @@ def before_fold(model_name: str, theta: FloatArray, point: FloatArray) -> BoolAr
                 at = step * point[:, far]
                 before[far] &= newton_kernel(model_name)(far.size, own, at, at)[1][0] > 0.0
     return before
+
+
+def _bend(model_name: str, radius: FloatArray, k: Iterable[FloatArray]) -> FloatArray:
+    """Largest change of the displacement, px per px, up to a radius; below one, nothing folds."""
+    # A radial term k r^m bends by m k r^(m - 1) px per px at most, a decentring one (even m) by three times that.
+    terms = get_model(model_name).coefficients
+    steep = [(1.0 if c.order % 2 else 3.0) * c.order * radius ** (c.order - 1) for c in terms]
+    return sum((a * b for a, b in zip(steep, k, strict=True)), np.zeros(1))
+
+
+def cannot_fold(model_name: str, thetas: FloatArray, xy: FloatArray) -> bool:
+    """Whether no parameters (D, p) fold at any pixel (N, 2), by a bound; False where that takes a closer look."""
+    if get_model(model_name).direction != "forward":
+        return False
+    low, high = thetas[:, :2].min(axis=0), thetas[:, :2].max(axis=0)
+    reach = np.hypot(*np.maximum(np.abs(xy - low), np.abs(xy - high)).max(axis=0))
+    # Where nothing bends by more than a half, an ideal point is at most twice as far out as its image.
+    return bool(_bend(model_name, np.array([2.0 * reach]), list(np.abs(thetas[:, 3:]).max(axis=0)))[0] < 0.5)
 
 
 def unproject_theta(model_name: str, theta: FloatArray, xy: FloatArray) -> FloatArray:

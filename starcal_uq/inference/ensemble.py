@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -24,6 +26,8 @@ PROPOSAL_DF = 8.0
 _INDEPENDENCE_WEIGHT = 0.7
 _CHUNK_STEPS = 25
 _MAX_CHUNKS = 20
+# Between checkpoints; whoever interrupts loses nothing, a process that is killed so much.
+_SECONDS = 0.5
 
 
 @dataclass(frozen=True)
@@ -117,7 +121,7 @@ def run_ensembles(
     chunk = max(_CHUNK_STEPS, -(-settings.n_steps // _MAX_CHUNKS))
     total = per_ensemble * len(seeds)
     # emcee prints a page about any exception in the density, Ctrl-C included.
-    with interrupt_between_steps() as check_interrupt:
+    with store.kept(), interrupt_between_steps() as check_interrupt:
         for index in range(store.ensemble, len(seeds)):
             state = store.state or _start(density, dim, seeds[index], settings.n_walkers)
             sampler = emcee.EnsembleSampler(settings.n_walkers, dim, density, moves=weighted, vectorize=True)
@@ -183,21 +187,40 @@ class _Store:
         self._accepted = np.zeros(n_ensembles, dtype=np.int64)
         self.ensemble, self.step = 0, 0
         self.state: Any = None
+        self._written, self._due = True, 0.0
         if path is not None and Path(path).exists():
             self._read(path)
 
     def add(self, index: int, first: int, last: int, sampler: Any, state: Any) -> None:
-        """Keep steps [first, last) of an ensemble unless they are burn-in, and write the checkpoint."""
+        """Keep steps [first, last) of an ensemble unless they are burn-in; now and then, write the checkpoint."""
         if first >= self._n_burn:
             kept = slice(first - self._n_burn, last - self._n_burn)
             self._u[index, kept] = sampler.get_chain()
             self._log_density[index, kept] = sampler.get_log_prob()
             self._accepted[index] += int(np.sum(sampler.backend.accepted))
         self.ensemble, self.step, self.state = index, last, state
-        if self._path is not None:
+        self._written = False
+        if time.monotonic() >= self._due:
+            self.keep()
+            self._due = time.monotonic() + _SECONDS
+
+    def keep(self) -> None:
+        """Write what is new since the checkpoint."""
+        if self._path is not None and not self._written:
             self._write(self._path)
+            self._written = True
+
+    @contextmanager
+    def kept(self) -> Iterator[None]:
+        """Within, what is done when an interrupt or an error ends it is in the checkpoint."""
+        try:
+            yield
+        except BaseException:
+            self.keep()
+            raise
 
     def next_ensemble(self) -> None:
+        self.keep()
         self.ensemble, self.step, self.state = self.ensemble + 1, 0, None
 
     def chains(self) -> Chains:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.camera.projection import unproject_theta
+from starcal_uq.camera.projection import cannot_fold, unproject_theta
 from starcal_uq.core.errors import DistortionError, ObservationError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.types import FloatArray
@@ -73,8 +73,10 @@ def random_sky(post: Posterior, like: Observations, n_frames: int, seed: int) ->
     x, y = (unproject_theta(model, post.mean, xy + s) - unproject_theta(model, post.mean, xy - s) for s in shift)
     angle = np.linalg.norm(np.cross(x, y), axis=1)
     usable = np.isfinite(angle) & (angle > 0.0)
-    for theta in post.thin(_DRAWS, seed)[:, :-1]:
-        usable &= np.isfinite(unproject_theta(model, theta, xy)).all(axis=1)
+    draws = post.thin(_DRAWS, seed)[:, :-1]
+    if not cannot_fold(model, draws, xy):
+        for theta in draws:
+            usable &= np.isfinite(unproject_theta(model, theta, xy)).all(axis=1)
     if not usable.any():
         raise DistortionError(f"the distortion {model!r} folds over everywhere: use more frames or a tighter prior.")
     counts = rng.choice(np.diff(like.frame_starts), n_frames)

@@ -187,6 +187,19 @@ def test_no_direction_beyond_a_fold(model, k):
     np.testing.assert_array_equal(seen, radius < (fold if model == "inverse" else rim))
 
 
+def test_where_a_bound_excludes_folds_there_are_none() -> None:
+    rng = np.random.default_rng(4)
+    xy = rng.uniform(0.0, [1024.0, 768.0], (200, 2))
+    said = []
+    for k1 in -np.geomspace(1e-9, 1e-5, 25):
+        thetas = np.array([[500.0, 380.0, 4000.0, k1, 0.0], [520.0, 390.0, 4010.0, 0.5 * k1, 0.1 * k1**2]])
+        whole = all(np.isfinite(projection.unproject_theta("brown", theta, xy)).all() for theta in thetas)
+        said.append(projection.cannot_fold("brown", thetas, xy))
+        assert whole or not said[-1]
+    assert said[0]
+    assert not said[-1]
+
+
 def test_a_direction_behind_the_camera_has_no_image():
     xy = projection.project(camera(), np.array([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0]]))
     assert np.isnan(xy[0]).all()
