@@ -35,7 +35,7 @@ from starcal_uq.presentation.figures.inference import (
 )
 from starcal_uq.presentation.figures.propagation import plot_attitude, plot_field_map
 from starcal_uq.presentation.figures.scales import axis_scale, symbol
-from starcal_uq.presentation.figures.style import figure_of, new_figure, painted, panels, png_bytes
+from starcal_uq.presentation.figures.style import figure_of, new_figure, panels, png_bytes
 from starcal_uq.propagation.attitude_error import AttitudeError, MisfitFound
 from tests.helpers.scenes import camera, nominal, observations
 
@@ -97,27 +97,6 @@ def overlapping(figure):
             boxes = [(label.get_text(), label.get_window_extent()) for label in shown]
             pairs += [(a[0], b[0]) for a, b in itertools.combinations(boxes, 2) if a[1].overlaps(b[1])]
     return pairs
-
-
-@pytest.mark.parametrize(
-    ("text", "angle"), [("σ = −3.5 × 10⁻² px", 0.0), ("k₁ [px⁻²]\nyaw", 90.0), ("tilted", 30.0), ("$s_f$", 0.0)]
-)
-def test_letters_stand_where_matplotlib_puts_them(text: str, angle: float) -> None:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    figure = new_figure(3.0, 3.0)
-    figure.text(0.3, 0.6, text, rotation=angle, color="#0072B2", alpha=0.8, va="center", fontsize=11)
-    ours = 255.0 - painted(figure, 160)
-    canvas = FigureCanvasAgg(figure)
-    figure.dpi = 160
-    canvas.draw()
-    theirs = 255.0 - np.asarray(canvas.buffer_rgba())[..., :3]
-    assert ours.shape == theirs.shape
-    assert ours.max(axis=(0, 1)) == pytest.approx(theirs.max(axis=(0, 1)), abs=1.0), "the colour"
-    assert ours.sum() == pytest.approx(theirs.sum(), rel=0.06)
-    for axis in (0, 1):
-        middles = [np.average(np.arange(p.shape[axis]), weights=p.sum(axis=(1 - axis, 2))) for p in (ours, theirs)]
-        assert middles[0] == pytest.approx(middles[1], abs=0.8)
 
 
 def test_corner_shows_every_sampled_parameter(run):

@@ -276,10 +276,19 @@ def svg_bytes(figure: Figure) -> bytes:
 
 
 def painted(figure: Figure, dpi: int) -> NDArray[np.uint8]:
-    """The figure's pixels (height, width, 3)."""
-    from starcal_uq.presentation.figures import painting
+    """The figure's pixels (height, width, 3), drawn once, where `Figure.savefig` draws twice."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-    return painting.painted(figure, dpi)
+    canvas, resolution = figure.canvas, figure.dpi
+    try:
+        figure.dpi = dpi
+        agg: Any = FigureCanvasAgg(figure)
+        agg.draw()
+        # Opaque, as all figures here are.
+        return np.ascontiguousarray(np.asarray(agg.buffer_rgba())[..., :3])
+    finally:
+        figure.dpi = resolution
+        figure.set_canvas(canvas)
 
 
 def _in_notebook() -> bool:
