@@ -10,7 +10,7 @@ says how well it is known.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
@@ -41,7 +41,6 @@ _LONGEST_YEARS = 250.0
 # Other dates and hours, in days and hours.
 _DATES = np.arange(-180.0, 181.0, 4.0)
 _HOURS = np.arange(-14.0, 14.1, 0.25)
-_HOUR_DEG = 15.041
 _LOWEST = np.sin(np.radians(5.0))
 
 
@@ -228,8 +227,7 @@ def _other_hours(rest: Remainder, site: Site, times: StrArray) -> Iterator[_Move
     constants = refraction_constants(site)
 
     def raised(hours: float) -> FloatArray | None:
-        east = (site.longitude_deg + _HOUR_DEG * hours + 180.0) % 360.0 - 180.0
-        zenith = site_among_stars(replace(site, longitude_deg=east), times)[0]
+        zenith = site_among_stars(site.later(hours), times)[0]
         up = frames.spread(np.ascontiguousarray(np.einsum("kij,kj->ik", state.rotations, zenith)))
         sine = np.sum(up * state.b, axis=0)
         if sine.min() < _LOWEST:

@@ -45,6 +45,8 @@ SUN_DISTANCE_AU = 1.0
 _IN_SPACE_KM_S = 1.0
 _NO_AIR = ("space", "rendered")
 _STARS_PER_FRAME = 4
+# Hours by which a zone's time differs from UTC at most.
+_ZONES = 14
 
 
 def earth_velocity_km_s(time_utc: Any) -> FloatArray:
@@ -288,22 +290,34 @@ def _earth_velocity(obs: Observations) -> FloatArray:
 
 def _altitudes(obs: Observations, site: Site, directions: FloatArray, velocity: FloatArray) -> FloatArray:
     """Altitude of every star as seen, degrees; an error where a frame's stars were below the horizon."""
-    zenith, moving = site_among_stars(site, obs.time_utc)
-    seen = refract(aberrate(directions, velocity + moving), zenith, refraction_constants(site))
-    altitude = altitude_deg(seen, zenith)
-    if not obs.n_stars:
-        return altitude
     starts = np.searchsorted(obs.frame, obs.frame_ids)
-    mean = np.add.reduceat(altitude, starts) / obs.stars_per_frame
+
+    def seen_from(place: Site) -> tuple[FloatArray, FloatArray]:
+        """Altitude of the stars, and their mean in each frame."""
+        zenith, moving = site_among_stars(place, obs.time_utc)
+        seen = refract(aberrate(directions, velocity + moving), zenith, refraction_constants(site))
+        altitude = altitude_deg(seen, zenith)
+        return altitude, np.add.reduceat(altitude, starts) / obs.stars_per_frame
+
+    if not obs.n_stars:
+        return np.empty(0)
+    altitude, mean = seen_from(site)
     below = np.flatnonzero(mean < 0.0)
     if len(below):
         first = below[0]
         times = "" if obs.time_utc is None else f" at {obs.time_utc[starts[first]]} UTC"
         others = f" (and {plural(len(below) - 1, 'other')})" if len(below) > 1 else ""
+        # Times of a zone that were taken for UTC are off by hours, and no frame was taken through the ground.
+        zones = sorted(range(-_ZONES, _ZONES + 1), key=abs)
+        hours = next((h for h in zones if seen_from(site.later(h))[1].min() > LEAST_ALTITUDE_DEG), None)
+        zone = ""
+        if hours is not None:
+            way = "later" if hours > 0 else "earlier"
+            zone = f"; times {plural(abs(hours), 'hour')} {way} put all frames above it"
         raise ObservationError(
             f"The stars of frame {obs.frame_ids[first]}{others} were {-mean[first]:.0f} degrees below the "
             f"horizon of the site ({site}){times}: correct the site (north and east are positive) or the time, which "
-            "must be UTC.",
+            f"must be UTC{zone}.",
             column="time_utc",
         )
     return altitude

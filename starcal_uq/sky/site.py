@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from starcal_uq.core.errors import SiteError
 from starcal_uq.core.toml import Key, Section, read_section, write_section
 from starcal_uq.core.types import AnyDict
 
+# By which a place turns among the stars in an hour.
+HOUR_DEG = 15.041067
 _HEADER = """\
 # Site of a camera on the ground.
 #
@@ -107,6 +109,10 @@ class Site:
         """Latitude and longitude."""
         north, east = self.latitude_deg, (self.longitude_deg + 180.0) % 360.0 - 180.0
         return f"{abs(north):.2f}° {'N' if north >= 0 else 'S'}, {abs(east):.2f}° {'E' if east >= 0 else 'W'}"
+
+    def later(self, hours: float) -> Site:
+        """The place that has the sky of so many hours later: one further east."""
+        return replace(self, longitude_deg=(self.longitude_deg + HOUR_DEG * hours + 180.0) % 360.0 - 180.0)
 
     def __str__(self) -> str:
         return f"{self.name + ', ' if self.name else ''}{self.words}, {self.height_m:.0f} m"

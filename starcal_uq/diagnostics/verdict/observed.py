@@ -12,7 +12,7 @@ from starcal_uq.core.status import Check, Level, Question, pass_or_warn
 from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals
 from starcal_uq.estimation.residual_map import OUTLIER_SIGMA
 from starcal_uq.sky.refraction import refraction_constants, shrinking
-from starcal_uq.sky.site import Site
+from starcal_uq.sky.site import HOUR_DEG, Site
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -33,8 +33,6 @@ COVERED_SHARE = 0.85
 _FAR_BELOW, _MAGNITUDES = 0.2, (1.5, 20.0)
 _SAME_UNIT = 1.3
 MIN_FRAMES = 5
-# By which a place turns among the stars in an hour.
-_HOUR_DEG = 15.041
 # What a wrong time may move parameters by and the numbers be used.
 _SMALL_SIGMA = 1.0
 # Commands and calls that checks give as remedies.
@@ -114,7 +112,7 @@ def _time_words(obs: Observations, found: TimeTest) -> tuple[str, str, str]:
         return "aberration twice", sentence, f"{CALIBRATE} --directions apparent"
     what, other = "Annual aberration", ""
     if found.cause == "hour":
-        east = _HOUR_DEG * found.later
+        east = HOUR_DEG * found.later
         what, other = "Refraction", f", or a site {significant(abs(east))}° further {'east' if east > 0.0 else 'west'}"
     sentence = f"{what} in the residuals is that of times {later} than stated{other}: {effect}."
     return f"times {later}", f"{sentence} Correct the times, which are UTC (column time_utc).", ""
