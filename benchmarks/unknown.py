@@ -1,25 +1,33 @@
 """Cameras of all kinds that nothing is known of, or something wrong: how many frames are identified, how many wrongly.
 
-    python benchmarks/unknown.py [--cameras 100] [--frames 5] [--pixels] [--seed 1]
+    python benchmarks/unknown.py [--frames 10000] [--seed 1] [--part 0 2] [--show] [--write]
 
-Every camera has its own field of view (1 to 80 degrees, evenly in its logarithm; ``--fields`` narrows it), detector
-(256 to 4096 px), lens (up to 0.3 % of distortion at the corner, principal point up to 1 % of the width off), depth,
-noise, missing stars and false ones (hot pixels, and clusters as from the Moon, clouds and a horizon); its frames look
-anywhere on the sky. The sheet is missing, right, or 20 to 50 % wrong, in turns. Frames are made here with NumPy alone,
-of the catalogue's places; with ``--pixels`` they are rendered, with defocus, hot pixels, streaks, the Moon and a
-horizon painted in, and their stars are measured.
+Every camera has its own field of view (4 to 80 degrees, evenly in its logarithm, and of every twentieth 1 to 4, where
+preparing a catalogue takes tens of seconds), detector (256 to 4096 px), lens (up
+to 0.3 % of distortion at the corner, principal point up to 1 % of the width off), depth, noise, missing stars and false
+ones (hot pixels, and clusters as from the Moon, clouds and a horizon); its frames look anywhere on the sky. The sheet
+is missing, right, or 20 or 50 % wrong, in turns. Nine cameras of ten give lists of ten frames, made here with NumPy
+alone of the catalogue's places; every tenth gives three images, rendered with defocus, hot pixels, streaks, the Moon
+and a horizon painted in, whose stars are measured.
 
 A frame counts where it shows at least six true stars among its thirty brightest. A star is wrong when its name is, a
 frame when at least half of its stars are; attitudes also hold the offset of the principal point. Intervals are Clopper
 and Pearson's, 95 %.
+
+What was done is kept in `.bench/unknown`, a line for each camera: a campaign that is stopped goes on, and several
+processes share one (``--part 0 2`` and ``--part 1 2``). ``--show`` prints the table of what there is and ``--write``
+puts it into the documentation (`docs/explanation/reliability.md`).
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections import defaultdict
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from time import process_time
 from types import SimpleNamespace
@@ -27,12 +35,21 @@ from typing import Any
 
 import numpy as np
 
-sys.path[:0] = [str(Path(__file__).resolve().parents[1])]
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT)]
 
 import starcal_uq as sc  # noqa: E402
+import starcal_uq.sky.catalogue as catalogue  # noqa: E402
+from benchmarks.pages import put  # noqa: E402
 from starcal_uq.pipeline.depth import identify_to_depth  # noqa: E402
 
+OUT = ROOT / ".bench" / "unknown"
+PAGE = ROOT / "docs" / "explanation" / "reliability.md"
 EPOCH = 2020.0
+# Frames of a camera that gives lists, and of every tenth, which gives images.
+LISTED, RENDERED, EVERY = 10, 3, 10
+# Fields of view, and those of every so many cameras.
+WIDE, NARROW, SELDOM = (4.0, 80.0), (1.0, 4.0), 20
 SHEETS = ("none", "right", "20 % off", "50 % off")
 LEAST, BRIGHTEST = 6, 30
 
@@ -127,12 +144,8 @@ def make_frames(rng: np.random.Generator, stars: Any, n: int, fields: tuple[floa
 def render_camera(rng: np.random.Generator, stars: Any, n: int, fields: tuple[float, float]) -> Made:
     """The same with pixels: defocus, hot pixels, streaks, the Moon and a horizon."""
     camera, bend, offset = make_camera(rng, fields)
-    size = min(camera.width_px, 1024)
-    scale = size / camera.width_px
-    offset = scale * offset
-    corner = 0.5 * scale * np.hypot(camera.width_px, camera.height_px)
-    height = int(scale * camera.height_px)
-    camera = sc.Camera(size, height, 5.0, scale * camera.focal_px * 5e-3, (size - 1) / 2, (height - 1) / 2)
+    size, height = camera.width_px, camera.height_px
+    corner = 0.5 * np.hypot(size, height)
     true = camera.replace(
         x0_px=camera.x0_px + offset[0], y0_px=camera.y0_px + offset[1], coefficients=(bend / corner**2, 0.0)
     )
@@ -147,11 +160,11 @@ def render_camera(rng: np.random.Generator, stars: Any, n: int, fields: tuple[fl
     )
     depth = stars.select(stars.mag <= limit + 0.5)
     images, rotations, truths = [], [], []
-    y, x = np.mgrid[:height, :size]
+    y, x = np.ogrid[:height, :size]
     for k in range(n):
         rotation = random_rotation(rng)
         rendered = sc.simulation.render(depth, true, rotation, sensor, seed=int(rng.integers(2**31)))
-        data = rendered.data.astype(float)
+        data = rendered.data.astype(np.float32)
         if rng.random() < 0.3:
             # The Moon and its light.
             at, radius = rng.random(2) * [size, height], rng.uniform(0.02, 0.06) * size
@@ -210,57 +223,96 @@ def judged(made: Made, sheet: str, rng: np.random.Generator) -> tuple[int, int, 
     return int(np.sum(made.counts)), identified, wrong, len(o), n_wrong, seconds
 
 
-def interval(k: int, n: int) -> str:
-    """A share with its interval."""
+def tried(number: int, seed: int, stars: Any) -> dict[str, Any]:
+    """What became of the frames of a camera."""
+    rng = np.random.default_rng([seed, number])
+    rendered, sheet = number % EVERY == EVERY - 1, SHEETS[(number + number // EVERY) % len(SHEETS)]
+    fields = NARROW if number // 2 % SELDOM == SELDOM - 1 else WIDE
+    made = render_camera(rng, stars, RENDERED, fields) if rendered else make_frames(rng, stars, LISTED, fields)
+    names = ("counting", "identified", "wrong", "stars", "wrong_stars", "seconds")
+    result = dict(zip(names, map(float, judged(made, sheet, rng)), strict=True))
+    camera = {"number": number, "field": made.camera.fov_deg[0], "width": made.camera.width_px}
+    return camera | {"sheet": sheet, "rendered": rendered, "frames": len(made.rotations)} | result
+
+
+def results(seed: int) -> list[dict[str, Any]]:
+    """What was done so far."""
+    lines = [line for path in sorted(OUT.glob(f"{seed}-*.jsonl")) for line in path.read_text().splitlines()]
+    return list({row["number"]: row for row in map(json.loads, lines)}.values())
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Shares by sheet, kind, field and detector, as Markdown."""
+    groups: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for row in sorted(rows, key=lambda row: (row["rendered"], SHEETS.index(row["sheet"]))):
+        groups["all"].append(row)
+        groups["images" if row["rendered"] else "lists"].append(row)
+        groups[f"sheet: {row['sheet']}"].append(row)
+    for row in sorted(rows, key=lambda row: row["field"]):
+        low, high = next((a, b) for a, b in pairwise((1, 2, 4, 10, 20, 40, 81)) if row["field"] <= b)
+        groups[f"field {low} to {min(high, 80)}°"].append(row)
+    for row in sorted(rows, key=lambda row: row["width"]):
+        groups[f"width {row['width']} px"].append(row)
+    lines = [
+        "|  | Cameras | Frames that count | Identified | Wrong frames | Wrong stars | Processor a frame: median, 95 % |",
+        "|---|---:|---:|---|---|---|---|",
+    ]
+    for name, group in groups.items():
+        n, found, wrong, n_stars, bad = (
+            int(sum(row[key] for row in group)) for key in ("counting", "identified", "wrong", "stars", "wrong_stars")
+        )
+        if not n:
+            continue
+        times = np.quantile([row["seconds"] / row["frames"] for row in group], [0.5, 0.95])
+        lines.append(
+            f"| {name} | {len(group)} | {n} | {share(found, n)} | {share(wrong, n)} | {bad} of {n_stars} | "
+            + ", ".join(f"{t:.2g} s" for t in times)
+            + " |"
+        )
+    n_frames = int(sum(row["frames"] for row in rows))
+    return f"{n_frames} frames, {len(rows)} cameras.\n\n" + "\n".join(lines)
+
+
+def share(k: int, n: int) -> str:
+    """A share in per cent with its interval."""
     from scipy.stats import beta
 
     low = beta.ppf(0.025, k, n - k + 1) if k else 0.0
     high = beta.ppf(0.975, k + 1, n - k) if k < n else 1.0
-    return f"{k} of {n} ({100 * low:.2f} to {100 * high:.2f} %)"
+    return f"{k} ({100 * low:.2f} to {100 * high:.2f} %)"
 
 
 def main() -> None:
-    """Make cameras and print the table, growing."""
+    """Go on until so many frames are tried, then show what there is."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cameras", type=int, default=100)
-    parser.add_argument("--frames", type=int, default=5)
-    parser.add_argument("--fields", type=float, nargs=2, default=(1.0, 80.0), metavar=("LOW", "HIGH"))
+    parser.add_argument("--frames", type=int, default=0)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--pixels", action="store_true")
+    parser.add_argument("--part", type=int, nargs=2, default=(0, 1), metavar=("NUMBER", "OF"))
+    parser.add_argument("--show", action="store_true")
+    parser.add_argument("--write", action="store_true")
     arguments = parser.parse_args()
-    stars = sc.load_catalogue(10.0, epoch=EPOCH)
-    stars = stars.select(np.argsort(stars.mag, kind="stable"))
-    total: dict[str, Any] = defaultdict(lambda: np.zeros(6))
-    make = render_camera if arguments.pixels else make_frames
-    for number in range(arguments.cameras):
-        rng = np.random.default_rng([arguments.seed, number])
-        made = make(rng, stars, arguments.frames, tuple(arguments.fields))
-        sheet = SHEETS[number % len(SHEETS)]
-        result = np.array(judged(made, sheet, rng))
-        fov = made.camera.fov_deg[0]
-        bin_name = next(f"to {top:g} deg" for top in (2, 5, 10, 20, 40, 90) if fov <= top)
-        for key in (f"sheet {sheet}", bin_name, "all"):
-            total[key] += result
-        if result[2] or result[4] or result[1] < result[0]:
-            print(
-                f"camera {number}: {fov:.1f} deg, {made.camera.width_px} px, sheet {sheet}: {result[1]:.0f} of "
-                f"{result[0]:.0f} frames, {result[2]:.0f} wrong, {result[4]:.0f} wrong stars, {result[5]:.1f} s",
-                flush=True,
-            )
-        if (number + 1) % 20 == 0:
-            print(f"{number + 1} cameras", flush=True)
-            report(total)
-    report(total)
-
-
-def report(total: dict[str, Any]) -> None:
-    """Shares so far."""
-    for key, (n, k, wrong, n_stars, bad, seconds) in total.items():
-        print(
-            f"{key:16s} identified {interval(int(k), int(n))}; wrong frames {interval(int(wrong), int(n))}; wrong "
-            f"stars {int(bad)} of {int(n_stars)}; {seconds / max(n, 1):.2f} s of the processor a frame",
-            flush=True,
-        )
+    part, of = arguments.part
+    done = {row["number"] for row in results(arguments.seed)}
+    # Every camera asks for some of few catalogues.
+    catalogue.load_catalogue = lru_cache(maxsize=8)(catalogue.load_catalogue)  # type: ignore[assignment]
+    mean = LISTED + (RENDERED - LISTED) / EVERY
+    todo = [k for k in range(part, round(arguments.frames / mean), of) if k not in done]
+    if todo:
+        OUT.mkdir(parents=True, exist_ok=True)
+        stars = sc.load_catalogue(10.0, epoch=EPOCH)
+        stars = stars.select(np.argsort(stars.mag, kind="stable"))
+        with (OUT / f"{arguments.seed}-{part}-{of}.jsonl").open("a", encoding="utf-8") as file:
+            for number in todo:
+                file.write(json.dumps(tried(number, arguments.seed, stars)) + "\n")
+                file.flush()
+    rows = results(arguments.seed)
+    if arguments.show:
+        for row in rows:
+            if row["wrong_stars"]:
+                print(row)
+        print(table(rows))
+    if arguments.write:
+        put(PAGE, "unknown cameras", table(rows))
 
 
 if __name__ == "__main__":

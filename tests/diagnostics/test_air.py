@@ -80,6 +80,13 @@ def test_frames_of_a_moment_need_no_times():
     found = air_test(replace(obs, time_utc=None), cal)
     assert found.is_air and np.isnan(found.latitude_deg)
     assert "the times" in observed.directions(obs, cal, found).sentence
+    # Directions of stars that were identified in images are made where these are read.
+    seen = replace(obs, time_utc=None, meta={**obs.meta, "source": "identified in Gaia DR3"})
+    check = observed.directions(seen, cal, found)
+    assert check.remedy == "starcal-uq run IMAGES... CAMERA -o RUN --force --site SITE --time UTC"
+    assert "--time" in check.sentence and "column" not in check.sentence
+    assert "--in-space" in observed.directions(seen, cal).remedy
+    assert "calibrate" not in observed.directions(seen, cal).remedy
 
 
 def test_thinner_air_is_air():

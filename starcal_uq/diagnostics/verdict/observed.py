@@ -38,7 +38,7 @@ _SMALL_SIGMA = 1.0
 # Commands and calls that checks give as remedies.
 CALIBRATE = "starcal-uq calibrate OBS CAMERA -o RUN --force"
 SCREEN = f"{CALIBRATE} --screen or sc.estimation.screen(obs, camera)"
-AIR_REMEDY = f"{CALIBRATE} --site SITE or {CALIBRATE} --in-space"
+FROM_IMAGES = "starcal-uq run IMAGES... CAMERA -o RUN --force"
 
 
 def directions(
@@ -50,9 +50,7 @@ def directions(
     seen = air(obs)
     wrong = [] if times is None else [_time_words(obs, times)]
     if found is not None and found.is_air:
-        wrong.append(
-            (f"refraction, p = {significant(found.p_value)}", air_words(obs, found), f"{CALIBRATE} --site SITE")
-        )
+        wrong.append((f"refraction, p = {significant(found.p_value)}", air_words(obs, found), _with_site(obs)))
     if wrong:
         values, sentences, remedies = zip(*wrong, strict=True)
         remedy = next(filter(None, remedies), "")
@@ -61,7 +59,7 @@ def directions(
         return Check(name, Question.TRUSTWORTHY, level, "; ".join(values), bound, " ".join(sentences), remedy)
     if declared == "apparent" and seen == "unknown":
         sentence = f"Aberration is in the directions, refraction is not. {conditional_words(cal)} {REMEDY}"
-        return Check(name, Question.TRUSTWORTHY, Level.WARN, "without refraction", bound, sentence, AIR_REMEDY)
+        return Check(name, Question.TRUSTWORTHY, Level.WARN, "without refraction", bound, sentence, _about_air(obs))
     if declared == "apparent":
         sentence = "The directions are declared as apparent: aberration is in them."
         if obs.meta.get("observer") == "space":
@@ -71,9 +69,10 @@ def directions(
                 f"Aberration and refraction at the site ({Site.from_dict(obs.meta['site'])}) are in the directions."
             )
         return Check(name, Question.TRUSTWORTHY, Level.PASS, declared, bound, sentence)
-    sentence, remedy = f"{_undeclared(obs)} {aberration_words(cal)}", f"{CALIBRATE} --directions apparent"
+    sentence = f"{_undeclared(obs)} {aberration_words(cal)}"
+    remedy = f"{_command(obs)} --time UTC" if _untimed_images(obs) else f"{_command(obs)} --directions apparent"
     if seen == "unknown":
-        sentence, remedy = f"{sentence} {conditional_words(cal)} {REMEDY}", f"{remedy} or {AIR_REMEDY}"
+        sentence, remedy = f"{sentence} {conditional_words(cal)} {REMEDY}", f"{remedy} or {_about_air(obs)}"
     return Check(name, Question.TRUSTWORTHY, Level.WARN, declared, bound, sentence, remedy)
 
 
@@ -84,7 +83,8 @@ def air_words(obs: Observations, found: AirTest) -> str:
         f"{significant(found.f_px)} px ({significant(found.f_sigma)} sigma)."
     )
     if not np.isfinite(found.latitude_deg):
-        return f"{first} State the site (--site) and the times (column time_utc), which the frames do not have."
+        times = "--time" if _from_images(obs) else "column time_utc"
+        return f"{first} State the site (--site) and the times ({times}), which the frames do not have."
     place = Site(found.latitude_deg, found.longitude_deg)
     errors = (significant(error) for error in (found.latitude_std_deg, found.longitude_std_deg))
     ends = " and ".join(f"± {error}°" for error in errors)
@@ -105,17 +105,42 @@ def _time_words(obs: Observations, found: TimeTest) -> tuple[str, str, str]:
     if found.cause == "no aberration":
         sentence = f"The residuals hold annual aberration that the directions do not: {effect}."
         if obs.time_utc is None:
-            return "no aberration", f"{sentence} Give the times (column time_utc).", ""
-        return "no aberration", sentence, f"{CALIBRATE} --directions catalogue"
+            return (
+                "no aberration",
+                f"{sentence} Give the times (column time_utc).",
+                f"{FROM_IMAGES} --time UTC" if _from_images(obs) else "",
+            )
+        return "no aberration", sentence, f"{_command(obs)} --directions catalogue"
     if found.cause == "aberration twice":
         sentence = f"The directions hold annual aberration twice: {effect}."
-        return "aberration twice", sentence, f"{CALIBRATE} --directions apparent"
+        return "aberration twice", sentence, f"{_command(obs)} --directions apparent"
     what, other = "Annual aberration", ""
     if found.cause == "hour":
         east = HOUR_DEG * found.later
         what, other = "Refraction", f", or a site {significant(abs(east))}° further {'east' if east > 0.0 else 'west'}"
     sentence = f"{what} in the residuals is that of times {later} than stated{other}: {effect}."
     return f"times {later}", f"{sentence} Correct the times, which are UTC (column time_utc).", ""
+
+
+def _from_images(obs: Observations) -> bool:
+    return str(obs.meta.get("source", "")).startswith("identified in ")
+
+
+def _untimed_images(obs: Observations) -> bool:
+    return _from_images(obs) and (obs.time_utc is None or not bool((obs.time_utc != "").all()))
+
+
+def _command(obs: Observations) -> str:
+    """The command that makes the directions of these stars: of images they are made while they are identified."""
+    return FROM_IMAGES if _from_images(obs) else CALIBRATE
+
+
+def _with_site(obs: Observations) -> str:
+    return f"{_command(obs)} --site SITE{' --time UTC' if _untimed_images(obs) else ''}"
+
+
+def _about_air(obs: Observations) -> str:
+    return f"{_with_site(obs)} or {_command(obs)} --in-space"
 
 
 def aberration_words(cal: Calibration) -> str:
