@@ -17,9 +17,8 @@ def _images(folder: str) -> list[Any]:
     loaded = [Image.open(path) for ending in ("tif*", "png") for path in sorted(Path(folder).glob(f"*.{ending}"))]
     if not loaded:
         raise Missing(f"{folder} is not on this machine")
-    for image in loaded:
-        image.load()
-    return loaded
+    # What it reads is grey or of three colours; a fourth channel, which says what is transparent, is no light.
+    return [image.convert("L") if image.mode in ("RGB", "RGBA", "LA", "P") else image.copy() for image in loaded]
 
 
 def centroids(folder: Path, *, images: str) -> Callable[[], Result]:
@@ -50,7 +49,7 @@ def identify(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
 
 def identify_unknown(folder: Path, *, images: str, field: float) -> Callable[[], Result]:
     """`solve_from_centroids` of its own centroids with its own database, for fields of 10 to 30 degrees."""
-    loaded = [image.convert("L") if image.mode == "RGB" else image for image in _images(images)]
+    loaded = _images(images)
     points = [(tetra3.get_centroids_from_image(image), (image.height, image.width)) for image in loaded]
     solver = tetra3.Tetra3("default_database")
 

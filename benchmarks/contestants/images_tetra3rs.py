@@ -18,7 +18,8 @@ def _images(folder: Path) -> list[np.ndarray]:
     paths = [path for ending in ("tif*", "png") for path in sorted(Path(folder).glob(f"*.{ending}"))]
     if not paths:
         raise Missing(f"{folder} is not on this machine")
-    return [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in paths]
+    # Grey in the depth of the file: what it reads has one channel.
+    return [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH) for path in paths]
 
 
 def centroids(folder: Path, *, images: str) -> Callable[[], Result]:
@@ -54,13 +55,18 @@ def identify(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
     return run
 
 
-def identify_unknown(folder: Path, *, images: str, field: float) -> Callable[[], Result]:
-    """`solve_from_centroids` of its own centroids with one guess, and patterns for fields of 5 to 30 degrees."""
-    grey = [image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in _images(images)]
+def identify_unknown(
+    folder: Path, *, images: str, field: float, extraction: dict[str, Any] | None = None
+) -> Callable[[], Result]:
+    """`solve_from_centroids` of its own centroids with one guess, and patterns for fields of 5 to 30 degrees.
+
+    With `extraction`, its centroids are those of these settings instead of its defaults.
+    """
+    grey = _images(images)
     database = tetra3rs.SolverDatabase.generate_from_gaia(
         max_fov_deg=30.0, min_fov_deg=5.0, epoch_proper_motion_year=2019.6
     )
-    points = [tetra3rs.extract_centroids(image, threads=1).centroids for image in grey]
+    points = [tetra3rs.extract_centroids(image, threads=1, **(extraction or {})).centroids for image in grey]
     height, width = grey[0].shape
 
     def run() -> Result:
