@@ -18,6 +18,8 @@ from starcal_uq.core.tasks import Progress
 from starcal_uq.presentation.tables import TextTable
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import pandas as pd
 
     from starcal_uq.estimation.calibration import Calibration
@@ -125,12 +127,12 @@ def show_screening(screening: Screening) -> None:
     say(screening.text)
 
 
-def show_summary(run: Run) -> None:
+def show_summary(run: Run, page: Path) -> None:
     """The run in a screen of 80 columns, with what to try, the place of the report, and the verdict last."""
     from starcal_uq.presentation.report.summary import terminal_summary, verdict_lines
 
     results = run.results
-    for line in ("", *terminal_summary(results), f"Report: {run.report().resolve()}"):
+    for line in ("", *terminal_summary(results), f"Report: {page.resolve()}"):
         say(line)
     style = _STYLES[results.verdict.level]
     for line in verdict_lines(results.verdict):

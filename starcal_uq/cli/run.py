@@ -240,10 +240,11 @@ def typed(arguments: Sequence[str]) -> list[str]:
 
 def _conclude(run: Run) -> Answer:
     """The summary; status 1 when a check or a requirement failed."""
-    show_summary(run)
+    page = run.report()
+    show_summary(run, page)
     results = {
         "run": run.path,
-        "report": run.report(),
+        "report": page,
         "verdict": run.verdict,
         "calibration": (run.calibration, run.truth),
         "screening": run.screening,

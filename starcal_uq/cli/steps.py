@@ -295,19 +295,25 @@ def report_command(
     out: Annotated[
         Path | None, typer.Option("-o", "--out", metavar="FILE", help="Another notebook to write.", parser=write_file)
     ] = None,
+    format: Annotated[
+        settings.ReportFormat,
+        typer.Option(help="pdf writes RUN/report.pdf as well, by an installed browser or WeasyPrint."),
+    ] = "html",
     force: Force = False,
 ) -> Answer:
-    """Write RUN/report.html, one self-contained file, from whatever the run holds; or a notebook."""
+    """Write RUN/report.html, one self-contained file, from whatever the run holds; as PDF too, or a notebook."""
     held = sc.Run(run, tell=note)
     if out is not None and not notebook:
         raise typer.BadParameter("--out names a notebook: add --notebook; the report has its place in RUN.")
+    if notebook and format != "html":
+        raise typer.BadParameter("--format is of the report: leave it or --notebook out.")
     if notebook:
         with progress_bar("notebook") as bar:
             page = held.notebook(out, force=force, progress=bar)
         say(f"Notebook: {page.resolve()}")
     else:
-        page = held.report(force=force)
-        show_summary(held)
+        page = held.pdf(force=force) if format == "pdf" else held.report(force=force)
+        show_summary(held, page)
     return Answer({"run": run, "report": page})
 
 

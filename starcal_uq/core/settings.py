@@ -46,6 +46,7 @@ Convention = Literal["eq14", "eq6"]
 FieldReading = Literal["window", "full"]
 Starter = Literal["camera", "site", "budget", "study", "example"]
 ExampleName = Literal["esa"]
+ReportFormat = Literal["html", "pdf"]
 ExportFormat = Literal[
     "opencv",
     "ros",

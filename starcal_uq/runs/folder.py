@@ -56,17 +56,19 @@ DIAGNOSIS_TABLES = {
 }
 HISTORY = "history.csv"
 CHECKPOINT = "sampling.checkpoint.npz"
+_PAGES = ("report", "pdf", "notebook")
 # Step -> steps that rest on its result.
 REST_ON: dict[str, tuple[str, ...]] = {
-    "calibrate": ("images", "inspect", "sample", "coupling", "propagate", "diagnose", "budget", "report", "notebook"),
-    "images": ("inspect", "report", "notebook"),
+    "calibrate": ("images", "inspect", "sample", "coupling", "propagate", "diagnose", "budget", *_PAGES),
+    "images": ("inspect", *_PAGES),
     "inspect": (),
-    "sample": ("coupling", "propagate", "budget", "report", "notebook"),
-    "coupling": ("report", "notebook"),
-    "propagate": ("budget", "report", "notebook"),
-    "diagnose": ("budget", "report", "notebook"),
-    "budget": ("report", "notebook"),
-    "report": (),
+    "sample": ("coupling", "propagate", "budget", *_PAGES),
+    "coupling": _PAGES,
+    "propagate": ("budget", *_PAGES),
+    "diagnose": ("budget", *_PAGES),
+    "budget": _PAGES,
+    "report": ("pdf",),
+    "pdf": (),
     "notebook": (),
 }
 # Files that have no name of their own in a run.
@@ -123,6 +125,8 @@ class RunFolder:
         The report (HTML, self-contained).
     inspection : Path
         The images with their stars (HTML, self-contained).
+    pdf : Path
+        The report for printing (PDF).
     notebook : Path
         The results as an executed notebook.
     """
@@ -148,6 +152,7 @@ class RunFolder:
     figures = _File("figures", "starcal-uq report RUN")
     report = _File("report.html", "starcal-uq report RUN")
     inspection = _File("frames.html", "starcal-uq inspect RUN")
+    pdf = _File("report.pdf", "starcal-uq report RUN --format pdf")
     notebook = _File("report.ipynb", "starcal-uq report RUN --notebook")
 
     def __init__(self, path: PathLike) -> None:

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.comparison.result import CameraComparison
     from starcal_uq.core.files import PathLike
+    from starcal_uq.core.settings import ReportFormat
     from starcal_uq.pipeline.inspection import Frames
     from starcal_uq.planning.plan import Plan
     from starcal_uq.studies.result import Study
@@ -23,6 +24,7 @@ def report(
     to: PathLike | None = None,
     *,
     truth: Camera | None = None,
+    format: ReportFormat = "html",
 ) -> Path:
     """Write the report of a run, or the page of another result.
 
@@ -37,24 +39,31 @@ def report(
     truth : Camera, optional
         The camera of a simulation, shown beside the estimate of a run. Observations made by `starcal_uq.simulate`
         carry it, and it is then taken from them.
+    format : {"html", "pdf"}
+        ``"pdf"`` prints the page of a run as well, by an installed browser or WeasyPrint.
 
     Returns
     -------
     Path
-        The page. It needs no network, no script and no other file.
+        The page, or its PDF. It needs no network, no script and no other file.
 
     Raises
     ------
     TypeError
-        If the result has no page, or nothing says where it goes.
+        If the result has no page, or no PDF, or nothing says where it goes.
+    MissingExtraError
+        If nothing is installed that makes a PDF.
     RunFolderError
         If there is no calibration, a file cannot be read, or files of different runs are mixed.
     """
     if isinstance(what, Run):
-        return what.report()
+        return what.pdf() if format == "pdf" else what.report()
     if isinstance(what, str | os.PathLike):
+        run = Run(what, truth)
         # A truth that is given is not of the folder.
-        return Run(what, truth).report(force=truth is not None)
+        return (run.pdf if format == "pdf" else run.report)(force=truth is not None)
+    if format != "html":
+        raise TypeError(f"only the report of a run is printed: open the page of a {type(what).__name__} in a browser.")
     if to is None:
         raise TypeError(f"say where the page of a {type(what).__name__} goes: report(what, to).")
     from starcal_uq.presentation.pages.write import write_page

@@ -874,6 +874,30 @@ class Run:
         return self.path / RunFolder.report
 
     @_writing
+    def pdf(self, *, force: bool = False) -> Path:
+        """Write the report as ``RUN/report.pdf``, by a browser that is installed or by WeasyPrint.
+
+        Parameters
+        ----------
+        force : bool
+            Whether to write report and PDF again.
+
+        Raises
+        ------
+        MissingExtraError
+            If nothing is installed that makes a PDF.
+        RunFolderError
+            If there is no calibration, a file cannot be read, or no PDF came of it.
+        """
+        page = self.report(force=force)
+        if force or not self.has("pdf"):
+            from starcal_uq.presentation.pages.printing import pdf_bytes
+
+            content = pdf_bytes(page)
+            with self._step("pdf", None, {}) as files:
+                atomic_write_bytes(files.pdf, content)
+        return self.path / RunFolder.pdf
+
     def notebook(self, to: PathLike | None = None, *, force: bool = False, progress: Progress | None = None) -> Path:
         """Write an executed notebook of whatever the run holds, ``RUN/report.ipynb``, to go on from.
 

@@ -67,6 +67,17 @@ def short_of(kind, small):
         return sc.sample(small.obs, small.cal, seed=0, likelihood=kind, **SHORT)
 
 
+PHASE = SimpleNamespace(
+    against="pixel phase in x",
+    name="phase",
+    is_of_noise=False,
+    p_holm=1e-9,
+    size_px=0.1,
+    moved_sigma=0.0,
+    moved_name="",
+)
+
+
 # What makes each function that can give a remedy do so; the remedies of all of them are executed.
 EXAMPLES = {
     "inference.checks._rhat": lambda s: [checks._rhat(changed(s.post, rhat=np.full(6, 1.1)))],
@@ -112,6 +123,18 @@ EXAMPLES = {
             )
         )
     ],
+    "diagnostics.verdict.estimate.estimators_agree": lambda s: [
+        estimate.estimators_agree(dataclasses.replace(s.cal, pair_theta=s.cal.theta + 99.0 * s.cal.sigmas))
+    ],
+    "diagnostics.verdict.estimate.misfit": lambda s: [
+        estimate.misfit(sc.diagnostics.misfit_tests(s.bent, sc.calibrate(s.bent, s.sheet, model="none")), "none"),
+        estimate.misfit(
+            SimpleNamespace(tests=[PHASE], found=lambda level: [PHASE]),
+        ),
+    ],
+    "diagnostics.verdict.estimate.predictive": lambda s: [
+        estimate.predictive(SimpleNamespace(statistics=[SimpleNamespace(name="tails", p_value=0.0, extreme=True)]))
+    ],
     "diagnostics.verdict.estimate.one_camera": lambda s: [
         estimate.one_camera(MixedCameras(2, "the frames are of 2 cameras", "0-5,8"))
     ],
@@ -134,6 +157,9 @@ EXAMPLES = {
         ]
         + [observed.directions(s.obs, s.cal, None, TimeTest("aberration twice", *(4 * [1.0]), "f", 2.0))]
     ),
+    "diagnostics.verdict.observed.residual_pattern": lambda s: [
+        observed.residual_pattern(s.bent, sc.calibrate(s.bent, s.sheet, model="none"))
+    ],
     "diagnostics.verdict.observed.screening": lambda s: [
         observed.screening(s.obs.with_meta(screening={"rejected": 0, "of": 9, "blame": "the model is wrong."}))
     ],
@@ -174,6 +200,10 @@ ELSEWHERE = {
     "diagnose RUN --force": "tests/cli/test_cli_statistics.py",
     "inspect RUN": "tests/cli/test_cli_images.py",
     "propagate RUN --attitudes PROFILE": "tests/cli/test_cli_mission.py",
+    "report": "tests/cli/test_cli.py",
+    "report RUN --format pdf": "tests/presentation/test_report.py",
+    "report RUN --notebook": "tests/presentation/test_report.py",
+    "schema": "tests/cli/test_schemas.py",
     "reproduce": "tests/cli/test_cli_paper.py",
     "run IMAGES... -o RUN": "tests/cli/test_cli_images.py",
     "study": "tests/cli/test_cli_study.py",

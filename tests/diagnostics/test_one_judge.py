@@ -14,7 +14,7 @@ from starcal_uq.cli import console
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.status import Check, Level, Question, worst
 from starcal_uq.diagnostics.verdict.judge import Place, judge
-from starcal_uq.diagnostics.verdict.observed import SCREEN
+from starcal_uq.diagnostics.verdict.observed import FROM_IMAGES, SCREEN
 from starcal_uq.inference.checks import check_draws
 from starcal_uq.presentation.report.page import context
 from starcal_uq.presentation.report.results import Results
@@ -129,5 +129,7 @@ def test_remedies_name_the_files_of_the_run():
     files = "'/run or that/observations.parquet' '/run or that/camera.toml' -o '/run or that-2'"
     assert steps.remedies[0] == f"starcal-uq run {files} --screen"
     assert Place("r").command("starcal-uq sample RUN --force --steps 400") == "starcal-uq sample r --force --steps 400"
+    images = Place("r", ("run", "/data/images", "--screen")).command(f"{FROM_IMAGES} --site SITE")
+    assert images == "starcal-uq run /data/images --screen -o r --site site.toml --force"
     # Without stars there is nothing to calibrate on.
     assert Place("r", observations=False).exact(check).remedies[0].startswith("starcal-uq calibrate OBS CAMERA -o r")

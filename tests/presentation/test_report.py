@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import shlex
 import shutil
+import sys
 from html.parser import HTMLParser
 
 import numpy as np
@@ -13,10 +15,13 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.tasks import processors
+from starcal_uq.diagnostics.verdict.judge import Place
 from starcal_uq.inference.checks import check_draws
 from starcal_uq.presentation.html import symbol
+from starcal_uq.presentation.pages import printing
 from starcal_uq.presentation.report.drawing import FIGURES, Ahead, draw_figures
 from starcal_uq.presentation.report.page import render
+from starcal_uq.presentation.report.summary import terminal_summary
 from starcal_uq.presentation.report.tables import attitude_rows, parameter_rows, weak_directions
 from starcal_uq.propagation.attitude_error import AttitudeError, MisfitFound
 from tests.helpers.scenes import camera, nominal, observations
@@ -124,6 +129,52 @@ def test_one_file_without_network_or_script(full):
     assert "http" not in re.sub(r"xmlns(:xlink)?='http://www.w3.org/[a-z0-9/]*'", "", text)
     assert "url(" not in text.replace("url(%23", "") and "@import" not in text
     assert len(text) < 3_000_000
+
+
+def test_first_page_says_what_can_be_used_and_the_rest_is_folded(full):
+    text = full.report.read_text(encoding="utf-8")
+    first, rest = text.split('id="appendix"')
+    for words_of in ("Can be used", "Not, or with care", "Common rotation", "Frame-dependent rest", "Estimate ± σ"):
+        assert words_of in first and "<details" not in first
+    assert rest.count('<details class="part">') == len(SECTIONS)
+    # Unfolded on paper, where no script runs.
+    assert "details::details-content { content-visibility: visible" in text and "prefers-color-scheme: dark" in text
+    paragraph = rest[rest.index("<blockquote") : rest.index("</blockquote>")]
+    assert "emcee" in paragraph and "100 kept steps, seed 1" in paragraph and "starcal_uq" in paragraph
+
+
+def test_summary_fits_80_columns_and_its_commands_can_be_put_together(full):
+    results = sc.Run(full.path).results
+    name = "a folder of a name that is long " * 3
+    place = Place(f"/data/{name}", ("run", "/data/obs.csv", "/data/camera.toml"))
+    obs = results.observations.with_meta(directions="undeclared")
+    lines = terminal_summary(dataclasses.replace(results, observations=obs, place=place))
+    assert all(len(line) <= 80 for line in lines if "/data/" not in line)
+    start = next(i for i, line in enumerate(lines) if line.lstrip().startswith("try: "))
+    end = next(i for i in range(start, len(lines)) if not lines[i].endswith("\\"))
+    command = "\n".join(lines[start : end + 1]).strip().removeprefix("try: ").replace("\\\n", "")
+    assert shlex.split(command)[1:6] == ["run", "/data/obs.csv", "/data/camera.toml", "-o", f"/data/{name}"]
+
+
+def test_without_a_browser_a_pdf_takes_one_sentence(run, monkeypatch, tmp_path):
+    made = sc.report(run.path)
+    monkeypatch.setattr(printing, "browsers", lambda: iter(()))
+    monkeypatch.setitem(sys.modules, "weasyprint", None)
+    with pytest.raises(sc.errors.MissingExtraError, match="install Chromium, Chrome or Edge, or `pip install weasy"):
+        sc.report(run.path, format="pdf")
+    broken, good = tmp_path / "broken", tmp_path / "good"
+    broken.write_text("#!/bin/sh\nexit 3\n")
+    good.write_text('#!/bin/sh\nfor a; do case "$a" in --print-to-pdf=*) echo %PDF > "${a#*=}";; esac; done\n')
+    for script in (broken, good):
+        script.chmod(0o755)
+    monkeypatch.setattr(printing, "browsers", lambda: iter([str(broken)]))
+    with pytest.raises(sc.errors.RunFolderError, match=r"broken made no PDF \(exit status 3\)"):
+        sc.report(run.path, format="pdf")
+    # The next one is asked; what is there is kept, and goes with the report that it shows.
+    monkeypatch.setattr(printing, "browsers", lambda: iter([str(broken), str(good)]))
+    assert sc.report(run.path, format="pdf").read_bytes() == b"%PDF\n" and made.exists()
+    sc.Run(run.path).report(force=True)
+    assert not run.pdf.exists()
 
 
 def test_figures_are_files_too(full):

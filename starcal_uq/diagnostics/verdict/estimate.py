@@ -11,7 +11,7 @@ from starcal_uq.core.formatting import count, fixed, join_words, plural, signifi
 from starcal_uq.core.status import Check, Level, Question, Status, pass_or_fail, pass_or_warn
 from starcal_uq.core.types import BoolArray
 from starcal_uq.diagnostics.misfit import ALPHA
-from starcal_uq.diagnostics.verdict.observed import CALIBRATE, SCREEN
+from starcal_uq.diagnostics.verdict.observed import CALIBRATE, NOISE, ROBUST, SCREEN, model_remedy, richer
 from starcal_uq.estimation.fallback import fallback_words
 from starcal_uq.estimation.undetermined import what_is_open
 from starcal_uq.maths.intervals import student_quantile
@@ -69,11 +69,6 @@ def determined(cal: Calibration) -> Check | None:
     return Check(name, Question.TRUSTWORTHY, Level.WARN, used, asked, sentence, remedy)
 
 
-def model_remedy(name: str) -> str:
-    """How to calibrate with a distortion model."""
-    return f"{CALIBRATE} --model {name} or sc.calibrate(obs, camera, model={name!r})"
-
-
 def estimators_agree(cal: Calibration) -> Check | None:
     """Do the interstar angles alone (the paper's estimator) lead to the same camera?"""
     difference = np.abs(cal.pair_theta - cal.theta)
@@ -91,7 +86,8 @@ def estimators_agree(cal: Calibration) -> Check | None:
     )
     level = pass_or_fail(good)
     value = f"{fixed(largest, 1)} sigma ({name})"
-    return Check("Two estimators", Question.CONVERGED, level, value, f"< {fixed(limit, 1)} sigma", sentence)
+    remedy = "" if good else SCREEN
+    return Check("Two estimators", Question.CONVERGED, level, value, f"< {fixed(limit, 1)} sigma", sentence, remedy)
 
 
 def _largest_z(size: float, cal: Calibration) -> float:
@@ -124,12 +120,14 @@ def truth_z(cal: Calibration, truth: Camera, post: Posterior | None = None) -> F
 # Frames that scatter by less than this beyond the formal errors are of no consequence, however sure.
 JACKKNIFE_RATIO = 1.1
 # Patterns that repeat on the scale of a pixel act like more noise; they do not bend the map of the field.
+_OF_THE_LENS = ("radius", "azimuth", "field", "field cells")
 _LIKE_NOISE = ("pixel phase in x", "pixel phase in y")
 
 
 def model_checks(diagnosis: Diagnosis) -> list[Check]:
     """Every check that a diagnosis allows."""
-    checks = [misfit(diagnosis.misfit), even_noise(diagnosis.misfit)]
+    fitted = "" if diagnosis.comparison is None else diagnosis.comparison.fitted
+    checks = [misfit(diagnosis.misfit, fitted), even_noise(diagnosis.misfit)]
     checks += [] if diagnosis.cameras is None else [one_camera(diagnosis.cameras)]
     checks += [] if diagnosis.jackknife is None else [jackknife(diagnosis.jackknife)]
     checks += [] if diagnosis.stars is None else [stars(diagnosis.stars)]
@@ -144,8 +142,8 @@ def one_camera(found: MixedCameras) -> Check:
     return Check("One camera", Question.TRUSTWORTHY, Level.FAIL, f"{found.n} cameras", "1", sentence, remedy)
 
 
-def misfit(found: Misfit) -> Check:
-    """Is there structure in the residuals?"""
+def misfit(found: Misfit, fitted: str = "") -> Check:
+    """Is there structure in the residuals that the model `fitted` leaves?"""
     name, bound = "Unexplained structure", f"p ≥ {MISFIT_P:g}"
     patterns = [test.p_holm for test in found.tests if not test.is_of_noise]
     value = f"p = {significant(min(patterns, default=1.0))}, corrected for {plural(len(found.tests), 'test')}"
@@ -172,7 +170,9 @@ def misfit(found: Misfit) -> Check:
             f"{significant(largest.moved_sigma)} sigma, the other parameters by less."
         )
     level = Level.FAIL if bending else Level.WARN
-    return Check(name, Question.TRUSTWORTHY, level, value, bound, sentence)
+    # A lens can follow what keeps its place in the field; what does not is at best counted as noise.
+    remedy = model_remedy(richer(fitted)) if any(t.against in _OF_THE_LENS for t in rejected) else NOISE
+    return Check(name, Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
 
 
 def even_noise(found: Misfit) -> Check:
@@ -198,8 +198,7 @@ def even_noise(found: Misfit) -> Check:
         f"{uneven.parameter_names[worst]} should be {fixed(float(uneven.ratios[worst]), 2)} times as large, and with "
         "fitted weights the estimate itself would be more precise."
     )
-    remedy = f"{CALIBRATE} --noise model or sc.calibrate(obs, camera, noise='model')"
-    return Check(name, Question.TRUSTWORTHY, Level.WARN, value, bound, sentence, remedy)
+    return Check(name, Question.TRUSTWORTHY, Level.WARN, value, bound, sentence, NOISE)
 
 
 def sensitivity(diagnosis: Diagnosis) -> str:
@@ -357,7 +356,8 @@ def predictive(found: PredictiveCheck) -> Check:
     else:
         sentence = "Data made by the model have the same spread, tails and patterns as the measured ones."
     name = "Posterior predictive check"
-    return Check(name, Question.TRUSTWORTHY, pass_or_warn(not extreme), value, "0.001 to 0.999", sentence)
+    level, remedy = pass_or_warn(not extreme), ROBUST if extreme else ""
+    return Check(name, Question.TRUSTWORTHY, level, value, "0.001 to 0.999", sentence, remedy)
 
 
 def starts(found: MultiStart) -> Check:

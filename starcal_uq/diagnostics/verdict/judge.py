@@ -14,7 +14,7 @@ from starcal_uq.core.formatting import join_words
 from starcal_uq.core.status import Check, Level, Question, worst
 from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.verdict import draws, estimate, observed
-from starcal_uq.diagnostics.verdict.observed import CALIBRATE
+from starcal_uq.diagnostics.verdict.observed import CALIBRATE, FROM_IMAGES
 from starcal_uq.estimation.noise_model import weighed
 
 if TYPE_CHECKING:
@@ -95,13 +95,14 @@ class Place:
         """A command with the files of this run in place of OBS, CAMERA, SITE and RUN; a call in Python as it is."""
         if not text.startswith("starcal-uq"):
             return text
-        if text.startswith(CALIBRATE) and self.words[:1] == ("run",):
+        start = next((words for words in (CALIBRATE, FROM_IMAGES) if text.startswith(words)), "")
+        if start and self.words[:1] == ("run",):
             # Everything that was asked for then, and this; of an option that is given twice the last one holds.
             made = shlex.join([*self.words, "-o", self.run])
-            text = f"starcal-uq {made}{text.removeprefix(CALIBRATE)} --force"
-        elif text.startswith(CALIBRATE) and self.observations:
+            text = f"starcal-uq {made}{text.removeprefix(start)} --force"
+        elif start == CALIBRATE and self.observations:
             given = [f"{self.run}/observations.parquet", f"{self.run}/camera.toml", "-o", f"{self.run}-2"]
-            text = f"starcal-uq run {shlex.join(given)}{text.removeprefix(CALIBRATE)}"
+            text = f"starcal-uq run {shlex.join(given)}{text.removeprefix(start)}"
         files = {"RUN": shlex.quote(self.run), "SITE": "site.toml"}
         return " ".join(files.get(word, word) for word in text.split(" "))
 

@@ -39,6 +39,7 @@ _SMALL_SIGMA = 1.0
 CALIBRATE = "starcal-uq calibrate OBS CAMERA -o RUN --force"
 SCREEN = f"{CALIBRATE} --screen or sc.estimation.screen(obs, camera)"
 FROM_IMAGES = "starcal-uq run IMAGES... CAMERA -o RUN --force"
+ROBUST, NOISE = f"{CALIBRATE} --robust", f"{CALIBRATE} --noise model or sc.calibrate(obs, camera, noise='model')"
 
 
 def directions(
@@ -175,7 +176,19 @@ def residual_pattern(obs: Observations, cal: Calibration) -> Check:
             "the model does not explain; it is not in any interval of this report."
         )
     value = f"p = {significant(p_value)}" + (f", pattern {significant(pattern)} px" if pattern > 0.0 else "")
-    return Check("Pattern in the residuals", Question.TRUSTWORTHY, level, value, f"p ≥ {PATTERN_P:g}", sentence)
+    remedy = "" if level is Level.PASS else model_remedy(richer(cal.camera.distortion))
+    name, bound = "Pattern in the residuals", f"p ≥ {PATTERN_P:g}"
+    return Check(name, Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
+
+
+def model_remedy(name: str) -> str:
+    """How to calibrate with a distortion model."""
+    return f"{CALIBRATE} --model {name} or sc.calibrate(obs, camera, model={name!r})"
+
+
+def richer(model: str) -> str:
+    """A distortion model that follows what this one cannot."""
+    return "brown3" if model == "brown_tangential" else "brown_tangential"
 
 
 def outliers(obs: Observations, cal: Calibration) -> Check:
