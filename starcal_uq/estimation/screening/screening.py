@@ -42,7 +42,14 @@ from starcal_uq.estimation.screening.result import (
     rejected_table,
     warnings_about,
 )
-from starcal_uq.estimation.screening.tails import Tails, allowed_near, blame_words, fit_tails, mark_beyond
+from starcal_uq.estimation.screening.tails import (
+    Tails,
+    allowed_near,
+    blame_words,
+    fit_tails,
+    follows_place,
+    mark_beyond,
+)
 from starcal_uq.observations.frames import StarFrames
 
 if TYPE_CHECKING:
@@ -161,7 +168,12 @@ def screen(
         use, tails = _all_that_hangs_together(frames, calibration, use, rates)
         last = _with_tails(options, tails)
         calibration = calibrate(obs.select(use), camera, throw=False, **last)
-        blame = blame_words(near, allowed, len(rounds), stable, calibration)
+        follows = follows_place(obs.select(use).xy, calibration)
+        if follows and last is not options:
+            # Tails would take what the lens does at some places for noise, and believe the others all the more.
+            last = options
+            calibration = calibrate(obs.select(use), camera, throw=False, **last)
+        blame = blame_words(near, allowed, len(rounds), stable, calibration, follows)
     kept = obs.select(use)
     if throw and not calibration.status.ok:
         # For the error alone.

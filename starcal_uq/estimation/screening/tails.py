@@ -29,6 +29,8 @@ BLAME_P = 1e-3
 # Probability that Gaussian noise is taken for one with tails.
 _TAILS_P = 1e-3
 _ROUNDS, _NU = 30, 40
+# Stars of a cell of the detector, cells along a side at most, and the fewest stars of a cell that counts.
+_PER_CELL, _MOST_CELLS, _FEWEST = 25, 12, 5
 
 
 def allowed_near(statistic: FloatArray, threshold: FloatArray, expected_false: float) -> tuple[int, int]:
@@ -129,6 +131,27 @@ def _fit(t: FloatArray) -> tuple[float, float, float]:
     return best
 
 
+def follows_place(xy: FloatArray, cal: Calibration) -> bool:
+    """Whether residuals follow the place on the detector, as those of a lens without its model do, and no tails.
+
+    Their directions alone are summed, cell by cell: the spatial signs of Mottonen & Oja (1995), which tails of any kind
+    leave as they are. Of n directions that are even, twice the squared length of the sum over n is a chi-square of two.
+    """
+    from scipy.special import chdtri
+
+    e = np.asarray(cal.residuals_px, dtype=np.float64)
+    length = np.hypot(*e.T)
+    sign = e / np.where(length > 0.0, length, 1.0)[:, None]
+    side = int(np.clip(np.sqrt(len(xy) / _PER_CELL), 2, _MOST_CELLS))
+    place = np.clip(xy / [cal.camera.width_px, cal.camera.height_px] * side, 0, side - 1).astype(np.int64)
+    cell = place @ [side, 1]
+    count = np.bincount(cell, minlength=side**2)
+    sums = np.stack([np.bincount(cell, part, side**2) for part in sign.T])
+    filled = count >= _FEWEST
+    statistic = 2.0 * float(np.sum(sums[:, filled] ** 2 / count[filled]))
+    return statistic > float(chdtri(2.0 * np.count_nonzero(filled), BLAME_P))
+
+
 def mark_beyond(table: pd.DataFrame, residuals: StarResiduals, tails: Tails, p_value: float) -> None:
     """State in the table of rejected rows, in place, how far beyond the tails single stars are."""
     single = table["reason"].isin(["displaced", "taste"]).to_numpy()
@@ -138,7 +161,7 @@ def mark_beyond(table: pd.DataFrame, residuals: StarResiduals, tails: Tails, p_v
     table.loc[single, "threshold"] = _limit(tails.nu, tails.scale2, p_value) / residuals.variance()
 
 
-def blame_words(near: int, allowed: int, n_rounds: int, stable: bool, cal: Calibration) -> str:
+def blame_words(near: int, allowed: int, n_rounds: int, stable: bool, cal: Calibration, follows: bool) -> str:
     """That the model is to blame, by what that is known, what became of the stars, and what helps."""
     found = [f"the rejections did not settle in {plural(n_rounds, 'round')}"] if not stable else []
     if near > allowed:
@@ -148,7 +171,10 @@ def blame_words(near: int, allowed: int, n_rounds: int, stable: bool, cal: Calib
         ]
     settings = cal.provenance.get("settings", {})
     tails = ", with the heavy tails of a Student t" if settings.get("likelihood") == "student_t" else ""
+    remedy = "Fit noise that varies (--noise model), or another distortion"
+    if follows:
+        remedy = "Their residuals follow the place on the detector: fit another distortion"
     return (
-        f"the model is wrong, not the stars: {' and '.join(found)}. They are kept{tails}. Fit noise that varies "
-        "(--noise model), or another distortion (--model; `starcal-uq diagnose RUN` compares them)."
+        f"the model is wrong, not the stars: {' and '.join(found)}. They are kept{tails}. {remedy} (--model; "
+        "`starcal-uq diagnose RUN` compares them)."
     )
