@@ -13,6 +13,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from sphinx.ext.napoleon import NumpyDocstring
+
 HERE = Path(__file__).parent
 PROJECT = tomllib.loads((HERE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
@@ -38,21 +40,36 @@ nb_execution_in_temp = True
 nb_execution_timeout = 300
 nb_execution_raise_on_error = True
 nb_merge_streams = True
-myst_enable_extensions = ["amsmath", "dollarmath"]
+myst_enable_extensions = ["amsmath", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 2
 
-autodoc_default_options = {"members": True, "member-order": "bysource", "show-inheritance": True}
+autodoc_default_options = {"members": True, "member-order": "bysource"}
 autodoc_typehints = "none"  # the docstrings state shapes and units, which annotations cannot
 napoleon_google_docstring = False
-napoleon_use_ivar = True  # fields of dataclasses are described once, in the docstring of the class
+# Names that share a line share an entry; fields of dataclasses are described once, in the docstring of the class.
+napoleon_use_param = False
+napoleon_custom_sections = [("Fields", "params_style")]
 napoleon_use_rtype = False
 napoleon_attr_annotations = False
+# The first words of a property are no type, whatever colon follows.
+NumpyDocstring._consume_inline_attribute = lambda self: ("", self._consume_to_end())  # type: ignore[method-assign]
+default_role = "py:obj"  # `name` is a link where it is public
+add_module_names = False
+python_maximum_signature_line_length = 60
 # Words of a docstring's types ("n_frames values") are taken for references; two classes may have such a field.
 suppress_warnings = ["ref.python"]
 
 html_theme = "furo"
 html_title = f"starcal_uq {release}"
-html_static_path: list[str] = []
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+
+
+def write_gallery(_app: object) -> None:
+    """Draw the figures of the gallery, in a process of its own: they change Matplotlib's state."""
+    code = "import gallery_figures, pathlib, sys; gallery_figures.main(pathlib.Path(sys.argv[1]))"
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parent)])}
+    subprocess.run([sys.executable, "-c", code, str(HERE / "gallery.md")], env=environment, check=True)
 
 
 def copy_notebooks(_app: object) -> None:
@@ -83,37 +100,109 @@ def write_command_help(_app: object) -> None:
     (HERE / "reference" / "_commands.txt").write_text("\n\n\n".join(texts) + "\n", encoding="utf-8")
 
 
+def public_objects() -> dict[str, dict[str, Any]]:
+    """What a user can name, by namespace: "" for the top, then the wings; modules among them left out."""
+    wings = sorted(path.parent.name for path in (HERE.parent / "starcal_uq").glob("*/__init__.pyi"))
+    found = {}
+    for wing in ("", *wings):
+        module = importlib.import_module(f"starcal_uq.{wing}".rstrip("."))
+        names = sorted(module.__all__, key=lambda name: (not name[0].isupper(), name.lower()))
+        public = {name: getattr(module, name) for name in names}
+        found[wing] = {name: value for name, value in public.items() if not isinstance(value, ModuleType)}
+    return found
+
+
+def drawn_by(public: Any) -> str:
+    """The figures of a class, with their places in the gallery."""
+    from starcal_uq.core.display import view_of
+
+    try:
+        names = sorted(view_of(public).figures) if isinstance(public, type) else []
+    except LookupError:
+        names = []
+    place = f"../../../gallery.md#{public.__name__.lower()}-" if names else ""
+    links = [f"[`plot.{name}()`]({place}{name.replace('_', '-')})" for name in names]
+    return f"\n## Figures\n\n{', '.join(links)}\n" if links else ""
+
+
 def write_reference(_app: object) -> None:
-    """One page a namespace, with what its stub offers: a public name cannot be forgotten here."""
+    """One page an object, and one a namespace, from what the stubs offer: a public name cannot be forgotten here."""
     folder = HERE / "reference" / "api"
     shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    wings = sorted(path.parent.name for path in (HERE.parent / "starcal_uq").glob("*/__init__.pyi"))
-    for place in ("", *wings):
-        module = importlib.import_module(f"starcal_uq.{place}".rstrip("."))
-        names = [name for name in module.__all__ if not isinstance(getattr(module, name), ModuleType)]
-        lines = [f"# {f'sc.{place}' if place else 'sc'}", "", (module.__doc__ or "").strip(), "", "```{eval-rst}"]
-        for name in sorted(names, key=lambda name: (not name[0].isupper(), name.lower())):
-            public = getattr(module, name)
+    for wing, objects in public_objects().items():
+        place = folder / (wing or "top")
+        place.mkdir(parents=True)
+        prefix = f"sc.{wing}." if wing else "sc."
+        module = f"starcal_uq.{wing}".rstrip(".")
+        pages, rows = [], []
+        for name, public in objects.items():
+            # Classes and functions may differ by a capital letter only, and file systems may not.
+            page = f"{name}-class" if isinstance(public, type) else name
+            pages.append(f"{place.name}/{page}")
             kind = "class" if isinstance(public, type) else "function" if callable(public) else "data"
-            lines.append(f".. auto{kind}:: {module.__name__}.{name}")
-        if place == "core":
-            lines.append(".. automodule:: starcal_uq.core.errors")
-        (folder / f"{place or '_top'}.md").write_text("\n".join([*lines, "```", ""]), encoding="utf-8")
+            text = f"# {prefix}{name}\n\n```{{eval-rst}}\n.. auto{kind}:: {module}.{name}\n```\n{drawn_by(public)}"
+            (place / f"{page}.md").write_text(text, encoding="utf-8")
+            told = (public.__doc__ or "").strip().partition("\n\n")[0] if kind != "data" else ""
+            told = " ".join(told.split()).replace("|", r"\|")
+            rows.append(f"| [`{prefix}{name}`]({pages[-1]}.md) | {told} |")
+        if wing == "core":
+            pages.append(f"{place.name}/errors")
+            errors = "# sc.errors\n\n```{eval-rst}\n.. automodule:: starcal_uq.core.errors\n```\n"
+            (place / "errors.md").write_text(errors, encoding="utf-8")
+            rows.append(f"| [`sc.errors`]({pages[-1]}.md) | Errors that a user can act on. |")
+        told = (importlib.import_module(module).__doc__ or "").strip() if wing else "What a day's work needs."
+        lines = [f"# {prefix.rstrip('.')}", "", told, "", "| | |", "|---|---|", *rows]
+        lines += ["", "```{toctree}", ":hidden:", "", *pages, "```", ""]
+        (folder / f"{wing or '_top'}.md").write_text("\n".join(lines), encoding="utf-8")
 
 
-def escape_formulas(_app: object, _what: str, _name: str, _object: object, _options: object, lines: list[str]) -> None:
-    """Keep the bars of |A| and the last underscore of `str_` from being read as markup; literals stay as they are."""
+def readable(_app: object, what: str, _name: str, _object: object, _options: object, lines: list[str]) -> None:
+    """Fields of a class under that name, links from types, and formulas that are not read as markup.
+
+    The bars of |A| and the last underscore of `str_` are kept; literals stay as they are.
+    """
     literal_above: int | None = None
     for number, line in enumerate(lines):
         indent = len(line) - len(line.lstrip())
+        if what == "class" and line == "Attributes" and set(lines[number + 1]) == {"-"}:
+            line = "Fields"
         if literal_above is not None and line.strip() and indent <= literal_above:
             literal_above = None
         if literal_above is None:
             parts = re.split(r"(``.*?``|`.*?`)", line)
             parts[::2] = [re.sub(r"(?<!\\)\||(?<=\w)_(?!\w)", r"\\\g<0>", part) for part in parts[::2]]
-            lines[number] = "".join(parts)
+            line = "".join(parts)
+            field, colon, kind = line.partition(" : ")
+            if colon and not indent:
+                line = field + colon + re.sub(r"\b[A-Z]\w+", lambda word: linked(word[0]), kind)
+            elif line in PUBLIC and number and set(lines[number - 1]) == {"-"}:  # what is returned
+                line = linked(line)
             literal_above = indent if line.rstrip().endswith("::") else None
+        lines[number] = line
+
+
+PUBLIC: dict[str, str] = {}
+
+
+def linked(name: str) -> str:
+    return f":py:obj:`{name}`" if name in PUBLIC else name
+
+
+def find_public(_app: object) -> None:
+    """Where each public name is described: classes of the top level in their wings' docstrings, too."""
+    for wing, objects in public_objects().items():
+        for name in objects:
+            PUBLIC.setdefault(name, ".".join(filter(None, ["starcal_uq", wing, name])))
+    PUBLIC["Status"] = "starcal_uq.core.Status"
+
+
+def resolve_short(app: Any, env: Any, node: Any, content: Any) -> Any:
+    """`Camera` and `Camera.load` stand for the public ones, from wherever they are named."""
+    first, dot, rest = node.get("reftarget", "").removeprefix("sc.").rpartition("starcal_uq.")[2].partition(".")
+    if node.get("refdomain") != "py" or first not in PUBLIC:
+        return None
+    target = PUBLIC[first] + dot + rest
+    return env.domains["py"].resolve_xref(env, node["refdoc"], app.builder, "obj", target, node, content)
 
 
 def setup(app: Any) -> None:
@@ -121,4 +210,7 @@ def setup(app: Any) -> None:
     app.connect("builder-inited", write_command_help)
     app.connect("builder-inited", write_reference)
     app.connect("builder-inited", copy_notebooks)
-    app.connect("autodoc-process-docstring", escape_formulas, priority=400)  # before napoleon
+    app.connect("builder-inited", write_gallery)
+    app.connect("builder-inited", find_public)
+    app.connect("missing-reference", resolve_short)
+    app.connect("autodoc-process-docstring", readable, priority=400)  # before napoleon

@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -39,6 +40,7 @@ from starcal_uq.presentation.figures.style import figure_of, new_figure, panels,
 from starcal_uq.propagation.attitude_error import AttitudeError, MisfitFound
 from tests.helpers.scenes import camera, nominal, observations
 
+ROOT = Path(__file__).parents[2]
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -295,3 +297,17 @@ def test_settings_of_the_user_stay_untouched(run):
 def test_importing_plots_imports_no_matplotlib():
     code = "import sys, starcal_uq.presentation.views; sys.exit('matplotlib' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_the_gallery_has_every_figure(monkeypatch):
+    """A figure without an entry is not shown to anybody who has not drawn it."""
+    from starcal_uq.paper.show import views as paper
+    from starcal_uq.presentation import views
+
+    monkeypatch.syspath_prepend(ROOT / "docs")
+    from gallery_figures import SCENES
+
+    tables = (views.VIEWS, paper.VIEWS)
+    figures = {f"{cls.__name__}.{name}" for table in tables for cls, view in table.items() for name in view.figures}
+    shown = [name for scene in SCENES for name in scene.figures]
+    assert (set(shown), len(shown)) == (figures, len(figures))

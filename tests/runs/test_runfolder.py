@@ -141,3 +141,18 @@ def test_a_file_is_no_run_folder(tmp_path):
         RunFolder(path).require("calibration")
     with pytest.raises(RunFolderError, match="is a file, not a folder"):
         RunFolder(path).create()
+
+
+def test_the_page_on_files_names_each_of_a_run():
+    from starcal_uq.runs.folder import _OTHERS, RunFolder
+
+    run = RunFolder("run")
+    paths = [
+        path
+        for name in dir(RunFolder)
+        if isinstance(path := getattr(run, name, None), Path) and path.parent == run.path
+    ]
+    told = (Path(__file__).parents[2] / "docs" / "reference" / "files.md").read_text("utf-8")
+    assert len(paths) > 15
+    names = {path.name for path in paths} | set(_OTHERS)
+    assert {name for name in names if f"`{name.rstrip('/')}" not in told} == set()

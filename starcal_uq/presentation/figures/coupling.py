@@ -37,7 +37,7 @@ def plot_correlation(coupling: Coupling, ax: Axes | None = None, *, extended: bo
         side = 1.4 + 0.62 * len(names)
         ax = style.new_axes(side + 0.8, side)
     image = _extended(ax, coupling) if extended else _heat_map(ax, np.asarray(coupling.correlation), names)
-    style.label(ax, "With the boresight" if extended else "Camera parameters")
+    style.label(ax, "With the boresight" if extended else "Camera parameters", pad=24)
     style.colour_bar(ax, image, "correlation")
     return ax
 

@@ -1,0 +1,245 @@
+"""The figures of the gallery: every figure that a result draws, with the code that makes it.
+
+`conf.py` runs the code when it builds the documentation and writes the page; a test holds the list against the views.
+"""
+
+from __future__ import annotations
+
+from contextlib import chdir
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import process_time
+from typing import Any
+
+THUMBNAIL_PX = 260
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Code that makes some results, and the code of their figures, by class and name of the figure."""
+
+    title: str
+    words: str
+    code: str
+    figures: dict[str, tuple[str, str]]
+    drawn: bool = True
+
+
+SCENES = (
+    Scene(
+        "A calibration",
+        "All of this section comes from one simulated campaign, and from what it says.",
+        """\
+import starcal_uq as sc
+
+truth = sc.paper.paper_camera()
+stars = sc.load_catalogue(max_mag=6.0)
+obs = sc.simulate(stars, truth, n_frames=60, min_stars=8, sigma_px=0.05, seed=3)
+camera = sc.paper.paper_start()
+cal = sc.calibrate(obs, camera)
+post = sc.sample(obs, cal, seed=1)""",
+        {
+            "Posterior.corner": ("Which values are believed, pair by pair?", "post.plot.corner(cal, truth)"),
+            "Posterior.prior_posterior": ("What did the data add to the prior?", "post.plot.prior_posterior(truth)"),
+            "Calibration.convergence": ("How did the three stages get there?", "cal.plot.convergence(truth)"),
+            "Calibration.residuals": ("What is left, and is it noise?", "cal.plot.residuals(obs)"),
+            "Coupling.correlation": (
+                "Which parameters trade against each other?",
+                "sc.coupling(post).plot.correlation()",
+            ),
+            "Coupling.correlations": (
+                "And with the attitude among them?",
+                "sc.coupling(post).plot.correlations()",
+            ),
+            "Coupling.couplings": ("What does not knowing the others cost?", "sc.coupling(post).plot.couplings()"),
+        },
+    ),
+    Scene(
+        "Attitude and budget",
+        "What the posterior means for directions and attitudes.",
+        """\
+from starcal_uq.budgeting.file import Requirement
+
+error = sc.propagate(post, obs)
+need = Requirement("R-1", "cross-boresight", 60.0, 0.997)
+budget = sc.budget(post, obs, error, file=sc.budgeting.BudgetFile(requirements=(need,)))""",
+        {
+            "AttitudeError.contributors": ("What does each part do to the attitude?", "error.plot.contributors()"),
+            "Budget.contributors": ("Who spends the budget?", "budget.plot.contributors()"),
+            "FieldMap.maps": ("Where on the detector?", "sc.propagation.field_map(post, obs).plot.maps()"),
+            "DistortionCurve.curve": (
+                "How well is the distortion known, star by star?",
+                "sc.propagation.distortion_curve(post, obs).plot.curve()",
+            ),
+        },
+    ),
+    Scene(
+        "A slew",
+        "Calibration errors change as stars move over the detector: along a slew they become a spectrum.",
+        """\
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+t_s = np.arange(300.0)
+turns = Rotation.from_rotvec(np.radians(0.1) * t_s[:, None] * [0.0, 1.0, 0.0]).as_quat()
+profile = sc.attitude.AttitudeProfile(t_s, turns)
+slew = sc.simulation.profile_frames(stars, truth, profile)
+spectrum = sc.propagation.error_spectrum(post, slew, n_draws=20)""",
+        {
+            "ErrorSpectrum.spectrum": ("At which frequencies?", "spectrum.plot.spectrum()"),
+            "ErrorSpectrum.time_series": ("And when?", "spectrum.plot.time_series()"),
+        },
+    ),
+    Scene(
+        "Questions to the model",
+        "Is the model right, are the intervals, and do two calibrations agree?",
+        """\
+diagnosis = sc.diagnose(obs, cal, models=("none", "k1", "brown", "brown3"), n_starts=0)
+validation = sc.validate(camera, n_replicates=40, n_frames=20, workers=0)
+halves = sc.comparison.compare_halves(obs, camera)""",
+        {
+            "Diagnosis.diagnosis": ("Does anything speak against the model?", "diagnosis.plot.diagnosis()"),
+            "Misfit.p_values": ("Which test does?", "diagnosis.misfit.plot.p_values()"),
+            "Jackknife.ratios": ("Are frames independent?", "diagnosis.jackknife.plot.ratios()"),
+            "ModelComparison.models": (
+                "Would another model predict better?",
+                "diagnosis.comparison.plot.models()",
+            ),
+            "Validation.ranks": ("Are the intervals right for this sensor?", "validation.plot.ranks()"),
+            "CameraComparison.difference": ("Do two halves of the data agree?", "halves.plot.difference()"),
+        },
+    ),
+    Scene(
+        "Plans",
+        "What a calibration will give, before there are data.",
+        """\
+plan = sc.plan(camera, stars, target_arcsec=20.0, n_geometries=300, n_campaigns=40)
+choice = sc.planning.choose_frames(camera, stars, n_frames=8, candidates=500, n_geometries=200)
+check = sc.planning.check_forecast(camera, stars, n_frames=(10, 30), n_campaigns=10, n_geometries=300, workers=0)""",
+        {
+            "Plan.forecast": ("How many frames does the target take?", "plan.plot.forecast()"),
+            "Plan.sweeps": ("What else would help?", "plan.plot.sweeps()"),
+            "FrameChoice.choice": ("Which frames are worth most?", "choice.plot.choice()"),
+            "ForecastCheck.check": ("Is the forecast right?", "check.plot.check()"),
+        },
+    ),
+    Scene(
+        "Coupling studies",
+        "What couples with what, over fields, frames, stars and models ([studies](explanation/studies.md)).",
+        """\
+sc.studies.write_study_template("frames-stars", "study.toml")
+study = sc.study("study.toml", workers=0)
+with open("simulated.toml", "w") as file:
+    file.write('''
+    study = {mode = "simulate", seeds = 6}
+    observation = {min_stars = 8, max_mag = 6.0, sigma_px = 0.05}
+    sweep = {frames = [10, 20]}
+
+    [camera]
+    width_px = 1024
+    height_px = 1024
+    pixel_um = 12.0
+    focal_mm = 70.2
+    x0_px = 511.5
+    y0_px = 511.5
+    distortion = "k1"
+    k1 = 2e-9
+    ''')
+simulated = sc.study("simulated.toml", workers=0)""",
+        {
+            "Study.maps": ("What do two axes do, at a glance?", "study.plot.maps()"),
+            "Study.map": ("One number over both", 'study.plot.map("frame_error_arcsec")'),
+            "Study.correlation": ("Does anything decouple the pairs?", "study.plot.correlation()"),
+            "Study.matrices": ("All correlations, cell by cell", "study.plot.matrices()"),
+            "Study.weakest": ("What is determined worst?", "study.plot.weakest()"),
+            "Study.inflation": ("Each sigma, others unknown and known", "study.plot.inflation()"),
+            "Study.needed": ("How many frames for a target?", "study.plot.needed()"),
+            "Study.simpler": ("Would a simpler model do?", "study.plot.simpler()"),
+            "Study.coverage": ("Do simulated intervals hold the truth?", "simulated.plot.coverage()"),
+        },
+    ),
+    Scene(
+        "Ye & Yang (2017) again",
+        "The paper's experiments, here with fewer repetitions than [the page on it](explanation/paper.md).",
+        """\
+paper = sc.paper.reproduce("paper", n_replicates=8, n_frames=50, study=False, workers=0)
+sizes = {"fields_deg": (7.0, 15.0), "frames": (12, 48), "max_mags": (5.5, 6.5), "n_replicates": 3, "n_frames": 12}
+bias = sc.paper.interaction_study(distortion_scales=(0.0, 0.1, 1.0, 10.0), workers=0, **sizes)""",
+        {
+            "Reproduction.trajectories": ("The paper's figure 3", "paper.plot.trajectories()"),
+            "Reproduction.error_fields": ("Its map of errors", "paper.plot.error_fields()"),
+            "Reproduction.printed_numbers": ("Its numbers beside ours", "paper.plot.printed_numbers()"),
+            "Replicates.spread": ("Which method is worth what?", "paper.replicates.plot.spread()"),
+            "InteractionStudy.bias": ("When does distortion bias the optics?", "bias.plot.bias()"),
+        },
+    ),
+    Scene(
+        "Its field experiment",
+        "Not drawn here, because it renders and identifies hundreds of images: `starcal-uq reproduce-field -o field`.",
+        """\
+from starcal_uq.paper.field.experiment import field_experiment
+
+night = field_experiment("field")""",
+        {
+            "FieldExperiment.rates": ("How many frames are identified?", "night.plot.rates()"),
+            "FieldExperiment.errors": ("How large are the errors?", "night.plot.errors()"),
+        },
+        drawn=False,
+    ),
+)
+
+
+def _anchor(key: str) -> str:
+    return key.lower().replace(".", "-").replace("_", "-")
+
+
+def _code(text: str) -> str:
+    return f"```python\n{text}\n```\n"
+
+
+def write(page: Path, folder: Path) -> float:
+    """Draw everything into a folder, write the page, and tell the processor time, s."""
+    import io
+
+    from PIL import Image
+
+    from starcal_uq.presentation.figures.style import figure_of, png_bytes
+
+    started = process_time()
+    folder.mkdir(parents=True, exist_ok=True)
+    names: dict[str, Any] = {}
+    thumbnails: list[str] = []
+    sections: list[str] = []
+    for scene in SCENES:
+        sections.append(f"## {scene.title}\n\n{scene.words}\n\n{_code(scene.code)}")
+        if scene.drawn:
+            exec(scene.code, names)
+        for key, (question, code) in scene.figures.items():
+            result, _, name = key.partition(".")
+            sections.append(f"({_anchor(key)})=\n### {question}\n")
+            if scene.drawn:
+                data = png_bytes(figure_of(eval(code, names)), dpi=110)
+                (folder / f"{_anchor(key)}.png").write_bytes(data)
+                small = Image.open(io.BytesIO(data)).convert("RGB")
+                small.thumbnail((THUMBNAIL_PX, THUMBNAIL_PX))
+                small.save(folder / f"{_anchor(key)}-small.png", optimize=True)
+                alt = f"{result}: {name}. {question}"
+                where = f"{folder.name}/{_anchor(key)}"
+                thumbnails.append(f"```{{image}} {where}-small.png\n:alt: {alt}\n:target: '#{_anchor(key)}'\n```\n")
+                sections.append(f"```{{image}} {where}.png\n:alt: {alt}\n:loading: lazy\n```\n")
+            sections.append(_code(code))
+    opening = """# Gallery
+
+Every figure that a result draws, with the code that makes it. A figure answers a question, which stands above it;
+`result.plot.<Tab>` lists those of a result, and each returns a Matplotlib figure or its axes to go on with.
+"""
+    grid = "::::{container} gallery\n" + "\n".join(thumbnails) + "::::\n"
+    page.write_text("\n".join([opening, grid, *sections]), encoding="utf-8")
+    return process_time() - started
+
+
+def main(page: Path) -> None:
+    """Write the page, in a folder of its own for the files that the code makes."""
+    with TemporaryDirectory() as scratch, chdir(scratch):
+        print(f"gallery: {write(page, page.parent / 'gallery'):.0f} s of processor time")
