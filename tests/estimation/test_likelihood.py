@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize
 
 from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.camera.distortion import model_names
@@ -20,6 +20,7 @@ from starcal_uq.estimation.compressed import (
     compress,
     gram_sums,
     moved,
+    optimum,
     scaled,
 )
 from starcal_uq.estimation.marginal import MarginalLikelihood
@@ -249,3 +250,17 @@ def test_derivatives_of_the_compressed_sum_of_squares():
     bends = [[(value(a + b) - value(a - b) - value(b - a) + value(-a - b)) / 4e-6 for a in unit] for b in unit]
     np.testing.assert_allclose(slope, steps, rtol=1e-4, atol=1e-3)
     np.testing.assert_allclose(hessian, bends, rtol=1e-3, atol=1e-2)
+
+
+def test_the_optimum_of_an_expansion_from_where_it_curves_the_wrong_way():
+    """A residual of ten that falls with the square: the full Hessian has a negative direction, Gauss-Newton's none."""
+    residuals = np.array(
+        [[10.0, -1.0, 0.0, -0.5, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0, 0.0, 0.0], [0.5, 0.0, 1.0, 0.0, 0.0, 0.0]]
+    )
+    compressed = CompressedLikelihood(np.zeros(2), np.eye(2), residuals.T @ residuals, 0.0, np.zeros(2), 100, 50, 5)
+    assert np.linalg.eigvalsh(_derivatives(compressed)[1])[0] < 0.0
+    found = optimum(compressed)
+    best = minimize(lambda z: compressed.sum_of_squares(z[None])[0], [3.0, -0.5], tol=1e-12)
+    np.testing.assert_allclose(found.trajectory[-1], best.x, atol=1e-4)
+    assert found.sum_of_squares == pytest.approx(best.fun, rel=1e-6)
+    assert np.all(np.diff(found.cost) < 0.0)
