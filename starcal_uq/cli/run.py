@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -49,6 +50,8 @@ from starcal_uq.cli.steps import load_table, sample_run
 from starcal_uq.core.store import finished
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.observations.files import READ
+
+_APART_STARS = 50_000
 
 if TYPE_CHECKING:
     from starcal_uq.core.types import AnyDict
@@ -187,6 +190,7 @@ def _after_calibration(
     **aligning: Any,
 ) -> None:
     """Sample, couple, propagate, question the model, budget, report: what is not done yet."""
+    from starcal_uq.diagnostics.diagnose import diagnose_apart
     from starcal_uq.presentation.report.drawing import (
         AFTER_BUDGET,
         AFTER_CALIBRATION,
@@ -195,6 +199,11 @@ def _after_calibration(
         AFTER_SAMPLING,
     )
 
+    apart = None
+    # With fewer stars the other process would take longer to load what it needs than this one takes for all of it.
+    many = run.calibration.partitions is None and len(run.observations) >= _APART_STARS
+    if many and not run.did("diagnose"):
+        apart = ahead.begin(partial(diagnose_apart, seed=sampling.seed), run.observations, run.calibration)
     ahead.draw(run.calibrated, AFTER_CALIBRATION)
     if run.images is not None:
         ahead.draw_frames(run.shown_frames)
@@ -210,7 +219,7 @@ def _after_calibration(
         show_posterior(run.posterior)
     if not run.did("diagnose"):
         with progress_bar("diagnosis") as progress:
-            run.diagnose(seed=sampling.seed, progress=progress)
+            run.diagnose(seed=sampling.seed, progress=progress, apart=apart)
     ahead.draw(run.results, AFTER_DIAGNOSIS)
     if show:
         show_attitude(run.attitude)

@@ -8,6 +8,7 @@ import pickle
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -15,6 +16,7 @@ from typing import IO, Any
 
 from starcal_uq.core.tasks import processors
 
+_WAIT_S = 0.005
 _PROGRAM = "import sys; sys.path[:] = {path!r}; from starcal_uq.core.beside import serve; serve({folder!r}, {parent})"
 
 
@@ -64,6 +66,14 @@ class Beside:
                 _pipe(self._process).flush()
         return number
 
+    def result(self, number: int) -> Any:
+        """Wait for the call of this number; its result, None if it failed."""
+        path = _path(self._folder.name, number, "result")
+        failed = _path(self._folder.name, number, "failed")
+        while self._process is not None and not (path.exists() or failed.exists()) and self._process.poll() is None:
+            time.sleep(_WAIT_S)
+        return pickle.loads(path.read_bytes()) if path.exists() else None
+
     def results(self) -> list[Any]:
         """Wait for all calls; their results, None for those that failed. Nothing can be handed over afterwards."""
         if self._process is not None:
@@ -82,6 +92,7 @@ def serve(folder: str, parent: int) -> None:
             result = pickle.dumps(function(*arguments))
         except Exception:
             # Whoever asked tries again, where the error is seen.
+            _path(folder, int(line), "failed").touch()
             continue
         part = _path(folder, int(line), "part")
         part.write_bytes(result)

@@ -7,7 +7,7 @@ from another calibration.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -142,6 +142,36 @@ class Diagnosis(Shown):
         return read_json(cls, path, "a diagnosis", "run `starcal-uq diagnose RUN --force` to write it again")
 
 
+@dataclass(frozen=True)
+class Apart:
+    """The part of a `Diagnosis` that takes data and estimate alone, and little to load: what can be found beside."""
+
+    misfit: Misfit
+    starts: MultiStart | None
+    stars: StarTest
+    air: AirTest | None
+    cameras: MixedCameras | None
+    times: TimeTest | None
+
+
+@one_thread()
+def diagnose_apart(
+    obs: Observations, cal: Calibration, *, n_starts: int = 5, seed: int = 0, whole: Calibration | None = None
+) -> Apart:
+    """Half of what `diagnose` finds, of stars with the noise that the estimate gives them.
+
+    `whole` is the calibration that partitioned observations have, where `cal` is that of their sample.
+    """
+    return Apart(
+        misfit=misfit_tests(obs, whole or cal),
+        starts=multi_start(obs, cal, n_starts, seed) if n_starts > 0 else None,
+        stars=star_test(obs, cal),
+        air=air_test(obs, cal, seed=seed),
+        cameras=MixedCameras.of(obs, cal.camera),
+        times=time_test(obs, cal, seed=seed),
+    )
+
+
 @bounded
 @one_thread()
 def diagnose(
@@ -153,6 +183,7 @@ def diagnose(
     n_starts: int = 5,
     seed: int = 0,
     progress: Progress | None = None,
+    apart: Callable[[], Apart | None] | None = None,
 ) -> Diagnosis:
     """Question the model of a calibration in every way there is.
 
@@ -171,38 +202,40 @@ def diagnose(
         Seed of everything random.
     progress : callable, optional
         Called with the number of steps done and their total.
+    apart : callable, optional
+        What waits for `diagnose_apart` of the same arguments, which runs elsewhere; None of it is asked for here again.
     """
     step = progress or (lambda done, total: None)
     obs, whole = weighed(obs, cal), cal
-    misfit = misfit_tests(obs, cal)
     if whole.partitions is not None:
         cal = calibrate(obs, whole.nominal, model=whole.nominal.distortion, duplicates="keep")
-    step(1, 5)
     normals = FrameNormals.at(obs, cal)
     found = _jackknife(obs, cal, normals)
-    step(2, 5)
+    step(1, 4)
     predictive = predictive_check(obs, whole, post, seed=seed)
-    step(3, 5)
-    starts = multi_start(obs, cal, n_starts, seed) if n_starts > 0 else None
-    step(4, 5)
+    step(2, 4)
     # A single frame cannot be left out.
     comparison = compare_models(obs, cal, models, seed=seed) if models and obs.n_frames > 1 else None
     if comparison is not None:
         comparison = of_all_stars(comparison, obs, whole)
-    step(5, 5)
+    step(3, 4)
+    rest = None if apart is None or whole.partitions is not None else apart()
+    if rest is None:
+        rest = diagnose_apart(obs, cal, n_starts=n_starts, seed=seed, whole=whole)
+    step(4, 4)
     settings = {"models": list(models), "n_starts": n_starts}
     return Diagnosis(
-        misfit=misfit,
+        misfit=rest.misfit,
         predictive=predictive,
         jackknife=found,
         comparison=comparison,
-        starts=starts,
+        starts=rest.starts,
         theta=tuple(whole.theta.tolist()),
         provenance=provenance(seed, settings, whole.data_hash_of(obs)),
-        stars=star_test(obs, cal),
-        air=air_test(obs, cal, seed=seed),
-        cameras=MixedCameras.of(obs, cal.camera),
-        times=time_test(obs, cal, seed=seed),
+        stars=rest.stars,
+        air=rest.air,
+        cameras=rest.cameras,
+        times=rest.times,
     )
 
 

@@ -762,7 +762,7 @@ class Run:
         if posterior is not None and self.has("attitude"):
             self.diagnosis = diagnosis if diagnosis.is_of(self.calibration) else None
             found = self._with_misfit(self.attitude)
-        settings = {name: value for name, value in options.items() if name != "progress"}
+        settings = {name: value for name, value in options.items() if name not in ("progress", "apart")}
         with self._step("diagnose", settings.pop("seed", None), settings) as files:
             for name, file_name in DIAGNOSIS_TABLES.items():
                 part = getattr(diagnosis, name)

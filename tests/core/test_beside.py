@@ -37,6 +37,8 @@ def test_what_fails_leaves_the_next_call_alone():
     with Beside() as other:
         for n in (-1, 4):
             other.call(math.factorial, n)
+        assert other.result(0) is None
+        assert other.result(1) == 24
         assert other.results() == [None, 24]
 
 
@@ -49,6 +51,7 @@ def test_a_process_that_is_killed_is_no_obstacle():
         # More than a pipe holds, to nobody.
         for _ in range(20):
             other.call(math.factorial, 3)
+        assert other.result(3) is None
         assert set(other.results()) == {None}
 
 
@@ -56,7 +59,7 @@ def test_one_processor_starts_nothing(monkeypatch):
     monkeypatch.setattr(beside, "processors", lambda: 1)
     with Beside() as other:
         other.call(math.factorial, 3)
-        assert other._process is None and other.results() == [None]
+        assert other._process is None and other.result(0) is None and other.results() == [None]
 
 
 def test_an_error_here_ends_the_process_there():

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import gc
-from collections.abc import Collection
-from typing import Any
+from collections.abc import Callable, Collection
+from functools import partial
+from typing import Any, TypeVar
 
 from starcal_uq.core.beside import Beside
 from starcal_uq.pipeline.inspection import Frames
@@ -21,6 +22,8 @@ from starcal_uq.presentation.figures.propagation import (
 )
 from starcal_uq.presentation.figures.style import figure_of, label, new_axes, svg_bytes
 from starcal_uq.presentation.report.results import Results
+
+T = TypeVar("T")
 
 # Figures by the step after which they can be drawn.
 AFTER_CALIBRATION = ("residuals", "residual_profiles", "convergence")
@@ -79,7 +82,7 @@ def _figure(results: Results, name: str) -> Any:
 
 
 class Ahead:
-    """Figures of a report, drawn by another process while what comes after them is computed; a context."""
+    """Another process that draws the figures of a report while what comes after them is computed; a context."""
 
     def __init__(self) -> None:
         self._beside = Beside()
@@ -93,6 +96,10 @@ class Ahead:
     def __exit__(self, *error: object) -> None:
         self._beside.__exit__(*error)
 
+    def begin(self, function: Callable[..., T], *arguments: Any) -> Callable[[], T | None]:
+        """Begin something else that can be done meanwhile; what waits for its result, None if it failed."""
+        return partial(self._beside.result, self._beside.call(function, *arguments))
+
     def draw(self, results: Results, names: Collection[str]) -> None:
         """Begin to draw the figures of these names, as far as the results allow them."""
         self._beside.call(draw_figures, results, names)
@@ -105,7 +112,7 @@ class Ahead:
         """What was drawn, by name; a figure that was drawn twice as it was drawn last."""
         drawn: dict[str, bytes] = {}
         for some in self._beside.results():
-            drawn |= some or {}
+            drawn |= some if isinstance(some, dict) else {}
         return drawn
 
 
