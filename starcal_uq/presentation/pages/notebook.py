@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -99,7 +101,7 @@ def executed(cells: Iterator[tuple[str, str]], place: Path, progress: Progress |
         from jupyter_client.kernelspec import KernelSpec
         from jupyter_client.manager import AsyncKernelManager
         from nbclient import NotebookClient
-        from nbclient.exceptions import CellExecutionError
+        from nbclient.exceptions import CellExecutionError, DeadKernelError
 
     class ThisPython(AsyncKernelManager):
         """Whatever kernels are installed, this interpreter has the package."""
@@ -127,16 +129,32 @@ def executed(cells: Iterator[tuple[str, str]], place: Path, progress: Progress |
         client = NotebookClient(
             notebook,
             kernel_manager_class=ThisPython,
-            timeout=600,
+            timeout=None,
             resources={"metadata": {"path": str(place)}},
             record_timing=False,
             on_cell_complete=lambda cell, cell_index: progress(cell_index + 1, len(made)) if progress else None,
         )
+        handlers = _handlers()
         try:
             client.execute(env=env, stderr=subprocess.DEVNULL)
-        except CellExecutionError as error:
+        except Exception as error:
+            # A signal makes the client end the kernel, after which it fails in one way or another.
+            if hasattr(client, "_async_cleanup_kernel_future"):
+                raise KeyboardInterrupt from None
+            if isinstance(error, DeadKernelError):
+                raise RunFolderError("the notebook's kernel ended unexpectedly: is there enough memory?") from None
+            if not isinstance(error, CellExecutionError):
+                raise
             said = f"{error.ename}: {error.evalue}".splitlines()[0]
-            raise RunFolderError(
-                f"a cell of the notebook failed ({said}): look at `starcal-uq report` first."
-            ) from None
+            raise RunFolderError(f"a cell of the notebook failed ({said}): try `starcal-uq report RUN`.") from None
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
     return str(write(notebook)) + "\n"
+
+
+def _handlers() -> dict[signal.Signals, Any]:
+    """What takes the signals now, where this thread may say so: the client of the notebook takes them meanwhile."""
+    if threading.current_thread() is not threading.main_thread():
+        return {}
+    return {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
