@@ -21,7 +21,10 @@ NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
     "name",
     [
         "quickstart",
-        *(pytest.param(name, marks=pytest.mark.slow) for name in ("coupling_study", "error_budget", "paper")),
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("coupling_study", "error_budget", "model_comparison", "own_images", "paper")
+        ),
     ],
 )
 def test_it_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
