@@ -187,7 +187,7 @@ def test_what_follows_a_calibration_follows_these(method, options):
 
 @pytest.mark.parametrize("method", ["samaan", "griffith"])
 def test_a_mirror_is_seen(method):
-    obs = observations()
+    obs = observations(n_frames=30)
     mirrored = dataclasses.replace(obs, y_px=1023.0 - obs.y_px)
     with pytest.raises(CalibrationError, match="the image is mirrored") as caught:
         run(mirrored, sc.paper.paper_start(), method)
