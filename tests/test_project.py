@@ -93,11 +93,18 @@ def test_make_commands_in_the_texts_exist(name: str) -> None:
 
 def test_links_in_the_texts_lead_somewhere() -> None:
     pages = [*ROOT.glob("*.md"), *(page for page in ROOT.glob("docs/**/*.md") if "_build" not in page.parts)]
+
+    def leads_somewhere(page: Path, target: str) -> bool:
+        # Building the documentation brings the notebooks there.
+        place = Path(os.path.normpath(page.parent / target))
+        brought = ROOT / "notebooks" / place.name if place.parent == ROOT / "docs" / "notebooks" else place
+        return brought.exists() or place.with_name(f"{place.name}.md").exists()
+
     broken = [
         f"{page.relative_to(ROOT)}: {target}"
         for page in pages
         for target in re.findall(r"\]\(([^)#:\s]+)(?:#[^)]*)?\)", page.read_text("utf-8"))
-        if not (page.parent / target).exists() and not (page.parent / f"{target}.md").exists()
+        if not leads_somewhere(page, target)
     ]
     assert broken == []
 

@@ -32,7 +32,7 @@ def new_command(
     path = Path("esa" if what == "example" else f"{what}.toml") if out is None else out
     if what == "example":
         sc.example_data("esa").save(path, force=force)
-        following = f"starcal-uq run {path / 'stars.ecsv'} {path / 'camera.toml'} -o RUN; whose data, in NOTICE"
+        following = f"starcal-uq run {path / 'stars.ecsv'} {path / 'camera.toml'} -o RUN (NOTICE: whose data)"
     elif what == "camera":
         sc.paper.paper_start().replace(name="my camera").save(path, force=force)
         following = f"put in the numbers of your data sheet, then starcal-uq run OBS {path} -o RUN"

@@ -20,6 +20,7 @@ from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.shapes import View, frame_shapes
 from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.observations.splits import one_of_each
 from starcal_uq.sky.refraction import refraction_constants, site_among_stars
 from starcal_uq.sky.site import Site
@@ -145,6 +146,7 @@ class Remainder:
     """
 
     def __init__(self, obs: Observations, cal: Calibration, seed: int) -> None:
+        obs = weighed(obs, cal)
         chosen = one_of_each(obs.n_frames, min(_FRAMES, max(_STARS * obs.n_frames // obs.n_stars, 3)), seed)
         self.obs = obs if len(chosen) == obs.n_frames else obs.select_frames(obs.frame_ids[chosen])
         self.likelihood = MarginalLikelihood(self.obs, cal.camera.distortion)

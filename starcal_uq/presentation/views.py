@@ -18,6 +18,7 @@ from starcal_uq.diagnostics.predictive import PredictiveCheck
 from starcal_uq.diagnostics.stars import StarTest
 from starcal_uq.diagnostics.validation.result import Validation
 from starcal_uq.diagnostics.verdict.estimate import models_sentence, star_sentence
+from starcal_uq.diagnostics.verdict.judge import Verdict
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.merging import Consistency
 from starcal_uq.estimation.screening.result import Screening
@@ -168,6 +169,7 @@ VIEWS: Mapping[type, View] = {
     ModelComparison: _view("Models", models_sentence, diagnostics.models_table, models=plot_comparison),
     PredictiveCheck: _view("Posterior predictive check", diagnostics.predictive_text, diagnostics.predictive_table),
     Diagnosis: View(diagnostics.diagnosis_text, diagnostics.diagnosis_html, {"diagnosis": plot_diagnosis}),
+    Verdict: _view("Verdict", diagnostics.verdict_text, lambda verdict: None, diagnostics.verdict_notes),
     Validation: _view("Validation", diagnostics.validation_text, diagnostics.validation_table, ranks=plot_validation),
     CameraComparison: _view(
         "Comparison", comparison.comparison_text, comparison.comparison_table, difference=plot_camera_comparison

@@ -10,6 +10,7 @@ import shlex
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from starcal_uq.core.display import Shown
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.status import Check, Level, Question, worst
 from starcal_uq.core.types import AnyDict
@@ -29,7 +30,7 @@ SCHEMA, VERSION = "starcal-uq/verdict", 1
 
 
 @dataclass(frozen=True)
-class Verdict:
+class Verdict(Shown):
     """All checks and what follows from them.
 
     Attributes

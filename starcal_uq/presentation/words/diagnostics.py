@@ -9,6 +9,7 @@ import numpy as np
 
 from starcal_uq.camera.distortion import Parameter
 from starcal_uq.core.formatting import count, decimals_for, fixed, join_words, percent, plural, significant
+from starcal_uq.core.status import Level
 from starcal_uq.diagnostics.diagnose import Diagnosis
 from starcal_uq.diagnostics.jackknife import Jackknife
 from starcal_uq.diagnostics.misfit import Misfit
@@ -18,6 +19,7 @@ from starcal_uq.diagnostics.stars import StarTest
 from starcal_uq.diagnostics.validation.replicates import LOG_LIKELIHOOD
 from starcal_uq.diagnostics.validation.result import ENOUGH_REPLICATES, Validation
 from starcal_uq.diagnostics.verdict.estimate import MISFIT_P, sensitivity
+from starcal_uq.diagnostics.verdict.judge import Verdict
 from starcal_uq.inference.checks import COMPRESSED_BOUND
 from starcal_uq.presentation.tables import TextTable, with_units
 
@@ -26,6 +28,16 @@ NBSP = "\N{NO-BREAK SPACE}"
 # from zero is said to be a bias.
 _SCALE_NOTED = 0.03
 _BIAS_NOTED = 0.1
+
+
+def verdict_text(verdict: Verdict) -> str:
+    """The outcome and the headline."""
+    return f"{verdict.level.value}. {verdict.headline}"
+
+
+def verdict_notes(verdict: Verdict) -> list[str]:
+    """Every check that did not pass."""
+    return [str(check) for check in verdict.checks if check.level is not Level.PASS]
 
 
 def misfit_text(found: Misfit) -> str:
