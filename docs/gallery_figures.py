@@ -96,7 +96,7 @@ spectrum = sc.propagation.error_spectrum(post, slew, n_draws=20)""",
         "Is the model right, are the intervals, and do two calibrations agree?",
         """\
 diagnosis = sc.diagnose(obs, cal, models=("none", "k1", "brown", "brown3"), n_starts=0)
-validation = sc.validate(camera, n_replicates=40, n_frames=20, workers=0)
+validation = sc.validate(camera, n_replicates=24, n_frames=20, workers=0)
 halves = sc.comparison.compare_halves(obs, camera)""",
         {
             "Diagnosis.diagnosis": ("Does anything speak against the model?", "diagnosis.plot.diagnosis()"),
