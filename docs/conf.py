@@ -16,6 +16,7 @@ from typing import Any
 from sphinx.ext.napoleon import NumpyDocstring
 
 HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE / "_ext"))
 PROJECT = tomllib.loads((HERE.parent / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
 project = "starcal_uq"
@@ -31,8 +32,10 @@ extensions = [
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
     "sphinx-mathjax-offline",
+    "example",
 ]
-exclude_patterns = ["_build"]
+copybutton_prompt_text = "$ "
+exclude_patterns = ["_build", "reference/_schemas.md"]
 source_suffix = {".md": "myst-nb", ".ipynb": "myst-nb"}
 # Notebooks are executed on every build, each in a folder of its own; one that fails fails the build.
 nb_execution_mode = "force"
@@ -70,6 +73,22 @@ def write_gallery(_app: object) -> None:
     code = "import gallery_figures, pathlib, sys; gallery_figures.main(pathlib.Path(sys.argv[1]))"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parent)])}
     subprocess.run([sys.executable, "-c", code, str(HERE / "gallery.md")], env=environment, check=True)
+
+
+def write_schemas(_app: object) -> None:
+    """Write the page of the documents that commands print with `--json`, from their declaration."""
+    from starcal_uq.cli.schemas import SCHEMAS, keys
+
+    lines: list[str] = []
+    for name, (version, part) in SCHEMAS.items():
+        what = "`RUN/verdict.json`" if name == "verdict" else f"`starcal-uq {name} --json`"
+        lines += [f"## {name}", "", f"{'Any command' if name == 'error' else what}, version {version}. {part.__doc__}", ""]
+        lines += ["| Key | Type | Unit | |", "|---|---|---|---|"]
+        for key, kind, unit, text in list(keys(name))[3:]:
+            said = text.replace("``", "`").replace("|", "\\|")
+            lines.append(f"| `{key}` | {kind} | {unit} | {said} |")
+        lines.append("")
+    (HERE / "reference" / "_schemas.md").write_text("\n".join(lines), encoding="utf-8")
 
 
 def copy_notebooks(_app: object) -> None:
@@ -208,6 +227,7 @@ def resolve_short(app: Any, env: Any, node: Any, content: Any) -> Any:
 def setup(app: Any) -> None:
     """Called by Sphinx."""
     app.connect("builder-inited", write_command_help)
+    app.connect("builder-inited", write_schemas)
     app.connect("builder-inited", write_reference)
     app.connect("builder-inited", copy_notebooks)
     app.connect("builder-inited", write_gallery)

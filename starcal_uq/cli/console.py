@@ -33,8 +33,8 @@ if TYPE_CHECKING:
 
 # `!starcal-uq` of a notebook has a terminal of 80 columns, which keeps every state of a bar.
 _IN_NOTEBOOK = "JPY_PARENT_PID" in os.environ
-# Where the output is not a terminal it has no width of its own; tables then get the room they need.
-_WIDTH = None if sys.stdout.isatty() and not _IN_NOTEBOOK else 110
+# Where the output is not a terminal it has no width of its own; tables then get the room they need, or what COLUMNS says.
+_WIDTH = None if (sys.stdout.isatty() and not _IN_NOTEBOOK) or "COLUMNS" in os.environ else 110
 _STYLES = {Level.PASS: "green", Level.WARN: "yellow", Level.FAIL: "red"}
 # Names of files, runs and requirements may hold square brackets and colons, which are no markup.
 out = Console(width=_WIDTH, markup=False, emoji=False, highlight=False)

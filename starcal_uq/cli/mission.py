@@ -59,7 +59,7 @@ def budget_command(
     file: Annotated[
         Path | None,
         typer.Option(
-            "--file",
+            "--budget",
             metavar="TOML",
             help="Contributors that the data cannot know, and requirements.",
             parser=read_file,
@@ -103,7 +103,7 @@ def budget_command(
     if template is not None:
         rows = sc.budget(opened.posterior, opened.observations, opened.attitude, seed=seed).rows
         sc.budgeting.write_budget_template(template, rows, force=force)
-        say(f"Budget file to fill in: {template}. Next: starcal-uq budget {run} --file {template}")
+        say(f"Budget file to fill in: {template}. Next: starcal-uq budget {run} --budget {template}")
         return Answer({"run": run, "files": [], "template": template, "budget": None})
     # Without a question of its own, the call shows what is there.
     if opened.has("budget") and file is None and confidence is None and not force:

@@ -42,7 +42,7 @@ def new_command(
         following = f"put in where the camera stood, then starcal-uq run OBS CAMERA -o RUN --site {path}"
     elif what == "budget":
         sc.budgeting.write_budget_template(path, force=force)
-        following = f"take away the marks before what you know, then starcal-uq budget RUN --file {path}"
+        following = f"take away the marks before what you know, then starcal-uq budget RUN --budget {path}"
     else:
         sc.studies.write_study_template("fov-distortion", path, force)
         following = f"change what is varied, then starcal-uq study {path} -o DIR"

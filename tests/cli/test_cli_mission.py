@@ -77,16 +77,16 @@ def test_budget_in_all_formats(cli, run, tmp_path):
 
 def test_violated_requirement_is_named_and_ends_with_status_1(cli, run, tmp_path):
     (tmp_path / "mission.toml").write_text(REQUIREMENTS)
-    status, out, err = cli("budget", "run", "--file", "mission.toml")
+    status, out, err = cli("budget", "run", "--budget", "mission.toml")
     assert status == 1
     assert "violated: 'R-1 impossible'" in err
     assert "R-2 generous" in out
     assert "R-2" not in err
     (tmp_path / "kind.toml").write_text(REQUIREMENTS.replace("0.001", "1e4"))
-    status, out, err = cli("budget", "run", "--file", "kind.toml", "--json")
+    status, out, err = cli("budget", "run", "--budget", "kind.toml", "--json")
     assert status == 2
     assert "budget.csv: exists already; make it again with --force" in err
-    status, out, err = cli("budget", "run", "--file", "kind.toml", "--json", "--force")
+    status, out, err = cli("budget", "run", "--budget", "kind.toml", "--json", "--force")
     assert status == 0
     assert [row["verdict"] for row in json.loads(out)["budget"]["requirements"]] == ["open", "open"]
     # The report of the run now has the section, and its figure.
@@ -108,9 +108,9 @@ def test_run_refuses_a_wrong_budget_file_before_any_work(cli, inputs, tmp_path):
 def test_starter_file_lists_what_is_open_and_loads(cli, run, tmp_path):
     status, out, _ = cli("budget", "run", "--template", "start.toml")
     assert status == 0
-    assert "starcal-uq budget run --file start.toml" in out
+    assert "starcal-uq budget run --budget start.toml" in out
     assert "thermo-elastic distortion" in (tmp_path / "start.toml").read_text("utf-8")
-    status, _, _ = cli("budget", "run", "--file", "start.toml")
+    status, _, _ = cli("budget", "run", "--budget", "start.toml")
     assert status == 0
 
 
@@ -199,7 +199,7 @@ def test_plan_before_any_data(cli, run, tmp_path, small_plans):
 
 def test_square_brackets_are_no_markup(cli, run, tmp_path):
     (tmp_path / "b.toml").write_text(REQUIREMENTS.replace("R-1 impossible", "R-1 [/x] rev [b]"))
-    status, out, err = cli("budget", "run", "--file", "b.toml")
+    status, out, err = cli("budget", "run", "--budget", "b.toml")
     assert status == 1
     assert "R-1 [/x] rev [b]" in out
     assert "R-1 [/x] rev [b]" in err
@@ -220,7 +220,7 @@ def test_a_runs_own_files_are_not_mixed_with_others(cli, run, tmp_path, small_pl
         assert "holds the results of another command" in err
     assert {path.name: path.read_bytes() for path in run.iterdir() if path.is_file()} == before
     (tmp_path / "b.toml").touch()
-    status, _, err = cli("budget", "run", "--file", "b.toml", "--template", "./b.toml", "--force")
+    status, _, err = cli("budget", "run", "--budget", "b.toml", "--template", "./b.toml", "--force")
     assert status == 2
     assert "write over" in err
     status, _, err = cli("compare", "run", "--split", "halves", "--labels", "a,a")
