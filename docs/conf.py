@@ -82,7 +82,12 @@ def write_schemas(_app: object) -> None:
     lines: list[str] = []
     for name, (version, part) in SCHEMAS.items():
         what = "`RUN/verdict.json`" if name == "verdict" else f"`starcal-uq {name} --json`"
-        lines += [f"## {name}", "", f"{'Any command' if name == 'error' else what}, version {version}. {part.__doc__}", ""]
+        lines += [
+            f"## {name}",
+            "",
+            f"{'Any command' if name == 'error' else what}, version {version}. {part.__doc__}",
+            "",
+        ]
         lines += ["| Key | Type | Unit | |", "|---|---|---|---|"]
         for key, kind, unit, text in list(keys(name))[3:]:
             said = text.replace("``", "`").replace("|", "\\|")

@@ -6,8 +6,9 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
@@ -15,6 +16,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.core.formatting import plural, significant
 from starcal_uq.core.status import Level
 from starcal_uq.core.tasks import Progress
+from starcal_uq.core.types import AnyDict
 from starcal_uq.presentation.tables import TextTable
 
 if TYPE_CHECKING:
@@ -33,7 +35,7 @@ if TYPE_CHECKING:
 
 # `!starcal-uq` of a notebook has a terminal of 80 columns, which keeps every state of a bar.
 _IN_NOTEBOOK = "JPY_PARENT_PID" in os.environ
-# Where the output is not a terminal it has no width of its own; tables then get the room they need, or what COLUMNS says.
+# What is no terminal has no width of its own: tables get the room that they need there, or what COLUMNS says.
 _WIDTH = None if (sys.stdout.isatty() and not _IN_NOTEBOOK) or "COLUMNS" in os.environ else 110
 _STYLES = {Level.PASS: "green", Level.WARN: "yellow", Level.FAIL: "red"}
 # Names of files, runs and requirements may hold square brackets and colons, which are no markup.
@@ -90,10 +92,16 @@ def note(message: str) -> None:
 
 def print_table(table: TextTable) -> None:
     """Draw a table; its marks become colours."""
-    drawn = Table(title=table.title or None, title_justify="left")
+    # Words and numbers are never cut off: a table that is too wide with its lines goes without them.
+    columns = [[head, *cells] for head, *cells in zip(table.heads, *table.rows, strict=True)]
+    least = [max((len(word) for cell in column for word in cell.split()), default=1) for column in columns]
+    wide = sum(least) + 3 * len(least) + 1 > out.width
+    look: AnyDict = {"box": SIMPLE_HEAD, "padding": (0, 1, 0, 0), "pad_edge": False} if wide else {}
+    drawn = Table(title=table.title or None, title_justify="left", **look)
     for place, (head, side) in enumerate(zip(table.heads, table.align, strict=True)):
         style = "bold" if place == 0 and side == "l" else None
-        drawn.add_column(head, justify="right" if side == "r" else "left", style=style)
+        justify: Any = "right" if side == "r" else "left"
+        drawn.add_column(head, justify=justify, style=style, min_width=least[place], overflow="fold")
     styles = {"total": "bold", "warning": "yellow", "fail": "red"}
     for row, mark in zip(table.rows, table.marks or ("",) * len(table.rows), strict=True):
         drawn.add_row(*row, style=styles.get(mark))

@@ -27,6 +27,7 @@ from starcal_uq.cli.options import (
 )
 from starcal_uq.cli.settings import ImageSettings, PlaceSettings, SkySettings
 from starcal_uq.core.files import UNFINISHED, ensure_new, table_ending
+from starcal_uq.core.formatting import plural
 from starcal_uq.core.settings import EPOCH, MAGNITUDES
 from starcal_uq.observations.files import WRITTEN
 
@@ -287,4 +288,4 @@ def _say_epoch(centroids: Centroids, epoch: float | None) -> None:
 
 def _say_disturbed(obs: Observations) -> None:
     if left_out := obs.meta.get("disturbed_stars", 0):
-        tell(f"{left_out} stars left out, because the light of a neighbour displaces them.")
+        tell(f"{plural(left_out, 'star')} left out, because the light of a neighbour displaces them.")

@@ -268,20 +268,22 @@ def plan_command(
     deep = sc.load_catalogue(max_mag=min(max_mag + 1.0, MAGNITUDES.high), epoch=epoch)
     stars = deep.select(deep.mag <= max_mag)
     sizes = tuple(frames or N_FRAMES)
-    found = sc.plan(
-        sheet,
-        deep,
-        sigma_px=used,
-        n_frames=sizes,
-        min_stars=min_stars,
-        max_mag=max_mag,
-        target_arcsec=target,
-        confidence=confidence,
-        scope=scope,
-        after=known,
-        distortion_percent=distortion_percent,
-        seed=seed,
-    )
+    with progress_bar("points of the sweeps") as progress:
+        found = sc.plan(
+            sheet,
+            deep,
+            sigma_px=used,
+            n_frames=sizes,
+            min_stars=min_stars,
+            max_mag=max_mag,
+            target_arcsec=target,
+            confidence=confidence,
+            scope=scope,
+            after=known,
+            distortion_percent=distortion_percent,
+            seed=seed,
+            progress=progress,
+        )
     choice = simulated = None
     if choose is not None:
         choice = sc.planning.choose_frames(

@@ -312,7 +312,8 @@ def report_command(
             page = held.notebook(out, force=force, progress=bar)
         say(f"Notebook: {page.resolve()}")
     else:
-        page = held.pdf(force=force) if format == "pdf" else held.report(force=force)
+        with progress_bar("figures") as bar:
+            page = held.pdf(force=force) if format == "pdf" else held.report(force=force, progress=bar)
         show_summary(held, page)
     return Answer({"run": run, "report": page})
 

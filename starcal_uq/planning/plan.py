@@ -21,7 +21,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import PlanningError
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import bounded
-from starcal_uq.core.tasks import one_thread
+from starcal_uq.core.tasks import Progress, one_thread
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.planning.forecast import N_CAMPAIGNS, N_FRAMES, SCOPES, Forecast, Forecaster, nea_arcsec
@@ -73,6 +73,7 @@ def plan(
     n_geometries: int = 3000,
     n_campaigns: int = N_CAMPAIGNS,
     seed: int = 0,
+    progress: Progress | None = None,
 ) -> Plan:
     """Forecast parameter and attitude errors of a calibration, and the frames that it needs.
 
@@ -113,6 +114,8 @@ def plan(
         Campaigns to average over.
     seed : int
         Repeats bit for bit.
+    progress : callable, optional
+        Called with the points of the sweeps that are done and all.
 
     Raises
     ------
@@ -170,7 +173,7 @@ def plan(
     table = None
     if sweeps:
         base = _Base(stars, camera, sigma_px, limit, min_stars, seed)
-        table = _sweep(base, frames, noise, scope, options | {"n_campaigns": _SWEEP_CAMPAIGNS}, target_arcsec)
+        table = _sweep(base, frames, noise, scope, options | {"n_campaigns": _SWEEP_CAMPAIGNS}, target_arcsec, progress)
     return Plan(
         camera=camera,
         sigma_px=noise,
@@ -232,10 +235,12 @@ def _sweep(
     scope: str,
     options: dict[str, Any],
     target_arcsec: float | None,
+    progress: Progress | None,
 ) -> pd.DataFrame:
     import pandas as pd
 
-    rows = []
+    rows: list[dict[str, Any]] = []
+    n_points = len(_MAG_STEPS) + len(_NOISE_FACTORS) + len(_FIELD_PARTS)
     for name, value, information, mission, sky in _points(base, frames, noise_px):
         forecaster = Forecaster(information, mission.mean_stars, mission, scope=scope, **options)
         row = {"sweep": name, "value": value, "sky_fraction": sky, "mean_stars": mission.mean_stars}
@@ -245,6 +250,8 @@ def _sweep(
             needed = forecaster.frames_needed(target_arcsec)
             row["frames_needed"] = np.inf if needed is None else float(needed)
         rows.append(row)
+        if progress is not None:
+            progress(len(rows), n_points)
     table = pd.DataFrame(rows)
     return table.astype({"n_frames": np.int64})
 

@@ -837,7 +837,13 @@ class Run:
         self.error_budget = made
         return made
 
-    def report(self, drawn: Callable[[], Mapping[str, bytes]] | None = None, *, force: bool = False) -> Path:
+    def report(
+        self,
+        drawn: Callable[[], Mapping[str, bytes]] | None = None,
+        *,
+        force: bool = False,
+        progress: Progress | None = None,
+    ) -> Path:
         """Write ``RUN/report.html`` of whatever the run holds, and the figures in ``RUN/figures``.
 
         A report follows from the rest of the run, and goes when that changes: one that is there is left as it is.
@@ -849,6 +855,8 @@ class Run:
             others are drawn now.
         force : bool
             Whether to write it again.
+        progress : callable, optional
+            Called with the figures drawn and all.
 
         Raises
         ------
@@ -861,7 +869,7 @@ class Run:
 
             page = prepared(self.results)
             figures = {} if drawn is None else dict(drawn())
-            figures |= draw_figures(self.results, [name for name in FIGURES if name not in figures])
+            figures |= draw_figures(self.results, [name for name in FIGURES if name not in figures], progress)
             if GALLERY not in figures and self.images is not None:
                 figures |= draw_gallery(self.shown_frames)
             html = page(figures, figures.pop(GALLERY, b"").decode())

@@ -8,6 +8,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 from starcal_uq.core.beside import Beside
+from starcal_uq.core.tasks import Progress
 from starcal_uq.pipeline.inspection import Frames
 from starcal_uq.presentation.figures.budgeting import plot_budget
 from starcal_uq.presentation.figures.coupling import plot_correlations, plot_couplings
@@ -36,10 +37,18 @@ GALLERY = "gallery"
 FIGURES = (*AFTER_CALIBRATION, *AFTER_SAMPLING, *AFTER_PROPAGATION, *AFTER_DIAGNOSIS, *AFTER_BUDGET)
 
 
-def draw_figures(results: Results, names: Collection[str] = FIGURES) -> dict[str, bytes]:
+def draw_figures(
+    results: Results, names: Collection[str] = FIGURES, progress: Progress | None = None
+) -> dict[str, bytes]:
     """The figures of these names that the results allow, as SVG."""
-    figures = ((name, _figure(results, name)) for name in names)
-    return {name: svg_bytes(figure) for name, figure in figures if figure is not None}
+    drawn = {}
+    for done, name in enumerate(names):
+        figure = _figure(results, name)
+        if figure is not None:
+            drawn[name] = svg_bytes(figure)
+        if progress is not None:
+            progress(done + 1, len(names))
+    return drawn
 
 
 def draw_gallery(frames: Frames) -> dict[str, bytes]:
