@@ -243,7 +243,7 @@ def test_sampling_with_given_degrees_of_freedom(spoilt: tuple[Any, Any]) -> None
     assert np.allclose(post.sd[:5], cal.sigmas, rtol=0.12)
     assert np.max(np.abs(post.mean - cal.theta) / cal.sigmas) < 0.2
     assert post.sigma_draws.mean() == pytest.approx(cal.sigma, rel=0.02)
-    short = {**QUICK, "n_walkers": 12, "n_steps": 4, "n_burn": 2}
+    short = {**QUICK, "n_walkers": 12, "n_steps": 8, "n_burn": 2}
     both = [sample(obs, cal, **short, likelihood="student_t", evaluation=name) for name in ("compressed", "exact")]
     assert both[1].diagnostics.likelihood_used == "exact"
     assert np.max(np.abs(both[0].mean - both[1].mean) / cal.sigmas) < 0.1
