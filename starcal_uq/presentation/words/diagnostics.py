@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -36,8 +37,9 @@ def verdict_text(verdict: Verdict) -> str:
 
 
 def verdict_notes(verdict: Verdict) -> list[str]:
-    """Every check that did not pass."""
-    return [str(check) for check in verdict.checks if check.level is not Level.PASS]
+    """Every check that did not pass; files of remedies as they are called from the current folder."""
+    here = f"{Path.cwd()}/"
+    return [str(check).replace(here, "") for check in verdict.checks if check.level is not Level.PASS]
 
 
 def misfit_text(found: Misfit) -> str:
