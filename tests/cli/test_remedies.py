@@ -200,7 +200,6 @@ ELSEWHERE = {
     "diagnose RUN --force": "tests/cli/test_cli_statistics.py",
     "inspect RUN": "tests/cli/test_cli_images.py",
     "propagate RUN --attitudes PROFILE": "tests/cli/test_cli_mission.py",
-    "report": "tests/cli/test_cli.py",
     "report RUN --format pdf": "tests/presentation/test_report.py",
     "report RUN --notebook": "tests/presentation/test_report.py",
     "schema": "tests/cli/test_schemas.py",
