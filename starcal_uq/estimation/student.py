@@ -148,7 +148,8 @@ class StudentLikelihood:
 
     def state(self, theta: FloatArray, sigma: float, nu: float) -> StudentState:
         """Find the best attitudes at theta (p,), sigma (px or factor) and nu."""
-        rotations = self.rotations
+        # Its square may overflow, which NumPy's numbers do without an error.
+        rotations, sigma = self.rotations, np.float64(sigma)
         with np.errstate(all="ignore"):
             for _ in range(_ATTITUDE_STEPS):
                 state, step, gain = self._step(theta, sigma, nu, rotations)

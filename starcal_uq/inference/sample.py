@@ -199,10 +199,11 @@ class _Run:
             log_likelihood, self.priors, source.theta, information, sigma, source.dof, given, source.extra
         )
 
-    def polynomial(self, exact: LogLikelihood, degree: int) -> LogLikelihood:
+    def polynomial(self, exact: LogLikelihood, degree: int) -> LogLikelihood | None:
         if self._mode is None:
             self._mode, _ = laplace_approximation(self.start(exact))
-        return fit_polynomial(self._mode, degree, np.random.default_rng(self.design_seed)).log_likelihood
+        fitted = fit_polynomial(self._mode, degree, np.random.default_rng(self.design_seed))
+        return None if fitted is None else fitted.log_likelihood
 
     def fingerprint(self, target: Target, name: str) -> str:
         identity = {k: v for k, v in self.provenance.items() if k != "created_utc"}
@@ -250,15 +251,20 @@ def _with_fallback(
     if evaluation == "exact":
         return run.sample("exact", exact, checkpoint), CompressionCheck()
     files: list[str] = []
+    outcome, compression = None, CompressionCheck()
     for degree in _DEGREES if fast is None else (0,):
         compressed = run.polynomial(exact, degree) if fast is None else fast
+        if compressed is None:
+            continue
         # Each attempt has its own file: on resuming, the finished ones must still be found complete.
         outcome = run.sample("compressed", compressed, _attempt(checkpoint, files))
         compression = _compare(run, outcome, compressed, exact)
         if compression.good:
             break
-    if evaluation == "auto" and not compression.good:
+    if evaluation == "auto" and (outcome is None or not compression.good):
         outcome = run.sample("exact", exact, _attempt(checkpoint, files))
+    if outcome is None:
+        raise SamplingError("no polynomial stands for this likelihood: use evaluation='auto' or 'exact'.")
     for path in files[:-1]:
         Path(path).unlink(missing_ok=True)
     return outcome, compression

@@ -8,14 +8,14 @@ posterior draws.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
 
 import numpy as np
 
 from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.inference.target import Target
+from starcal_uq.inference.target import Target, curvature
 
 # Points per coefficient, and their spread against the posterior's.
 _OVERSAMPLING = 2.5
@@ -23,6 +23,8 @@ _SPREAD = 1.25
 # Beyond this radius (standard deviations, plus the root of the dimension) the higher orders stay what they are there:
 # a cubic has no business far from its points.
 _REACH = 2.0
+# Negative curvature in every direction, the mode's own being one, of a posterior that the polynomial can stand for.
+_LEAST_CURVATURE = 0.1
 _CHUNK = 4096
 
 
@@ -74,8 +76,12 @@ def _monomials(u: FloatArray, exponents: IntArray) -> FloatArray:
     return product
 
 
-def fit_polynomial(target: Target, degree: int, rng: np.random.Generator) -> PolynomialLikelihood:
-    """Fit a polynomial to the log likelihood of a target that `laplace_approximation` has centred and whitened."""
+def fit_polynomial(target: Target, degree: int, rng: np.random.Generator) -> PolynomialLikelihood | None:
+    """Fit a polynomial to the log likelihood of a target that `laplace_approximation` has centred and whitened.
+
+    None where the posterior with it has no clear maximum there: a likelihood with several, of few stars with wrong ones
+    among them, is no polynomial, and draws would run away.
+    """
     d = target.dim
     exponents = tuple(
         np.array(list(combinations_with_replacement(range(d), k)), dtype=np.int64) for k in range(degree + 1)
@@ -95,4 +101,6 @@ def fit_polynomial(target: Target, degree: int, rng: np.random.Generator) -> Pol
     solution = np.linalg.lstsq(columns, values - values[0], rcond=None)[0]
     parts = np.split(solution, np.cumsum(sizes)[:-1])
     parts[0] = parts[0] + values[0]
-    return PolynomialLikelihood(target, exponents, tuple(parts), reach)
+    fitted = PolynomialLikelihood(target, exponents, tuple(parts), reach)
+    posterior = replace(target, log_likelihood=fitted.log_likelihood)
+    return fitted if np.min(np.linalg.eigvalsh(curvature(posterior))) > _LEAST_CURVATURE else None

@@ -203,6 +203,11 @@ def _outer(factor: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (product + product.T))
 
 
+def curvature(target: Target) -> FloatArray:
+    """Negative second derivatives (d, d) of the log density at a target's origin, in its coordinates."""
+    return -_derivatives(target.log_density, target.dim)[2]
+
+
 def _derivatives(density: Density, d: int) -> tuple[float, FloatArray, FloatArray]:
     """Value, gradient and Hessian at the origin by central differences, in one vectorised call."""
     unit = _STEP * np.eye(d)

@@ -12,6 +12,7 @@ import numpy as np
 
 from starcal_uq.core.errors import CalibrationError, IdentificationError, ObservationError
 from starcal_uq.core.formatting import plural
+from starcal_uq.core.settings import Bayer, Engine, bounded
 from starcal_uq.core.times import julian_year, utc_text
 from starcal_uq.estimation.noise_floor import settle_noise
 from starcal_uq.observations.matches import is_fits_table
@@ -20,7 +21,6 @@ from starcal_uq.sky.site import check_sky
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
-    from starcal_uq.core.settings import Bayer, Engine
     from starcal_uq.core.tasks import Progress
     from starcal_uq.core.types import FloatArray, StrArray
     from starcal_uq.estimation.calibration import Calibration
@@ -80,6 +80,7 @@ def _together(messages: Sequence[str]) -> str:
     return f"{len(messages)} images: {words}"
 
 
+@bounded
 def observations_from_images(
     images: Sequence[Path],
     camera: Camera | None,

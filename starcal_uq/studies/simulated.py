@@ -158,7 +158,7 @@ class SimulatedCells(Cells):
         design, draws = seed.spawn(2)
         if source.fast is None:
             polynomial = fit_polynomial(target, _CUBIC, np.random.default_rng(design))
-            target = replace(target, log_likelihood=polynomial.log_likelihood)
+            target = target if polynomial is None else replace(target, log_likelihood=polynomial.log_likelihood)
         if self.definition.posterior == "ensemble":
             steps = max(20, -(-self.definition.draws // _WALKERS))
             chains = run_ensembles(

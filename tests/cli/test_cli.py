@@ -57,7 +57,7 @@ def test_steps_one_by_one_with_json(cli, inputs):
     assert [row["parameter"] for row in table["parameters"]] == ["x0", "y0", "f", "k1", "k2", "sigma"]
     status, out, _ = cli("coupling", "run")
     assert status == 0
-    assert "variance inflation" in out
+    assert "what not knowing the others costs" in out
     status, out, _ = cli("sample", "run", "--json", "--seed", "3", *SMALL)
     assert status in (0, 1)
     assert len(json.loads(out)["posterior"]["parameters"]) == 6

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from starcal_uq.attitude.rotations import exp_rotation
+from starcal_uq.attitude.rotations import exp_rotation, quaternion_to_rotation
 from starcal_uq.camera.projection import project
 from starcal_uq.core.errors import CalibrationError, SamplingError
 from starcal_uq.estimation.calibrate import calibrate
@@ -317,7 +317,10 @@ def test_polynomial_stands_for_a_likelihood_and_stays_tame() -> None:
         return 1e6 - 0.5 * np.sum(u * u, axis=1) + 0.1 * u[:, 0] ** 2 * u[:, 1] - 200.0 * (np.log(sigma) + 3.0) ** 2
 
     target = Target(likelihood, priors, np.append(theta, -3.0), np.diag(np.append(sd, 0.05)), None)
-    cubic, flat = (fit_polynomial(target, degree, np.random.default_rng(1)).log_likelihood for degree in (3, 2))
+    fitted = [fit_polynomial(target, degree, np.random.default_rng(1)) for degree in (3, 2)]
+    assert fitted[0] is not None
+    assert fitted[1] is not None
+    cubic, flat = (one.log_likelihood for one in fitted)
     u = 0.8 * np.random.default_rng(2).standard_normal((500, 6))
     exact = target.likelihood_at(u)
     assert np.max(np.abs(cubic(*target.arguments(target.natural(u))) - exact)) < 1e-6
@@ -325,6 +328,23 @@ def test_polynomial_stands_for_a_likelihood_and_stays_tame() -> None:
     assert np.max(np.abs(flat(*target.arguments(target.natural(u))) - exact)) > 0.5
     far = target.natural(30.0 * u)
     assert np.all(cubic(*target.arguments(far)) < 1e6 - 100.0)
+
+    def two_peaks(at: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+        u = (at - theta) / sd
+        return likelihood(at, sigma) + 0.5 * u[:, 4] ** 2 - 2.0 * np.abs(np.abs(u[:, 4]) - 1.5)
+
+    assert fit_polynomial(dataclasses.replace(target, log_likelihood=two_peaks), 2, np.random.default_rng(1)) is None
+
+
+def test_a_noise_beyond_all_numbers_is_impossible_and_no_error() -> None:
+    obs = observations(n_frames=5)
+    cal = calibrate(obs, nominal(camera()))
+    rotations = quaternion_to_rotation(cal.quaternions)
+    student = StudentLikelihood(StarFrames.from_observations(obs), "brown", cal.theta, rotations)
+    values = student.many(np.stack([cal.theta] * 3), np.array([0.05, 1e200, np.inf]), np.full(3, 4.0))
+    assert np.isfinite(values[0])
+    assert values[1] < values[0] - 1e4
+    assert values[2] == -np.inf
 
 
 def test_prior_of_the_tails_is_a_gamma_density():

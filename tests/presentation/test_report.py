@@ -366,7 +366,7 @@ def test_a_report_takes_figures_that_are_drawn(run, monkeypatch):
     asked = []
     ahead = (run.figures / "convergence.svg").read_bytes()
     monkeypatch.setattr(
-        "starcal_uq.presentation.report.drawing.draw_figures", lambda _, names: asked.extend(names) or {}
+        "starcal_uq.presentation.report.drawing.draw_figures", lambda _, names, *rest: asked.extend(names) or {}
     )
     sc.Run(run.path).report(lambda: {"corner": ahead}, force=True)
     assert sorted([*asked, "corner"]) == sorted(FIGURES)

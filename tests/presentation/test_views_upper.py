@@ -19,6 +19,7 @@ from starcal_uq.diagnostics.models import ModelComparison
 from starcal_uq.diagnostics.predictive import PredictiveCheck
 from starcal_uq.diagnostics.stars import StarTest
 from starcal_uq.diagnostics.validation.result import Validation
+from starcal_uq.diagnostics.verdict.judge import Verdict, judge
 from starcal_uq.planning.check import ForecastCheck
 from starcal_uq.planning.design import FrameChoice
 from starcal_uq.planning.plan import Need, Plan
@@ -44,6 +45,7 @@ FIGURES = {
     Misfit: ["p_values"],
     Jackknife: ["ratios"],
     StarTest: [],
+    Verdict: [],
     ModelComparison: ["models"],
     PredictiveCheck: [],
     Diagnosis: ["diagnosis"],
@@ -107,7 +109,7 @@ def results() -> dict[type, Any]:
         *(error, error.agreement, sc.coupling(cal), sc.propagation.field_map(post, obs, 9)),
         *(sc.propagation.distortion_curve(post, obs, n=11, n_draws=50), validation(), plan, plan.needs[0]),
         sc.propagation.error_spectrum(post, slewing, n_draws=5),
-        *(diagnosis, diagnosis.misfit, diagnosis.jackknife, diagnosis.stars),
+        *(diagnosis, diagnosis.misfit, diagnosis.jackknife, diagnosis.stars, judge(obs, cal)),
         *(diagnosis.comparison, diagnosis.predictive),
         sc.comparison.compare_halves(obs, nominal(camera())),
         sc.planning.choose_frames(camera(), stars, n_frames=5, candidates=100, n_geometries=100),

@@ -209,7 +209,7 @@ def terminal_summary(results: Results) -> list[str]:
             cells = [_both(error, part, axis) for axis in (3, 2)]
             lines.append(f"  {name.lower():<30}{cells[0]:>25}{cells[1]:>19}".rstrip())
         untested = f"{IF_MODEL_HOLDS}; {WITH_MISFIT_FOUND}: {NOT_ASSESSED}"
-        lines.append(f"  {untested if error.misfit is None else f'{WITH_MISFIT_FOUND} ({IF_MODEL_HOLDS})'}")
+        lines.append(f"  {untested if error.misfit is None else f'{WITH_MISFIT_FOUND}; in brackets {IF_MODEL_HOLDS}'}")
     if (budget := results.budget) is not None:
         table = budget_summary(budget)
         lines.append("Budget" if budget.outcomes else f"Budget at {confidence_text(budget.confidence)}, arcsec")
