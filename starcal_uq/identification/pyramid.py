@@ -28,6 +28,9 @@ _GROUP = 10
 _LEAST_BASE = 0.12
 # Hypotheses of one triangle that are handed on, those with most support.
 _HANDED_ON = 6
+# Catalogue triangles that one search of a frame looks at. More than three times as many as any that found an attitude
+# took; so many fit by chance where the camera is too little known for the noise, and more of them would say no more.
+_MOST_CANDIDATES = 100_000
 
 
 @dataclass(frozen=True)
@@ -123,7 +126,7 @@ def hypotheses(
     """For each triangle, the hypotheses that a fourth star supports, best first.
 
     Triangles are made of the first `max_centroids` of `points` (n, 2), ideal pixels, brightest first; only those that a
-    search of the first `searched` has left (`remaining_order`).
+    search of the first `searched` has left (`remaining_order`). Ends where too many triangles of the catalogue fit.
     """
     n = min(len(points), max_centroids)
     if n < 4:
@@ -134,8 +137,12 @@ def hypotheses(
     angle = angle_between(b[:, None], b[None])
     length = np.hypot(*(u[:, None] - u[None]).transpose(2, 0, 1))
     bases: dict[tuple[int, int], tuple[IntArray, IntArray, FloatArray]] = {}
+    left = _MOST_CANDIDATES
     for triangle in _sorted_triangles(triangles, length, geometry):
         candidates = _look_up(triangle, b, angle, sigma, pairs, geometry, tolerance, bases)
+        left -= len(candidates)
+        if left < 0:
+            return
         if len(candidates):
             yield _supported(triangle, candidates, u, sigma, angle, length, pairs, geometry, tolerance)
 

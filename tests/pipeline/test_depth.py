@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
+from starcal_uq.identification import pyramid
 from starcal_uq.identification.blind import LEVELS, BlindSearch
 from starcal_uq.identification.engine import identify
 from starcal_uq.pipeline.depth import COUNTS, depth_for, identify_to_depth, stars_in_field
@@ -79,6 +80,29 @@ def test_a_failed_search_is_not_repeated(monkeypatch: pytest.MonkeyPatch) -> Non
     assert all(a[1] == b[0] for a, b in pairwise(ranges))
     # Every triangle gives six matches at most, of 200 at first and 60 with a worse lens.
     assert 0 < len(matches) <= n * 6 * (200 + 60)
+
+
+def test_a_search_ends_where_too_many_triangles_fit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stars at random places, a camera of which next to nothing is known: the work is bounded, whatever fits."""
+    table, _ = small_wide(1)
+    table.x_px, table.y_px = np.random.default_rng(3).uniform(1.0, 254.0, (2, len(table.frame)))
+    camera = sc.Camera(256, 256, 5.0, 400 * 5e-3, 127.5, 127.5)
+    fitted: list[int] = []
+
+    def looked_up(*arguments: Any) -> Any:
+        found = look_up(*arguments)
+        fitted.append(len(found))
+        return found
+
+    look_up = pyramid._look_up
+    monkeypatch.setattr(pyramid, "_look_up", looked_up)
+    options = {"search_focal": False, "cache": False, "centre_tolerance_px": 20.0}
+    assert identify(table, camera, sc.load_catalogue(4.0), **options).n_identified == 0
+    every = sum(fitted)
+    fitted.clear()
+    monkeypatch.setattr(pyramid, "_MOST_CANDIDATES", every // 20)
+    assert identify(table, camera, sc.load_catalogue(4.0), **options).n_identified == 0
+    assert max(fitted) < sum(fitted) < every // 2
 
 
 @pytest.mark.slow
