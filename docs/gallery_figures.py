@@ -226,7 +226,8 @@ def write(page: Path, folder: Path) -> float:
                 small.save(folder / f"{_anchor(key)}-small.png", optimize=True)
                 alt = f"{result}: {name}. {question}"
                 where = f"{folder.name}/{_anchor(key)}"
-                thumbnails.append(f"```{{image}} {where}-small.png\n:alt: {alt}\n:target: '#{_anchor(key)}'\n```\n")
+                options = f":alt: {alt}\n:target: '#{_anchor(key)}'\n"
+                thumbnails.append(f"```{{figure}} {where}-small.png\n{options}\n{result}<br>{name}\n```\n")
                 sections.append(f"```{{image}} {where}.png\n:alt: {alt}\n:loading: lazy\n```\n")
             sections.append(_code(code))
     opening = """# Gallery
