@@ -51,14 +51,15 @@ from starcal_uq.core.store import finished
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.observations.files import READ
 
-_APART_STARS = 50_000
-
 if TYPE_CHECKING:
     from starcal_uq.core.types import AnyDict
     from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
     from starcal_uq.presentation.report.drawing import Ahead
     from starcal_uq.runs.run import Run
+
+# From so many stars on, half of the diagnosis is worth another process.
+_APART_STARS = 50_000
 
 
 def demo(
