@@ -37,6 +37,7 @@ from starcal_uq.cli.documents import (
 from starcal_uq.cli.parts import Part
 from starcal_uq.cli.results import Verdict
 from starcal_uq.core.types import AnyDict
+from starcal_uq.diagnostics.verdict.judge import VERSION
 
 PREFIX = "starcal-uq/"
 # Endings of keys that tell the unit.
@@ -76,7 +77,7 @@ SCHEMAS: Mapping[str, tuple[int, type[Part]]] = {
     "reproduce": (1, Reproduce),
     "reproduce-field": (1, ReproduceField),
     "schema": (1, Schema),
-    "verdict": (1, Verdict),
+    "verdict": (VERSION, Verdict),
     "error": (1, Error),
 }
 _HEAD = {

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING
 
 from starcal_uq.core.errors import ObservationError
-from starcal_uq.core.settings import Directions
 from starcal_uq.observations.partitions import open_partitions
 from starcal_uq.observations.table import load_observations
 from starcal_uq.sky.site import check_sky
@@ -18,8 +17,6 @@ if TYPE_CHECKING:
     from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
     from starcal_uq.sky.site import Site
-
-DIRECTIONS = get_args(Directions)
 
 
 def observations_from_table(

@@ -64,6 +64,11 @@ class Verdict(Shown):
         """The checks that answer one question."""
         return tuple(check for check in self.checks if check.question is question)
 
+    @property
+    def doubts(self) -> tuple[Check, ...]:
+        """The checks that did not pass."""
+        return tuple(check for check in self.checks if check.level is not Level.PASS)
+
     def at(self, level: Level) -> tuple[Check, ...]:
         """The checks with this outcome."""
         return tuple(check for check in self.checks if check.level is level)

@@ -70,9 +70,7 @@ def context(results: Results) -> dict[str, Any]:
         "glance_caption": summary.glance_caption(results),
         "methods_paragraph": summary.methods_paragraph(results),
         "citations": [line.format(version=version) for line in summary.CITATIONS],
-        "diagnose": "starcal-uq diagnose RUN"
-        if results.place is None
-        else results.place.command("starcal-uq diagnose RUN"),
+        "diagnose": results.command("starcal-uq diagnose RUN"),
         "template_command": _template_command(results),
         "verdict": verdict,
         "marks": _MARKS,

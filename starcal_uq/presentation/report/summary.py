@@ -221,12 +221,10 @@ def terminal_summary(results: Results) -> list[str]:
         if budget.not_assessed:
             every = len(by_contributor(budget.rows))
             lines.append(f"  {len(budget.not_assessed)} of {every} contributors are {NOT_ASSESSED}: lower bounds")
-    checks = results.verdict.checks
     counts = [f"{len(results.verdict.at(level))} {words}" for level, words in _COUNTED if results.verdict.at(level)]
-    lines.append(f"Checks: {', '.join(counts)} of {len(checks)}")
-    for check in checks:
-        if check.level is not Level.PASS:
-            lines += _told(check)
+    lines.append(f"Checks: {', '.join(counts)} of {len(results.verdict.checks)}")
+    for check in results.verdict.doubts:
+        lines += _told(check)
     return lines
 
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.formatting import count, fixed, percent, plural, significant
-from starcal_uq.core.status import Level
 from starcal_uq.diagnostics.verdict.draws import propagation_difference
 from starcal_uq.diagnostics.verdict.observed import air, conditional_words, corrected_words
 from starcal_uq.presentation.html import card, listed
@@ -44,7 +43,7 @@ def run_html(results: Results) -> str:
     """The same for a notebook, with the table of the parameters and the checks that did not pass."""
     post, cal = results.posterior, results.calibration
     table = calibration_table(cal, results.truth) if post is None else posterior_table(post)
-    doubts = (str(check) for check in results.verdict.checks if check.level is not Level.PASS)
+    doubts = (str(check) for check in results.verdict.doubts)
     return card(f"Run {results.name}", run_text(results), table) + listed(doubts)
 
 

@@ -10,7 +10,6 @@ import numpy as np
 
 from starcal_uq.camera.distortion import Parameter
 from starcal_uq.core.formatting import count, decimals_for, fixed, join_words, percent, plural, significant
-from starcal_uq.core.status import Level
 from starcal_uq.diagnostics.diagnose import Diagnosis
 from starcal_uq.diagnostics.jackknife import Jackknife
 from starcal_uq.diagnostics.misfit import Misfit
@@ -39,7 +38,7 @@ def verdict_text(verdict: Verdict) -> str:
 def verdict_notes(verdict: Verdict) -> list[str]:
     """Every check that did not pass; files of remedies as they are called from the current folder."""
     here = f"{Path.cwd()}/"
-    return [str(check).replace(here, "") for check in verdict.checks if check.level is not Level.PASS]
+    return [str(check).replace(here, "") for check in verdict.doubts]
 
 
 def misfit_text(found: Misfit) -> str:

@@ -129,11 +129,6 @@ def frames_text(frames: Frames) -> str:
     return f"{words}; {calibrated} of them took part in the calibration."
 
 
-def frames_table(frames: Frames) -> TextTable:
-    """The first frames."""
-    return TextTable.of(frames.to_dataframe().head(MOST_FRAMES))
-
-
 def outcome_words(frame: InspectedFrame) -> str:
     """What became of a frame, in a few words."""
     if frame.n(IDENTIFIED):
