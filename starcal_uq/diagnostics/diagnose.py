@@ -22,7 +22,7 @@ from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import Progress, one_thread
 from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.diagnostics.air import AirTest, air_test
-from starcal_uq.diagnostics.jackknife import Jackknife, jackknife_frames
+from starcal_uq.diagnostics.jackknife import Jackknife, jackknife_frames, jackknife_of_all
 from starcal_uq.diagnostics.misfit import Misfit, misfit_tests
 from starcal_uq.diagnostics.models import MODELS, ModelComparison, compare_models, of_all_stars
 from starcal_uq.diagnostics.predictive import PredictiveCheck, predictive_check
@@ -32,7 +32,6 @@ from starcal_uq.estimation.calibrate import METHODS, calibrate, fit
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.cameras import MixedCameras
 from starcal_uq.estimation.noise_model import weighed
-from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.observations.splits import frame_sample
 
 if TYPE_CHECKING:
@@ -207,10 +206,9 @@ def diagnose(
     """
     step = progress or (lambda done, total: None)
     obs, whole = weighed(obs, cal), cal
-    if whole.partitions is not None:
+    if obs.n_frames < whole.n_frames and whole.partitions is not None:
         cal = calibrate(obs, whole.nominal, model=whole.nominal.distortion, duplicates="keep")
-    normals = FrameNormals.at(obs, cal)
-    found = _jackknife(obs, cal, normals)
+    found = jackknife_of_all(whole) or _jackknife(obs, cal)
     step(1, 4)
     predictive = predictive_check(obs, whole, post, seed=seed)
     step(2, 4)
@@ -239,9 +237,9 @@ def diagnose(
     )
 
 
-def _jackknife(obs: Observations, cal: Calibration, normals: FrameNormals) -> Jackknife | None:
+def _jackknife(obs: Observations, cal: Calibration) -> Jackknife | None:
     try:
-        return jackknife_frames(obs, cal, normals)
+        return jackknife_frames(obs, cal)
     except StarcalError:
         # Too few frames: the report then says that there is none.
         return None

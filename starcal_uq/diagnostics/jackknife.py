@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from starcal_uq.estimation.calibration import Calibration
+    from starcal_uq.estimation.residual_map import FrameScatter
     from starcal_uq.observations.table import Observations
 
 # Degrees of freedom of a noise that is taken as known.
@@ -45,7 +46,7 @@ class Jackknife(Shown):
     sandwich_covariance : (p, p) array
         ``H^-1 (sum_k g_k g_k^T) H^-1`` over frames: the cluster-robust one, with the leverage of each frame corrected.
     left_out : (K, p) array
-        Estimates without each frame, px units.
+        Estimates without each frame, px units; none of partitioned observations.
     effective_frames : (p,) array
         Frames of equal weight that would determine each parameter as unevenly as these K do: one more than
         Satterthwaite's degrees of freedom of `sandwich_covariance`.
@@ -178,19 +179,32 @@ def jackknife_frames(obs: Observations, cal: Calibration, normals: FrameNormals 
         raise CalibrationError(
             f"without frame {frame} the parameters are not determined: a jackknife needs more frames like it."
         )
-    k = obs.n_frames
+    return _jackknife(found.scatter(), cal, found.theta + z * found.scale)
+
+
+def jackknife_of_all(cal: Calibration) -> Jackknife | None:
+    """The jackknife over all frames of partitioned observations, without the single estimates; None if it has no sums.
+
+    The sums are made with the calibration, file by file.
+    """
+    found = None if cal.partitions is None else cal.partitions.scatter
+    if found is None or found.n_frames < 3 or not np.isfinite(found.steps).all():
+        return None
+    return _jackknife(found, cal, np.empty((0, len(found.theta))))
+
+
+def _jackknife(found: FrameScatter, cal: Calibration, left_out: FloatArray) -> Jackknife:
     unit = np.outer(found.scale, found.scale)
-    spread = z - z.mean(axis=0)
-    clustered, dof, tail_dof = found.clustered()
+    clustered, dof, tail_dof = found.clustered
     return Jackknife(
         parameter_names=cal.parameter_names,
-        formal_covariance=np.linalg.inv(found.matrix) * found.variance * unit,
-        jackknife_covariance=spread.T @ spread * (k - 1.0) / k * unit,
+        formal_covariance=found.formal * unit,
+        jackknife_covariance=found.jackknife * unit,
         sandwich_covariance=clustered * unit,
-        left_out=found.theta + z * found.scale,
+        left_out=left_out,
         effective_frames=dof + 1.0,
-        n_frames=k,
-        residual_dof=int(np.sum(found.dof)) - len(found.theta),
+        n_frames=found.n_frames,
+        residual_dof=found.dof - len(found.theta),
         tail_dof=tail_dof,
     )
 

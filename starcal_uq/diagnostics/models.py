@@ -225,7 +225,7 @@ def compare_models(
 
 def of_all_stars(found: ModelComparison, obs: Observations, cal: Calibration) -> ModelComparison:
     """The comparison on a sample of partitioned observations, with the moves by richer models that all stars give."""
-    if cal.partitions is None:
+    if cal.partitions is None or obs.n_frames == cal.n_frames:
         return found
     rotations = quaternion_to_rotation(cal.quaternions)
     richer = {other.model: other.theta for other in cal.partitions.richer}

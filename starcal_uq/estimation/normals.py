@@ -14,6 +14,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import exp_rotation, quaternion_to_rotation
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.residual_map import FrameScatter
 from starcal_uq.estimation.star_errors import StarSums, add_by_star
 from starcal_uq.estimation.sums import ATTITUDE_STEPS, ATTITUDE_TOLERANCE_RAD, frame_normals
 from starcal_uq.observations.frames import StarFrames
@@ -76,16 +77,23 @@ class FrameNormals:
         return cls.around(obs, cal.camera.distortion, cal.theta, quaternion_to_rotation(cal.quaternions))
 
     @classmethod
-    def around(cls, obs: Observations, model: str, theta: FloatArray, start: FloatArray) -> FrameNormals:
+    def around(
+        cls,
+        obs: Observations | StarFrames,
+        model: str,
+        theta: FloatArray,
+        start: FloatArray,
+        scale: FloatArray | None = None,
+    ) -> FrameNormals:
         """Normal equations of a distortion model at theta (p,), attitudes searched from `start` (K, 3, 3)."""
-        frames = StarFrames.from_observations(obs)
+        frames = obs if isinstance(obs, StarFrames) else StarFrames.from_observations(obs)
         for _ in range(ATTITUDE_STEPS):
             gram, shift, log_determinant = frame_normals(frames, model, theta, start)
             if not np.max(np.abs(shift)) >= ATTITUDE_TOLERANCE_RAD:
                 break
             start = exp_rotation(shift.T) @ start
         matrix = gram[:, 1:, 1:]
-        scale = 1.0 / np.sqrt(np.einsum("kaa->a", matrix))
+        scale = 1.0 / np.sqrt(np.einsum("kaa->a", matrix)) if scale is None else scale
         return cls(
             theta=theta,
             scale=scale,
@@ -97,36 +105,41 @@ class FrameNormals:
             dof=2 * frames.sizes - 3,
         )
 
-    def clustered(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Covariance (p, p) of z from the scatter of the frames, and two degrees of freedom (p,) of its diagonal.
+    def scatter(self, whole: tuple[FloatArray, FloatArray] | None = None) -> FrameScatter:
+        """How these frames scatter about the estimate; `whole` are matrix and slope of all, where they are a part.
 
-        Bell & McCaffrey (2002): residuals of frame k are multiplied by (I - h_k H^-1 h_k^T)^(-1/2), which frees the
-        covariance of what the fit takes up wherever noise is independent. Degrees of freedom are those of a chi-square
-        of the same variance (Satterthwaite), and of the same skewness, which are fewer where frames are uneven. All of
-        it needs only H_k, H and the slopes. Not finite where a frame alone determines a parameter.
+        All of it needs only H_k, H and the slopes. Not finite where a frame alone determines a parameter.
         """
-        root = np.linalg.inv(np.linalg.cholesky(self.matrix))
+        matrix, slope = (self.matrix, self.slopes.sum(axis=0)) if whole is None else whole
+        root = np.linalg.inv(np.linalg.cholesky(matrix))
         shares = root @ self.matrices @ root.T
         values, vectors = np.linalg.eigh(shares)
         free = 1.0 - values
-        with np.errstate(divide="ignore", invalid="ignore"):
-            stretch = np.where(free > 1e-10, free, np.nan) ** -0.5
-        adjust = np.einsum("kab,kb,kcb->kac", vectors, stretch, vectors)
-        step = np.linalg.solve(self.matrix, self.slopes.sum(axis=0))
-        left = (self.slopes - self.matrices @ step) @ root.T
+        free = np.where(free > 1e-10, free, np.nan)
+        adjust = np.einsum("kab,kb,kcb->kac", vectors, free**-0.5, vectors)
+        left = (self.slopes - self.matrices @ np.linalg.solve(matrix, slope)) @ root.T
         # Columns of `root` are the whitened parameters; their pull on frame k, adjusted, before and after its share.
         pull = np.einsum("kab,bj->kja", adjust, root)
         own = np.einsum("kab,kjb->kja", shares, pull)
-        scatter = np.einsum("kja,ka->kj", pull, left)
-        # Covariance of the scatter between frames: a diagonal less `own own^T`, for each parameter.
-        diagonal = np.sum(pull * own, axis=2)
-        inner = np.einsum("kja,kjb->jab", own, own)
-        square = np.sum(diagonal**2 - 2.0 * diagonal * np.sum(own**2, axis=2), axis=0) + np.sum(inner**2, axis=(1, 2))
-        trace = np.sum(diagonal - np.sum(own**2, axis=2), axis=0)
-        middle = np.einsum("kj,kja,kjb->jab", diagonal, own, own)
-        cube = np.sum(diagonal**3 - 3.0 * diagonal**2 * np.sum(own**2, axis=2), axis=0)
-        cube += 3.0 * np.einsum("jab,jab->j", middle, inner) - np.einsum("jab,jbc,jca->j", inner, inner, inner)
-        return scatter.T @ scatter, trace**2 / square, square**3 / cube**2
+        scores = np.einsum("kja,ka->kj", pull, left)
+        # Covariance of the scores between frames: a diagonal less `own own^T`, for each parameter.
+        diagonal, size = np.sum(pull * own, axis=2), np.sum(own**2, axis=2)
+        # Steps to the estimates without a frame, and ones.
+        steps = np.einsum("kab,kb,kcb,kc->ka", vectors, 1.0 / free, vectors, (slope - self.slopes) @ root.T) @ root
+        steps = np.concatenate([np.ones((len(steps), 1)), steps], axis=1)
+        return FrameScatter(
+            theta=self.theta,
+            scale=self.scale,
+            matrix=self.matrix,
+            squares=float(np.sum(self.squares)),
+            n_frames=len(self.dof),
+            dof=int(np.sum(self.dof)),
+            steps=steps.T @ steps,
+            scores=scores.T @ scores,
+            powers=np.array([np.sum(diagonal**n - n * diagonal ** (n - 1) * size, axis=0) for n in (1, 2, 3)]),
+            inner=np.einsum("kja,kjb->jab", own, own),
+            middle=np.einsum("kj,kja,kjb->jab", diagonal, own, own),
+        )
 
     def left_out(self) -> tuple[FloatArray, FloatArray]:
         """Estimates z (K, p) without each frame, and the matrices (K, p, p) of the remaining ones.

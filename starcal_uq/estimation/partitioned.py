@@ -33,7 +33,8 @@ from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.compressed import GramSums, gram_sums, optimum, settled
 from starcal_uq.estimation.duplicates import repeated
 from starcal_uq.estimation.marginal import MarginalLikelihood
-from starcal_uq.estimation.residual_map import OUTLIER_SIGMA, PartitionSums, ResidualMap, RicherModel
+from starcal_uq.estimation.normals import FrameNormals
+from starcal_uq.estimation.residual_map import OUTLIER_SIGMA, FrameScatter, PartitionSums, ResidualMap, RicherModel
 from starcal_uq.estimation.solvers import Normal, is_singular, levenberg_marquardt
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.estimation.sums import NormalSums, frame_sums, settled_sums, sum_of
@@ -99,11 +100,12 @@ def _gram(reader: PartitionReader, model: str, theta: FloatArray, whitening: Flo
 
 @dataclass(frozen=True)
 class _Residuals:
-    """Sums over stars and frames at the estimate: attitude response (3, p) and covariance (3, 3), and the residuals.
+    """Sums over stars and frames at the estimate: normal equations, attitudes' response and covariance, residuals.
 
     `richer` are the normal equations of the models of which that of the camera is a special case.
     """
 
+    normal: NormalSums
     response: FloatArray
     inverse: FloatArray
     sums: PartitionSums
@@ -128,7 +130,7 @@ def _residuals(
     obs = reader.load(part)
     likelihood = MarginalLikelihood(obs, camera.distortion)
     whole, e = likelihood.frames, np.empty((2, obs.n_stars))
-    _, attitudes = settled_sums(whole, camera.distortion, theta, likelihood.start_rotations(theta), e)
+    normal, attitudes = settled_sums(whole, camera.distortion, theta, likelihood.start_rotations(theta), e)
     stated = np.ones(obs.n_stars) if obs.sigma_px is None else obs.sigma_px
     size = np.max(np.abs(e), axis=0) / scale
     worst = int(np.argmax(size))
@@ -147,16 +149,25 @@ def _residuals(
         richer = tuple(
             frame_sums(whole, other.distortion, other.theta, attitudes.at(theta))[0] for other in _richer(camera)
         )
-    return _Residuals(np.sum(attitudes.response, axis=2), np.sum(attitudes.inverse, axis=2), sums, richer)
+    return _Residuals(normal, np.sum(attitudes.response, axis=2), np.sum(attitudes.inverse, axis=2), sums, richer)
 
 
 def _added_residuals(parts: Sequence[_Residuals]) -> _Residuals:
     return _Residuals(
+        sum_of([part.normal for part in parts]),
         np.sum([part.response for part in parts], axis=0),
         np.sum([part.inverse for part in parts], axis=0),
         PartitionSums.joined([part.sums for part in parts]),
         tuple(sum_of(some) for some in zip(*(part.richer for part in parts), strict=True)),
     )
+
+
+def _scatter(reader: PartitionReader, model: str, theta: FloatArray, whole: Normal, part: Partition) -> FrameScatter:
+    likelihood = MarginalLikelihood(reader.load(part), model)
+    frames, scale = likelihood.frames, 1.0 / np.sqrt(np.diag(whole.matrix))
+    near = frame_sums(frames, model, theta, likelihood.start_rotations(theta))[1].at(theta)
+    scaled = whole.matrix * np.outer(scale, scale), -whole.gradient * scale
+    return FrameNormals.around(frames, model, theta, near, scale).scatter(scaled)
 
 
 def _stepped(camera: Camera, sums: Sequence[NormalSums], variance: float) -> tuple[RicherModel, ...]:
@@ -252,6 +263,7 @@ def calibrate_partitions(
     camera = start.nominal.with_theta(theta)
     scale = sigma * float(np.sqrt(dof / (2.0 * n_stars)))
     rest = total(partial(_residuals, reader, camera, theta, scale, n_stars), _added_residuals)
+    scatter = total(partial(_scatter, reader, model, theta, rest.normal.normal), sum_of)
     likelihood = MarginalLikelihood(sample, model)
     state, _ = likelihood.profile(theta)
     residuals = likelihood.frames.in_pixels(state.e).T
@@ -285,7 +297,7 @@ def calibrate_partitions(
         compressed=compressed,
         provenance=record,
         fingerprints=None,
-        partitions=replace(rest.sums, richer=_stepped(camera, rest.richer, sigma**2)),
+        partitions=replace(rest.sums, richer=_stepped(camera, rest.richer, sigma**2), scatter=scatter),
     )
 
 

@@ -1,9 +1,9 @@
-"""Residuals as sums that add up over any number of stars: by cells of the detector, and by partition of the data."""
+"""Residuals as sums that add up over any number of stars: by cells of the detector, by frames, and by partitions."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -100,6 +100,76 @@ class RicherModel:
 
 
 @dataclass(frozen=True)
+class FrameScatter:
+    """How frames scatter about an estimate: sums over frames in scaled parameters ``z = (theta - theta_hat) / scale``.
+
+    Attributes
+    ----------
+    theta, scale : (p,) arrays
+        Estimate, px units, and unit of each parameter.
+    matrix : (p, p) array
+        Gauss-Newton matrix.
+    squares : float
+        Sum of squared whitened residuals.
+    n_frames, dof : int
+        Frames, and their independent numbers ``2 m_k - 3``.
+    steps : (p + 1, p + 1) array
+        Products of (1, z) of the estimates without each frame.
+    scores : (p, p) array
+        Products of the frames' slopes, their leverage corrected.
+    powers : (3, p), inner, middle : (p, p, p) arrays
+        From which the degrees of freedom of `clustered` follow.
+    """
+
+    theta: FloatArray
+    scale: FloatArray
+    matrix: FloatArray
+    squares: float
+    n_frames: int
+    dof: int
+    steps: FloatArray
+    scores: FloatArray
+    powers: FloatArray
+    inner: FloatArray
+    middle: FloatArray
+
+    def __add__(self, other: FrameScatter) -> FrameScatter:
+        return replace(
+            self,
+            **{
+                field.name: getattr(self, field.name) + getattr(other, field.name)
+                for field in fields(self)
+                if field.name not in ("theta", "scale")
+            },
+        )
+
+    @property
+    def formal(self) -> FloatArray:
+        """Covariance (p, p) of z if noise is Gaussian and independent."""
+        return np.asarray(np.linalg.inv(self.matrix) * self.squares / (self.dof - len(self.theta)))
+
+    @property
+    def jackknife(self) -> FloatArray:
+        """Covariance (p, p) of z from the estimates that leave one frame out."""
+        k, mean = self.n_frames, self.steps[0, 1:] / self.n_frames
+        return np.asarray((self.steps[1:, 1:] - k * np.outer(mean, mean)) * (k - 1.0) / k)
+
+    @property
+    def clustered(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Covariance (p, p) of z from the scatter of the frames, and two degrees of freedom (p,) of its diagonal.
+
+        Bell & McCaffrey (2002): residuals of frame k are multiplied by (I - h_k H^-1 h_k^T)^(-1/2), which frees the
+        covariance of what the fit takes up wherever noise is independent. Degrees of freedom are those of a chi-square
+        of the same variance (Satterthwaite), and of the same skewness, which are fewer where frames are uneven.
+        """
+        trace, square, cube = self.powers
+        square = square + np.sum(self.inner**2, axis=(1, 2))
+        cube = cube + 3.0 * np.einsum("jab,jab->j", self.middle, self.inner)
+        cube -= np.einsum("jab,jbc,jca->j", self.inner, self.inner, self.inner)
+        return self.scores, trace**2 / square, square**3 / cube**2
+
+
+@dataclass(frozen=True)
 class PartitionSums:
     """What is known of all residuals of a calibration that has kept those of a sample of its frames.
 
@@ -121,6 +191,8 @@ class PartitionSums:
         Frame of the largest.
     richer : tuple of RicherModel
         Models of which the calibration's is a special case.
+    scatter : FrameScatter or None
+        How all frames scatter about the estimate; None in a calibration of before.
     """
 
     n_stars: IntArray
@@ -132,6 +204,7 @@ class PartitionSums:
     largest: float
     largest_frame: int
     richer: tuple[RicherModel, ...] = ()
+    scatter: FrameScatter | None = None
 
     @classmethod
     def joined(cls, parts: Sequence[PartitionSums]) -> PartitionSums:

@@ -14,6 +14,7 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.core.errors import CalibrationError, ObservationError, RepeatedFramesError
+from starcal_uq.diagnostics.jackknife import jackknife_frames, jackknife_of_all
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.observations.partitions import PartitionedObservations
@@ -65,6 +66,37 @@ def test_partitions_give_the_calibration_of_the_table(small, tmp_path: Path) -> 
     whole = divided(obs, tmp_path / "whole", [0, 90])
     assert_equal(sc.calibrate(whole, camera), many, 1e-11)
     np.testing.assert_array_equal(sc.calibrate(parts, camera).theta, many.theta)
+    frames, own, of_one = (
+        jackknife_of_all(many),
+        jackknife_frames(obs, one),
+        jackknife_of_all(sc.calibrate(whole, camera)),
+    )
+    assert frames is not None and of_one is not None and frames.n_frames == own.n_frames == 90
+    for name in ("formal_covariance", "jackknife_covariance", "sandwich_covariance", "dof", "tail_dof"):
+        np.testing.assert_allclose(getattr(frames, name), getattr(own, name), rtol=1e-7)
+        np.testing.assert_allclose(getattr(frames, name), getattr(of_one, name), rtol=1e-10)
+
+
+def test_frames_that_disagree_are_found_in_files_that_the_sample_leaves_out(tmp_path: Path) -> None:
+    obs, camera = sensor(100)
+    parts = divided(obs, tmp_path / "frames", list(range(0, 101, 5)))
+    found = {}
+    for bent in (False, True):
+        if bent:
+            # Every frame of one file has a focal length of its own, by a thousandth.
+            table = obs.select((obs.frame >= 35) & (obs.frame < 40))
+            scale = 1.0 + 1e-3 * np.random.default_rng(3).standard_normal(5)[table.frame - 35]
+            moved = {"x_px": 512.0 + (table.x_px - 512.0) * scale, "y_px": 512.0 + (table.y_px - 512.0) * scale}
+            folder = parts.parts[7].path
+            sc.Observations(**{**table.columns, **moved}, meta=table.meta).save(folder, force=True)
+            parts = sc.observations.open_partitions(parts.folder)
+        cal, sample = sc.calibrate(parts, camera, model="brown"), parts.sample()
+        assert sample.n_frames == 80 and not np.isin(range(35, 40), sample.frame).any()
+        among = jackknife_frames(sample, sc.calibrate(sample, camera))
+        every = sc.diagnose(parts, cal, models=(), n_starts=0).jackknife if bent else jackknife_of_all(cal)
+        assert every is not None and every.n_frames == 100
+        found[bent] = among.p_values[2], every.p_values[2]
+    assert found[True][0] > 0.01 and min(found[False]) > 0.01 and found[True][1] < 1e-6
 
 
 def test_stars_that_state_their_noise(tmp_path: Path) -> None:
@@ -220,6 +252,7 @@ def test_workers_of_a_scheduler_give_the_bits_of_one_process_even_if_one_is_kill
     np.testing.assert_array_equal(found.theta, alone.theta)
     np.testing.assert_array_equal(found.compressed.gram, alone.compressed.gram)
     np.testing.assert_array_equal(found.partitions.chi2, alone.partitions.chi2)
+    np.testing.assert_array_equal(found.partitions.scatter.scores, alone.partitions.scatter.scores)
 
 
 @pytest.mark.slow
