@@ -175,6 +175,8 @@ def warn_undeclared(obs: Observations | PartitionedObservations, camera: Camera)
     if low:
         words = f"note: {plural(int(low), 'star')} left out, because they stood lower than 10 degrees."
         tell(words)
+    if "frame_names" in obs.meta:
+        tell(f"note: frames were numbered as they come: {obs.meta['frame_names']}.")
     ignored = obs.meta.get("ignored_columns")
     if ignored:
         tell(f"note: columns not used: {', '.join(ignored)}")

@@ -7,7 +7,7 @@ import re
 import stat
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
@@ -60,7 +60,9 @@ def read_path(value: str | Path) -> Path:
     """Path of a file or a folder that can be read."""
     path = _path(value)
     if _mode(path) is None:
-        raise _refuse(path, "does not exist; check the path")
+        # Files of these names are what `new` writes.
+        new = path.stem in get_args(settings.Starter) and path.suffix == ".toml"
+        raise _refuse(path, f"does not exist; check the path{f', or starcal-uq new {path.stem}' if new else ''}")
     if not os.access(path, os.R_OK):
         raise _refuse(path, "cannot be read; check its permissions")
     return path
@@ -220,7 +222,8 @@ Columns = Annotated[
     typer.Option(
         "--column",
         metavar="NAME=IN_FILE",
-        help="A column that is called otherwise in the file; repeatable.",
+        help='A column that is called otherwise, or in another unit: `--column "ra_deg=RA [h] * 15"`, '
+        '`--column "x_px=X - 1"`; repeatable.',
         callback=checked(parse_columns),
     ),
 ]

@@ -9,6 +9,7 @@ import csv
 import io
 import json
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -32,6 +33,7 @@ from starcal_uq.core.files import (
     ensure_new,
     listed,
     reading,
+    shown,
     table_ending,
 )
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, StrArray
@@ -80,6 +82,8 @@ class RawTable:
         Rows that do not fit the header.
     spreadsheet : bool
         Whether texts are those of `starcal_uq.core.files.cell_text`.
+    decimal_comma : bool
+        Whether numbers are written as 0,5.
     """
 
     columns: dict[str, Any]
@@ -90,6 +94,7 @@ class RawTable:
     units: dict[str, str] = field(default_factory=dict)
     problems: list[Problem] = field(default_factory=list)
     spreadsheet: bool = False
+    decimal_comma: bool = False
 
 
 WHAT, REMEDY = "a readable table", "write it again"
@@ -130,12 +135,15 @@ def read_table(
         )
     ending = table_ending(path, READ)
     names = {name: mapping.get(name, name) for name in COLUMNS}
-    wanted, data = {names[name] for name in only}, _read_bytes(path)
+    wanted = {own for name in only for own in (names[name], _linear(names[name])[0])}
+    data = _read_bytes(path)
     with reading(path, WHAT, REMEDY, ObservationError):
         raw = _read(path, data, ending, wanted) if frames is None else _read_frames(path, data, wanted, names, frames)
         check_names(path, raw, names, mapping)
         if not len(raw.numbers):
             raise ObservationError(f"{path}: the table has a header but no rows; give a table with observations.")
+        if frames is None and check:
+            _number_frames(raw, names["frame"])
         columns, problems, unknown_frame = convert_columns(path, raw, {name: names[name] for name in only})
         if check:
             problems += check_columns(columns, camera, unknown_frame)
@@ -143,6 +151,36 @@ def read_table(
         named = [replace(p, column=names[p.column] if p.column else None) for p in problems]
         raise_problems(str(path), raw.word, raw.numbers, named)
         return columns, table_meta(path, raw, names, mapping)
+
+
+_LINEAR = re.compile(
+    r"(?P<own>.+?)\s*(?:(?P<times>[*/])\s*(?P<factor>[0-9.]+(?:e-?[0-9]+)?)\s*)?(?P<shift>[+-]\s*[0-9.]+(?:e-?[0-9]+)?)?"
+)
+
+
+def _linear(text: str, names: Sequence[str] = ()) -> tuple[str, float, float]:
+    """Column, factor and shift of a text such as ``RA [h] * 15`` or ``X - 1``; a column of that name goes before."""
+    found = _LINEAR.fullmatch(text)
+    if text in names or found is None:
+        return text, 1.0, 0.0
+    try:
+        factor = float(found["factor"] or 1.0)
+        shift = float((found["shift"] or "0").replace(" ", ""))
+        return found["own"], factor if found["times"] != "/" else 1.0 / factor, shift
+    except (ValueError, ZeroDivisionError):
+        return text, 1.0, 0.0
+
+
+def _number_frames(raw: RawTable, own: str) -> None:
+    """Number frames that have names, such as those of images, as they come."""
+    cells = raw.columns.get(own)
+    if isinstance(cells, np.ndarray) and cells.dtype.kind == "U":
+        cells = cells.tolist()
+    if isinstance(cells, list) and not any(re.match(r"\s*([-+.]?\d[\d.e+-]*)?\s*$", cell) for cell in cells):
+        found = {cell: number for number, cell in enumerate(dict.fromkeys(cells))}
+        raw.columns[own] = np.array([found[cell] for cell in cells], dtype=np.int64)
+        names = list(found)
+        raw.meta["frame_names"] = f"0 is {shown(names[0])}, {len(names) - 1} is {shown(names[-1])}"
 
 
 def _read(path: Path, data: bytes, ending: str, wanted: set[str]) -> RawTable:
@@ -157,19 +195,24 @@ def _read(path: Path, data: bytes, ending: str, wanted: set[str]) -> RawTable:
 
 def check_names(path: Path, raw: RawTable, names: Mapping[str, str], mapping: Mapping[str, str]) -> None:
     """Raise `ObservationError` where a column is missing that is required or was named."""
-    missing = [c for c in names if names[c] not in raw.names and (COLUMNS[c].required or c in mapping)]
+    there = {c: _linear(own, raw.names)[0] in raw.names for c, own in names.items()}
+    missing = [c for c in names if not there[c] and (COLUMNS[c].required or c in mapping)]
     if missing:
         wanted = names[missing[0]]
         others = f" (so are {', '.join(names[c] for c in missing[1:])})" if missing[1:] else ""
         raise ObservationError(
-            f"{path}: column {wanted} is missing{others}; add it, or map it from one of the file's columns "
-            f"({listed(raw.names)}).",
+            f"{path}: column {wanted} is missing{others}; {say_column(missing[0], raw.names)}.",
             column=wanted,
             problems=[f"{path}: column {names[c]} is missing." for c in missing],
         )
     for name in names.values():
         if raw.names.count(name) > 1:
             raise ObservationError(f"{path}: column {name} occurs twice; remove or rename one.", column=name)
+
+
+def say_column(name: str, names: Sequence[str]) -> str:
+    """How to say which of the `names` in a file is a column."""
+    return f'say which it is, as by --column "{name}=NAME" or columns={{...}}, of those in the file ({listed(names)})'
 
 
 def convert_columns(
@@ -180,13 +223,16 @@ def convert_columns(
     problems = list(raw.problems)
     unknown_frame = np.zeros(len(raw.numbers), dtype=np.bool_)
     for name, own in names.items():
+        own, factor, shift = _linear(own, raw.names)
         cells = raw.columns.get(own)
         if cells is None:
             continue
         kind = COLUMNS[name].kind
+        if (factor, shift) != (1.0, 0.0) and kind != "number":
+            raise ObservationError(f"{path}: column {name} holds no quantities; give the name of a column alone.")
         if isinstance(cells, np.ndarray):
             if kind == "number" or (kind == "whole" and cells.dtype.kind in "iu"):
-                columns[name] = cells
+                columns[name] = cells if (factor, shift) == (1.0, 0.0) else cells * factor + shift
                 continue
             cells = [str(value) for value in cells.tolist()]
         if not COLUMNS[name].required and not any(map(str.strip, cells)):
@@ -196,8 +242,11 @@ def convert_columns(
             columns[name], bad = parse_whole(name, cells)
             unknown_frame[[p.row for p in bad]] = True
         elif kind == "number":
+            if raw.decimal_comma:
+                cells = [cell.replace(",", ".") for cell in cells]
             values, bad = parse_numbers(name, cells)
-            columns[name] = _to_unit(path, name, values, raw.units.get(own, ""))
+            values = _to_unit(path, name, values, raw.units.get(own, ""))
+            columns[name] = values if (factor, shift) == (1.0, 0.0) else values * factor + shift
         elif kind == "time":
             columns[name], bad = parse_times(name, cells)
         else:
@@ -227,7 +276,8 @@ def _to_unit(path: Path, name: str, values: FloatArray, unit: str) -> FloatArray
 def table_meta(path: Path, raw: RawTable, names: Mapping[str, str], mapping: Mapping[str, str]) -> AnyDict:
     """The metadata of a table: what the file carries, where it came from, and which columns were ignored."""
     meta = {"source": str(path), **raw.meta}
-    ignored = [name for name in raw.names if name not in names.values()]
+    used = {_linear(own, raw.names)[0] for own in names.values()}
+    ignored = [name for name in raw.names if name not in used]
     meta["ignored_columns"] = ignored or list(meta.get("ignored_columns", []))
     if mapping:
         meta["columns"] = dict(mapping)
@@ -250,7 +300,8 @@ def _read_text(path: Path, data: bytes, ecsv: bool) -> RawTable:
             f"{path}, line {line}: the text is not UTF-8; save the file in the encoding UTF-8.", row=line
         ) from None
     header = _ecsv_header(path, text) if ecsv else {}
-    rows, numbers = _rows(path, text, header.get("delimiter", "," if not ecsv else " "))
+    delimiter = header.get("delimiter", " ") if ecsv else _delimiter(text)
+    rows, numbers = _rows(path, text, delimiter)
     if not rows:
         raise ObservationError(f"{path}: the file holds comments only; give a table of observations.")
     names = [name.strip() for name in rows.pop(0)]
@@ -270,7 +321,14 @@ def _read_text(path: Path, data: bytes, ecsv: bool) -> RawTable:
         units={column["name"]: column["unit"] for column in header.get("datatype", []) if column.get("unit")},
         problems=problems,
         spreadsheet=not ecsv,
+        decimal_comma=delimiter == ";",
     )
+
+
+def _delimiter(text: str) -> str:
+    """What stands between the columns: a comma, or, if the header has none, what else spreadsheets write."""
+    header = next((line for line in io.StringIO(text) if line.strip() and not line.startswith("#")), "")
+    return next((other for other in (";", "\t") if other in header and "," not in header), ",")
 
 
 def _rows(path: Path, text: str, delimiter: str) -> tuple[list[list[str]], list[int]]:

@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from starcal_uq.core.errors import ObservationError
-from starcal_uq.core.files import PathLike, listed
+from starcal_uq.core.files import PathLike
 from starcal_uq.core.manifest import read_manifest
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import AnyDict, IntArray
 from starcal_uq.observations.checks import check_mapping
 from starcal_uq.observations.columns import COLUMNS
-from starcal_uq.observations.files import ParquetSummary, parquet_column, parquet_summary, read_table
+from starcal_uq.observations.files import ParquetSummary, parquet_column, parquet_summary, read_table, say_column
 from starcal_uq.observations.table import Observations
 
 if TYPE_CHECKING:
@@ -253,8 +253,7 @@ def _check_alike(
         own = reader.columns.get(name, name)
         if own not in summary.names and (COLUMNS[name].required or name in reader.columns):
             raise ObservationError(
-                f"{path}: column {own} is missing; add it, or map it from one of the file's columns "
-                f"({listed(summary.names)}).",
+                f"{path}: column {own} is missing; {say_column(name, summary.names)}.",
                 column=own,
             )
         if (own in summary.names) != (own in first.names):

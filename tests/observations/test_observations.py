@@ -532,6 +532,22 @@ def test_same_star_in_two_frames_is_no_duplicate(tmp_path):
     assert load_observations(write_csv(tmp_path / "obs.csv", changed(ra_deg_0="360.0"))).ra_deg[0] == 360.0
 
 
+def test_columns_in_other_units_frames_by_name_and_semicolons(tmp_path):
+    path, plain = tmp_path / "mine.csv", load_observations(write_csv(tmp_path / "obs.csv", ROWS))
+    lines = [f"night {r[0]}.tif;{float(r[1]) + 1!r};{r[2]};{float(r[3]) / 15!r};{r[4]}".replace(".", ",") for r in ROWS]
+    path.write_text("\n".join(["Image;X - 1;X [px];RA [h];Dec", *lines]))
+    columns = {"frame": "Image", "x_px": "X - 1 - 1", "y_px": "X [px]", "ra_deg": "RA [h] * 15", "dec_deg": "Dec"}
+    obs = load_observations(path, columns=columns)
+    for name in ("x_px", "y_px", "ra_deg", "dec_deg"):
+        np.testing.assert_allclose(obs.columns[name], plain.columns[name], rtol=1e-14)
+    np.testing.assert_array_equal(obs.frame, np.searchsorted(plain.frame_ids, plain.frame))
+    assert obs.meta["frame_names"].startswith("0 is 'night ") and obs.meta["ignored_columns"] == []
+    # A column that is called so goes before what could be reckoned.
+    assert load_observations(path, columns=columns | {"x_px": "X - 1"}).x_px[0] == plain.x_px[0] + 1.0
+    with pytest.raises(ObservationError, match="column star_id holds no quantities"):
+        load_observations(path, columns=columns | {"star_id": "RA [h] * 15"})
+
+
 # ---- bad files ---------------------------------------------------------------------------------------------------
 
 
@@ -539,8 +555,8 @@ def test_missing_columns(tmp_path):
     path = write_csv(tmp_path / "obs.csv", [row[:3] for row in ROWS], ["frame", "x_px", "why"])
     error = caught(path)
     assert str(error) == (
-        f"{path}: column y_px is missing (so are ra_deg, dec_deg); add it, or map it from one of the file's columns "
-        "(frame, x_px, why)."
+        f'{path}: column y_px is missing (so are ra_deg, dec_deg); say which it is, as by --column "y_px=NAME" or '
+        "columns={...}, of those in the file (frame, x_px, why)."
     )
     assert (error.row, error.column, len(error.problems)) == (None, "y_px", 3)
     twice = write_csv(tmp_path / "twice.csv", [[*row, "1"] for row in ROWS], [*HEADER, "x_px"])

@@ -258,9 +258,12 @@ def noise(obs: Observations, cal: Calibration) -> Check:
 
 def _stated_unit(obs: Observations, cal: Calibration) -> str:
     """What the column of stated noise holds, where it is not px; empty if that cannot be told."""
-    stated = obs.sigma_px
+    stated, floor = obs.sigma_px, obs.meta.get("noise_floor_px")
     if stated is None:
         return ""
+    if floor:  # The column is not the user's.
+        less = f"Less scatter than the stars state: the {significant(floor)} px that were added to each are too many."
+        return less if cal.sigma < 1.0 else ""
     arcsec_per_px = ARCSEC / cal.camera.focal_px
     if obs.mag is not None and np.array_equal(stated, obs.mag):
         return "Column sigma_px holds the magnitudes: give the noise in px, or leave it out."
