@@ -14,20 +14,10 @@ from starcal_uq.core.types import FloatArray
 
 
 def rotation_to_quaternion(rotation: FloatArray) -> FloatArray:
-    """Quaternions of rotation matrices.
+    """Scalar-last unit quaternions (..., 4), scalar part not negative, of proper rotation matrices (..., 3, 3).
 
     Of the four algebraically equal formulas the one with the largest divisor is used, matrix by matrix (Shepperd
     1978), so that half turns lose no digits.
-
-    Parameters
-    ----------
-    rotation : (..., 3, 3) array
-        Proper rotation matrices.
-
-    Returns
-    -------
-    (..., 4) array
-        Scalar-last unit quaternions with a scalar part that is not negative.
     """
     m = np.asarray(rotation, dtype=float)
     if m.shape[-2:] != (3, 3):
@@ -52,22 +42,7 @@ def rotation_to_quaternion(rotation: FloatArray) -> FloatArray:
 
 
 def quaternion_to_rotation(quaternion: FloatArray) -> FloatArray:
-    """Rotation matrices of quaternions, which need not be normalised.
-
-    Parameters
-    ----------
-    quaternion : (..., 4) array
-        Scalar-last quaternions.
-
-    Returns
-    -------
-    (..., 3, 3) array
-
-    Raises
-    ------
-    ValueError
-        For a quaternion of norm zero.
-    """
+    """Rotation matrices (..., 3, 3) of scalar-last quaternions (..., 4) of any norm; ValueError for a norm of zero."""
     q = np.asarray(quaternion, dtype=float)
     if q.shape[-1:] != (4,):
         raise ValueError(f"quaternions have shape (..., 4), not {q.shape}.")

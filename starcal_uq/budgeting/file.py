@@ -460,13 +460,7 @@ confidence = 0.997
 
 
 def template_text(rows: Sequence[Contributor] = ()) -> str:
-    """Text of the starter file.
-
-    Parameters
-    ----------
-    rows : sequence of Contributor
-        Rows of a budget: what is assessed there on all axes is left out. Without them, everything is listed.
-    """
+    """Text of the starter file: everything, or what `rows` of a budget leave unassessed on an axis."""
     parts = [_HEADER]
     for entry in FROM_FILE:
         mine = [row for row in rows if row.name == entry.name]

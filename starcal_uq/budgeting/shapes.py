@@ -116,18 +116,10 @@ def half_width(distribution: str, confidence: float, tail_997: float = GAUSSIAN_
 
 
 def deviates(distribution: str, uniform: FloatArray, log_scale: FloatArray, tail_997: float) -> FloatArray:
-    """Deviations of mean 0 and standard deviation 1 at the given probabilities.
+    """Deviations of mean 0 and standard deviation 1 at probabilities `uniform` (n,); rows that share one err together.
 
-    Parameters
-    ----------
-    distribution : str
-        One of `DISTRIBUTIONS`.
-    uniform : (n,) array
-        Probabilities; rows that share them err together.
-    log_scale : (n,) array
-        Standard normal deviates that decide about sigma where it changes from frame to frame.
-    tail_997 : float
-        Half-width at 99.7 % as in `Contributor`.
+    `log_scale` (n,) are standard normal deviates that decide about sigma where it changes from frame to frame;
+    `distribution` and `tail_997` are those of a `Contributor`.
     """
     from scipy.special import ndtri
 

@@ -35,15 +35,7 @@ _loaded: dict[str, ModuleType] = {}
 
 
 def use(choice: str) -> None:
-    """Choose ``numpy``, ``numba`` or ``auto`` for this process and those that it starts.
-
-    Raises
-    ------
-    StarcalError
-        For another word.
-    MissingExtraError
-        For ``numba`` where it is not installed.
-    """
+    """Choose ``numpy``, ``numba`` or ``auto`` for this process and those that it starts."""
     _check(choice)
     os.environ[SWITCH] = choice
 

@@ -142,13 +142,7 @@ def model_names() -> tuple[str, ...]:
 
 
 def get_model(name: str) -> DistortionModel:
-    """Look a distortion model up.
-
-    Raises
-    ------
-    DistortionError
-        For a name that is not in the registry.
-    """
+    """Look a distortion model up; DistortionError for a name that is not in the registry."""
     try:
         return _MODELS[name]
     except KeyError:
@@ -181,13 +175,7 @@ PARAMETERS: dict[str, Parameter] = {spec.name: spec for spec in _OPTICS} | COEFF
 
 
 def parameter_called(name: str) -> Parameter:
-    """The parameter of this name, of whatever model has it.
-
-    Raises
-    ------
-    DistortionError
-        For a name that no model has.
-    """
+    """The parameter of this name, of whatever model has it; DistortionError where none has."""
     try:
         return PARAMETERS[name]
     except KeyError:

@@ -13,13 +13,7 @@ if TYPE_CHECKING:
 
 
 def detector_axes(camera: Camera, n: int) -> tuple[FloatArray, FloatArray]:
-    """Grid lines x (n,) and y (n,) in px, from edge to edge of the detector.
-
-    Raises
-    ------
-    ValueError
-        For fewer than two grid points.
-    """
+    """Grid lines x (n,) and y (n,) in px, from edge to edge of the detector; ValueError for fewer than two."""
     if n < 2:
         raise ValueError(f"a map needs at least 2 grid points along each side, not {n}.")
     return np.linspace(-0.5, camera.width_px - 0.5, n), np.linspace(-0.5, camera.height_px - 0.5, n)

@@ -97,13 +97,7 @@ def _ros_matrix(rows: int, columns: int, data: str) -> str:
 
 
 def read_pinhole(text: str) -> Pinhole:
-    """What a file of any of the four holds.
-
-    Raises
-    ------
-    ValueError
-        If the text is none of theirs, or holds another kind of lens; the message says which.
-    """
+    """What a file of any of the four holds; ValueError says what else its text is."""
     pitch = _PITCH.search(text)
     content = _content(text)
     read = _reader(content)

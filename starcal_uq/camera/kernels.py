@@ -51,29 +51,12 @@ def emit_source(
     read: Callable[[int, int], str] = "inputs[{}][{}]".format,
     write: Callable[[int, int], str] = "out[{}][{}]".format,
 ) -> str:
-    """Write the instruction list of a CasADi SX function as Python source.
+    """Write the instruction list of a dense CasADi SX function as Python source, ``def name(inputs, out)``.
 
-    Parameters
-    ----------
-    function : casadi.Function
-        An SX function with dense inputs and outputs.
-    name : str
-        Name of the emitted Python function.
-    arguments : str
-        Its arguments.
-    read, write : callable
-        From the number of an input or output and of its element to what stands for it in the source.
-
-    Returns
-    -------
-    str
-        ``def name(inputs, out)``: `inputs` is a sequence (one entry per input) of sequences of scalars or (n,) arrays,
-        one per element; `out` is a sequence of (n_elements, n) arrays, one per output, which are filled.
-
-    Raises
-    ------
-    NotImplementedError
-        For an operation without a NumPy counterpart in this module.
+    `inputs` is a sequence (one entry per input) of sequences of scalars or (n,) arrays, one per element; `out` is a
+    sequence of (n_elements, n) arrays, one per output, which are filled. `read` and `write` make what stands in the
+    source for an input or output from its number and that of its element. NotImplementedError for an operation without
+    a NumPy counterpart in this module.
     """
     import casadi as ca
 
@@ -116,20 +99,7 @@ class Kernel:
     shapes: tuple[tuple[int, ...], ...]
 
     def __call__(self, n: int, *inputs: Any) -> tuple[FloatArray, ...]:
-        """Evaluate for `n` stars.
-
-        Parameters
-        ----------
-        n : int
-            Number of stars.
-        *inputs
-            One per symbolic input, each of shape (elements,) when all stars share it or (elements, n).
-
-        Returns
-        -------
-        tuple of arrays
-            One per output, of shape ``(*shape, n)``.
-        """
+        """Outputs ``(*shape, n)`` for `n` stars; inputs (elements,) are shared by all, others are (elements, n)."""
         outputs = [np.empty((int(np.prod(shape)), n)) for shape in self.shapes]
         arrays = [np.asarray(value, dtype=np.float64) for value in inputs]
         # Python floats keep the arithmetic of shared scalars cheap.
@@ -151,17 +121,7 @@ class Kernel:
 
 
 def build_kernel(name: str, inputs: Sequence[Any], outputs: Sequence[Any], shapes: Sequence[tuple[int, ...]]) -> Kernel:
-    """Build a kernel from CasADi expressions.
-
-    Parameters
-    ----------
-    name : str
-        Name of the CasADi function.
-    inputs, outputs : sequences of casadi.SX
-        Symbols and expressions; an output's elements are laid out row-major over its shape.
-    shapes : sequence of tuple of int
-        Shape of every output.
-    """
+    """Build a kernel from CasADi symbols and expressions; elements of an output lie row-major over its shape."""
     import casadi as ca
 
     function = ca.Function(name, list(inputs), [ca.densify(ca.vec(ca.SX(output))) for output in outputs], {"cse": True})

@@ -24,10 +24,7 @@ _SQUARE_RTOL = 1e-9
 def to_opencv(distortion: str, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Camera matrix (3, 3) in pixels and coefficients k1, k2, p1, p2, k3 (5,) from x0, y0, f, k... in pixels.
 
-    Raises
-    ------
-    CameraError
-        For an inverse distortion model.
+    CameraError for an inverse distortion model.
     """
     model = get_model(distortion)
     if model.direction != "forward":
@@ -46,13 +43,7 @@ def to_opencv(distortion: str, theta: FloatArray) -> tuple[FloatArray, FloatArra
 def from_opencv(
     camera_matrix: ArrayLike, dist_coeffs: ArrayLike | None, distortion: str | None
 ) -> tuple[str, list[float]]:
-    """Distortion model and x0, y0, f, k... in pixels; see ``Camera.from_opencv``.
-
-    Raises
-    ------
-    CameraError
-        For fx != fy, skew, or coefficients that the distortion model cannot hold.
-    """
+    """Distortion model and x0, y0, f, k... in pixels; see ``Camera.from_opencv``."""
     x0, y0, f = _pinhole(np.asarray(camera_matrix, dtype=np.float64))
     dist = np.zeros(0) if dist_coeffs is None else np.asarray(dist_coeffs, dtype=np.float64).ravel()
     if not np.all(np.isfinite(dist)):

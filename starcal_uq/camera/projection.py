@@ -132,13 +132,8 @@ def bent_index(model_name: str) -> tuple[IntArray, IntArray]:
 def forward_kernel(model_name: str, order: str) -> Kernel:
     """Kernel of the forward model at phi = 0.
 
-    Parameters
-    ----------
-    model_name : str
-        Registry name.
-    order : {"value", "attitude", "first", "bent"}
-        Outputs: value (2,); with ``attitude`` also d/dphi (3, 2); with ``first`` also d/dtheta (p, 2) before it; with
-        ``bent`` also the second derivatives over (theta, phi) of `bent_index`, (n, 2).
+    `order` is "value" (2,); "attitude", also d/dphi (3, 2); "first", also d/dtheta (p, 2) before it; "bent", also the
+    second derivatives over (theta, phi) of `bent_index`, (n, 2).
     """
     import casadi as ca
 
@@ -206,22 +201,10 @@ def newton_kernel(model_name: str) -> Kernel:
 
 
 def solve_displacement(model_name: str, theta: FloatArray, target: FloatArray) -> FloatArray:
-    """Solve ``point + displacement(point) = target``.
+    """Offsets (2, n) from the principal point, px, that solve ``point + displacement(point) = target``.
 
-    Parameters
-    ----------
-    model_name : str
-        Registry name.
-    theta : (p,) array
-        Parameters x0, y0, f, k... in px units.
-    target : (2, n) array
-        Offsets from the principal point, px: the start, from which Newton's method converges monotonically for radial
-        distortion that does not fold.
-
-    Returns
-    -------
-    (2, n) array
-        Offsets in px; not finite where Newton's method meets a fold, but it may step over one (`before_fold`).
+    Newton's method starts from the target, whence it converges monotonically for radial distortion that does not fold.
+    Where it meets a fold they are not finite, but it may step over one (`before_fold`).
     """
     kernel = newton_kernel(model_name)
     n, point = target.shape[1], target
@@ -421,17 +404,7 @@ def _no_inverse(camera: Camera) -> DistortionError:
 
 
 def monotonic_expression(model_name: str, theta: Any, max_radius_px: float) -> Any:
-    """Jacobian determinants of the distortion over the field, as a CasADi vector that is positive without folds.
-
-    Parameters
-    ----------
-    model_name : str
-        Registry name.
-    theta : casadi.SX, (p,)
-        Parameters, px units.
-    max_radius_px : float
-        Radius of the field around the principal point.
-    """
+    """Jacobian determinants of the distortion up to a radius, px, as a CasADi vector that is positive without folds."""
     import casadi as ca
 
     if not get_model(model_name).coefficients:

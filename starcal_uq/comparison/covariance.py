@@ -55,20 +55,10 @@ def difference_rule(
     observations: tuple[Observations, Observations] | None,
     fingerprints: tuple[Fingerprints | None, Fingerprints | None] = (None, None),
 ) -> Rule:
-    """The rule for two calibrations or posteriors.
+    """The rule for two calibrations or posteriors with their labels.
 
-    Parameters
-    ----------
-    a, b : Calibration or Posterior
-        The estimates.
-    labels : (str, str)
-        Names of the two.
-    same_data : bool or None
-        True or False overrules what hashes and frames say.
-    observations : pair of Observations or None
-        The frames that each rests on, in which shared ones are then looked for.
-    fingerprints : pair of Fingerprints or None
-        Those of the frames of each, by which images that were measured anew are found as well.
+    `same_data` overrules what hashes and frames say. In the `observations`, the frames that each rests on, shared ones
+    are looked for; by `fingerprints` images that were measured anew are found as well.
     """
     data, seen = _relation(a, b, same_data, observations, fingerprints)
     if data == INDEPENDENT:

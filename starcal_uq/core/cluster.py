@@ -115,19 +115,8 @@ class Cluster:
 def cluster(scheduler: Scheduler = None, *, workers: int | None = None, caller: str = "") -> Iterator[Cluster]:
     """Processes to work with, which end with the block unless they are somebody else's.
 
-    Parameters
-    ----------
-    scheduler : str, Client or None
-        Address of a Dask scheduler, or a client of one, whose workers then do all; None for processes of this machine.
-    workers : int, optional
-        Processes of this machine: as many as processors by default (one without Dask); 0 or 1 stays in this one.
-    caller : str
-        Function that users call, for messages.
-
-    Raises
-    ------
-    ClusterError
-        When no scheduler answers, or processes cannot be started.
+    Those of a Dask scheduler (its address, or a client of one), or `workers` of this machine: as many as processors by
+    default (one without Dask); 0 or 1 stays in this one. `caller` is the function that users call, for messages.
     """
     if scheduler is None:
         if workers is None:  # the results are the same, and one process needs no Dask

@@ -12,19 +12,8 @@ from starcal_uq.core.errors import MissingExtraError
 def extra(name: str, what: str, instead: str = "") -> Iterator[None]:
     """For a block of imports: a library that is missing is named with the command that installs it.
 
-    Parameters
-    ----------
-    name : str
-        Extra of ``pyproject.toml`` that brings the library.
-    what : str
-        What needs it, in the plural, such as "FITS images".
-    instead : str
-        Another way out, an order, where there is one.
-
-    Raises
-    ------
-    MissingExtraError
-        If a library is not installed.
+    `name` is the extra of ``pyproject.toml`` that brings the library, `what` needs it, in the plural, such as "FITS
+    images", and `instead` is another way out, an order, where there is one.
     """
     try:
         yield

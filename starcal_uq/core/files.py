@@ -211,10 +211,7 @@ def unpack(packed: bytes) -> Iterator[bytes]:
 def read_parquet(source: Path | bytes, wanted: Collection[str] | None = None) -> pa.Table:
     """A Parquet file, or those of its columns that are wanted; one that cannot be what it declares is refused.
 
-    Raises
-    ------
-    ValueError, OSError, pyarrow.ArrowException
-        For a damaged file; the caller's `reading` makes a sentence of it.
+    The caller's `reading` makes a sentence of whatever is raised.
     """
     import pyarrow as pa
     from pyarrow import parquet

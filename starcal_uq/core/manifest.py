@@ -117,10 +117,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 def commit(folder: Path, manifest: Manifest, old: Collection[str]) -> Manifest:
     """Let the files in ``manifest.stage`` count, and remove those of `old` that are no more; all or nothing.
 
-    Raises
-    ------
-    RunFolderError
-        If a file is in the way that the run has not written.
+    Refused if a file is in the way that the run has not written.
     """
     for name in manifest.files:
         if name not in old and os.path.lexists(folder / name):
@@ -238,27 +235,10 @@ def making(
 ) -> Iterator[Path]:
     """Yield a folder for all results of a command; they take their places at once, if the block succeeds.
 
-    Until then `folder` holds the results of before. What the command has kept there on its way (`core.store.Kept`) goes
-    when the results are there.
-
-    Parameters
-    ----------
-    folder : path
-        Folder of the results, which is made; no other process can make results there.
-    command : str
-        Name of the command.
-    main : str
-        The result that versions without records always wrote.
-    force : bool
-        Whether to replace results of before.
-    also : sequence of str
-        Patterns of results that may be replaced without being recorded, because functions write them one by one.
-
-    Raises
-    ------
-    RunFolderError
-        If the folder holds something else, or another process makes results there; in the end, if a file is in the way
-        of a result, or the system refuses to write.
+    Until then `folder`, in which no other process can make results, holds the results of before. What the command has
+    kept there on its way (`core.store.Kept`) goes when the results are there. `main` is the result that versions
+    without records always wrote; `also` are patterns of results that may be replaced without being recorded, because
+    functions write them one by one.
     """
     place = Path(folder)
     with alone(place):
@@ -300,12 +280,7 @@ _writing: dict[tuple[int, int], int] = {}
 def alone(folder: PathLike, *, make: bool = True) -> Iterator[None]:
     """Refuse a folder into which another process writes; one that is killed leaves nothing locked.
 
-    Parameters
-    ----------
-    folder : path
-        The folder; one that was made for this is removed if it stays empty.
-    make : bool
-        Whether to make a folder that is missing; otherwise nothing is locked then.
+    A missing folder is made, and removed again if it stays empty; without `make` nothing is locked then.
     """
     if not (make or os.path.isdir(folder)):
         yield

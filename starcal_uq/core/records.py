@@ -38,24 +38,12 @@ _HALVES = re.compile("[\ud800-\udfff]")
 def to_plain(
     record: Any, arrays: Arrays | None = None, apart: Collection[str] | None = None, *, null: bool = False
 ) -> Any:
-    """A record as dictionaries, lists, numbers and text, for JSON.
+    """A record, or anything that a record may hold, as dictionaries, lists, numbers and text, for JSON.
 
-    Parameters
-    ----------
-    record : dataclass
-        The record, or anything that a record may hold.
-    arrays : dict, optional
-        Takes arrays under the names of their fields (``stages`` holds ``stage0_cost``, ``stage1_cost``...), which are
-        then left out of the result; by default arrays become lists.
-    apart : collection of str, optional
-        Fields whose arrays go there; all by default.
-    null : bool
-        Write NaN as None, because strict JSON has no other word for it; `from_plain` reads both.
-
-    Raises
-    ------
-    TypeError
-        For a value that no file of ours can hold.
+    `arrays` takes arrays under the names of their fields (``stages`` holds ``stage0_cost``, ``stage1_cost``...), or
+    those of the fields `apart` alone, which are then left out of the result; without it they become lists. `null`
+    writes NaN as None, because strict JSON has no other word for it; `from_plain` reads both. TypeError for a value
+    that no file of ours can hold.
     """
     return _Writer(arrays, apart, null).plain(record, "")
 
@@ -100,20 +88,8 @@ class _Writer:
 def from_plain(cls: type[Record], data: Any, arrays: Arrays | None = None) -> Record:
     """Inverse of `to_plain`.
 
-    Parameters
-    ----------
-    cls : type
-        Class of the record.
-    data : dict
-        What `to_plain` gave. A field that is missing has its default; a name that is a property of the class was
-        written for readers and is passed over.
-    arrays : dict, optional
-        What `to_plain` put there.
-
-    Raises
-    ------
-    ValueError, TypeError
-        For a field that is missing, unknown, or holds something else.
+    A field that is missing has its default; a name that is a property of the class was written for readers and is
+    passed over. ValueError or TypeError for a field that is missing, unknown, or holds something else.
     """
     made: Record = _value(cls, data, arrays or {}, "")
     return made

@@ -54,28 +54,17 @@ def run_tasks(
     Parameters
     ----------
     task : callable
-        From the number of a task to its result; sent once to every process. The result must depend on the number alone.
-    n_tasks : int
-        How many.
+        From the number of a task to its result, which depends on the number alone; sent once to every process.
     caller : str
         Function that users call, for messages.
     chunk : int
         Tasks sent to a process at once: about a second's work, which is also what Ctrl-C waits for.
     workers : int, optional
         Processes; 0 stays in this one, None takes as many as there are processors.
-    progress : callable, optional
-        Called as ``progress(done, total)``.
     each : callable, optional
         Called with every result as it arrives, in this process; what it keeps survives whatever comes later.
     kept : Kept, optional
         Results of an earlier call, which are not computed again, and to which each new one is added.
-
-    Raises
-    ------
-    SamplingError
-        If processes cannot be used.
-    KeyboardInterrupt
-        If Ctrl-C was pressed before the first result.
     """
     known: dict[int, T] = {} if kept is None else kept.results(n_tasks)
     results: Numbered[T] = list(known.items())

@@ -26,28 +26,11 @@ _ISO = re.compile(
 
 
 def julian_days(time_utc: Any, ut1_minus_utc_s: float = 0.0) -> tuple[FloatArray, FloatArray, IntArray]:
-    """Julian dates of the different times among some UTC times.
+    """Two-part Julian dates TT and UT1 (m, 2) of the different times among n, and which of them each time is (n,).
 
-    Parameters
-    ----------
-    time_utc
-        One UTC time or a sequence of n: ISO 8601 text ("2026-11-21T03:04:05.6", a trailing "Z" or an offset such as
-        "+02:00" is understood), `datetime.datetime` or `numpy.datetime64`. A time without an offset is UTC.
-    ut1_minus_utc_s
-        UT1 - UTC, seconds.
-
-    Returns
-    -------
-    tt, ut1 : ndarray, shape (m, 2)
-        Two-part Julian dates of the m different times; a table of observations repeats one time for every star of a
-        frame.
-    inverse : ndarray, shape (n,)
-        Which of them each time is.
-
-    Raises
-    ------
-    CatalogueError
-        A time is not readable; the message quotes it and gives its place among several, from 1.
+    A time is ISO 8601 text ("2026-11-21T03:04:05.6", a trailing "Z" or an offset such as "+02:00" is understood),
+    `datetime.datetime` or `numpy.datetime64`, UTC without an offset. CatalogueError quotes one that is not readable,
+    with its place among several, from 1.
     """
     times = np.atleast_1d(np.asarray(time_utc)).astype(str)
     unique, inverse = np.unique(times, return_inverse=True)
@@ -64,10 +47,7 @@ def julian_year(time_utc: Any) -> float:
 def utc_text(time: str) -> str:
     """One UTC time as tables hold it, YYYY-MM-DDTHH:MM:SS[.f]; an offset such as "+02:00" is taken out.
 
-    Raises
-    ------
-    CatalogueError
-        The time is not readable, or a date alone; the message quotes it.
+    CatalogueError quotes one that is not readable, or a date alone.
     """
     match = _ISO.fullmatch(time.strip())
     if match is not None and match[4] is None and match[7] is None:

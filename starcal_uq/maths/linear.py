@@ -14,19 +14,9 @@ _WORST_CONDITION = 1e13
 
 
 def inverse_symmetric(packed: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Invert symmetric 3 x 3 matrices given by their six unique entries.
+    """Inverses (3, 3, K) and determinants (K,) of symmetric matrices given by xx, xy, xz, yy, yz, zz (6, K).
 
-    Parameters
-    ----------
-    packed : (6, K) array
-        Entries xx, xy, xz, yy, yz, zz.
-
-    Returns
-    -------
-    inverse : (3, 3, K) array
-        Inverses; not finite where the matrix is singular.
-    determinant : (K,) array
-        Determinants.
+    Not finite where the matrix is singular.
     """
     xx, xy, xz, yy, yz, zz = packed
     a = yy * zz - yz * yz
@@ -73,13 +63,7 @@ def correlation_of(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def symmetric_inverse(matrix: FloatArray) -> FloatArray:
-    """Exactly symmetric inverse (p, p) of a covariance or a precision matrix.
-
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        For a diagonal that is not positive, or a singular matrix.
-    """
+    """Exactly symmetric inverse (p, p) of a covariance or a precision matrix; LinAlgError for a singular one."""
     if not np.all(np.diag(matrix) > 0.0):
         raise np.linalg.LinAlgError("the diagonal is not positive")
     correlation, sd = correlation_of(matrix)

@@ -28,19 +28,7 @@ _SPAN = 9.0
 def weighted_chi_square_tail(weights: FloatArray, x: float, dof: float = np.inf) -> float:
     """P(sum_j w_j z_j^2 > x), or P(... > x s) with s an independent chi-square over its `dof` degrees of freedom.
 
-    Parameters
-    ----------
-    weights : (r,) array
-        Not negative, not all zero.
-    x : float
-        Threshold.
-    dof : float
-        Degrees of freedom of the noise that scales the weights; infinite where the noise is known.
-
-    Raises
-    ------
-    ValueError
-        For negative weights, or none that is positive.
+    ValueError for weights (r,) that are negative, or none that is positive.
     """
     w = np.asarray(weights, dtype=np.float64)
     if np.any(w < 0.0) or not np.any(w > 0.0):

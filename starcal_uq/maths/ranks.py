@@ -31,34 +31,16 @@ def evaluation_points(n_values: int) -> int:
 
 
 def counts_below(ranks: IntArray, n_values: int) -> IntArray:
-    """Number of ranks below i / K for i = 1 .. K - 1.
-
-    Parameters
-    ----------
-    ranks : (n,) array of int
-        Values in 0 .. n_values - 1.
-    n_values : int
-        How many values a rank can take: one more than the number of draws.
-    """
+    """Number of ranks (n,), of 0 .. K - 1, below i / K for i = 1 .. K - 1; K is one more than the number of draws."""
     k = evaluation_points(n_values)
     edges = np.arange(1, k) * (n_values // k)
     return np.asarray(np.searchsorted(np.sort(ranks), edges, side="left"), dtype=np.int64)
 
 
 def uniformity_p_value(ranks: IntArray, n_values: int) -> float:
-    """Probability that uniform ranks come at least as near to a tail, anywhere, as these.
+    """Probability that uniform ranks (n,), of 0 .. n_values - 1, come at least as near to a tail, anywhere, as these.
 
-    Parameters
-    ----------
-    ranks : (n,) array of int
-        Values in 0 .. n_values - 1.
-    n_values : int
-        How many values a rank can take: one more than the number of draws.
-
-    Returns
-    -------
-    float
-        Exact for independent ranks; NaN without ranks.
+    Exact for independent ranks; NaN without ranks.
     """
     from scipy.stats import binom
 
@@ -74,19 +56,7 @@ def uniformity_p_value(ranks: IntArray, n_values: int) -> float:
 def uniformity_band(n: int, n_values: int, probability: float = 0.95) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Band that holds the whole empirical distribution of n uniform ranks with at least the given probability.
 
-    Parameters
-    ----------
-    n : int
-        Number of ranks.
-    n_values : int
-        How many values a rank can take: one more than the number of draws.
-    probability : float
-        Probability of staying inside at all points.
-
-    Returns
-    -------
-    z, lower, upper : (K - 1,) arrays
-        Points i / K, and the smallest and largest fraction of ranks below them.
+    Points z = i / K, and the smallest and largest fraction of ranks below them, (K - 1,) each, for ranks of 0 .. K - 1.
     """
     k = evaluation_points(n_values)
     inside, outside = 0.0, 0.5

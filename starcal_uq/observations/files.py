@@ -464,13 +464,7 @@ class ParquetSummary:
 
 
 def parquet_summary(path: Path, column: str) -> ParquetSummary:
-    """Rows, columns, metadata and the range of one column of whole numbers, from the end of the file.
-
-    Raises
-    ------
-    ObservationError
-        If it is no Parquet file.
-    """
+    """Rows, columns, metadata and the range of one column of whole numbers, from the end of the file."""
     with open_parquet(path) as file:
         schema, rows = file.schema_arrow, file.metadata
         names = tuple(schema.names)
@@ -567,18 +561,9 @@ def _csv_text(columns: Mapping[str, Any]) -> str:
 def write_partition(
     columns: Mapping[str, Any], named: Mapping[str, tuple[IntArray, StrArray]], meta: AnyDict, path: Path
 ) -> None:
-    """Write one Parquet file of a folder of partitions, atomically and quickly.
+    """Write one Parquet file of a folder of partitions, atomically and quickly; overwritten.
 
-    Parameters
-    ----------
-    columns : mapping
-        Columns (N,) of numbers.
-    named : mapping
-        Columns of texts: for each row its place (N,) in a list of different texts.
-    meta : dict
-        Metadata.
-    path : Path
-        File; overwritten.
+    `columns` (N,) are numbers; of texts, `named` has for each row its place (N,) in a list of different ones.
     """
     import pyarrow as pa
     from pyarrow import parquet

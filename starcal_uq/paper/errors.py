@@ -102,12 +102,7 @@ def map_error(truth: Camera, estimate: Camera, xy_px: FloatArray | None = None, 
     """Compare the directions that two cameras give to the same pixels, the best common rotation removed.
 
     At places `xy_px` (N, 2), such as those of stars, with equal weights; without them on a grid of `n` points along
-    each side of the detector, weighted by area.
-
-    Raises
-    ------
-    DistortionError
-        When the distortion of a camera folds over within these points.
+    each side of the detector, weighted by area. DistortionError when a distortion folds over within these points.
     """
     if xy_px is None:
         xy, weight = detector_grid(truth, n)
@@ -140,12 +135,7 @@ def undistorted(camera: Camera, xy_px: FloatArray, how: Undistortion = "model") 
 
     With `how` ``model`` as the camera's own distortion model says. The others take its first two coefficients as those
     of one equation of the paper: eq. 14 with r of the ideal point, which makes it implicit; eq. 14 with r of the
-    measured point; eq. 6.
-
-    Raises
-    ------
-    DistortionError
-        When the camera's own distortion folds over within these points.
+    measured point; eq. 6. DistortionError when the camera's own distortion folds over within these points.
     """
     xy = np.asarray(xy_px, dtype=np.float64).reshape(-1, 2)
     if how not in UNDISTORTIONS:
@@ -180,22 +170,10 @@ def reprojection_error_px(
 ) -> PointErrors:
     """The paper's reprojection error (eq. 16) under one of its readings.
 
-    Parameters
-    ----------
-    truth, estimate : Camera
-        Cameras.
-    xy_px, noise_px : (N, 2) arrays
-        Places where the true camera sees the stars, and centroid noise added before they are undistorted.
-    undistortion : {"model", "eq14", "eq14_measured", "eq6"}
-        Use of the estimated coefficients (`undistorted`).
-    optics : {"truth", "focal", "estimate"}
-        Origin of the ideal points of eq. 15, under the true attitude: f and principal point of Table 1, the estimated f
-        with the principal point of Table 1, or both estimated.
-
-    Raises
-    ------
-    DistortionError
-        When the distortion of a camera folds over within these points.
+    The true camera sees the stars at `xy_px` (N, 2), to which `noise_px` (N, 2) is added before they are undistorted
+    (`undistorted`) by the estimated coefficients. `optics` are the origin of the ideal points of eq. 15, under the true
+    attitude: f and principal point of Table 1, the estimated f ("focal") with the principal point of Table 1, or both
+    estimated. DistortionError when a distortion folds over within these points.
     """
     if optics not in OPTICS:
         raise ValueError(f"optics {optics!r} is unknown: use one of {', '.join(OPTICS)}.")

@@ -44,26 +44,11 @@ def depth_for(centroids: Centroids, camera: Camera) -> float:
 def identify_to_depth(
     centroids: Centroids, camera: Camera | None, year: float, max_mag: float | None = None, **options: Any
 ) -> tuple[StarCatalogue, Identification]:
-    """Identify with the embedded catalogue to the depth that the frames need.
+    """Identify with the embedded catalogue to the depth that the frames need; the stars searched for, and the result.
 
     A search at any focal length looks at each level of brightness once, and loads fainter stars only where brighter
-    ones are no answer.
-
-    Parameters
-    ----------
-    centroids, camera
-        As for `identify`.
-    year : float
-        Julian year of the star positions.
-    max_mag : float, optional
-        Magnitude limit, Gaia G; chosen by default.
-    **options
-        Those of `identify`.
-
-    Returns
-    -------
-    StarCatalogue, Identification
-        The stars that were searched for, and the result.
+    ones are no answer. `year` is the Julian year of the star positions, `max_mag` the limit in Gaia G, which is chosen
+    by default, and the options are those of `identify`.
     """
     from starcal_uq.identification.engine import identify
     from starcal_uq.sky.catalogue import load_catalogue

@@ -29,21 +29,9 @@ ToCatalogue: TypeAlias = Callable[[FloatArray, StrArray], FloatArray]
 def undisplaced(centroids: Centroids, obs: Observations, camera: Camera, to_catalogue: ToCatalogue) -> Centroids:
     """The same table with the centroids of identified frames moved to where the catalogue would have them.
 
-    Parameters
-    ----------
-    centroids : Centroids
-        Centroids as measured, counted as `obs` is.
-    obs : Observations
-        Identified stars with apparent directions and times.
-    camera : Camera
-        Calibrated with them.
-    to_catalogue : callable
-        Apparent directions (n, 3) and their times (n,) to catalogue directions (n, 3).
-
-    Returns
-    -------
-    Centroids
-        The frame's mean displacement stays in its attitude. Frames that are not in `obs` are as they were.
+    `obs` are identified stars with apparent directions and times, counted as the centroids are, and `to_catalogue`
+    makes catalogue directions (n, 3) of apparent ones (n, 3) and their times (n,). A frame's mean displacement stays in
+    its attitude; frames that are not in `obs` are as they were.
     """
     if obs.time_utc is None or not obs.n_stars:
         return centroids
@@ -66,15 +54,7 @@ def undisplaced(centroids: Centroids, obs: Observations, camera: Camera, to_cata
 
 
 def as_measured(obs: Observations, moved: Centroids, measured: Centroids) -> Observations:
-    """Observations made of moved centroids, with the places that were measured.
-
-    Parameters
-    ----------
-    obs : Observations
-        Identified among `moved`.
-    moved, measured : Centroids
-        Tables of the same centroids, row by row.
-    """
+    """Observations that were identified among moved centroids, with the places that were measured, row by row."""
     from scipy.spatial import cKDTree
 
     far = 10.0 * float(np.abs(np.concatenate([moved.x_px, moved.y_px, [1.0]])).max())

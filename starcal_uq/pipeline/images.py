@@ -201,24 +201,9 @@ def observations_from_centroids(
 ) -> tuple[Observations | None, Identification, ImageCalibration | None]:
     """What `observations_from_images` does with the centroids of its images.
 
-    Parameters
-    ----------
-    centroids : Centroids
-        Stars of all images.
-    camera, max_mag, epoch, directions, site, in_space, tell
-        As in `observations_from_images`.
-    identification : dict, optional
-        Options of `identify`.
-    known : Calibration or Posterior, optional
-        What is known of this camera, with which the stars are identified once.
-    lenient : bool
-        Whether stars that do not determine the camera are taken as they were identified first, and none is no error.
-
-    Returns
-    -------
-    Observations, Identification, ImageCalibration
-        The last identification; the first is None where no star was identified, the third where they were identified
-        once.
+    With what is `known` of this camera the stars are identified once. If `lenient`, stars that do not determine the
+    camera are taken as they were identified first, and none is no error. The last identification is returned; the
+    observations are None where no star was identified, the calibration where they were identified once.
     """
     from starcal_uq.pipeline.depth import depth_text, identify_to_depth
     from starcal_uq.pipeline.refine import identify_and_calibrate
@@ -309,19 +294,9 @@ def stated_site(centroids: Centroids) -> Site | None:
 
 
 def with_time(centroids: Centroids, time_utc: str | None) -> Centroids:
-    """Centroids with a time (UTC) for all frames whose images do not say it, be it in their header.
+    """Centroids with a time (UTC) for all frames whose images do not say it in their header; none for None.
 
-    Parameters
-    ----------
-    centroids : Centroids
-        Times from the names of files give way.
-    time_utc : str or None
-        Middle of the exposure; None leaves all as it is. An offset such as "+02:00" is taken out.
-
-    Raises
-    ------
-    CatalogueError
-        When the time is not readable, or a date alone.
+    Times from the names of files give way. An offset such as "+02:00" is taken out.
     """
     from starcal_uq.images.image import time_in_name_message
 
@@ -339,13 +314,7 @@ def with_time(centroids: Centroids, time_utc: str | None) -> Centroids:
 
 
 def of_one_size(centroids: Centroids) -> Centroids:
-    """The frames of the size that most images have; the others are left out, with their reason.
-
-    Parameters
-    ----------
-    centroids : Centroids
-        As `extract_centroids` gives them.
-    """
+    """The frames of the size that most images have; the others are left out, with their reason."""
     sizes = centroids.meta.get("other_sizes", {})
     if not sizes:
         return centroids

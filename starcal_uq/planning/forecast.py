@@ -293,14 +293,9 @@ class Forecaster:
         return mixture_radius(self._noise, self.confidence)
 
     def frames_needed(self, target_arcsec: float, share: float | None = None) -> int | None:
-        """Fewest frames whose radius is within a target; None where no number up to ten million is enough.
+        """Fewest frames whose radius (arcsec) is within a target; None where no number up to ten million is enough.
 
-        Parameters
-        ----------
-        target_arcsec : float
-            Two-axis error across the boresight at the confidence.
-        share : float, optional
-            Part of the campaigns that keep the target, such as 0.95; by default campaigns keep it on average.
+        `share` is the part of the campaigns that keep it, such as 0.95; by default campaigns keep it on average.
         """
         if self.floor_arcsec() >= target_arcsec:
             return None

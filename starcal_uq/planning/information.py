@@ -91,13 +91,9 @@ class FrameSet:
         return rest
 
     def seen_within(self, fraction: float) -> FloatArray:
-        """Information (M, p, p) when only stars in the middle of the detector are used.
+        """Information (M, p, p) of the stars in a middle part of the detector's area, a window of the detector's shape.
 
-        Parameters
-        ----------
-        fraction : float
-            Part of the detector's area, as a window of the detector's shape around its centre. A frame with fewer than
-            three stars in it has no information.
+        A frame with fewer than three stars in it has none.
         """
         centre = np.array(self.camera.centre_px)[:, None]
         half = 0.5 * np.sqrt(fraction) * np.array([[self.camera.width_px], [self.camera.height_px]])
@@ -112,13 +108,7 @@ class FrameSet:
 
 
 def look_at(stars: StarCatalogue, camera: Camera, rotations: FloatArray, noise: Noise, min_stars: int) -> FrameSet:
-    """The frames at given attitudes that show enough stars; the others are left out.
-
-    Raises
-    ------
-    PlanningError
-        When none shows `min_stars`.
-    """
+    """The frames at given attitudes that show enough stars; the others are left out, and none is an error."""
     views = Sky(stars, camera, EDGE_SIGMAS * largest_noise(noise, stars.mag, camera)).views(rotations)
     enough = np.array([len(seen) >= min_stars for seen, _ in views], dtype=np.bool_)
     if not enough.any():
@@ -134,26 +124,14 @@ def look_at(stars: StarCatalogue, camera: Camera, rotations: FloatArray, noise: 
 def random_frames(
     stars: StarCatalogue, camera: Camera, noise: Noise, *, n_frames: int, min_stars: int, seed: int
 ) -> FrameSet:
-    """Frames at uniformly random attitudes that show at least `min_stars` stars, as `simulate` takes them.
-
-    Raises
-    ------
-    CatalogueError
-        When the field is too narrow for the catalogue to show `min_stars`.
-    """
+    """Frames at uniformly random attitudes that show at least `min_stars` stars, as `simulate` takes them."""
     sky = Sky(stars, camera, EDGE_SIGMAS * largest_noise(noise, stars.mag, camera))
     rng = np.random.default_rng(seed)
     return _frame_set(stars, camera, *choose_attitudes(sky, rng, n_frames=n_frames, min_stars=min_stars), noise)
 
 
 def noise_of(noise: Noise, mag: FloatArray, pixel: FloatArray) -> FloatArray:
-    """Noise of stars with magnitudes (n,) at pixels (2, n), px per axis, (n,).
-
-    Raises
-    ------
-    PlanningError
-        When it is not positive and finite for every star.
-    """
+    """Noise of stars with magnitudes (n,) at pixels (2, n), px per axis, (n,); refused unless positive and finite."""
     if isinstance(noise, NoiseModel):
         return noise.at(pixel[0], pixel[1], mag)
     values = np.asarray(noise(mag), dtype=np.float64) if callable(noise) else np.full(mag.shape, float(noise))

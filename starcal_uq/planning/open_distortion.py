@@ -83,20 +83,8 @@ class DistortionRange:
 def open_range(camera: Camera, given: tuple[float, float] | None, calibrated: bool) -> tuple[float, float] | None:
     """Range of the displacement of the corner that is open, per cent; None where the distortion is known.
 
-    Parameters
-    ----------
-    camera : Camera
-        The sheet; coefficients that are not all zero are known.
-    given : (float, float), optional
-        Range that the user states; by default barrel distortion up to that of an f-theta lens, and as much
-        pincushion, as far as neither folds on the detector.
-    calibrated : bool
-        Whether the camera was calibrated.
-
-    Raises
-    ------
-    PlanningError
-        For a range that makes no sense, or one beside known coefficients.
+    It is known of a calibrated camera and from coefficients that are not all zero. Unless a range is given, it is
+    barrel distortion up to that of an f-theta lens, and as much pincushion, as far as neither folds on the detector.
     """
     stated = calibrated or not camera.coefficients or any(camera.coefficients)
     if given is None:
@@ -172,18 +160,9 @@ def distortion_range(
     options: dict[str, Any],
     seed: int,
 ) -> DistortionRange:
-    """Forecast over a range of distortions.
+    """Forecast over a range of distortions, `bounds` on the displacement of the corner, per cent.
 
-    Parameters
-    ----------
-    base : FrameSet
-        Frames of the plan, of a camera whose distortion lies in the range.
-    stars, noise, n_frames, min_stars, target_arcsec, scope, seed
-        As `starcal_uq.plan` has them.
-    bounds : (float, float)
-        Displacement of the corner, per cent.
-    options : dict
-        Further options of `Forecaster`.
+    `base` are frames of the plan, of a camera whose distortion lies in the range; `options` are those of `Forecaster`.
     """
     camera = base.camera
     percent = nodes(camera, bounds)

@@ -296,13 +296,7 @@ def _sky_fraction(stars: StarCatalogue, camera: Camera, noise: Noise, min_stars:
 
 
 def start_information(after: HasInformation | None, camera: Camera) -> FloatArray | None:
-    """Information (p, p) of data that are there already; None without.
-
-    Raises
-    ------
-    PlanningError
-        When they are about other parameters than the camera's.
-    """
+    """Information (p, p) of data that are there already; None without. Refused if about other parameters."""
     if after is None:
         return None
     start = np.asarray(after.information, dtype=np.float64)

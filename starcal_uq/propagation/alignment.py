@@ -33,21 +33,8 @@ def alignment_frames(
 ) -> tuple[Observations, str]:
     """The frames of an alignment, and what they are in words.
 
-    Parameters
-    ----------
-    post, obs : Posterior, Observations
-        The camera, and the frames whose numbers of stars a random sky takes.
-    alignment : Observations or str or None
-        Frames of the alignment; ``random`` (None) for a random sky, ``observed`` for `obs`.
-    n_frames : int or None
-        Number of random frames; 100 if it is not given.
-    seed : int
-        Draws the random sky.
-
-    Raises
-    ------
-    ObservationError
-        For another word, fewer than one frame, or a number of frames beside frames that are given.
+    ``random`` (None) is a random sky of `n_frames` (100) frames with the numbers of stars of `obs`, ``observed`` is
+    `obs`. ObservationError for another word, fewer than one frame, or a number of frames beside frames that are given.
     """
     if isinstance(alignment, Observations) or alignment == OBSERVED:
         if n_frames is not None:

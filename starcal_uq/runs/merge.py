@@ -104,22 +104,9 @@ def join_observations(
 
     The frame numbers of the first run stay, those of each further run are shifted to follow; ``meta["merged"]`` holds
     the shifts. An optional column that only some runs have is filled where it may have gaps, and left out otherwise.
-
-    Parameters
-    ----------
-    tables : sequence of Observations
-        One per run.
-    names : sequence of str
-        What the runs are called.
-    noise : sequence of float, optional
-        Noise of each run, px or a factor on what its stars state, to be written as their stated noise.
-    keep_shared : bool
-        Whether stars that two runs hold are let pass.
-
-    Raises
-    ------
-    CalibrationError
-        If a star of a frame is in two runs, only some state their noise, or directions are of different kinds.
+    `noise` of each run (px, or a factor on what its stars state) is written as their stated noise. A star of a frame
+    that is in two runs is refused unless `keep_shared`; so are tables of which only some state their noise, and
+    directions of different kinds.
     """
     kinds = {table.meta["directions"] for table in tables}
     if len(kinds) > 1:

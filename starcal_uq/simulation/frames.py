@@ -175,10 +175,7 @@ def choose_attitudes(
 ) -> tuple[FloatArray, list[tuple[IntArray, FloatArray]]]:
     """Attitudes (n, 3, 3), random or given, that show at least `min_stars` stars, and their `Sky.views`.
 
-    Raises
-    ------
-    CatalogueError
-        When a given attitude shows fewer stars, or random ones nearly always do.
+    CatalogueError when a given attitude shows fewer stars, or random ones nearly always do.
     """
     if attitudes is not None:
         frames = sky.views(attitudes)

@@ -18,19 +18,9 @@ def pattern_rotations(
 ) -> FloatArray:
     """Attitudes (n, 3, 3) of a pattern, R_cam_icrs.
 
-    Parameters
-    ----------
-    pattern : {"random", "stare", "roll", "raster", "scan"}
-        Anywhere; always the same; one place with the roll going once around; five by five places that are a quarter of
-        the field apart, in turn; or along a great circle with a tenth of the field from frame to frame.
-    n : int
-        Number of attitudes.
-    rng : Generator
-        Draws the place and its roll, or all attitudes of ``random``.
-    fov_deg : float
-        Width of the field, deg.
-    place : (3, 3) array, optional
-        Attitude that the pattern starts from, instead of a drawn one.
+    "random": anywhere; "stare": always the same; "roll": one place with the roll going once around; "raster": five by
+    five places that are a quarter of the field apart, in turn; "scan": along a great circle with a tenth of the field
+    from frame to frame. They start from an attitude `place` (3, 3), or from a drawn one.
     """
     if pattern == "random":
         return random_rotations(n, rng)

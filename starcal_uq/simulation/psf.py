@@ -20,14 +20,8 @@ def profiles(centre_px: FloatArray, sigma_px: float, kind: str) -> tuple[IntArra
     """Fractions of the light along one axis, around each of many centres (n,); a whole number is the centre of a pixel.
 
     `sigma_px` is that of the Gaussian before integration over pixels (which adds 1/12 px^2 to its square); the kind
-    ``sampled`` takes the density at each pixel's centre instead.
-
-    Returns
-    -------
-    first : (n,) array of int
-        The first pixel of each row.
-    fraction : (n, w) array
-        Fractions of the light in the pixels ``first + 0, 1, ..., w - 1``.
+    ``sampled`` takes the density at each pixel's centre instead. The first pixel of each row (n,), and the fractions
+    (n, w) in the pixels from there on.
     """
     reach = half_width_px(sigma_px)
     first = np.rint(centre_px).astype(np.int64) - reach

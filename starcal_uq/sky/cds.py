@@ -138,11 +138,6 @@ def read_cds(path: Path, kind: CdsFormat, readme: Path | None) -> StarCatalogue:
 
     Without a `readme`, the file "ReadMe" beside it is taken if it describes the needed columns, else the published
     layout.
-
-    Raises
-    ------
-    CatalogueError
-        Names the file, the line, the column and the remedy.
     """
     layout = _LAYOUTS[kind]
     lines = _text(path).split("\n")

@@ -65,11 +65,8 @@ def holds_proper_motion(records: GaiaRecords) -> bool:
 def completed_proper_motion(records: GaiaRecords, in_file: bool) -> tuple[FloatArray, BoolArray, FloatArray]:
     """Proper motions of records (n,): the file's where it has any at all, else those of the tables of this package.
 
-    Returns
-    -------
-    tuple of ndarray
-        Proper motion, mas/yr, right ascension times cos(dec), shape (n, 2); whether it is known, shape (n,); years
-        from the epoch of each position to J2016.0, shape (n,).
+    Proper motion (n, 2), mas/yr, right ascension times cos(dec); whether it is known (n,); years from the epoch of each
+    position to J2016.0 (n,).
     """
     motion, years = np.zeros((len(records), 2)), np.zeros(len(records))
     if in_file:

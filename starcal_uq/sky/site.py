@@ -155,12 +155,7 @@ class Site:
 
 
 def check_sky(directions: str | None, site: Site | None, in_space: bool) -> None:
-    """Refuse a site together with what contradicts it.
-
-    Raises
-    ------
-    SiteError
-    """
+    """Refuse a site together with what contradicts it."""
     if site is not None and in_space:
         raise SiteError("A camera in space has no site on the ground: give one or the other.")
     if site is not None and directions not in (None, "catalogue"):

@@ -124,12 +124,7 @@ def camera_of(base: Camera, settings: Mapping[str, Any]) -> Camera:
     """The camera of a cell.
 
     The distortion stays what it is in millimetres on the detector when pixels change, and in pixels when the focal
-    length does.
-
-    Raises
-    ------
-    StudyError
-        Where the settings make no camera: a distortion that folds over inside the field, or terms that cancel.
+    length does. StudyError for a distortion that folds over inside the field, or terms that cancel.
     """
     camera = base
     if "pixels" in settings:

@@ -216,18 +216,9 @@ class Sweep:
     def over(
         self, numbers: FloatArray, statistic: Statistic = "median", pooled: Sequence[str] = (), cells: Any = True
     ) -> FloatArray:
-        """A statistic of a number of every cell, over seeds, as an array over the axes; NaN where no cell has it.
+        """A statistic of a number (C,) of every cell, over seeds, as an array over the axes; NaN where no cell has it.
 
-        Parameters
-        ----------
-        numbers : (C,) array
-            One for each cell.
-        statistic : {"median", "low", "high", "mean", "count"}
-            What is taken over seeds.
-        pooled : sequence of str
-            Axes that count as seeds; the array has one value for them.
-        cells : (C,) array of bool, optional
-            Cells to count.
+        Axes `pooled` count as seeds; the array has one value for them. Of `cells` (C,), those that are true count.
         """
         shape = tuple(1 if axis in pooled else n for axis, n in zip(self.axes, self.shape, strict=True))
         numbers = np.asarray(numbers, dtype=np.float64)
@@ -301,22 +292,11 @@ class Sweep:
     def lines(
         self, numbers: FloatArray, along: str, by: str | None = None, at: Mapping[str, Any] | None = None
     ) -> Lines:
-        """A number of every cell along an axis, a line for every value of another one, all others held.
+        """A number (C,) of every cell along an axis, a line for every value of another one, all others held.
 
-        Parameters
-        ----------
-        numbers : (C,) array
-            One for each cell.
-        along, by : str
-            Axes; without `by` there is one line.
-        at : dict, optional
-            Values of other axes; those that are not given are held at the middle one of their values (where most
-            cells have numbers), and what was drawn from a Latin hypercube is not held at all.
-
-        Raises
-        ------
-        ValueError
-            For a name that is no axis, or a value that an axis does not have.
+        They are held `at` values, by default at the middle one of theirs (where most cells have numbers); what was
+        drawn from a Latin hypercube is not held at all. ValueError for a name that is no axis, or a value that an axis
+        does not have.
         """
         held = self.held(along, by, at)
         cells = self._cells(held)
@@ -363,13 +343,7 @@ class Sweep:
     def pooled(
         self, numbers: FloatArray, along: str, at: Mapping[str, Any] | None = None, statistic: Statistic = "median"
     ) -> FloatArray:
-        """A statistic of a number at every value of an axis, over seeds and all axes that `at` does not hold.
-
-        Raises
-        ------
-        ValueError
-            As `lines` does.
-        """
+        """A statistic of a number at every value of an axis, over seeds and all axes that `at` does not hold."""
         self._check(along)
         others = [axis for axis in self.axes if axis != along]
         return self.over(numbers, statistic, others, self._cells(at or {})).ravel()

@@ -308,10 +308,7 @@ def weights_of(cell: Cell) -> str:
 def take_frames(key: GeometryKey, heaven: Heaven, most: int) -> Geometry:
     """Frames of a geometry; `most` limits those of random attitudes that serve many campaigns.
 
-    Raises
-    ------
-    StudyError
-        When the catalogue cannot fill them.
+    StudyError when the catalogue cannot fill them.
     """
     depth = heaven.depth(key.max_mag)
     window = _Views(depth, key.camera, key.max_mag, key.margin_px)
@@ -397,17 +394,10 @@ class Statements:
 
 
 def statements(geometry: Geometry, noise_px: FloatArray, offset_px: float = 0.0) -> Statements:
-    """What the frames of a geometry say.
+    """What the frames of a geometry say with centroid noise (N,), px per axis.
 
-    Parameters
-    ----------
-    geometry : Geometry
-        The frames.
-    noise_px : (N,) array
-        Centroid noise, px per axis.
-    offset_px : float
-        Error of a star's direction, px at the boresight per axis, the same in all of its images; images are weighed by
-        both together.
+    `offset_px` is the error of a star's direction, px at the boresight per axis, the same in all of its images; images
+    are weighed by both together.
     """
     frames = geometry.frames(np.hypot(noise_px, offset_px))
     camera = geometry.camera
