@@ -219,8 +219,8 @@ def refine(
             status = Status.NOT_FINITE
             break
         costs.append(-2.0 * state.value)
-        likelihood.rotations = state.rotations
         found = likelihood.information(theta, state, sigma)
+        likelihood.follow(theta, state, found)
         if is_singular(found.reweighted):
             status = Status.SINGULAR
             break
@@ -235,6 +235,8 @@ def refine(
         theta = _volume_step(likelihood, theta, sigma, nu)
         trajectory[-1] = theta
     state = likelihood.state(theta, sigma, nu)
+    information = likelihood.information(theta, state, sigma)
+    likelihood.follow(theta, state, information)
     costs.append(-2.0 * state.value)
     trajectory, costs = trajectory[: len(costs)], costs[: len(trajectory)]
     stage = Stage("refinement", np.array(trajectory), np.array(costs), status, evaluations, perf_counter() - began)
@@ -248,7 +250,7 @@ def refine(
         nu=nu,
         sigma_std=float(sigma * errors[0]),
         nu_std=float((nu - DOF_RANGE[0]) * errors[1]) if free else 0.0,
-        information=likelihood.information(theta, state, sigma),
+        information=information,
     )
 
 

@@ -34,8 +34,8 @@ DEFAULT_DOF = 4.0
 _ATTITUDE_STEPS = 60
 # Expected gain of a further attitude step in any frame, nat; it is added to the value, so that its square remains.
 _GAIN = 1e-7
-# What is good enough where doubtful stars make the steps slow, nat.
-_ENOUGH = 1e-4
+# What is good enough after so many steps: where one maximum is about to vanish into another, they get very slow.
+_ENOUGH, _SLOW_STEPS = 1e-4, 12
 # A frame takes Newton's step where that promises less than this, nat, and the slower step that never overshoots before.
 _NEWTON_GAIN = 1.0
 # Share of the reweighted determinant below which the observed curvature is not one (few stars, all of them doubtful).
@@ -43,6 +43,8 @@ _CURVED = 1e-2
 # Stars whose ideal place lies this many times farther out than any measured one cannot be in the field: they are no
 # tail of the noise, a polynomial distortion knows nothing of them, and they are left out.
 _OUT_OF_FIELD = 1.5
+# Points are evaluated together as long as their stars are no more than these: their columns then stay in the cache.
+_STARS_AT_ONCE = 8192
 
 
 def parse_dof(dof: float | str | None, error: type[StarcalError]) -> float | None:
@@ -138,30 +140,28 @@ class StudentLikelihood:
         rotations: FloatArray,
         usable: BoolArray | None = None,
     ) -> None:
-        self.frames, self.model_name, self.rotations = frames, model_name, rotations
+        self.frames, self.model_name = frames, model_name
         offset = frames.pixel - theta[:2, None]
         far = _OUT_OF_FIELD * float(np.max(np.hypot(offset[0], offset[1])))
         # Decided once: a star that came and went with theta would make the likelihood jump.
         self._seen = frames.rotated(rotations)[2] > 1.0 / np.hypot(1.0, far / theta[2])
         if usable is not None:
             self._seen &= usable
+        self._origin, self._rotations, self._turns = theta, rotations, np.zeros((3, len(theta), frames.n_frames))
+        self._copies = frames
+
+    def follow(self, theta: FloatArray, state: StudentState, information: Information) -> None:
+        """Start later searches at the attitudes that follow, to first order, from those of a state at theta.
+
+        A frame with doubtful stars can have several attitudes that are maxima: searches from afar end now in one and
+        now in another, and the likelihood jumps.
+        """
+        self._origin, self._rotations, self._turns = theta, state.rotations, information.turns
 
     def state(self, theta: FloatArray, sigma: float, nu: float) -> StudentState:
         """Find the best attitudes at theta (p,), sigma (px or factor) and nu."""
-        # Its square may overflow, which NumPy's numbers do without an error.
-        rotations, sigma = self.rotations, np.float64(sigma)
-        with np.errstate(all="ignore"):
-            for _ in range(_ATTITUDE_STEPS):
-                state, step, gain = self._step(theta, sigma, nu, rotations)
-                largest = float(np.max(gain))
-                if not np.isfinite(largest):
-                    break
-                if largest < _GAIN:
-                    return state
-                rotations = exp_rotation(step.T) @ rotations
-            if largest < _ENOUGH:
-                return state
-        return replace(state, value=-np.inf)
+        values, state = self._search(theta[None], np.array([sigma]), np.array([nu]))
+        return replace(state, value=float(np.sum(values)))
 
     def log_likelihood(self, theta: FloatArray, sigma: float, nu: float) -> float:
         """Log likelihood at one point."""
@@ -169,44 +169,75 @@ class StudentLikelihood:
 
     def by_frame(self, theta: FloatArray, sigma: float, nu: float) -> FloatArray:
         """Log likelihood (K,) of every frame at one point; their sum is `log_likelihood`."""
-        state = self.state(theta, sigma, nu)
-        loss = np.log1p(np.sum(state.e * state.e, axis=0) / (nu * sigma**2))
-        dof = 2.0 * self.frames.sum(state.seen.astype(np.float64)) - 3.0 * (state.inverse[0, 0] > 0.0)
-        sign, log_volume = np.linalg.slogdet(np.moveaxis(state.inverse, 2, 0))
-        values: FloatArray = -0.5 * (nu + 2.0) * self.frames.sum(np.where(state.seen, loss, 0.0)) - dof * np.log(sigma)
-        return np.where(np.isfinite(state.value), values + 0.5 * np.where(sign > 0.0, log_volume, 0.0), -np.inf)
+        values: FloatArray = self._search(theta[None], np.array([sigma]), np.array([nu]))[0][0]
+        return values
 
     def many(self, theta: FloatArray, sigma: FloatArray, nu: FloatArray) -> FloatArray:
         """Log likelihood (n,) at theta (n, p), sigma (n,) and nu (n,)."""
-        points = zip(theta, sigma, nu, strict=True)
-        return np.array([self.log_likelihood(t, float(s), float(v)) for t, s, v in points])
+        n = max(1, _STARS_AT_ONCE // self.frames.n_stars)
+        parts = [slice(i, i + n) for i in range(0, len(theta), n)]
+        return np.concatenate([self._search(theta[i], sigma[i], nu[i])[0].sum(axis=1) for i in parts])
+
+    def _search(self, theta: FloatArray, sigma: FloatArray, nu: FloatArray) -> tuple[FloatArray, StudentState]:
+        """Log likelihood (n, K) at the best attitudes of n points, and the model of the points that took longest."""
+        k, left = self.frames.n_frames, np.arange(len(theta))
+        values = np.full((len(theta), k), -np.inf)
+        # Squares of sigma may overflow.
+        with np.errstate(all="ignore"):
+            turn = np.einsum("ipk,np->nki", self._turns, theta - self._origin).reshape(-1, 3)
+            rotations = exp_rotation(turn) @ np.tile(self._rotations, (len(left), 1, 1))
+            for number in range(_ATTITUDE_STEPS):
+                value, state, step, gain = self._step(theta[left], sigma[left], nu[left], rotations)
+                largest = gain.reshape(-1, k).max(axis=1)
+                good = largest < (_GAIN if number < _SLOW_STEPS else _ENOUGH)
+                values[left[good]] = value.reshape(-1, k)[good]
+                on = np.isfinite(largest) & ~good
+                if not on.any():
+                    break
+                moving = np.repeat(on, k)
+                left, rotations = left[on], exp_rotation(step.T[moving]) @ rotations[moving]
+        return values, state
+
+    def _copied(self, n: int) -> StarFrames:
+        """The frames n times over."""
+        k = self.frames.n_frames
+        if self._copies.n_frames < n * k:
+            self._copies = StarFrames.joined([self.frames] * n)
+        return self._copies if self._copies.n_frames == n * k else self._copies.part(0, n * k)
 
     def _step(
-        self, theta: FloatArray, sigma: float, nu: float, rotations: FloatArray
-    ) -> tuple[StudentState, FloatArray, FloatArray]:
-        """The model at given attitudes, the next step (3, K), and the gain (K,) that it promises."""
-        frames = self.frames
+        self, theta: FloatArray, sigma: FloatArray, nu: FloatArray, rotations: FloatArray
+    ) -> tuple[FloatArray, StudentState, FloatArray, FloatArray]:
+        """Log likelihood (nK,) and model of n points at given attitudes, the next step (3, nK), the gain (nK,) of it.
+
+        Stars and frames are those of the first point, then those of the second, and so on.
+        """
+        n, k, frames = len(theta), self.frames.n_frames, self._copied(len(theta))
+        if n == 1:
+            # Numbers that all stars share keep arithmetic cheap.
+            point, scale, frame_scale, freedom = theta[0], sigma[0], sigma[0], nu[0]
+        else:
+            point, scale, freedom = (np.repeat(x.T, self.frames.n_stars, axis=-1) for x in (theta, sigma, nu))
+            frame_scale = np.repeat(sigma, k)
         b = frames.rotated(rotations)
         xy, a = forward_kernel(self.model_name, "attitude")(
-            frames.n_stars, theta, b, forward_root(self.model_name, theta, b)
+            frames.n_stars, point, b, forward_root(self.model_name, point, b)
         )
         e = frames.pixel - xy
-        seen = self._seen & np.isfinite(e).all(axis=0)
+        seen = np.tile(self._seen, n) & np.isfinite(e).all(axis=0)
         if not seen.all():
             e[:, ~seen], a[..., ~seen] = 0.0, 0.0
         if frames.weight is not None:
             e *= frames.weight
             a *= frames.weight
-        square = np.sum(e * e, axis=0)
-        scaled = square / sigma**2
-        weight = (nu + 2.0) / (nu + scaled)
-        radial = 2.0 * weight / (nu * sigma**2 + square)
-        d = np.sum(a * e, axis=1)
+        square = _dot(e, e)
+        scaled = square / scale**2
+        weight = (freedom + 2.0) / (freedom + scaled)
+        radial = 2.0 * weight / (freedom * scale**2 + square)
+        d = np.stack([_dot(along, e) for along in a])
         slope = frames.sum(weight * d)
-        full = np.stack([weight * np.sum(a[i] * a[j], axis=0) for i, j in zip(ROWS, COLUMNS, strict=True)])
-        lacking = np.stack([radial * d[i] * d[j] for i, j in zip(ROWS, COLUMNS, strict=True)])
-        reweighted = frames.sum(full)
-        observed = reweighted - frames.sum(lacking)
+        reweighted = frames.sum(np.stack([weight * _dot(a[i], a[j]) for i, j in zip(ROWS, COLUMNS, strict=True)]))
+        observed = reweighted - frames.sum(_lacking(radial, d))
         safe, safe_determinant = inverse_symmetric(reweighted)
         inverse, determinant = inverse_symmetric(observed)
         xx, xy_, _, yy, _, _ = observed
@@ -214,8 +245,7 @@ class StudentLikelihood:
         if not curved.all():
             # Doubtful stars bend the cost the other way: they are counted as flat, in frames that need it.
             flat = np.minimum(radial, weight / np.maximum(square, np.finfo(float).tiny))
-            lacking = np.stack([flat * d[i] * d[j] for i, j in zip(ROWS, COLUMNS, strict=True)])
-            milder, milder_determinant = inverse_symmetric(reweighted - frames.sum(lacking))
+            milder, milder_determinant = inverse_symmetric(reweighted - frames.sum(_lacking(flat, d)))
             usable = ~curved & (milder_determinant > _CURVED * safe_determinant)
             inverse = np.where(usable, milder, inverse)
             determinant = np.where(usable, milder_determinant, determinant)
@@ -224,18 +254,18 @@ class StudentLikelihood:
         fixed = safe_determinant > 0.0
         inverse = np.where(fixed, np.where(curved, inverse, safe), 0.0)
         step = np.einsum("ijk,jk->ik", inverse, slope)
-        gain = 0.5 * np.sum(step * slope, axis=0) / sigma**2
+        gain = 0.5 * np.sum(step * slope, axis=0) / frame_scale**2
         wild = fixed & ~(gain < _NEWTON_GAIN)
         if wild.any():
             step[:, wild] = np.einsum("ijk,jk->ik", safe[..., wild], slope[:, wild])
         seen &= frames.spread(fixed.astype(np.float64)) > 0.0
         weight, radial = np.where(seen, weight, 0.0), np.where(seen, radial, 0.0)
-        loss = 0.5 * (nu + 2.0) * float(np.sum(np.log1p(scaled[seen] / nu)))
-        volume = np.where(fixed, np.where(curved, determinant, safe_determinant), 1.0)
-        log_volume = -0.5 * float(np.sum(np.log(volume)))
-        state = StudentState(0.0, log_volume, rotations, b, e, a, weight, radial, inverse, seen)
-        value = float(np.sum(gain)) - loss - state.dof * np.log(sigma) + log_volume
-        return replace(state, value=value), step, gain
+        loss = frames.sum(np.where(seen, 0.5 * (freedom + 2.0) * np.log1p(scaled / freedom), 0.0))
+        log_volume = -0.5 * np.log(np.where(fixed, np.where(curved, determinant, safe_determinant), 1.0))
+        dof = 2.0 * frames.sum(seen.astype(np.float64)) - 3.0 * fixed
+        value: FloatArray = gain - loss - dof * np.log(frame_scale) + log_volume
+        state = StudentState(0.0, float(np.sum(log_volume)), rotations, b, e, a, weight, radial, inverse, seen)
+        return value, state, step, gain
 
     def derivatives(self, theta: FloatArray, state: StudentState) -> FloatArray:
         """Derivative (p, 2, N) of the whitened prediction with respect to theta at fixed attitudes."""
@@ -264,7 +294,7 @@ class StudentLikelihood:
             matrix=0.5 * (matrix + matrix.T) / sigma**2,
             reweighted=reweighted / sigma**2,
             variability=star_scores @ star_scores.T / sigma**4,
-            rotation_per_theta=-np.mean(response, axis=2),
+            turns=-response,
             attitude_noise=np.mean(state.inverse, axis=2) * sigma**2,
         )
 
@@ -283,8 +313,8 @@ class Information:
         Information if the weights were known; never smaller, and always positive.
     variability : (p, p) array
         Sum over stars of the outer products of their scores.
-    rotation_per_theta : (3, p) array
-        Mean over frames of d(attitude) / d(theta), rad per px unit.
+    turns : (3, p, K) array
+        d(best attitude) / d(theta) of every frame, rad per px unit.
     attitude_noise : (3, 3) array
         Mean over frames of the attitude covariance, rad^2.
     """
@@ -293,5 +323,19 @@ class Information:
     matrix: FloatArray
     reweighted: FloatArray
     variability: FloatArray
-    rotation_per_theta: FloatArray
+    turns: FloatArray
     attitude_noise: FloatArray
+
+    @property
+    def rotation_per_theta(self) -> FloatArray:
+        """Mean (3, p) of `turns` over the frames."""
+        return np.asarray(np.mean(self.turns, axis=2))
+
+
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    return np.asarray(a[0] * b[0] + a[1] * b[1])
+
+
+def _lacking(radial: FloatArray, d: FloatArray) -> FloatArray:
+    """What the observed curvature of attitudes lacks of the reweighted one, per star (6, N)."""
+    return np.stack([radial * d[i] * d[j] for i, j in zip(ROWS, COLUMNS, strict=True)])

@@ -176,8 +176,11 @@ class _Frames:
         self._near = self.gaussian.sums(post.camera.theta)[1]
         self.student: StudentLikelihood | None = None
         if post.diagnostics.likelihood == _STUDENT:
-            theta, rotations = post.camera.theta, self.reference.rotations
-            self.student = StudentLikelihood(self.frames, self.model, theta, rotations)
+            theta, sigma = post.camera.theta, float(np.mean(post.draws[:, -1]))
+            nu = float(np.mean(post.dof_draws if post.dof_draws is not None else post.provenance["settings"]["dof"]))
+            self.student = StudentLikelihood(self.frames, self.model, theta, self.reference.rotations)
+            state = self.student.state(theta, sigma, nu)
+            self.student.follow(theta, state, self.student.information(theta, state, sigma))
 
     def profile(self, theta: FloatArray) -> Any:
         return self.gaussian.profile(theta, self._near.at(theta))[0]
