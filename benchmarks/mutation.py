@@ -1,15 +1,16 @@
 """Do the tests notice when the mathematics is changed? Mutation testing by one command.
 
-    python benchmarks/mutation.py [--subject NAME ...] [--number N] [--seed 1] [--again] [--show] [--write]
+    python benchmarks/mutation.py [--seed N] [--subject NAME ...] [--again] [--show] [--write]
 
-A mutant is one small change of the source: a sign, a comparison, a constant, a transpose. Of all mutants of a subject
-some are drawn by the seed: one of each function, and beyond that a second of each; a larger number holds a smaller
-one. Each is given to the tests that reach its line, in a
-process of its own; it is killed when one of them fails. What was tried is kept in `.bench/mutation`;
-``--again`` tries those that survived, after tests were strengthened. ``--show`` prints survivors as differences,
-``--write`` puts the table into the documentation (`docs/explanation/reliability.md`).
+A mutant is one small change of the source: a sign, a comparison, a constant, a transpose. A seed draws one of each
+function of a subject; a later seed leaves out what those before it draw, so its first result is of changes that no test
+was written against. Each is given to the fast tests that reach its line, in a process of its own; it is killed when one
+of them fails. What was drawn and tried is kept in `.bench/mutation`, so a run that is stopped goes on; without
+``--seed`` nothing new is tried. ``--again`` tries those that survived, after tests were strengthened. ``--show`` prints
+survivors as differences, ``--write`` puts the table of all draws into `docs/explanation/reliability.md`.
 
-Only the tests that reach a line are run for it, in a process that is forked after the heavy libraries are loaded.
+A subject's tests are collected once. Each mutant is a fork of that process in which the one function gets its changed
+code; what stands outside functions is imported anew.
 
 Not mutated, because no test should care: sentences, annotations, decorators, what follows ``raise``, sizes of blocks,
 seeds, and -1 where it stands for the last axis of two or for a size to be found. `estimation/loops` is left out: its
@@ -21,23 +22,31 @@ from __future__ import annotations
 import argparse
 import ast
 import difflib
+import gc
 import hashlib
 import importlib
 import importlib.abc
 import importlib.machinery
+import inspect
 import json
+import math
 import os
 import re
 import resource
 import signal
+import subprocess
 import sys
 import time
+import traceback
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from types import CodeType, FrameType
+from types import CodeType, FrameType, FunctionType
 from typing import Any
+
+import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 OUT = ROOT / ".bench" / "mutation"
@@ -58,16 +67,12 @@ SUBJECTS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "budget": (("budgeting/*.py",), ("budgeting",)),
     "inference": (("inference/*.py",), ("inference",)),
 }
-HEAVY = (
-    *("numpy", "scipy.linalg", "scipy.optimize", "scipy.stats", "scipy.special", "scipy.spatial", "scipy.interpolate"),
-    *("casadi", "emcee", "arviz", "pandas", "pyarrow.parquet", "astropy.table", "pydantic", "hypothesis", "openpyxl"),
-    *("jinja2", "matplotlib.pyplot", "xarray", "dask", "rich", "typer"),
-)
 # A mutant may take this many times what its tests take, and this long beside, of the processor's time.
 SLOWER, BESIDE_S = 5.0, 20.0
 # Tests of a mutant take at most this long (s) without it: the quickest files that reach the line.
 LONGEST_S = 60.0
-FIRST = 5
+# Exit status of a fork that came to no result.
+BROKEN = 97
 
 COMPARISONS = {ast.Lt: ">=", ast.LtE: ">", ast.Gt: "<=", ast.GtE: "<", ast.Eq: "!=", ast.NotEq: "=="}
 COMPARISONS |= {ast.Is: "is not", ast.IsNot: "is", ast.In: "not in", ast.NotIn: "in"}
@@ -308,18 +313,16 @@ def functions(found: Iterable[Mutant]) -> int:
     return len({(mutant.file, mutant.function) for mutant in found})
 
 
-def sampled(subject: str, number: int | None, seed: int) -> tuple[list[Mutant], dict[str, str], list[Mutant]]:
-    """Some mutants of a subject in the order of the source, the text of each file, and all mutants."""
-    texts = {file: (ROOT / file).read_text("utf-8") for file in files_of(subject)}
-    everything = [mutant for file in texts for mutant in mutants(file)]
-    drawn = sorted(everything, key=lambda m: hashlib.sha256(f"{seed} {key(m, texts[m.file])}".encode()).digest())
-    turns = Counter[tuple[str, str]]()
-    ranks = []
-    for mutant in drawn:
-        ranks.append(turns[mutant.file, mutant.function])
-        turns[mutant.file, mutant.function] += 1
-    drawn = [mutant for _, mutant in sorted(zip(ranks, drawn, strict=True), key=lambda pair: pair[0])]
-    return sorted(drawn[: number or len(turns)], key=lambda m: (m.file, m.start)), texts, everything
+def drawn(found: dict[str, Mutant], seed: int, before: Iterable[str] = ()) -> list[str]:
+    """Keys of the mutants that a seed draws, in the order of the source; without those `before` and of lower seeds."""
+    chosen: dict[tuple[str, str], str] = {}
+    gone = {*before}
+    for turn in range(1, seed + 1):
+        gone |= {*chosen.values()}
+        chosen = {}
+        for name in sorted({*found} - gone, key=lambda name: hashlib.sha256(f"{turn} {name}".encode()).digest()):
+            chosen.setdefault((found[name].file, found[name].function), name)
+    return sorted(chosen.values(), key=lambda name: (found[name].file, found[name].start))
 
 
 class Changed(importlib.abc.MetaPathFinder, importlib.machinery.SourceFileLoader):
@@ -346,7 +349,9 @@ class Reached:
     def __init__(self, files: list[str]) -> None:
         self.files = {str(ROOT / file): file for file in files}
         self.tests: dict[str, dict[str, Any]] = {}
-        self.lines: set[tuple[str, int]] = set()
+        self.lines = set[tuple[str, int]]()
+        # What a fixture reaches counts for all tests that ask for it.
+        self.fixtures: dict[Any, set[tuple[str, int]]] = {}
 
     def local(self, frame: FrameType, event: str, argument: Any) -> Any:
         self.lines.add((self.files[frame.f_code.co_filename], frame.f_lineno))
@@ -355,19 +360,30 @@ class Reached:
     def trace(self, frame: FrameType, event: str, argument: Any) -> Any:
         return self.local if frame.f_code.co_filename in self.files else None
 
-    def pytest_runtest_protocol(self, item: Any, nextitem: Any) -> None:
-        self.lines, self.began = set(), time.process_time()
-        sys.settrace(self.trace)
+    @pytest.hookimpl(wrapper=True)
+    def pytest_fixture_setup(self, fixturedef: Any) -> Any:
+        before, self.lines = self.lines, set()
+        try:
+            return (yield)
+        finally:
+            self.fixtures[fixturedef] = self.lines
+            self.lines = self.lines | before
 
-    def pytest_runtest_logfinish(self, nodeid: str, location: Any) -> None:
-        sys.settrace(None)
-        self.tests[nodeid] = {"seconds": time.process_time() - self.began, "lines": sorted(self.lines)}
+    @pytest.hookimpl(wrapper=True)
+    def pytest_runtest_protocol(self, item: Any) -> Any:
+        self.lines, began = set(), time.process_time()
+        sys.settrace(self.trace)
+        try:
+            return (yield)
+        finally:
+            sys.settrace(None)
+            asked = (found for several in item._fixtureinfo.name2fixturedefs.values() for found in several)
+            lines = self.lines.union(*(self.fixtures.get(fixture, ()) for fixture in asked))
+            self.tests[item.nodeid] = {"seconds": time.process_time() - began, "lines": sorted(lines)}
 
 
 def quiet_pytest(arguments: list[str], log: Path, plugins: list[Any]) -> int:
     """Run pytest in this process, its output into a file."""
-    import pytest
-
     output = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
     os.dup2(output, 1)
     os.dup2(output, 2)
@@ -375,25 +391,28 @@ def quiet_pytest(arguments: list[str], log: Path, plugins: list[Any]) -> int:
     return int(pytest.main([*options, *arguments], plugins))
 
 
-def forked(work: Any, seconds: float) -> str:
-    """What became of `work()` in a process of its own: its exit status, or ``timeout``."""
+def forked(work: Callable[[], int], seconds: float = 0.0) -> str:
+    """What became of `work()` in a process of its own, of so much processor time: its status, or ``timeout``."""
     process = os.fork()
     if process == 0:
-        status = 97
+        status = BROKEN
         try:
-            os.setsid()
-            resource.setrlimit(resource.RLIMIT_CPU, (int(seconds) + 1, int(seconds) + 5))
-            resource.setrlimit(resource.RLIMIT_AS, (12 << 30, 12 << 30))
+            if seconds:
+                os.setsid()
+                resource.setrlimit(resource.RLIMIT_CPU, (int(seconds) + 1, int(seconds) + 5))
+                resource.setrlimit(resource.RLIMIT_AS, (12 << 30, 12 << 30))
             status = work()
+        except Exception:
+            traceback.print_exc()
         finally:
             os._exit(status)
     # A process that waits for something that never comes uses no processor.
-    end = time.monotonic() + 20.0 * seconds
+    end = time.monotonic() + (20.0 * seconds or math.inf)
     while time.monotonic() < end:
         found, status = os.waitpid(process, os.WNOHANG)
         if found:
             return "timeout" if os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGXCPU else str(status)
-        time.sleep(0.02)
+        time.sleep(0.01)
     os.killpg(process, signal.SIGKILL)
     os.waitpid(process, 0)
     return "timeout"
@@ -404,26 +423,10 @@ def digest(*paths: Path) -> str:
     return hashlib.sha256(b"".join(path.read_bytes() for path in sorted(paths))).hexdigest()[:16]
 
 
-def reach(subject: str) -> dict[str, dict[str, Any]]:
-    """Tests of a subject with the lines they reach; measured once for each state of the files."""
-    files, tests = files_of(subject), [ROOT / "tests" / name for name in SUBJECTS[subject][1]]
-    sources = [path for test in tests for path in (sorted(test.glob("test_*.py")) if test.is_dir() else [test])]
-    kept = OUT / f"reach-{subject}-{digest(*(ROOT / file for file in files), *sources)}.json"
-    if not kept.exists():
-        print(f"{subject}: measuring which tests reach which lines", flush=True)
-
-        def work() -> int:
-            plugin = Reached(files)
-            status = quiet_pytest([str(test) for test in tests], OUT / f"reach-{subject}.log", [plugin])
-            if status == 0:
-                kept.write_text(json.dumps(plugin.tests), "utf-8")
-            return status
-
-        forked(work, 3000.0)
-        if not kept.exists():
-            raise SystemExit(f"the tests of {subject} fail without any change: {OUT / f'reach-{subject}.log'}")
-    found: dict[str, dict[str, Any]] = json.loads(kept.read_text("utf-8"))
-    return found
+def files_of_tests(subject: str) -> list[Path]:
+    """Files of the tests that answer for a subject."""
+    named = [ROOT / "tests" / name for name in SUBJECTS[subject][1]]
+    return [path for test in named for path in (sorted(test.glob("test_*.py")) if test.is_dir() else [test])]
 
 
 def tests_for(mutant: Mutant, tests: dict[str, dict[str, Any]]) -> tuple[list[str], float]:
@@ -459,82 +462,212 @@ def difference(mutant: Mutant, text: str) -> str:
     return "\n".join([f"{mutant.file}:{mutant.line} ({mutant.what})", *list(lines)[3:]])
 
 
-def try_one(mutant: Mutant, text: str, tests: dict[str, dict[str, Any]]) -> str:
-    """``killed``, ``timeout`` or ``survived``."""
-    names, _ = tests_for(mutant, tests)
-    # Most fall to the first few, and then the other files of tests need not be imported.
-    for part in (names[:FIRST], names[FIRST:]):
-
-        def work(part: list[str] = part) -> int:
-            sys.meta_path.insert(0, Changed(mutant.file, mutant.source(text)))
-            return quiet_pytest(part, OUT / "last.log", [])
-
-        status = forked(work, SLOWER * sum(tests[name]["seconds"] for name in part) + BESIDE_S) if part else "0"
-        if status != "0":
-            return "timeout" if status == "timeout" else "killed"
-    return "survived"
+def codes(code: CodeType) -> dict[tuple[str, int], CodeType]:
+    """Code of the functions of a module and of its classes, by their name and first line."""
+    found: dict[tuple[str, int], CodeType] = {}
+    for part in code.co_consts:
+        if isinstance(part, CodeType):
+            function = part.co_flags & inspect.CO_OPTIMIZED
+            found |= {(part.co_qualname, part.co_firstlineno): part} if function else codes(part)
+    return found
 
 
-def run(subject: str, number: int | None, seed: int, again: bool) -> dict[str, Any]:
-    """Try the mutants of a subject that were not tried yet."""
-    chosen, texts, everything = sampled(subject, number, seed)
+Functions = dict[tuple[str, str, int], list[FunctionType]]
+
+
+def functions_of(files: Iterable[str]) -> Functions:
+    """All functions that some files made, whoever holds them, by file, name and first line."""
+    wanted = {str(ROOT / file) for file in files}
+    found: Functions = {}
+    gc.unfreeze()
+    for thing in gc.get_objects():
+        if type(thing) is FunctionType and thing.__code__.co_filename in wanted:
+            code = thing.__code__
+            found.setdefault((code.co_filename, code.co_qualname, code.co_firstlineno), []).append(thing)
+    gc.freeze()
+    return found
+
+
+def changes(mutant: Mutant, text: str, live: Functions) -> list[Callable[[], None]]:
+    """What makes the functions of this process those of the mutant; nothing if its change is in no function."""
+    path, new_text = str(ROOT / mutant.file), mutant.source(text)
+    old, new = (codes(compile(source, path, "exec", dont_inherit=True)) for source in (text, new_text))
+    found: list[Callable[[], None]] = []
+    for place, code in new.items():
+        if code != old.get(place):
+            found += [partial(setattr, function, "__code__", code) for function in live.get((path, *place), [])]
+    for before, node in zip(ast.walk(ast.parse(text)), ast.walk(ast.parse(new_text)), strict=False):
+        if isinstance(node, ast.FunctionDef) and isinstance(before, ast.FunctionDef):
+            if ast.dump(before.args) == ast.dump(node.args):
+                continue
+            line = min([node.lineno, *(part.lineno for part in node.decorator_list)])
+            for function in (f for (p, _, at), several in live.items() if (p, at) == (path, line) for f in several):
+                found += [partial(_set_defaults, function, node.args)]
+    return found
+
+
+def _set_defaults(function: FunctionType, arguments: ast.arguments) -> None:
+    def value(node: ast.expr) -> Any:
+        return eval(compile(ast.Expression(node), "", "eval"), function.__globals__)
+
+    function.__defaults__ = tuple(map(value, arguments.defaults)) or None
+    named = zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True)
+    function.__kwdefaults__ = {key.arg: value(node) for key, node in named if node is not None} or None
+
+
+class Trials:
+    """Mutants of a subject, tried in forks of a process that has collected its tests; a plug-in for pytest."""
+
+    def __init__(self, subject: str, todo: list[tuple[Mutant, str]], tell: Callable[[Mutant, str], None]) -> None:
+        self.subject, self.todo, self.tell = subject, todo, tell
+
+    def pytest_runtestloop(self, session: Any) -> bool:
+        items = {item.nodeid: item for item in session.items}
+        tests = self.reach(session)
+        live = functions_of({mutant.file for mutant, _ in self.todo})
+        for mutant, text in self.todo:
+            names, seconds = tests_for(mutant, tests)
+            new = changes(mutant, text, live)
+
+            def within(new: list[Callable[[], None]] = new, names: list[str] = names) -> int:
+                for change in new:
+                    change()
+                return self.tests(session, [items[name] for name in names])
+
+            def anew(mutant: Mutant = mutant, text: str = text, names: list[str] = names) -> int:
+                for name in [name for name in sys.modules if name.split(".")[0] in ("starcal_uq", "tests", "conftest")]:
+                    del sys.modules[name]
+                sys.meta_path.insert(0, Changed(mutant.file, mutant.source(text)))
+                return quiet_pytest(names, OUT / f"last-{os.getppid()}.log", [])
+
+            status = forked(within if new else anew, SLOWER * seconds + BESIDE_S)
+            if status == str(BROKEN << 8):
+                raise RuntimeError(f"a mutant could not be tried: {difference(mutant, text)}")
+            self.tell(mutant, {"0": "survived", "timeout": "timeout"}.get(status, "killed"))
+        return True
+
+    @staticmethod
+    def tests(session: Any, items: list[Any]) -> int:
+        for item, following in zip(items, [*items[1:], None], strict=True):
+            item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
+            if session.testsfailed:
+                return 1
+        return 0
+
+    def reach(self, session: Any) -> dict[str, dict[str, Any]]:
+        """Tests with the lines they reach; measured once for each state of the sources and of a file of tests."""
+        files = files_of(self.subject)
+        sources = [ROOT / file for file in files]
+        kept = {path: OUT / f"reach-{path.stem}-{digest(*sources, path)}.json" for path in files_of_tests(self.subject)}
+        missing = [item for item in session.items if not kept[item.path].exists()]
+
+        def work() -> int:
+            plugin = Reached(files)
+            session.config.pluginmanager.register(plugin)
+            status = self.tests(session, missing)
+            for path in {item.path for item in missing if not status}:
+                names = [item.nodeid for item in missing if item.path == path]
+                kept[path].write_text(json.dumps({name: plugin.tests[name] for name in names}), "utf-8")
+            return status
+
+        if missing and forked(work) != "0":
+            raise RuntimeError("the tests fail without any change")
+        found: dict[str, dict[str, Any]] = {}
+        for path in {item.path: None for item in session.items}:
+            found |= json.loads(kept[path].read_text("utf-8"))
+        return found
+
+
+def entries() -> list[dict[str, Any]]:
+    """What was tried, in the order of time."""
     log = OUT / "tried.jsonl"
-    known = dict(_known(log))
-    tests = None
-    outcomes: list[tuple[Mutant, str, str]] = []
-    for i, mutant in enumerate(chosen):
-        text = texts[mutant.file]
-        name = key(mutant, text)
-        if name not in known or (again and known[name] == "survived"):
-            tests = reach(subject) if tests is None else tests
-            known[name] = try_one(mutant, text, tests)
-            with log.open("a", encoding="utf-8") as stream:
-                stream.write(json.dumps({"key": name, "outcome": known[name], **asdict(mutant)}) + "\n")
-            print(
-                f"{subject} {i + 1}/{len(chosen)} {mutant.file}:{mutant.line} {mutant.what}: {known[name]}", flush=True
-            )
-        outcomes.append((mutant, known[name], text))
-    return {"subject": subject, "all": everything, "outcomes": outcomes}
+    return [json.loads(line) for line in log.read_text("utf-8").splitlines()] if log.exists() else []
 
 
-def _known(log: Path) -> Iterator[tuple[str, str]]:
-    if log.exists():
-        for line in log.read_text("utf-8").splitlines():
-            entry = json.loads(line)
-            yield entry["key"], entry["outcome"]
+def draw(subject: str, seed: int) -> None:
+    """Keep what a seed draws of a subject, as the source is now."""
+    kept = OUT / f"draw-{seed}-{subject}.json"
+    if not kept.exists():
+        found = known(subject)[0]
+        before = [name for path in OUT.glob(f"draw-*-{subject}.json") for name in json.loads(path.read_text())["keys"]]
+        commit = subprocess.run(["git", "rev-parse", "HEAD"], capture_output=True, text=True, check=False).stdout
+        made = {"commit": commit.strip(), "mutants": len(found), "functions": functions(found.values())}
+        keys = drawn(found, seed, before)
+        kept.write_text(json.dumps({"subject": subject, "seed": seed, **made, "keys": keys}), "utf-8")
 
 
-def table(results: list[dict[str, Any]]) -> str:
+def known(subject: str) -> tuple[dict[str, Mutant], dict[str, str]]:
+    """All mutants of a subject by their key, and the text of its files."""
+    texts = {file: (ROOT / file).read_text("utf-8") for file in files_of(subject)}
+    return {key(mutant, texts[mutant.file]): mutant for file in texts for mutant in mutants(file)}, texts
+
+
+def draws(subjects: Iterable[str]) -> list[dict[str, Any]]:
+    """Kept draws of some subjects: with the first outcome of each key, and the last."""
+    tried, found = entries(), []
+    for subject in subjects:
+        now, texts = known(subject)
+        for path in sorted(OUT.glob(f"draw-*-{subject}.json")):
+            one = json.loads(path.read_text("utf-8"))
+            of_these = {name: [e["outcome"] for e in tried if e["key"] == name] for name in one["keys"]}
+            first = {name: outcomes[0] for name, outcomes in of_these.items() if outcomes}
+            last = {name: of_these[name][-1] for name in first}
+            last |= {name: "gone" for name, what in last.items() if what == "survived" and name not in now}
+            found.append({**one, "first": first, "last": last, "now": now, "texts": texts})
+    return found
+
+
+def run(one: dict[str, Any], again: bool) -> None:
+    """Try the mutants of a draw that were not tried yet, or those that survived."""
+    title, names = f"{one['subject']} {one['seed']}", one["last"]
+    chosen = [name for name in one["keys"] if (names.get(name) == "survived" if again else name not in names)]
+    todo = {one["now"][name]: name for name in chosen if name in one["now"]}
+    if not todo:
+        return
+    screen = os.fdopen(os.dup(1), "w")
+    count = iter(range(1, len(todo) + 1))
+
+    def tell(mutant: Mutant, outcome: str) -> None:
+        with (OUT / "tried.jsonl").open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps({"key": todo[mutant], "outcome": outcome, **asdict(mutant)}) + "\n")
+        place = f"{mutant.file}:{mutant.line} {mutant.what}"
+        print(f"{title} {next(count)}/{len(todo)} {place}: {outcome}", file=screen, flush=True)
+
+    log = OUT / f"{title.replace(' ', '-')}.log"
+    trials = Trials(one["subject"], [(mutant, one["texts"][mutant.file]) for mutant in todo], tell)
+    if forked(lambda: quiet_pytest([str(path) for path in files_of_tests(one["subject"])], log, [trials])) != "0":
+        raise SystemExit(f"the tests of {title} cannot be run: {log}")
+
+
+def table(found: list[dict[str, Any]]) -> str:
     """The table of the documentation."""
     from starcal_uq.maths.intervals import binomial_interval
 
     lines = [
-        "| Subject | Mutants | In functions | Tried | In functions | Killed | Of these by time | Survived | "
-        "Share killed (95 %) |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| Subject | Mutants | In functions | Seed | Tried | Killed at first | By time | Share (95 %) | "
+        "Killed now | Gone | Left |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
-    for result in results:
-        outcomes = [outcome for _, outcome, _ in result["outcomes"]]
-        n, survived, late = len(outcomes), outcomes.count("survived"), outcomes.count("timeout")
+    for one in found:
+        first, last = [*one["first"].values()], Counter(one["last"].values())
+        n, late, survived = len(first), first.count("timeout"), first.count("survived")
         low, high = binomial_interval(n - survived, n)
+        tried = f"{n}" if n == len(one["keys"]) else f"{n} of {len(one['keys'])}"
         share = f"{100 * (n - survived) / n:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
-        reached = functions(mutant for mutant, _, _ in result["outcomes"])
-        lines.append(
-            f"| {result['subject']} | {len(result['all'])} | {functions(result['all'])} | {n} | {reached} | "
-            f"{n - survived} | {late} | {survived} | {share} |"
-        )
+        killed, gone, left = last["killed"] + last["timeout"], last["gone"], last["survived"]
+        row = (one["subject"], one["mutants"], one["functions"], one["seed"], tried, n - survived, late, share)
+        lines.append(f"| {' | '.join(map(str, (*row, killed, gone, left)))} |")
     return "\n".join(lines)
 
 
 def main(arguments: list[str] | None = None) -> None:
     """The command."""
     parser = argparse.ArgumentParser(description="Mutation testing of the mathematics.")
+    parser.add_argument("--seed", type=int, help="try what this seed draws, as far as it was not tried")
     parser.add_argument("--subject", nargs="+", choices=[*SUBJECTS], default=[*SUBJECTS])
-    parser.add_argument("--number", type=int, help="mutants of each subject (one of each function)")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--again", action="store_true", help="try again those that survived")
+    parser.add_argument("--again", action="store_true", help="try again those that survived, of all draws")
     parser.add_argument("--show", action="store_true", help="print what survived")
-    parser.add_argument("--write", action="store_true", help="put the table into the documentation")
+    parser.add_argument("--write", action="store_true", help="put the table of all draws into the documentation")
     options = parser.parse_args(arguments)
     OUT.mkdir(parents=True, exist_ok=True)
     os.chdir(ROOT)
@@ -543,19 +676,18 @@ def main(arguments: list[str] | None = None) -> None:
     os.environ.update(
         dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"), MPLBACKEND="Agg"
     )
-    import warnings
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        for module in HEAVY:
-            importlib.import_module(module)
-    results = [run(subject, options.number, options.seed, options.again) for subject in options.subject]
+    if options.seed is not None:
+        for subject in options.subject:
+            draw(subject, options.seed)
+    for one in draws(options.subject):
+        if options.again or one["seed"] == options.seed:
+            run(one, options.again)
     if options.show:
-        for result in results:
-            for mutant, outcome, text in result["outcomes"]:
-                if outcome == "survived":
-                    print(difference(mutant, text), end="\n\n")
-    made = table(results)
+        for one in draws(options.subject):
+            for name, mutant in one["now"].items():
+                if one["last"].get(name) == "survived":
+                    print(f"seed {one['seed']} {difference(mutant, one['texts'][mutant.file])}", end="\n\n")
+    made = table([one for one in draws(SUBJECTS) if one["first"]])
     print(made)
     if options.write:
         from benchmarks.pages import put

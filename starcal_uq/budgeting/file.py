@@ -265,7 +265,7 @@ def _frames(tables: Any, path: str | os.PathLike[str]) -> dict[str, FloatArray]:
             values = np.zeros(0)
         if values.size and not np.abs(values).max() < _LARGE:
             values = np.zeros(0)
-        if values.shape == (4,) and np.isfinite(values).all() and np.any(values):
+        if values.shape == (4,) and np.any(values):
             values = quaternion_to_rotation(values / np.linalg.norm(values))
         if values.shape != (3, 3) or not np.abs(values @ values.T - np.eye(3)).max() < _ORTHONORMAL:
             raise BudgetError(

@@ -61,8 +61,7 @@ def two_axis_radius(confidence: float, sigma_x: float, sigma_y: float, spread: f
         beyond = np.exp(-0.5 * (radius / scale[:, None]) ** 2 / variance).mean(axis=1)
         return float(weights @ beyond) - (1.0 - confidence)
 
-    # Rounding must not move the root out of its bracket where the sigmas are equal; a mixture reaches further.
-    reach = 1.001 * math.sqrt(-2.0 * math.log1p(-confidence)) + (60.0 if spread > 0.0 else 1e-9)
+    reach = 4.0
     while excess(reach) > 0.0:
         reach *= 2.0
     return large * float(brentq(excess, 0.0, reach, xtol=1e-13))

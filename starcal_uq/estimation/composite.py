@@ -194,7 +194,7 @@ def enough_frames(objective: PairObjective) -> bool:
 
 
 def pair_covariance(
-    objective: PairObjective, theta: FloatArray, chi2: float, residual_dof: int, tolerance: float = 0.0
+    objective: PairObjective, theta: FloatArray, chi2: float, residual_dof: int, tolerance: float
 ) -> FloatArray:
     """Covariance (p, p) of the pair estimate: empirical where there are `enough_frames`, else that of Gaussian noise.
 

@@ -145,7 +145,7 @@ def broken(frame: pd.DataFrame, change: str) -> pd.DataFrame:
     elif change == "repeat":
         frame.loc[4, "time_s"] = frame.loc[3, "time_s"]
     elif change == "length":
-        frame.loc[4, ["qx", "qy", "qz", "qw"]] *= 1.01
+        frame.loc[4, ["qx", "qy", "qz", "qw"]] *= 1.0015
     elif change == "nan":
         frame.loc[4, "qz"] = np.nan
     elif change == "text":
@@ -165,7 +165,7 @@ def broken(frame: pd.DataFrame, change: str) -> pd.DataFrame:
     [
         ("back", r"line 7: the time 10 s does not come after 30 s; sort the rows"),
         ("repeat", r"line 7: the time 30 s does not come after 30 s"),
-        ("length", r"line 7: the quaternion has the length 1\.01, not 1"),
+        ("length", r"line 7: the quaternion has the length 1\.0015, not 1"),
         ("nan", r"line 7: qz is '', not a number"),
         ("text", r"line 7: qz is 'north', not a number"),
         ("column", r"column qz is missing; give qx, qy, qz, qw beside time_s or time_utc \(the file has time_s, qx"),
@@ -180,6 +180,9 @@ def test_bad_files_are_refused_in_one_sentence(tmp_path: Path, change: str, mess
         load_attitude_profile(path)
     assert "bad.csv" in str(caught.value)
     assert "\n" not in str(caught.value)
+    if change == "length":
+        with pytest.raises(AttitudeProfileError, match=r"bad.parquet: row 5: the quaternion"):
+            load_attitude_profile(write(broken(table(slew(8)), change), tmp_path / "bad.parquet"))
 
 
 def test_unreadable_files_are_named(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import starcal_uq as sc
@@ -203,11 +204,19 @@ def test_nothing_found_nothing_inflated() -> None:
     assert any("found nothing" in note for note in found.notes)
 
 
-def test_what_a_misfit_adds_is_in_the_row_with_its_reason() -> None:
+def test_what_a_misfit_adds_is_in_the_row_with_its_reason(tmp_path: Path) -> None:
     """The attitude error brings it along; from pixels to there see `tests/diagnostics/test_pattern.py`."""
     found = MisfitFound(1.0, np.zeros(3), np.array([0.7, 0.7, 10.0]), (), ("misfit, pattern over radius",))
-    made_of = budget(POST, OBS, attitude(misfit=found), n_samples=20_000)  # type: ignore[arg-type]
+    held = attitude().if_model_holds_arcsec[:, :3]
+    covariance = held[:, :, None] * held[:, None] * np.array([[1.0, 0.6, -0.3], [0.6, 1.0, 0.2], [-0.3, 0.2, 1.0]])
+    made_of = budget(POST, OBS, attitude(misfit=found, covariance_arcsec2=covariance), n_samples=20_000)  # type: ignore[arg-type]
     rows = {(row.name, row.axis): row for row in made_of.rows}
+    # What is added is independent between the axes: covariances stay, variances grow.
+    for name, place in ((COMMON, 1), (REST, 2)):
+        lines = [rows[name, axis] for axis in ("pitch", "yaw", "roll")]
+        sigma = np.array([line.sigma_arcsec for line in lines])
+        kept = np.array([line.axis_correlation for line in lines]) * np.outer(sigma, sigma)
+        assert np.allclose(kept - covariance[place], np.diag(sigma**2 - held[place] ** 2), rtol=1e-9, atol=1e-12)
     assert rows[REST, "pitch"].sigma_arcsec == pytest.approx(np.hypot(0.006, 0.7))
     assert rows[REST, "roll"].sigma_arcsec == pytest.approx(np.hypot(0.05, 10.0))
     # The added part has no tail of its own; with next to all of the variance it leaves next to nothing of the tail.
@@ -216,6 +225,17 @@ def test_what_a_misfit_adds_is_in_the_row_with_its_reason() -> None:
     assert "pattern over radius" in rows[REST, "pitch"].conditions
     assert not rows[COMMON, "pitch"].inflated and not rows[NEA, "pitch"].inflated
     assert any(REST in note and "inflated" in note for note in made_of.notes)
+    # A file of the version before has the sigma of inflated rows alone.
+    made_of.save(tmp_path / "budget.csv")
+    older = pd.read_csv(tmp_path / "budget.csv", dtype=str, keep_default_na=False).drop(
+        columns="with_misfit_found_arcsec"
+    )
+    older = older.rename(columns={"if_model_holds_arcsec": "raw_sigma_arcsec"})
+    older.loc[older["name"] != REST, "raw_sigma_arcsec"] = "nan"
+    older.to_csv(tmp_path / "older.csv", index=False)
+    read = [row for row in Budget.load(tmp_path / "older.csv").rows if row.inflated]
+    assert [(row.name, row.axis) for row in read] == [(REST, axis) for axis in ("pitch", "yaw", "roll")]
+    assert read[0].if_model_holds_arcsec == 0.006
 
 
 def comparison(rejected: bool) -> Any:

@@ -245,6 +245,10 @@ def test_worst_cases_that_must_not_meet_leave_a_limit_open() -> None:
         outcome = Outcome(Requirement("R", "pitch", limit, 0.9973, "before alignment", "temporal"), found)
         assert outcome.verdict == verdict and outcome.between == (verdict == "open")
         assert f"is {verdict}" in outcome_text(outcome)
+    # Open for another reason: half an arcsecond is left, and a row is missing.
+    missing = dataclasses.replace(outcome, total=dataclasses.replace(found, not_assessed=("one",)))
+    missing = dataclasses.replace(missing, requirement=dataclasses.replace(outcome.requirement, limit_arcsec=59.9))
+    assert missing.verdict == "open" and not missing.between
     open_one = Outcome(Requirement("R", "pitch", 45.0, 0.9973, "before alignment", "temporal", "rule"), found)
     assert "is open: at the least 34.3 and at most 59.4 arcsec against a limit of 45.0." in outcome_text(open_one)
 

@@ -76,6 +76,8 @@ def test_moments(tmp_path: Path, lines: str, sigma: float, mean: float) -> None:
     row = load_budget_file(written(tmp_path, ROW.replace("sigma_arcsec = 0.2", lines))).contributors[0]
     assert row.sigma_arcsec == pytest.approx(sigma) and row.mean_arcsec == pytest.approx(mean)
     assert row.applies is ("applies" not in lines)
+    combination = "none" if "applies" in lines else "mean: linear" if "constant" in lines else "in squares"
+    assert row.combination == combination
 
 
 @pytest.mark.parametrize("name", ["Star Catalogue", "STAR  catalogue"])

@@ -12,6 +12,7 @@ from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.camera.distortion import model_names
 from starcal_uq.camera.projection import project
 from starcal_uq.core.records import from_plain, to_plain
+from starcal_uq.estimation import compressed as module
 from starcal_uq.estimation.compressed import (
     CompressedLikelihood,
     _derivatives,
@@ -32,7 +33,7 @@ def _information_scale(matrix):
     return 1.0 / np.sqrt(np.diag(matrix))
 
 
-def test_attitudes_are_searched_from_where_it_was_said():
+def test_attitudes_are_searched_from_where_it_was_said(monkeypatch):
     likelihood, theta = MarginalLikelihood(with_sigmas(observations(n_frames=20)), "brown"), camera().theta
     assert likelihood.rotations is None and likelihood.last_sums is None
     assert likelihood.kernels == "numpy"
@@ -48,6 +49,12 @@ def test_attitudes_are_searched_from_where_it_was_said():
     likelihood.use_sums(sums, attitudes)
     assert likelihood.last_sums == (sums, attitudes)
     assert np.max(off(likelihood.rotations)) < 1e-9
+    # They serve the compressed likelihood at their own point alone.
+    known = []
+    monkeypatch.setattr(module, "gram_sums", lambda *given: known.append(given[-1]) or gram_sums(*given))
+    for point in (theta, theta + np.array([1e-3, 0.0, 0.0, 0.0, 0.0])):
+        compress(likelihood, point, symmetric_inverse(sums.normal.matrix))
+    assert known == [(sums, attitudes), None]
     likelihood.use_rotations(best)
     assert likelihood.last_sums is None and likelihood.rotations is best
     assert np.max(off(likelihood.rotations_at(theta))) < 1e-9

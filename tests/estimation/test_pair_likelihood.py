@@ -213,7 +213,7 @@ def test_fewer_frames_than_parameters_have_the_covariance_of_gaussian_noise() ->
     unit = np.outer(cal.sigmas, cal.sigmas)
     assert np.linalg.eigvalsh(cal.covariance / unit)[0] > 1e-4
     assert np.linalg.eigvalsh(objective.godambe(cal.pair_theta) / unit)[0] < 1e-12
-    unknown = pair_covariance(objective, cal.pair_theta, np.inf, cal.dof)
+    unknown = pair_covariance(objective, cal.pair_theta, np.inf, cal.dof, 0.0)
     assert unknown.shape == (5, 5) and np.isnan(unknown).all()
 
 

@@ -110,3 +110,20 @@ def test_godambe_is_larger_than_the_naive_covariance():
     ratio = np.sqrt(np.diag(objective.godambe(theta))) / naive
     assert (ratio > 2.0).all()
     assert (ratio < 4.5).all()
+
+
+@pytest.mark.parametrize("n_frames", [4, 9])
+def test_godambe_is_the_scatter_of_the_scores_of_single_frames(n_frames):
+    """From all pairs, frame by frame, with k / (k - p) for few frames; the last point serves only where it is near."""
+    frames, theta = StarFrames.from_observations(observations(n_frames=n_frames)), camera("none").theta
+    objective, far = PairObjective(frames, "none"), theta + np.array([0.0, 0.0, 20.0])
+
+    def scatter(theta):
+        both = [PairObjective(frames.part(k, k + 1), "none").residuals(theta) for k in range(n_frames)]
+        scores = np.stack([jacobian.T @ residuals for residuals, jacobian in both])
+        inverse = np.linalg.inv(sum(jacobian.T @ jacobian for _, jacobian in both))
+        return inverse @ scores.T @ scores @ inverse * n_frames / (n_frames - 3)
+
+    assert np.allclose(objective.godambe(theta), scatter(theta), rtol=1e-6)
+    assert np.array_equal(objective.godambe(theta + 1e-9, tolerance=1e-3), objective.godambe(theta))
+    assert np.allclose(objective.godambe(far, tolerance=1e-3), scatter(far), rtol=1e-6)

@@ -141,6 +141,9 @@ def test_stars_that_cannot_be_in_the_field_say_nothing() -> None:
     assert list(np.flatnonzero(~state.seen)) == [5]
     assert not state.e[:, 5].any()
     assert state.value == pytest.approx(without.log_likelihood(theta, 0.05, 4.0), abs=1e-6)
+    frames = with_far.by_frame(theta, 0.05, 4.0)
+    assert np.sum(frames) == pytest.approx(state.value, abs=1e-6)
+    assert np.allclose(frames, without.by_frame(theta, 0.05, 4.0), rtol=0, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", ["random", "neighbour"])
