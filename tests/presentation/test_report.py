@@ -510,3 +510,14 @@ def test_every_place_shows_the_same_two_figures_under_the_same_two_names(unrecor
     assert np.isnan(opened.attitude.with_misfit_found_arcsec).all()
     assert all(np.isnan(row.with_misfit_found_arcsec) for row in opened.error_budget.rows)
     assert "misfit of the camera model" in opened.error_budget.not_assessed
+
+
+def test_the_first_page_on_paper_names_failures_before_warnings_and_leaves_commands_to_the_appendix(full):
+    first, rest = full.report.read_text(encoding="utf-8").split('id="appendix"')
+    levels = re.findall(r'<div class="note (fail|warning)', first)
+    assert levels == sorted(levels) and first.count('<p class="paper">') == bool(levels)
+    # In the appendix every command stands with its check; the first page hides them on paper.
+    assert rest.count('class="try"') == first.count('class="try"') and "#summary .try, #summary .later" in first
+    table = rest[rest.index('<table class="checks">') :]
+    found = re.findall(r'<tr><td class="key">.*?<span class="badge (\w+)', table)
+    assert found == sorted(found, key=["fail", "warning", "pass"].index)
