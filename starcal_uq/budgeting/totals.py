@@ -476,7 +476,7 @@ def _meeting(mean: FloatArray, worst: float, chance: FloatArray) -> FloatArray:
         towards = np.column_stack((np.cos(angle), np.sin(angle)))
     reached = mean + worst * towards
     size = np.linalg.norm(reached, axis=1)
-    spread = np.atleast_2d(np.cov(chance)) if chance.shape[1] > 1 else np.zeros((len(mean), len(mean)))
+    spread = np.atleast_2d(np.cov(chance, bias=True))
     along = np.sqrt(np.einsum("ni,ij,nj->n", reached, spread, reached)) / np.maximum(size, 1e-300)
     furthest: FloatArray = reached[int(np.argmax(size + 2.0 * along))]
     return furthest

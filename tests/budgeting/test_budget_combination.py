@@ -19,7 +19,7 @@ from starcal_uq.budgeting.shapes import (
     one_axis_factor,
     two_axis_radius,
 )
-from starcal_uq.budgeting.totals import Total, _heaviest, _one_of_many, covariance, draw, grouped_sigma, total
+from starcal_uq.budgeting.totals import Total, _heaviest, _one_of_many, covariance, draw, grouped_sigma, total, totals
 from starcal_uq.presentation.words.budgeting import outcome_text
 
 
@@ -375,6 +375,9 @@ def test_a_quantile_beyond_the_samples_is_not_known() -> None:
     assert abs(resolved.sampled_arcsec - 6.6 * half_width("gaussian", 0.9999, 3.9)) < 4.0 * resolved.sampled_se_arcsec
     # What has no spread needs no samples.
     assert combined([row("shift", 0.0, mean_arcsec=2.0)], confidence=0.9999999).sampled_arcsec == 2.0
+    nothing = combined([row("one", 0.0), row("other", 0.0)])
+    assert (nothing.dominant, nothing.dominant_share, nothing.rule_arcsec) == ("", 0.0, 0.0)
+    assert nothing.explanation.startswith("No error is left")
 
 
 def test_one_case_of_many_is_the_quantile_itself() -> None:
@@ -408,11 +411,42 @@ def test_no_reason_is_a_bare_share() -> None:
     cases = [
         ([row("noise", 1.0, tail_997=3.9)], 0.6, "more of its errors are small"),
         ([row("step", 1.0, distribution="uniform")], 0.6, "reaches further"),
+        ([row("step", 0.2, distribution="uniform"), row("noise", 0.2)], 0.997, "'step' cannot exceed a fixed size"),
         ([row("noise", 1.0), row("tiny", 0.001, distribution="uniform", mean_arcsec=0.5)], 0.997, "a mean shifts"),
     ]
     for rows, confidence, words in cases:
         found = combined(rows, confidence=confidence)
         assert words in found.explanation and "'tiny'" not in found.explanation
+
+
+def test_totals_scale_with_their_rows_and_their_sentences_stay() -> None:
+    rows = [
+        *both("noise", 1.0, tail_997=3.4, interpretation="temporal"),
+        *both("step", 2.0, distribution="uniform", interpretation="ensemble", absorbed_by_alignment="in part"),
+        *both("ground", 0.7, distribution="rayleigh", mean_arcsec=1.4, interpretation="ensemble"),
+        row("wave", 0.8, distribution="arcsine", correlation_group="heat"),
+        row("bend", 0.5, "yaw", correlation_group="-heat", absorbed_by_alignment="yes"),
+        row("shift", 0.0, "roll", distribution="constant", mean_arcsec=3.0),
+        row("lens", 0.4, "roll", absorbed_by_alignment="caused by it"),
+    ]
+    small = [dataclasses.replace(r, sigma_arcsec=1e-3 * r.sigma_arcsec, mean_arcsec=1e-3 * r.mean_arcsec) for r in rows]
+    for one, other in zip(*(totals(some, 0.95, n_samples=20_000)[0] for some in (rows, small)), strict=True):
+        for name, value in vars(one).items():
+            expected = 1e-3 * value if name.endswith("_arcsec") else value
+            found = getattr(other, name)
+            assert found == (pytest.approx(expected, nan_ok=True) if isinstance(value, float) else expected), name
+
+
+def test_the_case_of_many_is_of_one_sided_errors_about_their_mean() -> None:
+    """A ground error of one sign, next to no noise: its distribution, and not its mirror image."""
+    one = stats.rayleigh(scale=3.0)
+    rows = [
+        row("ground", one.std(), distribution="rayleigh", mean_arcsec=one.mean(), interpretation="ensemble"),
+        row("noise", 1e-3, interpretation="temporal"),
+    ]
+    found = combined(rows, confidence=0.95, interpretation="temporal")
+    assert found.sampled_least_arcsec == pytest.approx(one.ppf(0.95), rel=0.01)
+    assert 2.0 * one.mean() - one.ppf(0.05) < 0.9 * found.sampled_least_arcsec
 
 
 # --- correlated axes, and other frames --------------------------------------------------------------------------------
