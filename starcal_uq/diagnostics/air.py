@@ -26,6 +26,7 @@ from starcal_uq.sky.refraction import refraction_constants, site_among_stars
 from starcal_uq.sky.site import Site
 
 if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.observations.table import Observations
 
@@ -78,7 +79,7 @@ class AirTest:
 
 
 @bounded
-def air_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> AirTest | None:
+def air_test(obs: Observations, cal: Calibration, *, seed: int = 0, rest: Remainder | None = None) -> AirTest | None:
     """Look for refraction in the residuals of a calibration.
 
     Parameters
@@ -87,32 +88,35 @@ def air_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> AirTest |
         The data and the estimate made from them.
     seed : int
         Seed of the draws of noise.
+    rest : Remainder, optional
+        What is left of the residuals, where it is known already.
 
     Returns
     -------
     AirTest or None
         None where from no place all stars were above the horizon.
     """
-    air = _Air(obs, cal, seed)
+    rest = rest or Remainder(obs, cal, seed)
+    air = _Air(rest, cal.camera)
     places = air.possible(_sphere(_PLACES))
     if not len(places):
         return None
     columns, _ = air.columns(places)
     length = np.linalg.norm(columns, axis=1)
-    z = columns @ air.residuals / length / air.sigma
+    z = columns @ rest.residuals / length / rest.sigma
     best = int(np.argmax(z))
     rng = np.random.default_rng(seed)
     values, vectors = np.linalg.eigh(columns @ columns.T / np.outer(length, length))
     kept = values > 1e-10 * values[-1]
     noise = rng.standard_normal((_DRAWS, int(np.count_nonzero(kept)))) @ (vectors[:, kept] * np.sqrt(values[kept])).T
-    noise /= np.sqrt(rng.chisquare(air.dof, _DRAWS) / air.dof)[:, None]
+    noise /= np.sqrt(rng.chisquare(rest.dof, _DRAWS) / rest.dof)[:, None]
     p_value = (1.0 + float(np.count_nonzero(noise.max(axis=1) >= z[best]))) / (_DRAWS + 1.0)
     nothing = float("nan")
     found = dict.fromkeys(("latitude_deg", "longitude_deg", "latitude_std_deg", "longitude_std_deg"), nothing)
     found |= {"f_px": nothing, "f_sigma": nothing}
     is_air = False
     for density in _DENSITIES if p_value < AIR_P else ():
-        gain = 2.0 * density * columns @ air.residuals - (density * length) ** 2
+        gain = 2.0 * density * columns @ rest.residuals - (density * length) ** 2
         place, gained, covariance = air.settled(places[np.argmax(gain)], density)
         is_air = bool(z[best] ** 2 - gained < _AIR_CHI2) and air.left_by_frame(place, density) > AIR_P
         if is_air:
@@ -126,8 +130,8 @@ def air_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> AirTest |
         std = np.degrees(np.sqrt(np.diag(covariance)))
         found |= {"latitude_deg": float(np.degrees(latitude)), "longitude_deg": float(np.degrees(longitude))}
         found |= {"latitude_std_deg": float(std[0]), "longitude_std_deg": float(std[1] / max(np.cos(latitude), 1e-3))}
-    size, error = float(z[best] * air.sigma / length[best]), float(air.sigma / length[best])
-    return AirTest(p_value, size, error, is_air, n_frames=air.obs.n_frames, **found)
+    size, error = float(z[best] * rest.sigma / length[best]), float(rest.sigma / length[best])
+    return AirTest(p_value, size, error, is_air, n_frames=rest.obs.n_frames, **found)
 
 
 class Remainder:
@@ -170,18 +174,17 @@ class Remainder:
         return flat - along @ self.basis.T, np.linalg.solve(self._triangle, along.T).T
 
 
-class _Air(Remainder):
+class _Air:
     """Refraction of some frames from any place."""
 
-    def __init__(self, obs: Observations, cal: Calibration, seed: int) -> None:
-        super().__init__(obs, cal, seed)
-        self._camera = cal.camera
-        self._axes, self.timed = _earth(self.obs)
+    def __init__(self, rest: Remainder, camera: Camera) -> None:
+        self._rest, self._camera = rest, camera
+        self._axes, self.timed = _earth(rest.obs)
         self._constants = refraction_constants(Site(45.0, 0.0))
 
     def possible(self, places: FloatArray) -> FloatArray:
         """Those places (g, 3) from which all stars were above the horizon."""
-        frames = self.likelihood.frames
+        frames = self._rest.likelihood.frames
         turned = [frames.spread(np.ascontiguousarray(self._axes[:, axis].T)) for axis in range(3)]
         seen = np.stack([np.sum(axis * frames.r, axis=0) for axis in turned])
         found: FloatArray = places[np.min(places @ seen, axis=1) > _LOWEST]
@@ -190,34 +193,34 @@ class _Air(Remainder):
     def columns(self, places: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Whitened shifts (g, 2 N) by standard air as seen from places (g, 3), and what parameters took up (g, p)."""
         a, b = self._constants
-        frames, state = self.likelihood.frames, self.state
+        frames, state = self._rest.likelihood.frames, self._rest.state
         shifts = np.empty((len(places), 2, frames.n_stars))
         for number, place in enumerate(places):
             zenith = np.einsum("kij,akj,a->ik", state.rotations, self._axes.transpose(1, 0, 2), place)
             up = frames.spread(np.ascontiguousarray(zenith))
             sine = np.maximum(np.sum(up * state.b, axis=0), _LOWEST)
-            shifts[number] = self.shift(up * ((a + b * (1.0 / sine**2 - 1.0)) / sine))
-        return self.left(shifts)
+            shifts[number] = self._rest.shift(up * ((a + b * (1.0 / sine**2 - 1.0)) / sine))
+        return self._rest.left(shifts)
 
     def left_by_frame(self, place: FloatArray, density: float) -> float:
         """Probability that frames by themselves, without that air, differ so much in scale and shape by noise."""
         from scipy.special import fdtrc
 
-        frames, theta = self.likelihood.frames, self._camera.theta
-        view = View.of(self.likelihood, self.state, theta, slice(0, frames.n_stars))
+        frames, theta = self._rest.likelihood.frames, self._camera.theta
+        view = View.of(self._rest.likelihood, self._rest.state, theta, slice(0, frames.n_stars))
         weight = 1.0 if frames.weight is None else frames.weight
-        own = self.likelihood.project_out(self.state, frame_shapes(self._camera).columns(view) * weight)
+        own = self._rest.likelihood.project_out(self._rest.state, frame_shapes(self._camera).columns(view) * weight)
         number = np.repeat(np.arange(frames.n_frames), frames.sizes)
         spread = np.zeros((3, frames.n_frames, 2, frames.n_stars))
         spread[:, number, :, np.arange(frames.n_stars)] = own.transpose(2, 0, 1)
         flat = spread.reshape(3 * frames.n_frames, -1)
-        flat -= (flat @ self.basis) @ self.basis.T
-        left = self.residuals - self.columns(place[None])[0][0] * density
+        flat -= (flat @ self._rest.basis) @ self._rest.basis.T
+        left = self._rest.residuals - self.columns(place[None])[0][0] * density
         values, vectors = np.linalg.eigh(flat @ flat.T)
         kept = values > 1e-8 * values[-1]
         explained = float(np.sum((vectors[:, kept].T @ (flat @ left)) ** 2 / values[kept]))
         rank = int(np.count_nonzero(kept))
-        dof = self.dof - rank
+        dof = self._rest.dof - rank
         if dof < 1:
             return 1.0
         return float(fdtrc(rank, dof, explained / rank / ((float(left @ left) - explained) / dof)))
@@ -227,20 +230,20 @@ class _Air(Remainder):
 
         The covariance is that of moves to the north and to the east.
         """
-        scale = self.sigma**2
+        scale = self._rest.sigma**2
         for _ in range(_STEPS):
             north, east = _tangents(place)
             beside = [_unit(place + _STEP_RAD * way) for way in (north, east)]
             here, *moved = self.columns(np.stack([place, *beside]))[0] * density
             slopes = (np.stack(moved) - here) / _STEP_RAD
             covariance = np.linalg.inv(slopes @ slopes.T) * scale
-            step = covariance @ slopes @ (self.residuals - here) / scale
+            step = covariance @ slopes @ (self._rest.residuals - here) / scale
             size = float(np.hypot(*step))
             place = _unit(place + min(1.0, 0.2 / max(size, 1e-12)) * (step[0] * north + step[1] * east))
             if size < _STEP_RAD:
                 break
         last = self.columns(place[None])[0][0] * density
-        return place, float(2.0 * last @ self.residuals - last @ last) / scale, covariance
+        return place, float(2.0 * last @ self._rest.residuals - last @ last) / scale, covariance
 
 
 def _earth(obs: Observations) -> tuple[FloatArray, bool]:

@@ -83,7 +83,7 @@ class _Moved:
 
 
 @bounded
-def time_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> TimeTest | None:
+def time_test(obs: Observations, cal: Calibration, *, seed: int = 0, rest: Remainder | None = None) -> TimeTest | None:
     """Look for a wrong time in the residuals of a calibration.
 
     Parameters
@@ -92,13 +92,15 @@ def time_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> TimeTest
         The data and the estimate made from them.
     seed : int
         Seed of the choice of frames, where there are many.
+    rest : Remainder, optional
+        What is left of the residuals, where it is known already.
 
     Returns
     -------
     TimeTest or None
         The slip that explains most; None where none is seen.
     """
-    rest = Remainder(obs, cal, seed)
+    rest = rest or Remainder(obs, cal, seed)
     numbers = star_numbers(rest.obs, cal.camera.focal_px)
     frames = np.repeat(np.arange(rest.obs.n_frames), rest.likelihood.frames.sizes)
     best, most = None, 0.0

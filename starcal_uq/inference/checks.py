@@ -21,7 +21,7 @@ from starcal_uq.estimation.student import DEFAULT_DOF
 from starcal_uq.inference.derived import derived_quantities
 from starcal_uq.inference.ensemble import Chains, autocorrelation
 from starcal_uq.inference.named import LIKELIHOODS
-from starcal_uq.inference.posterior import Diagnostics, Laplace, Posterior
+from starcal_uq.inference.posterior import Derived, Diagnostics, Laplace, Posterior
 from starcal_uq.inference.target import ImportanceCheck, LogLikelihood, Target
 
 if TYPE_CHECKING:
@@ -232,9 +232,13 @@ def measure(
     )
 
 
-def check_draws(post: Posterior, notes: Sequence[str] = ()) -> tuple[Check, ...]:
+def check_draws(
+    post: Posterior, notes: Sequence[str] = (), derived: tuple[Derived, ...] | None = None
+) -> tuple[Check, ...]:
     """Hold everything that is known of draws against its bound; checks that they have already are not looked at."""
-    checks = [_rhat(post), _effective_draws(post), _acceptance(post), _derived(post), _digits(post), _bounds(post)]
+    derived = derived_quantities(post) if derived is None else derived
+    checks = [_rhat(post), _effective_draws(post), _acceptance(post), _derived(post, derived)]
+    checks += [_digits(post), _bounds(post)]
     several = (_degrees_of_freedom(post), _independent(post), _evaluation(post), _likelihood(post, notes))
     return (*checks, *(check for check in several if check is not None), _priors(post))
 
@@ -282,9 +286,9 @@ def _acceptance(post: Posterior) -> Check:
     return Check("Acceptance", Question.CONVERGED, level, value, f"{low:g} to {high:g}", sentence, remedy)
 
 
-def _derived(post: Posterior) -> Check:
+def _derived(post: Posterior, derived: Sequence[Derived]) -> Check:
     """Did what follows from the parameters converge, too?"""
-    derived = sorted(derived_quantities(post), key=lambda d: -d.rhat)
+    derived = sorted(derived, key=lambda d: -d.rhat)
     rhat, ess = max(d.rhat for d in derived), min(min(d.ess_bulk, d.ess_tail) for d in derived)
     late = [d.name for d in derived if not (d.rhat < RHAT_BOUND and min(d.ess_bulk, d.ess_tail) > ESS_BOUND)]
     sentence = (

@@ -6,58 +6,17 @@ while a difference of them is not.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
-
 import numpy as np
 
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.types import FloatArray
 from starcal_uq.inference import arviz as arviz_compat
-
-if TYPE_CHECKING:
-    from starcal_uq.inference.posterior import Posterior
-
-
-@dataclass(frozen=True)
-class Derived:
-    """One quantity.
-
-    Attributes
-    ----------
-    name, unit : str
-        Name and unit.
-    mean, sd, mcse : float
-        Moments over the draws, and the Monte Carlo standard error of the mean.
-    rhat, ess_bulk, ess_tail : float
-        Convergence over separately seeded ensembles.
-    """
-
-    name: str
-    unit: str
-    mean: float
-    sd: float
-    mcse: float
-    rhat: float
-    ess_bulk: float
-    ess_tail: float
-
-
-# What was found last, and of what: checks and report ask for the same, which is a tenth of the time of sampling.
-_last: tuple[tuple[Any, ...], tuple[Derived, ...]] = ((), ())
+from starcal_uq.inference.posterior import Derived, Posterior
 
 
 def derived_quantities(post: Posterior) -> tuple[Derived, ...]:
     """Focal length in mm, displacement by the distortion at the corner, and the common rotation about each axis."""
-    global _last
-    of = (post.draws, post.camera, post.rotation_per_theta, post.n_ensembles)
-    if not _last[0] or any(mine is not theirs for mine, theirs in zip(of, _last[0], strict=True)):
-        _last = of, _derived(post)
-    return _last[1]
-
-
-def _derived(post: Posterior) -> tuple[Derived, ...]:
     draws = post.theta_draws
     rotation = (draws - post.mean) @ post.rotation_per_theta.T * ARCSEC
     values: dict[tuple[str, str], FloatArray] = {("focal length", "mm"): draws[:, 2] * post.camera.pixel_um / 1000.0}

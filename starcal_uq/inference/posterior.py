@@ -90,6 +90,30 @@ class Laplace:
         return mean, np.sqrt(variance)
 
 
+@dataclass(frozen=True)
+class Derived:
+    """One quantity.
+
+    Attributes
+    ----------
+    name, unit : str
+        Name and unit.
+    mean, sd, mcse : float
+        Moments over the draws, and the Monte Carlo standard error of the mean.
+    rhat, ess_bulk, ess_tail : float
+        Convergence over separately seeded ensembles.
+    """
+
+    name: str
+    unit: str
+    mean: float
+    sd: float
+    mcse: float
+    rhat: float
+    ess_bulk: float
+    ess_tail: float
+
+
 @dataclass(frozen=True, eq=False)
 class Diagnostics:
     """Evidence that the draws are draws from the posterior.
@@ -136,6 +160,8 @@ class Diagnostics:
         ``marginal``, ``pairs``, ``pairs_naive``, ``student_t``, or the name of the likelihood that was passed.
     checks : tuple of Check
         Every check of the draws, made once while sampling.
+    derived : tuple of Derived
+        What follows from the parameters, with its convergence; empty in posteriors of before.
     """
 
     rhat: FloatArray
@@ -159,6 +185,7 @@ class Diagnostics:
     likelihood: str = "marginal"
     checks: tuple[Check, ...] = ()
     compressed_frames: tuple[int, int] = (0, 0)
+    derived: tuple[Derived, ...] = ()
 
     SHAPES: ClassVar[Shapes] = {
         **dict.fromkeys(("rhat", "ess_bulk", "ess_tail", "mcse", "autocorrelation", "psis_mean", "psis_sd"), ("p",)),

@@ -24,6 +24,7 @@ from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.undetermined import open_parameters
 from starcal_uq.inference.checks import CompressionCheck, chain_order, check_compression, check_draws, measure
+from starcal_uq.inference.derived import derived_quantities
 from starcal_uq.inference.ensemble import PROPOSAL_DF, Chains, EnsembleSettings, Moves, run_ensembles
 from starcal_uq.inference.named import Source, check_names, find_source, label_of, resolved_dof
 from starcal_uq.inference.posterior import Laplace, Posterior
@@ -329,10 +330,11 @@ def _assemble(run: _Run, outcome: _Outcome, compression: CompressionCheck) -> Po
         dof_draws=None if extra is None else extra.reshape(-1),
         star_error_px=0.0 if cal.star_errors is None else cal.star_errors.total_px,
     )
-    checks = (*source.checks, *check_draws(posterior, source.notes))
+    derived = derived_quantities(posterior)
+    checks = (*source.checks, *check_draws(posterior, source.notes, derived))
     if outcome.checkpoint is not None:
         Path(outcome.checkpoint).unlink(missing_ok=True)
-    return replace(posterior, diagnostics=replace(diagnostics, checks=checks))
+    return replace(posterior, diagnostics=replace(diagnostics, checks=checks, derived=derived))
 
 
 def _without_extra(outcome: _Outcome) -> tuple[FloatArray, Chains, Laplace, FloatArray]:

@@ -52,7 +52,7 @@ def _misfit_sentence(diagnosis: Diagnosis) -> str:
 def derived_table(post: Posterior) -> TextTable:
     """Convergence of what follows from the parameters."""
     rows = []
-    for d in derived_quantities(post):
+    for d in post.diagnostics.derived or derived_quantities(post):
         mean = "0" if d.name.startswith("common") else fixed(d.mean, decimals_for(d.sd))
         share = percent(d.mcse / d.sd if d.sd > 0.0 else 0.0)
         ess = (count(int(d.ess_bulk)), count(int(d.ess_tail)))
