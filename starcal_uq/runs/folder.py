@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import STEP, PathLike, as_plain, check_new_folder, new_folder
+from starcal_uq.core.files import STEP, PathLike, as_plain, check_new_folder, flushed_together, new_folder
 from starcal_uq.core.manifest import (
     MANIFEST,
     NEW,
@@ -242,7 +242,8 @@ class RunFolder:
         """
         old = self.create().manifest
         with self.writing(), staged(self.path) as stage:
-            yield RunFolder(stage)
+            with flushed_together():
+                yield RunFolder(stage)
             # A file of another step that this one has changed stays a file of that step.
             made = {
                 name: entry_of(path, old.files[name].step if name in old.files else step)

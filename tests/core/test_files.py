@@ -1,8 +1,10 @@
-"""Cells of tables that may be opened as spreadsheets."""
+"""Cells of tables that may be opened as spreadsheets, and files that are written together."""
 
 from __future__ import annotations
 
 import csv
+import errno
+import os
 from pathlib import Path
 
 import pandas as pd
@@ -11,7 +13,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 import starcal_uq as sc
-from starcal_uq.core.files import cell_content, cell_text, write_csv
+from starcal_uq.core.errors import RunFolderError
+from starcal_uq.core.files import atomic_write_bytes, cell_content, cell_text, flushed_together, write_csv
+from starcal_uq.runs.folder import RunFolder
 from tests.helpers.mutants import _observations
 
 FORMULAS = ("=1+1", "=cmd|' /C calc'!A0", "+1+1", "-1+1", "@SUM(A1)", "\t=1", "\n=1", "'=1")
@@ -51,3 +55,37 @@ def test_names_of_stars_come_back(tmp_path: Path, ending: str) -> None:
     assert list(again.star_id) == list(odd.star_id)
     text = (tmp_path / f"o.{ending}").read_bytes()
     assert ending != "csv" or (b",=" not in text and b",@" not in text and b",-1+1" not in text)
+
+
+def test_files_of_a_step_are_on_the_disk_before_they_count(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[str] = []
+    flush, rename = os.fsync, os.replace
+
+    def flushed(handle: int) -> None:
+        done.append(f"flush {os.fstat(handle).st_ino}")
+        flush(handle)
+
+    def renamed(source: os.PathLike[str], target: os.PathLike[str]) -> None:
+        done.append(f"name {Path(target).name}")
+        rename(source, target)
+
+    monkeypatch.setattr(os, "fsync", flushed)
+    monkeypatch.setattr(os, "replace", renamed)
+    run = RunFolder(tmp_path)
+    with run.step("calibrate", {}) as stage:
+        for name in ("a", "b"):
+            atomic_write_bytes(stage.path / name, b"content")
+        assert not any(word.startswith("flush") for word in done)
+        files = [f"flush {(stage.path / name).stat().st_ino}" for name in ("a", "b")]
+    counts = done.index("name run.json")
+    assert set(files) <= set(done[:counts])
+    assert done[counts - 1].startswith("flush") and done[counts - 1] not in files
+
+
+def test_a_disk_that_refuses_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(_handle: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.raises(RunFolderError, match="second: cannot be written"), flushed_together():
+        atomic_write_bytes(tmp_path / "second", b"content")
+        monkeypatch.setattr(os, "fsync", full)
