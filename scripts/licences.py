@@ -17,14 +17,14 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "reference" / "licences.md"
-EXTRAS = ("cluster", "compiled", "excel", "images", "tetra3rs")
+EXTRAS = ("asdf", "cluster", "compiled", "excel", "images", "notebook", "raw", "tetra3rs")
 HEAD = """# Licences
 
 `starcal_uq` is under the MIT licence, but for one table: the example data (`stars.ecsv`) were measured in images by the
 European Space Agency and stand under CC BY-SA 3.0 IGO, as those do (`starcal_uq/pipeline/data/esa/NOTICE`).
 
 This is what comes with it, as a dependency or a dependency's dependency, in any of the supported versions of
-Python, and what the extras but *asdf* and *raw* add, as the packages' own metadata say it (`make supply` makes this
+Python, and what the extras for users add, as the packages' own metadata say it (`make supply` makes this
 table). None of it is part of our files: each is installed as its authors publish it, and those under the LGPL
 (*casadi*, *sep*) can be replaced by the user.
 
@@ -34,11 +34,20 @@ table). None of it is part of our files: each is installed as its authors publis
 
 
 def licence(package: Distribution) -> str:
-    """What a package says of itself: expression, classifiers or the first line of its text."""
+    """What a package says of itself: expression, classifiers, the first line of its text or the text."""
     said = [line.rpartition(" :: ")[2] for line in package.metadata.get_all("Classifier", []) if "License ::" in line]
     names = ", ".join(name for name in said if name != "OSI Approved")
     text = (package.metadata.get("License") or "").strip().partition("\n")[0]
-    return package.metadata.get("License-Expression") or names or text or "not stated"
+    return package.metadata.get("License-Expression") or names or text or by_text(package) or "not stated"
+
+
+def by_text(package: Distribution) -> str:
+    """Of a package whose metadata have the text alone: the BSD licence of three clauses, known by its last one."""
+    files = [
+        file.read_text() for file in package.files or () if file.name in package.metadata.get_all("License-File", [])
+    ]
+    known = any("Redistributions in binary form" in text and "Neither the name" in text for text in files)
+    return "BSD-3-Clause" if known else ""
 
 
 def licences() -> dict[str, str]:
@@ -66,9 +75,13 @@ def main() -> None:
         print(json.dumps(licences()))
         return
     table: dict[str, str] = {}
+    pins = PAGE.parents[2].joinpath("constraints.txt").read_text("utf-8")
+    pinned = {canonicalize_name(line.partition("==")[0]) for line in pins.splitlines() if "==" in line}
     for python in sys.argv[1:]:
         made = subprocess.run([python, __file__], capture_output=True, text=True, check=True).stdout
         table |= json.loads(made)
+    if unpinned := sorted(set(table) - pinned):
+        raise SystemExit(f"constraints.txt does not pin {', '.join(unpinned)}")
     PAGE.write_text(HEAD + "".join(f"| {name} | {table[name]} |\n" for name in sorted(table)), "utf-8")
 
 

@@ -3,9 +3,10 @@
     supply.py [--all] [--python VERSION ...] [--keep FOLDER]
 
 1. The source distribution is built, and the wheel from it; both are compared with what is under version control.
-2. For each Python: the wheel with its tests' extra into an empty environment, at the versions of `constraints.txt`; the
-   tests run against it in a folder without the package's source.
-3. The source distribution likewise, once, and there the tests of the project itself as well.
+2. For each Python: the wheel without any extra into an empty environment, at the versions of `constraints.txt`; the
+   tests run against it in a folder without the package's source, those of an extra are skipped. Then with all extras.
+3. Extras one after the other beside the wheel, once: their tests run. The source distribution, once, and there the
+   tests of the project itself as well.
 4. The wheel with the lowest versions that `pyproject.toml` allows, on the lowest Python.
 5. The licences of everything that comes along, into `docs/reference/licences.md`.
 
@@ -33,8 +34,11 @@ TESTS = (
     *("tests/camera", "tests/observations", "tests/core/test_cluster.py", "tests/images/test_centroids.py"),
     *("tests/sky/test_catalogue.py", "tests/estimation/test_sums.py", "tests/inference/test_arviz_compat.py"),
     *("tests/inference/test_sampler.py", "tests/budgeting/test_budget.py", "tests/runs/test_previous_files.py"),
-    *("tests/presentation/test_plots.py", "tests/cli/test_cli.py"),
+    *("tests/presentation/test_plots.py", "tests/cli/test_cli.py", "tests/core/test_extras.py"),
 )
+# What tests need beside the package, and extras that are tried by themselves.
+TOOLS = ("pytest", "hypothesis", "jsonschema")
+EXTRAS = ("images", "cluster", "excel", "notebook")
 # What is under version control and stays at home.
 HOME = re.compile(r"\.ci/|\.git")
 
@@ -62,12 +66,16 @@ def interpreter(version: str) -> Path | None:
     return None
 
 
-def environment(folder: Path, python: Path, what: str, constraints: Path) -> Path:
+def environment(folder: Path, python: Path, constraints: Path, *what: str) -> Path:
     """An empty environment with `what` in it, and its interpreter."""
     run("uv", "venv", "--quiet", "--clear", "--python", python, folder)
     inside = folder / "bin" / "python"
-    run("uv", "pip", "install", "--quiet", "--python", inside, "--constraint", constraints, what)
+    install(inside, constraints, *what)
     return inside
+
+
+def install(inside: Path, constraints: Path, *what: str) -> None:
+    run("uv", "pip", "install", "--quiet", "--python", inside, "--constraint", constraints, *what)
 
 
 def unpacked(archive: Path, folder: Path, package: bool) -> Path:
@@ -82,7 +90,8 @@ def unpacked(archive: Path, folder: Path, package: bool) -> Path:
 
 def tested(python: Path, tree: Path, tests: tuple[str, ...], *options: str) -> None:
     where = run(python, "-c", "import starcal_uq; print(starcal_uq.__file__)", cwd=tree).strip()
-    out = run(python, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-m", "not slow", *options, *tests, cwd=tree)
+    options = ("-m", "not slow", *options)
+    out = run(python, "-m", "pytest", "-q", "-p", "no:cacheprovider", *options, *tests, cwd=tree)
     say(f"{out.strip().splitlines()[-1]}; tested: {where}")
 
 
@@ -125,22 +134,28 @@ def main() -> None:
         source = unpacked(archives["sdist"], work / "source", package=True)
         # Tests of the project read its source; one call is checked by mypy, which `make test` does.
         chosen = ("tests", "--ignore=tests/test_project.py") if options.all else TESTS
-        inside = []
+        inside, plain, pins, wheel = [], [], ROOT / "constraints.txt", str(archives["wheel"])
         for version, python in pythons.items():
-            say(f"wheel, Python {version}")
-            wheel = f"{archives['wheel']}[test]"
-            inside.append(environment(work / f"wheel-{version}", python, wheel, ROOT / "constraints.txt"))
+            say(f"wheel without extras, Python {version}")
+            plain.append(environment(work / f"plain-{version}", python, pins, wheel, *TOOLS))
+            tested(plain[-1], tests, chosen)
+            say(f"wheel with all extras, Python {version}")
+            inside.append(environment(work / f"wheel-{version}", python, pins, f"{wheel}[all,test]"))
             tested(inside[-1], tests, chosen)
         version, python = next(iter(pythons.items()))
+        for extra in EXTRAS:
+            say(f"wheel with {extra} and those before it, Python {version}")
+            install(plain[0], pins, f"{wheel}[{extra}]")
+            tested(plain[0], tests, chosen, "-m", "extra and not slow")
         say(f"source distribution, Python {version}")
-        built = environment(work / "sdist", python, f"{archives['sdist']}[test]", ROOT / "constraints.txt")
+        built = environment(work / "sdist", python, pins, f"{archives['sdist']}[test]")
         tested(built, source, ("tests/test_project.py", "tests/test_benchmarks.py", "tests/observations"))
         say(f"lowest versions, Python {version}")
         lowest = work / "lowest.txt"
-        extras = [f"--extra={name}" for name in ("cluster", "compiled", "excel", "images", "tetra3rs")]
+        extras = [f"--extra={name}" for name in (*EXTRAS, "asdf", "compiled", "tetra3rs")]
         run("uv", "pip", "compile", "--quiet", "--resolution", "lowest-direct", "--python", python, *extras,
             "pyproject.toml", "--output-file", lowest)  # fmt: skip
-        low = environment(work / "lowest", python, f"{archives['wheel']}[test]", lowest)
+        low = environment(work / "lowest", python, lowest, f"{wheel}[test]")
         # Old versions are out of date by what came after them.
         tested(low, tests, chosen, "-W", "ignore::DeprecationWarning")
         run(sys.executable, ROOT / "scripts" / "licences.py", *inside)

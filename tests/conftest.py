@@ -16,11 +16,13 @@ os.environ["XDG_CACHE_HOME"] = os.path.join(tempfile.gettempdir(), "starcal_uq-t
 
 import warnings
 from collections.abc import Iterator
-from importlib.metadata import version
+from functools import cache
+from importlib.metadata import distributions, requires, version
 from pathlib import Path
 
 import hypothesis
 import pytest
+from packaging.requirements import Requirement
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -82,6 +84,22 @@ LONG = (
     *("test_notebook.py", "paper/", "cli/", "diagnostics/", "planning/", "estimation/", "presentation/"),
     *("identification/", "inference/", "sky/", "budgeting/", "runs/", "comparison/", "propagation/"),
 )
+
+
+@cache
+def installed(extra: str) -> bool:
+    """Whether every library of an extra is there."""
+    needed = map(Requirement, requires("starcal-uq") or ())
+    markers = [(one.name, one.marker) for one in needed if one.marker and one.marker.evaluate({"extra": extra})]
+    assert markers, f"{extra} is no extra of this package"
+    return all(any(distributions(name=name)) for name, _ in markers)
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip tests of an extra that is not installed; `make supply` runs them without any."""
+    for mark in item.iter_markers("extra"):
+        if not installed(mark.args[0]):
+            pytest.skip(f"the extra {mark.args[0]} is not installed")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

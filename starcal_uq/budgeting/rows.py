@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from decimal import Decimal
+from typing import ClassVar
 
 from starcal_uq.core.constants import CROSS_BORESIGHT, INTERACTION
 from starcal_uq.maths.intervals import HALF_WIDTH_997
@@ -87,6 +88,8 @@ class Contributor:
     applies : bool
         False where the file states that there is no such error: it then counts as zero, with that as its reason.
     """
+
+    DOCUMENTED: ClassVar = ("assessed", "combination")
 
     name: str
     ecss_class: str

@@ -22,6 +22,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 
@@ -95,6 +96,8 @@ class Total:
     explanation : str
         Why the two bounds differ, or that they agree.
     """
+
+    DOCUMENTED: ClassVar = ("at_least",)
 
     scope: str
     axis: str

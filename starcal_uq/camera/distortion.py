@@ -159,6 +159,11 @@ def simpler_models(name: str) -> tuple[str, ...]:
     )
 
 
+def next_simpler(name: str) -> str:
+    """The richest of `simpler_models`; empty where there is none."""
+    return max(simpler_models(name), key=lambda other: len(get_model(other).coefficients), default="")
+
+
 def parameters(model_name: str) -> tuple[Parameter, ...]:
     """Parameters of a camera with this distortion model, in their fixed order x0, y0, f, k..."""
     return _OPTICS + get_model(model_name).coefficients

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-from starcal_uq.cli.parts import Number, Of, Part, says
 from starcal_uq.cli.results import (
     OWN,
     Attitude,
@@ -20,8 +19,8 @@ from starcal_uq.cli.results import (
     OfStars,
     Posterior,
     Screening,
-    Verdict,
 )
+from starcal_uq.core.documents import Number, Of, Part, says
 from starcal_uq.core.types import AnyDict
 
 
@@ -113,7 +112,9 @@ class Diagnosis(Part):
     predictive: Annotated[list[Any], Of("diagnostics.predictive:PredictiveStatistic")] = says(
         "Measured residuals against those that the model makes"
     )
-    starts: Annotated[Any, Of("diagnostics.diagnose:MultiStart")] = says("Fits from other starts; null where none were")
+    starts: Annotated[Any | None, Of("diagnostics.diagnose:MultiStart")] = says(
+        "Fits from other starts; null where none were"
+    )
     notes: list[str] = says("What follows, in words")
 
     @classmethod
@@ -175,7 +176,7 @@ class Run(Part):
 
     run: str = says("Run folder")
     report: str = says("Its report")
-    verdict: Verdict = says("Whether its numbers may be used")
+    verdict: Annotated[Any, Of("diagnostics.verdict.judge:Verdict")] = says("Whether its numbers may be used")
     calibration: Calibration = says("The estimate")
     screening: Screening | None = says("Stars left out by --screen; null without it")
     posterior: Posterior = says("The posterior")
@@ -217,15 +218,6 @@ class Compare(Part):
     messages: list[str] = says("What deserves attention")
     text: str = says("The verdict in words")
     provenance: AnyDict = says("Of both, and settings")
-
-
-class Need(Part):
-    """Frames that a target takes."""
-
-    scope: str = says("Part of the error")
-    frames: int | None = says("Frames; null where none suffice")
-    frames_surely: int | None = says("Frames that suffice for 95 % of the campaigns; null where none do")
-    floor_arcsec: Number = says("What is left with any number of frames")
 
 
 class Forecast(Part):
@@ -306,7 +298,7 @@ class Plan(Part):
     confidence: Number = says("Probability of keeping the target")
     scope: str = says("Part of the error that the target is for")
     target_arcsec: Number = says("Target; null without one")
-    needs: list[Need] = says("Frames that it takes")
+    needs: Annotated[list[Any], Of("planning.plan:Need")] = says("Frames that it takes")
     forecast: list[Forecast] = says("Campaigns by size")
     text: str = says("The plan in words")
     provenance: AnyDict = says("Time, seed, settings and versions")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any
 
-from starcal_uq.cli.parts import Number, Of, Part, says
+from starcal_uq.core.documents import Number, Of, Part, says
 from starcal_uq.core.types import AnyDict
 
 OWN = "that of the parameter"
@@ -59,31 +59,6 @@ class Calibration(Part):
         }
 
 
-class Check(Part):
-    """One check."""
-
-    key: str = says("Its name for programs")
-    name: str = says("Its name")
-    value: str = says("What was found, with its unit")
-    bound: str = says("What was asked for")
-    sentence: str = says("What it means")
-    remedy: str = says("Command or Python call that may mend it; empty where nothing of the kind helps")
-    level: str = says("pass, warning or fail")
-    question: str = says("converged or trustworthy: the question that it helps to answer")
-
-    @classmethod
-    def take(cls, result: Any) -> Mapping[str, Any]:
-        return {**super().take(result), "question": result.question.name.lower()}
-
-
-class Verdict(Part):
-    """Whether the numbers of a run may be used."""
-
-    level: str = says("pass, warning or fail: the worst of the checks")
-    headline: str = says("The verdict in a sentence")
-    checks: list[Check] = says("Every check")
-
-
 class Sampled(Part):
     """The posterior of one parameter."""
 
@@ -112,7 +87,7 @@ class Posterior(Part):
 
     n_draws: int = says("Draws")
     level: str = says("pass, warning or fail: the worst of the checks of the draws")
-    checks: list[Check] = says("The checks of the draws")
+    checks: Annotated[list[Any], Of("core.status:Check")] = says("The checks of the draws")
     parameters: list[Sampled] = says("Parameters in order")
 
     @classmethod
@@ -197,18 +172,9 @@ class Budget(Part):
 
     title: str = says("Title")
     confidence: Number = says("Confidence of the totals")
-    contributors: Annotated[
-        list[Any],
-        Of(
-            "budgeting.rows:Contributor",
-            assessed=(bool, "Whether anybody has put a number on it"),
-            combination=(str, "How it enters the totals"),
-        ),
-    ] = says("Contributors by axis")
+    contributors: Annotated[list[Any], Of("budgeting.rows:Contributor")] = says("Contributors by axis")
     classes: list[ClassSum] = says("Classes of the standard by axis, after alignment")
-    totals: Annotated[list[Any], Of("budgeting.totals:Total", at_least=(bool, "Whether contributors are missing"))] = (
-        says("Totals by scope, axis and interpretation")
-    )
+    totals: Annotated[list[Any], Of("budgeting.totals:Total")] = says("Totals by scope, axis and interpretation")
     requirements: Annotated[
         list[Any],
         Of(

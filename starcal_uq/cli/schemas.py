@@ -34,12 +34,11 @@ from starcal_uq.cli.documents import (
     Studied,
     Validate,
 )
-from starcal_uq.cli.parts import Part
-from starcal_uq.cli.results import Verdict
+from starcal_uq.core import documents
+from starcal_uq.core.documents import PREFIX, Part, part_of
 from starcal_uq.core.types import AnyDict
-from starcal_uq.diagnostics.verdict.judge import VERSION
+from starcal_uq.diagnostics.verdict.judge import VERSION, Verdict
 
-PREFIX = "starcal-uq/"
 # Endings of keys that tell the unit.
 _UNITS = {
     "arcsec": "arcsec",
@@ -77,7 +76,7 @@ SCHEMAS: Mapping[str, tuple[int, type[Part]]] = {
     "reproduce": (1, Reproduce),
     "reproduce-field": (1, ReproduceField),
     "schema": (1, Schema),
-    "verdict": (VERSION, Verdict),
+    "verdict": (VERSION, part_of(Verdict)),
     "error": (1, Error),
 }
 _HEAD = {
@@ -87,12 +86,9 @@ _HEAD = {
 }
 
 
-def document(name: str, results: Mapping[str, Any], status: int) -> AnyDict:
+def document(name: str, results: Any, status: int) -> AnyDict:
     """The document of a schema that holds some results."""
-    version, part = SCHEMAS[name]
-    return {"schema": PREFIX + name, "version": version, "exit_status": status} | part.model_validate(
-        results
-    ).model_dump()
+    return documents.document(name, *SCHEMAS[name], results, status)
 
 
 def json_schema(name: str) -> AnyDict:

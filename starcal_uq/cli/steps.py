@@ -327,7 +327,8 @@ def export_command(
         typer.Option(
             "--to",
             help="The camera for opencv, ros, kalibr, mrcal, tetra3rs, tetra3, as a sip FITS header or asdf; "
-            "covariance (JSON); draws as csv or netcdf; the table of parameters in latex or markdown.",
+            "covariance (JSON); draws as csv or netcdf, or with all of ArviZ's groups as arviz; the table of "
+            "parameters in latex or markdown.",
         ),
     ],
     out: Annotated[
@@ -337,7 +338,8 @@ def export_command(
     force: Force = False,
 ) -> Answer:
     """Write the calibrated camera, or what is known of it, for another program; say how near that comes."""
-    made = sc.export(source, to, out, force=force)
+    with progress_bar("log likelihood") as progress:
+        made = sc.export(source, to, out, force=force, progress=progress)
     say(made.note)
     say(f"File: {made.path}")
     return Answer({"file": made.path, "to": to, "error_px": made.error_px, "text": made.note})

@@ -59,6 +59,7 @@ ExportFormat = Literal[
     "covariance",
     "csv",
     "netcdf",
+    "arviz",
     "latex",
     "markdown",
 ]

@@ -6,6 +6,12 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import Enum
+from typing import ClassVar
+
+# Commands that remedies give; `Check.remedy` says what their words in capitals stand for.
+CALIBRATE = "starcal-uq calibrate OBS CAMERA -o RUN --force"
+PLAN = "starcal-uq plan CAMERA --after RUN --choose 10"
+MORE = "Take more frames: the command names those that help most."
 
 
 class Status(Enum):
@@ -62,10 +68,10 @@ class Level(Enum):
 
 
 class Question(Enum):
-    """What a check helps to answer."""
+    """What a check helps to answer: did it converge, and can it be trusted?"""
 
-    CONVERGED = "Did it converge?"
-    TRUSTWORTHY = "Can it be trusted?"
+    CONVERGED = "converged"
+    TRUSTWORTHY = "trustworthy"
 
 
 @dataclass(frozen=True)
@@ -80,14 +86,21 @@ class Check:
         Question that it helps to answer.
     level : Level
         Outcome.
-    value, bound : str
-        Measured value and what was asked for, with units.
+    value : str
+        What was found, with its unit.
+    bound : str
+        What was asked for, with its unit.
     sentence : str
         Meaning, in plain words.
     remedy : str
         Command or Python call that may mend it, several joined by " or "; empty where it passed or nothing of the kind
         helps. OBS, CAMERA, SITE and RUN stand for the user's files, ``obs``, ``camera`` and ``cal`` for results.
+    advice : str
+        What to do with the instrument or the data, an order: before the command, or where none helps; else empty. Of a
+        check that did not pass, remedy and advice are never both empty.
     """
+
+    DOCUMENTED: ClassVar = ("key",)
 
     name: str
     question: Question
@@ -96,6 +109,7 @@ class Check:
     bound: str
     sentence: str
     remedy: str = ""
+    advice: str = ""
 
     @property
     def remedies(self) -> tuple[str, ...]:
@@ -113,8 +127,14 @@ class Check:
         return self.name if self.name[1:2] == "-" else self.name[0].lower() + self.name[1:]
 
     def __str__(self) -> str:
-        remedy = f" Remedy: {self.remedy}" if self.remedy else ""
-        return f"{self.level.value}: {self.name}, {self.value} (asked for: {self.bound}). {self.sentence}{remedy}"
+        remedy = f"Remedy: {self.remedy}" if self.remedy else ""
+        said = " ".join(filter(None, (self.sentence, self.advice, remedy)))
+        return f"{self.level.value}: {self.name}, {self.value} (asked for: {self.bound}). {said}"
+
+
+def model_remedy(name: str) -> str:
+    """How to calibrate with a distortion model."""
+    return f"{CALIBRATE} --model {name} or sc.calibrate(obs, camera, model={name!r})"
 
 
 def worst(checks: Iterable[Check]) -> Level:

@@ -67,6 +67,9 @@ class MultiStart:
         Frames that were fitted, of `of_frames`; 0 in a diagnosis of a version that took all.
     of_frames : int
         Frames of the calibration.
+    start : tuple of float
+        Start that reached the best optimum, where that is a better one: focal length (mm), principal point (px); else
+        empty.
     """
 
     n: int
@@ -76,6 +79,7 @@ class MultiStart:
     largest_sigma: float
     n_frames: int = 0
     of_frames: int = 0
+    start: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -258,6 +262,7 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
     side = _START_CENTRE * max(nominal.width_px, nominal.height_px)
     same = better = failed = 0
     largest = 0.0
+    best: tuple[float, tuple[float, ...]] = (np.inf, ())
     # Errors of the stars weigh an estimate that was found without them: that is what a start leads to.
     reached = None if cal.star_errors is None else cal.stages[-2]
     reference, lowest = (cal.theta, cal.chi2) if reached is None else (reached.theta, float(reached.cost[-1]))
@@ -290,7 +295,8 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
             largest = max(largest, difference)
         elif chi2 < lowest * (1.0 - _BETTER):
             better += 1
-    return MultiStart(n, same, better, failed, largest, some.n_frames, obs.n_frames)
+            best = min(best, (chi2, (start.focal_mm, start.x0_px, start.y0_px)))
+    return MultiStart(n, same, better, failed, largest, some.n_frames, obs.n_frames, best[1])
 
 
 def _few(obs: Observations) -> Observations:

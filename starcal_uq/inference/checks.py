@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.camera.distortion import Parameter
+from starcal_uq.camera.distortion import Parameter, next_simpler
 from starcal_uq.core.formatting import count, decimals_for, fixed, join_words, percent, plural, significant
-from starcal_uq.core.status import Check, Level, Question, pass_or_fail, pass_or_warn
+from starcal_uq.core.status import MORE, PLAN, Check, Level, Question, model_remedy, pass_or_fail, pass_or_warn
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.estimation.student import DEFAULT_DOF
 from starcal_uq.inference.derived import derived_quantities
@@ -346,17 +346,18 @@ def _bounds(post: Posterior) -> Check:
     edges = np.array([camera.width_px - 0.5, camera.height_px - 0.5])
     room = np.concatenate([(post.mean[:2] + 0.5) / sd[:2], (edges - post.mean[:2]) / sd[:2], post.mean[2:3] / sd[2:3]])
     good = outside <= _BOUNDS_SHARE and folded == 0.0
+    remedy, advice = "" if good else PLAN, ""
     if good:
         sentence = "No draw has its principal point off the detector, f below zero or a distortion that folds."
     elif folded > 0.0:
         sentence = "The distortion of some draws folds over within the field: the data do not determine it."
+        remedy = _simpler(post)
     else:
-        sentence = (
-            f"{percent(outside)} of the draws have their principal point off the detector or f below zero: add frames."
-        )
+        sentence = f"{percent(outside)} of the draws have their principal point off the detector or f below zero."
+        advice = MORE
     value = f"nearest bound {significant(float(np.min(room)))} sigma away"
     bound = f"≤ {percent(_BOUNDS_SHARE, 1)} of draws outside"
-    return Check("Bounds", Question.CONVERGED, pass_or_fail(good), value, bound, sentence)
+    return Check("Bounds", Question.CONVERGED, pass_or_fail(good), value, bound, sentence, remedy, advice)
 
 
 def _independent(post: Posterior) -> Check:
@@ -375,7 +376,7 @@ def _independent(post: Posterior) -> Check:
         sentence += " Newton's method did not settle on the mode; importance sampling starts from its last step."
     value = f"means {fixed(d.agreement_mean, 3)} sigma, sigmas {percent(d.agreement_sd)}, k-hat {fixed(d.psis_khat, 2)}"
     bound = f"{fixed(tolerance, 3)} sigma, {percent(tolerance)}, {KHAT_BOUND:g}"
-    remedy = _longer(post) if light and not agree else ""
+    remedy = "" if light and agree else _longer(post) if light else _simpler(post)
     level = pass_or_fail(light and agree)
     return Check("Independent posterior", Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
 
@@ -435,19 +436,26 @@ def _priors(post: Posterior) -> Check:
     pull = np.abs(post.draws.mean(axis=0)[: len(names)] - prior_mean) / prior_sd
     limited, pulled = _names(post, share > _PRIOR_SHARE), _names(post, pull > _PRIOR_PULL)
     largest = int(np.argmax(share))
+    remedy = advice = ""
     if limited:
         sentence = f"The prior, not the data, decides {join_words(limited)}."
+        remedy, advice = PLAN, MORE
     elif pulled:
         furthest = fixed(float(np.max(pull)), 1)
-        sentence = (
-            f"The data put {join_words(pulled)} up to {furthest} prior standard deviations away from the prior's mean: "
-            "check the nominal camera, or widen the prior."
-        )
+        sentence = f"The data put {join_words(pulled)} {furthest} prior standard deviations away from the prior's mean."
+        advice = "Correct the nominal camera, or state a wider prior in a TOML file (--priors)."
     else:
         sentence = "The data decide every parameter; the priors hardly matter."
     value = f"sigma {percent(float(share[largest]))} of the prior's ({names[largest]})"
     level = pass_or_warn(not limited and not pulled)
-    return Check("Influence of the priors", Question.TRUSTWORTHY, level, value, f"≤ {percent(_PRIOR_SHARE)}", sentence)
+    bound = f"≤ {percent(_PRIOR_SHARE)}"
+    return Check("Influence of the priors", Question.TRUSTWORTHY, level, value, bound, sentence, remedy, advice)
+
+
+def _simpler(post: Posterior) -> str:
+    """Fewer coefficients for the data to determine; frames that determine them where there are none."""
+    name = next_simpler(post.camera.distortion)
+    return f"{model_remedy(name)} or {PLAN}" if name else PLAN
 
 
 def _names(post: Posterior, which: BoolArray) -> list[str]:

@@ -23,6 +23,7 @@ import numpy as np
 
 from starcal_uq.camera.projection import forward_kernel, forward_root
 from starcal_uq.core.errors import SamplingError
+from starcal_uq.core.files import PathLike, write_netcdf
 from starcal_uq.core.settings import bounded, check_memory
 from starcal_uq.core.tasks import Progress, one_thread
 from starcal_uq.core.types import FloatArray
@@ -30,6 +31,7 @@ from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.student import StudentLikelihood
 from starcal_uq.inference.arviz import to_arviz
+from starcal_uq.inference.posterior import Variables, write_group
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.splits import frame_sample
 
@@ -95,6 +97,45 @@ def arviz_data(
         For an unknown group, or one that there is not: the log likelihood needs the data of the posterior, and a
         likelihood of star positions in which frames are independent.
     """
+    return to_arviz(_datasets(post, obs, groups, n_draws, n_frames, seed, progress))
+
+
+@bounded
+@one_thread()
+def write_arviz(
+    post: Posterior,
+    obs: Observations,
+    path: PathLike,
+    *,
+    n_draws: int = 1000,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> tuple[str, ...]:
+    """Write what `arviz_data` gives as netCDF, all or nothing, for programs that read ArviZ's schema; its groups."""
+    made = _datasets(post, obs, None, n_draws, 20, seed, progress)
+
+    def fill(file: Any) -> None:
+        for name, dataset in made.items():
+            variables: Variables = {
+                str(key): (tuple(map(str, v.dims)), v.values, dict(v.attrs)) for key, v in dataset.variables.items()
+            }
+            # Coordinates that are no dimensions, as xarray names them to itself.
+            beside = " ".join(str(key) for key in dataset.coords if key not in dataset.dims)
+            write_group(file.create_group(name), variables, dataset.attrs | ({"coordinates": beside} if beside else {}))
+
+    write_netcdf(path, fill)
+    return tuple(made)
+
+
+def _datasets(
+    post: Posterior,
+    obs: Observations,
+    groups: Sequence[Group] | None,
+    n_draws: int,
+    n_frames: int,
+    seed: int,
+    progress: Progress | None,
+) -> dict[str, xr.Dataset]:
     obs = weighed(obs, post)
     hashed = post.provenance.get("data_sha256")
     refused = _refused(post, hashed in (None, obs.data_hash))
@@ -132,7 +173,7 @@ def arviz_data(
     for group in GROUPS:
         if group in chosen:
             made[group] = makers[group]()
-    return to_arviz(made)
+    return made
 
 
 def _refused(post: Posterior, same_data: bool) -> dict[str, str]:

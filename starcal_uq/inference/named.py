@@ -17,7 +17,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.settings import Evaluation, LikelihoodName
-from starcal_uq.core.status import Check, Level, Question
+from starcal_uq.core.status import CALIBRATE, Check, Level, Question
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.student import DOF_RANGE, log_excess_prior, parse_dof
 from starcal_uq.inference.target import Extra, Likelihood, LogLikelihood
@@ -137,7 +137,7 @@ def find_source(
         cal.method,
         "one that fits the distortion",
         sentence,
-        "starcal-uq calibrate OBS CAMERA -o RUN --force or sc.calibrate(obs, camera)",
+        f"{CALIBRATE} or sc.calibrate(obs, camera)",
     )
     return replace(source, checks=(check,))
 

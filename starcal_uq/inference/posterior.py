@@ -347,6 +347,9 @@ class Posterior(Shown):
             )
             for i in self.sampled
         }
+        if self.dof_draws is not None:
+            about: AnyDict = {"units": "1", "long_name": "degrees of freedom of Student's t", "scale": 1.0}
+            variables["dof"] = (("chain", "draw"), self.dof_draws.reshape(shape), about)
         attrs: AnyDict = {
             "inference_library": "emcee",
             "inference_library_version": str(self.provenance.get("versions", {}).get("emcee")),
@@ -420,10 +423,10 @@ class Posterior(Shown):
 
         # xarray would do it, but loads Dask for a lock, which takes longer than sampling.
         def fill(file: Any) -> None:
-            _write(file, {name: (_ARRAYS[name], value, {}) for name, value in arrays.items()}, attrs)
+            write_group(file, {name: (_ARRAYS[name], value, {}) for name, value in arrays.items()}, attrs)
             for group, (variables, coords, about) in self._groups().items():
                 dimensions: Variables = {name: ((name,), values, {}) for name, values in coords.items()}
-                _write(file.create_group(group), dimensions | variables, about)
+                write_group(file.create_group(group), dimensions | variables, about)
 
         write_netcdf(path, fill)
 
@@ -456,15 +459,19 @@ class Posterior(Shown):
             return made
 
 
-def _write(group: Any, variables: Variables, attrs: AnyDict) -> None:
+def write_group(group: Any, variables: Variables, attrs: AnyDict) -> None:
     """Put variables with their dimensions, and attributes, into a group of a netCDF file."""
     for name, (dimensions, values, about) in variables.items():
         for dimension, size in zip(dimensions, values.shape, strict=True):
             if dimension not in group.dimensions:
                 group.dimensions[dimension] = size
         # Steps that were rejected repeat their walker's place: two fifths of the bytes.
-        packed = {"compression": "gzip", "compression_opts": 1} if values.size > _WORTH_PACKING else {}
-        group.create_variable(name, dimensions, data=values, **packed).attrs.update(about)
+        options: AnyDict = {"compression": "gzip", "compression_opts": 1} if values.size > _WORTH_PACKING else {}
+        if values.dtype.kind == "U":
+            import h5py
+
+            values, options = values.astype(object), options | {"dtype": h5py.string_dtype()}
+        group.create_variable(name, dimensions, data=values, **options).attrs.update(about)
     group.attrs.update(attrs)
 
 

@@ -12,8 +12,11 @@ from starcal_uq.camera.distortion import parameters
 from starcal_uq.camera.exchange import CAMERA_FORMATS, Exported, export_camera
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import PathLike, atomic_write_text, ensure_new, write_csv
+from starcal_uq.core.formatting import join_words
+from starcal_uq.core.tasks import Progress
 from starcal_uq.core.types import AnyDict
 from starcal_uq.estimation.calibration import Calibration
+from starcal_uq.inference.groups import write_arviz
 from starcal_uq.inference.posterior import Posterior
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.estimation import calibration_table
@@ -29,6 +32,7 @@ def export(
     path: PathLike | None = None,
     *,
     force: bool = False,
+    progress: Progress | None = None,
 ) -> Exported:
     """Write a calibrated camera, or what is known of it, for another program.
 
@@ -40,11 +44,14 @@ def export(
     to : str
         One of `FORMATS`. ``opencv``, ``ros``, ``kalibr``, ``mrcal``, ``tetra3rs``, ``tetra3``, ``sip`` and ``asdf``
         hold the camera; ``covariance`` (JSON) parameters and their covariance, ``csv`` and ``netcdf`` the draws,
-        ``latex`` and ``markdown`` the table of the parameters.
+        ``arviz`` (netCDF) a thousand of them with all of ArviZ's groups, ``latex`` and ``markdown`` the table of the
+        parameters.
     path : path, optional
         File to write; by default one in the current folder, named after the run and the format.
     force : bool
         Whether to replace a file.
+    progress : callable, optional
+        Called as ``progress(done, total)`` while the log likelihood of ``arviz`` is computed.
 
     Returns
     -------
@@ -64,7 +71,7 @@ def export(
         raise RunFolderError(f"{to!r} is no format: use one of {', '.join(FORMATS)}.")
     if isinstance(what, str | os.PathLike):
         what = Run(what) if os.path.isdir(what) or not os.path.exists(what) else Camera.load(what)
-    name = "camera"
+    name, run = "camera", what if isinstance(what, Run) else None
     if isinstance(what, Run):
         name, what = what.name, what.best
     place = Path(f"{name}-{to}{FORMATS[to]}" if path is None else path)
@@ -75,6 +82,11 @@ def export(
     if to in _OF_DRAWS and not isinstance(what, Posterior):
         raise RunFolderError(f"{name}: has no draws for {to}; run `starcal-uq sample RUN` first, or export covariance.")
     ensure_new(place, force)
+    if to == "arviz":
+        if run is None or not isinstance(what, Posterior):
+            raise RunFolderError("arviz holds draws and data: name the folder of a run.")
+        groups = write_arviz(what, run.observations, place, progress=progress)
+        return Exported(place, 0.0, f"{join_words(groups)}, for `az.from_netcdf`.")
     return Exported(place, 0.0, _RESULTS[to](what, place))
 
 
@@ -126,7 +138,7 @@ def _write_table(mark: Callable[[TextTable], str]) -> Callable[[Calibration | Po
     return write
 
 
-_OF_DRAWS = ("csv", "netcdf")
+_OF_DRAWS = ("csv", "netcdf", "arviz")
 _RESULTS = {
     "covariance": _write_covariance,
     "csv": _write_draws,
@@ -139,6 +151,7 @@ FORMATS = {name: form.ending for name, form in CAMERA_FORMATS.items()} | {
     "covariance": ".json",
     "csv": ".csv",
     "netcdf": ".nc",
+    "arviz": ".nc",
     "latex": ".tex",
     "markdown": ".md",
 }

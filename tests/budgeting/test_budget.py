@@ -441,6 +441,7 @@ def test_a_confidence_beyond_the_samples_is_not_judged_by_them(
     assert control.verdict == "met" and control.total.sampled_se_arcsec > 0.0
 
 
+@pytest.mark.extra("excel")
 def test_a_budget_beyond_the_samples_is_whole(stated: Path, tmp_path: Path) -> None:
     from openpyxl import load_workbook
 
@@ -510,6 +511,7 @@ def test_what_is_no_budget_is_refused(tmp_path: Path, text: str) -> None:
         Budget.load(tmp_path / "none.csv")
 
 
+@pytest.mark.extra("excel")
 def test_excel_has_numbers_units_and_marks(stated: Path, tmp_path: Path) -> None:
     from openpyxl import load_workbook
 
@@ -534,6 +536,7 @@ def test_excel_has_numbers_units_and_marks(stated: Path, tmp_path: Path) -> None
     assert "Requirements" not in load_workbook(tmp_path / "plain.xlsx").sheetnames
 
 
+@pytest.mark.extra("excel")
 def test_names_with_characters_that_no_workbook_holds_are_written(tmp_path: Path) -> None:
     from openpyxl import load_workbook
 

@@ -81,6 +81,7 @@ def test_tetra3rs_reads_its_file_and_sees_the_same_directions(camera, tmp_path):
     assert largest(camera.focal_px * (plane - seen[:, :2] / seen[:, 2:])) <= made.error_px + 1e-5
 
 
+@pytest.mark.extra("images")
 def test_a_header_with_sip_gives_the_angles_between_pixels(camera, tmp_path):
     from astropy.io.fits import Header
     from astropy.wcs import WCS

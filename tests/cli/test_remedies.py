@@ -12,9 +12,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import typer
+from click import ClickException
 
 import starcal_uq as sc
+from starcal_uq.cli.commands import app
 from starcal_uq.core.status import Level, Status
+from starcal_uq.diagnostics.diagnose import MultiStart
 from starcal_uq.diagnostics.times import TimeTest
 from starcal_uq.diagnostics.verdict import draws, estimate, observed
 from starcal_uq.estimation.cameras import MixedCameras
@@ -67,6 +71,7 @@ def short_of(kind, small):
         return sc.sample(small.obs, small.cal, seed=0, likelihood=kind, **SHORT)
 
 
+E = np.eye(6)
 PHASE = SimpleNamespace(
     against="pixel phase in x",
     name="phase",
@@ -78,7 +83,7 @@ PHASE = SimpleNamespace(
 )
 
 
-# What makes each function that can give a remedy do so; the remedies of all of them are executed.
+# What makes each function that makes a check find fault; what all of them give to try is executed, or parsed.
 EXAMPLES = {
     "inference.checks._rhat": lambda s: [checks._rhat(changed(s.post, rhat=np.full(6, 1.1)))],
     "inference.checks._effective_draws": lambda s: [
@@ -90,7 +95,16 @@ EXAMPLES = {
     "inference.checks._degrees_of_freedom": lambda s: [
         checks._degrees_of_freedom(dataclasses.replace(s.post, dof_draws=np.arange(float(len(s.post.draws)))))
     ],
-    "inference.checks._independent": lambda s: [checks._independent(changed(s.post, agreement_sd=2.0))],
+    "inference.checks._bounds": lambda s: [
+        checks._bounds(dataclasses.replace(s.post, draws=s.post.draws + shift)) for shift in (1e5 * E[0], 1e-5 * E[3])
+    ],
+    "inference.checks._priors": lambda s: [
+        checks._priors(dataclasses.replace(s.post, priors=s.post.priors.replace(**priors)))
+        for priors in ({"focal_fraction": 1e-6}, {"focal_px": 1.5 * s.post.priors.focal_px})
+    ],
+    "inference.checks._independent": lambda s: [
+        checks._independent(changed(s.post, **found)) for found in ({"agreement_sd": 2.0}, {"psis_khat": 2.0})
+    ],
     "inference.checks._evaluation": lambda s: [
         checks._evaluation(changed(s.post, compressed_max_difference=value)) for value in (9.0, float("nan"))
     ],
@@ -126,6 +140,17 @@ EXAMPLES = {
     "diagnostics.verdict.estimate.estimators_agree": lambda s: [
         estimate.estimators_agree(dataclasses.replace(s.cal, pair_theta=s.cal.theta + 99.0 * s.cal.sigmas))
     ],
+    "diagnostics.verdict.estimate.against_truth": lambda s: [
+        estimate.against_truth(s.cal, s.camera.replace(x0_px=900.0), s.post)
+    ],
+    "diagnostics.verdict.estimate.starts": lambda s: [
+        estimate.starts(found)
+        for found in (
+            MultiStart(8, 6, 2, 0, 0.0, start=(70.1, 511.5, 520.25)),
+            MultiStart(8, 6, 2, 0, 0.0),
+            MultiStart(8, 6, 0, 2, 0.0),
+        )
+    ],
     "diagnostics.verdict.estimate.misfit": lambda s: [
         estimate.misfit(sc.diagnostics.misfit_tests(s.bent, sc.calibrate(s.bent, s.sheet, model="none")), "none"),
         estimate.misfit(
@@ -142,7 +167,9 @@ EXAMPLES = {
         estimate.comparison(sc.diagnostics.compare_models(s.bent, sc.calibrate(s.bent, s.sheet, model="none")))
     ],
     "diagnostics.verdict.estimate.even_noise": lambda s: [
-        estimate.even_noise(sc.diagnostics.misfit_tests(s.uneven, sc.calibrate(s.uneven, s.sheet)))
+        estimate.even_noise(found)
+        for whole in [sc.diagnostics.misfit_tests(s.uneven, sc.calibrate(s.uneven, s.sheet))]
+        for found in (whole, dataclasses.replace(whole, uneven=None))
     ],
     "diagnostics.verdict.estimate.jackknife": lambda s: [
         estimate.jackknife(dataclasses.replace(s.jackknife, sandwich_covariance=9.0 * s.jackknife.formal_covariance))
@@ -155,10 +182,40 @@ EXAMPLES = {
             observed.directions(dataclasses.replace(s.obs, meta=meta), s.cal)
             for meta in ({"directions": "undeclared"}, {"directions": "apparent", "observer": "unknown"})
         ]
-        + [observed.directions(s.obs, s.cal, None, TimeTest("aberration twice", *(4 * [1.0]), "f", 2.0))]
+        + [
+            observed.directions(s.obs, s.cal, None, TimeTest(cause, *(4 * [1.0]), "f", 2.0))
+            for cause in ("aberration twice", "no aberration", "epoch", "date", "hour")
+        ]
     ),
     "diagnostics.verdict.observed.residual_pattern": lambda s: [
         observed.residual_pattern(s.bent, sc.calibrate(s.bent, s.sheet, model="none"))
+    ],
+    "diagnostics.verdict.observed.noise": lambda s: [
+        observed.noise(
+            dataclasses.replace(s.obs, sigma_px=np.full(s.obs.n_stars, stated)), dataclasses.replace(s.cal, **noise)
+        )
+        for stated, noise in (
+            (0.05, {"sigma": 9.0}),
+            (0.05, {"sigma": 1e-4}),
+            (0.05, {"sigma": 0.2, "sigma_name": "sigma_scale"}),
+            (1.0, {"sigma": s.cal.camera.focal_px / 206265.0, "sigma_name": "sigma_scale"}),
+        )
+    ],
+    "diagnostics.verdict.observed.partitions": lambda s: [
+        observed.partitions(
+            dataclasses.replace(
+                s.cal,
+                partitions=SimpleNamespace(
+                    n_stars=np.array([99, 99]),
+                    n_frames=np.array([9, 9]),
+                    chi2=s.cal.sigma**2 * np.array([900.0, 170.0]),
+                ),
+            )
+        )
+    ],
+    "diagnostics.verdict.observed.coverage": lambda s: [
+        observed.coverage(obs, dataclasses.replace(s.cal, residuals_px=s.cal.residuals_px[: obs.n_stars]))
+        for obs in (s.obs.select_frames(s.obs.frame_ids[:3]), s.obs.select(s.obs.x_px < 500.0))
     ],
     "diagnostics.verdict.observed.screening": lambda s: [
         observed.screening(s.obs.with_meta(screening={"rejected": 0, "of": 9, "blame": "the model is wrong."}))
@@ -223,6 +280,7 @@ ARGUMENTS = {
     "method='three_stage'": "sc.calibrate(obs, camera, {})",
     "parameters='all'": "sc.calibrate(obs, camera, method='griffith', recursion=sc.estimation.RecursionOptions({}))",
     "solver='ipopt'": "sc.calibrate(obs, camera, {})",
+    "solver='minpack'": "sc.calibrate(obs, camera, {})",
 }
 
 
@@ -248,15 +306,14 @@ def sentences(tree):
             yield node.value
 
 
-def test_every_check_that_gives_a_remedy_has_an_example():
-    """A check function that is added with a remedy is missing here until it has one."""
+def test_every_check_has_an_example():
+    """A check function that is added is missing here until it has one."""
     giving, shared = set(), ("_sampling", "_converged")
     for module, tree in trees():
         for function in (node for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)):
             for call in (node for node in ast.walk(function) if isinstance(node, ast.Call)):
                 name = getattr(call.func, "id", "")
-                with_remedy = len(call.args) > 6 or any(keyword.arg == "remedy" for keyword in call.keywords)
-                if (name == "Check" and with_remedy) or (module == "inference.checks" and name in shared):
+                if name == "Check" or (module == "inference.checks" and name in shared):
                     giving.add(f"{module}.{function.name}")
     assert giving - {f"inference.checks.{name}" for name in shared} == set(EXAMPLES)
 
@@ -269,9 +326,13 @@ def remedies(small):
     small.drifting[: len(small.drifting) // 2] += small.post.sd
     found = {}
     for name, make in EXAMPLES.items():
-        given = {check.remedy for check in make(small) if check.level is not Level.PASS and check.remedy}
-        assert given, f"{name} gave no remedy"
-        found |= dict.fromkeys(one for remedy in given for one in remedy.split(" or "))
+        doubts = [check for check in make(small) if check.level is not Level.PASS]
+        assert doubts, f"{name} found no fault"
+        for check in doubts:
+            # Something to try: a command, a call, or an order of what to do with instrument or data.
+            assert check.remedies or check.advice, f"{name} gives nothing to try: {check}"
+            assert not check.advice or re.fullmatch(r"[A-Z].*\.", check.advice), check.advice
+            found |= dict.fromkeys(check.remedies)
     return list(found)
 
 
@@ -279,14 +340,18 @@ def remedies(small):
 def execute(small, cli, tmp_path):
     """Run a command as a user would, on a copy of the files; its words in capitals stand for them."""
 
-    def run(command, more=""):
+    def run(command, more="", parse=False):
         folder = tmp_path / f"files{len(list(tmp_path.iterdir()))}"
         shutil.copytree(small.folder, folder)
         words = [*shlex.split(command), *shlex.split(more)]
         ground = "GROUND_" if "SITE" in words else "PATCH_" if "--star-errors" in words else ""
         files = {"OBS": f"{ground}OBS.csv", "CAMERA": f"{ground}CAMERA.toml", "SITE": "SITE.toml", "FILE": "new.toml"}
         files |= {name: name for name in ("RUN", "RUN_A", "RUN_B", "DIR")}
-        status, out, err = cli(*(folder / files[word] if word in files else word for word in words))
+        words = [str(folder / files[word]) if word in files else word for word in words]
+        if parse:
+            typer.main.get_command(app).commands[words[0]].make_context(words[0], words[1:])
+            return
+        status, out, err = cli(*words)
         # 1 is the verdict on so short a run; 2 is a command that cannot be.
         assert status in (0, 1) and "error:" not in err, (command, out, err)
 
@@ -294,12 +359,15 @@ def execute(small, cli, tmp_path):
 
 
 def test_every_remedy_of_a_check_can_be_executed(small, remedies, execute):
-    assert len(remedies) > 15
+    assert len(remedies) > 20
     names = {"sc": sc, "obs": small.obs, "camera": small.camera, "cal": small.cal}
     for remedy in remedies:
         program, _, command = remedy.partition(" ")
         if program == "starcal-uq":
-            execute(command, "--ensembles 2 --walkers 14 --steps 20" if command.startswith("sample") else "")
+            words = command.split()
+            more = {"sample": "--ensembles 2 --walkers 14 --steps 20", "plan": "--frames 10"}.get(words[0], "")
+            # It takes long; a test of its own executes it.
+            execute(command, more, parse=words[0] == "validate")
         else:
             assert remedy.startswith("sc."), remedy
             stars = {"obs": small.patch, "camera": small.sheet} if "star_errors" in remedy else {}
@@ -334,3 +402,5 @@ def test_control_a_remedy_that_names_no_option_is_refused(small, execute):
         sc.sample(small.obs, small.cal, likelihood="exact")
     with pytest.raises(AssertionError):
         execute("sample RUN --force --likelihood exact")
+    with pytest.raises(ClickException, match="exact"):
+        execute("sample RUN --force --likelihood exact", parse=True)

@@ -57,6 +57,7 @@ def test_sums_are_those_of_one_fixed_tree() -> None:
     assert Cluster().reduce(share, [7], total) == share(7)
 
 
+@pytest.mark.extra("cluster")
 def test_no_scheduler_is_said_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("starcal_uq.core.cluster._CONNECT_S", 0.5)
     for address in ("tcp://127.0.0.1:9", "nonsense://here"):

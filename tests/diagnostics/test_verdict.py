@@ -213,7 +213,7 @@ def test_an_estimate_that_did_not_converge_fails_with_its_remedy(run):
     cal = dataclasses.replace(run.cal, status=sc.core.Status.MAX_ITERATIONS)
     check = outcome("Estimation", run.obs, cal)
     assert check.level is Level.FAIL
-    assert sc.core.Status.MAX_ITERATIONS.remedy in check.sentence
+    assert sc.core.Status.MAX_ITERATIONS.remedy[1:] in check.advice
 
 
 def test_estimators_that_disagree_fail(run):

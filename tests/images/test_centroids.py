@@ -9,8 +9,6 @@ import numpy as np
 import pandas as pd
 import PIL.Image
 import pytest
-import sep
-from astropy.io import fits
 from scipy.spatial import cKDTree
 from scipy.special import erf
 
@@ -24,6 +22,10 @@ from starcal_uq.images.centroids import COLUMNS, FRAME_COLUMNS, Centroids
 from starcal_uq.images.extract import extract_centroids
 from starcal_uq.images.image import Image, read_image
 from tests.helpers.speed import sort_a_million, times_as_long
+
+sep, fits = (
+    pytest.importorskip(name, reason="the extra images is not installed") for name in ("sep", "astropy.io.fits")
+)
 
 BACKGROUND_E, READ_NOISE_E = 50.0, 5.0
 

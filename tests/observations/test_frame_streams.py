@@ -166,6 +166,7 @@ def test_other_complaints_are_those_of_the_loader(tmp_path):
         list(stream_frames(path, batch_rows=50))
 
 
+@pytest.mark.extra("images")
 def test_what_cannot_be_streamed_is_refused_at_once(tmp_path):
     with pytest.raises(ObservationError, match="does not exist"):
         stream_frames(tmp_path / "nowhere.parquet")

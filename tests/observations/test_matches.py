@@ -6,15 +6,17 @@ import json
 
 import numpy as np
 import pytest
-from astropy.coordinates import SkyCoord
-from astropy.io import fits
-from astropy.table import Table
-from astropy.wcs import WCS
 
 import starcal_uq as sc
 from starcal_uq.core.errors import ObservationError, RunFolderError
 from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.pipeline.images import are_images
+
+ASTROPY = [
+    pytest.importorskip(f"astropy.{name}", reason="the extra images is not installed")
+    for name in ("coordinates", "io.fits", "table", "wcs")
+]
+SkyCoord, fits, Table, WCS = ASTROPY[0].SkyCoord, ASTROPY[1], ASTROPY[2].Table, ASTROPY[3].WCS
 
 CAMERA = sc.Camera(1000, 800, 10.0, 50.0, 499.5, 399.5, "none")
 # The same camera and its attitude as astropy has them: y down and x to the west, as in a picture of the sky.

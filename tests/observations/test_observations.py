@@ -20,7 +20,7 @@ from tests.helpers.speed import sort_a_million, times_as_long
 APPARENT = {"ra_deg": "ra_apparent_deg", "dec_deg": "dec_apparent_deg"}
 CAMERA = Camera(1024, 768, 6.9, 35.0, 511.5, 383.5)
 TIME = "2026-11-21T01:02:03"
-ENDINGS = (".csv", ".ecsv", ".parquet")
+ENDINGS = (".csv", pytest.param(".ecsv", marks=pytest.mark.extra("images")), ".parquet")
 
 HEADER = ["frame", "x_px", "y_px", "ra_deg", "dec_deg"]
 ROWS = [
@@ -168,6 +168,7 @@ def test_select():
         obs.select_frames([-1, 77])
 
 
+@pytest.mark.extra("images")
 def test_to_dataframe_and_table():
     obs = random_table()
     frame = obs.to_dataframe()
@@ -251,6 +252,7 @@ def test_required_columns_alone_are_enough(tmp_path, ending):
     assert back.meta["ignored_columns"] == []
 
 
+@pytest.mark.extra("images")
 def test_meta_with_numpy_values_is_saved_as_plain_values(tmp_path):
     obs = random_table(meta={"seed": np.int64(3), "observer_velocity_km_s": np.array([1.0, 2.0, 3.0]), "p": Path("a")})
     for ending in (".ecsv", ".parquet"):
@@ -317,6 +319,7 @@ def test_optional_columns_may_be_empty(tmp_path):
     np.testing.assert_array_equal(load_observations(path).mag, [np.nan, np.nan, 1, 2, 3, 4])
 
 
+@pytest.mark.extra("images")
 def test_ecsv_written_by_astropy_in_other_units(tmp_path):
     from astropy import units as u
     from astropy.table import QTable
@@ -345,6 +348,7 @@ def test_ecsv_written_by_astropy_in_other_units(tmp_path):
     assert "column dec_deg has the unit 'm'; give it in deg." in str(caught(tmp_path / "obs.ecsv"))
 
 
+@pytest.mark.extra("images")
 def test_our_ecsv_is_read_by_astropy(tmp_path):
     from astropy.table import Table
 
@@ -396,6 +400,7 @@ def test_columns_of_other_names(tmp_path):
     assert "'ra' is no column of observations; use frame" in str(caught(path, columns={"ra": "alpha"}))
 
 
+@pytest.mark.extra("images")
 def test_other_directions_are_undeclared(tmp_path):
     """What a file declares of its ra_deg and dec_deg does not hold for other columns."""
     table = random_table().to_table()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import warnings
 from typing import get_args
 
 import numpy as np
@@ -12,6 +14,7 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.settings import ExportFormat
+from starcal_uq.inference.groups import GROUPS
 from starcal_uq.runs.exchange import FORMATS
 from tests.helpers.scenes import observations
 
@@ -39,12 +42,32 @@ def test_covariance_draws_and_tables(run, tmp_path):
     assert draws.columns[0] == "x0 [px]"
     again = sc.Posterior.load(sc.export(run, "netcdf", tmp_path / "d.nc").path)
     assert np.array_equal(again.draws, run.posterior.draws)
-    for to, name in (("netcdf", "d.nc"), ("csv", "d.csv"), ("covariance", "c.json")):
+    for to, name in (("netcdf", "d.nc"), ("arviz", "d.nc"), ("csv", "d.csv"), ("covariance", "c.json")):
         sc.export(run, to, tmp_path / name, force=True)
     lines = sc.export(run, "markdown", tmp_path / "t.md").path.read_text().splitlines()
     assert len(lines) == 2 + len(run.posterior.parameter_names)
     assert {line.count("|") for line in lines} == {10}
     assert sc.export(run, "latex", tmp_path / "t.tex").path.read_text().startswith(r"\begin{tabular}")
+
+
+def test_arviz_reads_what_is_written_for_it(run, tmp_path):
+    made = sc.export(run, "arviz", tmp_path / "a.nc")
+    assert "log_likelihood" in made.note and made.note.endswith("for `az.from_netcdf`.")
+    expected = run.arviz()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        again = importlib.import_module("arviz").from_netcdf(made.path)
+    for group in ("posterior", "sample_stats", *GROUPS):
+        one, other = (
+            data[group].to_dataset() if hasattr(data[group], "to_dataset") else data[group]
+            for data in (again, expected)
+        )
+        assert set(one.variables) == set(other.variables) and set(one.coords) == set(other.coords), group
+        for name in other.variables:
+            assert np.array_equal(one[name].values, other[name].values), (group, name)
+            assert one[name].attrs.get("units") == other[name].attrs.get("units")
+    with pytest.raises(RunFolderError, match="name the folder of a run"):
+        sc.export(run.posterior, "arviz")
 
 
 def test_a_calibration_alone_and_a_camera_alone(run, tmp_path, monkeypatch):

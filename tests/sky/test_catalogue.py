@@ -236,6 +236,7 @@ def test_propagation_agrees_with_erfa_to_1_mas_in_50_years() -> None:
     assert np.allclose(new_pm_dec[plain], (expected[3] / MAS)[plain], rtol=0, atol=0.5)
 
 
+@pytest.mark.extra("images")
 def test_propagation_agrees_with_astropy_and_goes_back() -> None:
     from astropy import units as u
     from astropy.coordinates import Distance, SkyCoord

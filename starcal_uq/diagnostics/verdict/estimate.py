@@ -6,12 +6,22 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.camera.distortion import get_model
+from starcal_uq.camera.distortion import get_model, next_simpler
 from starcal_uq.core.formatting import count, fixed, join_words, plural, significant
-from starcal_uq.core.status import Check, Level, Question, Status, pass_or_fail, pass_or_warn
+from starcal_uq.core.status import (
+    CALIBRATE,
+    PLAN,
+    Check,
+    Level,
+    Question,
+    Status,
+    model_remedy,
+    pass_or_fail,
+    pass_or_warn,
+)
 from starcal_uq.core.types import BoolArray
 from starcal_uq.diagnostics.misfit import ALPHA
-from starcal_uq.diagnostics.verdict.observed import CALIBRATE, NOISE, ROBUST, SCREEN, model_remedy, richer
+from starcal_uq.diagnostics.verdict.observed import NOISE, ROBUST, SCREEN, richer
 from starcal_uq.estimation.fallback import fallback_words
 from starcal_uq.estimation.undetermined import what_is_open
 from starcal_uq.maths.intervals import student_quantile
@@ -39,7 +49,9 @@ _REMEDIES = {
     Status.OUTSIDE_DETECTOR: _IPOPT,
     Status.FOLDED: _IPOPT,
     Status.INCONSISTENT: SCREEN,
+    Status.STALLED: f"{CALIBRATE} --solver minpack or sc.calibrate(obs, camera, solver='minpack')",
 }
+_INFLATE = "sc.diagnostics.accept_inflation(cal, sc.diagnostics.jackknife_frames(obs, cal))"
 
 
 def estimation(cal: Calibration, post: Posterior | None = None) -> Check:
@@ -49,14 +61,17 @@ def estimation(cal: Calibration, post: Posterior | None = None) -> Check:
     if cal.status.ok:
         sentence = f"All {plural(len(cal.stages), 'stage')} ended at an optimum, after {plural(steps, 'iteration')}."
     else:
-        sentence = f"The estimate is not an optimum: {cal.remedy}."
-    remedies = {} if cal.solver == "filter" else _REMEDIES
-    level, remedy = pass_or_fail(cal.status.ok), remedies.get(cal.status, "")
+        sentence = "The estimate is not an optimum."
+    simpler = next_simpler(cal.camera.distortion)
+    remedies = {Status.SINGULAR: f"{model_remedy(simpler)} or {PLAN}" if simpler else PLAN, **_REMEDIES}
+    level = pass_or_fail(cal.status.ok)
+    remedy = "" if cal.solver == "filter" else remedies.get(cal.status, "")
+    advice = "" if cal.status.ok else f"{cal.remedy[0].upper()}{cal.remedy[1:]}."
     if post is not None and cal.undetermined:
         # Sampling refuses priors that do not determine what the data leave open.
         level, said = Level.WARN, what_is_open(cal.undetermined)
         sentence = f"{said[0].upper()}{said[1:]}: there the posterior is that of the priors."
-    return Check("Estimation", Question.CONVERGED, level, words, "converged", sentence, remedy)
+    return Check("Estimation", Question.CONVERGED, level, words, "converged", sentence, remedy, advice)
 
 
 def determined(cal: Calibration) -> Check | None:
@@ -107,7 +122,8 @@ def against_truth(cal: Calibration, truth: Camera, post: Posterior | None = None
         else f"{name} is further from the truth than its sigma allows: the uncertainties are wrong."
     )
     value = f"largest |z| {fixed(largest, 1)} ({name})"
-    return Check("Known truth", Question.TRUSTWORTHY, pass_or_fail(good), value, f"< {fixed(limit, 1)}", sentence)
+    level, bound, remedy = pass_or_fail(good), f"< {fixed(limit, 1)}", "" if good else "starcal-uq validate CAMERA"
+    return Check("Known truth", Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
 
 
 def truth_z(cal: Calibration, truth: Camera, post: Posterior | None = None) -> FloatArray:
@@ -187,7 +203,7 @@ def even_noise(found: Misfit) -> Check:
     changes = f"The residuals hold {join_words([test.name for test in rejected])}"
     if found.uneven is None:
         sentence = f"{changes}, which the weights of the stars do not know: the stated sigmas may be wrong."
-        return Check(name, Question.TRUSTWORTHY, Level.WARN, value, bound, sentence)
+        return Check(name, Question.TRUSTWORTHY, Level.WARN, value, bound, sentence, _INFLATE)
     uneven = found.uneven
     if not uneven.model.varies:
         sentence = f"{changes}, too little of it to change a stated sigma."
@@ -240,7 +256,7 @@ def jackknife(found: Jackknife) -> Check:
         )
     else:
         sentence = "Frames scatter as the formal errors say."
-    remedy = "sc.diagnostics.accept_inflation(cal, sc.diagnostics.jackknife_frames(obs, cal))" if np.any(bad) else ""
+    remedy = _INFLATE if np.any(bad) else ""
     level = pass_or_warn(not np.any(bad))
     return Check("Jackknife over frames", Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
 
@@ -365,12 +381,19 @@ def starts(found: MultiStart) -> Check:
     value = f"{found.same} of {found.n} starts"
     if found.n_frames < found.of_frames:
         value += f", {count(found.n_frames)} of {plural(found.of_frames, 'frame')}"
+    remedy = advice = ""
     if found.better:
-        level, sentence = Level.FAIL, "A start elsewhere reached a better optimum: calibrate again from there."
+        level, sentence = Level.FAIL, "A start elsewhere reached a better optimum."
+        advice = "Calibrate again from there, or from a camera file that is nearer to the lens."
+        if found.start:
+            pairs = zip(("focal_mm", "x0_px", "y0_px"), found.start, strict=True)
+            start = ", ".join(f"{name}={value:.6g}" for name, value in pairs)
+            remedy = f"sc.calibrate(obs, camera.replace({start}))"
     elif found.same < found.n:
         stuck = found.n - found.same
         level = Level.WARN
         sentence = f"{plural(stuck, 'start')} did not reach this optimum, and no start reached a better one."
+        remedy, advice = SCREEN, "Accept it if the focal length of the camera file is surely good to 5 %."
     else:
         level, sentence = Level.PASS, "Starts scattered around the nominal camera all lead to this optimum."
-    return Check("Other starts", Question.CONVERGED, level, value, "all at the same optimum", sentence)
+    return Check("Other starts", Question.CONVERGED, level, value, "all at the same optimum", sentence, remedy, advice)

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import shlex
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from starcal_uq.core.display import Shown
 from starcal_uq.core.formatting import join_words
-from starcal_uq.core.status import Check, Level, Question, worst
+from starcal_uq.core.status import CALIBRATE, Check, Level, Question, worst
 from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.verdict import draws, estimate, observed
-from starcal_uq.diagnostics.verdict.observed import CALIBRATE, FROM_IMAGES
+from starcal_uq.diagnostics.verdict.observed import FROM_IMAGES
 from starcal_uq.estimation.noise_model import weighed
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
     from starcal_uq.propagation.attitude_error import AttitudeError
 
-SCHEMA, VERSION = "starcal-uq/verdict", 1
+VERSION = 1
 
 
 @dataclass(frozen=True)
@@ -41,24 +41,21 @@ class Verdict(Shown):
         The verdict in one sentence.
     """
 
+    DOCUMENTED: ClassVar = ("level",)
+
     checks: tuple[Check, ...]
     headline: str
 
     @property
     def level(self) -> Level:
-        """The worst outcome."""
+        """The worst outcome of the checks."""
         return worst(self.checks)
 
     def to_dict(self) -> AnyDict:
         """The verdict as ``verdict.json`` holds it; `VERSION` rises when a key goes or changes its meaning."""
-        kept = ("key", "name", "value", "bound", "sentence", "remedy")
-        checks = [
-            {name: getattr(check, name) for name in kept}
-            | {"level": check.level.value, "question": check.question.name.lower()}
-            for check in self.checks
-        ]
-        head = {"schema": SCHEMA, "version": VERSION, "exit_status": self.level.exit_status}
-        return {**head, "level": self.level.value, "headline": self.headline, "checks": checks}
+        from starcal_uq.core.documents import document, part_of
+
+        return document("verdict", VERSION, part_of(Verdict), self, self.level.exit_status)
 
     def of(self, question: Question) -> tuple[Check, ...]:
         """The checks that answer one question."""
@@ -109,8 +106,10 @@ class Place:
         elif start == CALIBRATE and self.observations:
             given = [f"{self.run}/observations.parquet", f"{self.run}/camera.toml", "-o", f"{self.run}-2"]
             text = f"starcal-uq run {shlex.join(given)}{text.removeprefix(start)}"
-        files = {"RUN": shlex.quote(self.run), "SITE": "site.toml"}
-        return " ".join(files.get(word, word) for word in text.split(" "))
+        words, files = text.split(" "), {"RUN": shlex.quote(self.run), "SITE": "site.toml"}
+        if not {"OBS", "IMAGES..."} & set(words):
+            files["CAMERA"] = shlex.quote(f"{self.run}/camera.toml")
+        return " ".join(files.get(word, word) for word in words)
 
 
 def judge(

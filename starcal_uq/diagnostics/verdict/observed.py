@@ -8,7 +8,7 @@ import numpy as np
 
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.formatting import fixed, percent, plural, significant
-from starcal_uq.core.status import Check, Level, Question, pass_or_warn
+from starcal_uq.core.status import CALIBRATE, MORE, PLAN, Check, Level, Question, model_remedy, pass_or_warn
 from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals
 from starcal_uq.estimation.residual_map import OUTLIER_SIGMA
 from starcal_uq.sky.refraction import refraction_constants, shrinking
@@ -36,7 +36,6 @@ MIN_FRAMES = 5
 # What a wrong time may move parameters by and the numbers be used.
 _SMALL_SIGMA = 1.0
 # Commands and calls that checks give as remedies.
-CALIBRATE = "starcal-uq calibrate OBS CAMERA -o RUN --force"
 SCREEN = f"{CALIBRATE} --screen or sc.estimation.screen(obs, camera)"
 FROM_IMAGES = "starcal-uq run IMAGES... CAMERA -o RUN --force"
 ROBUST, NOISE = f"{CALIBRATE} --robust", f"{CALIBRATE} --noise model or sc.calibrate(obs, camera, noise='model')"
@@ -51,13 +50,13 @@ def directions(
     seen = air(obs)
     wrong = [] if times is None else [_time_words(obs, times)]
     if found is not None and found.is_air:
-        wrong.append((f"refraction, p = {significant(found.p_value)}", air_words(obs, found), _with_site(obs)))
+        wrong.append((f"refraction, p = {significant(found.p_value)}", air_words(obs, found), _with_site(obs), ""))
     if wrong:
-        values, sentences, remedies = zip(*wrong, strict=True)
-        remedy = next(filter(None, remedies), "")
+        values, sentences, remedies, orders = zip(*wrong, strict=True)
+        remedy, advice = next(filter(None, remedies), ""), " ".join(filter(None, orders))
         small = times is not None and len(wrong) == 1 and times.moves_sigma < _SMALL_SIGMA
         level = Level.WARN if small else Level.FAIL
-        return Check(name, Question.TRUSTWORTHY, level, "; ".join(values), bound, " ".join(sentences), remedy)
+        return Check(name, Question.TRUSTWORTHY, level, "; ".join(values), bound, " ".join(sentences), remedy, advice)
     if declared == "apparent" and seen == "unknown":
         sentence = f"Aberration is in the directions, refraction is not. {conditional_words(cal)} {REMEDY}"
         return Check(name, Question.TRUSTWORTHY, Level.WARN, "without refraction", bound, sentence, _about_air(obs))
@@ -94,33 +93,31 @@ def air_words(obs: Observations, found: AirTest) -> str:
     return f"{first} {asked}; the residuals point to {place.words} ({ends})."
 
 
-def _time_words(obs: Observations, found: TimeTest) -> tuple[str, str, str]:
-    """Value, sentence and remedy of a time, or an epoch, that is not that of the stars."""
+def _time_words(obs: Observations, found: TimeTest) -> tuple[str, str, str, str]:
+    """Value, sentence, remedy and advice of a time, or an epoch, that is not that of the stars."""
     effect = f"it moves {found.moves} by {significant(found.moves_sigma)} sigma"
     unit = {"epoch": "years", "date": "days", "hour": "hours"}.get(found.cause, "")
     later = f"{significant(abs(found.later))} ± {significant(found.later_std)} {unit}"
     later += " later" if found.later > 0.0 else " earlier"
     if found.cause == "epoch":
         sentence = f"By proper motion the stars are those of an epoch {later} than that of the directions: {effect}."
-        return f"epoch {later}", f"{sentence} Correct the times, or give directions of the epoch of the images.", ""
+        return f"epoch {later}", sentence, "", "Correct the times, or give directions of the epoch of the images."
     if found.cause == "no aberration":
         sentence = f"The residuals hold annual aberration that the directions do not: {effect}."
         if obs.time_utc is None:
-            return (
-                "no aberration",
-                f"{sentence} Give the times (column time_utc).",
-                f"{FROM_IMAGES} --time UTC" if _from_images(obs) else "",
-            )
-        return "no aberration", sentence, f"{_command(obs)} --directions catalogue"
+            if _from_images(obs):
+                return "no aberration", sentence, f"{FROM_IMAGES} --time UTC", ""
+            return "no aberration", sentence, "", "Give the times (column time_utc)."
+        return "no aberration", sentence, f"{_command(obs)} --directions catalogue", ""
     if found.cause == "aberration twice":
         sentence = f"The directions hold annual aberration twice: {effect}."
-        return "aberration twice", sentence, f"{_command(obs)} --directions apparent"
+        return "aberration twice", sentence, f"{_command(obs)} --directions apparent", ""
     what, other = "Annual aberration", ""
     if found.cause == "hour":
         east = HOUR_DEG * found.later
         what, other = "Refraction", f", or a site {significant(abs(east))}° further {'east' if east > 0.0 else 'west'}"
     sentence = f"{what} in the residuals is that of times {later} than stated{other}: {effect}."
-    return f"times {later}", f"{sentence} Correct the times, which are UTC (column time_utc).", ""
+    return f"times {later}", sentence, "", "Correct the times, which are UTC (column time_utc)."
 
 
 def _from_images(obs: Observations) -> bool:
@@ -181,11 +178,6 @@ def residual_pattern(obs: Observations, cal: Calibration) -> Check:
     return Check(name, Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
 
 
-def model_remedy(name: str) -> str:
-    """How to calibrate with a distortion model."""
-    return f"{CALIBRATE} --model {name} or sc.calibrate(obs, camera, model={name!r})"
-
-
 def richer(model: str) -> str:
     """A distortion model that follows what this one cannot."""
     return "brown3" if model == "brown_tangential" else "brown_tangential"
@@ -237,7 +229,7 @@ def noise(obs: Observations, cal: Calibration) -> Check:
     good = low <= cal.sigma <= high
     if fitted is not None and not fitted.multiplies:
         good = PLAUSIBLE_NOISE_PX[0] <= cal.sigma * fitted.level_px <= PLAUSIBLE_NOISE_PX[1]
-    unit = "" if scaled else " px"
+    unit, remedy, advice = "" if scaled else " px", "", ""
     value = f"{significant(cal.sigma, 3)}{unit}"
     if good:
         sentence = "The stated noise of the stars is confirmed." if scaled else "Usual for star centroids."
@@ -247,33 +239,37 @@ def noise(obs: Observations, cal: Calibration) -> Check:
         sentence = (
             "Far more scatter than centroids have: identifications, camera file or distortion model may be wrong."
         )
+        remedy = SCREEN
+    elif scaled:
+        sentence, remedy = "Less scatter than is stated: the stated noise is too large.", NOISE
     else:
-        sentence = "Less scatter than centroids have: the stated noise is too large, or the data are not measurements."
-    if not good and scaled and fitted is None:
-        sentence = _stated_unit(obs, cal) or sentence
+        sentence = "Less scatter than centroids have: the data are not measurements."
+        advice = "Give centroids as they were measured, not positions that were computed or smoothed."
+    if not good and scaled and fitted is None and (unlike := _stated_unit(obs, cal)):
+        (sentence, advice), remedy = unlike, ""
     name = f"Factor on the {'stated' if fitted is None else 'fitted'} noise" if scaled else "Centroid noise per axis"
     bound = f"{low:g} to {high:g}{unit}"
-    return Check(name, Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence)
+    return Check(name, Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, remedy, advice)
 
 
-def _stated_unit(obs: Observations, cal: Calibration) -> str:
-    """What the column of stated noise holds, where it is not px; empty if that cannot be told."""
-    stated, floor = obs.sigma_px, obs.meta.get("noise_floor_px")
+def _stated_unit(obs: Observations, cal: Calibration) -> tuple[str, str] | None:
+    """What the column of stated noise holds, where it is not px, and what to do; None if that cannot be told."""
+    stated, in_px = obs.sigma_px, "Give the noise in px, or leave the column out."
     if stated is None:
-        return ""
-    if floor:  # The column is not the user's.
+        return None
+    if floor := obs.meta.get("noise_floor_px"):  # The column is not the user's.
         less = f"Less scatter than the stars state: the {significant(floor)} px that were added to each are too many."
-        return less if cal.sigma < 1.0 else ""
+        return (less, "Accept it: the factor is in every interval.") if cal.sigma < 1.0 else None
     arcsec_per_px = ARCSEC / cal.camera.focal_px
     if obs.mag is not None and np.array_equal(stated, obs.mag):
-        return "Column sigma_px holds the magnitudes: give the noise in px, or leave it out."
+        return "Column sigma_px holds the magnitudes.", in_px
     if cal.sigma < _FAR_BELOW and np.ptp(stated) > _MAGNITUDES[0] and stated.max() < _MAGNITUDES[1]:
         ends = f"{stated.min():.3g} to {stated.max():.3g}"
-        return f"Column sigma_px ({ends}) looks like magnitudes: give the noise in px, or leave it out."
+        return f"Column sigma_px ({ends}) looks like magnitudes.", in_px
     if 1.0 / _SAME_UNIT < cal.sigma * arcsec_per_px < _SAME_UNIT:
         per = significant(arcsec_per_px, 3)
-        return f"Column sigma_px looks like arcseconds, of which a pixel has {per}: divide it by that."
-    return ""
+        return f"Column sigma_px looks like arcseconds, of which a pixel has {per}.", "Divide it by that."
+    return None
 
 
 def partitions(cal: Calibration) -> Check | None:
@@ -295,10 +291,11 @@ def partitions(cal: Calibration) -> Check | None:
     sentence = (
         f"The files scatter as alike as noise of one size lets them ({place})."
         if good
-        else f"The files scatter unequally ({place}): look for what changed there, or calibrate them apart and compare."
+        else f"The files scatter unequally ({place})."
     )
-    value, bound = f"p = {significant(p_value)}", f"p ≥ {PATTERN_P:g}"
-    return Check("Noise of the files", Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence)
+    value, bound, name = f"p = {significant(p_value)}", f"p ≥ {PATTERN_P:g}", "Noise of the files"
+    advice = "" if good else "Look for what changed in that file, or calibrate each by itself and compare the runs."
+    return Check(name, Question.TRUSTWORTHY, pass_or_warn(good), value, bound, sentence, advice=advice)
 
 
 def terms(cal: Calibration) -> Check | None:
@@ -329,13 +326,15 @@ def coverage(obs: Observations, cal: Calibration) -> Check:
     n_frames = obs.n_frames if cal.partitions is None else cal.n_frames
     value = f"{percent(share, 3)} of the field, {plural(n_frames, 'frame')}"
     bound = f"≥ {percent(COVERED_SHARE)}, ≥ {MIN_FRAMES} frames"
+    remedy, advice = PLAN, MORE
     if share < COVERED_SHARE:
         level, sentence = Level.WARN, "Parts of the field hold no stars: the distortion is extrapolated there."
     elif n_frames < MIN_FRAMES:
         level, sentence = Level.WARN, "Few frames: errors common to a whole frame cannot be told from the camera."
     else:
         level, sentence = Level.PASS, "Stars covered the field, so that no part of it is extrapolated."
-    return Check("Coverage of the field", Question.TRUSTWORTHY, level, value, bound, sentence)
+        remedy = advice = ""
+    return Check("Coverage of the field", Question.TRUSTWORTHY, level, value, bound, sentence, remedy, advice)
 
 
 def _noise_px(obs: Observations, cal: Calibration) -> float:

@@ -246,6 +246,7 @@ def _both(error: AttitudeError, row: int, axis: int) -> str:
 def _told(check: Check) -> list[str]:
     """A check that did not pass, and what to try."""
     lines = _wrapped(f"{check.level.value}: {check.name}. {check.sentence}", "  ")
+    lines += _wrapped(check.advice, "    ") if check.advice else []
     for one in check.remedies:
         lines += _command(one)
     return lines

@@ -1,4 +1,4 @@
-"""How an object of a command's document is declared: its keys, what each holds, and where a result has it.
+"""JSON documents: how an object of one is declared, by its keys or by a record, and how a result becomes one.
 
 NaN and infinity are null: not known, not determined, or not assessed.
 """
@@ -15,7 +15,7 @@ from importlib import import_module
 from inspect import getdoc
 from pathlib import Path
 from types import UnionType
-from typing import Any, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, create_model, model_validator
@@ -24,6 +24,7 @@ from pydantic_core import CoreSchema
 from starcal_uq.core.types import AnyDict
 
 Number = float | None
+PREFIX = "starcal-uq/"
 
 
 def says(text: str, unit: str = "") -> Any:
@@ -66,14 +67,28 @@ class Part(BaseModel):
         return {key: getattr(result, key) for key in cls.model_fields}
 
 
+def document(name: str, version: int, part: type[Part], results: Any, status: int) -> AnyDict:
+    """The document of a schema, its name and version first."""
+    head = {"schema": PREFIX + name, "version": version, "exit_status": status}
+    return head | part.model_validate(results).model_dump()
+
+
 @cache
-def _part_of(record: type) -> type[Part]:
-    """The part with the fields of a record of ours, whose docstring says what they are."""
+def part_of(record: type) -> type[Part]:
+    """The part with the fields of a record of ours, whose docstring says what they are.
+
+    Properties are in it that its class variable ``DOCUMENTED`` names.
+    """
     said: dict[str, str] = {}
     for names, text in re.findall(r"^(\w[\w, ]*) : .*\n((?: {4}.*\n?)+)", getdoc(record) or "", re.MULTILINE):
         said |= dict.fromkeys(names.split(", "), " ".join(text.split()).removesuffix("."))
     hints = get_type_hints(record)
-    keys: AnyDict = {field.name: (_kind(hints[field.name]), says(said[field.name])) for field in fields(record)}
+    keys: AnyDict = {}
+    for name in getattr(record, "DOCUMENTED", ()):
+        getter = getattr(record, name).fget
+        text = (getdoc(getter) or "").partition("\n")[0].removesuffix(".")
+        keys[name] = (_kind(get_type_hints(getter)["return"]), says(text))
+    keys |= {field.name: (_kind(hints[field.name]), says(said[field.name])) for field in fields(record)}
     return create_model(record.__name__, __base__=Part, __doc__=(getdoc(record) or "").partition("\n")[0], **keys)
 
 
@@ -89,8 +104,8 @@ def _kind(hint: Any) -> Any:
     if origin in (tuple, list):
         return list[_kind(args[0])]  # type: ignore[misc]
     if isinstance(hint, type) and issubclass(hint, Enum):
-        return str
-    return _part_of(hint) if is_dataclass(hint) and isinstance(hint, type) else hint
+        return Literal[tuple(member.value for member in hint)]
+    return part_of(hint) if is_dataclass(hint) and isinstance(hint, type) else hint
 
 
 class Of:
@@ -101,8 +116,11 @@ class Of:
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         module, name = self._record.split(":")
-        part = _part_of(getattr(import_module(f"starcal_uq.{module}"), name))
+        part = part_of(getattr(import_module(f"starcal_uq.{module}"), name))
         if self._more:
             keys: AnyDict = {key: (kind, says(text)) for key, (kind, text) in self._more.items()}
             part = create_model(name, __base__=part, __doc__=part.__doc__, **keys)
-        return handler.generate_schema(list[part] if get_origin(source) is list else part | None)  # type: ignore[valid-type]
+        origin = get_origin(source)
+        return handler.generate_schema(
+            list[part] if origin is list else part | None if origin in (Union, UnionType) else part  # type: ignore[valid-type]
+        )
