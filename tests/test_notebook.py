@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import Any
 
 import nbformat
 import pytest
+from jupyter_client.manager import start_new_kernel
 from nbclient import NotebookClient
 
 import starcal_uq as sc
@@ -15,6 +17,13 @@ from starcal_uq.presentation.pages.notebook import executed, write_cells
 from tests.helpers.scenes import observations
 
 NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
+
+
+def at_home(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Jupyter's own files stay out of the home folder."""
+    for name in ("JUPYTER_CONFIG_DIR", "JUPYTER_DATA_DIR", "JUPYTER_RUNTIME_DIR", "IPYTHONDIR"):
+        monkeypatch.setenv(name, str(folder / name.lower()))
+    monkeypatch.setenv("PYTHONPATH", str(NOTEBOOKS.parent))
 
 
 @pytest.mark.parametrize(
@@ -28,10 +37,7 @@ NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
     ],
 )
 def test_it_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Jupyter's own files stay out of the home folder.
-    for folder in ("JUPYTER_CONFIG_DIR", "JUPYTER_DATA_DIR", "JUPYTER_RUNTIME_DIR", "IPYTHONDIR"):
-        monkeypatch.setenv(folder, str(tmp_path / folder.lower()))
-    monkeypatch.setenv("PYTHONPATH", str(NOTEBOOKS.parent))
+    at_home(tmp_path, monkeypatch)
     monkeypatch.delenv("MPLBACKEND", raising=False)  # the kernel draws inline
     notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
     client = NotebookClient(
@@ -83,6 +89,56 @@ def test_a_run_becomes_a_notebook_of_its_own(tmp_path: Path, monkeypatch: pytest
         run.notebook()
     run.sample(n_steps=20, seed=2, force=True)
     assert not path.exists(), "it is of a posterior that is gone"
+
+
+@pytest.mark.slow
+def test_an_interrupted_cell_leaves_the_session_and_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The stop button of a notebook, while `Run.sample` and `sc.sample` work."""
+    at_home(tmp_path, monkeypatch)
+    monkeypatch.chdir(tmp_path)
+    run = sc.Run(tmp_path / "run")
+    run.calibrate(observations(n_frames=12), sc.paper.paper_start())
+    seen: list[str] = []
+    manager, client = start_new_kernel(kernel_name="python3")
+
+    def cell(source: str, stop: str = "\0") -> str:
+        """The name of the error that a cell ends with; stopped when it has printed `stop`."""
+
+        def printed(message: dict[str, Any]) -> None:
+            seen.append(message["content"].get("text", ""))
+            if stop in seen[-1]:
+                manager.interrupt_kernel()
+
+        content = client.execute_interactive(source, output_hook=printed, timeout=120)["content"]
+        return str(content.get("ename", ""))
+
+    try:
+        assert not cell(
+            "import numpy as np, starcal_uq as sc\n"
+            "run = sc.Run('run')\n"
+            "short = dict(seed=1, n_ensembles=2, n_walkers=14, n_steps=400)\n"
+            "def told(done, total):\n"
+            "    if done == 300: print('far enough', flush=True)\n"
+            "    if done > 300: time.sleep(0.01)\n"
+            "import time"
+        )
+        assert cell("run.sample(**short, progress=told)", "far enough") == "KeyboardInterrupt"
+        assert cell("sc.sample(run.observations, run.calibration, **short, progress=told)", "far enough")
+        # What was done is kept, nothing else is, and the same cell goes on.
+        assert [path.name for path in run.path.glob("*checkpoint*")] and not run.has("posterior")
+        assert not cell(
+            "steps = []\n"
+            "post = run.sample(**short, progress=lambda done, total: steps.append(done))\n"
+            "whole = sc.sample(run.observations, run.calibration, **short)\n"
+            "assert steps[0] > 250, steps[0]\n"
+            "assert np.array_equal(post.draws, whole.draws)\n"
+            "print('the same', flush=True)"
+        )
+        assert "the same\n" in seen
+    finally:
+        client.stop_channels()
+        manager.shutdown_kernel(now=True)
+    assert run.has("posterior") and not list(run.path.glob("*checkpoint*"))
 
 
 @pytest.mark.slow
