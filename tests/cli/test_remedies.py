@@ -13,7 +13,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import typer
-from click import ClickException
 
 import starcal_uq as sc
 from starcal_uq.cli.commands import app
@@ -402,5 +401,5 @@ def test_control_a_remedy_that_names_no_option_is_refused(small, execute):
         sc.sample(small.obs, small.cal, likelihood="exact")
     with pytest.raises(AssertionError):
         execute("sample RUN --force --likelihood exact")
-    with pytest.raises(ClickException, match="exact"):
+    with pytest.raises(typer.BadParameter, match="exact"):
         execute("sample RUN --force --likelihood exact", parse=True)
