@@ -213,18 +213,9 @@ _DAY_S = 86_400.0
 
 @dataclass(frozen=True)
 class ProfileTable:
-    """What a file says.
+    """What a file says: times (K,), s, of UTC times the seconds since the first, and quaternions (K, 4) as they stand.
 
-    Attributes
-    ----------
-    time_s : (K,) array
-        Times, s; of UTC times the seconds since the first.
-    quaternions : (K, 4) array
-        Scalar last, as they stand.
-    numbers : (K,) array
-        Line (CSV, ECSV), or row from 1 (Parquet).
-    word : str
-        ``"line"`` or ``"row"``.
+    `numbers` (K,) are lines (CSV, ECSV) or rows from 1 (Parquet), which `word` tells: ``"line"`` or ``"row"``.
     """
 
     time_s: FloatArray

@@ -72,10 +72,6 @@ def budget(
     n_samples, seed : int
         Number and seed of the sampled totals.
 
-    Returns
-    -------
-    Budget
-
     Raises
     ------
     BudgetError

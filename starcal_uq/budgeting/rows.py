@@ -149,14 +149,9 @@ class Contributor:
 
 @dataclass(frozen=True)
 class Expected:
-    """A contributor that a star-sensor budget must name.
+    """A contributor that a star-sensor budget must name, with entries of a `Contributor`; a file may state otherwise.
 
-    Attributes
-    ----------
-    name, ecss_class, interpretation, absorbed_by_alignment, distribution : str
-        Entries of a `Contributor`; a file may state otherwise.
-    what : str
-        Description and usual source of the number, for people.
+    `what` is the description and usual source of the number, for people.
     """
 
     name: str

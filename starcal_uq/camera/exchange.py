@@ -265,15 +265,7 @@ def _asdf(camera: Camera, path: Path) -> tuple[float, str]:
 
 @dataclass(frozen=True)
 class CameraFormat:
-    """How a camera is written for another program.
-
-    Attributes
-    ----------
-    ending : str
-        Ending of the file's name.
-    write : callable
-        ``(camera, path) -> (largest error in px, sentence)``.
-    """
+    """The ending of a file's name, and ``write(camera, path) -> (largest error in px, sentence)``."""
 
     ending: str
     write: Callable[[Camera, Path], tuple[float, str]]

@@ -28,20 +28,9 @@ _PITCH = re.compile(r"^\s*# pixel_um: (\S+)\s*$", re.MULTILINE)
 
 @dataclass(frozen=True)
 class Pinhole:
-    """What such a file holds.
+    """What such a file holds: size and matrix (3, 3) in px, and k1, k2, p1, p2, k3 (5,), dimensionless.
 
-    Attributes
-    ----------
-    width_px, height_px : int
-        Size of the detector, pixels.
-    matrix : (3, 3) array
-        Camera matrix, pixels.
-    dist_coeffs : (5,) array
-        k1, k2, p1, p2, k3, dimensionless.
-    pixel_um : float or None
-        Pixel pitch, micrometres, where it is stated.
-    name : str
-        Name of the camera.
+    `pixel_um` is the pixel pitch, micrometres, where it is stated.
     """
 
     width_px: int

@@ -84,14 +84,8 @@ def emit_source(
 class Kernel:
     """A vectorised function generated from CasADi.
 
-    Attributes
-    ----------
-    function : casadi.Function
-        The symbolic original, kept so that tests can compare.
-    run : callable
-        The emitted NumPy function.
-    shapes : tuple of tuple of int
-        Shape of every output, without the trailing axis of stars.
+    `function` is the symbolic original, kept so that tests can compare, `run` the emitted NumPy function, and `shapes`
+    those of the outputs, without the trailing axis of stars.
     """
 
     function: Any

@@ -30,16 +30,10 @@ INDEPENDENT, SAME, A_IN_B, B_IN_A, OVERLAP = "independent", "same", "A within B"
 
 @dataclass(frozen=True)
 class Rule:
-    """How the covariance of the difference follows from those of the two estimates.
+    """How the covariance of the difference follows from those of the two estimates: their sum with `signs`, if known.
 
-    Attributes
-    ----------
-    data : str
-        ``independent``, ``same``, ``A within B``, ``B within A`` or ``overlapping``.
-    signs : (float, float) or None
-        Covariance of the difference is the sum of both covariances with these signs; None where it is not known.
-    words : str
-        The rule, or why there is none.
+    `data` is ``independent``, ``same``, ``A within B``, ``B within A`` or ``overlapping``; `words` are the rule, or why
+    there is none.
     """
 
     data: str

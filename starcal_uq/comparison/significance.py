@@ -110,18 +110,9 @@ def one_noise(a: Estimate, b: Estimate, rule: Rule) -> tuple[Estimate, Estimate]
 class DifferenceTests:
     """A difference on the grid held against its covariance; NaN where that is not known.
 
-    Attributes
-    ----------
-    outside : float
-        Root mean square of what no error of the parameters explains, arcsec.
-    sigma, ratio : (N,) array
-        Expected length at each point, arcsec, and the length found over it.
-    expected : float
-        Root mean square length expected, arcsec.
-    p_map, p_parameters, statistic, p_worst, p_worst_error : float
-        Numbers of `CameraComparison` with these names.
-    n_directions : int
-        Number of directions that were tested.
+    `outside` is the root mean square of what no error of the parameters explains, arcsec; `sigma` and `ratio` (N,) are
+    the expected length at each point, arcsec, and the length found over it; `expected` is the root mean square length
+    expected, arcsec. The others are the numbers of `CameraComparison` with these names, of `n_directions` tested.
     """
 
     outside: float

@@ -14,16 +14,9 @@ from typing import Any
 
 @dataclass(frozen=True)
 class View:
-    """How the results of one class are shown; every function takes the result first.
+    """How the results of one class are shown: sentences, HTML for a notebook, and what draws after ``result.plot.``.
 
-    Attributes
-    ----------
-    text : callable or None
-        The result in a few sentences, plain text.
-    html : callable or None
-        The result for a notebook.
-    figures : mapping of str to callable
-        Functions that draw, by the name that users type after ``result.plot.``.
+    Every function takes the result first.
     """
 
     text: Callable[[Any], str] | None = None

@@ -44,17 +44,7 @@ _digests: dict[tuple[int, int, int, int], str] = {}
 
 @dataclass(frozen=True)
 class Entry:
-    """One file of a run.
-
-    Attributes
-    ----------
-    bytes : int
-        Its size.
-    sha256 : str
-        Hash of its content.
-    step : str
-        The step that it belongs to.
-    """
+    """One file of a run: its size in bytes, the hash of its content, and the step that it belongs to."""
 
     bytes: int
     sha256: str
@@ -65,22 +55,11 @@ class Entry:
 class Manifest:
     """What a run holds.
 
-    Attributes
-    ----------
-    files : dict of Entry
-        The files that the run has written, by their names within the folder; others are the user's.
-    steps : dict of dict
-        Provenance of each step that is done: time, seed, settings, versions.
-    command : dict or None
-        What the whole run is made of, of one that a single command makes: settings and hashes of the inputs.
-    words : tuple of str
-        That command as it was typed, without the program's name.
-    complete : bool
-        False while that command is under way, or was interrupted.
-    stage : str
-        Folder in which files of the last step wait to be moved to their places.
-    gone : tuple of str
-        Files that rested on what the last step replaced, to be removed.
+    `files` are those that the run has written, by their names within the folder; others are the user's. `steps` have
+    the provenance of each step that is done. Of a run that a single command makes, `command` holds settings and hashes
+    of the inputs, `words` the command as it was typed, without the program's name; it is not `complete` while the
+    command is under way, or was interrupted. In the folder `stage`, files of the last step wait to be moved to their
+    places; those that are `gone` rested on what it replaced, and are to be removed.
     """
 
     files: dict[str, Entry] = field(default_factory=dict)

@@ -16,7 +16,7 @@ from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from functools import cache
 from types import NoneType, UnionType
-from typing import IO, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import IO, Any, ClassVar, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from starcal_uq.core.files import PathLike, atomic_path, atomic_write_text, chec
 from starcal_uq.core.types import AnyDict
 
 Record = TypeVar("Record")
+S = TypeVar("S", bound="Saved")
 Arrays = dict[str, Any]
 
 _FORMAT, _DOCUMENT = "format", "document"
@@ -271,6 +272,34 @@ def read(cls: type[Record], path: PathLike, kind: str, what: str, remedy: str) -
         if kind and str(arrays.pop(_FORMAT)) != kind:
             raise ValueError("another format")
         return from_plain(cls, json.loads(str(arrays.pop(_DOCUMENT))) if kind else {}, arrays)
+
+
+class Saved:
+    """A record with a file of its own, ``.npz`` or JSON; `FILE` says what it is and what to do where it is none.
+
+    A `KIND` is that of `write`; None is JSON.
+    """
+
+    KIND: ClassVar[str | None] = None
+    FILE: ClassVar[tuple[str, str]]
+
+    def save(self, path: PathLike) -> None:
+        """Write everything to one file, atomically and without loss; overwritten."""
+        if self.KIND is None:
+            write_json(self, path)
+        else:
+            write(self, path, self.KIND)
+
+    @classmethod
+    def load(cls: type[S], path: PathLike) -> S:
+        """Read what `save` wrote.
+
+        Raises
+        ------
+        RunFolderError
+            If the file is missing or is something else.
+        """
+        return read_json(cls, path, *cls.FILE) if cls.KIND is None else read(cls, path, cls.KIND, *cls.FILE)
 
 
 def read_arrays(path: PathLike) -> Arrays:

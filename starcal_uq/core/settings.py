@@ -67,15 +67,7 @@ ExportFormat = Literal[
 
 @dataclass(frozen=True)
 class Limit:
-    """Numbers that a setting may be.
-
-    Attributes
-    ----------
-    low, high : int or float
-        Least and greatest.
-    whole : bool
-        Whether it is a whole number.
-    """
+    """The least and the greatest number that a setting may be, and whether it is a whole one."""
 
     low: float
     high: float

@@ -28,16 +28,9 @@ _PATTERN, _WHOLE = "[!.]*.parquet", "all-{}.parquet"
 
 
 class Store:
-    """Rows with a key, of a folder, or of memory alone where there is none.
+    """Rows with a key, of a folder, which is made, or of memory alone where there is none.
 
-    Parameters
-    ----------
-    folder : path or None
-        The folder, which is made.
-    schema : pyarrow.Schema
-        Columns of the rows, ``key`` among them.
-    read : callable
-        From the path of a part to its rows.
+    The `schema` has a column ``key``; `read` makes rows of the path of a part.
     """
 
     def __init__(self, folder: PathLike | None, schema: pa.Schema, read: Callable[[Path], pa.Table]) -> None:
@@ -102,15 +95,8 @@ class Kept:
     """Results of numbered tasks in the folder of a command that is not finished.
 
     Those that depend on something else than is wanted now are not found, and a part that cannot be read is passed over.
-
-    Parameters
-    ----------
-    folder : path
-        The folder of the command.
-    identity : object
-        All that the tasks depend on but their number: a record, or what a record may hold.
-    kinds : types, optional
-        Named tuples and dataclasses that results are, or hold.
+    `identity` is all that the tasks depend on but their number: a record, or what a record may hold; `kinds` are the
+    named tuples and dataclasses that results are, or hold.
     """
 
     def __init__(self, folder: PathLike, identity: object, kinds: Sequence[type] = ()) -> None:

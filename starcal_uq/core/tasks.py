@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from starcal_uq.core.store import Kept
 
 Progress = Callable[[int, int], None]
+Item = TypeVar("Item")
 T = TypeVar("T")
 # Numbers of the tasks and their results.
 Numbered = list[tuple[int, T]]
@@ -69,7 +70,7 @@ def run_tasks(
     known: dict[int, T] = {} if kept is None else kept.results(n_tasks)
     results: Numbered[T] = list(known.items())
     todo = [number for number in range(n_tasks) if number not in known]
-    task = _Some(task, todo) if known else task
+    task = ByPlace(task, todo) if known else task
     workers = min(processors() if workers is None else workers, -(-len(todo) // chunk))
     interrupted = False
 
@@ -101,14 +102,14 @@ def run_tasks(
 
 
 @dataclass(frozen=True)
-class _Some(Generic[T]):
-    """Some of the tasks, by their places."""
+class ByPlace(Generic[Item, T]):
+    """A task for some items, by their places."""
 
-    task: Callable[[int], T]
-    numbers: list[int]
+    task: Callable[[Item], T]
+    items: list[Item]
 
     def __call__(self, place: int) -> T:
-        return self.task(self.numbers[place])
+        return self.task(self.items[place])
 
 
 def processors() -> int:

@@ -77,18 +77,10 @@ def unknown_key(key: str, known: Collection[str]) -> str:
 
 
 class Key:
-    """What may stand under a key.
+    """What may stand under a key: its type, and the text of what to write, said wherever it is missing or wrong.
 
-    Parameters
-    ----------
-    kind : type
-        Type; a whole number may stand for a float, but neither text nor a truth value for a number.
-    wanted : str
-        Text of what to write, said wherever the key is missing or wrong.
-    required : bool
-        Whether it must be given.
-    **bounds : Any
-        Limits as of `pydantic.Field`, such as ``gt=0``.
+    A whole number may stand for a float, but neither text nor a truth value for a number. The bounds are limits as of
+    `pydantic.Field`, such as ``gt=0``.
     """
 
     def __init__(self, kind: Any, wanted: str, *, required: bool = False, **bounds: Any) -> None:
@@ -103,15 +95,7 @@ class Key:
 
 @dataclass(frozen=True)
 class Section:
-    """Schema of a table.
-
-    Attributes
-    ----------
-    keys : dict
-        Known keys.
-    error : type
-        Error to raise.
-    """
+    """Schema of a table: its keys, and the error to raise."""
 
     keys: Mapping[str, Key]
     error: type[StarcalError]

@@ -15,9 +15,8 @@ import numpy as np
 
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StarcalError
-from starcal_uq.core.files import PathLike
 from starcal_uq.core.provenance import provenance
-from starcal_uq.core.records import read_json, write_json
+from starcal_uq.core.records import Saved
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import Progress, one_thread
 from starcal_uq.core.types import AnyDict, FloatArray
@@ -83,7 +82,7 @@ class MultiStart:
 
 
 @dataclass(frozen=True)
-class Diagnosis(Shown):
+class Diagnosis(Shown, Saved):
     """What questions the model of a run.
 
     Attributes
@@ -124,25 +123,12 @@ class Diagnosis(Shown):
     cameras: MixedCameras | None = None
     times: TimeTest | None = None
 
+    FILE = "a diagnosis", "run `starcal-uq diagnose RUN --force` to write it again"
+
     def is_of(self, cal: Calibration) -> bool:
         """True if this calibration is the one that was diagnosed."""
         same_data = self.provenance.get("data_sha256") == cal.provenance.get("data_sha256")
         return same_data and list(self.theta) == cal.theta.tolist()
-
-    def save(self, path: PathLike) -> None:
-        """Write everything as JSON, atomically; overwritten."""
-        write_json(self, path)
-
-    @classmethod
-    def load(cls, path: PathLike) -> Diagnosis:
-        """Read what `save` wrote.
-
-        Raises
-        ------
-        RunFolderError
-            If the file is missing or is not a diagnosis.
-        """
-        return read_json(cls, path, "a diagnosis", "run `starcal-uq diagnose RUN --force` to write it again")
 
 
 @dataclass(frozen=True)

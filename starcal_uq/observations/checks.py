@@ -28,18 +28,9 @@ _TIME = re.compile(r"(\d{4}-\d\d-\d\d)[T ](\d\d:\d\d)(:\d\d(?:\.\d+)?)?(?:Z|[+-]
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing that is wrong.
+    """One thing that is wrong in a row, from 0; `column` is None if the whole row is at fault.
 
-    Attributes
-    ----------
-    row : int
-        Row, from 0.
-    column : str or None
-        Column, None if the whole row is at fault.
-    reason, remedy : str
-        Clauses for the message.
-    other : int or None
-        Row that this one repeats.
+    Reason and remedy are clauses for the message; `other` is a row that this one repeats.
     """
 
     row: int

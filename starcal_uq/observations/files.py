@@ -64,26 +64,9 @@ READ = (*WRITTEN, ".json")
 class RawTable:
     """A table as it stands in a file: texts, or numbers where the format has types.
 
-    Attributes
-    ----------
-    columns : dict
-        Name in the file to a list of str or an array, shape (N,); of Parquet only the wanted columns.
-    names : list of str
-        Names of all columns of the file.
-    numbers : array of int64, shape (N,)
-        Line (CSV, ECSV) or row from 1 (Parquet).
-    word : str
-        ``"line"`` or ``"row"``.
-    meta : dict
-        Metadata of the table.
-    units : dict
-        Name in the file to unit, where one is stated.
-    problems : list of Problem
-        Rows that do not fit the header.
-    spreadsheet : bool
-        Whether texts are those of `starcal_uq.core.files.cell_text`.
-    decimal_comma : bool
-        Whether numbers are written as 0,5.
+    Of `columns`, by name in the file, Parquet gives only the wanted ones; `names` are those of all. `numbers` (N,) are
+    lines (CSV, ECSV) or rows from 1 (Parquet), as `word` says. `problems` are rows that do not fit the header. Texts of
+    a `spreadsheet` are those of `starcal_uq.core.files.cell_text`; with `decimal_comma`, numbers are written as 0,5.
     """
 
     columns: dict[str, Any]
@@ -444,16 +427,7 @@ def own_meta(schema: Any) -> AnyDict:
 class ParquetSummary:
     """What a Parquet file says of itself without being read.
 
-    Attributes
-    ----------
-    n_rows : int
-        Rows.
-    names : tuple of str
-        Columns.
-    meta : dict
-        Metadata of the table.
-    first, last : int or None
-        Smallest and largest value of the column asked for, where the file states them.
+    `first` and `last` are the smallest and largest value of the column asked for, where the file states them.
     """
 
     n_rows: int

@@ -18,18 +18,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StarFrames:
-    """Measured pixels and catalogue directions, contiguous by frame.
+    """Measured pixels (2, N), px, and unit vectors `r` (3, N), ICRS, contiguous by frame.
 
-    Attributes
-    ----------
-    pixel : (2, N) array
-        Measured positions, px.
-    r : (3, N) array
-        Unit vectors, ICRS.
-    weight : (N,) array or None
-        Inverse of the stated noise of each star, 1/px; None when all stars are alike.
-    starts : (K + 1,) array of int
-        Frame k holds the stars ``starts[k]:starts[k + 1]``.
+    `weight` (N,) is the inverse of the stated noise of each star, 1/px; None when all stars are alike. Frame k holds
+    the stars ``starts[k]:starts[k + 1]``.
     """
 
     pixel: FloatArray

@@ -36,19 +36,7 @@ SAMPLE_FRAMES, _SAMPLE_PARTS = 2000, 16
 
 @dataclass(frozen=True)
 class Partition:
-    """One file.
-
-    Attributes
-    ----------
-    path : Path
-        File, absolute, so that other processes find it.
-    n_stars : int
-        Rows.
-    first_frame, last_frame : int
-        Smallest and largest frame number.
-    names : tuple of str
-        Columns of the file.
-    """
+    """One file, by its absolute path, so that other processes find it: rows, range of frame numbers, columns."""
 
     path: Path
     n_stars: int
@@ -61,16 +49,9 @@ class Partition:
 class PartitionReader:
     """How a partition becomes observations; small, and sent to the processes that read.
 
-    Attributes
-    ----------
-    camera : Camera or None
-        Camera on whose detector every centroid must lie.
-    columns : dict
-        Names in the files of columns that are called otherwise.
-    meta : dict
-        Entries of `Observations.meta` that are declared for all partitions.
-    prepare : callable or None
-        Picklable function through which every table goes, such as one that makes directions apparent.
+    Every centroid must lie on the detector of the camera. `columns` are names in the files of columns that are called
+    otherwise, `meta` entries that are declared for all partitions, and every table goes through the picklable function
+    `prepare`, such as one that makes directions apparent.
     """
 
     camera: Camera | None = None

@@ -17,14 +17,8 @@ _Array = TypeVar("_Array", bound="np.ndarray[Any, Any]")
 class FrameRows:
     """Rows sorted by frame; a class that has these columns gets the rest from here.
 
-    Attributes
-    ----------
-    frame : array of int64, shape (N,)
-        Frame number of each row, ascending.
-    frame_ids : array of int64, shape (K,)
-        Frame numbers, ascending.
-    x_px, y_px : array, shape (N,)
-        Centroids, pixels.
+    `frame` (N,) is the frame number of each row and `frame_ids` (K,) are all of them, both ascending; `x_px` and `y_px`
+    (N,) are centroids, px.
     """
 
     frame: IntArray

@@ -6,7 +6,6 @@ estimates, the sigmas that each method gives, and the Cramer-Rao bound of the de
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -20,7 +19,7 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import CalibrationError, DistortionError, SamplingError, StarcalError
 from starcal_uq.core.files import PathLike
 from starcal_uq.core.provenance import provenance
-from starcal_uq.core.records import read, write
+from starcal_uq.core.records import Saved
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.store import Kept
 from starcal_uq.core.tasks import Progress, run_tasks
@@ -53,7 +52,6 @@ _OF_PAIRS = ("least_squares", "three_stage")
 SHARE = 4
 _LEAST = 8
 _TESTS = ("bias_p", "claimed_p", "coverage95_p", "claimed_classical_p")
-_FORMAT = "starcal_uq replicates 1"
 # Arrays with one entry for each method and replicate.
 _BY_METHOD = ("estimates", "claimed", "classical", "map_px", "map_arcsec", "reprojection_px")
 _ARRAYS = ("replicate", "crlb", *_BY_METHOD)
@@ -112,7 +110,7 @@ METHODS = (
 
 
 @dataclass(frozen=True, eq=False)
-class Replicates(Shown):
+class Replicates(Shown, Saved):
     """Estimates and claims of M methods over n replicates, for p parameters of the truth.
 
     Attributes
@@ -165,6 +163,8 @@ class Replicates(Shown):
     interrupted: bool
     provenance: AnyDict
 
+    KIND = "starcal_uq replicates 1"
+    FILE = "a set of replicates", "run `starcal-uq reproduce` to write it"
     SHAPES: ClassVar[Shapes] = {
         **{"methods": ("m",), "failures": ("m",), "replicate": ("n",), "crlb": ("n", "p")},
         **dict.fromkeys(("estimates", "claimed", "classical"), ("m", "n", "p")),
@@ -251,21 +251,6 @@ class Replicates(Shown):
     def n_failed(self, label: str) -> int:
         """Number of replicates in which a method gave no result."""
         return sum(map(bool, self.failures[self._at(label)]))
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write everything to one ``.npz`` file, atomically; overwritten."""
-        write(self, path, _FORMAT)
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Replicates:
-        """Read what `save` wrote, without loss.
-
-        Raises
-        ------
-        RunFolderError
-            If the file is missing or is not a set of replicates.
-        """
-        return read(cls, path, _FORMAT, "a set of replicates", "run `starcal-uq reproduce` to write it")
 
 
 class Experiment(NamedTuple):

@@ -68,10 +68,6 @@ def reproduce(
     force : bool
         Replace results of before, when those of this call are complete; other files in the folder stay.
 
-    Returns
-    -------
-    Reproduction
-
     Raises
     ------
     RunFolderError

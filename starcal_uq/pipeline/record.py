@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from starcal_uq.core.display import Shown
 from starcal_uq.core.files import PathLike
-from starcal_uq.core.records import read_json, write_json
+from starcal_uq.core.records import Saved
 from starcal_uq.pipeline.refine import identified_pairs
 
 if TYPE_CHECKING:
@@ -64,7 +64,7 @@ class ImageRow:
 
 
 @dataclass(frozen=True)
-class ImageRecord(Shown):
+class ImageRecord(Shown, Saved):
     """The images of a run.
 
     Attributes
@@ -87,25 +87,12 @@ class ImageRecord(Shown):
     parity: str
     sources: tuple[str, ...] = ()
 
+    FILE = "a record of images", "run `starcal-uq run IMAGES... -o RUN` again"
+
     @property
     def left_out(self) -> tuple[ImageRow, ...]:
         """Images without an identified star."""
         return tuple(row for row in self.rows if not row.n_last)
-
-    def save(self, path: PathLike) -> None:
-        """Write as JSON, all or nothing."""
-        write_json(self, path)
-
-    @classmethod
-    def load(cls, path: PathLike) -> ImageRecord:
-        """Read what `save` wrote.
-
-        Raises
-        ------
-        RunFolderError
-            If the file cannot be read or is something else.
-        """
-        return read_json(cls, path, "a record of images", "run `starcal-uq run IMAGES... -o RUN` again")
 
 
 def record_images(centroids: Centroids, images: ImageCalibration, sources: Sequence[PathLike] = ()) -> ImageRecord:

@@ -47,15 +47,7 @@ _TOLERANCE, _GUESS_FRAMES = 0.002, 1000
 
 @dataclass(frozen=True, eq=False)
 class Quantity:
-    """Something linear in the parameters.
-
-    Attributes
-    ----------
-    name : str
-        Column in tables, with the unit.
-    form : (p, p) array
-        Matrix by which the variance is the sum of ``form * covariance``.
-    """
+    """Something linear in the parameters, whose variance is the sum of ``form * covariance``; its name has the unit."""
 
     name: str
     form: FloatArray
@@ -190,23 +182,12 @@ class Forecaster:
         Stars per frame on average.
     mission : FrameSet
         Frames whose attitudes count.
-    confidence : float
-        Probability of the two-axis radius.
-    scope : str
-        One of `SCOPES`.
-    start : (p, p) array, optional
-        Information that is there already.
-    start_dof : float
-        Degrees of freedom of those data.
+    confidence, scope : float, str
+        Probability of the two-axis radius, and one of `SCOPES`.
+    start, start_dof : (p, p) array, float
+        Information that is there already, and the degrees of freedom of those data.
     n_campaigns : int
         Campaigns to average over.
-    seed : int
-        Repeats bit for bit.
-
-    Raises
-    ------
-    PlanningError
-        For an unknown scope, or a confidence that is no probability.
     """
 
     def __init__(

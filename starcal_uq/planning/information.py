@@ -37,22 +37,10 @@ _STARS_AT_ONCE = 20_000
 class FrameSet:
     """Frames that could be taken, without noise, and what each says. M frames, N stars, p parameters.
 
-    Attributes
-    ----------
-    camera : Camera
-        Seen through which, and linearised at which.
-    rotations : (M, 3, 3) array
-        R_cam_icrs.
-    frames : StarFrames
-        Noise-free pixels, directions, and the inverse of each star's noise.
-    mag : (N,) array
-        Magnitudes.
-    information : (M, p, p) array
-        Fisher information of each frame on the parameters, its attitude eliminated (px units).
-    response : (M, 3, p) array
-        Derivative of its attitude (pitch, yaw, roll; rad) with respect to the parameters.
-    noise : (M, 3, 3) array
-        Covariance of its attitude due to centroid noise, rad^2.
+    `frames` are noise-free pixels, directions and the inverse of each star's noise, with magnitudes `mag` (N,);
+    `information` (M, p, p) is that of each frame on the parameters, its attitude eliminated (px units), `response`
+    (M, 3, p) the derivative of its attitude (pitch, yaw, roll; rad) with respect to them, and `noise` (M, 3, 3) the
+    covariance of its attitude due to centroid noise, rad^2.
     """
 
     camera: Camera

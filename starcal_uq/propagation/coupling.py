@@ -172,10 +172,6 @@ def coupling(result: HasCovariance) -> Coupling:
         Supplies the covariance (of the draws, or of the estimate), the Fisher information of the data, the response of
         the common attitude to the parameters, and, for a posterior, the prior. Of a plan it is what the frames that
         its target takes will give (`Plan.expected` for another number).
-
-    Returns
-    -------
-    Coupling
     """
     from starcal_uq.camera.distortion import parameters
 

@@ -16,7 +16,6 @@ the field by the same pitch and yaw.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, ClassVar
 
@@ -26,7 +25,7 @@ from starcal_uq.camera.fields import area_weights, detector_axes, grid_points, r
 from starcal_uq.camera.projection import unproject, unproject_jacobian
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.display import Shown
-from starcal_uq.core.records import read, write
+from starcal_uq.core.records import Saved
 from starcal_uq.core.types import FloatArray, Shapes
 
 if TYPE_CHECKING:
@@ -37,7 +36,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False)
-class FieldMap(Shown):
+class FieldMap(Shown, Saved):
     """1-sigma uncertainty of directions on a grid of pixels that spans the detector from edge to edge.
 
     Sigmas are per axis: the root of the mean variance of the two axes of the tangent plane, i.e. of half the trace. The
@@ -76,6 +75,8 @@ class FieldMap(Shown):
     rotation_covariance_arcsec2: FloatArray | None = None
     equivalent_covariance_px2: FloatArray | None = None
 
+    KIND = ""
+    FILE = "a field map", "run `starcal-uq propagate RUN --force` to write it again"
     SHAPES: ClassVar[Shapes] = {
         **{"x_px": ("x",), "y_px": ("y",), "star_x_px": ("n",), "star_y_px": ("n",)},
         **dict.fromkeys(("sigma_absolute_arcsec", "sigma_compensated_arcsec"), ("y", "x")),
@@ -107,21 +108,6 @@ class FieldMap(Shown):
             if covariance is not None:
                 maps |= {f"{kind}_{name}_arcsec2": covariance[:, :, i, j].ravel() for name, (i, j) in entries.items()}
         return pd.DataFrame({"x_px": x.ravel(), "y_px": y.ravel(), **maps})
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write all arrays to one ``.npz`` file, atomically; overwritten."""
-        write(self, path, "")
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> FieldMap:
-        """Read what `save` wrote, without loss; a file of an earlier version lacks the ellipses.
-
-        Raises
-        ------
-        RunFolderError
-            If the file is missing or is not a field map.
-        """
-        return read(cls, path, "", "a field map", "run `starcal-uq propagate RUN --force` to write it again")
 
 
 def field_map(post: Posterior, obs: Observations, n: int = 25) -> FieldMap:

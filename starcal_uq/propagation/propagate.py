@@ -168,26 +168,12 @@ def propagate(
 
 @dataclass(frozen=True, eq=False)
 class _Sampled:
-    """What draws through QUEST say, and what of it first order does not, on some of the frames.
+    """What draws through QUEST say, and what of it first order does not, on k of the frames (`places`).
 
-    Variances beyond first order are those of the draws less those that the responses give for the same draws.
-
-    Attributes
-    ----------
-    places : (k,) array
-        Places of the frames.
-    common : (D, 3) array
-        Common rotation of every draw, rad.
-    together : (3, p) array
-        Its first-order response on these frames.
-    beyond_common, beyond_constant : (3,) array
-        Variance beyond first order of the common rotation and of the mean of the rest, rad^2.
-    beyond_rest, beyond_whole : (k, 3) array
-        The same of the rest and of the whole rotation in each frame.
-    noise_excess : (3,) array
-        The same of noise.
-    interaction : (d, k, 3) array
-        Interaction of noise and camera, rad.
+    Variances beyond first order, rad^2, are those of the draws less those that the responses give for the same draws:
+    of the common rotation and of the mean of the rest (3,), of the rest and of the whole rotation in each frame (k, 3),
+    and of noise (3,). `common` (D, 3) is the common rotation of every draw, rad, `together` (3, p) its first-order
+    response on these frames, and `interaction` (d, k, 3) that of noise and camera, rad.
     """
 
     places: IntArray
@@ -279,22 +265,10 @@ class _Moments:
 class FrameGeometry:
     """Frames as QUEST sees them at the posterior mean, with its first-order responses.
 
-    Displacements db of the directions turn the attitude by phi = [sum w (I - b b^T)]^-1 sum w b x db.
-
-    Attributes
-    ----------
-    post, obs : Posterior, Observations
-        Posterior and observations that it is made from.
-    weights : (N,) array or None
-        Weights of QUEST; None where all stars count alike.
-    noise_px : (N,) array
-        Centroid noise of every star at the posterior mean, px per axis.
-    response : (K, 3, p) array
-        d phi / d theta, rad per px unit.
-    noise_response : (2, N, 3) array
-        Turn of a star's frame when its x, or its y, is off by one standard deviation, rad.
-    noise_covariance : (K, 3, 3) array
-        Covariance of phi from centroid noise, rad^2.
+    Displacements db of the directions turn the attitude by phi = [sum w (I - b b^T)]^-1 sum w b x db; weights (N,) are
+    None where all stars count alike. `noise_px` (N,) is the centroid noise per axis; `response` (K, 3, p) is
+    d phi / d theta, rad per px unit, `noise_response` (2, N, 3) the turn of a star's frame when its x, or its y, is off
+    by one standard deviation, rad, and `noise_covariance` (K, 3, 3) the covariance of phi from centroid noise, rad^2.
     """
 
     post: Posterior

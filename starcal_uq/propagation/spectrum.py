@@ -13,7 +13,6 @@ and draws through QUEST give what first order misses.
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
@@ -22,7 +21,7 @@ import numpy as np
 from starcal_uq.core.constants import ARCSEC, AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import AttitudeProfileError, SamplingError
-from starcal_uq.core.records import read, write
+from starcal_uq.core.records import Saved
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray, Shapes
 from starcal_uq.propagation.attitude_error import OBSERVED
@@ -199,13 +198,12 @@ def _autocorrelation(first: FloatArray, step: float) -> tuple[FloatArray, FloatA
     return lag, products / power
 
 
-_KIND = "starcal_uq error spectrum 1"
 _AVERAGES = 60
 
 
 # Smaller is rounding.
 @dataclass(frozen=True, eq=False)
-class ErrorSpectrum(Shown):
+class ErrorSpectrum(Shown, Saved):
     """Spectrum of the frame-dependent attitude error of a calibration along a series of frames.
 
     Axes are pitch, yaw and roll, as for `AttitudeError`.
@@ -254,6 +252,8 @@ class ErrorSpectrum(Shown):
     n_draws: int
     frames: str = OBSERVED
 
+    KIND = "starcal_uq error spectrum 1"
+    FILE = "an error spectrum", "compute it with error_spectrum"
     SHAPES: ClassVar[Shapes] = {
         **{"frequency_hz": ("f",), "psd_arcsec2_hz": ("f", 3), "lag_s": ("l",), "autocorrelation": ("l", 3)},
         **dict.fromkeys(("nea_psd_arcsec2_hz", "variance_arcsec2", "nea_arcsec"), (3,)),
@@ -325,21 +325,6 @@ class ErrorSpectrum(Shown):
                 "nea_arcsec2_hz": np.tile(self.nea_psd_arcsec2_hz, n),
             }
         )
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write everything to one ``.npz`` file, atomically and without loss; overwritten."""
-        write(self, path, _KIND)
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> ErrorSpectrum:
-        """Read what `save` wrote.
-
-        Raises
-        ------
-        RunFolderError
-            If the file is missing or is not such a spectrum.
-        """
-        return read(cls, path, _KIND, "an error spectrum", "compute it with error_spectrum")
 
 
 def _crossing(lag: FloatArray, correlation: FloatArray) -> float:

@@ -208,17 +208,8 @@ def choose_attitudes(
 class Window:
     """The detector on the sky.
 
-    Parameters
-    ----------
-    camera : Camera
-        Optics and detector.
-    margin_px : float
-        Stars nearer to the edge than this are left out; a negative margin lets in stars outside the detector.
-
-    Attributes
-    ----------
-    min_cosine : float
-        Cosine of the cone around the optical axis that holds everything on the detector.
+    Stars nearer to the edge than `margin_px` are left out; a negative margin lets in stars outside the detector.
+    `min_cosine` is that of the cone around the optical axis that holds everything on it.
     """
 
     def __init__(self, camera: Camera, margin_px: float) -> None:
@@ -241,15 +232,7 @@ class Window:
 
 
 class Sky(Window):
-    """Finds the stars of a catalogue on the detector.
-
-    Parameters
-    ----------
-    stars : StarCatalogue
-        Catalogue.
-    camera, margin_px
-        As for `Window`.
-    """
+    """Finds the stars of a catalogue on the detector (`Window`)."""
 
     def __init__(self, stars: StarCatalogue, camera: Camera, margin_px: float) -> None:
         super().__init__(camera, margin_px)

@@ -206,10 +206,6 @@ def render(
     time_utc : str, optional
         Middle of the exposure, to be recorded.
 
-    Returns
-    -------
-    RenderedFrame
-
     Raises
     ------
     SensorError

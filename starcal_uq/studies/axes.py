@@ -25,22 +25,10 @@ _CANCELLED = 0.02
 
 @dataclass(frozen=True)
 class Axis:
-    """Something that a study can vary.
+    """Something that a study can vary: its key in files, and words and unit for labels.
 
-    Attributes
-    ----------
-    name : str
-        Key in files, coordinate in results.
-    words : str
-        Description, for labels.
-    unit : str
-        Unit; empty for names and counts.
-    limit : Limit or None
-        Numbers that it takes; None for an axis of names.
-    choices : tuple of str
-        Names that it takes; empty where any will do.
-    base : float, int, str or None
-        Value where nothing is said; None leaves it to the camera, or to nature.
+    It takes numbers within a limit, or names, any where there are no `choices`. `base` is its value where nothing is
+    said; None leaves it to the camera, or to nature.
     """
 
     name: str

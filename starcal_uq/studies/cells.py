@@ -53,15 +53,7 @@ Numbers = AnyDict
 
 
 class Cells(ABC):
-    """Numbers of cells, one after the other; what neighbours share is kept from one to the next.
-
-    Parameters
-    ----------
-    definition : StudyDefinition
-        The study.
-    heaven : Heaven
-        Its stars.
-    """
+    """Numbers of cells, one after the other; what neighbours share is kept from one to the next."""
 
     def __init__(self, definition: StudyDefinition, heaven: Heaven) -> None:
         self.definition, self.heaven = definition, heaven

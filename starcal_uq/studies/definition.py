@@ -63,15 +63,7 @@ _RANGE = {name: key for name, key in _SPAN.items() if name != "n"}
 
 @dataclass(frozen=True)
 class Cell:
-    """One combination of settings, once.
-
-    Attributes
-    ----------
-    settings : dict
-        Value of every axis that has one.
-    seed_index : int
-        Repetition: another sky, other noise.
-    """
+    """One combination of settings, the value of every axis that has one; another seed is another sky, other noise."""
 
     settings: AnyDict
     seed_index: int

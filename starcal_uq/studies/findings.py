@@ -33,19 +33,10 @@ Statistic = Literal["median", "low", "high", "mean", "count"]
 class Curve:
     """A number along one axis, its median over seeds first and then over all other axes.
 
-    Attributes
-    ----------
-    axis : str
-        Name of the axis.
-    values : tuple
-        Its values; the median of each part where there are too many.
-    median, low, high : (n,) arrays
-        Median over the other axes, least and most over them.
-    change : float
-        Largest less smallest value along the axis, the median of it over the other axes.
-    chance : float
-        Change that other seeds (in a Latin hypercube, the other drawn axes) make less than once in a thousand times; 0
-        with one seed.
+    `values` are those of the axis, the median of each part where there are too many; median, least and most (n,) are
+    over the other axes. `change` is the largest less the smallest value along the axis, the median of it over the other
+    axes; `chance` is what other seeds (in a Latin hypercube, the other drawn axes) make of it less than once in a
+    thousand times, 0 with one seed.
     """
 
     axis: str
@@ -81,22 +72,9 @@ class Curve:
 
 @dataclass(frozen=True)
 class Lines:
-    """A number along one axis, a line for every value of another one.
+    """A number along one axis (n values), a line for every value of another one, `by`, where there is one.
 
-    Attributes
-    ----------
-    along : str
-        The axis.
-    values : tuple
-        Its values (n).
-    by : str or None
-        The axis that tells the lines apart.
-    by_values : tuple
-        Its values, one for each line; empty without `by`.
-    held : dict
-        Where the other axes are held.
-    median, low, high : (lines, n) arrays
-        Median, least and most over seeds.
+    The other axes are `held` at values; median, least and most (lines, n) are over seeds.
     """
 
     along: str
@@ -113,22 +91,10 @@ class Lines:
 class Pair:
     """How two parameters are coupled over the sweep.
 
-    Attributes
-    ----------
-    names : tuple of str
-        The two parameters.
-    strongest, weakest : float
-        Correlations (median over seeds) where they are largest and smallest in size.
-    strongest_at, weakest_at : dict
-        Where that is, by axis.
-    seeds : float
-        Range of the correlation over seeds at a place, the median over all places; 0 for a Latin hypercube.
-    mean_size : float
-        Size of the correlation, the mean over all places; 0 where a model lacks one of the two.
-    sizes : tuple of Curve
-        Size of the correlation along every axis.
-    costs : tuple of Curve
-        Logarithm of 1 / sqrt(1 - r^2), what the coupling of this pair alone costs in sigma, along every axis.
+    Correlations (median over seeds) where they are largest and smallest in size, and where that is. `seeds` is their
+    range over seeds at a place, the median over all places, 0 for a Latin hypercube; `mean_size` their size, the mean
+    over all places, 0 where a model lacks one of the two. Along every axis, `sizes` are the size, and `costs` the
+    logarithm of 1 / sqrt(1 - r^2), what the coupling of this pair alone costs in sigma.
     """
 
     names: tuple[str, str]
@@ -154,14 +120,9 @@ def matters(cost: Curve) -> bool:
 
 @dataclass(frozen=True)
 class Direction:
-    """A kind of weakest direction.
+    """A kind of weakest direction, and the share of the places of the sweep that have it.
 
-    Attributes
-    ----------
-    together, against : tuple of str
-        Parameters that grow together, and those that shrink meanwhile; both empty where nothing is coupled.
-    share : float
-        Part of the places of the sweep where the weakest direction is of this kind.
+    Parameters grow together, and others shrink meanwhile; none of either where nothing is coupled.
     """
 
     together: tuple[str, ...]
@@ -173,14 +134,8 @@ class Direction:
 class Turn:
     """The kinds of weakest direction along the axis that tells them apart best.
 
-    Attributes
-    ----------
-    axis : str
-        Name of the axis.
-    runs : tuple of (tuple of values, int)
-        Neighbouring values that share a kind, and the number of that kind.
-    told : float
-        Part of the places that the axis alone tells right.
+    `runs` are neighbouring values that share a kind, with its number; `told` is the part of the places that the axis
+    alone tells right.
     """
 
     axis: str
@@ -191,14 +146,7 @@ class Turn:
 class Sweep:
     """The cells of a study by their place: every number as a dense array over the axes.
 
-    Parameters
-    ----------
-    data : Dataset
-        Of a study.
-    axes : sequence of str
-        Names of the swept axes.
-    latin : sequence of str
-        Those that were drawn from a Latin hypercube.
+    Of the swept axes, those in `latin` were drawn from a Latin hypercube.
     """
 
     def __init__(self, data: xr.Dataset, axes: Sequence[str], latin: Sequence[str] = ()) -> None:

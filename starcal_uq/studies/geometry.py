@@ -146,22 +146,9 @@ class _Views(Window):
 
 @dataclass(frozen=True, eq=False)
 class Geometry:
-    """M frames without noise, N stars.
+    """M frames without noise, N stars: attitudes (M, 3, 3), R_cam_icrs, and the stars' pixels (N, 2), px.
 
-    Attributes
-    ----------
-    camera : Camera
-        Seen through which.
-    depth : Depth
-        Catalogue that `star` counts in.
-    rotations : (M, 3, 3) array
-        R_cam_icrs.
-    starts : (M + 1,) array of int
-        Stars of each frame.
-    star : (N,) array of int
-        Which they are.
-    pixel : (N, 2) array
-        Where they are, px.
+    ``starts`` (M + 1,) bounds the stars of each frame, and `star` (N,) counts in the catalogue of `depth`.
     """
 
     camera: Camera
@@ -359,24 +346,11 @@ def _random(key: GeometryKey, window: _Views, n: int) -> Geometry:
 class Statements:
     """What M frames say of p parameters, and what the parameters do to M attitudes.
 
-    Attributes
-    ----------
-    camera : Camera
-        Linearised at which.
-    information : (M, p, p) array
-        Of each frame, its attitude eliminated.
-    weights : (M,) array
-        Sum over the stars of each frame of the squared inverse noise, px^-2.
-    mean_stars : float
-        Stars in a frame on average.
-    common : (3, p) array
-        Common rotation, rad per unit of a parameter.
-    rest_forms : (3, p, p) array
-        Mean square over frames of what an attitude adds to it, rad^2.
-    noise : (3,) array
-        Mean over frames of the variance of an attitude, rad^2.
-    star_spread : tuple of (p, p) array, or None
-        By errors of the stars: variance of a frame's score beyond its information, and covariance of two frames'.
+    `information` (M, p, p) of each frame, its attitude eliminated; `weights` (M,), the sum over its stars of the
+    squared inverse noise, px^-2; `common` (3, p), the common rotation, rad per unit of a parameter; `rest_forms`
+    (3, p, p), the mean square over frames of what an attitude adds to it, rad^2; `noise` (3,), the mean over frames of
+    the variance of an attitude, rad^2; `star_spread`, by errors of the stars, (p, p) each: variance of a frame's score
+    beyond its information, and covariance of two frames'.
     """
 
     camera: Camera

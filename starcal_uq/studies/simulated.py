@@ -185,16 +185,9 @@ class SimulatedCells(Cells):
 
 @dataclass(frozen=True, eq=False)
 class GroundPrior:
-    """A prior of p parameters.
+    """A prior: `precision` (p,) of what the prior set states, 0 elsewhere, and means (p,), px units.
 
-    Attributes
-    ----------
-    precision : (p,) array
-        Of what the prior set states; 0 elsewhere.
-    centre : (p,) array
-        Means, px units.
-    full : GaussianPriors
-        With wide priors elsewhere, to sample with.
+    `full` has wide priors elsewhere, to sample with.
     """
 
     precision: FloatArray

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,13 +25,6 @@ def _schema() -> pa.Schema:
     fields = [(name, pa.string()) for name in ("key", "model", "status", *TEXTS)]
     fields += [(name, pa.list_(pa.float64()) if dims else pa.float64()) for name, (dims, _, _) in VARIABLES.items()]
     return pa.schema(fields)
-
-
-def rows_table(rows: Sequence[AnyDict]) -> pa.Table:
-    """Rows of cells, `row` each, as a table."""
-    import pyarrow as pa
-
-    return pa.Table.from_pylist(list(rows), schema=_schema())
 
 
 def row(key: str, model: str, numbers: AnyDict) -> AnyDict:

@@ -7,7 +7,7 @@ import secrets
 import shutil
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +22,7 @@ from starcal_uq.core.manifest import NEW, alone, making, read_manifest
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.store import held, take_over
-from starcal_uq.core.tasks import Progress, one_thread, run_tasks
+from starcal_uq.core.tasks import ByPlace, Progress, one_thread, run_tasks
 from starcal_uq.core.types import AnyDict
 from starcal_uq.sky.catalogue import load_catalogue
 from starcal_uq.studies.axes import AXES
@@ -210,16 +210,8 @@ def batches_of(definition: StudyDefinition, todo: Batch) -> list[Batch]:
 class Work:
     """From a batch of cells to their rows, in any process.
 
-    Parameters
-    ----------
-    definition : StudyDefinition
-        The study.
-    stars : StarCatalogue or None
-        Its stars; the embedded ones, which every process reads for itself, by default.
-    max_mag : float
-        The deepest limit.
-    stars_hash : str
-        What identifies the stars.
+    Without stars it takes the embedded ones to `max_mag`, which every process reads for itself; the hash identifies
+    them.
     """
 
     def __init__(
@@ -260,17 +252,6 @@ class Work:
 _computers: dict[str, Callable[[Cell], AnyDict]] = {}
 
 
-@dataclass(frozen=True)
-class _Numbered:
-    """Work by the number of a batch."""
-
-    work: Work
-    batches: list[Batch]
-
-    def __call__(self, index: int) -> list[AnyDict]:
-        return self.work(self.batches[index])
-
-
 def run_batches(
     work: Work,
     batches: list[Batch],
@@ -288,7 +269,7 @@ def run_batches(
         return False
     # A process takes seconds to start: what is done sooner is done here.
     workers = 0 if workers is None and len(batches) < _FEW_BATCHES else workers
-    task = _Numbered(work, batches)
+    task = ByPlace(work, batches)
     _, interrupted = run_tasks(task, len(batches), caller="starcal_uq.study", chunk=1, workers=workers, each=keep)
     return interrupted
 

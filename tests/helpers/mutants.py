@@ -346,7 +346,7 @@ def _write_results(folder: Path) -> None:
     from starcal_uq.core.store import write_part
     from starcal_uq.identification.pairs import StarPairs
     from starcal_uq.inference.ensemble import EnsembleSettings, _Store
-    from starcal_uq.studies.store import row, rows_table
+    from starcal_uq.studies.store import Store, row
     from tests.helpers.studies import made_study
 
     for name, to in CAMERAS.items():
@@ -361,7 +361,9 @@ def _write_results(folder: Path) -> None:
     study.data.attrs["definition"] = json.dumps(study.definition.to_dict())
     study.save(folder)
     write_manifest(folder, Manifest({"camera.toml": Entry(680, "0" * 64, "calibrate")}, {"calibrate": {"seed": 1}}))
-    write_part(rows_table([row("a", "brown", {"status": "ok", "truth": np.arange(5.0)})]), folder / "cells.parquet")
+    cells = Store(None)
+    cells.append([row("a", "brown", {"status": "ok", "truth": np.arange(5.0)})])
+    write_part(cells.table(), folder / "cells.parquet")
     import emcee
 
     store = _Store(2, EnsembleSettings(16, 6, 10, 2), 6, folder / "checkpoint.npz", "fingerprint")

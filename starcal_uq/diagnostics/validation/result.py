@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
@@ -11,7 +10,7 @@ import numpy as np
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.core.display import Shown
-from starcal_uq.core.records import read, write
+from starcal_uq.core.records import Saved
 from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray, Shapes
 from starcal_uq.diagnostics.validation.replicates import INTERVAL
 from starcal_uq.inference.priors import Priors
@@ -25,7 +24,6 @@ if TYPE_CHECKING:
 FAMILY_LEVEL = 0.01
 # Below this many replicates, intervals that are half as wide as they should be could go unnoticed.
 ENOUGH_REPLICATES = 100
-_FORMAT = "starcal_uq validation 1"
 
 
 class Finding(NamedTuple):
@@ -48,7 +46,7 @@ class Finding(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Validation(Shown):
+class Validation(Shown, Saved):
     """Truths against their posteriors over n replicates, for Q quantities and p parameters.
 
     Attributes
@@ -111,6 +109,8 @@ class Validation(Shown):
     interrupted: bool
     provenance: AnyDict
 
+    KIND = "starcal_uq validation 1"
+    FILE = "a validation", "run `starcal-uq validate CAMERA` to write it"
     SHAPES: ClassVar[Shapes] = {
         **{"quantities": ("q",), "units": ("q",), "truth": ("n", "p+1")},
         **dict.fromkeys(("replicate", "nees", "nees_calibration", "compression_error", "dof"), ("n",)),
@@ -224,18 +224,3 @@ class Validation(Shown):
                 "rank_p": self.rank_p_value,
             }
         )
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write everything to one ``.npz`` file, atomically; overwritten."""
-        write(self, path, _FORMAT)
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Validation:
-        """Read what `save` wrote, without loss.
-
-        Raises
-        ------
-        RunFolderError
-            If the file is missing or is not a validation.
-        """
-        return read(cls, path, _FORMAT, "a validation", "run `starcal-uq validate CAMERA` to write it")
