@@ -325,17 +325,9 @@ def find_optics(
 ) -> FoundOptics | None:
     """The focal length that frames agree on; None where there is none.
 
-    Parameters
-    ----------
-    frames
-        Points (n, 2) from the detector's middle, brightest first, and their noise (n,), px.
-    stars
-        Catalogue of at least so many stars of the whole sky, or of all that there are.
-    width_px, height_px
-        Detector.
-    ranges
-        Focal lengths to look for, px: first in the first range, then in the next. No level of the catalogue is searched
-        twice for one range.
+    A frame is points (n, 2) from the detector's middle, brightest first, and their noise (n,), px. `stars` gives a
+    catalogue of at least so many stars of the whole sky, or of all that there are. `ranges` are focal lengths, px, to
+    look for first in the first, then in the next; no level of the catalogue is searched twice for one range.
 
     A frame alone counts where chance makes what it shows less than once in 10^9; otherwise two must agree.
     """

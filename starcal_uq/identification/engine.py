@@ -281,13 +281,7 @@ class _Attempt:
 
 
 def sheet_of(centroids: CentroidTable) -> tuple[Camera, bool]:
-    """The camera as its images describe it, and whether they say its focal length.
-
-    Raises
-    ------
-    IdentificationError
-        If the table does not say the size of the images.
-    """
+    """The camera as its images describe it, and whether they say its focal length; their size must be stated."""
     said = getattr(centroids, "meta", {}).get("optics", {})
     if not said:
         raise IdentificationError(

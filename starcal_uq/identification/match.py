@@ -36,14 +36,9 @@ _DISTINCT = 28.0
 
 @dataclass(frozen=True, eq=False)
 class CameraState:
-    """Attitude and camera relative to the nominal one.
+    """Attitude (b = R r) and camera relative to the nominal one.
 
-    Attributes
-    ----------
-    rotation : (3, 3) array
-        b = R r.
-    shared : (4,) array
-        ln of the focal length over its nominal value, shift of the principal point (px), kappa (px).
+    `shared` (4,) are ln of the focal length over its nominal value, shift of the principal point (px), kappa (px).
     """
 
     rotation: FloatArray
@@ -52,31 +47,14 @@ class CameraState:
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """Stars of one frame.
+    """Stars of one frame: rows (m,) of its centroids and of the catalogue, with residuals (m, 2), px.
 
-    Attributes
-    ----------
-    state : CameraState
-        Attitude and camera.
-    centroid, star : (m,) arrays of int
-        Rows of the frame's centroids and of the catalogue.
-    residual_px : (m, 2) array
-        Measured minus predicted.
-    gate_px : float
-        Largest distance accepted, for the centroid of median noise.
-    noise_scale : float
-        Noise found over noise stated, at least 1.
-    log10_false : float
-        Decimal logarithm of the expected number of wrong attitudes on the whole sky that match as well.
-    n_ambiguous : int
-        Centroids that more than one star fits.
-    n_unlike_brightness : int
-        Centroids left out because they are farther from their star, and less of its brightness, than chance explains.
-    n_possible : int
-        Centroids, or stars of the catalogue in the field if those are fewer: no match has more.
-    information : (4, 4) array, gradient : (4,) array
-        Information on the shared parameters, attitude eliminated: information times their best value is
-        ``gradient``.
+    `gate_px` is the largest distance accepted, for the centroid of median noise; `noise_scale` the noise found over
+    that stated, at least 1; `log10_false` the decimal logarithm of the expected number of wrong attitudes on the whole
+    sky that match as well. `n_ambiguous` centroids fit more than one star; `n_unlike_brightness` were left out because
+    they are farther from their star, and less of its brightness, than chance explains; no match has more than
+    `n_possible`, the centroids, or the stars in the field if those are fewer. `information` (4, 4) is on the shared
+    parameters, attitude eliminated; times their best value it is `gradient` (4,).
     """
 
     state: CameraState

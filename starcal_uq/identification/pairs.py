@@ -38,22 +38,9 @@ _VERSION = 1
 class StarPairs:
     """Pattern stars and the angles between them; n stars, P pairs.
 
-    Attributes
-    ----------
-    star : (n,) array of int
-        Rows of the catalogue.
-    directions : (n, 3) array
-        Unit vectors.
-    first, second : (P,) arrays of int
-        Pattern stars (0 to n - 1) of each pair, sorted by angle.
-    angle : (P,) array
-        Angle of each pair, rad, increasing.
-    neighbour : (2 P,) array of int
-        Partners of pattern star 0, then of star 1 and so on; those of one star by increasing angle.
-    neighbour_angle : (2 P,) array
-        Angles to them, rad.
-    neighbour_start : (n + 1,) array of int
-        First partner of each star.
+    `star` (n,) are rows of the catalogue; pairs are of pattern stars `first` and `second` (P,), sorted by `angle`, rad.
+    `neighbour` (2 P,) are the partners of pattern star 0, then of star 1 and so on, those of one star by increasing
+    angle, with `neighbour_angle` (2 P,), rad; `neighbour_start` (n + 1,) is the first of each star.
     """
 
     star: IntArray
@@ -71,12 +58,7 @@ class StarPairs:
     def near_angle(self, star: IntArray, angle_rad: FloatArray, tolerance_rad: float) -> tuple[IntArray, IntArray]:
         """Pattern stars at angles (m,) from pattern stars `star` (m,), each within the tolerance.
 
-        Returns
-        -------
-        question : (h,) array of int
-            Index into `star`, of each hit.
-        partner : (h,) array of int
-            The pattern star.
+        Of each hit the index into `star`, and the pattern star, (h,) each.
         """
         edges, per_rad = self._steps
         place = star * _STEPS

@@ -37,14 +37,8 @@ _MOST_CANDIDATES = 100_000
 class CameraTolerance:
     """How far the camera may be from its nominal values.
 
-    Attributes
-    ----------
-    focal : float
-        Relative error of the focal length.
-    centre_px : float
-        Error of the principal point per axis, px.
-    distortion_px : float
-        Unknown displacement at the farthest corner, px.
+    Relative error of the focal length, error of the principal point per axis, px, and unknown displacement at the
+    farthest corner, px.
     """
 
     focal: float
@@ -54,17 +48,7 @@ class CameraTolerance:
 
 @dataclass(frozen=True)
 class FieldGeometry:
-    """The nominal camera as the search sees it.
-
-    Attributes
-    ----------
-    focal_px : float
-        Nominal focal length, px.
-    width_px, height_px : float
-        Detector.
-    corner_px : float
-        Distance of the farthest corner from the principal point, px.
-    """
+    """The nominal camera as the search sees it; `corner_px` is from the principal point."""
 
     focal_px: float
     width_px: float

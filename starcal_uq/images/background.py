@@ -29,21 +29,11 @@ _CUT_OFF = 0.05
 class PreparedImage:
     """An image made ready for detection and fits.
 
-    Attributes
-    ----------
-    counts : array of float32, shape (height, width)
-        Counts above the background; 0 where there is no value.
-    noise : array, shape (height, width)
-        Noise of the background, counts.
-    usable, saturated : array of bool, shape (height, width), or None
-        Pixels to use, None for all; saturated pixels, None for none.
-    counts_per_e : float
-        Inverse gain, 0 where unknown.
-    gain_is_measured : bool
-        Whether the gain was read off the noise of the background because none is known.
-    parity : int or None
-        Remainder of (x + y) / 2 of the pixels that were measured, those that see green in a mosaic of colours; the
-        others hold the mean of their neighbours, and are not `usable`. None where all were measured.
+    `counts` (height, width) are above the background, 0 where there is no value; `noise` is that of the background. Of
+    pixels, all are `usable` and none `saturated` where these are None. `counts_per_e` is the inverse gain, 0 where
+    unknown; it may be measured, read off the noise of the background. `parity` is the remainder of (x + y) / 2 of the
+    pixels that were measured, those that see green in a mosaic of colours; the others hold the mean of their
+    neighbours, and are not usable. None where all were measured.
     """
 
     counts: Any
@@ -62,11 +52,7 @@ def prepare_image(
 
     Without a `gain` (electrons per count) it is read off the noise of the background if that will do; `read_noise_e`
     (electrons, a floor of the noise) needs the gain. `saturation` (counts) is what the image says where it is None.
-
-    Raises
-    ------
-    ImageError
-        If no pixel has a value, all are equal, or too many are saturated.
+    Refused are images without a pixel that has a value, with equal ones alone, or with too many saturated.
     """
     with extra("images", "star images"):
         import sep

@@ -52,22 +52,11 @@ class DetectionOptions:
 
 @dataclass(frozen=True)
 class FrameStars:
-    """The stars of one image, brightest first.
+    """The stars of one image, brightest first, by columns of `Centroids` but ``frame``.
 
-    Attributes
-    ----------
-    columns : dict
-        Name of a column of `Centroids` to array; ``frame`` is not among them.
-    background, noise, psf_sigma_px : float
-        Median background and noise, counts; width of the star images.
-    gain_e_per_count : float or None
-        The gain that was given, by which fluxes are in electrons.
-    measured_gain_e_per_count : float or None
-        The gain read off the noise of the background where none was given; it serves the noise of the stars only.
-    messages : list of str
-        Notes on what was left out, without the name of the image.
-    windowed : bool
-        Whether the centroids are windowed because the star images are no round Gaussians.
+    Median background and noise, counts, and the width of the star images. Fluxes are in electrons by the gain that was
+    given; one that was read off the noise of the background serves the noise of the stars only. Messages say what was
+    left out, without the name of the image; centroids are `windowed` where star images are no round Gaussians.
     """
 
     columns: dict[str, Any]

@@ -27,22 +27,11 @@ _SQRT_2PI = float(np.sqrt(2.0 * np.pi))
 
 @dataclass(frozen=True)
 class Stamps:
-    """Squares of pixels around n positions.
+    """Squares of pixels (n, m, m) around n positions, from first column `x0` and row `y0` (n,) on.
 
-    Attributes
-    ----------
-    x0, y0 : array of int64, shape (n,)
-        First column and row.
-    counts : array, shape (n, m, m)
-        Counts above the background; 0 where not `fine`.
-    good : array of bool, shape (n, m, m)
-        Pixels to use.
-    fine : array of bool, shape (n, m, m)
-        Pixels that are good, or no loss: those between, in a mosaic of colours, hold the mean of their neighbours.
-    variance : array, shape (n,)
-        Variance of the background, counts squared.
-    counts_per_e : float
-        Inverse gain; 0 leaves photon noise of the star away.
+    `counts` are above the background, 0 where not `fine`; `good` are pixels to use, `fine` those that are good, or no
+    loss: those between, in a mosaic of colours, hold the mean of their neighbours. `variance` (n,) is that of the
+    background, counts squared; `counts_per_e` the inverse gain, and 0 leaves photon noise of the star away.
     """
 
     x0: IntArray
@@ -61,22 +50,11 @@ class Stamps:
 
 @dataclass(frozen=True)
 class StarFit:
-    """Result of `fit_stars` for n stars.
+    """Result of `fit_stars` for n stars: positions in the image, px, and fluxes, counts.
 
-    Attributes
-    ----------
-    x_px, y_px : array, shape (n,)
-        Position in the image.
-    flux : array, shape (n,)
-        Counts.
-    covariance : array, shape (n, 3, 3)
-        Covariance of (x, y, flux), px and counts; infinite where the pixels do not determine the star.
-    sigma_px : array, shape (n,)
-        Width of the star image, before integration over pixels.
-    weight : array, shape (n, m, m)
-        Inverse variance of each pixel, 0 where it was not used.
-    residual : array, shape (n, m, m)
-        Counts minus the other stars of the field that reach into the stamp.
+    `covariance` (n, 3, 3) of (x, y, flux) is infinite where the pixels do not determine the star; `sigma_px` (n,) is
+    the width of the star image, before integration over pixels; `weight` (n, m, m) the inverse variance of each pixel,
+    0 where it was not used; `residual` (n, m, m) counts minus the other stars of the field that reach into the stamp.
     """
 
     x_px: FloatArray

@@ -25,10 +25,7 @@ _ITERATIONS = 30
 class PhaseError:
     """Displacement of centroids along one axis by -amplitude sin(2 pi x).
 
-    Attributes
-    ----------
-    amplitude_px, sigma_px : float
-        Amplitude, 0 where it is not significant, and its standard deviation, infinite with too few stars.
+    The amplitude is 0 where it is not significant; its standard deviation is infinite with too few stars.
     """
 
     amplitude_px: float

@@ -24,16 +24,10 @@ _LEFT_MOVING = (0.8, 0.15)
 
 @dataclass(frozen=True)
 class Psf:
-    """What the star images of a frame look like.
+    """What the star images of a frame look like: width, px, before integration over pixels.
 
-    Attributes
-    ----------
-    sigma_px : float
-        Width before integration over pixels.
-    beyond : float
-        Light beyond the Gaussian as a part of it; 0 where it is not significant.
-    elongation : float
-        Length over width, with the pixel; 1 where it is not significant.
+    `beyond` is light beyond the Gaussian as a part of it, 0 where it is not significant; `elongation` is length over
+    width, with the pixel, 1 where it is not significant.
     """
 
     sigma_px: float

@@ -23,7 +23,7 @@ from starcal_uq.core.types import AnyDict, IntArray
 from starcal_uq.observations.checks import check_mapping
 from starcal_uq.observations.columns import COLUMNS
 from starcal_uq.observations.files import ParquetSummary, parquet_column, parquet_summary, read_table, say_column
-from starcal_uq.observations.table import Observations
+from starcal_uq.observations.table import Observations, joined_columns
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
@@ -161,7 +161,7 @@ class PartitionedObservations:
             share = max(1, round(n_frames * len(own) / n))
             kept = own if share >= len(own) else own[((np.arange(share) + 0.5) * len(own) / share).astype(int)]
             tables.append(self.reader.load(part, check=True, frames=kept))
-        return _joined(tables)
+        return Observations(**joined_columns(tables), meta=tables[0].meta)
 
 
 def open_partitions(
@@ -276,18 +276,3 @@ def _check_frames(parts: Sequence[Partition], reader: PartitionReader) -> None:
         for path in set(seen) - {earlier.path for earlier in open_} - {part.path}:
             del seen[path]
         open_.append(part)
-
-
-def _joined(tables: Sequence[Observations]) -> Observations:
-    """All rows in one table; a column that only some have is filled, or left out where it may have no gaps."""
-    columns: AnyDict = {}
-    for name, column in COLUMNS.items():
-        values = [getattr(table, name) for table in tables]
-        missing = [value is None for value in values]
-        if all(missing) or (any(missing) and not column.gaps):
-            continue
-        gap: Any = "" if column.kind == "text" else np.nan
-        columns[name] = np.concatenate(
-            [np.full(len(t), gap) if v is None else v for t, v in zip(tables, values, strict=True)]
-        )
-    return Observations(**columns, meta=tables[0].meta)

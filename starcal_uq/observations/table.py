@@ -381,3 +381,18 @@ def _marked(texts: StrArray) -> bytes:
 
 def _all_missing(values: Any) -> bool:
     return bool(np.all(values == "" if values.dtype.kind == "U" else np.isnan(values)))
+
+
+def joined_columns(tables: Sequence[Observations], **instead: Sequence[FloatArray]) -> AnyDict:
+    """All rows of several tables; a column that only some have is filled, or left out where it may have no gaps."""
+    columns: AnyDict = {}
+    for name, column in COLUMNS.items():
+        values: Sequence[Any] = instead.get(name) or [getattr(table, name) for table in tables]
+        missing = [value is None for value in values]
+        if all(missing) or (any(missing) and not column.gaps):
+            continue
+        gap: Any = "" if column.kind == "text" else np.nan
+        columns[name] = np.concatenate(
+            [np.full(len(table), gap) if v is None else v for table, v in zip(tables, values, strict=True)]
+        )
+    return columns

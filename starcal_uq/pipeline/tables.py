@@ -31,31 +31,10 @@ def observations_from_table(
 ) -> Observations:
     """Read a table and make its directions apparent as far as the user has declared how.
 
-    Parameters
-    ----------
-    path : Path, or several
-        As `load_observations` reads them.
-    camera : Camera
-        Its detector bounds the pixels.
-    columns : mapping, optional
-        Names in the file of columns that are called otherwise.
-    directions : {"undeclared", "catalogue", "apparent"}, optional
-        What the directions in the file are; the file's own metadata by default. With ``catalogue``, or with an observer
-        velocity, annual aberration is applied at each row's ``time_utc``.
-    observer_velocity_km_s : (3,) sequence, optional
-        Velocity relative to the Earth's centre, ICRS axes.
-    site : Site, optional
-        Where on the ground the camera stood: refraction and daily aberration are applied too, and stars lower than ten
-        degrees left out.
-    in_space : bool
-        Whether the camera was above the air, so that nothing need be said of refraction.
-
-    Raises
-    ------
-    ObservationError
-        For bad rows, or when aberration is asked for without times.
-    SiteError
-        For a site together with directions that need none.
+    With directions ``catalogue`` (by default the file's own metadata say what they are), or with an observer velocity
+    relative to the Earth's centre (ICRS axes), annual aberration is applied at each row's ``time_utc``. With a `site`
+    on the ground, refraction and daily aberration are applied too, and stars lower than ten degrees left out;
+    `in_space`, nothing need be said of refraction. Paths and columns are as `load_observations` takes them.
     """
     obs = load_observations(path, camera=camera, columns=columns)
     path = path if isinstance(path, Path) else path[0]

@@ -9,15 +9,14 @@ import numpy as np
 
 from starcal_uq.core.errors import CalibrationError, RunFolderError
 from starcal_uq.core.files import PathLike, check_new_folder
-from starcal_uq.core.types import AnyDict, FloatArray, StrArray
+from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.compressed import optimum
 from starcal_uq.estimation.duplicates import fingerprints_of
 from starcal_uq.estimation.fingerprints import shared
 from starcal_uq.estimation.merging import check_mergeable, merge, merging_noise, refuse_shared, renumbered
-from starcal_uq.observations.columns import COLUMNS
-from starcal_uq.observations.table import Observations
+from starcal_uq.observations.table import Observations, joined_columns
 from starcal_uq.runs.run import Run
 
 
@@ -115,19 +114,12 @@ def join_observations(
             "mean different things: declare them when calibrating."
         )
     _, shifts = renumbered([table.frame_ids for table in tables])
-    columns: AnyDict = {}
-    for name in COLUMNS:
-        values = [getattr(table, name) for table in tables]
-        if name == "sigma_px" and noise is not None:
-            values = [_stated(table, factor) for table, factor in zip(tables, noise, strict=True)]
-        missing = [value is None for value in values]
-        if name == "sigma_px" and any(missing) and not all(missing):
+    if noise is None:
+        if len({table.sigma_px is None for table in tables}) > 1:
             raise CalibrationError("only some of the runs state the noise of their stars: merge with noise 'own'.")
-        if all(missing) or (any(missing) and not COLUMNS[name].gaps):
-            continue
-        columns[name] = np.concatenate(
-            [_gaps(name, len(t)) if v is None else v for t, v in zip(tables, values, strict=True)]
-        )
+        columns = joined_columns(tables)
+    else:
+        columns = joined_columns(tables, sigma_px=list(map(_stated, tables, noise)))
     columns["frame"] = np.concatenate([table.frame + shift for table, shift in zip(tables, shifts, strict=True)])
     if not keep_shared:
         _check_disjoint(columns, tables, names)
@@ -145,10 +137,6 @@ def join_observations(
 def _stated(table: Observations, factor: float) -> FloatArray:
     stated = np.ones(len(table)) if table.sigma_px is None else table.sigma_px
     return np.asarray(factor * stated)
-
-
-def _gaps(name: str, n: int) -> FloatArray | StrArray:
-    return np.full(n, "", dtype=np.str_) if COLUMNS[name].kind == "text" else np.full(n, np.nan)
 
 
 def _check_disjoint(columns: AnyDict, tables: Sequence[Observations], names: Sequence[str]) -> None:

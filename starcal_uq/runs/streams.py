@@ -46,31 +46,10 @@ def filter_run(
     columns: Mapping[str, str] | None = None,
     force: bool = False,
 ) -> Calibration:
-    """Calibrate recursively from a file that need not fit into memory.
+    """Calibrate recursively from a file that need not fit into memory, into a run folder without observations.
 
-    Parameters
-    ----------
-    path : path
-        What `stream_frames` reads.
-    camera : Camera
-        Start values.
-    out : path
-        Run folder: ``camera.toml``, ``calibration.json`` and ``history.csv``; it holds no observations.
-    method, options
-        As for `RecursiveCalibration`.
-    columns : mapping, optional
-        Names in the file of columns that are called otherwise.
-    force : bool
-        Replace the run that the folder holds.
-
-    Raises
-    ------
-    RunFolderError
-        When the folder holds results.
-    ObservationError, CalibrationError
-        As `stream_frames` and `RecursiveCalibration`.
-    KeyboardInterrupt
-        After Ctrl-C; the state is kept, and the same call goes on from it.
+    `path` and `columns` are what `stream_frames` takes, `method` and `options` those of `RecursiveCalibration`. After
+    Ctrl-C the state is kept, and the same call goes on from it. A folder that holds results is refused unless `force`.
     """
     with RunFolder(out).writing(make=True):
         return _filter_run(Run(out), stream_frames(path, camera, columns), camera, method, options, columns, force)

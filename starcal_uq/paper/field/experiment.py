@@ -92,15 +92,6 @@ def field_experiment(
         How the printed sensor is read (`READINGS`).
     seed, workers, progress, force
         As in `reproduce`.
-
-    Raises
-    ------
-    RunFolderError, SamplingError, KeyboardInterrupt
-        As in `reproduce`.
-    CalibrationError
-        For numbers that are too small or an unknown reading, or when a method gives no result.
-    IdentificationError
-        When the frames of the calibration cannot be identified.
     """
     if reading not in READINGS:
         raise CalibrationError(f"reading {reading!r} of the field unit is unknown: use one of {', '.join(READINGS)}.")
