@@ -139,7 +139,11 @@ class SkySettings(PlaceSettings):
     frames: Annotated[
         str | None,
         typer.Option(
-            metavar="LIST", help="Frames of the table to take, such as 0-4,7.", callback=checked(parse_frames)
+            "--only-frames",
+            "--frames",
+            metavar="LIST",
+            help="Frames of the table to take, such as 0-4,7. (In other commands `--frames` is a number of frames.)",
+            callback=checked(parse_frames),
         ),
     ] = None
     observer_velocity: Annotated[

@@ -26,13 +26,25 @@ def new_command(
             parser=write_path,
         ),
     ] = None,
+    template: Annotated[
+        settings.StudyTemplate | None,
+        typer.Option(
+            metavar="NAME",
+            help="Of a study: fov-distortion (the default), frames-stars, magnitude-noise or distortion-models.",
+        ),
+    ] = None,
     force: Force = False,
 ) -> Answer:
     """Write a starter file with comments (camera, site, budget, study), or real data to try everything on."""
+    if template is not None and what != "study":
+        raise typer.BadParameter(f"--template belongs to a study, and this is a new {what}.")
     path = Path("esa" if what == "example" else f"{what}.toml") if out is None else out
     if what == "example":
         sc.example_data("esa").save(path, force=force)
-        following = f"starcal-uq run {path / 'stars.ecsv'} {path / 'camera.toml'} -o RUN (NOTICE: whose data)"
+        files = ", ".join(
+            str(path / name) for name in ("stars.ecsv", "camera.toml", "site.toml", "NOTICE (whose data)")
+        )
+        following = f"starcal-uq run {path / 'stars.ecsv'} {path / 'camera.toml'} -o RUN"
     elif what == "camera":
         sc.paper.paper_start().replace(name="my camera").save(path, force=force)
         following = f"put in the numbers of your data sheet, then starcal-uq run OBS {path} -o RUN"
@@ -44,7 +56,7 @@ def new_command(
         sc.budgeting.write_budget_template(path, force=force)
         following = f"take away the marks before what you know, then starcal-uq budget RUN --budget {path}"
     else:
-        sc.studies.write_study_template("fov-distortion", path, force)
+        sc.studies.write_study_template(template or "fov-distortion", path, force)
         following = f"change what is varied, then starcal-uq study {path} -o DIR"
-    say(f"{path}: {following}")
+    say(f"{files if what == 'example' else path}: {following}")
     return Answer({"file": path, "text": following})

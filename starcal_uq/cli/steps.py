@@ -77,7 +77,7 @@ def load_table(
     chosen = parse_frames(sky.frames)
     if isinstance(path, Path) and path.is_dir():
         if chosen is not None:
-            raise typer.BadParameter("--frames belongs to one table: leave files out of the folder instead.")
+            raise typer.BadParameter("--only-frames belongs to one table: leave files out of the folder instead.")
         obs = partitions_from_folder(path, camera, **known)
     else:
         obs = observations_from_table(path, camera, **known)

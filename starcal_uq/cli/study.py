@@ -18,7 +18,9 @@ def study_command(
     file: Annotated[
         Path,
         typer.Argument(
-            metavar="STUDY", help="What is varied (TOML); --template writes one to start from.", parser=write_file
+            metavar="STUDY",
+            help="What is varied (TOML); `starcal-uq new study` writes one to start from.",
+            parser=write_file,
         ),
     ] = Path("study.toml"),
     out: Annotated[
@@ -33,10 +35,7 @@ def study_command(
     ] = Path("study"),
     template: Annotated[
         settings.StudyTemplate | None,
-        typer.Option(
-            metavar="NAME",
-            help="Write a commented STUDY and stop: fov-distortion, frames-stars, magnitude-noise, distortion-models.",
-        ),
+        typer.Option(metavar="NAME", hidden=True, help="As `starcal-uq new study`: write STUDY and stop."),
     ] = None,
     workers: Annotated[
         int | None, number("workers", "Processes; as many as processors by default, 0 for this one.")

@@ -63,7 +63,7 @@ class FrameFocals:
 
     @property
     def largest(self) -> str:
-        """Frames of the largest group, as ``--frames`` takes them."""
+        """Frames of the largest group, as ``--only-frames`` takes them."""
         return frame_ranges(self.frame_ids[self.group == np.bincount(self.group).argmax()])
 
     def words(self, camera: Camera) -> str:
@@ -76,7 +76,7 @@ class FrameFocals:
         chosen = self.largest if self.largest.count(",") < _WORDS else "LIST"
         return (
             f"the frames are of {plural(self.n_groups, 'camera')}, or some are wrong: focal length {join_words(told)}; "
-            f"calibrate each by itself (--frames {chosen})"
+            f"calibrate each by itself (--only-frames {chosen})"
         )
 
 
@@ -91,7 +91,7 @@ class MixedCameras:
     words : str
         What is known of them, in one clause.
     frames : str
-        Frames of the largest group, as ``--frames`` takes them.
+        Frames of the largest group, as ``--only-frames`` takes them.
     """
 
     n: int
@@ -115,7 +115,7 @@ def _listed(frames: IntArray) -> str:
 
 
 def frame_ranges(frames: IntArray) -> str:
-    """Frame numbers as ``--frames`` takes them, such as 0-4,7."""
+    """Frame numbers as ``--only-frames`` takes them, such as 0-4,7."""
     ends = np.flatnonzero(np.diff(frames) != 1)
     first, last = frames[np.concatenate([[0], ends + 1])], frames[np.append(ends, len(frames) - 1)]
     return ",".join(str(a) if a == b else f"{a}-{b}" for a, b in zip(first.tolist(), last.tolist(), strict=True))

@@ -137,7 +137,7 @@ class StudyDefinition:
         StudyError
             If the file cannot be read or makes no sense; the message names file, key and remedy.
         """
-        remedy = "write one with `starcal-uq study --template fov-distortion`"
+        remedy = "write one with `starcal-uq new study`"
         return cls.from_dict(read_toml(path, "study", StudyError, remedy), str(path), Path(path).parent)
 
     @classmethod

@@ -42,7 +42,8 @@ def test_cells_without_numbers_alone_are_status_1(painting_cli, tmp_path: Path) 
 
 
 def test_templates_and_errors(painting_cli, tmp_path: Path) -> None:
-    assert painting_cli("study", "--template", "frames-stars")[0] == 0
+    assert painting_cli("new", "study", "--template", "frames-stars")[0] == 0
+    assert painting_cli("new", "camera", "--template", "frames-stars")[0] == 2
     assert (tmp_path / "study.toml").exists()
     status, printed, _ = painting_cli("study", "new.toml", "--template", "frames-stars")
     assert (status, printed.split(".")[0]) == (0, "Study to fill in: new")

@@ -262,7 +262,7 @@ ELSEWHERE = {
     "reproduce": "tests/cli/test_cli_paper.py",
     "run IMAGES... -o RUN": "tests/cli/test_cli_images.py",
     "study": "tests/cli/test_cli_study.py",
-    "study --template fov-distortion": "tests/cli/test_cli_study.py",
+    "new study": "tests/cli/test_cli_study.py",
     "validate CAMERA": "tests/cli/test_cli_statistics.py",
     "--help": "tests/cli/test_cli.py",
 }

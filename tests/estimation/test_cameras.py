@@ -55,7 +55,7 @@ def test_three_cameras():
 
 def test_a_failing_calibration_names_the_cameras_and_the_frames_to_take():
     obs, camera, _ = mixed(0, 1.4, 4)
-    with pytest.raises(CalibrationError, match=r"of 2 cameras.* in frames 0-5 and .* in frames 6-9.*--frames 0-5"):
+    with pytest.raises(CalibrationError, match=r"of 2 cameras.* in frames 0-5 and .* in frames 6-9.*--only-frames 0-5"):
         sc.calibrate(obs, camera)
     assert sc.calibrate(obs.in_ranges([(0, 5)]), camera).status.ok
 
@@ -65,7 +65,7 @@ def test_a_calibration_of_two_like_cameras_fails_a_check():
     cal = sc.calibrate(obs, camera)
     found = MixedCameras.of(obs, cal.camera)
     check = estimate.one_camera(found)
-    assert check.level is Level.FAIL and check.remedy.endswith("--frames 0-5")
+    assert check.level is Level.FAIL and check.remedy.endswith("--only-frames 0-5")
 
 
 @pytest.mark.parametrize(

@@ -153,7 +153,7 @@ def model_checks(diagnosis: Diagnosis) -> list[Check]:
 
 def one_camera(found: MixedCameras) -> Check:
     """Do the frames' own focal lengths ask for several cameras?"""
-    remedy = f"{CALIBRATE} --frames {found.frames}"
+    remedy = f"{CALIBRATE} --only-frames {found.frames}"
     sentence = f"{found.words[0].upper()}{found.words[1:]}."
     return Check("One camera", Question.TRUSTWORTHY, Level.FAIL, f"{found.n} cameras", "1", sentence, remedy)
 

@@ -63,8 +63,8 @@ class Verdict(Shown):
 
     @property
     def doubts(self) -> tuple[Check, ...]:
-        """The checks that did not pass."""
-        return tuple(check for check in self.checks if check.level is not Level.PASS)
+        """The checks that did not pass, failures first."""
+        return (*self.at(Level.FAIL), *self.at(Level.WARN))
 
     def at(self, level: Level) -> tuple[Check, ...]:
         """The checks with this outcome."""
