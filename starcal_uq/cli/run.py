@@ -16,16 +16,14 @@ from starcal_uq.cli.answers import Answer
 from starcal_uq.cli.console import (
     note,
     progress_bar,
-    show_attitude,
     show_calibration,
-    show_posterior,
     show_screening,
     show_summary,
     tell,
     warn_air,
 )
 from starcal_uq.cli.images import load_images
-from starcal_uq.cli.mission import show_budget, tell_violations
+from starcal_uq.cli.mission import tell_violations
 from starcal_uq.cli.options import (
     Alignment,
     AlignmentFrames,
@@ -84,7 +82,6 @@ def demo(
             tell("Calibrating from f = 72 mm and the detector's centre ...")
             run.calibrate(obs, sc.paper.paper_start())
         show_calibration(run.calibration, truth)
-        tell("Sampling the posterior, couplings, attitude error, then questioning the model ...")
         _after_calibration(run, ahead, SamplingSettings(seed=seed))
     return _conclude(run)
 
@@ -151,7 +148,7 @@ def run_command(
             _calibrate(run, inputs, camera, from_images, options, sky, images)
         show_calibration(run.calibration, run.truth)
         warn_air(run.observations, run.calibration)
-        _after_calibration(run, ahead, sampling, draws, budget, show=True, **aligning)
+        _after_calibration(run, ahead, sampling, draws, budget, **aligning)
     return _conclude(run)
 
 
@@ -186,8 +183,6 @@ def _after_calibration(
     sampling: SamplingSettings,
     draws: int = 300,
     budget: Path | None = None,
-    *,
-    show: bool = False,
     **aligning: Any,
 ) -> None:
     """Sample, couple, propagate, question the model, budget, report: what is not done yet."""
@@ -205,6 +200,7 @@ def _after_calibration(
     many = run.calibration.partitions is None and (ahead.loaded or len(run.observations) >= _APART_STARS)
     if many and not run.did("diagnose"):
         apart = ahead.begin(partial(diagnose_apart, seed=sampling.seed), run.observations, run.calibration)
+    tell("Sampling the posterior, couplings, attitude error, then questioning the model ...")
     ahead.draw(run.calibrated, AFTER_CALIBRATION)
     if run.images is not None:
         ahead.draw_frames(run.shown_frames)
@@ -216,18 +212,12 @@ def _after_calibration(
     if not run.did("propagate"):
         run.propagate(n_draws=draws, seed=sampling.seed, **aligning)
     ahead.draw(run.results, AFTER_PROPAGATION)
-    if show:
-        show_posterior(run.posterior)
     if not run.did("diagnose"):
         with progress_bar("diagnosis") as progress:
             run.diagnose(seed=sampling.seed, progress=progress, apart=apart)
     ahead.draw(run.results, AFTER_DIAGNOSIS)
-    if show:
-        show_attitude(run.attitude)
     if not run.did("budget"):
         run.budget(file=budget, seed=sampling.seed)
-    if show:
-        show_budget(run.error_budget)
     ahead.draw(run.results, AFTER_BUDGET)
     run.report(ahead.figures)
 

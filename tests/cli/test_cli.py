@@ -21,10 +21,10 @@ from tests.helpers.outside import campaign
 from tests.helpers.scenes import observations
 
 
-def test_run_writes_everything_and_prints_the_tables(painting_cli, inputs, tmp_path):
+def test_run_writes_everything_and_ends_with_its_summary(painting_cli, inputs, tmp_path):
     status, out, err = painting_cli("run", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", *SMALL)
     assert status in (0, 1)
-    for heading in ("Calibration", "Posterior", "Attitude error", "Report:"):
+    for heading in ("Calibration", "posterior ± 1 sigma", "Attitude error", "Report:"):
         assert heading in out
     assert "Neither time nor observer velocity was declared" in err
     run = sc.runs.RunFolder(tmp_path / "run")
