@@ -298,7 +298,7 @@ ONCE = [
     ("observations.ecsv", lambda d: d.replace(b"datatype:", b"datatipe:"), "the ECSV header is not valid YAML"),
     ("catalogue.ecsv", _header_only, "holds no stars"),
     ("centroids.ecsv", lambda d: d.split(b"\n")[0] + b"\n", "is not a readable table"),
-    ("observations.csv", lambda d: b"\x07,x\n1,2\n", r"one of the file's columns \(\\x07, x\)"),
+    ("observations.csv", lambda d: b"\x07,x\n1,2\n", r"of those in the file \(\\x07, x\)"),
     ("catalogue.csv.gz", lambda d: d[:100], "is not readable as CSV"),
     (
         "catalogue.fits",
