@@ -277,6 +277,8 @@ def calibrate_partitions(
         "sample_frames": sample.n_frames,
         "sample_stars": sample.n_stars,
         "sample_sha256": sample.data_hash,
+        # By which another folder that has some of the files is known.
+        "data_sha256": sorted(seen.hashes),
     }
     return replace(
         start,

@@ -158,6 +158,8 @@ def sample(
     data_hash = cal.provenance.get("data_sha256") if obs is None else cal.data_hash_of(obs)
     source = find_source(likelihood, obs, cal, dof)
     record = provenance(seed, chosen, data_hash)
+    if "partitions" in cal.provenance:
+        record["partitions"] = cal.provenance["partitions"]
     if cal.noise_model is not None:
         record["noise_model"] = cal.noise_model.record(frames=False)
     run = _Run(cal, source, priors, settings, n_ensembles, seed, sigma, progress, record)

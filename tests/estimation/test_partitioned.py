@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -125,6 +126,21 @@ def test_runs_of_partitions_are_merged(small, tmp_path: Path) -> None:
     together = sc.calibrate(whole, camera)
     assert merged.n_frames == together.n_frames == 170 and merged.n_stars == len(whole)
     assert np.max(np.abs(merged.theta - together.theta) / together.sigmas) < 0.01
+
+
+def test_folders_that_share_a_file_are_not_merged(small, tmp_path: Path) -> None:
+    _, camera, parts = small
+    for name, some in (("a", parts.parts[:3]), ("b", parts.parts[2:])):
+        (tmp_path / f"frames-{name}").mkdir()
+        for part in some:
+            # Another name is no other file.
+            shutil.copyfile(part.path, tmp_path / f"frames-{name}" / f"{name}-{part.path.name}")
+        frames = sc.observations.open_partitions(tmp_path / f"frames-{name}")
+        sc.Run(tmp_path / name).calibrate(frames, camera)
+        sc.Run(tmp_path / name).sample(seed=1, n_steps=20)
+    with pytest.raises(CalibrationError, match="b: holds the same observations as a, which would count twice"):
+        sc.runs.merge_runs([tmp_path / "a", tmp_path / "b"])
+    assert sc.runs.compare_runs(tmp_path / "a", tmp_path / "b").data == "overlapping"
 
 
 def test_file_with_another_noise_is_found(small, tmp_path: Path) -> None:
