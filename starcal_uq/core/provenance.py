@@ -40,7 +40,7 @@ def provenance(seed: int | None, settings: Mapping[str, Any], data_hash: str | N
 
 
 def data_hashes(provenance: AnyDict) -> set[str]:
-    """Hashes of all data that a result rests on: its own, those of its partitions and of the runs it was merged from."""
+    """Hashes of all data that a result rests on: its own, of its partitions, and of the runs it was merged from."""
     parts = provenance.get("merge", {}).get("parts", [])
     hashes = {str(value) for part in parts for value in part["data_sha256"]}
     hashes |= set(provenance.get("partitions", {}).get("data_sha256", ()))
