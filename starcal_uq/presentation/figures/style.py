@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import re
 import sys
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -40,13 +41,19 @@ BARS: dict[str, Any] = {"markersize": 4.0, "linestyle": "none", "elinewidth": 1.
 
 def new_figure(width_in: float, height_in: float) -> Figure:
     """An empty figure that no window manager knows of and that shows itself in a notebook."""
+    return _notebook_figure()(figsize=(width_in, height_in), layout="constrained", facecolor="white")
+
+
+@cache
+def _notebook_figure() -> type[Figure]:
+    """The class, made once: matplotlib writes a page about each class of artists."""
     from matplotlib.figure import Figure
 
     class NotebookFigure(Figure):
         def _repr_png_(self) -> bytes:
             return png_bytes(self, dpi=110)
 
-    return NotebookFigure(figsize=(width_in, height_in), layout="constrained", facecolor="white")
+    return NotebookFigure
 
 
 def panels(
@@ -243,7 +250,7 @@ _SHORTER = tuple(
     for pattern, short in (
         (r"<\?xml[^>]*>|<!DOCTYPE[^>]*>|<!--.*?-->|<metadata>.*?</metadata>", ""),
         # Not of numbers below one, which are scales.
-        (r"(?<![ (-]0)(\.\d\d)\d+", r"\1"),
+        (r"(?<=\.\d\d)(?<![ (-]0\.\d\d)\d+", ""),
         (r"\s*\n\s*", " "),
         (r"<g id=\"[^\"]*\"", "<g"),
         (r"<g ?/>", ""),
