@@ -24,9 +24,6 @@ import ast
 import difflib
 import gc
 import hashlib
-import importlib
-import importlib.abc
-import importlib.machinery
 import inspect
 import json
 import math
@@ -42,6 +39,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from functools import partial
+from importlib.machinery import SourceFileLoader
 from pathlib import Path
 from types import CodeType, FrameType, FunctionType
 from typing import Any
@@ -325,24 +323,6 @@ def drawn(found: dict[str, Mutant], seed: int, before: Iterable[str] = ()) -> li
     return sorted(chosen.values(), key=lambda name: (found[name].file, found[name].start))
 
 
-class Changed(importlib.abc.MetaPathFinder, importlib.machinery.SourceFileLoader):
-    """Gives one file of the package another text."""
-
-    def __init__(self, file: str, text: str) -> None:
-        module = file.removesuffix(".py").replace("/", ".")
-        super().__init__(module, str(ROOT / file))
-        self.text = text
-
-    def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> importlib.machinery.ModuleSpec | None:
-        if fullname != self.name:
-            return None
-        return importlib.machinery.ModuleSpec(fullname, self, origin=self.path)
-
-    def get_code(self, fullname: str) -> CodeType:
-        code: CodeType = compile(self.text, self.path, "exec", dont_inherit=True)
-        return code
-
-
 class Reached:
     """Which lines of some files each test reaches, and what it costs; a plug-in for pytest."""
 
@@ -537,7 +517,14 @@ class Trials:
             def anew(mutant: Mutant = mutant, text: str = text, names: list[str] = names) -> int:
                 for name in [name for name in sys.modules if name.split(".")[0] in ("starcal_uq", "tests", "conftest")]:
                     del sys.modules[name]
-                sys.meta_path.insert(0, Changed(mutant.file, mutant.source(text)))
+                changed, plain = str(ROOT / mutant.file), SourceFileLoader.get_code
+
+                def get_code(loader: Any, name: str) -> CodeType | None:
+                    if loader.path != changed:
+                        return plain(loader, name)
+                    return compile(mutant.source(text), changed, "exec", dont_inherit=True)
+
+                SourceFileLoader.get_code = get_code
                 return quiet_pytest(names, OUT / f"last-{os.getppid()}.log", [])
 
             status = forked(within if new else anew, SLOWER * seconds + BESIDE_S)
