@@ -148,3 +148,71 @@ def test_sampling_again_keeps_the_settings(post: Posterior) -> None:
         checks.resample(post, likelihood="gaussian")
         == "sc.sample(obs, cal, n_walkers=16, n_steps=60, likelihood=likelihood)"
     )
+
+
+def moved(post: Posterior, column: int, draws: np.ndarray) -> Posterior:
+    """With other draws of one parameter."""
+    return dataclasses.replace(post, draws=np.insert(np.delete(post.draws, column, axis=1), column, draws, axis=1))
+
+
+def test_a_sampler_that_hardly_moves(post: Posterior) -> None:
+    rates = np.full_like(post.diagnostics.acceptance, 0.4)
+    good = checks._acceptance(changed(post, acceptance=rates))
+    assert good.level is Level.PASS and good.remedy == "" and good.value == "0.40 to 0.40"
+    for rate in (0.05, 0.99):
+        rates.flat[1] = rate
+        bad = checks._acceptance(changed(post, acceptance=rates))
+        assert bad.level is Level.FAIL and "hardly moves" in bad.sentence
+        assert "moves='stretch'" in bad.remedy and f"n_steps={10 * N_STEPS}" in bad.remedy
+
+
+@pytest.mark.parametrize("sd", [0.7, 5.3])
+def test_monte_carlo_error_is_held_against_the_last_printed_digit(post: Posterior, sd: float) -> None:
+    """Means are printed to the second digit of sigma: to 0.01 px of 0.7, to 0.1 px of 5.3."""
+    unit = 10.0 ** (np.floor(np.log10(sd)) - 1.0)
+    z = post.draws[:, 2] - post.draws[:, 2].mean()
+    at = moved(post, 2, 5800.0 + sd / z.std(ddof=1) * z)
+    for share, level in ((0.9, Level.PASS), (1.8, Level.WARN)):
+        mcse = np.zeros(6)
+        mcse[2] = share * unit
+        check = checks._digits(changed(at, mcse=mcse))
+        assert check.level is level and check.value == f"{share:.2f} units of the last digit (f)"
+    assert "digit of f:" in check.sentence and times_longer(check) == np.ceil(1.2 * 1.8**2)
+
+
+def test_draws_beyond_what_a_camera_can_be(post: Posterior) -> None:
+    camera, n = post.camera, len(post.draws)
+    spread = np.linspace(-1.0, 1.0, n)
+    sd = spread.std(ddof=1)
+    # Ten standard deviations from each edge of the detector in turn; pixels reach half a pixel beyond their centres.
+    for column, edge, inside in ((0, -0.5, 1.0), (1, -0.5, 1.0), (0, camera.width_px - 0.5, -1.0)):
+        near = checks._bounds(moved(post, column, edge + inside * 10.0 * sd + spread))
+        assert near.level is Level.PASS and near.value == "nearest bound 10 sigma away"
+    for share, level in ((0.0005, Level.PASS), (0.02, Level.FAIL)):
+        x0 = np.full(n, 500.0) + spread
+        x0[: round(share * n)] = -1.0
+        check = checks._bounds(moved(post, 0, x0))
+        assert check.level is level
+    assert check.sentence.startswith("2.0\N{NO-BREAK SPACE}% of the draws have their principal point off")
+    k1 = post.draws[:, 3].copy()
+    k1[0] = -1e-5
+    folds = checks._bounds(moved(post, 3, k1))
+    assert folds.level is Level.FAIL and "folds over" in folds.sentence
+
+
+def test_the_prior_or_the_data(post: Posterior) -> None:
+    names = list(post.parameter_names)
+    mean, sd = post.priors.mean(names), post.priors.sd(names)
+    z = np.random.default_rng(1).standard_normal(len(post.draws))
+    z = (z - z.mean()) / z.std(ddof=1)
+    assert checks._priors(post).level is Level.PASS
+    for shift, share, level, words in (
+        (0.0, 0.4, Level.PASS, "The data decide every parameter"),
+        (0.0, 0.6, Level.WARN, "The prior, not the data, decides y0."),
+        (-3.5, 0.1, Level.WARN, "The data put y0 up to 3.5 prior standard deviations away"),
+        (2.5, 0.1, Level.PASS, "The data decide"),
+    ):
+        check = checks._priors(moved(post, 1, mean[1] + sd[1] * (shift + share * z)))
+        assert check.level is level and check.sentence.startswith(words)
+        if share > 0.3:
+            assert check.value == f"sigma {100 * share:.0f}\N{NO-BREAK SPACE}% of the prior's (y0)"
