@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
+from starcal_uq.propagation.coupling import weak_directions
 from tests.helpers.scenes import camera, nominal, observations
 
 
@@ -38,6 +39,21 @@ def test_weak_direction_is_said_in_words(found):
     assert "x0" not in found.weak_directions[0].words
 
 
+@pytest.mark.parametrize("r", [0.25, 0.5, -0.9])
+def test_directions_of_two_correlated_parameters(r):
+    """Variances 1 + r and 1 - r: within 0.7 and 1.4 times that of uncoupled parameters nothing is coupled."""
+    first, *rest = weak_directions(np.array([[1.0, r, 0.0], [r, 1.0, 0.0], [0.0, 0.0, 1.0]]), ("a", "b", "c"))
+    assert [d.variance for d in (first, *rest)] == pytest.approx([1.0 + abs(r), 1.0, 1.0 - abs(r)])
+    assert rest[0].words == "c: not coupled to the others"
+    for direction, word, together in ((first, "poorly", r > 0.0), (rest[1], "well", r < 0.0)):
+        names, said = direction.words.split(": ")
+        if abs(r) < 0.3:
+            assert said == "not coupled to the others"
+            continue
+        assert said == f"{word} determined, {direction.variance:.2g} times the variance of uncoupled parameters"
+        assert names in ({"a and b together", "b and a together"} if together else {"a against b", "b against a"})
+
+
 def test_inflation_is_the_price_of_not_knowing_the_others(found):
     scale = 1 / found.sigma_marginal
     precision = np.linalg.inv(found.covariance * np.outer(scale, scale))
@@ -56,11 +72,13 @@ def test_contraction_is_the_share_of_the_prior_variance_that_went(calibrated, fo
     assert "contraction" not in found.to_dataframe()
 
 
-def test_principal_point_and_boresight_are_one_near_gauge(found):
+def test_principal_point_and_boresight_are_one_near_gauge(calibrated, found):
     names = found.extended_names
     e = found.extended_correlation
     assert e[names.index("x0"), names.index("yaw")] == pytest.approx(-1.0, abs=1e-3)
     assert e[names.index("y0"), names.index("pitch")] == pytest.approx(1.0, abs=1e-3)
+    turned = calibrated.rotation_per_theta @ found.covariance @ calibrated.rotation_per_theta.T
+    assert np.allclose(found.common_rotation_arcsec, np.rad2deg(np.sqrt(np.diag(turned))) * 3600.0, rtol=1e-9)
     # 1 px of principal point is 1 / f of boresight.
     expected = np.rad2deg(found.sigma_marginal[0] / 5852.0) * 3600.0
     assert found.common_rotation_arcsec[1] == pytest.approx(expected, rel=0.02)

@@ -136,6 +136,10 @@ def test_sampling_sees_what_first_order_does_not() -> None:
     assert list(table.columns) == ["contributor", "axis", "sampled_over_first_order"]
     assert np.nanmax(np.abs(table["sampled_over_first_order"] - 1.0)) == found.agreement.largest
     assert found.agreement.text in found.agreement._repr_html_()
+    # Nothing of one beside something of the other is no agreement; nothing of both has none.
+    nothing = dataclasses.replace(found, nea_arcsec=np.full(3, 1e-9))
+    assert np.allclose(nothing.agreement.ratio[0], 0.0, rtol=0, atol=1e-6)
+    assert np.isnan(dataclasses.replace(nothing, analytic_nea_arcsec=np.full(3, 1e-9)).agreement.ratio[0]).all()
 
 
 @pytest.mark.parametrize("alignment", ["random", "observed"])
