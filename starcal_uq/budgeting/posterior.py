@@ -39,16 +39,16 @@ def posterior_rows(attitude: AttitudeError, post: Posterior) -> tuple[Contributo
     expected = list(FROM_POSTERIOR)
     if np.all(np.isfinite(attitude.interaction_arcsec)):
         expected.append(INTERACTING)
-    found, reasons = attitude.misfit, {}
-    if found is not None:
-        reasons = {COMMON: found.common_reasons, REST: found.rest_reasons}
+    found = attitude.misfit
+    reasons = {} if found is None else {COMMON: found.common_reasons, REST: found.rest_reasons}
+    factors = {} if found is None else dict.fromkeys(reasons, found.factor)
     tails = _tails(attitude)
     rows = []
     for entry in expected:
         place = CONTRIBUTORS.index(entry.name)
         held, with_misfit = attitude.if_model_holds_arcsec[place], attitude.with_misfit_found_arcsec[place]
         counted = attitude.headline_arcsec[place]
-        factor = found.factor if found is not None and entry.name in reasons else 1.0
+        factor = factors.get(entry.name, 1.0)
         scale = np.divide(factor * held[:3], counted[:3], out=np.zeros(3), where=counted[:3] > 0.0)
         correlation = axis_correlations(attitude.covariance_arcsec2[place], scale)
         alignment = f"; alignment on {attitude.alignment}" if entry.name == COMMON else ""
@@ -134,7 +134,7 @@ def _tails(attitude: AttitudeError) -> dict[tuple[str, str], float]:
     quantile is chance.
     """
     table = attitude.to_dataframe()
-    rows = table[table["contributor"].isin((NEA, REST)) & (table["if_model_holds_arcsec"] > 0.0)]
+    rows = table[table["contributor"].isin((NEA, REST))]
     ratios = (rows["p997_if_model_holds_arcsec"] / rows["if_model_holds_arcsec"]).tolist()
     keys = zip(rows["contributor"].tolist(), rows["axis"].tolist(), strict=True)
     return {key: max(ratio, GAUSSIAN_997) for key, ratio in zip(keys, ratios, strict=True) if math.isfinite(ratio)}

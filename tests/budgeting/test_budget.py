@@ -87,7 +87,7 @@ limit_arcsec = 100.0
 def attitude(**changes: Any) -> AttitudeError:
     nea, common, rest = np.array([0.46, 0.46, 6.6]), np.array([4.8, 4.7, 0.01]), np.array([0.006, 0.006, 0.05])
     values = [nea, common, rest, np.hypot(common, rest), np.array([1e-4, 1e-4, 1e-3])]
-    factors = np.array([[3.2], [2.9], [3.9], [2.97], [3.0]])
+    factors = np.array([[3.2], [3.3], [3.9], [2.97], [3.0]])
     cross = [float(np.sqrt(np.mean(v[:2] ** 2))) for v in values]
     table = np.column_stack((np.array(values), cross))
     return dataclasses.replace(
@@ -204,9 +204,45 @@ def test_nothing_found_nothing_inflated() -> None:
     assert any("found nothing" in note for note in found.notes)
 
 
-def test_what_a_misfit_adds_is_in_the_row_with_its_reason(tmp_path: Path) -> None:
+def test_classes_hold_what_counts_in_a_scope(stated: Path) -> None:
+    """In squares row by row, without what the alignment absorbs or does not apply."""
+    found = made(stated)
+    assert any(not row.applies for row in found.rows)
+    for scope in ("before alignment", "after alignment"):
+        for line in found.classes_dataframe(scope).to_dict("records"):
+            rows = [r for r in found.rows if (r.ecss_class, r.axis) == (line["ecss_class"], line["axis"]) and r.applies]
+            if scope == "after alignment":
+                rows = [row for row in rows if row.absorbed_by_alignment != "yes"]
+            else:
+                rows = [row for row in rows if row.absorbed_by_alignment != "caused by it"]
+            known = [row.sigma_arcsec for row in rows if row.assessed]
+            assert line["at_least"] == (len(known) < len(rows))
+            expected = math.sqrt(sum(sigma**2 for sigma in known)) if known or not rows else math.nan
+            assert line["sigma_arcsec"] == pytest.approx(expected, nan_ok=True)
+    counted = {row.ecss_class for row in found.rows if row.applies and row.absorbed_by_alignment != "caused by it"}
+    assert {*found.classes_dataframe("before alignment")["ecss_class"]} == counted
+
+
+def test_tables_say_what_rows_totals_and_requirements_are(stated: Path) -> None:
+    found = made(stated)
+    for table, entries in (
+        (found.to_dataframe(), found.rows),
+        (found.totals_dataframe(), found.totals),
+        (found.requirements_dataframe(), found.outcomes),
+    ):
+        assert len(table) == len(entries)
+        for line, entry in zip(table.to_dict("records"), entries, strict=True):
+            for name, value in line.items():
+                places = (entry, getattr(entry, "requirement", None), getattr(entry, "total", None))
+                (expected, *_) = [getattr(place, name) for place in places if hasattr(place, name)]
+                expected = "; ".join(expected) if name == "not_assessed" else expected
+                assert value == expected or (math.isnan(value) and math.isnan(expected)), name
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.3])
+def test_what_a_misfit_adds_is_in_the_row_with_its_reason(tmp_path: Path, factor: float) -> None:
     """The attitude error brings it along; from pixels to there see `tests/diagnostics/test_pattern.py`."""
-    found = MisfitFound(1.0, np.zeros(3), np.array([0.7, 0.7, 10.0]), (), ("misfit, pattern over radius",))
+    found = MisfitFound(factor, np.zeros(3), np.array([0.7, 0.7, 10.0]), (), ("misfit, pattern over radius",))
     held = attitude().if_model_holds_arcsec[:, :3]
     covariance = held[:, :, None] * held[:, None] * np.array([[1.0, 0.6, -0.3], [0.6, 1.0, 0.2], [-0.3, 0.2, 1.0]])
     made_of = budget(POST, OBS, attitude(misfit=found, covariance_arcsec2=covariance), n_samples=20_000)  # type: ignore[arg-type]
@@ -216,14 +252,19 @@ def test_what_a_misfit_adds_is_in_the_row_with_its_reason(tmp_path: Path) -> Non
         lines = [rows[name, axis] for axis in ("pitch", "yaw", "roll")]
         sigma = np.array([line.sigma_arcsec for line in lines])
         kept = np.array([line.axis_correlation for line in lines]) * np.outer(sigma, sigma)
-        assert np.allclose(kept - covariance[place], np.diag(sigma**2 - held[place] ** 2), rtol=1e-9, atol=1e-12)
-    assert rows[REST, "pitch"].sigma_arcsec == pytest.approx(np.hypot(0.006, 0.7))
-    assert rows[REST, "roll"].sigma_arcsec == pytest.approx(np.hypot(0.05, 10.0))
+        added = np.diag(sigma**2 - (factor * held[place]) ** 2)
+        assert np.allclose(kept - factor**2 * covariance[place], added, rtol=1e-9, atol=1e-12)
+    assert rows[REST, "pitch"].sigma_arcsec == pytest.approx(np.hypot(factor * 0.006, 0.7))
+    assert rows[REST, "roll"].sigma_arcsec == pytest.approx(np.hypot(factor * 0.05, 10.0))
+    # Common rotations are one Gaussian, whatever the tail of their draws.
+    assert rows[COMMON, "pitch"].tail_997 == GAUSSIAN_997 < rows[NEA, "pitch"].tail_997
     # The added part has no tail of its own; with next to all of the variance it leaves next to nothing of the tail.
     assert GAUSSIAN_997 < rows[REST, "pitch"].tail_997 < GAUSSIAN_997 + 0.01
     assert rows[REST, "pitch"].if_model_holds_arcsec == 0.006 and rows[REST, "pitch"].inflated
     assert "pattern over radius" in rows[REST, "pitch"].conditions
-    assert not rows[COMMON, "pitch"].inflated and not rows[NEA, "pitch"].inflated
+    assert rows[COMMON, "pitch"].inflated == (factor > 1.0) and not rows[NEA, "pitch"].inflated
+    if factor > 1.0:
+        return
     assert any(REST in note and "inflated" in note for note in made_of.notes)
     # A file of the version before has the sigma of inflated rows alone.
     made_of.save(tmp_path / "budget.csv")
