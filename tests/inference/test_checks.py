@@ -209,7 +209,7 @@ def test_the_prior_or_the_data(post: Posterior) -> None:
     for shift, share, level, words in (
         (0.0, 0.4, Level.PASS, "The data decide every parameter"),
         (0.0, 0.6, Level.WARN, "The prior, not the data, decides y0."),
-        (-3.5, 0.1, Level.WARN, "The data put y0 up to 3.5 prior standard deviations away"),
+        (-3.5, 0.1, Level.WARN, "The data put y0 3.5 prior standard deviations away"),
         (2.5, 0.1, Level.PASS, "The data decide"),
     ):
         check = checks._priors(moved(post, 1, mean[1] + sd[1] * (shift + share * z)))
