@@ -8,7 +8,7 @@ say together about the camera narrows the tolerances for a second pass over all 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import partial
 from os import PathLike
 from typing import Protocol
@@ -24,7 +24,7 @@ from starcal_uq.core.errors import IdentificationError
 from starcal_uq.core.settings import Engine, bounded
 from starcal_uq.core.types import FloatArray
 from starcal_uq.identification.blind import AGREEMENT, FOCAL_RANGE, find_optics
-from starcal_uq.identification.match import Match
+from starcal_uq.identification.match import CameraState, Match
 from starcal_uq.identification.proposers import Proposer, prepare_engine
 from starcal_uq.identification.pyramid import CameraTolerance
 from starcal_uq.identification.result import FoundOptics, FrameIdentification, Identification, Parity
@@ -46,6 +46,12 @@ from starcal_uq.sky.catalogue import StarCatalogue
 _WORSE_LENS = 4.0
 # This many frames with most stars decide whether another way of searching is worth the time.
 _PROBES = 10
+# After so many frames in vain the focal length is looked for: that takes less time than one such frame.
+_IN_VAIN = 3
+# So many frames of a camera say enough of it to narrow the search for the others.
+_AGREE = 3
+# A frame is searched again when a tolerance is smaller than this part of what it was.
+_BETTER = 0.7
 # Frames with fewer stars say nothing about the common camera.
 _CAMERA_STARS = 7
 # After a search at any focal length in vain, of frames with so many stars, the other frames get so many triangles.
@@ -168,7 +174,7 @@ def identify(
     if calibration is not None:
         sheet, tolerance = calibration.camera, calibrated_tolerance(calibration, tolerance)
     prepare = partial(prepare_engine, engine, cache=cache, cache_dir=cache_dir)
-    attempt = _Attempt(centroids, catalogue, sheet, tolerance, prepare)
+    attempt = _Attempt(centroids, catalogue, sheet, tolerance, prepare, share_camera)
     _check(centroids, sheet, attempt.stars)
     searching = search_focal and calibration is None
     if told:
@@ -177,14 +183,15 @@ def identify(
     if searching and not attempt.good:
         optics = _found_optics(attempt.field, catalogue, sheet, told)
         if optics is not None:
-            other = _Attempt(centroids, catalogue, *_with(sheet, tolerance, optics, told), prepare, optics.mirrored)
+            found = _with(sheet, tolerance, optics, told)
+            other = _Attempt(centroids, catalogue, *found, prepare, share_camera, optics.mirrored)
             other.run(progress, False)
             if other.n_solved > attempt.n_solved:
                 attempt = other
     if told or optics is not None:
         rich = max(map(len, attempt.field.xy), default=0) >= _RICH_STARS
         attempt.finish(progress, hopeless=searching and rich and optics is None and not attempt.good)
-    return attempt.result(share_camera, optics)
+    return attempt.result(optics)
 
 
 class _Attempt:
@@ -197,13 +204,16 @@ class _Attempt:
         camera: Camera,
         tolerance: CameraTolerance,
         prepare: Callable[..., Proposer],
+        share_camera: bool,
         mirrored: bool = False,
     ) -> None:
-        self.centroids, self.camera, self.prepare = centroids, camera, prepare
+        self.centroids, self.camera, self.prepare, self.share_camera = centroids, camera, prepare, share_camera
         self.stars, self.tolerance = catalogue.for_camera(camera), tolerance
         self.parity: Parity = "mirrored" if mirrored else "normal"
         self.field = FrameTable(centroids, camera, mirrored)
         self.results: dict[int, Found] = {}
+        # The tolerances of frames that were searched with the camera of others.
+        self._narrowed: dict[int, CameraTolerance] = {}
         self._search: Search | None = None
 
     @property
@@ -227,17 +237,46 @@ class _Attempt:
         return _failed(self.results, self.field)
 
     def run(self, progress: Callable[[int, int], None] | None, stop: bool) -> None:
-        """Search every frame; with `stop`, none after the first few with most stars if none of those is found."""
-        n = len(self.field.ids)
-        frames = [k for k in range(n) if len(self.field.xy[k]) >= MIN_STARS]
-        first = sorted(frames, key=lambda k: -len(self.field.xy[k]))[:_PROBES] if stop else []
-        for k in [*first, *range(n)]:
-            if stop and len(self.results) == len(first) and first and not self.n_solved:
+        """Search every frame, those with most stars first; with `stop`, only while a third of them is found.
+
+        What the first ones found say of the camera narrows the search for the others.
+        """
+        useful, n_solved = _useful(self.results.values()), self.n_solved
+        narrow: tuple[Search, FrameTable, FloatArray] | None = None
+        enough = _AGREE
+        for k in self._in_turn():
+            if k in self.results:
+                continue
+            tried = len(self.results)
+            if stop and tried >= _IN_VAIN and 3 * n_solved < tried and len(self.field.xy[k]) >= MIN_STARS:
                 return
-            if k not in self.results:
-                self.results[k] = self.search.frame(self.field, k)
-                if progress is not None:
-                    progress(len(self.results), n)
+            if self.share_camera and len(useful) >= enough:
+                narrow, enough = self._narrow(useful), 2 * len(useful)
+            if narrow is None:
+                found = self.search.frame(self.field, k)
+            else:
+                found = _relative(narrow[0].frame(narrow[1], k), narrow[2])
+                self._narrowed[k] = narrow[0].tolerance
+            self.results[k] = found
+            useful += _useful([found])
+            n_solved += found.match is not None
+            if progress is not None:
+                progress(len(self.results), len(self.field.ids))
+
+    def _in_turn(self) -> list[int]:
+        """Frames with most stars first, but a middling one early: most stars may be those of trees or clouds."""
+        xy = self.field.xy
+        order = sorted(range(len(xy)), key=lambda k: (-len(xy[k]), xy[k][:1].tolist()))
+        middle = sum(len(points) >= MIN_STARS for points in xy) // 2
+        if middle >= _IN_VAIN:
+            order.insert(_IN_VAIN - 1, order.pop(middle))
+        return order
+
+    def _narrow(self, useful: list[Match]) -> tuple[Search, FrameTable, FloatArray]:
+        """The search with the camera that matches agree on, its frames, and by what that camera differs."""
+        shared, covariance = self.search.common_camera(useful)
+        camera = _moved(self.field.camera, shared)
+        return self.search.narrowed(camera, covariance), self.field.seen_by(camera), shared
 
     def finish(self, progress: Callable[[int, int], None] | None, hopeless: bool = False) -> None:
         """Search what is left, as mirror images and with a worse lens where most frames fail.
@@ -248,7 +287,11 @@ class _Attempt:
             self.search.triangles = min(self.search.triangles, _FEW_TRIANGLES)
         self.run(progress, False)
         failed = self._failed()
-        if len(failed) > self.n_solved and self.parity == "normal" and not hopeless:
+        if len(failed) > self.n_solved and self._narrowed:
+            # Perhaps the first frames do not speak for the others.
+            self.results |= _retry(self.search, self.field, [k for k in failed if k in self._narrowed])
+            self._narrowed, failed = {}, self._failed()
+        if len(failed) > self.n_solved and self.n_solved < 2 and self.parity == "normal" and not hopeless:
             # Every frame of a camera has one handedness: the one that more frames have.
             flipped = FrameTable(self.centroids, self.camera, mirrored=True)
             mirror = Search(flipped.camera, self.stars, self.tolerance, self.search.proposer)
@@ -263,20 +306,22 @@ class _Attempt:
             self.results |= other
             self._search = worse if _solved(other.values()) else self.search
 
-    def result(self, share_camera: bool, optics: FoundOptics | None) -> Identification:
+    def result(self, optics: FoundOptics | None) -> Identification:
         """What became of all frames, with what they say together about the camera."""
         results = [self.results.get(k, NOT_SEARCHED) for k in range(len(self.field.ids))]
         useful = _useful(results)
         refined = self.field.camera
-        if useful:
-            shared, covariance = self.search.common_camera(useful)
-            refined = _moved(self.field.camera, shared)
-            if share_camera and len(useful) > 1:
-                second = self.search.narrowed(refined, covariance)
-                again = self.field.seen_by(refined)
-                results = [second.again(again, k, found, shared) for k, found in enumerate(results)]
-                if useful := _useful(results):
-                    refined = _moved(refined, second.common_camera(useful)[0])
+        if self.share_camera and len(useful) > 1:
+            second, again, shared = self._narrow(useful)
+            # What was not found with a camera known as well is not looked for once more.
+            known = {k for k, t in self._narrowed.items() if not _much_narrower(second.tolerance, t)}
+            given_up = {k for k in known if results[k].match is None}
+            results = [f if k in given_up else second.again(again, k, f, shared) for k, f in enumerate(results)]
+            refined, useful = again.camera, _useful(results)
+            if useful:
+                refined = _moved(refined, second.common_camera(useful)[0])
+        elif useful:
+            refined = _moved(refined, self.search.common_camera(useful)[0])
         return _result(self.field, results, refined, self.stars, self.parity, self.centroids, optics)
 
 
@@ -334,6 +379,19 @@ def _with(sheet: Camera, tolerance: CameraTolerance, optics: FoundOptics, told: 
 def _useful(results: Iterable[Found]) -> list[Match]:
     """Matches that say something about the common camera."""
     return [f.match for f in results if f.match is not None and len(f.match) >= _CAMERA_STARS]
+
+
+def _much_narrower(one: CameraTolerance, other: CameraTolerance) -> bool:
+    """Whether the camera is known so much better that a search may find what it did not find before."""
+    return any(a < _BETTER * b for a, b in zip(astuple(one), astuple(other), strict=True))
+
+
+def _relative(found: Found, shared: FloatArray) -> Found:
+    """A frame matched with a camera moved by `shared`, as seen from the camera that was moved."""
+    if (m := found.match) is None:
+        return found
+    state = CameraState(m.state.rotation, m.state.shared + shared)
+    return replace(found, match=replace(m, state=state, gradient=m.gradient + m.information @ shared))
 
 
 def calibrated_tolerance(calibration: CalibratedCamera, largest: CameraTolerance) -> CameraTolerance:

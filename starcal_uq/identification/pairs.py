@@ -13,15 +13,17 @@ import os
 import sys
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
+from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path
 from starcal_uq.core.records import read_arrays
-from starcal_uq.core.types import FloatArray, IntArray
+from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -30,6 +32,10 @@ if TYPE_CHECKING:
 PATTERN_STARS = 18
 # Steps of angle in the table of neighbours.
 _STEPS = 256
+# Numbers of the table of cubes that says where no star is near, its least chord, and questions that it is worth.
+_CUBES, _LEAST_CUBE, _MANY = 1 << 22, 2.0**-12, 5_000
+# Pairs whose angles are computed together.
+_AT_ONCE = 1 << 17
 # Part of the key of every cache file: to be raised when the content or its meaning changes.
 _VERSION = 1
 
@@ -45,10 +51,10 @@ class StarPairs:
 
     star: IntArray
     directions: FloatArray
-    first: IntArray
-    second: IntArray
+    first: NDArray[np.int32]
+    second: NDArray[np.int32]
     angle: FloatArray
-    neighbour: IntArray
+    neighbour: NDArray[np.int32]
     neighbour_angle: FloatArray
     neighbour_start: IntArray
 
@@ -77,6 +83,24 @@ class StarPairs:
         inside = np.flatnonzero(np.abs(self.neighbour_angle[row] - angle_rad[question]) <= tolerance_rad)
         return question[inside], self.neighbour[row[inside]]
 
+    def near_place(self, directions: FloatArray, chord: float) -> tuple[IntArray, FloatArray]:
+        """Rows of the unit vectors (m, 3) that may have a pattern star within a chord, and how near the nearest is.
+
+        For many of them a table of small cubes says where there is none, sooner than the tree.
+        """
+        place = np.arange(len(directions))
+        size = 2.0 ** (0.5 * np.ceil(2.0 * np.log2(max(chord, _LEAST_CUBE))))
+        if size in self._cubes or len(place) > _MANY:
+            if size not in self._cubes:
+                self._cubes[size] = _cubes_near(self.directions, size)
+            place = np.flatnonzero(self._cubes[size][_hash(directions * (1.0 / size))])
+        return place, self.tree.query(directions[place], distance_upper_bound=chord)[0]
+
+    @cached_property
+    def _cubes(self) -> dict[float, BoolArray]:
+        """For each size of cubes those, by hash, that a pattern star is in, or not farther from than such a size."""
+        return {}
+
     def ready(self) -> StarPairs:
         """The same, with what is derived made now, so that no frame waits for it."""
         _ = self.tree, self._steps
@@ -90,40 +114,69 @@ class StarPairs:
         return cKDTree(self.directions)
 
     @cached_property
-    def _steps(self) -> tuple[IntArray, float]:
+    def _steps(self) -> tuple[NDArray[np.int32], float]:
         """Where each step of each star's neighbours begins, (n * steps + 1,), and the steps per rad."""
         width = (float(self.angle[-1]) if len(self.angle) else 1.0) / _STEPS * (1.0 + 1e-12)
-        star = np.repeat(np.arange(len(self)), np.diff(self.neighbour_start))
-        step = np.clip((self.neighbour_angle * (1.0 / width)).astype(np.int64), 0, _STEPS - 1)
-        counts = np.bincount(star * _STEPS + step, minlength=len(self) * _STEPS)
-        return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64), 1.0 / width
+        star = np.repeat(np.arange(len(self), dtype=np.int32) * np.int32(_STEPS), np.diff(self.neighbour_start))
+        star += np.minimum(self.neighbour_angle * (1.0 / width), _STEPS - 1.0).astype(np.int32)
+        edges = np.zeros(len(self) * _STEPS + 1, dtype=np.int32)
+        np.cumsum(np.bincount(star, minlength=len(edges) - 1), out=edges[1:])
+        return edges, 1.0 / width
 
 
 def find_star_pairs(
     directions: FloatArray, mag: FloatArray, field_sr: float, max_angle_rad: float, per_field: int = PATTERN_STARS
 ) -> StarPairs:
     """Choose pattern stars, `per_field` of them in a field of view, and list their pairs up to the largest angle."""
+    from scipy.sparse import csr_array
     from scipy.spatial import cKDTree
 
     order = np.argsort(mag, kind="stable")
     # Twice as many as needed on average leaves enough far from the Milky Way.
     order = order[: int(np.ceil(2.5 * per_field * 4.0 * np.pi / field_sr))]
-    near = cKDTree(directions[order]).query_pairs(_chord(np.sqrt(field_sr / np.pi)), output_type="ndarray")
-    brighter = np.bincount(near.max(axis=1), minlength=len(order)) if len(near) else np.zeros(len(order))
+    near = (
+        cKDTree(directions[order]).query_pairs(_chord(np.sqrt(field_sr / np.pi)), output_type="ndarray").reshape(-1, 2)
+    )
+    brighter = np.bincount(near[:, 1], minlength=len(order))
     star = order[brighter < per_field].astype(np.int64)
     chosen = np.ascontiguousarray(directions[star])
-    pairs = cKDTree(chosen).query_pairs(_chord(max_angle_rad), output_type="ndarray").reshape(-1, 2).astype(np.int64)
-    # In an order of their own first, which decides between equal angles and does not depend on the library's.
-    pairs = pairs[np.argsort(pairs[:, 0] * len(star) + pairs[:, 1])]
-    angle = angle_between(chosen[pairs[:, 0]], chosen[pairs[:, 1]])
-    rank = np.argsort(angle, kind="stable")
+    pairs = cKDTree(chosen).query_pairs(_chord(max_angle_rad), output_type="ndarray").reshape(-1, 2).astype(np.int32)
+    angle = np.empty(len(pairs))
+    for rows in (slice(k, k + _AT_ONCE) for k in range(0, len(pairs), _AT_ONCE)):
+        angle[rows] = angle_between(chosen[pairs[rows, 0]], chosen[pairs[rows, 1]])
+    rank = np.argsort(angle).astype(np.int32)
     pairs, angle = pairs[rank], angle[rank]
-    # Each pair twice, in the order of angles, which sorting by one star and then the other keeps.
-    by_star = np.argsort(pairs.ravel(), kind="stable")
-    start = np.concatenate([[0], np.cumsum(np.bincount(pairs.ravel(), minlength=len(star)))]).astype(np.int64)
-    neighbour = pairs[:, ::-1].ravel()[by_star]
+    # Equal angles in an order that does not depend on the library's.
+    same = np.flatnonzero(np.diff(angle) == 0.0)
+    same = np.union1d(same, same + 1)
+    pairs[same] = pairs[same[np.lexsort((pairs[same, 1], pairs[same, 0], angle[same]))]]
+    # Each pair twice, in the order of angles, which transposing a sparse row keeps: by counts, without comparing.
+    twice = np.arange(2 * len(pairs), dtype=np.int32)
+    row = csr_array((twice, pairs.ravel(), np.array([0, len(twice)], dtype=np.int32)), shape=(1, len(star)))
+    by_star = row.tocsc()
+    neighbour = pairs[:, ::-1].ravel()[by_star.data]
     first, second = np.ascontiguousarray(pairs.T)
-    return StarPairs(star, chosen, first, second, angle, neighbour, np.repeat(angle, 2)[by_star], start)
+    start = by_star.indptr.astype(np.int64)
+    return StarPairs(star, chosen, first, second, angle, neighbour, angle[by_star.data // 2], start)
+
+
+def _cubes_near(directions: FloatArray, size: float) -> BoolArray:
+    """Which cubes, by hash, are not farther than their size from one of the directions (n, 3)."""
+    table = np.zeros(_CUBES, dtype=np.bool_)
+    inside = directions / size - np.floor(directions / size)
+    steps = (-1, 0, 1)
+    apart = [[np.maximum(np.maximum(k - x, x - k - 1.0), 0.0) ** 2 for k in steps] for x in inside.T]
+    for i, j, k in product(range(3), repeat=3):
+        near = apart[0][i] + apart[1][j] + apart[2][k] <= 1.0 + 1e-6
+        table[_hash(directions[near] / size + (i - 1.0, j - 1.0, k - 1.0))] = True
+    return table
+
+
+def _hash(place: FloatArray) -> NDArray[np.int32]:
+    """A number below `_CUBES` of the unit cube that each place (m, 3) is in; that integers overflow is meant."""
+    x, y, z = np.floor(place).astype(np.int32).T
+    number: NDArray[np.int32] = x * np.int32(73856093) ^ y * np.int32(19349663) ^ z * np.int32(83492791)
+    return number & np.int32(_CUBES - 1)
 
 
 def angle_between(a: FloatArray, b: FloatArray) -> FloatArray:

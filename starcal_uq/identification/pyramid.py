@@ -167,8 +167,9 @@ def _look_up(
     if key not in bases:
         slack = base * (tolerance.focal + bias) + SIGMAS * np.hypot(sigma[i], sigma[j]) / f
         low, high = np.searchsorted(pairs.angle, (base - slack, base + slack))
-        first, second, size = pairs.first[low:high], pairs.second[low:high], pairs.angle[low:high] / base
-        bases[key] = np.concatenate([first, second]), np.concatenate([second, first]), np.concatenate([size, size])
+        one, two, size = pairs.first[low:high], pairs.second[low:high], pairs.angle[low:high] / base
+        a, c = np.concatenate([one, two], dtype=np.int64), np.concatenate([two, one], dtype=np.int64)
+        bases[key] = a, c, np.concatenate([size, size])
     a, c, scale = bases[key]
     near = angle[i, k]
     near_tol = noise * np.hypot(1.0, near / base) + bias * near
@@ -218,8 +219,9 @@ def _supported(
     gate_px = SIGMAS * np.hypot(sigma[others], noise * (1.0 + 1.5 * reach / span))
     gate_px = gate_px + geometry.relative_bias(tolerance) * (reach + span)
     gate = gate_px / geometry.focal_px
-    distance, _ = pairs.tree.query(sky.reshape(-1, 3), distance_upper_bound=float(gate.max()))
-    support = np.sum(distance.reshape(len(candidates), -1) < gate, axis=1)
+    place, distance = pairs.near_place(sky.reshape(-1, 3), float(gate.max()))
+    candidate, other = np.divmod(place, len(others))
+    support = np.bincount(candidate[distance < gate[other]], minlength=len(candidates))
     best = np.argsort(-support, kind="stable")
     best = best[support[best] > 0][:_HANDED_ON]
     return [Hypothesis(rotation[m], float(scale[m])) for m in best]

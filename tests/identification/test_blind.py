@@ -188,5 +188,5 @@ def test_failure_is_bounded_in_count(stars: StarCatalogue, monkeypatch: pytest.M
     found = identify(table, square_camera(20.0), stars, cache=False)
     assert found.n_identified == 0
     # The last ten are with a worse lens.
-    assert [triangles for _, triangles in looks] == [200] * 10 + [40] * 30 + [60] * 10
+    assert [triangles for _, triangles in looks] == [200] * 3 + [40] * 37 + [60] * 10
     assert {k for k, _ in looks} == set(range(n))
