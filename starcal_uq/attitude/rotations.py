@@ -26,19 +26,13 @@ def rotation_to_quaternion(rotation: FloatArray) -> FloatArray:
     wx, wy, wz = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1]
     xy, xz, yz = m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1]
     # Four times q q^T: each row is parallel to the quaternion.
-    rows = np.stack(
-        (
-            np.stack((1.0 + xx - yy - zz, xy, xz, wx), axis=-1),
-            np.stack((xy, 1.0 - xx + yy - zz, yz, wy), axis=-1),
-            np.stack((xz, yz, 1.0 - xx - yy + zz, wz), axis=-1),
-            np.stack((wx, wy, wz, 1.0 + xx + yy + zz), axis=-1),
-        ),
-        axis=-2,
-    )
-    best = np.argmax(np.diagonal(rows, axis1=-2, axis2=-1), axis=-1)
-    q: FloatArray = np.take_along_axis(rows, best[..., None, None], axis=-2)[..., 0, :]
-    q = q / np.linalg.norm(q, axis=-1, keepdims=True)
-    return np.where(q[..., 3:] < 0.0, -q, q)
+    square = (1.0 + xx - yy - zz, 1.0 - xx + yy - zz, 1.0 - xx - yy + zz, 1.0 + xx + yy + zz)
+    best = np.argmax(square, axis=0)
+    rows = ((square[0], xy, xz, wx), (xy, square[1], yz, wy), (xz, yz, square[2], wz), (wx, wy, wz, square[3]))
+    x, y, z, w = (np.choose(best, column) for column in zip(*rows, strict=True))
+    norm = np.sqrt(x * x + y * y + z * z + w * w)
+    norm = np.where(w < 0.0, -norm, norm)
+    return np.stack((x / norm, y / norm, z / norm, w / norm), axis=-1)
 
 
 def quaternion_to_rotation(quaternion: FloatArray) -> FloatArray:
@@ -46,12 +40,15 @@ def quaternion_to_rotation(quaternion: FloatArray) -> FloatArray:
     q = np.asarray(quaternion, dtype=float)
     if q.shape[-1:] != (4,):
         raise ValueError(f"quaternions have shape (..., 4), not {q.shape}.")
-    norm2 = np.sum(q * q, axis=-1)
+    return _of_quaternion(*np.moveaxis(q, -1, 0))
+
+
+def _of_quaternion(x: FloatArray, y: FloatArray, z: FloatArray, w: FloatArray) -> FloatArray:
+    norm2 = x * x + y * y + z * z + w * w
     if np.any(norm2 == 0.0):
         raise ValueError("a quaternion of norm zero is not a rotation.")
-    x, y, z, w = np.moveaxis(q, -1, 0)
     s = 2.0 / norm2
-    matrix = np.empty((*q.shape[:-1], 3, 3))
+    matrix = np.empty((*norm2.shape, 3, 3))
     matrix[..., 0, 0] = 1.0 - s * (y * y + z * z)
     matrix[..., 1, 1] = 1.0 - s * (x * x + z * z)
     matrix[..., 2, 2] = 1.0 - s * (x * x + y * y)
@@ -103,8 +100,10 @@ def exp_rotation(phi: FloatArray) -> FloatArray:
     v = np.asarray(phi, dtype=float)
     if v.shape[-1:] != (3,):
         raise ValueError(f"rotation vectors have shape (..., 3), not {v.shape}.")
-    half = 0.5 * np.linalg.norm(v, axis=-1, keepdims=True)
-    return quaternion_to_rotation(np.concatenate((0.5 * v * np.sinc(half / np.pi), np.cos(half)), axis=-1))
+    x, y, z = np.moveaxis(v, -1, 0)
+    half = 0.5 * np.sqrt(x * x + y * y + z * z)
+    along = np.sinc(half / np.pi)
+    return _of_quaternion(0.5 * x * along, 0.5 * y * along, 0.5 * z * along, np.cos(half))
 
 
 def random_rotations(n: int, rng: np.random.Generator) -> FloatArray:

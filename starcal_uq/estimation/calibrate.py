@@ -576,7 +576,7 @@ def _pair_stages(
     # Without an optical axis there is nothing to attach the distortion to; later stages would only hide it.
     if len(camera.theta) > 3 and stages[0].status is not Status.NOT_FINITE:
         stages.append(distortion_stage(frames, camera, stages[0].theta))
-        stages.append(joint_stage(pairs, camera, stages[1].theta, solver, max_iterations, tolerance))
+        stages.append(joint_stage(pairs, camera, stages[1].theta, solver, max_iterations, tolerance, last))
         if not stages[-1].status.ok or _far(stages[0], camera):
             # Distortion of tens of pixels pulls the undistorted fit far from the axis, and the linear stage may then
             # lead to another minimum or into a fold; the nominal optics without distortion are the safer start.

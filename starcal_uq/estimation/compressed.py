@@ -396,7 +396,7 @@ def monomial_map(offset: FloatArray, matrix: FloatArray) -> FloatArray:
         A.
     """
     p = len(offset)
-    rows, columns = np.triu_indices(p)
+    rows, columns = _pairs(p)
     q = 1 + p + len(rows)
     t = np.zeros((q, q))
     t[0, 0] = 1.0
@@ -589,7 +589,7 @@ def settled(compressed: CompressedLikelihood) -> CompressedLikelihood:
 def _derivatives(compressed: CompressedLikelihood) -> tuple[FloatArray, FloatArray]:
     """Gradient (p,) and Hessian (p, p) of the sum of squares with respect to z, at z = 0."""
     p = len(compressed.theta_hat)
-    rows, columns = np.triu_indices(p)
+    rows, columns = _pairs(p)
     bend = np.zeros((p, p))
     bend[rows, columns] = compressed.gram[0, p + 1 :]
     hessian = 2.0 * compressed.gram[1 : p + 1, 1 : p + 1] + 2.0 * (bend + bend.T)

@@ -77,7 +77,8 @@ class Fingerprints:
         offset = xy - np.asarray(centre_px)[:, None]
         rows = _most_central(np.sum(np.square(offset, out=offset), axis=0), obs.frame_starts[:-1], sizes)
         found = np.take(xy, rows, axis=1)
-        error = np.hypot(*_unsmooth(xy, residuals_px.T, rows, found))
+        left = _unsmooth(xy, residuals_px.T, rows, found)
+        error = np.sqrt(left[0] ** 2 + left[1] ** 2)
         free = np.sqrt(1.0 - 1.5 / np.maximum(sizes, 2))
         error /= np.repeat(free, np.minimum(sizes, _MARKS))
         return cls(sizes.astype(np.int64), found.T.astype(np.float32, order="C"), error.astype(np.float32))

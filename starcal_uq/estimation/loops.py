@@ -29,7 +29,7 @@ _HEAD = """
 import numpy as np
 from numba import float64, int64, njit, types
 
-P, STRIDE, CHUNK, GRAM_CHUNK, ROWS, EXPLICIT, WIDTH = {p}, {stride}, {chunk}, 64, {rows}, {explicit}, {width}
+P, STRIDE, CHUNK, GRAM_CHUNK, ROWS, EXPLICIT = {p}, {stride}, {chunk}, 64, {rows}, {explicit}
 DEGENERATE = {degenerate}
 # Sums in another order and fused products, nothing that changes what is done with NaN and infinity.
 HELPER = dict(no_cpython_wrapper=True, no_cfunc_wrapper=True)
@@ -316,8 +316,8 @@ def attitudes(theta, x0, y0, r0, r1, r2, starts, rotations):
 def pair_sums(theta, x0, y0, r0, r1, r2, starts, rotations, scores, matrix):
     # Rows of the buffer: b, its derivatives, R', E, D B, and of each star's frame B^T B and E^T B.
     R, E, BB, EB = 3 + 3 * P, 6 + 3 * P, 12 + 3 * P, 18 + 3 * P
-    work, buf, stars = np.zeros(8 * STRIDE), np.empty((27 + 3 * P) * STRIDE), np.zeros(CHUNK * WIDTH)
-    acc, eb, bb, score = np.empty((3, WIDTH + 12)), np.empty((3, 3)), np.empty((3, 3)), np.empty(P)
+    work, buf = np.zeros(8 * STRIDE), np.empty((27 + 3 * P) * STRIDE)
+    acc, eb, bb, score = np.empty((3, 3 * P + 9)), np.empty((3, 3)), np.empty((3, 3)), np.empty(P)
     n_frames = len(starts) - 1
     cost, first = 0.0, 0
     while first < n_frames:
@@ -338,19 +338,16 @@ def pair_sums(theta, x0, y0, r0, r1, r2, starts, rotations, scores, matrix):
         for q in range(3):
             for i in range(m):
                 buf[(E + q) * STRIDE + i] = buf[q * STRIDE + i] - buf[(R + q) * STRIDE + i]
-        # Star by star, for the sums over the stars of a frame.
-        for i in range(m):
-            for q in range(3 * P + 6):
-                stars[i * WIDTH + q] = buf[(3 + q) * STRIDE + i]
         for f in range(first, last):
             j, end = starts[f] - s0, starts[f + 1] - s0
-            pair_products_0(stars, j, end, acc)
-            pair_products_1(stars, j, end, acc)
-            pair_products_2(stars, j, end, acc)
+            acc[:] = 0.0
+            pair_products_0(buf, j, end, acc)
+            pair_products_1(buf, j, end, acc)
+            pair_products_2(buf, j, end, acc)
             for a in range(3):
                 for c in range(3):
-                    rr, ee = acc[a, WIDTH + c], acc[a, WIDTH + 8 + c]
-                    re, er = acc[a, WIDTH + 3 + c], acc[c, WIDTH + 3 + a]
+                    rr, ee = acc[min(a, c), 3 * P + max(a, c)], acc[min(a, c), 3 * P + 6 + max(a, c)]
+                    re, er = acc[a, 3 * P + 3 + c], acc[c, 3 * P + 3 + a]
                     cost += ee * rr + re * er + ee * (2.0 * re + 0.5 * ee)
                     eb[a, c] = er + ee
                     bb[a, c] = rr + re + er + ee
@@ -385,7 +382,7 @@ _GRAM = """
 @njit(GRAM_SUMS, **FAST)
 def gram_sums(theta, l, x0, y0, r0, r1, r2, weight, starts, rotations, shift, path, inverse, gram, slope):
     work, buf = np.zeros(8 * STRIDE), np.zeros(GRAM_ROWS * STRIDE)
-    acc, solved = np.zeros((3, SECOND)), np.empty(3)
+    acc = np.zeros((3, SECOND))
     zero = starts[0]
     n, first, s0 = starts[len(starts) - 1], zero, zero
     while s0 < n:
@@ -446,15 +443,13 @@ def gram_sums(theta, l, x0, y0, r0, r1, r2, weight, starts, rotations, shift, pa
             second_2(buf, j, end, acc)
             j = end
             if s0 + j == starts[f + 1]:
-                for q in range(SECOND):
-                    for c in range(3):
-                        solved[c] = (
-                            inverse[c, 0, f] * acc[0, q] + inverse[c, 1, f] * acc[1, q] + inverse[c, 2, f] * acc[2, q]
-                        )
-                    for p in range(q + 1):
-                        gram[1 + P + p, 1 + P + q] -= (
-                            acc[0, p] * solved[0] + acc[1, p] * solved[1] + acc[2, p] * solved[2]
-                        )
+                for p in range(SECOND):
+                    a, b, c = acc[0, p], acc[1, p], acc[2, p]
+                    g0 = inverse[0, 0, f] * a + inverse[0, 1, f] * b + inverse[0, 2, f] * c
+                    g1 = inverse[1, 0, f] * a + inverse[1, 1, f] * b + inverse[1, 2, f] * c
+                    g2 = inverse[2, 0, f] * a + inverse[2, 1, f] * b + inverse[2, 2, f] * c
+                    for q in range(p, SECOND):
+                        gram[1 + P + p, 1 + P + q] -= acc[0, q] * g0 + acc[1, q] * g1 + acc[2, q] * g2
                 acc[:] = 0.0
         first = f
         s0 += m
@@ -512,20 +507,17 @@ def _pair_sources(p: int) -> list[str]:
     """Sums over a frame or a chunk for the interstar angles; rows as `pair_sums` fills them."""
     db, r, e, d, bb, eb = 3, 3 + 3 * p, 6 + 3 * p, 9 + 3 * p, 12 + 3 * p, 18 + 3 * p
     profile: _Sums = [(f"profile[{i}, {k}]", [(i, 3 + k)]) for i in range(3) for k in range(3)]
-    sums = _sums_source("pair_profile", "buf, j, end, profile", "j", "end", profile)
-    sources = ["@njit(**ORDERED, **HELPER)\n" + sums]
-    # B^T [dB], R'^T [R' E] and E^T [E] of a frame, from stars that hold [dB R' E] each: neighbours fill a register.
-    width, first = _width(p), 3 * p
+    sources = [
+        "@njit(**ORDERED, **HELPER)\n" + _sums_source("pair_profile", "buf, j, end, profile", "j", "end", profile)
+    ]
+    # B^T [dB], R'^T [R' E] and E^T [E] of a frame, of the symmetric ones half: one sum more costs what it adds.
     for x in range(3):
-        terms = [("b", q) for q in range(width)]
-        terms += [("r", first + q) for q in range(8)] + [("e", first + 3 + q) for q in range(4)]
-        lines = [f"def pair_products_{x}(stars, j, end, acc):"]
-        lines += [f"    s{n} = 0.0" for n in range(len(terms))]
-        lines += ["    for i in range(j, end):", f"        o = i * {width}"]
-        lines += [f"        r, e = stars[o + {first + x}], stars[o + {first + 3 + x}]", "        b = r + e"]
-        lines += [f"        s{n} += {left} * stars[o + {q}]" for n, (left, q) in enumerate(terms)]
-        lines += [f"    acc[{x}, {n}] = s{n}" for n in range(len(terms))]
-        sources.append("@njit(**ORDERED, **HELPER)\n" + "\n".join(lines) + "\n")
+        sums = [(f"acc[{x}, {q}]", [(x, db + q)]) for q in range(3 * p)]
+        sums += [(f"acc[{x}, {3 * p + c}]", [(r + x, r + c)]) for c in range(x, 3)]
+        sums += [(f"acc[{x}, {3 * p + 3 + c}]", [(r + x, e + c)]) for c in range(3)]
+        sums += [(f"acc[{x}, {3 * p + 6 + c}]", [(e + x, e + c)]) for c in range(x, 3)]
+        products = _sums_source(f"pair_products_{x}", "buf, j, end, acc", "j", "end", sums)
+        sources.append("@njit(**ORDERED, **HELPER)\n" + products)
     pairs = [(a, c) for a in range(p) for c in range(a, p)]
     lines = [
         "def pair_matrix(buf, m, matrix):",
@@ -551,21 +543,25 @@ def _pair_sources(p: int) -> list[str]:
     return sources
 
 
-def _width(p: int) -> int:
-    """Numbers of a star in `pair_sums`, a multiple of four: derivatives, R', E and what is read beyond them."""
-    return -(-(3 * p + 8) // 4) * 4
-
-
 def _packed(i: int, j: int) -> int:
     """Place of an entry of a symmetric matrix among its six unique ones."""
     return 3 * min(i, j) - min(i, j) * (min(i, j) + 1) // 2 + max(i, j)
+
+
+def _row(number: int) -> str:
+    return f"buf[{number} * STRIDE + i]"
+
+
+def _sum_of(terms: list[str]) -> str:
+    return " + ".join(terms) if terms else "0.0"
 
 
 def _expansion_sources(model_name: str, p: int) -> list[str]:
     """Columns of the compressed likelihood of a chunk, as `compressed._Expansion` forms them, one axis each.
 
     Rows of the buffer: e, H, A and the second derivatives that do not vanish, two axes each; of each star's frame the
-    path (3, p), the shift (3) and the inverse (6); then the columns, two axes each.
+    path (3, p), the shift (3) and the inverse (6); then the columns, two axes each, and what one axis needs meanwhile.
+    A loop holds no more values than there are registers for. The whitening l is lower triangular.
     """
     rows, columns = (index.tolist() for index in bent_index(model_name))
     h, a, bent = 2, 2 + 2 * p, 8 + 2 * p
@@ -573,66 +569,73 @@ def _expansion_sources(model_name: str, p: int) -> list[str]:
     shift, inverse = path + 3 * p, path + 3 * p + 3
     out = inverse + 6
     q = (p + 1) * (p + 2) // 2
+    turned, pseudo = out + 2 * q + 8, out + 2 * q + 8 + 3 * p
     at = {(0, 0): 0, (0, 1): 1, (0, 2): 2, (1, 1): 3, (1, 2): 4, (2, 2): 5}
-    sources = [f"PATH, COLUMNS, Q, SECOND, GRAM_ROWS = {path}, {out}, {q}, {q - p - 1}, {out + 2 * q + 8}"]
+    own = [(n, t, d) for n, (t, d) in enumerate(zip(rows, columns, strict=True)) if d < p]
+    sources = [f"PATH, COLUMNS, Q, SECOND, GRAM_ROWS = {path}, {out}, {q}, {q - p - 1}, {pseudo + 3}"]
     for x in range(2):
-        body: list[str] = []
+        lines = [f"def expand_{x}(l, buf, m, slope):"]
 
-        def sum_of(terms: list[str]) -> str:
-            return " + ".join(terms) if terms else "0.0"
+        def loop(body: list[str], lines: list[str] = lines) -> None:
+            lines += ["    for i in range(m):", *(f"        {line}" for line in body)]
 
-        def put(column: int, value: str, body: list[str] = body, x: int = x) -> None:
-            body.append(f"buf[{out + 2 * column + x} * STRIDE + i] = {value}")
-
-        names = {"e": 0} | {f"h{t}": h + 2 * t for t in range(p)} | {f"a{c}": a + 2 * c for c in range(3)}
-        names |= {f"q{n}": bent + 2 * n for n in range(len(rows))}
-        body += [f"{name} = buf[{row + x} * STRIDE + i]" for name, row in names.items()]
-        frame = {f"k{c}_{z}": path + p * c + z for c in range(3) for z in range(p)}
-        frame |= {f"s{c}": shift + c for c in range(3)} | {f"n{c}{d}": inverse + n for (c, d), n in at.items()}
-        body += [f"{name} = buf[{row} * STRIDE + i]" for name, row in frame.items()]
-        put(0, "e - (s0 * a0 + s1 * a1 + s2 * a2)")
-        body += [f"g{c} = " + sum_of([f"n{min(c, d)}{max(c, d)} * a{d}" for d in range(3)]) for c in range(3)]
+        body = [f"a{c} = {_row(a + 2 * c + x)}" for c in range(3)] + [f"h{t} = {_row(h + 2 * t + x)}" for t in range(p)]
+        taken = _sum_of([f"{_row(shift + c)} * a{c}" for c in range(3)])
+        body.append(f"{_row(out + x)} = {_row(x)} - ({taken})")
+        for c in range(3):
+            terms = [f"{_row(inverse + at[min(c, d), max(c, d)])} * a{d}" for d in range(3)]
+            body.append(f"{_row(pseudo + c)} = {_sum_of(terms)}")
         for z in range(p):
-            terms = [f"l[{t * p + z}] * h{t}" for t in range(p)] + [f"k{c}_{z} * a{c}" for c in range(3)]
-            put(1 + z, f"-({sum_of(terms)})")
+            terms = [f"l[{t * p + z}] * h{t}" for t in range(z, p)]
+            terms += [f"{_row(path + p * c + z)} * a{c}" for c in range(3)]
+            body.append(f"{_row(out + 2 + 2 * z + x)} = -({_sum_of(terms)})")
+        loop(body)
+        # The derivatives of A along z, and half of what the path itself bends.
+        for z in range(p):
+            body = [f"q{n} = {_row(bent + 2 * n + x)}" for n, d in enumerate(columns) if d >= p]
+            body += [f"k{d} = {_row(path + p * d + z)}" for d in range(3)]
             for c in range(3):
-                own = [
+                mixed = [
                     f"l[{t * p + z}] * q{n}"
                     for n, (t, d) in enumerate(zip(rows, columns, strict=True))
-                    if t < p and d == p + c
+                    if z <= t < p and d == p + c
                 ]
-                turned = [
-                    f"k{d}_{z} * q{n}"
+                along = [
+                    f"k{d} * q{n}"
                     for n, (one, two) in enumerate(zip(rows, columns, strict=True))
                     for b, d in {(one - p, two - p), (two - p, one - p)}
                     if one >= p and b == c
                 ]
-                body.append(f"m{z}_{c}, r{z}_{c} = {sum_of(own)}, {sum_of(turned)}")
-                body.append(f"u{z}_{c} = m{z}_{c} + 0.5 * r{z}_{c}")
-        body += [f"t{z} += " + sum_of([f"g{c} * (m{z}_{c} + r{z}_{c})" for c in range(3)]) for z in range(p)]
-        # Second derivatives over theta alone: first with one direction, then with the other.
-        own_entries = [(n, t, d) for n, (t, d) in enumerate(zip(rows, columns, strict=True)) if d < p]
-        used = sorted({t for _, t, d in own_entries} | {d for _, t, d in own_entries})
-        for z in range(p):
-            for t in used:
-                terms = [
-                    f"l[{other * p + z}] * q{n}"
-                    for n, one, two in own_entries
-                    for mine, other in {(one, two), (two, one)}
-                    if mine == t
-                ]
-                body.append(f"w{t}_{z} = {sum_of(terms)}")
+                body += [f"m{c}, r{c} = {_sum_of(mixed)}, {_sum_of(along)}"]
+                body += [f"{_row(turned + 3 * z + c)} = m{c} + 0.5 * r{c}"]
+            body.append("t += " + _sum_of([f"{_row(pseudo + c)} * (m{c} + r{c})" for c in range(3)]))
+            lines.append("    t = 0.0")
+            loop(body)
+            lines.append(f"    slope[{z}] += 2.0 * t")
         column = 1 + p
         for z in range(p):
+            body = [f"q{n} = {_row(bent + 2 * n + x)}" for n, _, _ in own]
+            body += [f"u{c}, k{c} = {_row(turned + 3 * z + c)}, {_row(path + p * c + z)}" for c in range(3)]
             for y in range(z, p):
-                terms = [f"l[{t * p + z}] * w{t}_{y}" for t in used]
-                terms += [f"u{z}_{c} * k{c}_{y} + k{c}_{z} * u{y}_{c}" for c in range(3)]
-                put(column, f"{'-0.5' if z == y else '-1.0'} * ({sum_of(terms)})")
+                # A diagonal entry of z z^T stands once in the expansion, halved; the others stand for both orders.
+                weights = {
+                    n: [
+                        f"l[{one * p + z}] * l[{two * p + y}]" for one, two in {(t, d), (d, t)} if z <= one and y <= two
+                    ]
+                    for n, t, d in own
+                }
+                used = [n for n, terms in weights.items() if terms]
+                lines += [f"    c{y}_{n} = {-0.5 if z == y else -1.0} * ({_sum_of(weights[n])})" for n in used]
+                bends = [
+                    f"u{c} * k{c}"
+                    if z == y
+                    else f"(u{c} * {_row(path + p * c + y)} + k{c} * {_row(turned + 3 * y + c)})"
+                    for c in range(3)
+                ]
+                plain = _sum_of([f"c{y}_{n} * q{n}" for n in used])
+                body.append(f"{_row(out + 2 * column + x)} = {plain} - ({_sum_of(bends)})")
                 column += 1
-        lines = [f"def expand_{x}(l, buf, m, slope):"]
-        lines += [f"    t{z} = 0.0" for z in range(p)]
-        lines += ["    for i in range(m):", *(f"        {line}" for line in body)]
-        lines += [f"    slope[{z}] += 2.0 * t{z}" for z in range(p)]
+            loop(body)
         sources.append("@njit(**FAST, **HELPER)\n" + "\n".join(lines) + "\n")
     for c in range(3):
         sums: _Sums = [
@@ -659,8 +662,7 @@ def source(model_name: str) -> str:
         _star_source(backward_kernel(model_name, True), "backward_kernel", lambda o, n: 3 * o + n),
         _star_source(forward_kernel(model_name, "bent"), "bent_kernel", lambda o, n: bent[o] + n, "x, y, z"),
     ]
-    sizes = {"p": p, "stride": _STRIDE, "chunk": _CHUNK, "rows": rows, "width": _width(p)}
-    head = _HEAD.format(**sizes, explicit=explicit, degenerate=DEGENERATE)
+    head = _HEAD.format(p=p, stride=_STRIDE, chunk=_CHUNK, rows=rows, explicit=explicit, degenerate=DEGENERATE)
     inlined = ["@njit(**INLINE)\n" + kernel for kernel in functions]
     parts = [head, *inlined, *_normal_sources(rows), *_pair_sources(p), _LOOPS, _PAIRS]
     parts += [*_expansion_sources(model_name, p), _GRAM]

@@ -10,6 +10,7 @@ small, and every term below is formed from E, so that nothing cancels:
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import cached_property
 
 import numpy as np
 
@@ -81,11 +82,14 @@ class PairObjective:
         self.frames = frames
         self.model_name = model_name
         self.n_parameters = 3 + len(get_model(model_name).coefficients)
-        self._blocks = frames.parts(_BLOCK_STARS)
         self._turned_at: FloatArray | None = None
         self._turned, self._rotations = np.empty((3, 0)), np.empty((0, 3, 3))
         self._compiled = kernels(model_name, frames.n_stars) == "numba"
         self._last: tuple[FloatArray, Normal, FloatArray] | None = None
+
+    @cached_property
+    def _blocks(self) -> list[tuple[int, int]]:
+        return self.frames.parts(_BLOCK_STARS)
 
     @property
     def n_pairs(self) -> int:
