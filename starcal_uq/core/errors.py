@@ -7,8 +7,8 @@ stands and exits with status 2.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from starcal_uq.core.status import Status
@@ -106,12 +106,28 @@ class IdentificationError(StarcalError):
 
 
 class CalibrationError(StarcalError):
-    """The estimate was not found; `status` says why and what to do, `undetermined` names what the data leave open."""
+    """The estimate was not found; `status` says why and what to do, `undetermined` names what the data leave open.
 
-    def __init__(self, message: str, status: Status | None = None, undetermined: Sequence[str] = ()) -> None:
+    `calibration` is what was found, where it has residuals to look at.
+    """
+
+    def __init__(
+        self, message: str, status: Status | None = None, undetermined: Sequence[str] = (), calibration: Any = None
+    ) -> None:
         super().__init__(message)
         self.status = status
         self.undetermined = tuple(undetermined)
+        self.calibration = calibration
+
+
+# From observations and a calibration that failed: what is wrong with the former, in a sentence, or None.
+Reason = Callable[[Any, Any], str | None]
+REASONS: list[Callable[[], Reason]] = []
+
+
+def register_reason(load: Callable[[], Reason]) -> None:
+    """Add what those above an estimate know of why it fails; `load` is called when one does, and may import then."""
+    REASONS.append(load)
 
 
 class RepeatedFramesError(CalibrationError):

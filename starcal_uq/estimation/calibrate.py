@@ -271,7 +271,7 @@ def calibrate(
         if star_errors and calibration.status.ok:
             calibration = with_star_errors(weighed(obs, calibration), calibration)
     if throw:
-        raise_unless_good(calibration.status, calibration.remedy)
+        raise_unless_good(calibration.status, calibration.remedy, calibration)
     repeating = repeating_frames(calibration, duplicates)
     if not len(repeating) or not isinstance(obs, Observations):
         return calibration

@@ -75,6 +75,7 @@ def fit_determined(
                     f"(--model {used}, or model={used!r} in Python).",
                     status,
                     names,
+                    found,
                 ) from failure
             because = "the stars are too few" if status is Status.SINGULAR else f"the fit ended in {status.name}"
             because = f"{what_is_open(names) if names else because} with the latter"

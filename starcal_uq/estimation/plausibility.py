@@ -17,7 +17,7 @@ from typing import ParamSpec, TypeVar
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.core.errors import CalibrationError, RepeatedFramesError
+from starcal_uq.core.errors import REASONS, CalibrationError, RepeatedFramesError
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
@@ -105,7 +105,13 @@ def explanation(error: CalibrationError, obs: object, camera: object, *, screene
     if not isinstance(obs, Observations):
         obs = _head(obs)
     sentence = None if obs is None else find_reason(obs, camera, error.status, screened=screened)
-    return None if sentence is None else CalibrationError(f"{str(error).partition(':')[0]}: {sentence}.", error.status)
+    if sentence is not None:
+        return CalibrationError(f"{str(error).partition(':')[0]}: {sentence}.", error.status)
+    if obs is None or error.calibration is None or not error.calibration.has_residuals:
+        return None
+    known = (load()(obs, error.calibration) for load in REASONS)
+    first = next((sentence for sentence in known if sentence is not None), None)
+    return None if first is None else CalibrationError(f"{error} First, {first}", error.status, error.undetermined)
 
 
 def _head(stream: object) -> Observations | None:

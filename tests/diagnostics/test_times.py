@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import starcal_uq as sc
+from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Level
 from starcal_uq.diagnostics import time_test
 from starcal_uq.diagnostics.verdict import observed
@@ -113,6 +114,16 @@ def test_a_wrong_time_is_named(slip):
     assert check.level is (Level.FAIL if found.moves_sigma > 1.0 else Level.WARN)
     words = {"date": "days later than stated", "hour": "further east", "epoch": "By proper motion"}
     assert words.get(cause, "annual aberration") in check.sentence
+
+
+@pytest.mark.parametrize(("sigma_px", "n_frames", "years"), [(0.2, 25, -100.0), (1.0, 6, 0.0)])
+def test_a_fit_that_fails_by_a_wrong_time_says_so(sigma_px, n_frames, years):
+    obs, camera = seen(2, n_frames=n_frames, field_deg=2.0, sigma_px=sigma_px, years=years)
+    with pytest.raises(CalibrationError, match="do not determine x0 and y0: more frames") as caught:
+        sc.calibrate(make_apparent(obs), camera, model="brown")
+    told = "First, by proper motion the stars are those of an epoch 100 ± 7.5 years earlier" in str(caught.value)
+    # Too much noise is the fault of no time.
+    assert told == ("First" in str(caught.value)) == bool(years)
 
 
 def hard(obs, kind, rng):

@@ -120,6 +120,20 @@ def _time_words(obs: Observations, found: TimeTest) -> tuple[str, str, str, str]
     return f"times {later}", sentence, "", "Correct the times, which are UTC (column time_utc)."
 
 
+def wrong_time(obs: Observations, cal: Calibration) -> str | None:
+    """The wrong time that the residuals of a calibration show, with its remedy, as the end of a sentence."""
+    from starcal_uq.diagnostics.times import time_test
+
+    try:
+        found = time_test(obs, cal)
+    except np.linalg.LinAlgError:
+        return None
+    if found is None or not np.isfinite(found.moves_sigma):
+        return None
+    _, sentence, remedy, advice = _time_words(obs, found)
+    return sentence[0].lower() + " ".join(filter(None, (sentence[1:], advice, f"Use `{remedy}`." if remedy else "")))
+
+
 def _from_images(obs: Observations) -> bool:
     return str(obs.meta.get("source", "")).startswith("identified in ")
 

@@ -336,7 +336,8 @@ class RecursiveCalibration:
         return loaded
 
 
-def raise_unless_good(status: Status, remedy: str = "") -> None:
+def raise_unless_good(status: Status, remedy: str = "", calibration: Calibration | None = None) -> None:
     """Raise the `CalibrationError` of a status that is not CONVERGED."""
     if not status.ok:
-        raise CalibrationError(f"the calibration did not end well ({status.name}): {remedy or status.remedy}.", status)
+        message = f"the calibration did not end well ({status.name}): {remedy or status.remedy}."
+        raise CalibrationError(message, status, calibration=calibration)
