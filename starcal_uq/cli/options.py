@@ -211,7 +211,7 @@ OptionalCamera = Annotated[
     ),
 ]
 RunPath = Annotated[
-    Path, typer.Argument(metavar="RUN", help="Run folder made by `starcal-uq calibrate`.", parser=read_path)
+    Path, typer.Argument(metavar="RUN", help="Run folder of `starcal-uq calibrate` or `run`.", parser=read_path)
 ]
 NewRun = Annotated[Path, typer.Option("-o", "--out", metavar="RUN", help="Folder for the results.", parser=write_path)]
 Force = Annotated[bool, typer.Option("--force", help="Replace results that exist.")]
@@ -232,7 +232,7 @@ TimeUtc = Annotated[
     typer.Option(
         "--time",
         metavar="UTC",
-        help="Images: middle of the exposure of files that do not say it; goes before a time in the file's name.",
+        help="Middle of the exposure of files that do not say it; goes before a time in the file's name.",
         callback=checked(_check_time),
     ),
 ]
@@ -240,7 +240,7 @@ BayerMosaic = Annotated[
     settings.Bayer | None,
     typer.Option(
         "--bayer",
-        help="Images: colours of the first 2 x 2 pixels, row by row, where each pixel sees one colour and the files do "
+        help="Colours of the first 2 x 2 pixels, row by row, where each pixel sees one colour and the files do "
         "not say it: RGGB, BGGR, GRBG or GBRG; none for none.",
     ),
 ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
+from copy import copy
 from dataclasses import asdict, astuple, dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
@@ -133,7 +134,7 @@ class PlaceSettings:
 
 @dataclass(frozen=True)
 class SkySettings(PlaceSettings):
-    """What is known of the directions, and how the observer moved."""
+    """The table, its directions, and how the observer moved."""
 
     column: Columns = None
     frames: Annotated[
@@ -159,27 +160,25 @@ class SkySettings(PlaceSettings):
 
 @dataclass(frozen=True)
 class ImageSettings:
-    """What belongs to images alone; None where nothing was said."""
+    """What belongs to images alone. None where nothing was said."""
 
     max_mag: Annotated[
         float | None,
-        number(MAGNITUDES, "Images: magnitude limit, Gaia G; as the frames need it by default."),
+        number(MAGNITUDES, "Magnitude limit, Gaia G; as the frames need it by default."),
     ] = None
-    epoch: Annotated[
-        float | None, number(EPOCH, "Images: Julian year of the star positions; the images' own by default.")
-    ] = None
+    epoch: Annotated[float | None, number(EPOCH, "Julian year of the star positions; the images' own by default.")] = (
+        None
+    )
     focal_tolerance: Annotated[
         float | None,
-        number("focal_tolerance", "Images: relative error of the nominal focal length; 0.03 by default."),
+        number("focal_tolerance", "Relative error of the nominal focal length; 0.03 by default."),
     ] = None
-    gain: Annotated[
-        float | None, number("gain_e_per_count", "Images: electrons per count, where they do not say it.")
-    ] = None
+    gain: Annotated[float | None, number("gain_e_per_count", "Electrons per count, where they do not say it.")] = None
     time: TimeUtc = None
     bayer: BayerMosaic = None
     engine: Annotated[
         settings.Engine | None,
-        typer.Option(help="Images: what finds attitudes: pyramid, or tetra3rs (extra of that name)."),
+        typer.Option(help="What finds attitudes: pyramid, or tetra3rs (extra of that name)."),
     ] = None
 
 
@@ -254,6 +253,13 @@ def command_of(name: str, settings: Mapping[str, Any], files: Mapping[str, Path]
     return {"command": name, "settings": told, "inputs": identity(files)}
 
 
+def _under(record: Any, hint: Any) -> Any:
+    """The type of an option that stands in the help under the words of its record."""
+    option = copy(hint.__metadata__[0])
+    option.rich_help_panel = str(record.__doc__).partition(".")[0]
+    return Annotated[hint.__origin__, option]
+
+
 def unfolded(name: str, command: Callable[..., Answer]) -> Callable[..., None]:
     """What is called by the name of a command: one option for each field of its records, and --json."""
     parameters: list[inspect.Parameter] = []
@@ -266,7 +272,9 @@ def unfolded(name: str, command: Callable[..., Answer]) -> Callable[..., None]:
         hints = get_type_hints(record, include_extras=True)
         records[parameter.name] = record
         parameters += [
-            inspect.Parameter(f.name, parameter.KEYWORD_ONLY, default=f.default, annotation=hints[f.name])
+            inspect.Parameter(
+                f.name, parameter.KEYWORD_ONLY, default=f.default, annotation=_under(record, hints[f.name])
+            )
             for f in fields(record)
         ]
     parameters.append(inspect.Parameter("json", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=Json))

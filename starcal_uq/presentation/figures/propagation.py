@@ -125,7 +125,7 @@ def plot_glance(error: AttitudeError, cal: Calibration, obs: Observations, field
     bar.set_ylabel("")
     # The page says what else there is to say.
     bars.set_xlabel(bars.get_xlabel().partition("\n")[0])
-    stars.set_xlabel("x [px]")
+    style.label(stars, "Residuals", "x [px]")
     for panel, aside in ((bars, 0.46), (stars, 0.42), (ax, 0.42)):
         style.label_distance(panel, x_in=0.25, y_in=aside)
     return figure
