@@ -19,7 +19,17 @@ from starcal_uq.budgeting.shapes import (
     one_axis_factor,
     two_axis_radius,
 )
-from starcal_uq.budgeting.totals import Total, _heaviest, _one_of_many, covariance, draw, grouped_sigma, total, totals
+from starcal_uq.budgeting.totals import (
+    Total,
+    _heaviest,
+    _meeting,
+    _one_of_many,
+    covariance,
+    draw,
+    grouped_sigma,
+    total,
+    totals,
+)
 from starcal_uq.presentation.words.budgeting import outcome_text
 
 
@@ -378,6 +388,27 @@ def test_a_quantile_beyond_the_samples_is_not_known() -> None:
     nothing = combined([row("one", 0.0), row("other", 0.0)])
     assert (nothing.dominant, nothing.dominant_share, nothing.rule_arcsec) == ("", 0.0, 0.0)
     assert nothing.explanation.startswith("No error is left")
+
+
+def test_worst_cases_meet_the_mean_where_they_reach_furthest() -> None:
+    """Along the mean without chance, along the chance without a mean; one axis or two."""
+    nothing = np.zeros((2, 1))
+    for mean in ([3.0, 4.0], [0.0, -2.0], [-5.0, 0.0]):
+        reached = _meeting(np.array(mean), 5.0, nothing)
+        assert reached == pytest.approx(np.array(mean) * (1.0 + 5.0 / np.hypot(*mean)), abs=0.1)
+    chance = np.random.default_rng(0).standard_normal((2, 1000)) * np.array([[0.1], [3.0]])
+    assert abs(_meeting(np.zeros(2), 5.0, chance)[1]) == pytest.approx(5.0, abs=0.01)
+    assert _meeting(np.array([-2.0]), 3.0, np.zeros((1, 1))).tolist() == [-5.0]
+
+
+def test_the_combination_of_a_row_is_said() -> None:
+    for group, words in (
+        ("", "in squares"),
+        ("heat", "linear within group 'heat', then in squares"),
+        ("- heat", "linear within group 'heat', then in squares (against the others)"),
+    ):
+        assert row("bend", 1.0, correlation_group=group).combination == words
+    assert row("bend", 1.0, source="not assessed").combination == "not in the totals"
 
 
 def test_one_case_of_many_is_the_quantile_itself() -> None:
