@@ -13,6 +13,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from sphinx.addnodes import desc_signature
 from sphinx.ext.napoleon import NumpyDocstring
 
 HERE = Path(__file__).parent
@@ -229,8 +230,22 @@ def resolve_short(app: Any, env: Any, node: Any, content: Any) -> Any:
     return env.domains["py"].resolve_xref(env, node["refdoc"], app.builder, "obj", target, node, content)
 
 
+def name_twice(_app: object, doctree: Any) -> None:
+    """Objects bear their names at the top and under their wing, whichever links of the source pages have."""
+    import starcal_uq as sc
+
+    for node in doctree.findall(desc_signature):
+        for name in [name for name in node["ids"] if name.startswith("starcal_uq.")]:
+            rest = name.split(".")[1:]
+            there = getattr(sc, rest[0], sc)
+            wing = rest[0] if isinstance(there, ModuleType) else str(there.__module__).split(".")[1]
+            below = rest[1:] if wing == rest[0] else [wing, *rest]
+            node["ids"].append(".".join(["starcal_uq", *below]))
+
+
 def setup(app: Any) -> None:
     """Called by Sphinx."""
+    app.connect("doctree-read", name_twice)
     app.connect("builder-inited", write_command_help)
     app.connect("builder-inited", write_schemas)
     app.connect("builder-inited", write_reference)
