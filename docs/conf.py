@@ -152,6 +152,8 @@ def drawn_by(public: Any) -> str:
 
 def write_reference(_app: object) -> None:
     """One page an object, and one a namespace, from what the stubs offer: a public name cannot be forgotten here."""
+    from starcal_uq.core.records import Saved
+
     folder = HERE / "reference" / "api"
     shutil.rmtree(folder, ignore_errors=True)
     for wing, objects in public_objects().items():
@@ -165,7 +167,10 @@ def write_reference(_app: object) -> None:
             page = f"{name}-class" if isinstance(public, type) else name
             pages.append(f"{place.name}/{page}")
             kind = "class" if isinstance(public, type) else "function" if callable(public) else "data"
-            text = f"# {prefix}{name}\n\n```{{eval-rst}}\n.. auto{kind}:: {module}.{name}\n```\n{drawn_by(public)}"
+            of_file = isinstance(public, type) and issubclass(public, Saved)
+            files = "\n\n   .. automethod:: save\n   .. automethod:: load" if of_file else ""
+            directive = f".. auto{kind}:: {module}.{name}{files}"
+            text = f"# {prefix}{name}\n\n```{{eval-rst}}\n{directive}\n```\n{drawn_by(public)}"
             (place / f"{page}.md").write_text(text, encoding="utf-8")
             told = (public.__doc__ or "").strip().partition("\n\n")[0] if kind != "data" else ""
             told = " ".join(told.split()).replace("|", r"\|")
