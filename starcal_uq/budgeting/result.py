@@ -35,15 +35,7 @@ _AXIS_NAMES = {
 
 @dataclass(frozen=True)
 class Outcome(Shown):
-    """A requirement against the total that it is about.
-
-    Attributes
-    ----------
-    requirement : Requirement
-        Requirement that is judged.
-    total : Total
-        The total at the requirement's confidence.
-    """
+    """A requirement against the total that it is about, which is at the requirement's confidence."""
 
     requirement: Requirement
     total: Total

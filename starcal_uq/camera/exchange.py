@@ -34,17 +34,10 @@ _EXACT_PX = 1e-6
 
 @dataclass(frozen=True)
 class Exported:
-    """A camera in the words of another program.
+    """A camera in the words of another program: the file, and one sentence on what it holds and how near it is.
 
-    Attributes
-    ----------
-    path : Path
-        The file.
-    error_px : float
-        Largest distance over the detector between what the file and the camera make of the same direction, px; 0 where
-        the format has the camera's own terms.
-    note : str
-        One sentence on what the file holds and how near it is.
+    `error_px` is the largest distance over the detector between what the file and the camera make of the same
+    direction, px; 0 where the format has the camera's own terms.
     """
 
     path: Path
@@ -53,27 +46,9 @@ class Exported:
 
 
 def export_camera(camera: Camera, to: str, path: PathLike, *, force: bool = False) -> Exported:
-    """Write a camera for another program.
+    """Write a camera for another program, one of `CAMERA_FORMATS`; without `Camera.name` the file gets a neutral one.
 
-    Parameters
-    ----------
-    camera : Camera
-        The camera; without `Camera.name` the file gets a neutral one.
-    to : str
-        One of `CAMERA_FORMATS`.
-    path : path
-        File to write.
-    force : bool
-        Whether to replace a file.
-
-    Raises
-    ------
-    CameraError
-        For an unknown format or a camera that folds over within its detector.
-    MissingExtraError
-        If the format's library is not installed.
-    RunFolderError
-        If the file exists and `force` is false.
+    CameraError for an unknown format or a camera that folds over within its detector.
     """
     if to not in CAMERA_FORMATS:
         raise CameraError(f"{to!r} is no format for a camera: use one of {', '.join(CAMERA_FORMATS)}.")

@@ -8,22 +8,9 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class Column:
-    """One column of the table, as it is called in files.
+    """One column of the table, as it is called in files, with its unit (or none) and content in words.
 
-    Attributes
-    ----------
-    name : str
-        Name in files and of the attribute.
-    kind : {"whole", "number", "text", "time"}
-        Type of the values.
-    unit : str
-        Unit, empty where there is none.
-    required : bool
-        Whether every table has the column.
-    gaps : bool
-        Whether single values may be missing (NaN, or an empty text).
-    description : str
-        Content, in words.
+    `required` columns are in every table; with `gaps`, single values may be missing (NaN, or an empty text).
     """
 
     name: str

@@ -43,16 +43,8 @@ _STREAMED = ("frame", "x_px", "y_px", "ra_deg", "dec_deg", "sigma_px")
 class FrameStream:
     """The frames of a file or of a folder of files; can be iterated over again and again.
 
-    Attributes
-    ----------
-    paths : tuple of Path
-        The files, read in this order.
-    camera : Camera or None
-        If given, every centroid must lie on its detector.
-    columns : dict
-        Names in the files of columns that are called otherwise.
-    batch_rows : int
-        Rows in memory at a time; a frame that is cut by the end of a batch is put together again.
+    Every centroid must lie on the detector of the camera. `columns` are names in the files of columns that are called
+    otherwise. Of `batch_rows` in memory at a time, a frame that is cut by the end of a batch is put together again.
     """
 
     paths: tuple[Path, ...]

@@ -25,20 +25,10 @@ IMAGES = "images.json"
 
 @dataclass(frozen=True)
 class RoundRecord:
-    """One round of identification and calibration.
+    """One round of identification and calibration: frames identified, stars calibrated.
 
-    Attributes
-    ----------
-    n_frames : int
-        Frames identified.
-    n_stars : int
-        Stars calibrated.
-    new, given_up : int
-        Stars identified that the round before had not, and the other way round; zero in the first round.
-    parameters : dict
-        Name to (estimate, standard deviation), px units.
-    sigma_name, sigma
-        Which noise was estimated, and its value.
+    Stars are `new` or `given_up` against the round before; zero in the first. `parameters` are estimates with standard
+    deviations, px units, and `sigma` is that noise which was estimated, as `sigma_name` says.
     """
 
     n_frames: int

@@ -349,20 +349,10 @@ class Need(Shown):
 
 @dataclass(frozen=True, eq=False)
 class Expected:
-    """A calibration that is planned, for `coupling`, or for `after` of another plan.
+    """A calibration that is planned, for `coupling`, or for `after` of another plan; px units, attitudes in rad.
 
-    Attributes
-    ----------
-    camera : Camera
-        The sheet.
-    n_frames : int
-        Number of frames.
-    covariance, information : (p, p) array
-        Covariance of the parameters, and information on them, px units.
-    rotation_per_theta : (3, p) array
-        Common rotation that a parameter causes, rad.
-    attitude_noise : (3, 3) array
-        Covariance of one frame's attitude due to centroid noise, rad^2.
+    `rotation_per_theta` (3, p) is the common rotation that a parameter causes, `attitude_noise` (3, 3) the covariance
+    of one frame's attitude due to centroid noise.
     """
 
     camera: Camera

@@ -39,14 +39,7 @@ _TREE_COSINE = 0.5
 class Campaign:
     """Data of one calibration, as simulated studies take them.
 
-    Attributes
-    ----------
-    n_frames, min_stars : int
-        Number of frames, and of stars in each at least (3 or more).
-    sigma_px : float
-        Centroid noise, px per axis.
-    max_mag : float
-        Magnitude limit of the sensor.
+    Frames, the least stars in each (3 or more), centroid noise in px per axis, and the sensor's magnitude limit.
     """
 
     n_frames: int
