@@ -66,7 +66,7 @@ NEEDS: dict[str, tuple[str, str, Callable[[Path], Any]]] = {
     "cameras for tetra3rs": ("tetra3rs", "tetra3rs", partial(export, "tetra3rs")),
     "compiled kernels": ("numba", "compiled", lambda _: compiled.use("numba")),
     "Dask schedulers": ("distributed", "cluster", lambda _: on_processes(scheduler="tcp://127.0.0.1:1")),
-    "executed notebooks": ("nbclient", "notebook", partial(executed, iter([]))),
+    "executed notebooks": ("ipykernel", "notebook", partial(executed, iter([]))),
     "several processes over one set of files": ("distributed", "cluster", lambda _: on_processes(workers=2)),
 }
 

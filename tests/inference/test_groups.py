@@ -82,6 +82,16 @@ def test_arviz_writes_all_of_it(data: Any, tmp_path: Path) -> None:
     assert np.array_equal(again[LOG_LIKELIHOOD].values, data["log_likelihood"][LOG_LIKELIHOOD].values)
 
 
+def test_sampled_degrees_of_freedom_are_a_variable(post: Posterior, tmp_path: Path) -> None:
+    assert "dof" not in post.data["posterior"]
+    free = replace(post, dof_draws=np.linspace(3.0, 9.0, len(post.draws)))
+    free.save(tmp_path / "free.nc")
+    for one in (free, Posterior.load(tmp_path / "free.nc")):
+        dof = one.data["posterior"]["dof"]
+        assert dof.dims == ("chain", "draw") and dof.attrs["units"] == "1"
+        assert np.array_equal(dof.values.ravel(), free.dof_draws)
+
+
 def test_the_same_seed_gives_the_same_images(post: Posterior, obs: sc.Observations) -> None:
     one, same, other = (
         arviz_data(post, obs, groups=["posterior_predictive"], n_draws=8, n_frames=3, seed=seed) for seed in (5, 5, 6)
