@@ -42,7 +42,7 @@ def test_covariance_draws_and_tables(run, tmp_path):
     assert draws.columns[0] == "x0 [px]"
     again = sc.Posterior.load(sc.export(run, "netcdf", tmp_path / "d.nc").path)
     assert np.array_equal(again.draws, run.posterior.draws)
-    for to, name in (("netcdf", "d.nc"), ("arviz", "d.nc"), ("csv", "d.csv"), ("covariance", "c.json")):
+    for to, name in (("netcdf", "d.nc"), ("csv", "d.csv"), ("covariance", "c.json")):
         sc.export(run, to, tmp_path / name, force=True)
     lines = sc.export(run, "markdown", tmp_path / "t.md").path.read_text().splitlines()
     assert len(lines) == 2 + len(run.posterior.parameter_names)
@@ -50,6 +50,7 @@ def test_covariance_draws_and_tables(run, tmp_path):
     assert sc.export(run, "latex", tmp_path / "t.tex").path.read_text().startswith(r"\begin{tabular}")
 
 
+@pytest.mark.slow
 def test_arviz_reads_what_is_written_for_it(run, tmp_path):
     made = sc.export(run, "arviz", tmp_path / "a.nc")
     assert "log_likelihood" in made.note and made.note.endswith("for `az.from_netcdf`.")
