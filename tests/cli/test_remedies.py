@@ -22,6 +22,7 @@ from starcal_uq.diagnostics.times import TimeTest
 from starcal_uq.diagnostics.verdict import draws, estimate, observed
 from starcal_uq.estimation.cameras import MixedCameras
 from starcal_uq.inference import checks
+from starcal_uq.inference.derived import derived_quantities
 from starcal_uq.runs.folder import FILES
 from tests.helpers.ground_scenes import NOMINAL, SITE, ground_frames
 from tests.helpers.outside import campaign
@@ -89,7 +90,9 @@ EXAMPLES = {
         checks._effective_draws(changed(s.post, ess_tail=np.full(6, 90.0)))
     ],
     "inference.checks._acceptance": lambda s: [checks._acceptance(changed(s.post, acceptance=np.full(2, 0.01)))],
-    "inference.checks._derived": lambda s: [checks._derived(dataclasses.replace(s.post, draws=s.drifting))],
+    "inference.checks._derived": lambda s: [
+        checks._derived(post, derived_quantities(post)) for post in [dataclasses.replace(s.post, draws=s.drifting)]
+    ],
     "inference.checks._digits": lambda s: [checks._digits(changed(s.post, mcse=0.1 * s.post.sd))],
     "inference.checks._degrees_of_freedom": lambda s: [
         checks._degrees_of_freedom(dataclasses.replace(s.post, dof_draws=np.arange(float(len(s.post.draws)))))
