@@ -27,6 +27,8 @@ _NEWTON_STEPS = 60
 # After a last step of this size the error is its square times what the distortion bends per px, below rounding; the
 # kernels take one more Newton step from the root, which squares it again.
 _NEWTON_TOLERANCE_PX = 1e-5
+# Of a radius, until a fold is told to a millionth of it.
+_HALVINGS = 20
 
 
 @dataclass(frozen=True)
@@ -255,9 +257,15 @@ def before_fold(model_name: str, theta: FloatArray, point: FloatArray) -> BoolAr
             own = theta if theta.ndim == 1 else theta[:, far]
             safe = bend[far] ** (1.0 / (1 - min(c.order for c in coefficients)))
             # From there on in steps of 4 % at most, each point on its own way.
-            for step in np.geomspace(1.0, safe, 2 + int(-np.log(safe.min()) / 0.04)):
+            inner = outer = np.full(far.size, np.nan)
+            for step in np.geomspace(safe, 1.0, 2 + int(-np.log(safe.min()) / 0.04)):
                 at = step * point[:, far]
-                before[far] &= newton_kernel(model_name)(far.size, own, at, at)[1][0] > 0.0
+                determinant = newton_kernel(model_name)(far.size, own, at, at)[1][0]
+                # A parabola through three steps has the minimum between them.
+                bend = inner - 2.0 * outer + determinant
+                dips = (outer < inner) & (outer <= determinant) & (8.0 * bend * outer <= (determinant - inner) ** 2)
+                before[far] &= (determinant > 0.0) & ~dips
+                inner, outer = outer, determinant
     return before
 
 
@@ -309,18 +317,18 @@ def _unprojected(model_name: str, theta: FloatArray, xy: FloatArray, derivatives
 def fold_radius_px(model_name: str, theta: FloatArray, max_radius_px: float) -> float:
     """Smallest radius up to `max_radius_px` at which the distortion folds over; infinity when it does not.
 
-    The map folds where the determinant of its Jacobian is not positive; it is sampled every 0.2 % of the range along
-    36 directions; a radial model is the same in all of them.
+    The map folds where the determinant of its Jacobian is not positive (`before_fold`), in any of 36 directions; a
+    radial model is the same in all of them.
     """
-    radius = np.linspace(0.0, max_radius_px, 501)[1:]
     angle = np.zeros(1) if get_model(model_name).radial else np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
-    points = np.stack([np.outer(np.cos(angle), radius).ravel(), np.outer(np.sin(angle), radius).ravel()])
-    with np.errstate(all="ignore"):
-        # On the fold itself Newton's step, which nobody asks for here, has no length.
-        _, determinant = newton_kernel(model_name)(points.shape[1], theta, points, points)
-    # det <= 0 marks a fold; a second crossing can make it positive again, so the first one counts.
-    folded = (determinant[0].reshape(angle.size, radius.size) <= 0.0).any(axis=0)
-    return float(radius[np.argmax(folded)]) if folded.any() else float("inf")
+    rim = max_radius_px * np.stack([np.cos(angle), np.sin(angle)])
+    clear, folded = 0.0, 1.0
+    if before_fold(model_name, theta, rim).all():
+        return float("inf")
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (clear + folded)
+        clear, folded = (middle, folded) if before_fold(model_name, theta, middle * rim).all() else (clear, middle)
+    return max_radius_px * folded
 
 
 def project(camera: Camera, b_cam: FloatArray) -> FloatArray:

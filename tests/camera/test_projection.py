@@ -187,6 +187,29 @@ def test_no_direction_beyond_a_fold(model, k):
     np.testing.assert_array_equal(seen, radius < (fold if model == "inverse" else rim))
 
 
+@pytest.mark.parametrize("model", ["k1", "brown", "brown3", "brown_tangential", "inverse"])
+def test_a_fold_is_where_a_dense_scan_has_it(model):
+    """Random coefficients, some of which fold over a stretch of a few px only; in one direction, and in all of them."""
+    rng, reach, folds = np.random.default_rng(7), 700.0, 0
+    radius = np.linspace(0.0, reach, 4001)[1:]
+    angle = np.zeros(1) if get_model(model).radial else np.linspace(0.0, 2.0 * np.pi, 36, endpoint=False)
+    rays = np.array([np.cos(angle), np.sin(angle)])
+    points = (rays[:, :, None] * radius).reshape(2, -1)
+    for _ in range(40):
+        sizes = [10.0 ** rng.uniform(-2.0, 0.3) / reach ** (c.order - 1) for c in get_model(model).coefficients]
+        theta = np.array([0.0, 0.0, 4000.0, *rng.choice([-1.0, 1.0], len(sizes)) * sizes])
+        with np.errstate(all="ignore"):
+            determinant = projection.newton_kernel(model)(points.shape[1], theta, points, points)[1][0]
+        bad = determinant.reshape(angle.size, -1) <= 0.0
+        first = np.where(bad.any(axis=1), radius[np.argmax(bad, axis=1)], np.inf)
+        assert projection.fold_radius_px(model, theta, reach) == pytest.approx(np.min(first), abs=0.4)
+        for where, clear in ((np.minimum(first, reach) - 1.0, True), (first + 1.0, False)):
+            some = np.isfinite(where)
+            assert (projection.before_fold(model, theta, where[some] * rays[:, some]) == clear).all()
+        folds += int(np.isfinite(first).any())
+    assert 3 < folds < 40
+
+
 def test_where_a_bound_excludes_folds_there_are_none() -> None:
     rng = np.random.default_rng(4)
     xy = rng.uniform(0.0, [1024.0, 768.0], (200, 2))
