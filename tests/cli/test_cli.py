@@ -120,6 +120,19 @@ def test_help_teaches(cli, command):
     assert len(out.splitlines()) > 8
 
 
+def test_options_stand_under_what_they_are_for_and_a_missing_file_under_the_command_that_writes_it(cli, inputs):
+    out = cli("run", "--help")[1]
+    panels = ("Options", "How a camera is estimated", "What belongs to images alone", "How a posterior is sampled")
+    places = [out.index(f" {words} ") for words in panels]
+    assert places == sorted(places) and places[1] < out.index("--noise") < places[2] < out.index("--gain") < places[3]
+    status, _, err = cli("calibrate", inputs / "obs.csv", "site/camera.toml", "-o", "run")
+    assert status == 2 and "site/camera.toml': does not exist; check the path, or starcal-uq new camera" in err
+    assert "starcal-uq new" not in cli("calibrate", inputs / "obs.csv", "mine.toml", "-o", "run")[2]
+    for name in ("--only-frames", "--frames"):
+        said = cli("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "run", name, "a")[2]
+        assert "is no list of frame numbers" in said
+
+
 def _line(path, number, text):
     lines = path.read_text().splitlines()
     lines[number - 1] = text
