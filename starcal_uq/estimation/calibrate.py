@@ -433,7 +433,8 @@ def _stages(
 
 
 def _noise_at(pairs: PairObjective, likelihood: MarginalLikelihood, theta: FloatArray) -> float:
-    likelihood.use_rotations(likelihood.start_rotations(theta) if pairs.rotations is None else pairs.rotations)
+    rotations = pairs.rotations_at(theta)
+    likelihood.use_rotations(likelihood.start_rotations(theta) if rotations is None else rotations)
     return noise_px(likelihood, theta)
 
 

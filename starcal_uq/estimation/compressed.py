@@ -301,8 +301,9 @@ def gram_sums(
     theta = np.asarray(theta, dtype=np.float64)
     if kernels(model_name, frames.n_stars) == "numba":
         sums, at = settled_sums(frames, model_name, theta, rotations) if known is None else known
-        moved = (at.shift, at.response, at.inverse)
-        gram, slope = gram_loop(frames, model_name, theta, whitening, at.rotations, moved)
+        # A nanoradian that is left would move the estimate by some 1e-8 sigma.
+        moved = (np.zeros_like(at.shift), at.response, at.inverse)
+        gram, slope = gram_loop(frames, model_name, theta, whitening, at.at(theta), moved)
         return GramSums(gram, sums.log_determinant, slope, frames.n_stars, frames.n_frames)
     return _expanded(frames, model_name, theta, whitening, rotations, lambda part, block, stars: None)
 

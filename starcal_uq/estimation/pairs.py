@@ -102,15 +102,21 @@ class PairObjective:
         """Attitudes (K, 3, 3) by QUEST near to the last point, if that was finite."""
         return None if self._turned_at is None else self._rotations
 
+    def rotations_at(self, theta: FloatArray) -> FloatArray | None:
+        """As `rotations`, at theta itself where loops find them faster than a refinement takes the step they save."""
+        with np.errstate(all="ignore"):
+            self._turn(theta, 0.0 if self._compiled else _TURN_AGAIN_PX)
+        return self.rotations
+
     def directions(self, theta: FloatArray, frames: StarFrames) -> tuple[FloatArray, FloatArray]:
         """Measured unit vectors (3, N) and their derivatives (p, 3, N)."""
         root = backward_root(self.model_name, theta, frames.pixel)
         b, db = backward_kernel(self.model_name, True)(frames.n_stars, theta, frames.pixel, root)
         return b, db
 
-    def _turn(self, theta: FloatArray) -> FloatArray:
+    def _turn(self, theta: FloatArray, within_px: float = _TURN_AGAIN_PX) -> FloatArray:
         """Attitudes (K, 3, 3) that turn the catalogue nearly into the camera frame; new ones if these are too far."""
-        if self._turned_at is not None and np.max(np.abs(theta[:3] - self._turned_at)) <= _TURN_AGAIN_PX:
+        if self._turned_at is not None and np.max(np.abs(theta[:3] - self._turned_at)) <= within_px:
             return self._rotations
         frames = self.frames
         found = attitude_loop(frames, self.model_name, theta) if self._compiled else None

@@ -365,17 +365,17 @@ def _marked(texts: StrArray) -> bytes:
     """Each text behind its length, such as ``3:abc``, one after the other."""
     n, width = len(texts), texts.dtype.itemsize // 4
     code = np.ascontiguousarray(texts).view(np.uint32).reshape(n, width)
-    length = np.count_nonzero(code, axis=1)
     plain = width and width < 1000 and int(code.max(initial=0)) < 128
-    if not plain or not np.array_equal(code != 0, np.arange(width) < length[:, None]):
+    letters = code.astype(np.uint8) if plain else np.empty((n, 0), dtype=np.uint8)
+    there = letters != 0
+    if not plain or (there[:, 1:] > there[:, :-1]).any():
         return "".join(f"{len(text)}:{text}" for text in texts.tolist()).encode()
     # Plain letters without a gap: all at once, as rows of bytes in which a zero stands for nothing.
-    rows = np.zeros((n, 4 + width), dtype=np.uint8)
-    for place, unit in enumerate((100, 10, 1)):
-        digit = length // unit
-        rows[:, place] = np.where((digit > 0) | (unit == 1), 48 + digit % 10, 0)
-    rows[:, 3] = ord(":")
-    rows[:, 4:] = code
+    rows = np.empty((n, 4 + width), dtype=np.uint8)
+    marks = [f"{length}:".rjust(4, "\0").encode() for length in range(width + 1)]
+    length = (there @ np.ones(width, dtype=np.float32)).astype(np.int64)
+    rows[:, :4] = np.take(np.array([list(mark) for mark in marks], dtype=np.uint8), length, axis=0)
+    rows[:, 4:] = letters
     return bytes(rows[rows != 0])
 
 
