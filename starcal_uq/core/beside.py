@@ -18,11 +18,11 @@ from typing import IO, Any
 
 from starcal_uq.core.tasks import processors
 
-_WAIT_S, _IDLE_S = 0.005, 0.05
+_WAIT_S = 0.005
 # Numbers of a call and of the first of those that were handed over with it; what is written and read at once.
 _RECORD = struct.Struct("=II")
 _MOST = 4
-_PROGRAM = "import sys; sys.path[:] = {path!r}; from starcal_uq.core.beside import serve; serve({folder!r})"
+_PROGRAM = "import sys; sys.path[:] = {path!r}; from starcal_uq.core.beside import serve; serve({folder!r}, {gate})"
 _PREPARE, _END = "prepare", "end"
 # Where a process that has no other threads and no windows may be doubled.
 _FORKS = sys.platform == "linux"
@@ -51,18 +51,23 @@ class Beside:
         self._process: subprocess.Popen[bytes] | None = None
         self._prepare = prepare
         self._n_calls = 0
+        # A pipe into which nothing is written: who reads from it waits until it is closed, or this process is gone.
+        self._gate: IO[bytes] | None = None
 
     def __enter__(self) -> Beside:
         if processors() > 1:
             (Path(self._folder.name) / _PREPARE).write_bytes(pickle.dumps(self._prepare))
-            program = _PROGRAM.format(path=sys.path, folder=self._folder.name)
-            with contextlib.suppress(OSError):
+            wait, gate = os.pipe()
+            self._gate = os.fdopen(gate, "wb")
+            program = _PROGRAM.format(path=sys.path, folder=self._folder.name, gate=wait)
+            with contextlib.suppress(OSError), os.fdopen(wait, "rb"):
                 self._process = subprocess.Popen(
                     [sys.executable, "-c", program],
                     stdin=subprocess.PIPE,
                     stdout=subprocess.DEVNULL,
                     stderr=subprocess.DEVNULL,
                     env=os.environ | _ONE_THREAD,
+                    pass_fds=(wait,) if _FORKS else (),
                     # Ctrl-C reaches every process of a terminal; the first one decides what to do about it.
                     start_new_session=True,
                 )
@@ -75,6 +80,8 @@ class Beside:
                 os.killpg(self._process.pid, signal.SIGKILL)
             self._process.kill()
             self._process.communicate()
+        if self._gate is not None:
+            self._gate.close()
         self._folder.cleanup()
 
     @property
@@ -122,12 +129,14 @@ class Beside:
             (Path(self._folder.name) / _END).touch()
             with contextlib.suppress(OSError):
                 _pipe(self._process).close()
+            if self._gate is not None:
+                self._gate.close()
             self._process.wait()
         found = (_path(self._folder.name, number, "result") for number in range(self._n_calls))
         return [pickle.loads(path.read_bytes()) if path.exists() else None for path in found]
 
 
-def serve(folder: str) -> None:
+def serve(folder: str, gate: int) -> None:
     """Do the calls of a `Beside` until there are no more, or it is gone."""
     end = Path(folder) / _END
     # Whatever cannot be prepared is seen again by the calls.
@@ -142,9 +151,9 @@ def serve(folder: str) -> None:
         if os.fork() == 0:
             try:
                 signal.signal(signal.SIGCHLD, signal.SIG_DFL)
-                # The last one has a processor when the caller waits for the others.
-                while place == 0 and not end.exists() and end.parent.exists():
-                    time.sleep(_IDLE_S)
+                if place == 0:
+                    # There is a processor for this one when the caller waits for the others.
+                    os.read(gate, 1)
                 _do_calls(folder)
             finally:
                 os._exit(0)
