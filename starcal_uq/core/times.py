@@ -15,6 +15,8 @@ from starcal_uq.core.types import FloatArray, IntArray
 
 FIRST_YEAR, LAST_YEAR = 1960, 2100
 _EXAMPLE = "2026-11-21T03:04:05.6"
+# How images of several nights are given theirs.
+TIMES_IN_NAMES = "where they differ a time in each file's name (2026-11-21T030405_1.fits)"
 
 # Scales that are UTC within 0.9 s, and seconds by which others are ahead of TAI; barycentric time is TT within 2 ms.
 _UTC_NAMES = ("UTC", "UT", "UT1", "GMT")

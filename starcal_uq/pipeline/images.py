@@ -13,7 +13,7 @@ import numpy as np
 from starcal_uq.core.errors import CalibrationError, IdentificationError, ObservationError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.settings import Bayer, Engine, bounded
-from starcal_uq.core.times import julian_year, utc_text
+from starcal_uq.core.times import TIMES_IN_NAMES, julian_year, utc_text
 from starcal_uq.estimation.noise_floor import settle_noise
 from starcal_uq.observations.matches import is_fits_table
 from starcal_uq.sky.apparent import catalogue_directions, make_apparent, without_low_stars
@@ -338,6 +338,6 @@ def _check_times(centroids: Centroids) -> None:
         others = f" (and {plural(len(untimed) - 1, 'other')})" if len(untimed) > 1 else ""
         raise ObservationError(
             f"{untimed[0]}{others}: the image has no time, without which the site does not say where the stars stood; "
-            "give the time (UTC, such as 2026-11-21T03:04:05).",
+            f"give the time (--time, UTC, such as 2026-11-21T03:04:05), or {TIMES_IN_NAMES}.",
             column="time_utc",
         )

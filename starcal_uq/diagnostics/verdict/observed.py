@@ -9,6 +9,7 @@ import numpy as np
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.formatting import fixed, percent, plural, significant
 from starcal_uq.core.status import CALIBRATE, MORE, PLAN, Check, Level, Question, model_remedy, pass_or_warn
+from starcal_uq.core.times import TIMES_IN_NAMES
 from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals
 from starcal_uq.estimation.residual_map import OUTLIER_SIGMA
 from starcal_uq.sky.refraction import refraction_constants, shrinking
@@ -83,8 +84,8 @@ def air_words(obs: Observations, found: AirTest) -> str:
         f"{significant(found.f_px)} px ({significant(found.f_sigma)} sigma)."
     )
     if not np.isfinite(found.latitude_deg):
-        times = "--time" if _from_images(obs) else "column time_utc"
-        return f"{first} State the site (--site) and the times ({times}), which the frames do not have."
+        times = f"--time, or {TIMES_IN_NAMES}" if _from_images(obs) else "column time_utc"
+        return f"{first} The frames have no times: state the site (--site) and the times ({times})."
     place = Site(found.latitude_deg, found.longitude_deg)
     errors = (significant(error) for error in (found.latitude_std_deg, found.longitude_std_deg))
     ends = " and ".join(f"± {error}°" for error in errors)
