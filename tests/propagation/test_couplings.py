@@ -79,6 +79,9 @@ def test_principal_point_and_boresight_are_one_near_gauge(calibrated, found):
     assert e[names.index("y0"), names.index("pitch")] == pytest.approx(1.0, abs=1e-3)
     turned = calibrated.rotation_per_theta @ found.covariance @ calibrated.rotation_per_theta.T
     assert np.allclose(found.common_rotation_arcsec, np.rad2deg(np.sqrt(np.diag(turned))) * 3600.0, rtol=1e-9)
+    single = np.sqrt(np.diag(turned + calibrated.attitude_noise))
+    joint = found.single_frame_correlation * np.outer(found.sigma_marginal, single)
+    assert np.allclose(joint, found.covariance @ calibrated.rotation_per_theta.T, rtol=1e-9, atol=0.0)
     # 1 px of principal point is 1 / f of boresight.
     expected = np.rad2deg(found.sigma_marginal[0] / 5852.0) * 3600.0
     assert found.common_rotation_arcsec[1] == pytest.approx(expected, rel=0.02)
