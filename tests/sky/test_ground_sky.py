@@ -704,7 +704,7 @@ def test_real_frames_of_another_hemisphere_are_refused(esa, tmp_path):
         observations_from_images([folder], camera, max_mag=7.0, site=replace(NOORDWIJK, latitude_deg=-52.2))
     for number, image in enumerate(sorted(folder.iterdir())[2:4]):
         shutil.copy(image, tmp_path / f"night{number}.tiff")
-    with pytest.raises(ObservationError, match=r"night0.tiff \(and 1 other\): the image has no time.* in each file's name"):
+    with pytest.raises(ObservationError, match=r"night0.tiff \(and 1 other\): .* no time.* in each file's name"):
         observations_from_images([tmp_path], camera, max_mag=7.0, site=NOORDWIJK)
     obs, _, _ = observations_from_images([tmp_path], camera, max_mag=7.0, site=NOORDWIJK, time_utc=TIME)
     assert obs.meta["observer"] == "ground"
