@@ -287,10 +287,13 @@ class _Attempt:
             self.search.triangles = min(self.search.triangles, _FEW_TRIANGLES)
         self.run(progress, False)
         failed = self._failed()
-        if len(failed) > self.n_solved and self._narrowed:
-            # Perhaps the first frames do not speak for the others.
-            self.results |= _retry(self.search, self.field, [k for k in failed if k in self._narrowed])
-            self._narrowed, failed = {}, self._failed()
+        most = len(failed) > self.n_solved
+        # Perhaps the first frames do not speak for the others: those may be of another camera.
+        lost = [k for k in failed if k in self._narrowed]
+        self.results |= _retry(self.search, self.field, lost, _PROBES if most else _IN_VAIN)
+        if most:
+            self._narrowed = {}
+        failed = self._failed()
         if len(failed) > self.n_solved and self.n_solved < 2 and self.parity == "normal" and not hopeless:
             # Every frame of a camera has one handedness: the one that more frames have.
             flipped = FrameTable(self.centroids, self.camera, mirrored=True)
@@ -420,11 +423,11 @@ def _solved(results: Iterable[Found]) -> int:
     return sum(f.match is not None for f in results)
 
 
-def _retry(search: Search, field: FrameTable, frames: list[int]) -> dict[int, Found]:
+def _retry(search: Search, field: FrameTable, frames: list[int], probes: int = _PROBES) -> dict[int, Found]:
     """Frames searched in another way: all of them, if one of the first few is found so."""
-    result = {k: search.frame(field, k) for k in frames[:_PROBES]}
+    result = {k: search.frame(field, k) for k in frames[:probes]}
     if _solved(result.values()):
-        result |= {k: search.frame(field, k) for k in frames[_PROBES:]}
+        result |= {k: search.frame(field, k) for k in frames[probes:]}
     return result
 
 

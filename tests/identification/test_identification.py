@@ -282,6 +282,17 @@ def test_good_frames_go_on_among_bad_ones(stars: Any, folder: Path) -> None:
     assert wrong_rows(plain, table, names) == 0
 
 
+def test_frames_of_two_cameras_are_all_found(stars: Any, folder: Path) -> None:
+    """The first frames narrow the search for the others, which may be of another camera."""
+    frames = []
+    for seed, focal in enumerate((1.0, 1.02)):
+        table, *_ = random_frames(stars, square_camera(12.0, focal), 6, seed)
+        xy = np.column_stack([table.x_px, table.y_px])
+        frames += [(xy[table.frame == k], table.flux[table.frame == k]) for k in range(6)]
+    found = identify(centroid_table(frames), square_camera(12.0), stars, cache_dir=folder)
+    assert found.n_identified == 12
+
+
 def test_mirrored_images(stars: Any, folder: Path) -> None:
     camera = square_camera(12.0, shift_px=8.0)
     table, *_ = random_frames(stars, camera, 3, 9)
