@@ -292,7 +292,7 @@ def gram_sums(
     theta : (p,) array
         Point of expansion, px units; the same for all parts.
     whitening : (p, p) array
-        L in ``theta = theta_hat + L z``; the same for all parts.
+        L in ``theta = theta_hat + L z``, lower triangular; the same for all parts.
     rotations : (K, 3, 3) array
         Attitudes to start from.
     known : tuple of NormalSums and Attitudes, optional
