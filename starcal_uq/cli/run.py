@@ -196,8 +196,8 @@ def _after_calibration(
     )
 
     apart = None
-    # A process that has loaded nothing takes longer to load what it needs than this one takes for all of fewer stars.
-    many = run.calibration.partitions is None and (ahead.loaded or len(run.observations) >= _APART_STARS)
+    # With fewer stars the other process would take longer to load what it needs than this one takes for all of it.
+    many = run.calibration.partitions is None and len(run.observations) >= _APART_STARS
     if many and not run.did("diagnose"):
         apart = ahead.begin(partial(diagnose_apart, seed=sampling.seed), run.observations, run.calibration)
     tell("Sampling the posterior, couplings, attitude error, then questioning the model ...")

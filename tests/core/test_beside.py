@@ -16,11 +16,6 @@ from starcal_uq.core import beside
 from starcal_uq.core.beside import Beside
 
 
-class _Unreadable:
-    def __reduce__(self):
-        return math.factorial, (-1,)
-
-
 @pytest.fixture(autouse=True)
 def two_processors(monkeypatch):
     monkeypatch.setattr(beside, "processors", lambda: 2)
@@ -58,42 +53,6 @@ def test_a_process_that_is_killed_is_no_obstacle():
             other.call(math.factorial, 3)
         assert other.result(3) is None
         assert set(other.results()) == {None}
-
-
-def _meet(folder, name, other):
-    """Wait for another call that waits for this one."""
-    (folder / name).touch()
-    until = time.monotonic() + 60.0
-    while not (folder / other).exists() and time.monotonic() < until:
-        time.sleep(0.01)
-    return (folder / other).exists(), os.getpid()
-
-
-several_processors = pytest.mark.skipif(
-    not beside._FORKS or beside.processors() < 2, reason="takes processes that can be doubled, and two processors"
-)
-
-
-@several_processors
-def test_calls_run_beside_each_other_when_the_caller_waits(tmp_path):
-    with Beside() as other:
-        assert other.each(_meet, [(tmp_path, "a", "b"), (tmp_path, "b", "a")]) == range(2)
-        (first, one), (second, two) = other.results()
-    assert first and second and one != two
-
-
-@several_processors
-def test_a_call_that_dies_is_no_obstacle():
-    with Beside() as other:
-        other.each(os._exit, [(3,), (3,)])
-        assert other.result(0) is None and other.results() == [None, None]
-
-
-def test_what_cannot_be_read_there_has_failed():
-    with Beside() as other:
-        numbers = other.each(_Unreadable(), [(1,), (2,)])
-        assert [other.result(number) for number in numbers] == [None, None]
-        assert other.result(other.call(math.factorial, 4)) == 24
 
 
 def test_one_processor_starts_nothing(monkeypatch):

@@ -94,20 +94,16 @@ class Ahead:
     """Another process that draws the figures of a report while what comes after them is computed; a context."""
 
     def __init__(self) -> None:
-        # What drawing needs takes a second to load.
-        self._beside = Beside(_load)
+        self._beside = Beside()
 
     def __enter__(self) -> Ahead:
         self._beside.__enter__()
+        # What drawing needs takes a second to load.
+        self._beside.call(_load)
         return self
 
     def __exit__(self, *error: object) -> None:
         self._beside.__exit__(*error)
-
-    @property
-    def loaded(self) -> bool:
-        """Whether what begins there has little to load: what this process has loaded for drawing."""
-        return self._beside.spreads
 
     def begin(self, function: Callable[..., T], *arguments: Any) -> Callable[[], T | None]:
         """Begin something else that can be done meanwhile; what waits for its result, None if it failed."""
@@ -115,7 +111,7 @@ class Ahead:
 
     def draw(self, results: Results, names: Collection[str]) -> None:
         """Begin to draw the figures of these names, as far as the results allow them."""
-        self._beside.each(draw_figures, [(results, (name,)) for name in names])
+        self._beside.call(draw_figures, results, names)
 
     def draw_frames(self, frames: Frames) -> None:
         """Begin to draw the frames that the report shows."""
