@@ -202,6 +202,17 @@ def test_times_that_are_no_series_are_refused() -> None:
     assert rounded.step_s == pytest.approx(1.0 / 3.0, rel=1e-5)
 
 
+def test_slower_frames_have_the_same_errors_at_lower_frequencies() -> None:
+    post, obs = posterior(), frames()
+    one, four = (error_spectrum(post, obs, step * np.arange(601.0), n_draws=5) for step in (1.0, 4.0))
+    np.testing.assert_allclose(4.0 * four.frequency_hz, one.frequency_hz, rtol=1e-12)
+    for density in ("psd_arcsec2_hz", "nea_psd_arcsec2_hz"):
+        np.testing.assert_allclose(getattr(four, density), 4.0 * getattr(one, density), rtol=1e-9)
+    np.testing.assert_allclose(four.lag_s, 4.0 * one.lag_s, rtol=1e-12)
+    np.testing.assert_allclose(four.autocorrelation, one.autocorrelation, rtol=1e-9, atol=1e-12)
+    np.testing.assert_array_equal(four.variance_arcsec2, one.variance_arcsec2)
+
+
 def test_file_is_lossless(tmp_path: Path) -> None:
     found = spectrum()
     found.save(tmp_path / "spectrum.npz")
