@@ -46,6 +46,8 @@ GROUPS: tuple[Group, ...] = get_args(Group)
 LOG_LIKELIHOOD = "frame_log_density"
 _PIXELS = ("x_px", "y_px", "residual_x_px", "residual_y_px")
 _GAUSSIAN, _STUDENT = "marginal", "student_t"
+# Draws of all groups, and frames of those that hold images.
+_DRAWS, _FRAMES = 1000, 20
 
 
 @bounded
@@ -55,8 +57,8 @@ def arviz_data(
     obs: Observations,
     *,
     groups: Sequence[Group] | None = None,
-    n_draws: int = 1000,
-    n_frames: int = 20,
+    n_draws: int = _DRAWS,
+    n_frames: int = _FRAMES,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Any:
@@ -107,12 +109,12 @@ def write_arviz(
     obs: Observations,
     path: PathLike,
     *,
-    n_draws: int = 1000,
+    n_draws: int = _DRAWS,
     seed: int = 0,
     progress: Progress | None = None,
 ) -> tuple[str, ...]:
     """Write what `arviz_data` gives as netCDF, all or nothing, for programs that read ArviZ's schema; its groups."""
-    made = _datasets(post, obs, None, n_draws, 20, seed, progress)
+    made = _datasets(post, obs, None, n_draws, _FRAMES, seed, progress)
 
     def fill(file: Any) -> None:
         for name, dataset in made.items():

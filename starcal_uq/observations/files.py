@@ -203,6 +203,7 @@ def convert_columns(
 ) -> tuple[dict[str, Any], list[Problem], BoolArray]:
     """Typed columns, what was wrong with their cells, and the rows whose frame is unknown."""
     columns: dict[str, Any] = {}
+    converted: dict[str, tuple[float, float]] = {}
     problems = list(raw.problems)
     unknown_frame = np.zeros(len(raw.numbers), dtype=np.bool_)
     for name, own in names.items():
@@ -211,11 +212,13 @@ def convert_columns(
         if cells is None:
             continue
         kind = COLUMNS[name].kind
-        if (factor, shift) != (1.0, 0.0) and kind != "number":
-            raise ObservationError(f"{path}: column {name} holds no quantities; give the name of a column alone.")
+        if (factor, shift) != (1.0, 0.0):
+            if kind != "number":
+                raise ObservationError(f"{path}: column {name} holds no quantities; give the name of a column alone.")
+            converted[name] = factor, shift
         if isinstance(cells, np.ndarray):
             if kind == "number" or (kind == "whole" and cells.dtype.kind in "iu"):
-                columns[name] = cells if (factor, shift) == (1.0, 0.0) else cells * factor + shift
+                columns[name] = cells
                 continue
             cells = [str(value) for value in cells.tolist()]
         if not COLUMNS[name].required and not any(map(str.strip, cells)):
@@ -228,14 +231,16 @@ def convert_columns(
             if raw.decimal_comma:
                 cells = [cell.replace(",", ".") for cell in cells]
             values, bad = parse_numbers(name, cells)
-            values = _to_unit(path, name, values, raw.units.get(own, ""))
-            columns[name] = values if (factor, shift) == (1.0, 0.0) else values * factor + shift
+            columns[name] = _to_unit(path, name, values, raw.units.get(own, ""))
         elif kind == "time":
             columns[name], bad = parse_times(name, cells)
         else:
             texts = [cell.strip() for cell in cells]
             columns[name] = np.array(list(map(cell_content, texts)) if raw.spreadsheet else texts, dtype=np.str_)
         problems += bad
+    for name in converted.keys() & columns.keys():
+        factor, shift = converted[name]
+        columns[name] = columns[name] * factor + shift
     return columns, problems, unknown_frame
 
 
