@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import difflib
-import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from textwrap import wrap
 from typing import Any
@@ -30,8 +29,8 @@ from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.files import atomic_write_text, ensure_new
 from starcal_uq.core.settings import PROBABILITY
-from starcal_uq.core.toml import read_toml, unknown_key
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.toml import Key, Section, read_toml
+from starcal_uq.core.types import AnyDict, FloatArray
 
 # As people write them: X and Y are across the boresight, Z is along it.
 _AXIS_NAMES = {
@@ -42,44 +41,52 @@ _AXIS_NAMES = {
 }
 
 _REQUIREMENT_AXES = {key: names for key, names in _AXIS_NAMES.items() if key != "all"}
-# A full turn; no error is larger.
-_FULL_TURN_ARCSEC = 1_296_000.0
 # What the starter's names bring along, and nobody can guess for others.
 _OWN_KEYS = ("ecss_class", "interpretation", "absorbed_by_alignment")
+_OWN = Expected("", "other", "ensemble", "no", "gaussian", "")
 # Names as similar as this are one name mistyped.
 _SAME_NAME = 0.9
 JUDGED_BY = ("both", "rule", "sampling")
 
-# What may stand in the tables: keys, with the words or the type that they take.
-Keys = Mapping[str, type | tuple[str, ...]]
-BUDGET_KEYS: Keys = {"title": str, "confidence": float}
-CONTRIBUTOR_KEYS: Keys = {
-    "name": str,
-    "ecss_class": ECSS_CLASSES,
-    "axis": tuple(_AXIS_NAMES),
-    "mean_arcsec": float,
-    "sigma_arcsec": float,
-    "half_width_arcsec": float,
-    "distribution": DISTRIBUTIONS,
-    "interpretation": INTERPRETATIONS,
-    "absorbed_by_alignment": ABSORBED,
-    "correlation_group": str,
-    "conditions": str,
-    "provenance": str,
-    "applies": bool,
+# What may stand in the tables; no error is larger than a full turn.
+_TURN = 1_296_000.0
+_TEXT = Key(str, "text in quotes")
+_NAME = Key(str, "text in quotes", required=True, pattern=r"\S")
+_SIZE = Key(float, f"a number of arcsec from 0 to {_TURN:.0f}, a full turn", ge=0.0, le=_TURN)
+_CONFIDENCE = Key(float, "a share between 0 and 1, such as 0.997", lt=1e9)
+BUDGET_KEYS = {"title": _TEXT, "confidence": _CONFIDENCE}
+CONTRIBUTOR_KEYS = {
+    "name": _NAME,
+    "ecss_class": Key.choice(ECSS_CLASSES),
+    "axis": Key.choice(tuple(_AXIS_NAMES), required=True),
+    "mean_arcsec": Key(float, f"a number of arcsec, at most {_TURN:.0f}, a full turn", ge=-_TURN, le=_TURN),
+    "sigma_arcsec": _SIZE,
+    "half_width_arcsec": _SIZE,
+    "distribution": Key.choice(DISTRIBUTIONS),
+    "interpretation": Key.choice(INTERPRETATIONS),
+    "absorbed_by_alignment": Key.choice(ABSORBED),
+    "correlation_group": _TEXT,
+    "conditions": _TEXT,
+    "provenance": Key(str, "where the number is from, because a budget is signed", required=True, pattern=r"\S"),
+    "applies": Key(bool, "true or false, without quotes"),
 }
-REQUIREMENT_KEYS: Keys = {
-    "name": str,
-    "axis": tuple(_REQUIREMENT_AXES),
-    "limit_arcsec": float,
-    "confidence": float,
-    "scope": SCOPES,
-    "interpretation": INTERPRETATIONS,
-    "judged_by": JUDGED_BY,
-    "frame": str,
+REQUIREMENT_KEYS = {
+    "name": _NAME,
+    "axis": Key.choice(tuple(_REQUIREMENT_AXES), required=True),
+    "limit_arcsec": Key(
+        float, f"a positive number of arcsec, at most {_TURN:.0f}, a full turn", required=True, gt=0.0, le=_TURN
+    ),
+    "confidence": _CONFIDENCE,
+    "scope": Key.choice(SCOPES),
+    "interpretation": Key.choice(INTERPRETATIONS),
+    "judged_by": Key.choice(JUDGED_BY),
+    "frame": _TEXT,
 }
 SENSOR = "sensor"
-FRAME_KEYS: Keys = {"rotation": list}
+_FRAME = Section({"rotation": Key(Any, "a matrix of three rows, or a quaternion", required=True)}, BudgetError)
+_HEAD, _CONTRIBUTOR, _REQUIREMENT = (
+    Section(keys, BudgetError) for keys in (BUDGET_KEYS, CONTRIBUTOR_KEYS, REQUIREMENT_KEYS)
+)
 # Rows of a matrix that people round to six digits.
 _ORTHONORMAL = 1e-5
 # Parts of a quaternion, which need not have unit length.
@@ -150,62 +157,17 @@ class BudgetFile:
     frames: Mapping[str, FloatArray] = field(default_factory=dict)
 
 
-class _Table:
-    """One table of the file, whose keys are taken with their type checked."""
-
-    def __init__(self, data: Any, where: str, known: Keys) -> None:
-        if not isinstance(data, Mapping):
-            raise BudgetError(f"{where}: is no table; write [[contributor]] or [[requirement]] above its keys.")
-        self.data, self.where, self.known = data, where, known
-        for key in data:
-            if key in _GONE:
-                raise BudgetError(f"{where}: key {key} is no longer read, because {_GONE[key]}; delete the line.")
-            if key not in known:
-                raise BudgetError(f"{where}: {unknown_key(key, known)}.".replace("?.", "?"))
-
-    def __contains__(self, key: str) -> bool:
-        return key in self.data
-
-    def text(self, key: str, default: str | None = None) -> str:
-        value = self.data.get(key, default)
-        if value is None:
-            raise BudgetError(f"{self.where}: key {key} is missing; write it as text in quotes.")
-        if not isinstance(value, str) or (default is None and not value.strip()):
-            raise BudgetError(f"{self.where}: key {key} is {value!r}; write text in quotes.")
-        return value.strip()
-
-    def choice(self, key: str, default: str | None = None) -> str:
-        value, allowed = self.text(key, default), self.known[key]
-        assert isinstance(allowed, tuple)
-        found = {entry.lower(): entry for entry in allowed}.get(value.lower())
-        if found is None:
-            raise BudgetError(f"{self.where}: key {key} is {value!r}; write one of {', '.join(map(repr, allowed))}.")
-        return found
-
-    def number(self, key: str, default: float | None = None, *, least: float = -math.inf) -> float:
-        value = self.data.get(key, default)
-        if value is None:
-            raise BudgetError(f"{self.where}: key {key} is missing; write a number of arcsec.")
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or value != value or abs(value) == math.inf:
-            raise BudgetError(f"{self.where}: key {key} is {value!r}; write a finite number.")
-        # Before anything is made of it: an integer may be too large for a float.
-        if abs(value) > _FULL_TURN_ARCSEC:
-            much = (
-                f"more than {_FULL_TURN_ARCSEC:.0f} arcsec, a full turn" if key.endswith("arcsec") else "far too large"
-            )
-            raise BudgetError(f"{self.where}: key {key} is {much}; correct the number.")
-        if value < least:
-            raise BudgetError(f"{self.where}: key {key} is {value!r}; write a number of at least {least:g}.")
-        return float(value)
-
-    def flag(self, key: str, default: bool) -> bool:
-        value = self.data.get(key, default)
-        if not isinstance(value, bool):
-            raise BudgetError(f"{self.where}: key {key} is {value!r}; write true or false, without quotes.")
-        return value
-
-    def confidence(self, key: str, default: float | None = None) -> float:
-        return checked_confidence(self.number(key, default), f"{self.where}: key {key}")
+def _read(data: Any, where: str, section: Section) -> AnyDict:
+    """Checked values of one table, texts without the space around them."""
+    if not isinstance(data, Mapping):
+        raise BudgetError(f"{where}: is no table; write [[contributor]] or [[requirement]] above its keys.")
+    for key in data:
+        if key in _GONE:
+            raise BudgetError(f"{where}: key {key} is no longer read, because {_GONE[key]}; delete the line.")
+    values = section.check(data, where)
+    if "confidence" in values:
+        checked_confidence(values["confidence"], f"{where}: key confidence")
+    return {key: value.strip() if isinstance(value, str) else value for key, value in values.items()}
 
 
 def checked_confidence(value: float, where: str) -> float:
@@ -233,18 +195,16 @@ def load_budget_file(path: str | os.PathLike[str]) -> BudgetFile:
                 "only."
             )
     frames = _frames(content.get("frame", {}), path)
-    head = _Table(content.get("budget", {}), f"{path}, [budget]", BUDGET_KEYS)
-    confidence = head.confidence("confidence") if "confidence" in head else None
-    rows: list[Contributor] = []
-    for number, table in enumerate(_tables(content, "contributor", path), start=1):
-        rows += _contributor(_Table(table, f"{path}, [[contributor]] {number}", CONTRIBUTOR_KEYS))
+    head = _read(content.get("budget", {}), f"{path}, [budget]", _HEAD)
+    rows = [row for table, where in _tables(content, "contributor", path) for row in _contributor(table, where)]
     _no_doubles([(row.name, row.axis) for row in rows], f"{path}: contributor")
+    asked: AnyDict = {"confidence": 0.997} | head
     requirements = tuple(
-        _requirement(_Table(table, f"{path}, [[requirement]] {number}", REQUIREMENT_KEYS), confidence, tuple(frames))
-        for number, table in enumerate(_tables(content, "requirement", path), start=1)
+        _requirement(table, where, asked["confidence"], tuple(frames))
+        for table, where in _tables(content, "requirement", path)
     )
     _no_doubles([(requirement.name,) for requirement in requirements], f"{path}: requirement")
-    return BudgetFile(tuple(rows), requirements, head.text("title", ""), confidence, str(path), frames)
+    return BudgetFile(tuple(rows), requirements, head.get("title", ""), head.get("confidence"), str(path), frames)
 
 
 def _frames(tables: Any, path: str | os.PathLike[str]) -> dict[str, FloatArray]:
@@ -254,13 +214,11 @@ def _frames(tables: Any, path: str | os.PathLike[str]) -> dict[str, FloatArray]:
     frames = {}
     for name, data in tables.items():
         where = f"{path}, [frame.{name}]"
-        table = _Table(data, where, FRAME_KEYS)
+        table = _read(data, where, _FRAME)
         if name == SENSOR:
             raise BudgetError(f"{where}: this is the frame of the rows; give yours another name.")
-        if "rotation" not in table:
-            raise BudgetError(f"{where}: key rotation is missing; write a matrix of three rows, or a quaternion.")
         try:
-            values = np.array(table.data["rotation"], dtype=np.float64)
+            values = np.array(table["rotation"], dtype=np.float64)
         except (TypeError, ValueError, OverflowError):
             values = np.zeros(0)
         if values.size and not np.abs(values).max() < _LARGE:
@@ -278,13 +236,17 @@ def _frames(tables: Any, path: str | os.PathLike[str]) -> dict[str, FloatArray]:
     return frames
 
 
-def _tables(content: Mapping[str, Any], key: str, path: str | os.PathLike[str]) -> list[Any]:
+def _tables(content: Mapping[str, Any], key: str, path: str | os.PathLike[str]) -> Iterator[tuple[Any, str]]:
+    """The tables of one kind, and how messages call each: by its number and name."""
     found = content.get(key, [])
     if not isinstance(found, list):
         raise BudgetError(
             f"{path}: [{key}] must be written with two brackets, [[{key}]], because there may be several."
         )
-    return found
+    for number, table in enumerate(found, start=1):
+        name = table.get("name") if isinstance(table, Mapping) else None
+        named = f" ({name.strip()!r})" if isinstance(name, str) and name.strip() else ""
+        yield table, f"{path}, [[{key}]] {number}{named}"
 
 
 def _no_doubles(names: Sequence[tuple[str, ...]], where: str) -> None:
@@ -294,45 +256,26 @@ def _no_doubles(names: Sequence[tuple[str, ...]], where: str) -> None:
             raise BudgetError(f"{where} {shown} is stated twice; keep one, or give them different names.")
 
 
-def _contributor(table: _Table) -> list[Contributor]:
-    written = table.text("name")
-    table.where += f" ({written!r})"
-    name, close = _known_name(written)
+def _contributor(data: Any, where: str) -> list[Contributor]:
+    table = _read(data, where, _CONTRIBUTOR)
+    name, close = _known_name(table["name"])
     if name in {entry.name for entry in (*FROM_POSTERIOR, INTERACTING)}:
         raise BudgetError(
-            f"{table.where}: key name: this row is filled by the posterior; give yours another name, or propagate "
-            "over other frames."
+            f"{where}: key name: this row is filled by the posterior; give yours another name, or propagate over other "
+            "frames."
         )
-    starter = {entry.name: entry for entry in FROM_FILE}.get(name)
-    if starter is None:
-        _check_own(table, name, close)
-    known = starter or _own(name)
-    axes = _AXIS_NAMES[table.choice("axis").lower()]
-    distribution = table.choice("distribution", known.distribution)
-    applies = table.flag("applies", True)
-    mean, sigma = (0.0, 0.0) if not applies else _moments(table, distribution)
-    provenance = table.text("provenance", "")
-    if not provenance:
-        raise BudgetError(
-            f"{table.where}: key provenance is missing; write where the number is from, because a budget is signed."
-        )
+    known = {entry.name: entry for entry in FROM_FILE}.get(name)
+    if known is None:
+        _check_own(table, where, name, close)
+    stated: AnyDict = {
+        key: table[key] for key in ("correlation_group", "conditions", "provenance", "applies") if key in table
+    }
+    for key in ("distribution", *_OWN_KEYS):
+        stated[key] = table.get(key, getattr(known or _OWN, key))
+    mean, sigma = _moments(table, where, stated["distribution"]) if table.get("applies", True) else (0.0, 0.0)
     return [
-        Contributor(
-            name=name,
-            ecss_class=table.choice("ecss_class", known.ecss_class),
-            axis=axis,
-            mean_arcsec=mean,
-            sigma_arcsec=sigma,
-            distribution=distribution,
-            interpretation=table.choice("interpretation", known.interpretation),
-            absorbed_by_alignment=table.choice("absorbed_by_alignment", known.absorbed_by_alignment),
-            correlation_group=table.text("correlation_group", ""),
-            conditions=table.text("conditions", ""),
-            provenance=provenance,
-            source="file",
-            applies=applies,
-        )
-        for axis in axes
+        Contributor(name=name, axis=axis, mean_arcsec=mean, sigma_arcsec=sigma, source="file", **stated)
+        for axis in _AXIS_NAMES[table["axis"]]
     ]
 
 
@@ -346,70 +289,55 @@ def _known_name(written: str) -> tuple[str, str]:
     return written, names[close[0]] if close else ""
 
 
-def _check_own(table: _Table, name: str, close: str) -> None:
+def _check_own(table: AnyDict, where: str, name: str, close: str) -> None:
     """Refuse a mistyped name of the starter, and a contributor of the user's own that leaves out what it is."""
     similar = difflib.SequenceMatcher(None, close.lower(), " ".join(name.lower().split())).ratio() if close else 0.0
     if similar >= _SAME_NAME:
         raise BudgetError(
-            f"{table.where}: key name: did you mean {close!r}? Write that, or a name of your own that differs more."
+            f"{where}: key name: did you mean {close!r}? Write that, or a name of your own that differs more."
         )
     missing = [key for key in _OWN_KEYS if key not in table]
-    if missing and table.flag("applies", True):
+    if missing and table.get("applies", True):
         hint = f"did you mean {close!r}? " if close else ""
         raise BudgetError(
-            f"{table.where}: {hint}The starter has no such name, and a contributor of your own must state "
+            f"{where}: {hint}The starter has no such name, and a contributor of your own must state "
             f"{', '.join(missing)} as well."
         )
 
 
-def _own(name: str) -> Expected:
-    return Expected(name, "other", "ensemble", "no", "gaussian", "")
-
-
-def _moments(table: _Table, distribution: str) -> tuple[float, float]:
+def _moments(table: AnyDict, where: str, distribution: str) -> tuple[float, float]:
     """Mean and standard deviation as the file states them."""
     stated = [key for key in ("sigma_arcsec", "half_width_arcsec") if key in table]
     if distribution == "constant":
         if stated:
-            raise BudgetError(f"{table.where}: key {stated[0]}: a constant has no spread; give mean_arcsec alone.")
-        return table.number("mean_arcsec"), 0.0
+            raise BudgetError(f"{where}: key {stated[0]}: a constant has no spread; give mean_arcsec alone.")
+        if "mean_arcsec" not in table:
+            raise BudgetError(f"{where}: key mean_arcsec is missing; add the number of arcsec that is always there.")
+        return table["mean_arcsec"], 0.0
     if len(stated) != 1:
         what = "is missing" if not stated else "and half_width_arcsec are both given"
-        raise BudgetError(f"{table.where}: key sigma_arcsec {what}; write either sigma_arcsec or half_width_arcsec.")
-    value = table.number(stated[0], least=0.0)
+        raise BudgetError(f"{where}: key sigma_arcsec {what}; write either sigma_arcsec or half_width_arcsec.")
+    value = table[stated[0]]
     if stated[0] == "half_width_arcsec":
         if distribution not in HALF_WIDTHS:
             raise BudgetError(
-                f"{table.where}: key half_width_arcsec: a {distribution} error has no end; write sigma_arcsec, or "
+                f"{where}: key half_width_arcsec: a {distribution} error has no end; write sigma_arcsec, or "
                 "distribution = 'uniform' or 'arcsine'."
             )
         value /= HALF_WIDTHS[distribution]
-    return table.number("mean_arcsec", RAYLEIGH_MEAN * value if distribution == "rayleigh" else 0.0), value
+    return table.get("mean_arcsec", RAYLEIGH_MEAN * value if distribution == "rayleigh" else 0.0), value
 
 
-def _requirement(table: _Table, confidence: float | None, frames: tuple[str, ...]) -> Requirement:
-    name = table.text("name")
-    table.where += f" ({name!r})"
-    axis = table.choice("axis").lower()
-    frame = table.text("frame", SENSOR)
+def _requirement(data: Any, where: str, confidence: float, frames: tuple[str, ...]) -> Requirement:
+    table: AnyDict = {"confidence": confidence} | _read(data, where, _REQUIREMENT)
+    frame = table.get("frame", SENSOR)
     if frame not in (SENSOR, *frames):
         raise BudgetError(
-            f"{table.where}: key frame is {frame!r}, which no table of the file describes; write [frame.{frame}] with "
-            "its rotation."
+            f"{where}: key frame is {frame!r}, which no table of the file describes; write [frame.{frame}] with its "
+            "rotation."
         )
-    limit = table.number("limit_arcsec")
-    if not limit > 0.0:
-        raise BudgetError(f"{table.where}: key limit_arcsec is {limit!r}; write a positive number of arcsec.")
-    return Requirement(
-        name=name,
-        axis=axis if axis == CROSS_BORESIGHT else _REQUIREMENT_AXES[axis][0],
-        limit_arcsec=limit,
-        confidence=table.confidence("confidence", 0.997 if confidence is None else confidence),
-        scope=table.choice("scope", SCOPES[1]),
-        interpretation=table.choice("interpretation", "mixed"),
-        judged_by=table.choice("judged_by", "both"),
-        frame=frame,
-    )
+    axis = table.pop("axis")
+    return Requirement(axis=axis if axis == CROSS_BORESIGHT else _REQUIREMENT_AXES[axis][0], **table)
 
 
 _LETTERS = dict(zip(AXES, "XYZ", strict=True))

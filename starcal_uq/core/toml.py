@@ -5,11 +5,11 @@ from __future__ import annotations
 import difflib
 import os
 import tomllib
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.files import PathLike, atomic_write_text, ensure_new, shown
@@ -83,8 +83,24 @@ class Key:
     `pydantic.Field`, such as ``gt=0``.
     """
 
+    words: tuple[str, ...] = ()
+
     def __init__(self, kind: Any, wanted: str, *, required: bool = False, **bounds: Any) -> None:
         self.kind, self.wanted, self.required, self.bounds = kind, wanted, required, bounds
+
+    @classmethod
+    def choice(cls, words: Sequence[str], *, required: bool = False) -> Key:
+        """One of these words, in any case."""
+        key = cls(str, f"one of {', '.join(map(repr, words))}", required=required)
+        key.words = tuple(words)
+        return key
+
+    def word(self, text: str) -> str:
+        """The word of the list that is meant."""
+        for word in self.words:
+            if word.lower() == text.strip().lower():
+                return word
+        raise ValueError
 
     @classmethod
     def number(cls, limit: Limit, words: str, *, required: bool = False) -> Key:
@@ -102,12 +118,13 @@ class Section:
 
     @cached_property
     def _schema(self) -> type[BaseModel]:
-        from pydantic import ConfigDict, Field, create_model
+        from pydantic import AfterValidator, ConfigDict, Field, create_model
 
         fields: AnyDict = {}
         for name, key in self.keys.items():
             options: AnyDict = {**key.bounds} if key.required else {"default": None, **key.bounds}
-            fields[name] = (key.kind, Field(**options))
+            kind = Annotated[str, AfterValidator(key.word)] if key.words else key.kind
+            fields[name] = (kind, Field(**options))
         config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
         return create_model("Table", __config__=config, **fields)
 

@@ -5,18 +5,16 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 
 from starcal_uq.core.errors import SensorError
-from starcal_uq.core.toml import read_section, unknown_key, write_section
+from starcal_uq.core.toml import Key, Section, read_section, write_section
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.simulation.psf import KINDS, profiles
 
-_WHOLE = ("bits", "hot_pixel_seed")
-_POSITIVE = ("psf_sigma_px", "zero_point_e_s", "exposure_s", "gain_e_per_count", "full_well_e")
 _HEADER = """\
 # Sensor of a star camera.
 #
@@ -28,6 +26,28 @@ _HEADER = """\
 # hot_pixel_seed: which pixels they are.
 
 """
+
+
+_E = "a number of electrons"
+_SECTION = Section(
+    {
+        "psf_sigma_px": Key(float, "a number of pixels from 0.1 to 100", ge=0.1, le=100.0),
+        "psf": Key.choice(KINDS),
+        "zero_point_e_s": Key(float, f"{_E} per second above 0", gt=0.0),
+        "exposure_s": Key(float, "a number of seconds above 0", gt=0.0),
+        "background_e_px_s": Key(float, f"{_E} per pixel and second, 0 or more", ge=0.0),
+        "dark_e_px_s": Key(float, f"{_E} per pixel and second, 0 or more", ge=0.0),
+        "read_noise_e": Key(float, f"{_E}, 0 or more", ge=0.0),
+        "gain_e_per_count": Key(float, f"{_E} per count above 0", gt=0.0),
+        "offset_counts": Key(float, "a number of counts, 0 or more", ge=0.0),
+        "bits": Key(int, "a whole number from 1 to 16", ge=1, le=16),
+        "full_well_e": Key(float, f"{_E} above 0", gt=0.0),
+        "hot_pixel_fraction": Key(float, "a number from 0 to 1", ge=0.0, le=1.0),
+        "hot_pixel_e_s": Key(float, f"{_E} per second, 0 or more", ge=0.0),
+        "hot_pixel_seed": Key(int, "a whole number, 0 or more", ge=0),
+    },
+    SensorError,
+)
 
 
 @dataclass(frozen=True)
@@ -89,11 +109,9 @@ class Sensor:
     hot_pixel_seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.psf not in KINDS:
-            raise SensorError(f"sensor: psf is {self.psf!r}; use one of {', '.join(KINDS)}.")
-        for field in fields(self):
-            if field.name != "psf":
-                object.__setattr__(self, field.name, _checked(field.name, getattr(self, field.name)))
+        given = {key: value.item() if isinstance(value, np.generic) else value for key, value in vars(self).items()}
+        for name, value in _SECTION.check(given, "sensor").items():
+            object.__setattr__(self, name, value)
 
     @classmethod
     def from_psf_radius(cls, radius_px: float, *, fraction: float = 1.0 - math.exp(-2.0), **values: Any) -> Sensor:
@@ -108,7 +126,8 @@ class Sensor:
         **values
             The other attributes.
         """
-        if not (_number(radius_px) and radius_px > 0.0 and _number(fraction) and 0.0 < fraction < 1.0):
+        numbers = all(isinstance(value, int | float | np.number) for value in (radius_px, fraction))
+        if not (numbers and 0.0 < radius_px < math.inf and 0.0 < fraction < 1.0):
             raise SensorError(
                 f"sensor: a PSF of radius {radius_px!r} px that holds {fraction!r} of the light is impossible; "
                 "give a radius above 0 and a fraction between 0 and 1."
@@ -174,8 +193,7 @@ class Sensor:
 
     def replace(self, **changes: Any) -> Sensor:
         """A copy with some attributes changed."""
-        _only_known(changes, "sensor")
-        return replace(self, **changes)
+        return self.from_dict(asdict(self) | changes)
 
     def to_dict(self) -> dict[str, Any]:
         """The [sensor] table: plain values."""
@@ -190,8 +208,7 @@ class Sensor:
         SensorError
             For an unknown key or a value that does not fit.
         """
-        _only_known(table, "sensor")
-        return cls(**table)
+        return cls(**_SECTION.check(table, "sensor"))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Sensor:
@@ -202,41 +219,8 @@ class Sensor:
         SensorError
             If the file cannot be read or its content does not fit; the message names file, key and remedy.
         """
-        section = read_section(path, "sensor", SensorError)
-        try:
-            return cls.from_dict(section)
-        except SensorError as error:
-            raise SensorError(f"{path}: {error}") from None
+        return cls(**_SECTION.check(read_section(path, "sensor", SensorError), f"{path}, section [sensor]"))
 
     def save(self, path: str | os.PathLike[str], force: bool = False) -> None:
         """Write the sensor to a TOML file without loss of digits; `force` allows to write over one."""
         write_section(path, "sensor", self.to_dict(), _HEADER, force)
-
-
-def _only_known(table: Mapping[str, Any], where: str) -> None:
-    known = [field.name for field in fields(Sensor)]
-    for key in table:
-        if key not in known:
-            raise SensorError(f"{where}: {unknown_key(key, known)}.")
-
-
-def _number(value: Any) -> bool:
-    is_number = isinstance(value, (int, float, np.integer, np.floating)) and not isinstance(value, bool)
-    return is_number and math.isfinite(value)
-
-
-def _checked(key: str, value: Any) -> int | float:
-    wanted = "a whole number" if key in _WHOLE else "a finite number"
-    if not _number(value) or (key in _WHOLE and value != int(value)):
-        raise SensorError(f"sensor: {key} is {value!r}; give {wanted}.")
-    low, high = 0.0, math.inf
-    if key == "bits":
-        low, high = 1, 16
-    elif key == "hot_pixel_fraction":
-        high = 1.0
-    elif key == "psf_sigma_px":
-        low, high = 0.1, 100.0
-    if not low <= value <= high or (key in _POSITIVE and value <= 0.0):
-        bounds = f"between {low:g} and {high:g}" if high < math.inf else "above 0" if key in _POSITIVE else "0 or more"
-        raise SensorError(f"sensor: {key} is {value!r}; it must be {bounds}.")
-    return int(value) if key in _WHOLE else float(value)

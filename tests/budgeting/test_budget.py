@@ -361,11 +361,11 @@ def result(folder: Path, head: str, table: dict[str, Any]) -> str:
 
 
 def values(kind: Any, now: Any) -> list[Any]:
-    if isinstance(kind, tuple):
-        return list({str(aliases): word for word in kind for aliases in [_AXIS_NAMES.get(word, word)]}.values())
-    if kind is float:
+    if kind.words:
+        return list({str(aliases): word for word in kind.words for aliases in [_AXIS_NAMES.get(word, word)]}.values())
+    if kind.kind is float:
         return [0.9 * (now or 10.0), now]
-    return ["text of its own", now] if kind is str else [False, True]
+    return ["text of its own", now] if kind.kind is str else [False, True]
 
 
 @pytest.mark.parametrize(("head", "key"), [(head, key) for head, (keys, _) in TABLES.items() for key in keys])

@@ -171,7 +171,7 @@ def test_odd_numbers_in_a_budget_are_refused_in_a_sentence_or_make_sense(tmp_pat
     rows["contributor"][0] |= own
     keys = {"budget": BUDGET_KEYS, "contributor": CONTRIBUTOR_KEYS, "requirement": REQUIREMENT_KEYS}
     path, refused = tmp_path / "budget.toml", set()
-    floats = [(table, key) for table, known in keys.items() for key, kind in known.items() if kind is float]
+    floats = [(table, key) for table, known in keys.items() for key, kind in known.items() if kind.kind is float]
     for table, key in floats:
         for odd in ODD:
             content = copy.deepcopy(rows)
