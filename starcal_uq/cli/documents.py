@@ -390,8 +390,7 @@ class Study(Part):
 class Studied(Part):
     """A coupling study."""
 
-    template: str | None = says("STUDY that was written instead; null without --template")
-    study: Study | None = says("Its results; null with --template")
+    study: Study = says("Its results")
 
 
 class Published(Part):

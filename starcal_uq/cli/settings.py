@@ -141,9 +141,8 @@ class SkySettings(PlaceSettings):
         str | None,
         typer.Option(
             "--only-frames",
-            "--frames",
             metavar="LIST",
-            help="Frames of the table to take, such as 0-4,7. (In other commands `--frames` is a number of frames.)",
+            help="Frames of the table to take, such as 0-4,7.",
             callback=checked(parse_frames),
         ),
     ] = None

@@ -10,8 +10,7 @@ import typer
 import starcal_uq as sc
 from starcal_uq.cli.answers import INTERRUPTED, Answer
 from starcal_uq.cli.console import note, print_table, progress_bar, say
-from starcal_uq.cli.options import Force, SchedulerAddress, number, write_file, write_path
-from starcal_uq.core import settings
+from starcal_uq.cli.options import Force, SchedulerAddress, number, read_file, write_path
 
 
 def study_command(
@@ -20,7 +19,7 @@ def study_command(
         typer.Argument(
             metavar="STUDY",
             help="What is varied (TOML); `starcal-uq new study` writes one to start from.",
-            parser=write_file,
+            parser=read_file,
         ),
     ] = Path("study.toml"),
     out: Annotated[
@@ -33,10 +32,6 @@ def study_command(
             parser=write_path,
         ),
     ] = Path("study"),
-    template: Annotated[
-        settings.StudyTemplate | None,
-        typer.Option(metavar="NAME", hidden=True, help="As `starcal-uq new study`: write STUDY and stop."),
-    ] = None,
     workers: Annotated[
         int | None, number("workers", "Processes; as many as processors by default, 0 for this one.")
     ] = None,
@@ -49,10 +44,6 @@ def study_command(
     Cells that are there already are not computed again; `--force` computes all anew, and then replaces them. Status 1
     when no cell has numbers.
     """
-    if template is not None:
-        sc.studies.write_study_template(template, file, force)
-        say(f"Study to fill in: {file}. Next: starcal-uq study {file} -o {out}")
-        return Answer({"template": file, "study": None})
     pages: list[Path] = []
 
     def page_of(found: sc.studies.Study, folder: Path) -> None:
@@ -75,7 +66,7 @@ def study_command(
     page = pages[0] if pages else None
     _show(found, page)
     status = INTERRUPTED if not found.complete else int(not found.ok.any())
-    return Answer({"template": None, "study": (found, out, page)}, status)
+    return Answer({"study": (found, out, page)}, status)
 
 
 def _show(found: sc.studies.Study, page: Path | None) -> None:
