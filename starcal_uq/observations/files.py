@@ -10,7 +10,7 @@ import io
 import json
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -118,7 +118,7 @@ def read_table(
         )
     ending = table_ending(path, READ)
     names = {name: mapping.get(name, name) for name in COLUMNS}
-    wanted = {own for name in only for own in (names[name], _linear(names[name])[0])}
+    wanted = columns_for(names[name] for name in only)
     data = _read_bytes(path)
     with reading(path, WHAT, REMEDY, ObservationError):
         raw = _read(path, data, ending, wanted) if frames is None else _read_frames(path, data, wanted, names, frames)
@@ -154,6 +154,16 @@ def _linear(text: str, names: Sequence[str] = ()) -> tuple[str, float, float]:
         return text, 1.0, 0.0
 
 
+def columns_for(texts: Iterable[str]) -> set[str]:
+    """The columns of a file that may be behind these texts, whichever of its names they hold."""
+    return {own for text in texts for own in (text, _linear(text)[0])}
+
+
+def column_behind(text: str, names: Sequence[str]) -> str:
+    """The column of a file that a text such as ``RA [h] * 15`` is made of."""
+    return _linear(text, names)[0]
+
+
 def _number_frames(raw: RawTable, own: str) -> None:
     """Number frames that have names, such as those of images, as they come."""
     cells = raw.columns.get(own)
@@ -178,7 +188,7 @@ def _read(path: Path, data: bytes, ending: str, wanted: set[str]) -> RawTable:
 
 def check_names(path: Path, raw: RawTable, names: Mapping[str, str], mapping: Mapping[str, str]) -> None:
     """Raise `ObservationError` where a column is missing that is required or was named."""
-    there = {c: _linear(own, raw.names)[0] in raw.names for c, own in names.items()}
+    there = {c: column_behind(own, raw.names) in raw.names for c, own in names.items()}
     missing = [c for c in names if not there[c] and (COLUMNS[c].required or c in mapping)]
     if missing:
         wanted = names[missing[0]]
@@ -264,7 +274,7 @@ def _to_unit(path: Path, name: str, values: FloatArray, unit: str) -> FloatArray
 def table_meta(path: Path, raw: RawTable, names: Mapping[str, str], mapping: Mapping[str, str]) -> AnyDict:
     """The metadata of a table: what the file carries, where it came from, and which columns were ignored."""
     meta = {"source": str(path), **raw.meta}
-    used = {_linear(own, raw.names)[0] for own in names.values()}
+    used = {column_behind(own, raw.names) for own in names.values()}
     ignored = [name for name in raw.names if name not in used]
     meta["ignored_columns"] = ignored or list(meta.get("ignored_columns", []))
     if mapping:
@@ -288,7 +298,7 @@ def _read_text(path: Path, data: bytes, ecsv: bool) -> RawTable:
             f"{path}, line {line}: the text is not UTF-8; save the file in the encoding UTF-8.", row=line
         ) from None
     header = _ecsv_header(path, text) if ecsv else {}
-    delimiter = header.get("delimiter", " ") if ecsv else _delimiter(text)
+    delimiter = header.get("delimiter", " ") if ecsv else delimiter_of(io.StringIO(text))
     rows, numbers = _rows(path, text, delimiter)
     if not rows:
         raise ObservationError(f"{path}: the file holds comments only; give a table of observations.")
@@ -313,9 +323,9 @@ def _read_text(path: Path, data: bytes, ecsv: bool) -> RawTable:
     )
 
 
-def _delimiter(text: str) -> str:
+def delimiter_of(lines: Iterable[str]) -> str:
     """What stands between the columns: a comma, or, if the header has none, what else spreadsheets write."""
-    header = next((line for line in io.StringIO(text) if line.strip() and not line.startswith("#")), "")
+    header = next((line for line in lines if line.strip() and not line.startswith("#")), "")
     return next((other for other in (";", "\t") if other in header and "," not in header), ",")
 
 

@@ -22,13 +22,20 @@ from starcal_uq.core.settings import bounded
 from starcal_uq.core.types import AnyDict, IntArray
 from starcal_uq.observations.checks import check_mapping
 from starcal_uq.observations.columns import COLUMNS
-from starcal_uq.observations.files import ParquetSummary, parquet_column, parquet_summary, read_table, say_column
+from starcal_uq.observations.files import (
+    ParquetSummary,
+    column_behind,
+    parquet_column,
+    parquet_summary,
+    read_table,
+    say_column,
+)
 from starcal_uq.observations.table import Observations, joined_columns
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
 
-# What estimates are made of; the other columns are read for the sample of frames alone.
+# What estimates are made of; the other columns are for diagnoses, and read for the sample of frames alone.
 STREAMED = ("frame", "x_px", "y_px", "ra_deg", "dec_deg", "sigma_px")
 # Frames that stand for all of them where stars are looked at one by one, and files that they are taken from.
 SAMPLE_FRAMES, _SAMPLE_PARTS = 2000, 16
@@ -232,6 +239,8 @@ def _check_alike(
     """Columns that estimates are made of must be in all files or in none, and directions of one kind."""
     for name in STREAMED:
         own = reader.columns.get(name, name)
+        # Frame numbers are read as they are.
+        own = own if name == "frame" else column_behind(own, summary.names)
         if own not in summary.names and (COLUMNS[name].required or name in reader.columns):
             raise ObservationError(
                 f"{path}: column {own} is missing; {say_column(name, summary.names)}.",

@@ -24,19 +24,20 @@ from starcal_uq.observations.files import (
     RawTable,
     arrow_values,
     check_names,
+    columns_for,
     convert_columns,
+    delimiter_of,
     open_parquet,
     own_meta,
     table_meta,
 )
+from starcal_uq.observations.partitions import STREAMED
 from starcal_uq.observations.table import Observations
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
 
 _BATCH_ROWS = 16_384
-# What estimates are made of; the other columns of a table are for diagnoses, which need all stars at once.
-_STREAMED = ("frame", "x_px", "y_px", "ra_deg", "dec_deg", "sigma_px")
 
 
 @dataclass(frozen=True)
@@ -156,12 +157,12 @@ class _Rows:
 def _frames_of(path: Path, stream: FrameStream, seen: _Seen) -> Iterator[Observations]:
     """The frames of one file."""
     names = {name: stream.columns.get(name, name) for name in COLUMNS}
-    wanted = {name: names[name] for name in _STREAMED}
+    wanted = {name: names[name] for name in STREAMED}
     batches = _parquet_batches if path.suffix.lower() == ".parquet" else _csv_batches
     held: _Rows | None = None
     meta: AnyDict = {}
     word = "row"
-    for raw in batches(path, set(wanted.values()), stream.batch_rows):
+    for raw in batches(path, columns_for(wanted.values()), stream.batch_rows):
         word = raw.word
         if held is None:
             check_names(path, raw, names, stream.columns)
@@ -231,9 +232,11 @@ def _parquet_batches(path: Path, wanted: set[str], batch_rows: int) -> Iterator[
 def _csv_batches(path: Path, wanted: set[str], batch_rows: int) -> Iterator[RawTable]:
     try:
         with path.open(encoding="utf-8-sig", newline="") as text:
+            delimiter = delimiter_of(text)
+            text.seek(0)
             # As in whole files: a comment becomes a blank line, so that lines keep their numbers.
             lines = ("\n" if line.startswith("#") else line for line in text)
-            reader = csv.reader(lines, skipinitialspace=True, strict=True)
+            reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=True, strict=True)
             rows = ((reader.line_num, row) for row in reader if any(map(str.strip, row)))
             header = next(rows, None)
             if header is None:
@@ -248,7 +251,8 @@ def _csv_batches(path: Path, wanted: set[str], batch_rows: int) -> Iterator[RawT
                             row=number,
                         )
                 columns = {name: [row[i] for _, row in batch] for i, name in enumerate(names) if name in wanted}
-                yield RawTable(columns, names, np.array([number for number, _ in batch]), "line")
+                numbers = np.array([number for number, _ in batch])
+                yield RawTable(columns, names, numbers, "line", decimal_comma=delimiter == ";")
     except UnicodeDecodeError:
         raise ObservationError(f"{path}: the text is not UTF-8; save the file in the encoding UTF-8.") from None
     except csv.Error as error:

@@ -50,6 +50,27 @@ def test_frames_come_one_by_one_and_whole(tmp_path, ending, batch_rows, stated):
     assert len(list(stream)) == obs.n_frames
 
 
+@pytest.mark.parametrize("ending", [".parquet", ".csv"])
+def test_columns_in_other_units_are_those_of_a_whole_table(tmp_path, ending):
+    obs = observations(n_frames=4)
+    table = obs.to_dataframe()[list(COLUMNS[:5])]
+    table["X"], table["RA [h]"] = table.pop("x_px") + 1.0, table.pop("ra_deg") / 15.0
+    path = tmp_path / f"table{ending}"
+    columns = {"x_px": "X - 1", "ra_deg": "RA [h] * 15"}
+    table.to_parquet(path) if ending == ".parquet" else table.to_csv(path, index=False, sep=";", decimal=",")
+    whole = sc.load_observations(path, columns=columns)
+    found = [stream_frames(path, camera(), columns, batch_rows=7)]
+    if ending == ".parquet":
+        found.append(sc.observations.open_partitions(tmp_path, camera(), columns))
+        with pytest.raises(ObservationError, match="column RA is missing; say which it is"):
+            sc.observations.open_partitions(tmp_path, camera(), columns | {"ra_deg": "RA * 15"})
+    for frames in found:
+        frames = list(frames)
+        for name in COLUMNS[:5]:
+            np.testing.assert_array_equal(np.concatenate([getattr(f, name) for f in frames]), getattr(whole, name))
+    np.testing.assert_allclose(whole.ra_deg, obs.ra_deg, rtol=1e-14)
+
+
 @pytest.mark.parametrize("method", ["griffith", "samaan"])
 def test_a_file_is_calibrated_without_being_loaded(tmp_path, method):
     obs = observations(n_frames=100)
