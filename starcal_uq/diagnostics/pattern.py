@@ -88,19 +88,13 @@ class Pattern:
 
 @dataclass(frozen=True, eq=False)
 class Response:
-    """What a pattern does to the attitudes of some frames.
+    """What a pattern does to the attitudes of some frames."""
 
-    Attributes
-    ----------
-    common_arcsec, rest_arcsec : (3,) array
-        Common rotation, and root mean square over frames of the rest, about pitch, yaw and roll; the noise of the
-        amplitudes is taken off their squares.
-    common_upper_arcsec, rest_upper_arcsec : (3,) array
-        Bounds of both at 95 %.
-    """
-
+    # `common_arcsec`, `rest_arcsec`, (3,): common rotation, and root mean square over frames of the rest, about
+    # pitch, yaw and roll; the noise of the amplitudes is taken off their squares.
     common_arcsec: FloatArray
     rest_arcsec: FloatArray
+    # `common_upper_arcsec`, `rest_upper_arcsec`, (3,): bounds of both at 95 %.
     common_upper_arcsec: FloatArray
     rest_upper_arcsec: FloatArray
 
@@ -203,22 +197,15 @@ def _square(matrices: FloatArray, pattern: Pattern) -> tuple[FloatArray, FloatAr
 
 @dataclass(frozen=True)
 class Fit:
-    """Sums over all stars from which shapes are fitted.
+    """Sums over all stars from which shapes are fitted."""
 
-    Attributes
-    ----------
-    gram, blocks : (p + 1 + q, p + 1 + q) array
-        Products of parameters, residuals and columns of all families, attitudes removed; and the part of them that
-        scale and shape of every frame by itself explain.
-    raw : (p + 1 + q,) array
-        Squares of the same before attitudes were removed.
-    p, dof, block_rank : int
-        Parameters, degrees of freedom of the residuals, and those that frames by themselves take.
-    """
-
+    # `gram`, `blocks`, (p + 1 + q, p + 1 + q): products of parameters, residuals and columns of all families,
+    # attitudes removed; and the part of them that scale and shape of every frame by itself explain.
     gram: FloatArray
     blocks: FloatArray
-    raw: FloatArray
+    raw: FloatArray  # (p + 1 + q,): squares of the same before attitudes were removed
+    # `p`, `dof`, `block_rank`: parameters, degrees of freedom of the residuals, and those that frames by themselves
+    # take.
     p: int
     dof: int
     block_rank: int

@@ -23,32 +23,16 @@ class BinnedResiduals:
     """Mean residual vectors in square cells of the detector.
 
     Cells with fewer than five stars are left out; n is the number of the others.
-
-    Attributes
-    ----------
-    centres : (n, 2) array
-        Cell centres, px.
-    means : (n, 2) array
-        Mean residuals, px.
-    counts : (n,) array
-        Stars in the cell.
-    chi2 : (n,) array
-        |mean|^2 over its variance per axis if residuals are noise alone; two degrees of freedom each.
-    noise_px : (n,) array
-        Standard deviation per axis of a mean that is noise alone, px.
-    cell_px : float
-        Side of a cell.
-    n_empty : int
-        Cells left out.
     """
 
-    centres: FloatArray
-    means: FloatArray
-    counts: FloatArray
+    centres: FloatArray  # (n, 2): cell centres, px
+    means: FloatArray  # (n, 2): mean residuals, px
+    counts: FloatArray  # (n,): stars in the cell
+    # (n,): |mean|^2 over its variance per axis if residuals are noise alone; two degrees of freedom each.
     chi2: FloatArray
-    noise_px: FloatArray
-    cell_px: float
-    n_empty: int
+    noise_px: FloatArray  # (n,): standard deviation per axis of a mean that is noise alone, px
+    cell_px: float  # Side of a cell
+    n_empty: int  # Cells left out
 
     @property
     def p_value(self) -> float:
@@ -124,28 +108,15 @@ def normalised_residuals(cal: Calibration, obs: Observations) -> FloatArray:
 
 @dataclass(frozen=True)
 class Profile1D:
-    """Mean residuals in bins of one quantity, for two components.
+    """Mean residuals in bins of one quantity, for two components."""
 
-    Attributes
-    ----------
-    title, label : str
-        Quantity that they are held against, and the axis label with its unit.
-    names : tuple of str
-        The two components.
-    centres : (n,) array
-        Mean of the quantity in each bin.
-    means : (2, n) array
-        Mean residuals, px.
-    errors : (n,) array
-        Standard error of a mean from noise alone, px.
-    """
-
+    # `title`, `label`: quantity that they are held against, and the axis label with its unit.
     title: str
     label: str
-    names: tuple[str, str]
-    centres: FloatArray
-    means: FloatArray
-    errors: FloatArray
+    names: tuple[str, str]  # The two components
+    centres: FloatArray  # (n,): mean of the quantity in each bin
+    means: FloatArray  # (2, n): mean residuals, px
+    errors: FloatArray  # (n,): standard error of a mean from noise alone, px
 
 
 _XY, _POLAR = ("x", "y"), ("radial", "tangential")

@@ -35,27 +35,13 @@ _LEAST_SPREAD = 1e-9
 
 @dataclass(frozen=True)
 class View:
-    """Some frames, as the shapes see them.
+    """Some frames, as the shapes see them."""
 
-    Attributes
-    ----------
-    rows : slice
-        Rows of the stars in the table.
-    part : MarginalLikelihood
-        Likelihood of the stars.
-    state : Profile
-        The model at the best attitudes.
-    parameter_columns : (p, 2, n) array
-        Derivatives by the fitted parameters, not divided by the noise.
-    uv : (2, n) array
-        Predicted positions relative to the principal point, px.
-    """
-
-    rows: slice
-    part: MarginalLikelihood
-    state: Profile
-    parameter_columns: FloatArray
-    uv: FloatArray
+    rows: slice  # Rows of the stars in the table
+    part: MarginalLikelihood  # Likelihood of the stars
+    state: Profile  # The model at the best attitudes
+    parameter_columns: FloatArray  # (p, 2, n): derivatives by the fitted parameters, not divided by the noise
+    uv: FloatArray  # (2, n): predicted positions relative to the principal point, px
 
     @classmethod
     def of(cls, part: MarginalLikelihood, state: Profile, theta: FloatArray, rows: slice) -> View:
@@ -67,30 +53,17 @@ class View:
 
 @dataclass(frozen=True)
 class Shape:
-    """A family of shapes that one test looks for.
+    """A family of shapes that one test looks for."""
 
-    Attributes
-    ----------
-    name, against : str
-        Short name, and what the residuals are held against.
-    size : int
-        Number of columns.
-    columns : callable
-        ``View -> (size, 2, n)`` shifts in px.
-    labels : tuple of (str, str)
-        Name and unit of each column's amplitude, where amplitudes mean something by themselves.
-    per_amplitude : tuple of float
-        Amplitude in that unit of a column as it stands.
-    cell : callable, optional
-        ``View -> (n,)`` cell of every star, where the columns are shifts of those in one cell along each axis.
-    """
-
+    # `name`, `against`: short name, and what the residuals are held against.
     name: str
     against: str
-    size: int
-    columns: Callable[[View], FloatArray]
+    size: int  # Number of columns
+    columns: Callable[[View], FloatArray]  # ``View -> (size, 2, n)`` shifts in px
+    # Name and unit of each column's amplitude, where amplitudes mean something by themselves.
     labels: tuple[tuple[str, str], ...] = ()
-    per_amplitude: tuple[float, ...] = ()
+    per_amplitude: tuple[float, ...] = ()  # Amplitude in that unit of a column as it stands
+    # ``View -> (n,)`` cell of every star, where the columns are shifts of those in one cell along each axis.
     cell: Callable[[View], IntArray] | None = None
 
 

@@ -321,21 +321,11 @@ def _pair_covariance(pairs: PairObjective, likelihood: MarginalLikelihood, pair_
 
 @dataclass(frozen=True)
 class Fit:
-    """An estimate and nothing else.
+    """An estimate and nothing else."""
 
-    Attributes
-    ----------
-    theta : (p,) array
-        End of the last stage, px units.
-    chi2 : float
-        Sum of squared residuals there, px^2 or in units of the stated noise.
-    rotations : (K, 3, 3) array
-        Best attitudes.
-    """
-
-    theta: FloatArray
-    chi2: float
-    rotations: FloatArray
+    theta: FloatArray  # (p,): end of the last stage, px units
+    chi2: float  # Sum of squared residuals there, px^2 or in units of the stated noise
+    rotations: FloatArray  # (K, 3, 3): best attitudes
 
 
 @one_thread()

@@ -36,25 +36,16 @@ _WORDS = 12
 
 @dataclass(frozen=True)
 class FrameFocals:
-    """Focal length of each frame by itself.
+    """Focal length of each frame by itself."""
 
-    Attributes
-    ----------
-    frame_ids : (K,) array of int
-        Frames with at least four stars; of more than 300, a sample.
-    focal_px, sigma_px : (K,) array
-        Estimate at the given distortion, and its standard error from the scatter of the frame's stars, px.
-    group : (K,) array of int
-        Number of the group that a frame is of, from 0, by focal length; all 0 where there is one camera.
-    p_value : float
-        Probability that frames of one camera fall apart so.
-    """
-
-    frame_ids: IntArray
+    frame_ids: IntArray  # (K,): frames with at least four stars; of more than 300, a sample
+    # `focal_px`, `sigma_px`, (K,): estimate at the given distortion, and its standard error from the scatter of the
+    # frame's stars, px.
     focal_px: FloatArray
     sigma_px: FloatArray
+    # (K,): number of the group that a frame is of, from 0, by focal length; all 0 where there is one camera.
     group: IntArray
-    p_value: float
+    p_value: float  # Probability that frames of one camera fall apart so
 
     @property
     def n_groups(self) -> int:

@@ -45,54 +45,26 @@ _OFF_MINIMUM = 0.1
 
 @dataclass(frozen=True)
 class PairLikelihood:
-    """Composite log likelihood over all pairs of a data set, at a cost independent of the number of stars.
+    """Composite log likelihood over all pairs of a data set, at a cost independent of the number of stars."""
 
-    Attributes
-    ----------
-    theta_hat : (p,) array
-        Estimate that minimises the objective, px units.
-    covariance : (p, p) array
-        Covariance of `theta_hat`: Godambe's where `adjusted`, else that of independent pairs.
-    shrink : (p, p) array
-        L_H: from whitened parameters to the point where the objective is evaluated.
-    whitening : (p, p) array
-        L_G where `adjusted`, else L_H.
-    gram : (q, q) array
-        Sum of products of the columns (value, derivatives, half second derivatives) of all pairs over tau^2.
-    tau : float
-        Root mean square difference of interstar cosines at the estimate, rad.
-    pair_noise : float
-        kappa: root mean square standard deviation of a pair's difference for sigma = 1, rad.
-    sigma : float
-        Estimated noise, px, or factor on the stated noise.
-    chi2 : float
-        Sum of squared (whitened) pixel residuals at the best attitudes.
-    dof : int
-        Degrees of freedom that sigma is estimated with.
-    n_pairs : int
-        Number of pairs.
-    adjusted : bool
-        False for the naive likelihood.
-    narrowness : float
-        Godambe's standard deviations over those of independent pairs, root mean square over the parameters.
-    variability : {"expected", "empirical"}
-        V from the model (centroid noise through every star), or from the scatter of the frames' scores. The expected
-        one follows sigma; the empirical one knows the scatter already.
-    """
-
-    theta_hat: FloatArray
+    theta_hat: FloatArray  # (p,): estimate that minimises the objective, px units
+    # (p, p): covariance of `theta_hat`: Godambe's where `adjusted`, else that of independent pairs.
     covariance: FloatArray
-    shrink: FloatArray
-    whitening: FloatArray
+    shrink: FloatArray  # (p, p): L_H: from whitened parameters to the point where the objective is evaluated
+    whitening: FloatArray  # (p, p): L_G where `adjusted`, else L_H
+    # (q, q): sum of products of the columns (value, derivatives, half second derivatives) of all pairs over tau^2.
     gram: FloatArray
-    tau: float
-    pair_noise: float
-    sigma: float
-    chi2: float
-    dof: int
-    n_pairs: int
-    adjusted: bool
+    tau: float  # Root mean square difference of interstar cosines at the estimate, rad
+    pair_noise: float  # kappa: root mean square standard deviation of a pair's difference for sigma = 1, rad
+    sigma: float  # Estimated noise, px, or factor on the stated noise
+    chi2: float  # Sum of squared (whitened) pixel residuals at the best attitudes
+    dof: int  # Degrees of freedom that sigma is estimated with
+    n_pairs: int  # Number of pairs
+    adjusted: bool  # False for the naive likelihood
+    # Godambe's standard deviations over those of independent pairs, root mean square over the parameters.
     narrowness: float
+    # "expected" or "empirical": V from the model (centroid noise through every star), or from the scatter of the
+    # frames' scores. The expected one follows sigma; the empirical one knows the scatter already.
     variability: str
     objective: PairObjective = field(repr=False)
 

@@ -115,23 +115,12 @@ class CompressedLikelihood:
 
 @dataclass(frozen=True)
 class GramSums:
-    """What a part of the frames adds to a compressed likelihood around a given point; they add up.
+    """What a part of the frames adds to a compressed likelihood around a given point; they add up."""
 
-    Attributes
-    ----------
-    gram : (q, q) array
-        As in `CompressedLikelihood`.
-    log_determinant : float
-        ``sum_k log |A_k^T A_k|``.
-    log_determinant_slope : (p,) array
-        Its derivative with respect to z.
-    n_stars, n_frames : int
-        What was summed.
-    """
-
-    gram: FloatArray
-    log_determinant: float
-    log_determinant_slope: FloatArray
+    gram: FloatArray  # (q, q): as in `CompressedLikelihood`
+    log_determinant: float  # ``sum_k log |A_k^T A_k|``
+    log_determinant_slope: FloatArray  # (p,): its derivative with respect to z
+    # `n_stars`, `n_frames`: what was summed.
     n_stars: int
     n_frames: int
 
@@ -487,33 +476,15 @@ def _covariance(compressed: CompressedLikelihood) -> FloatArray:
 
 @dataclasses.dataclass(frozen=True)
 class Optimum:
-    """Least squares of a compressed likelihood.
+    """Least squares of a compressed likelihood."""
 
-    Attributes
-    ----------
-    compressed : CompressedLikelihood
-        Expanded around the optimum, whitened by the covariance there.
-    information : (p, p) array
-        Gauss-Newton information at the estimated noise, px units.
-    covariance : (p, p) array
-        Inverse of the information.
-    sigma : float
-        ``sqrt(S / (dof - p))``.
-    sum_of_squares : float
-        S at the optimum.
-    trajectory : (n, p) array
-        Estimates after each step, the start first.
-    cost : (n,) array
-        S along them.
-    """
-
-    compressed: CompressedLikelihood
-    information: FloatArray
-    covariance: FloatArray
-    sigma: float
-    sum_of_squares: float
-    trajectory: FloatArray
-    cost: FloatArray
+    compressed: CompressedLikelihood  # Expanded around the optimum, whitened by the covariance there
+    information: FloatArray  # (p, p): Gauss-Newton information at the estimated noise, px units
+    covariance: FloatArray  # (p, p): inverse of the information
+    sigma: float  # ``sqrt(S / (dof - p))``
+    sum_of_squares: float  # S at the optimum
+    trajectory: FloatArray  # (n, p): estimates after each step, the start first
+    cost: FloatArray  # (n,): S along them
 
     @property
     def theta(self) -> FloatArray:

@@ -41,30 +41,15 @@ _TURN_RAD = 1e-8
 
 @dataclass(frozen=True)
 class Profile:
-    """The model at the best attitude of every frame.
+    """The model at the best attitude of every frame."""
 
-    Attributes
-    ----------
-    rotations : (K, 3, 3) array
-        R_cam_icrs.
-    b : (3, N) array
-        Catalogue directions in the camera frame.
-    e : (2, N) array
-        Residuals, observed minus predicted, divided by the stated noise where there is one.
-    attitude : (3, 2, N) array
-        Derivative of the (whitened) prediction with respect to the frame's rotation vector.
-    inverse : (3, 3, K) array
-        Inverse of A^T A per frame.
-    log_determinant : (K,) array
-        log |A^T A|.
-    """
-
-    rotations: FloatArray
-    b: FloatArray
-    e: FloatArray
+    rotations: FloatArray  # (K, 3, 3): R_cam_icrs
+    b: FloatArray  # (3, N): catalogue directions in the camera frame
+    e: FloatArray  # (2, N): residuals, observed minus predicted, divided by the stated noise where there is one
+    # (3, 2, N): derivative of the (whitened) prediction with respect to the frame's rotation vector.
     attitude: FloatArray
-    inverse: FloatArray
-    log_determinant: FloatArray
+    inverse: FloatArray  # (3, 3, K): inverse of A^T A per frame
+    log_determinant: FloatArray  # (K,): log |A^T A|
 
 
 class MarginalLikelihood:

@@ -35,21 +35,11 @@ _MIN_STARS = 30
 
 @dataclass(frozen=True)
 class NoiseFloor:
-    """A floor under the stated noise.
+    """A floor under the stated noise."""
 
-    Attributes
-    ----------
-    floor_px : float
-        F, px per axis; zero where the residuals ask for none.
-    scale : float
-        s, the factor on the stated noise beside it.
-    p_value : float
-        How often noise without a floor gives such a likelihood ratio.
-    """
-
-    floor_px: float
-    scale: float
-    p_value: float
+    floor_px: float  # F, px per axis; zero where the residuals ask for none
+    scale: float  # s, the factor on the stated noise beside it
+    p_value: float  # How often noise without a floor gives such a likelihood ratio
 
     @property
     def needed(self) -> bool:

@@ -31,35 +31,16 @@ class FrameNormals:
     """Normal equations of every frame in scaled parameters ``z = (theta - theta_hat) / scale``.
 
     At a small step z the sum of squares of frame k is ``squares - 2 slopes . z + z . matrices z``.
-
-    Attributes
-    ----------
-    theta : (p,) array
-        Point of expansion, px units.
-    scale : (p,) array
-        Unit of each parameter: its standard deviation with the others known, per unit of noise.
-    matrices : (K, p, p) array
-        Gauss-Newton matrix.
-    slopes : (K, p) array
-        Minus half the gradient.
-    squares : (K,) array
-        Sum of squared whitened residuals.
-    log_determinant : (K,) array
-        log |A^T A| of the attitude columns.
-    rotations : (K, 3, 3) array
-        Best attitudes.
-    dof : (K,) array of int
-        Independent numbers ``2 m_k - 3``.
     """
 
-    theta: FloatArray
-    scale: FloatArray
-    matrices: FloatArray
-    slopes: FloatArray
-    squares: FloatArray
-    log_determinant: FloatArray
-    rotations: FloatArray
-    dof: IntArray
+    theta: FloatArray  # (p,): point of expansion, px units
+    scale: FloatArray  # (p,): unit of each parameter: its standard deviation with the others known, per unit of noise
+    matrices: FloatArray  # (K, p, p): Gauss-Newton matrix
+    slopes: FloatArray  # (K, p): minus half the gradient
+    squares: FloatArray  # (K,): sum of squared whitened residuals
+    log_determinant: FloatArray  # (K,): log |A^T A| of the attitude columns
+    rotations: FloatArray  # (K, 3, 3): best attitudes
+    dof: IntArray  # (K,): independent numbers ``2 m_k - 3``
 
     @property
     def matrix(self) -> FloatArray:
@@ -156,34 +137,18 @@ class FrameNormals:
 
 @dataclass(frozen=True)
 class StarNormals:
-    """What each of S stars says about the parameters through all of its images, in scaled parameters z.
+    """What each of S stars says about the parameters through all of its images, in scaled parameters z."""
 
-    Attributes
-    ----------
-    scale : (p,) array
-        Unit of each parameter, as in `FrameNormals`.
-    matrix : (p, p) array
-        Gauss-Newton matrix of all stars.
-    squares : float
-        Sum of squared whitened residuals after the fit.
-    scores : (S, p) array
-        Share of the slope at the estimate; they sum to nothing.
-    matrices, slopes : (S, p, p) and (S, p) arrays
-        What the normal equations lose without a star, the attitudes of its frames fitted anew.
-    response : (S, 2, p) array
-        Change of the slope by one px of offset of the star along each of its axes.
-    dof : int
-        Degrees of freedom after the fit.
-    """
-
-    scale: FloatArray
-    matrix: FloatArray
-    squares: float
-    scores: FloatArray
+    scale: FloatArray  # (p,): unit of each parameter, as in `FrameNormals`
+    matrix: FloatArray  # (p, p): Gauss-Newton matrix of all stars
+    squares: float  # Sum of squared whitened residuals after the fit
+    scores: FloatArray  # (S, p): share of the slope at the estimate; they sum to nothing
+    # `matrices`, `slopes`, (S, p, p) and (S, p): what the normal equations lose without a star, the attitudes of its
+    # frames fitted anew.
     matrices: FloatArray
     slopes: FloatArray
-    response: FloatArray
-    dof: int
+    response: FloatArray  # (S, 2, p): change of the slope by one px of offset of the star along each of its axes
+    dof: int  # Degrees of freedom after the fit
 
     @classmethod
     def at(cls, obs: Observations, cal: Calibration, numbers: IntArray) -> StarNormals:

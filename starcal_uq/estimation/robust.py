@@ -50,24 +50,12 @@ FitStages = Callable[[StarFrames, bool], list[Stage]]
 
 @dataclass(frozen=True)
 class RobustStart:
-    """Where the refinement starts.
+    """Where the refinement starts."""
 
-    Attributes
-    ----------
-    stages : list of Stage
-        The paper's stages on the trusted stars.
-    trusted : (N,) array of bool
-        Stars whose interstar angles agree with those of their frame.
-    frames : StarFrames
-        The trusted stars, without frames that hold fewer than three of them.
-    rotations : (K, 3, 3) array
-        Attitudes from the trusted stars.
-    """
-
-    stages: list[Stage]
-    trusted: BoolArray
-    frames: StarFrames
-    rotations: FloatArray
+    stages: list[Stage]  # The paper's stages on the trusted stars
+    trusted: BoolArray  # (N,): stars whose interstar angles agree with those of their frame
+    frames: StarFrames  # The trusted stars, without frames that hold fewer than three of them
+    rotations: FloatArray  # (K, 3, 3): attitudes from the trusted stars
 
 
 def star_scores(frames: StarFrames, model_name: str, theta: FloatArray) -> FloatArray:
@@ -154,32 +142,18 @@ def robust_start(frames: StarFrames, model_name: str, theta: FloatArray, fit: Fi
 
 @dataclass(frozen=True)
 class RobustFit:
-    """Maximum of the Student-t likelihood.
+    """Maximum of the Student-t likelihood."""
 
-    Attributes
-    ----------
-    stage : Stage
-        Trajectory; its cost is -2 log likelihood.
-    likelihood : StudentLikelihood
-        Started at the attitudes found.
-    state : StudentState
-        The model there.
-    sigma, nu : float
-        Scale and degrees of freedom.
-    sigma_std, nu_std : float
-        Standard errors of both; `nu_std` is 0 where nu was given, and not finite at a bound.
-    information : Information
-        Derivatives at the maximum.
-    """
-
-    stage: Stage
-    likelihood: StudentLikelihood
-    state: StudentState
+    stage: Stage  # Trajectory; its cost is -2 log likelihood
+    likelihood: StudentLikelihood  # Started at the attitudes found
+    state: StudentState  # The model there
+    # `sigma`, `nu`: scale and degrees of freedom.
     sigma: float
     nu: float
+    # `sigma_std`, `nu_std`: standard errors of both; `nu_std` is 0 where nu was given, and not finite at a bound.
     sigma_std: float
     nu_std: float
-    information: Information
+    information: Information  # Derivatives at the maximum
 
     @property
     def covariance(self) -> FloatArray:

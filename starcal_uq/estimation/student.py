@@ -72,42 +72,18 @@ def log_excess_prior(log_excess: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class StudentState:
-    """The model at the best attitude of every frame.
+    """The model at the best attitude of every frame."""
 
-    Attributes
-    ----------
-    value : float
-        Log likelihood; -inf where no attitude is a maximum.
-    log_volume : float
-        The part of it that is the volume of the attitudes, ``-1/2 sum_k log |A^T Omega A|``.
-    rotations : (K, 3, 3) array
-        R_cam_icrs.
-    b : (3, N) array
-        Catalogue directions in the camera frame.
-    e : (2, N) array
-        Residuals, divided by the stated noise where there is one.
-    attitude : (3, 2, N) array
-        Derivative of the whitened prediction with respect to the frame's rotation vector.
-    weight : (N,) array
-        w.
-    radial : (N,) array
-        ``2 w / (nu sigma^2 + |e|^2)``: what Omega lacks along e, per squared residual.
-    inverse : (3, 3, K) array
-        Inverse of ``A^T Omega A`` per frame.
-    seen : (N,) array of bool
-        False for stars that cannot be in the field, and in frames without two that can.
-    """
-
-    value: float
-    log_volume: float
-    rotations: FloatArray
-    b: FloatArray
-    e: FloatArray
-    attitude: FloatArray
-    weight: FloatArray
-    radial: FloatArray
-    inverse: FloatArray
-    seen: BoolArray
+    value: float  # Log likelihood; -inf where no attitude is a maximum
+    log_volume: float  # The part of it that is the volume of the attitudes, ``-1/2 sum_k log |A^T Omega A|``
+    rotations: FloatArray  # (K, 3, 3): R_cam_icrs
+    b: FloatArray  # (3, N): catalogue directions in the camera frame
+    e: FloatArray  # (2, N): residuals, divided by the stated noise where there is one
+    attitude: FloatArray  # (3, 2, N): derivative of the whitened prediction with respect to the frame's rotation vector
+    weight: FloatArray  # (N,): w
+    radial: FloatArray  # (N,): ``2 w / (nu sigma^2 + |e|^2)``: what Omega lacks along e, per squared residual
+    inverse: FloatArray  # (3, 3, K): inverse of ``A^T Omega A`` per frame
+    seen: BoolArray  # (N,): false for stars that cannot be in the field, and in frames without two that can
 
     @property
     def dof(self) -> int:
@@ -301,30 +277,14 @@ class StudentLikelihood:
 
 @dataclass(frozen=True)
 class Information:
-    """Derivatives of the log likelihood at one point, attitudes eliminated.
+    """Derivatives of the log likelihood at one point, attitudes eliminated."""
 
-    Attributes
-    ----------
-    score : (p,) array
-        Gradient.
-    matrix : (p, p) array
-        Observed information.
-    reweighted : (p, p) array
-        Information if the weights were known; never smaller, and always positive.
-    variability : (p, p) array
-        Sum over stars of the outer products of their scores.
-    turns : (3, p, K) array
-        d(best attitude) / d(theta) of every frame, rad per px unit.
-    attitude_noise : (3, 3) array
-        Mean over frames of the attitude covariance, rad^2.
-    """
-
-    score: FloatArray
-    matrix: FloatArray
-    reweighted: FloatArray
-    variability: FloatArray
-    turns: FloatArray
-    attitude_noise: FloatArray
+    score: FloatArray  # (p,): gradient
+    matrix: FloatArray  # (p, p): observed information
+    reweighted: FloatArray  # (p, p): information if the weights were known; never smaller, and always positive
+    variability: FloatArray  # (p, p): sum over stars of the outer products of their scores
+    turns: FloatArray  # (3, p, K): d(best attitude) / d(theta) of every frame, rad per px unit
+    attitude_noise: FloatArray  # (3, 3): mean over frames of the attitude covariance, rad^2
 
     @property
     def rotation_per_theta(self) -> FloatArray:

@@ -65,21 +65,14 @@ _OPTIONS: dict[str, tuple[str, Any]] = {
 
 @dataclass(frozen=True)
 class CompressionCheck:
-    """Compressed against exact log likelihood around the mode; NaN where they were not compared.
+    """Compressed against exact log likelihood around the mode; NaN where they were not compared."""
 
-    Attributes
-    ----------
-    max_difference : float
-        Largest difference within three standard deviations of the mode, relative to the mode, nat.
-    khat : float
-        Pareto shape of the weights exact over compressed at the checked draws; 0 where all of them lie within 0.1 nat.
-    n_frames, of_frames : int
-        Frames of the sample that was compared, its uncertainty being part of `max_difference`, and those that it stands
-        for; 0 where all were compared.
-    """
-
+    # Largest difference within three standard deviations of the mode, relative to the mode, nat.
     max_difference: float = float("nan")
+    # Pareto shape of the weights exact over compressed at the checked draws; 0 where all of them lie within 0.1 nat.
     khat: float = float("nan")
+    # `n_frames`, `of_frames`: frames of the sample that was compared, its uncertainty being part of `max_difference`,
+    # and those that it stands for; 0 where all were compared.
     n_frames: int = 0
     of_frames: int = 0
 

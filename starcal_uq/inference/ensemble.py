@@ -32,39 +32,23 @@ _SECONDS = 0.5
 
 @dataclass(frozen=True)
 class EnsembleSettings:
-    """How to sample.
+    """How to sample."""
 
-    Attributes
-    ----------
-    n_walkers, n_steps, n_burn : int
-        Per ensemble; burn-in steps come before and are not kept.
-    moves : {"mixture", "stretch"}
-        ``mixture`` is 0.7 of an independence proposal and 0.3 of differential evolution.
-    """
-
+    # `n_walkers`, `n_steps`, `n_burn`: per ensemble; burn-in steps come before and are not kept.
     n_walkers: int
     n_steps: int
     n_burn: int
+    # "mixture" or "stretch": ``mixture`` is 0.7 of an independence proposal and 0.3 of differential evolution.
     moves: Moves
 
 
 @dataclass(frozen=True)
 class Chains:
-    """Draws of all ensembles.
+    """Draws of all ensembles."""
 
-    Attributes
-    ----------
-    u : array (n_ensembles, n_steps, n_walkers, d)
-        Whitened coordinates.
-    log_density : array (n_ensembles, n_steps, n_walkers)
-        Log posterior there.
-    accepted : array (n_ensembles,)
-        Number of accepted proposals after the burn-in.
-    """
-
-    u: FloatArray
-    log_density: FloatArray
-    accepted: IntArray
+    u: FloatArray  # (n_ensembles, n_steps, n_walkers, d): whitened coordinates
+    log_density: FloatArray  # (n_ensembles, n_steps, n_walkers): log posterior there
+    accepted: IntArray  # (n_ensembles,): number of accepted proposals after the burn-in
 
 
 def student_t_proposal(df: float) -> Callable[[FloatArray, Any], tuple[FloatArray, FloatArray]]:

@@ -42,44 +42,20 @@ class NaivePairsWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Source:
-    """A likelihood, and where its maximum is.
+    """A likelihood, and where its maximum is."""
 
-    Attributes
-    ----------
-    name : str
-        One of `LIKELIHOODS`, or the name of an object that was passed.
-    theta : (p,) array
-        Estimate, px units.
-    information : (p, p) array
-        Information about theta there.
-    sigma : float
-        Noise there.
-    dof : float
-        Half of the curvature in log sigma.
-    exact : callable or None
-        From all stars; None without observations.
-    fast : callable or None
-        At a cost independent of the number of stars; None where a polynomial has to be fitted first.
-    extra : Extra or None
-        A further parameter.
-    notes : tuple of str
-        Sentences on the likelihood, for the check of its kind.
-    checks : tuple of Check
-        Checks that need no draws.
-    sample : FrameSample or None
-        What `fast` leaves out, told by some of the frames; None where `exact` itself is compared.
-    """
-
-    name: str
-    theta: FloatArray
-    information: FloatArray
-    sigma: float
-    dof: float
-    exact: LogLikelihood | None
+    name: str  # One of `LIKELIHOODS`, or the name of an object that was passed
+    theta: FloatArray  # (p,): estimate, px units
+    information: FloatArray  # (p, p): information about theta there
+    sigma: float  # Noise there
+    dof: float  # Half of the curvature in log sigma
+    exact: LogLikelihood | None  # From all stars; None without observations
+    # At a cost independent of the number of stars; None where a polynomial has to be fitted first.
     fast: LogLikelihood | None
-    extra: Extra | None = None
-    notes: tuple[str, ...] = ()
-    checks: tuple[Check, ...] = ()
+    extra: Extra | None = None  # A further parameter
+    notes: tuple[str, ...] = ()  # Sentences on the likelihood, for the check of its kind
+    checks: tuple[Check, ...] = ()  # Checks that need no draws
+    # What `fast` leaves out, told by some of the frames; None where `exact` itself is compared.
     sample: FrameSample | None = None
 
 

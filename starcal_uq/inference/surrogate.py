@@ -30,24 +30,12 @@ _CHUNK = 4096
 
 @dataclass(frozen=True)
 class PolynomialLikelihood:
-    """Log likelihood as a polynomial in the whitened coordinates of a target.
+    """Log likelihood as a polynomial in the whitened coordinates of a target."""
 
-    Attributes
-    ----------
-    target : Target
-        Coordinates; its origin is the mode.
-    exponents : tuple of (n_k, k) arrays of int
-        Coordinates multiplied in every monomial, by degree from 0 on.
-    coefficients : tuple of (n_k,) arrays
-        Coefficients of the monomials.
-    reach : float
-        Radius up to which degrees above two vary.
-    """
-
-    target: Target
-    exponents: tuple[IntArray, ...]
-    coefficients: tuple[FloatArray, ...]
-    reach: float
+    target: Target  # Coordinates; its origin is the mode
+    exponents: tuple[IntArray, ...]  # (n_k, k): coordinates multiplied in every monomial, by degree from 0 on
+    coefficients: tuple[FloatArray, ...]  # (n_k,): coefficients of the monomials
+    reach: float  # Radius up to which degrees above two vary
 
     def log_likelihood(self, theta: FloatArray, sigma: FloatArray, *extra: FloatArray) -> FloatArray:
         """Log likelihood (n,) at theta (n, p), sigma (n,) and a further parameter where there is one."""

@@ -40,55 +40,26 @@ class Likelihood(Protocol):
 
 @dataclass(frozen=True)
 class Extra:
-    """A parameter of the likelihood beyond theta and sigma, sampled as the logarithm of what exceeds its bound.
+    """A parameter of the likelihood beyond theta and sigma, sampled as the logarithm of what exceeds its bound."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the parameter.
-    log_prior : callable
-        Log prior density of that logarithm.
-    value : float
-        Start.
-    log_sd : float
-        Expected standard deviation of that logarithm.
-    bound : float
-        The parameter is larger.
-    """
-
-    name: str
-    log_prior: Callable[[FloatArray], FloatArray]
-    value: float
-    log_sd: float
-    bound: float
+    name: str  # Name of the parameter
+    log_prior: Callable[[FloatArray], FloatArray]  # Log prior density of that logarithm
+    value: float  # Start
+    log_sd: float  # Expected standard deviation of that logarithm
+    bound: float  # The parameter is larger
 
 
 @dataclass(frozen=True)
 class Target:
-    """Posterior density over u.
+    """Posterior density over u."""
 
-    Attributes
-    ----------
-    log_likelihood : callable
-        ``(theta (n, p), sigma (n,)) -> (n,)``, with `extra` ``(theta, sigma, extra (n,))``.
-    priors : Priors
-        Proper priors.
-    centre : array (d,)
-        Origin of u: theta, then log sigma if it is sampled, then that of `extra` if there is one.
-    transform : array (d, d)
-        Square root of the covariance at the origin.
-    sigma : float or None
-        The noise if it is given.
-    extra : Extra or None
-        A further parameter of the likelihood.
-    """
-
-    log_likelihood: LogLikelihood
-    priors: Priors
+    log_likelihood: LogLikelihood  # ``(theta (n, p), sigma (n,)) -> (n,)``, with `extra` ``(theta, sigma, extra (n,))``
+    priors: Priors  # Proper priors
+    # (d,): origin of u: theta, then log sigma if it is sampled, then that of `extra` if there is one.
     centre: FloatArray
-    transform: FloatArray
-    sigma: float | None
-    extra: Extra | None = None
+    transform: FloatArray  # (d, d): square root of the covariance at the origin
+    sigma: float | None  # The noise if it is given
+    extra: Extra | None = None  # A further parameter of the likelihood
 
     @property
     def dim(self) -> int:
@@ -246,22 +217,13 @@ def student_t_log_density(u: FloatArray, df: float) -> FloatArray:
 
 @dataclass(frozen=True)
 class ImportanceCheck:
-    """Moments of the posterior by importance sampling.
+    """Moments of the posterior by importance sampling."""
 
-    Attributes
-    ----------
-    khat : float
-        Pareto shape of the weights.
-    mean, sd : array (p+1,)
-        Moments of the parameters, px units.
-    ess : float
-        ``1 / sum w^2``: equivalent number of independent draws.
-    """
-
-    khat: float
+    khat: float  # Pareto shape of the weights
+    # `mean`, `sd`, (p+1,): moments of the parameters, px units.
     mean: FloatArray
     sd: FloatArray
-    ess: float
+    ess: float  # ``1 / sum w^2``: equivalent number of independent draws
 
 
 def importance_check(target: Target, n: int, df: float, rng: np.random.Generator) -> ImportanceCheck:

@@ -44,46 +44,23 @@ _MAX_TRUTHS = 1000
 
 @dataclass(frozen=True)
 class Replication:
-    """What all replicates share; sent once to every process.
+    """What all replicates share; sent once to every process."""
 
-    Attributes
-    ----------
-    camera : Camera
-        The truth, or the centre of what it is drawn around.
-    nominal : Camera
-        Start of every calibration.
-    priors : Priors
-        Sampled with; with ``truth="prior"`` the truth is drawn from them as well.
-    truth : {"fixed", "prior"}
-        Whether every replicate has one truth or a new one.
-    campaign : Campaign
-        Data of one calibration; the noise may be drawn from the prior instead.
-    seed : int
-        Replicate i depends on the seed and on i alone.
-    assumed_sigma_px : float or None
-        Noise that the sampler is told; None lets it sample the noise.
-    likelihood : str or callable
-        Name of a likelihood, or ``(obs, cal) -> Likelihood``.
-    moves : callable, optional
-        ``() -> list of (emcee move, weight)`` to sample with instead of the usual ones.
-    n_walkers, n_steps, n_burn : int
-        One ensemble.
-    thin : int
-        Every `thin`-th step is ranked: walkers of one step are independent of each other, steps nearly so after ten.
-    """
-
-    camera: Camera
-    nominal: Camera
-    priors: Priors
-    truth: Truth
-    campaign: Campaign
-    seed: int
-    assumed_sigma_px: float | None = None
-    likelihood: str | LikelihoodMaker = MARGINAL
+    camera: Camera  # The truth, or the centre of what it is drawn around
+    nominal: Camera  # Start of every calibration
+    priors: Priors  # Sampled with; with ``truth="prior"`` the truth is drawn from them as well
+    truth: Truth  # "fixed" or "prior": whether every replicate has one truth or a new one
+    campaign: Campaign  # Data of one calibration; the noise may be drawn from the prior instead
+    seed: int  # Replicate i depends on the seed and on i alone
+    assumed_sigma_px: float | None = None  # Noise that the sampler is told; None lets it sample the noise
+    likelihood: str | LikelihoodMaker = MARGINAL  # Name of a likelihood, or ``(obs, cal) -> Likelihood``
+    # ``() -> list of (emcee move, weight)`` to sample with instead of the usual ones.
     moves: Callable[[], list[tuple[Any, float]]] | None = None
+    # `n_walkers`, `n_steps`, `n_burn`: one ensemble.
     n_walkers: int = 64
     n_steps: int = 200
     n_burn: int = 20
+    # Every `thin`-th step is ranked: walkers of one step are independent of each other, steps nearly so after ten.
     thin: int = 10
 
     @property
@@ -105,45 +82,19 @@ class Replication:
 
 
 class TrialOutcome(NamedTuple):
-    """One replicate, over Q quantities and p parameters.
+    """One replicate, over Q quantities and p parameters."""
 
-    Attributes
-    ----------
-    replicate : int
-        Number of the replicate.
-    failure : str
-        Why there is no result; empty otherwise.
-    truth : (p+1,) array
-        Camera parameters and noise.
-    ranks : (Q,) array of int
-        Draws below the truth, of `Replication.n_ranked`.
-    covered : (Q,) array of bool
-        The truth lies between the 2.5 % and 97.5 % quantiles of all draws.
-    error : (Q,) array
-        Mean of the draws minus truth.
-    sd : (Q,) array
-        Standard deviation of the draws.
-    nees : float
-        Normalised squared error of the parameters with mean and covariance of the draws.
-    nees_calibration : float
-        Normalised squared error with the estimate and covariance of the calibration.
-    compression_error : float
-        Compressed minus exact log likelihood at the truth, nat.
-    dof : int
-        Degrees of freedom of the calibration.
-    """
-
-    replicate: int
-    failure: str
-    truth: FloatArray
-    ranks: IntArray
-    covered: BoolArray
-    error: FloatArray
-    sd: FloatArray
-    nees: float
-    nees_calibration: float
-    compression_error: float
-    dof: int
+    replicate: int  # Number of the replicate
+    failure: str  # Why there is no result; empty otherwise
+    truth: FloatArray  # (p+1,): camera parameters and noise
+    ranks: IntArray  # (Q,): draws below the truth, of `Replication.n_ranked`
+    covered: BoolArray  # (Q,): the truth lies between the 2.5 % and 97.5 % quantiles of all draws
+    error: FloatArray  # (Q,): mean of the draws minus truth
+    sd: FloatArray  # (Q,): standard deviation of the draws
+    nees: float  # Normalised squared error of the parameters with mean and covariance of the draws
+    nees_calibration: float  # Normalised squared error with the estimate and covariance of the calibration
+    compression_error: float  # Compressed minus exact log likelihood at the truth, nat
+    dof: int  # Degrees of freedom of the calibration
 
 
 def run_replicate(study: Replication, stars: StarCatalogue, index: int) -> TrialOutcome:

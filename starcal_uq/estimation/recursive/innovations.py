@@ -41,29 +41,19 @@ _DENSE_STARS = 200
 
 @dataclass(frozen=True)
 class PairNormals:
-    """Normal equations of K frames at one point, for p parameters.
+    """Normal equations of K frames at one point, for p parameters."""
 
-    Attributes
-    ----------
-    grams : (K, 1 + p, 1 + p) array
-        ``[d, J]^T [d, J]`` of every frame: sum of squares, gradient and information at unit noise (whitened by the
-        stated noise where there is one).
-    weighted : (K, 1 + p, 1 + p) array
-        Sums under the covariance that the filter assumes: `grams` itself for ``full``; for ``diagonal`` the sums
-        over pairs, each divided by its variance.
-    pairs : (K,) array
-        Number of independent numbers that the filter counts in a frame: 2 m - 3, or m (m - 1) / 2 for ``diagonal``.
-    response : (K, 3, p) array
-        Rotation of the frame that makes up for a change of the parameters, rad.
-    noise : (K, 3, 3) array
-        Covariance of the frame's attitude at unit noise, rad^2.
-    """
-
+    # (K, 1 + p, 1 + p): ``[d, J]^T [d, J]`` of every frame: sum of squares, gradient and information at unit noise
+    # (whitened by the stated noise where there is one).
     grams: FloatArray
+    # (K, 1 + p, 1 + p): sums under the covariance that the filter assumes: `grams` itself for ``full``; for
+    # ``diagonal`` the sums over pairs, each divided by its variance.
     weighted: FloatArray
+    # (K,): number of independent numbers that the filter counts in a frame: 2 m - 3, or m (m - 1) / 2 for
+    # ``diagonal``.
     pairs: FloatArray
-    response: FloatArray
-    noise: FloatArray
+    response: FloatArray  # (K, 3, p): rotation of the frame that makes up for a change of the parameters, rad
+    noise: FloatArray  # (K, 3, 3): covariance of the frame's attitude at unit noise, rad^2
 
 
 def frame_normals(

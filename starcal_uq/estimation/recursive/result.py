@@ -32,21 +32,11 @@ _UNMEASURED = 0.5
 
 @dataclass(frozen=True)
 class JointEstimate:
-    """Estimate of all p parameters.
+    """Estimate of all p parameters."""
 
-    Attributes
-    ----------
-    theta : (p,) array
-        Px units.
-    covariance : (p, p) array
-        Px units.
-    source : {"scatter of the frames", "filter"}
-        Origin of the covariance.
-    """
-
-    theta: FloatArray
-    covariance: FloatArray
-    source: str
+    theta: FloatArray  # (p,): px units
+    covariance: FloatArray  # (p, p): px units
+    source: str  # "scatter of the frames" or "filter": origin of the covariance
 
 
 def joint_estimate(recursion: Recursion, sums: FrameSums | None = None) -> JointEstimate:

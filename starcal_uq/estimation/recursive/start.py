@@ -29,21 +29,12 @@ _START_ITERATIONS = 200
 
 @dataclass(frozen=True)
 class StartPrior:
-    """What a recursion believes before its first frame.
+    """What a recursion believes before its first frame."""
 
-    Attributes
-    ----------
-    scale : (p,) array
-        Units of the parameters: 1 px for the optics, 1 px of displacement in the corner for a coefficient.
-    deviation : (q,) array
-        Standard deviations of the q estimated parameters, in those units.
-    reference_px : float
-        Noise that weighs them: as stated, px, or 1 where the stars state their own.
-    """
-
+    # (p,): units of the parameters: 1 px for the optics, 1 px of displacement in the corner for a coefficient.
     scale: FloatArray
-    deviation: FloatArray
-    reference_px: float
+    deviation: FloatArray  # (q,): standard deviations of the q estimated parameters, in those units
+    reference_px: float  # Noise that weighs them: as stated, px, or 1 where the stars state their own
 
 
 def prior_of(camera: Camera, options: RecursionOptions, per_star: bool) -> StartPrior:

@@ -30,17 +30,12 @@ _NARROW_MADS = 6.0
 
 @dataclass(frozen=True)
 class Consensus:
-    """What the stars of each frame agree on.
+    """What the stars of each frame agree on."""
 
-    Attributes
-    ----------
-    agree : (N,) bool array
-        Stars within the tolerance of their frame's best attitude; all false in a frame without three such stars.
-    offset_rad : (N,) array
-        Angle between measurement and catalogue direction at that attitude, approximately; NaN without an attitude.
-    """
-
+    # (N,): stars within the tolerance of their frame's best attitude; all false in a frame without three such stars.
     agree: BoolArray
+    # (N,): angle between measurement and catalogue direction at that attitude, approximately; NaN without an
+    # attitude.
     offset_rad: FloatArray
 
 

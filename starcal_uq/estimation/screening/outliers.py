@@ -41,34 +41,18 @@ _LEAST_VARIANCE = 1e-12
 
 @dataclass(frozen=True)
 class StarResiduals:
-    """Every star against the prediction of the others in use; N stars, K frames.
+    """Every star against the prediction of the others in use; N stars, K frames."""
 
-    Attributes
-    ----------
-    t : (N,) array
-        Change of the sum of squares with the star: px^2, or in units of the stated noise. Infinite for a star whose
-        direction is far from where it was measured, NaN in a frame without three stars in use.
-    residual_px : (N,) array
-        Distance between measurement and prediction, px (focal length times angle for a direction far away).
-    offset_rad : (N,) array
-        Angle between them.
-    frame_cost : (K,) array
-        Sum of squares of the stars in use; 0 in a frame without three.
-    frame_count : (K,) array of int
-        Stars in use; 0 in a frame without three.
-    in_use : (N,) bool array
-        Stars in use in frames with at least three.
-    dof : int
-        Degrees of freedom: ``sum_k (2 m_k - 3) - p``.
-    """
-
+    # (N,): change of the sum of squares with the star: px^2, or in units of the stated noise. Infinite for a star
+    # whose direction is far from where it was measured, NaN in a frame without three stars in use.
     t: FloatArray
+    # (N,): distance between measurement and prediction, px (focal length times angle for a direction far away).
     residual_px: FloatArray
-    offset_rad: FloatArray
-    frame_cost: FloatArray
-    frame_count: IntArray
-    in_use: BoolArray
-    dof: int
+    offset_rad: FloatArray  # (N,): angle between them
+    frame_cost: FloatArray  # (K,): sum of squares of the stars in use; 0 in a frame without three
+    frame_count: IntArray  # (K,): stars in use; 0 in a frame without three
+    in_use: BoolArray  # (N,): stars in use in frames with at least three
+    dof: int  # Degrees of freedom: ``sum_k (2 m_k - 3) - p``
 
     @property
     def cost(self) -> float:

@@ -66,22 +66,13 @@ def allowed_near(statistic: FloatArray, threshold: FloatArray, expected_false: f
 
 @dataclass(frozen=True)
 class Tails:
-    """Squared distances as those of a Student t in two dimensions.
+    """Squared distances as those of a Student t in two dimensions."""
 
-    Attributes
-    ----------
-    nu, scale2 : float
-        Degrees of freedom, and squared scale per axis in the unit of the squared distances.
-    gain : float
-        By how much it is likelier than a Gaussian, nat.
-    within : (n,) array of bool
-        Stars that belong to it.
-    """
-
+    # `nu`, `scale2`: degrees of freedom, and squared scale per axis in the unit of the squared distances.
     nu: float
     scale2: float
-    gain: float
-    within: BoolArray
+    gain: float  # By how much it is likelier than a Gaussian, nat
+    within: BoolArray  # (n,): stars that belong to it
 
     @property
     def heavy(self) -> bool:
