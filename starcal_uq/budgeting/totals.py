@@ -327,8 +327,8 @@ def explain(total: Total, counted: Sequence[Contributor], random: Sequence[Contr
     """One sentence or two on rule against sampling; empty if no error is random."""
     if not total.rule_arcsec > 0.0:
         return "No error is left: all rows are zero."
-    difference = total.rule_arcsec / total.sampled_arcsec - 1.0 if total.sampled_arcsec > 0.0 else math.inf
-    within = 3.0 * total.sampled_se_arcsec / max(total.sampled_arcsec, 1e-300)
+    difference = total.rule_arcsec / total.sampled_arcsec - 1.0
+    within = 3.0 * total.sampled_se_arcsec / total.sampled_arcsec
     if abs(difference) <= max(_AGREE, within):
         return f"Both bounds agree within {percent(max(_AGREE, within), 1)}."
     size = percent(abs(difference), 2)

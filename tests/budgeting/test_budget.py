@@ -22,11 +22,15 @@ from starcal_uq.budgeting.file import (
     BUDGET_KEYS,
     CONTRIBUTOR_KEYS,
     REQUIREMENT_KEYS,
+    BudgetFile,
+    Requirement,
     load_budget_file,
 )
+from starcal_uq.budgeting.posterior import alignment_rows, misfit_notes, posterior_rows
 from starcal_uq.budgeting.result import Budget
-from starcal_uq.budgeting.rows import ALIGNMENT, COMMON, FROM_FILE, GAUSSIAN_997, NEA, REST, UNTESTED
+from starcal_uq.budgeting.rows import ALIGNMENT, COMMON, FROM_FILE, GAUSSIAN_997, NEA, REST, UNTESTED, Contributor
 from starcal_uq.budgeting.shapes import one_axis_factor
+from starcal_uq.budgeting.totals import Total
 from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
 from starcal_uq.core.errors import BudgetError, RunFolderError
 from starcal_uq.core.records import to_plain
@@ -736,3 +740,224 @@ def test_a_missing_part_is_named_with_its_command(full: Any, tmp_path: Path) -> 
         sc.Run(tmp_path / "run").budget()
     with pytest.raises(BudgetError, match="does not exist"):
         sc.Run(full.path).budget(file=tmp_path / "none.toml", force=True)
+
+
+# --- whole rows, tables and files, written a second time --------------------------------------------------------------
+
+
+def test_rows_of_the_posterior_to_every_field() -> None:
+    """Each field of each row by hand: with correlated axes, a misfit, tails, and a rest that stays about X."""
+    held = attitude().if_model_holds_arcsec[:, :3]
+    correlation = np.array([[1.0, 0.6, -0.3], [0.6, 1.0, 0.2], [-0.3, 0.2, 1.0]])
+    error = attitude(
+        covariance_arcsec2=held[:, :, None] * held[:, None] * correlation,
+        misfit=MisfitFound(1.3, np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.02, 0.3]), ("why one",), ("a", "b")),
+        rest_constant_arcsec=np.array([0.0043, 0.0042, 0.0]),
+        alignment="12 frames of sky",
+        alignment_covariance_arcsec2=np.outer([0.1, 0.2, 0.3], [0.1, 0.2, 0.3]) * correlation,
+    )
+    common, rest = 1.3 * held[1], 1.3 * held[2]
+    sigmas = [np.hypot(common, [1.0, 0.0, 0.0]), np.hypot(rest, [0.0, 0.02, 0.3]), held[0], held[4]]
+    tails = [None, np.full(3, 3.9), np.full(3, 3.2), None]
+    names = [
+        (COMMON, "bias", "ensemble", "yes", 1.3, "; inflated: why one"),
+        (REST, "FOV spatial", "mixed", "no", 1.3, "; inflated: a; b"),
+        (NEA, "temporal noise (NEA)", "temporal", "no", 1.0, ""),
+        (INTERACTION, "temporal noise (NEA)", "mixed", "no", 1.0, ""),
+    ]
+    expected = []
+    for place, (name, group, kind, absorbed, factor, why) in zip((1, 2, 0, 4), names, strict=True):
+        index = len(expected) // 3
+        sigma, own = sigmas[index], factor * held[place]
+        for i, axis in enumerate(AXES):
+            line = [1.0 if i == j else correlation[i, j] * own[i] * own[j] / sigma[i] / sigma[j] for j in range(3)]
+            tail = tails[index]
+            longer = 0.0 if tail is None else (tail[i] - GAUSSIAN_997) * (own[i] / sigma[i]) ** 2
+            told = "star geometry of 100 frames (observed frames), brown distortion" + why
+            expected.append(
+                Contributor(
+                    *(name, group, axis, 0.0, sigma[i], "gaussian"),
+                    "ensemble" if (name, axis) == (REST, "pitch") else kind,
+                    absorbed,
+                    axis_correlation=tuple(line),
+                    tail_997=GAUSSIAN_997 + longer,
+                    conditions=told + ("; alignment on 12 frames of sky" if name == COMMON else ""),
+                    provenance="posterior of 400 draws, data 0123456789ab",
+                    source="posterior",
+                    if_model_holds_arcsec=held[place, i],
+                    with_misfit_found_arcsec=sigma[i],
+                )
+            )
+    for i, axis in enumerate(AXES):
+        expected.append(
+            Contributor(
+                *(ALIGNMENT, "bias", axis, 0.0, 0.1 * (i + 1), "gaussian", "ensemble", "caused by it"),
+                axis_correlation=tuple(correlation[i]),
+                conditions="noise of 12 frames of sky, reference attitude without error",
+                provenance="propagated with the posterior",
+                source="posterior",
+            )
+        )
+    found = [*posterior_rows(error, POST), *alignment_rows(error)]  # type: ignore[arg-type]
+    assert len(found) == len(expected) == 15
+    for one, other in zip(found, expected, strict=True):
+        for field in dataclasses.fields(Contributor):
+            value, wanted = getattr(one, field.name), getattr(other, field.name)
+            number = isinstance(wanted, (float, tuple))
+            assert value == (pytest.approx(wanted, rel=1e-9, nan_ok=True) if number else wanted), (one.name, field.name)
+    # Without covariances, or without a spread, axes are independent; without a hash none is named.
+    plain = dataclasses.replace(error, covariance_arcsec2=np.full((5, 3, 3), np.nan), nea_arcsec=np.zeros(3))
+    nameless = SimpleNamespace(**{**vars(POST), "provenance": {}, "draws": np.zeros((1, 6))})
+    first = posterior_rows(plain, nameless)[6]  # type: ignore[arg-type]
+    assert (first.axis_correlation, first.tail_997, first.sigma_arcsec) == ((), GAUSSIAN_997, 0.0)
+    assert first.provenance == "posterior of 1 draw"
+    assert misfit_notes(error) == (
+        f"The row {COMMON!r} is inflated: why one.",
+        f"The row {REST!r} is inflated: a; b.",
+    )
+    quiet = MisfitFound(1.0, np.zeros(3), np.zeros(3), notes=("more",))
+    assert len(misfit_notes(attitude(misfit=quiet))) == 2 and misfit_notes(attitude(misfit=quiet))[1] == "more"
+
+
+def test_a_budget_says_how_it_was_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "b.toml"
+    path.write_text(
+        '[budget]\ntitle = "T"\nconfidence = 0.99\n[frame.payload]\n'
+        "rotation = [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]\n"
+        + "".join(
+            f'[[contributor]]\nname = "{entry.name}"\naxis = "{axis}"\nsigma_arcsec = 0.5\nprovenance = "p"\n'
+            f'distribution = "gaussian"\nabsorbed_by_alignment = "{absorbed}"\n'
+            for entry, axis, absorbed in (
+                (FROM_FILE[0], "all", "in part"),
+                (FROM_FILE[1], "X", "in part"),
+                (FROM_FILE[3], "cross-boresight", "no"),
+            )
+        ),
+        encoding="utf-8",
+    )
+    found = made(path, n_samples=10_000, seed=5)
+    made_by = found.provenance
+    assert (made_by["seed"], made_by["data_sha256"]) == (5, "0123456789abcdef")
+    assert made_by["settings"] == {
+        "confidence": 0.99,
+        "n_samples": 10_000,
+        "file": str(path),
+        "alignment": "the frames themselves",
+        "frames": {"payload": [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]},
+    }
+    assert "frames" not in made(n_samples=10_000).provenance["settings"]
+    assert (found.title, found.confidence, made(n_samples=10_000).title) == ("T", 0.99, "Attitude error budget")
+    partly = {FROM_FILE[1].name: " (about Y (yaw) and Z (roll))", FROM_FILE[3].name: " (about Z (roll))"}
+    missing = [entry.name + partly.get(entry.name, "") for entry in (UNTESTED, *FROM_FILE[1:])]
+    assert found.notes == (
+        "After alignment: an alignment calibration on the frames themselves.",
+        "The model was not tested: the calibration rows hold if the model holds, and what they are with the misfit "
+        "found is not assessed (run `starcal-uq diagnose RUN`).",
+        f"Not assessed, and in no total: {', '.join(missing[:-1])} and {missing[-1]}. The totals say at least how "
+        "large the error is.",
+        f"Absorbed by alignment in part: {FROM_FILE[0].name} and {FROM_FILE[1].name}. It counts in full in bounds "
+        "after alignment, and not at all where these would violate a requirement.",
+    )
+    # A misfit that the attitude error holds is not found again.
+    tested = attitude(misfit=MisfitFound(1.0, np.zeros(3), np.zeros(3)))
+    twice = budget(POST, OBS, tested, misfit=object(), n_samples=10_000)  # type: ignore[arg-type]
+    assert UNTESTED.name not in {row.name for row in twice.rows}
+    with pytest.raises(BudgetError, match=r"n_samples is 9999, too few .* use at least 10000\."):
+        made(n_samples=9_999)
+    asked: list[tuple[str, float]] = []
+    monkeypatch.setattr("starcal_uq.budgeting.budget.check_memory", lambda *needed: asked.append(needed))
+    made(n_samples=10_000)
+    # Four scopes and kinds of three axes, in double precision.
+    assert asked == [("n_samples=10000", 8 * 12 * 10_000)]
+
+
+def test_rows_stated_on_one_axis_are_unknown_on_the_others() -> None:
+    """All that is known of the one is kept but what belongs to its number."""
+    stated = Contributor(
+        *("own", "other", "yaw", 1.0, 2.0, "uniform", "temporal", "in part", "heat", (0.1, 1.0, 0.2), 3.5, "hot", "by"),
+        source="file",
+        applies=False,
+    )
+    rows = [row for row in made(BudgetFile((stated,)), n_samples=10_000).rows if row.name == "own"]
+    expected = dataclasses.replace(
+        stated,
+        **{"mean_arcsec": math.nan, "sigma_arcsec": math.nan, "correlation_group": "", "axis_correlation": ()},
+        **{"conditions": "", "provenance": "", "source": "not assessed", "applies": True},
+    )
+    for row, axis in zip(rows, AXES, strict=True):
+        assert repr(row) == repr(stated if axis == "yaw" else dataclasses.replace(expected, axis=axis))
+    assert [row.inflated for row in rows] == [False] * 3
+    # What a row is where nothing is said.
+    assert repr(Contributor("a", "b", "c")) == (
+        "Contributor(name='a', ecss_class='b', axis='c', mean_arcsec=nan, sigma_arcsec=nan, distribution='gaussian', "
+        "interpretation='ensemble', absorbed_by_alignment='no', correlation_group='', axis_correlation=(), "
+        f"tail_997={GAUSSIAN_997}, conditions='', provenance='', source='not assessed', if_model_holds_arcsec=nan, "
+        "with_misfit_found_arcsec=nan, applies=True)"
+    )
+
+
+def test_json_is_all_that_the_tables_hold(stated: Path) -> None:
+    found = made(stated)
+    plain = found.to_dict()
+
+    def lines(entries: Any, *more: str) -> list[dict[str, Any]]:
+        names = [field.name for field in dataclasses.fields(entries[0])]
+        rows = [{name: getattr(entry, name) for name in (*names, *more)} for entry in entries]
+        return [
+            {key: None if isinstance(value, float) and math.isnan(value) else value for key, value in row.items()}
+            for row in rows
+        ]
+
+    assert plain["contributors"] == lines(found.rows, "assessed", "combination")
+    totals = lines(found.totals, "at_least")
+    assert plain["totals"] == [{**line, "not_assessed": "; ".join(line["not_assessed"])} for line in totals]
+    assert plain["requirements"] == [
+        {
+            **dataclasses.asdict(outcome.requirement),
+            "rule_arcsec": outcome.total.rule_arcsec,
+            "sampled_arcsec": outcome.total.sampled_arcsec,
+            "least_arcsec": outcome.least_arcsec,
+            "bound_arcsec": outcome.bound_arcsec,
+            "margin_arcsec": outcome.requirement.limit_arcsec - max(outcome.total.rule_arcsec, outcome.bound_arcsec),
+            "verdict": outcome.verdict,
+            "at_least": True,
+        }
+        for outcome in found.outcomes
+    ]
+    known = [line for line in plain["classes"] if line["sigma_arcsec"] is not None]
+    assert known and len(known) < len(plain["classes"]) == len(found.classes_dataframe())
+    for key in ("title", "confidence", "provenance"):
+        assert plain[key] == getattr(found, key)
+    assert plain["notes"] == list(found.notes) and plain["not_assessed"] == list(found.not_assessed)
+    assert len(plain) == 10
+
+
+def test_names_of_axes_and_limits_of_this_confidence(tmp_path: Path) -> None:
+    path = tmp_path / "limits.toml"
+    asked = [
+        'axis = "X"\n',
+        'axis = "X"\nconfidence = 0.9970000001\n',
+        'axis = "X"\nconfidence = 0.998\n',
+        'axis = "X"\ninterpretation = "temporal"\n',
+        'axis = "X"\nframe = "payload"\n',
+    ]
+    path.write_text(
+        "[frame.payload]\nrotation = [0, 0, 0, 1]\n"
+        + "".join(f'[[requirement]]\nname = "{n}"\nlimit_arcsec = 9.0\n{keys}' for n, keys in enumerate(asked)),
+        encoding="utf-8",
+    )
+    found = made(path, n_samples=10_000)
+    assert [outcome.requirement.name for outcome in found.comparable] == ["0"]
+    for axis in ("pitch", "x", " X ", "X (pitch)", "PITCH"):
+        assert found.total(axis) == found.totals[4 * 3] == found.total(axis, "after alignment", "mixed")
+    assert found.total("Z", "before alignment", "temporal") is found.totals[3 * 2 + 2]
+    with pytest.raises(BudgetError, match=r"is saved as \.csv"):
+        found.save(tmp_path / "budget.txt")
+    found.save(tmp_path / "budget.CSV")
+    text = (tmp_path / "budget.CSV").read_text(encoding="utf-8").splitlines()
+    names = [field.name for kind in (Contributor, Requirement, Total) for field in dataclasses.fields(kind)]
+    columns = ["record", *dict.fromkeys(names), "combination", "margin_arcsec", "verdict", "value"]
+    assert text[0] == ",".join(columns)
+    kinds = [line.split(",")[0] for line in text[1:]]
+    assert kinds == ["contributor"] * len(found.rows) + ["total"] * 24 + ["requirement"] * 5 + ["setting"] * 4
+    assert "\r" not in "".join(text)

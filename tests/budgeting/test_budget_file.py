@@ -137,7 +137,33 @@ BAD = {
     "other table": (ROW + "[limits]\na = 1\n", "limits is not known"),
     "confidence": ("[budget]\nconfidence = 99.7\n", "write 0.997 for 99.7 %"),
     "confidence of a few per cent": ("[budget]\nconfidence = 1.5\n", "write 0.015 for 1.5 %"),
-    "confidence 1": ("[budget]\nconfidence = 1\n", "lies between 0 and 1"),
+    "confidence 1": ("[budget]\nconfidence = 1\n", "is 1.0, but a confidence lies between 0 and 1, such as 0.997."),
+    "confidence of a hundred": (
+        "[budget]\nconfidence = 100\n",
+        "is 100.0, but a confidence lies between 0 and 1, such as 0.997.",
+    ),
+    "no confidence": ("[budget]\nconfidence = 0\n", "such as 0.997."),
+    "a turn and more": (
+        ROW.replace("0.2", "1296000.1"),
+        "is more than 1296000 arcsec, a full turn; correct the number.",
+    ),
+    "frame twice named": ("[frame.sensor]\nrotation = [0, 0, 0, 1]\n", "give yours another name"),
+    "frame without": ("[frame.a]\n", "key rotation is missing"),
+    "frame with more": ("[frame.a]\nrotation = [0, 0, 0, 1]\nunit = 1\n", "unit"),
+    "no list": ("requirement = 1\n", "must be written with two brackets, [[requirement]]"),
+    "second row": (
+        ROW + ROW.replace('"all"', '"w"').replace("star c", "noise of star c") + OWN,
+        "[[contributor]] 2 ('noise of",
+    ),
+    "own like none": (
+        ROW.replace("star catalogue", "xyz"),
+        "[[contributor]] 1 ('xyz'): The starter has no such name, and a contributor of your own must state ecss_class, "
+        "interpretation, absorbed_by_alignment as well.",
+    ),
+    "own that does not apply, but with a word for it": (
+        ROW.replace("star catalogue", "xyz").replace("sigma_arcsec = 0.2", "applies = 1"),
+        "write true or false",
+    ),
     "limit": (LIMIT.replace("10.0", "0"), "write a positive number of arcsec"),
     "no limit": (LIMIT.replace("limit_arcsec = 10.0", ""), "key limit_arcsec is missing"),
     "axis of a limit": (LIMIT.replace("cross-boresight", "all"), "key axis is 'all'"),
@@ -282,13 +308,18 @@ def test_frames_are_rotations_that_requirements_name(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.frames["payload"][0], [0.0, 0.0, 1.0], atol=1e-9)
     assert found.requirements[0].frame == "payload"
     # A quaternion of any length, and a matrix that was rounded to six digits.
-    for rotation in ("[0, 3, 0, 3]", "[[1, 0, 0], [0, 1.000004, 0], [0, 0, 1]]"):
+    for rotation in ("[0, 3, 0, 3]", "[0, 9e5, 0, 9e5]", "[[1, 0, 0], [0, 1.000004, 0], [0, 0, 1]]"):
         again = load_budget_file(written(tmp_path, f"[frame.payload]\nrotation = {rotation}\n")).frames["payload"]
         np.testing.assert_allclose(again @ again.T, np.eye(3), atol=1e-5)
     for rotation, words in (
         ("[[1, 0, 0], [0, 1, 0], [0, 0, -1]]", "mirrors"),
         ("[[1, 0, 0], [0, 1.0000075, 0], [0, 0, 1]]", "is no rotation"),
         ('"north"', "is no rotation"),
+        ("[0, 1.1e6, 0, 1.1e6]", "is no rotation"),
+        ("[0, 0, 0, 0]", "is no rotation"),
+        ("[[1, 0], [0, 1]]", "is no rotation"),
+        ("[]", "is no rotation"),
+        ("[nan, 0, 0, 1]", "is no rotation"),
     ):
         with pytest.raises(BudgetError, match=words):
             load_budget_file(written(tmp_path, f"[frame.payload]\nrotation = {rotation}\n"))
@@ -296,3 +327,29 @@ def test_frames_are_rotations_that_requirements_name(tmp_path: Path) -> None:
         load_budget_file(written(tmp_path, LIMIT + 'frame = "payload"\n'))
     with pytest.raises(BudgetError, match="needs a name"):
         load_budget_file(written(tmp_path, "[frame]\nrotation = 1\n"))
+
+
+def test_an_entry_of_the_starter_to_the_letter() -> None:
+    """All axes, or one by one those that are open."""
+
+    def entry(*axes: str) -> str:
+        words = [
+            "Thermo-elastic distortion: motion of boresight against mounting reference with temperature and its "
+            "gradients over",
+            "orbit and season.",
+        ]
+        keys = [
+            *("half_width_arcsec =", 'distribution = "arcsine"', 'ecss_class = "thermo-elastic"'),
+            *('interpretation = "temporal"', 'absorbed_by_alignment = "no"', 'conditions = ""', 'provenance = ""'),
+        ]
+        blocks = [["[[contributor]]", 'name = "thermo-elastic distortion"', f'axis = "{a}"', *keys] for a in axes]
+        return "#\n".join("".join(f"# {line}\n" for line in block) for block in (words, *blocks))
+
+    rows = [not_assessed(each, axis) for each in FROM_FILE for axis in AXES]
+    text = template_text(rows)
+    assert text == template_text()
+    assert f"\n\n{entry('cross-boresight', 'Z')}\n# Drift of focal length and distortion: " in text
+    assert "\n# sigma_arcsec =\n" in text.split("# Drift of")[1].split("# Chromatic")[0]
+    for known, open_ones in (("roll", "XY"), ("pitch", "YZ"), ("yaw", "XZ")):
+        some = [Contributor(r.name, "other", r.axis, source="file") if r.axis == known else r for r in rows]
+        assert f"\n\n{entry(*open_ones)}\n" in template_text(some)
