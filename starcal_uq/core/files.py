@@ -99,12 +99,8 @@ def atomic_path(path: PathLike, *, durable: bool = True) -> Iterator[Path]:
     """Yield a temporary path beside `path`, and rename it to `path` if the block succeeds; if not, `path` is as it was.
 
     The temporary name keeps the ending, because many writers choose the format by it. What is `durable` is on the disk
-    before it is renamed, so that a loss of power, too, leaves the old file or the new one.
-
-    Raises
-    ------
-    RunFolderError
-        If the folder is missing, `path` is a directory or a device, or the system refuses the write.
+    before it is renamed, so that a loss of power, too, leaves the old file or the new one. RunFolderError if the folder
+    is missing, `path` is a directory or a device, or the system refuses the write.
     """
     # A link is followed: replacing it by a file would silently detach the place it points to.
     target = Path(os.path.realpath(path))
@@ -149,12 +145,7 @@ _LATER: ContextVar[list[Path] | None] = ContextVar("_LATER", default=None)
 def flushed_together() -> Iterator[None]:
     """What this block writes by `atomic_path` is on the disk when it ends: flushed all at once, the disk waits once.
 
-    For files that count only afterwards.
-
-    Raises
-    ------
-    RunFolderError
-        If the system refuses it.
+    For files that count only afterwards. RunFolderError if the system refuses it.
     """
     from concurrent.futures import ThreadPoolExecutor
 

@@ -52,20 +52,12 @@ def run_tasks(
 ) -> tuple[list[T], bool]:
     """Run task 0 .. n_tasks - 1; the results in order, and whether Ctrl-C was pressed before all were complete.
 
-    Parameters
-    ----------
-    task : callable
-        From the number of a task to its result, which depends on the number alone; sent once to every process.
-    caller : str
-        Function that users call, for messages.
-    chunk : int
-        Tasks sent to a process at once: about a second's work, which is also what Ctrl-C waits for.
-    workers : int, optional
-        Processes; 0 stays in this one, None takes as many as there are processors.
-    each : callable, optional
-        Called with every result as it arrives, in this process; what it keeps survives whatever comes later.
-    kept : Kept, optional
-        Results of an earlier call, which are not computed again, and to which each new one is added.
+    `task`: from the number of a task to its result, which depends on the number alone; sent once to every process.
+    `caller`: function that users call, for messages.
+    `chunk`: tasks sent to a process at once: about a second's work, which is also what Ctrl-C waits for.
+    `workers`: processes; 0 stays in this one, None takes as many as there are processors.
+    `each`: called with every result as it arrives, in this process; what it keeps survives whatever comes later.
+    `kept`: results of an earlier call, which are not computed again, and to which each new one is added.
     """
     known: dict[int, T] = {} if kept is None else kept.results(n_tasks)
     results: Numbered[T] = list(known.items())

@@ -137,16 +137,7 @@ def air_test(obs: Observations, cal: Calibration, *, seed: int = 0, rest: Remain
 class Remainder:
     """Residuals of some frames, and of what displaces stars that part which attitudes and parameters cannot take up.
 
-    Attributes
-    ----------
-    obs : Observations
-        The frames.
-    residuals : (2 N,) array
-        Whitened residuals, x of all stars before y.
-    dof : int
-        Their degrees of freedom.
-    sigma : float
-        Their scatter.
+    `residuals` (2 N,) are whitened, x of all stars before y, with `dof` degrees of freedom and scatter `sigma`.
     """
 
     def __init__(self, obs: Observations, cal: Calibration, seed: int) -> None:

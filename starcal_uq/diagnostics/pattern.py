@@ -113,17 +113,12 @@ def response(
 ) -> Response:
     """What a pattern does to attitudes.
 
-    Parameters
-    ----------
-    pattern : Pattern
-        The pattern, at least of one family.
-    theta : sequence of float
-        Estimate of the camera that it was found beside, px units.
-    post, obs : Posterior, Observations
-        Posterior and data of the calibration.
-    seen, aligned : Observations
-        Frames of the mission, and those of its alignment, which decide what is common; `seen` if they are not given.
-        Where frames have no time, temperature or magnitudes, they get those of the calibration's frames and stars.
+    `pattern`: the pattern, at least of one family.
+    `theta`: estimate of the camera that it was found beside, px units.
+    `post`, `obs`: posterior and data of the calibration.
+    `seen`, `aligned`: frames of the mission, and those of its alignment, which decide what is common; `seen` if they
+        are not given. Where frames have no time, temperature or magnitudes, they get those of the calibration's frames
+        and stars.
     """
     camera = post.camera.with_theta(np.asarray(theta, dtype=np.float64))
     here = _Turned.of(pattern, camera, post, obs, seen)

@@ -72,17 +72,9 @@ def shapes(
 ) -> tuple[Shape, ...]:
     """Every family of shapes that the table allows; magnitude, time and temperature are used where they vary.
 
-    Parameters
-    ----------
-    obs : Observations
-        The table.
-    camera : Camera
-        The calibrated camera.
-    max_cells : int
-        Largest number of field cells along the longer side.
-    seen : Observations, optional
-        Other frames that the same shapes are wanted on. What these do not state is drawn from the table: the time of a
-        frame and its temperature together, the magnitude of a star by itself.
+    `max_cells`: largest number of field cells along the longer side.
+    `seen`: other frames that the same shapes are wanted on. What these do not state is drawn from the table: the time
+        of a frame and its temperature together, the magnitude of a star by itself.
     """
     seen = obs if seen is None else seen
     found = [*_missing_terms(camera), _axes(camera), _aberration()]

@@ -57,12 +57,8 @@ def assemble(
     """Everything that a calibration tells about the end of its last stage.
 
     The last of `stages` ends in the estimate; one named ``refinement`` is the maximum of `likelihood`. Without it, the
-    covariance of the result is `pair_covariance`, that of the estimate from interstar angles.
-
-    Raises
-    ------
-    CalibrationError
-        When there is no estimate that residuals could be taken at.
+    covariance of the result is `pair_covariance`, that of the estimate from interstar angles. CalibrationError when
+    there is no estimate that residuals could be taken at.
     """
     theta = stages[-1].theta
     refined = stages[-1].name == "refinement"
@@ -146,10 +142,8 @@ def failed(likelihood: MarginalLikelihood, theta: FloatArray, nominal: Camera, s
 def with_star_errors(obs: Observations, cal: Calibration) -> Calibration:
     """The calibration with errors that stars bring along estimated and marginalised, and the estimate that they weight.
 
-    Raises
-    ------
-    CalibrationError
-        When no star is seen twice and none states its error, or for more stars and frames than fit into memory.
+    CalibrationError when no star is seen twice and none states its error, or for more stars and frames than fit into
+    memory.
     """
     began = perf_counter()
     likelihood = MarginalLikelihood(obs, cal.camera.distortion)

@@ -332,10 +332,7 @@ class Fit:
 def fit(obs: Observations, camera: Camera, *, method: str = "efficient") -> Fit:
     """Go through the stages of `calibrate` without covariances, compression and whatever else a result holds.
 
-    Raises
-    ------
-    CalibrationError
-        As for `calibrate`, whose ``efficient`` and ``three_stage`` are the methods.
+    CalibrationError as for `calibrate`, whose ``efficient`` and ``three_stage`` are the methods.
     """
     likelihood = MarginalLikelihood(obs, camera.distortion)
     check_count(likelihood, camera)
@@ -348,10 +345,7 @@ def fit(obs: Observations, camera: Camera, *, method: str = "efficient") -> Fit:
 def refit(obs: Observations, cal: Calibration, model: str) -> Fit:
     """Another distortion model on the same stars, from the optics and attitudes of a calibration.
 
-    Raises
-    ------
-    CalibrationError
-        When neither they nor the nominal camera lead to an estimate.
+    CalibrationError when neither they nor the nominal camera lead to an estimate.
     """
     likelihood = MarginalLikelihood(obs, model)
     start = cal.nominal.replace(distortion=model, coefficients=(0.0,) * len(get_model(model).coefficients))

@@ -115,14 +115,8 @@ def frame_ranges(frames: IntArray) -> str:
 def frame_focals(obs: Observations, camera: Camera, *, seed: int = 0) -> FrameFocals:
     """Estimate the focal length of every frame by itself, and look for groups among them.
 
-    Parameters
-    ----------
-    obs : Observations
-        Identified stars.
-    camera : Camera
-        Principal point and distortion, and the focal length to start from.
-    seed : int
-        Seed of the draws that the split is held against.
+    `camera`: principal point and distortion, and the focal length to start from.
+    `seed`: seed of the draws that the split is held against.
     """
     enough = np.flatnonzero(obs.stars_per_frame >= _LEAST_STARS)
     chosen = enough[one_of_each(len(enough), _FRAMES, seed)]

@@ -114,12 +114,8 @@ def pair_likelihood(
 
     `chi2` is the sum of squared (whitened) pixel residuals at an estimate with its best attitudes, and `residual_dof`
     its ``sum_k (2 m_k - 3) - p``. Without `adjusted`, pairs are treated as independent, which is wrong. V is found as
-    `variability` says; ``auto`` takes the scatter of the frames from 50 frames per parameter on.
-
-    Raises
-    ------
-    SamplingError
-        When theta_hat is not a minimum of the objective.
+    `variability` says; ``auto`` takes the scatter of the frames from 50 frames per parameter on. SamplingError when
+    theta_hat is not a minimum of the objective.
     """
     objective = PairObjective(frames, model_name)
     theta_hat = np.array(theta_hat, dtype=np.float64)

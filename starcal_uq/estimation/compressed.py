@@ -272,20 +272,10 @@ def gram_sums(
 ) -> GramSums:
     """What a part of the frames adds to the compressed likelihood around theta (p,), in one pass.
 
-    Parameters
-    ----------
-    frames : StarFrames
-        The part.
-    model_name : str
-        Distortion model.
-    theta : (p,) array
-        Point of expansion, px units; the same for all parts.
-    whitening : (p, p) array
-        L in ``theta = theta_hat + L z``, lower triangular; the same for all parts.
-    rotations : (K, 3, 3) array
-        Attitudes to start from.
-    known : tuple of NormalSums and Attitudes, optional
-        Sums at theta with settled attitudes, where there are any; the compiled path need not make them again.
+    `theta` (p,): point of expansion, px units; the same for all parts.
+    `whitening` (p, p): L in ``theta = theta_hat + L z``, lower triangular; the same for all parts.
+    `rotations` (K, 3, 3): attitudes to start from.
+    `known`: sums at theta with settled attitudes, where there are any; the compiled path need not make them again.
     """
     theta = np.asarray(theta, dtype=np.float64)
     if kernels(model_name, frames.n_stars) == "numba":
@@ -329,20 +319,13 @@ def compress(
 ) -> CompressedLikelihood:
     """Compress a likelihood around an estimate.
 
-    Parameters
-    ----------
-    likelihood : MarginalLikelihood
-        Exact likelihood of the data.
-    theta_hat : (p,) array
-        Point of expansion, px units.
-    covariance : (p, p) array
-        Covariance there; sets the whitened coordinates.
-    rotations : (K, 3, 3) array, optional
-        Attitudes to start from; otherwise those where the likelihood's own searches start, or QUEST's.
-    stars : StarSums, optional
-        Stars that bring errors along, nothing added yet.
-    ratio : (2 S,) array, optional
-        Variances of their errors, in units of sigma^2.
+    `likelihood`: exact likelihood of the data.
+    `theta_hat` (p,): point of expansion, px units.
+    `covariance` (p, p): covariance there; sets the whitened coordinates.
+    `rotations` (K, 3, 3): attitudes to start from; otherwise those where the likelihood's own searches start, or
+        QUEST's.
+    `stars`: stars that bring errors along, nothing added yet.
+    `ratio` (2 S,): variances of their errors, in units of sigma^2.
     """
     whitening, theta = scaled_cholesky(covariance), np.asarray(theta_hat, dtype=np.float64)
     frames, model_name = likelihood.frames, likelihood.model_name
@@ -376,15 +359,7 @@ _GAIN = 1e-12
 
 
 def monomial_map(offset: FloatArray, matrix: FloatArray) -> FloatArray:
-    """T (q, q) with ``m(c + A z) = T m(z)`` for the monomials 1, z_a, z_a z_b (a <= b).
-
-    Parameters
-    ----------
-    offset : (p,) array
-        c.
-    matrix : (p, p) array
-        A.
-    """
+    """T (q, q) with ``m(c + A z) = T m(z)`` for the monomials 1, z_a, z_a z_b (a <= b); `offset` is c, `matrix` A."""
     p = len(offset)
     rows, columns = _pairs(p)
     q = 1 + p + len(rows)
@@ -402,14 +377,8 @@ def monomial_map(offset: FloatArray, matrix: FloatArray) -> FloatArray:
 def moved(compressed: CompressedLikelihood, theta_hat: FloatArray, whitening: FloatArray) -> CompressedLikelihood:
     """The same function of theta, expanded around another point in other whitened coordinates.
 
-    Parameters
-    ----------
-    compressed : CompressedLikelihood
-        Any expansion.
-    theta_hat : (p,) array
-        New point of expansion, px units.
-    whitening : (p, p) array
-        New L in ``theta = theta_hat + L z``.
+    `theta_hat` (p,): new point of expansion, px units.
+    `whitening` (p, p): new L in ``theta = theta_hat + L z``.
     """
     offset = compressed.whiten(theta_hat)[0]
     # Rows of the factors differ by twenty powers of ten.
@@ -500,10 +469,7 @@ class Optimum:
 def optimum(compressed: CompressedLikelihood) -> Optimum:
     """Minimise the sum of squares by Newton's method, expanding anew at every step.
 
-    Raises
-    ------
-    CalibrationError
-        When there is no minimum near the point of expansion.
+    CalibrationError when there is no minimum near the point of expansion.
     """
     here, p = compressed, len(compressed.theta_hat)
     dof = compressed.dof - p

@@ -37,23 +37,12 @@ def fit_determined(
 ) -> Calibration:
     """The calibration by `fit` with the model of a camera, or with the richest simpler one that the data determine.
 
-    Parameters
-    ----------
-    obs : Observations
-        The data.
-    camera : Camera
-        Nominal, with the model wanted.
-    fit : callable
-        Nominal camera to calibration; it may raise `CalibrationError`.
-    asked : bool
-        Whether the model was asked for by name: then it is that or, with `throw`, an error naming one that converges.
-    throw : bool
-        Whether a calibration that did not end well is of no use.
-
-    Raises
-    ------
-    CalibrationError
-        As `fit`, where no simpler model is to be had.
+    `camera`: nominal, with the model wanted.
+    `fit`: nominal camera to calibration; it may raise `CalibrationError`.
+    `asked`: whether the model was asked for by name: then it is that or, with `throw`, an error naming one that
+        converges.
+    `throw`: whether a calibration that did not end well is of no use.
+    CalibrationError as `fit`, where no simpler model is to be had.
     """
     failure, found = None, None
     try:

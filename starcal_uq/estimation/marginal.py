@@ -53,15 +53,7 @@ class Profile:
 
 
 class MarginalLikelihood:
-    """Exact attitude-marginalised likelihood of a table of observations.
-
-    Parameters
-    ----------
-    obs : Observations or StarFrames
-        Data.
-    model_name : str
-        Distortion model.
-    """
+    """Exact attitude-marginalised likelihood of a table of observations."""
 
     def __init__(self, obs: Observations | StarFrames, model_name: str) -> None:
         self.frames = obs if isinstance(obs, StarFrames) else StarFrames.from_observations(obs)

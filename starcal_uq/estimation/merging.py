@@ -462,14 +462,8 @@ def welch_james(square: float, information: FloatArray, dof: FloatArray) -> tupl
     same mean and variance; for one parameter this is the test of Welch (1951), and for p > 1 it is to unknown scalars
     what James (1954) and Johansen (1980) are to unknown matrices.
 
-    Parameters
-    ----------
-    square : float
-        The statistic.
-    information : (R, p, p) array
-        Information of each estimate at its own noise.
-    dof : (R,) array
-        Degrees of freedom of each noise.
+    `information` (R, p, p): information of each estimate at its own noise.
+    `dof` (R,): degrees of freedom of each noise.
     """
     from scipy.special import fdtrc
 

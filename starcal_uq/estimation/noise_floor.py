@@ -59,12 +59,7 @@ def noise_floor(cal: Calibration, obs: Observations, stated_px: FloatArray | Non
     """The noise that the residuals of a calibration have beyond what its observations state.
 
     `sigma_px` in every row are the weights of the calibration; `stated_px` (N,) is what the stars state, px, where a
-    floor is in `sigma_px` already.
-
-    Raises
-    ------
-    CalibrationError
-        When the observations state no noise.
+    floor is in `sigma_px` already. CalibrationError when the observations state no noise.
     """
     from scipy.special import erfc
 

@@ -173,12 +173,7 @@ def weighed(obs: Observations | PartitionedObservations, result: Any) -> Observa
 
     The data and their hash stay what they are, but for repeated frames that a calibration left out. Without a model,
     weights of another result's are what the table states. Of partitioned observations it is the sample of frames that
-    their calibration has kept.
-
-    Raises
-    ------
-    CalibrationError
-        When partitioned observations are not those of the result.
+    their calibration has kept. CalibrationError when partitioned observations are not those of the result.
     """
     if isinstance(obs, PartitionedObservations):
         return _sample_of(obs, result)
@@ -216,12 +211,7 @@ def _columns(terms: tuple[str, ...], radius: FloatArray, mag: FloatArray) -> Flo
 def star_squares(likelihood: MarginalLikelihood, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Squared whitened residuals (N,) of the stars, two axes, and their expectation 2 - h (N,) where weights are right.
 
-    Parameters
-    ----------
-    likelihood : MarginalLikelihood
-        Data with their weights.
-    theta : (p,) array
-        Estimate, px units.
+    `theta` (p,): estimate, px units.
     """
     state, _ = likelihood.profile(theta)
     h = likelihood.project_out(state, likelihood.derivatives(theta, state))
@@ -238,21 +228,9 @@ def fit_noise(
 ) -> tuple[NoiseModel, FloatArray]:
     """Fit the noise model around an estimate, weights and estimate in turn until they settle.
 
-    Parameters
-    ----------
-    obs : Observations
-        Identified stars; a noise that they state is multiplied.
-    camera : Camera
-        Estimate.
-    rounds : int
-        Largest number of fits; with 1 the estimate stays where it is.
-    max_iterations : int
-        Limit of each refinement.
-
-    Returns
-    -------
-    (NoiseModel, (p,) array)
-        The model, and the estimate with its weights.
+    `obs`: identified stars; a noise that they state is multiplied.
+    `rounds`: largest number of fits; with 1 the estimate stays where it is.
+    Returns the model, and the estimate (p,) with its weights.
     """
     obs, theta = obs.unweighted, camera.theta
     plain = StarFrames.from_observations(obs)
@@ -281,16 +259,8 @@ def fit_noise(
 def sigma_ratios(obs: Observations, camera: Camera, model: NoiseModel, sigma: float) -> FloatArray:
     """Real over stated standard deviations (p,) of an estimate with one noise, if the noise is that of a model.
 
-    Parameters
-    ----------
-    obs : Observations
-        Identified stars, with the weights of the estimate.
-    camera : Camera
-        Estimate.
-    model : NoiseModel
-        Noise of the stars.
-    sigma : float
-        Noise of the estimate, px or a factor on what the stars state.
+    `obs`: identified stars, with the weights of the estimate.
+    `sigma`: noise of the estimate, px or a factor on what the stars state.
     """
     likelihood = MarginalLikelihood(obs, camera.distortion)
     state, _ = likelihood.profile(camera.theta)

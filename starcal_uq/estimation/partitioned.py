@@ -197,31 +197,12 @@ def calibrate_partitions(
 ) -> Calibration:
     """Refine a calibration of a sample of frames on all partitions.
 
-    Parameters
-    ----------
-    obs : PartitionedObservations
-        Data.
-    sample : Observations
-        Sample of their frames.
-    start : Calibration
-        Calibration of the sample by the ``efficient`` method; its estimate from interstar angles stays.
-    cluster : Cluster
-        Processes that read the partitions.
-    max_iterations : int
-        Limit of the refinement.
-    duplicates : {"refuse", "keep"}
-        What to do with frames that hold the same pixels as another.
-    progress : callable, optional
-        Called with (partitions done, partitions) in every pass.
-
-    Raises
-    ------
-    CalibrationError
-        When there is no estimate.
-    RepeatedFramesError
-        When frames hold the same pixels and are refused.
-    ObservationError
-        For bad rows, with the file.
+    `start`: calibration of the sample by the ``efficient`` method; its estimate from interstar angles stays.
+    `cluster`: processes that read the partitions.
+    `duplicates`: what to do with frames that hold the same pixels as another.
+    `progress`: called with (partitions done, partitions) in every pass.
+    CalibrationError when there is no estimate. RepeatedFramesError when frames hold the same pixels and are refused.
+    ObservationError for bad rows, with the file.
     """
     reader, model, began = obs.reader, start.camera.distortion, perf_counter()
     # Chosen here once: what one process has compiled in the meantime must not change the digits of another.

@@ -101,12 +101,8 @@ def _in_threes(frames: StarFrames, kept: BoolArray) -> BoolArray:
 def robust_start(frames: StarFrames, model_name: str, theta: FloatArray, fit: FitStages) -> RobustStart:
     """Alternate between the paper's stages and leaving out stars that do not fit their frame.
 
-    ``fit(frames, all_parameters)`` gives the stages of Ye & Yang 2017, the first one only, or all.
-
-    Raises
-    ------
-    CalibrationError
-        When most stars fit neither their frame nor each other.
+    ``fit(frames, all_parameters)`` gives the stages of Ye & Yang 2017, the first one only, or all. CalibrationError
+    when most stars fit neither their frame nor each other.
     """
     trusted = np.zeros(frames.n_stars, dtype=np.bool_)
     # Coefficients start from zero, as in the paper: a nominal distortion is a guess.

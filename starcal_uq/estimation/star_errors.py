@@ -47,13 +47,7 @@ _LOG_RATIO = (-14.0, 9.0)
 
 
 def star_numbers(obs: Observations, focal_px: float) -> IntArray:
-    """Number the stars of a table by direction, or by name where all stars have one.
-
-    Returns
-    -------
-    (N,) array of int
-        The same number for images of the same star, from 0.
-    """
+    """Star of every image (N,), numbered from 0 by direction, or by name where all stars have one."""
     names = obs.star_id
     named = names is not None and bool(np.all(names != ""))
     tolerance = max(_SAME_NAME_PX / focal_px, _SAME_NAME_RAD) if named else _SAME_PX / focal_px
@@ -138,16 +132,9 @@ def _blocks(blocks: FloatArray) -> Any:
 class StarSums:
     """Sums over all images from which products with the covariance of star errors follow.
 
-    Parameters
-    ----------
-    numbers : (N,) array of int
-        Star of every image, from 0.
-    directions : (3, N) array
-        Catalogue directions.
-    focal_px : float
-        Focal length, px.
-    rigid : bool
-        Take the turn of the columns alone, of size one: shifts are then in units of the noise.
+    `numbers` (N,): star of every image, from 0.
+    `directions` (3, N): catalogue directions.
+    `rigid`: take the turn of the columns alone, of size one: shifts are then in units of the noise.
     """
 
     def __init__(self, numbers: IntArray, directions: FloatArray, focal_px: float, rigid: bool = False) -> None:
@@ -310,12 +297,7 @@ class StarErrors:
 class StarModel:
     """The stars of a table and the variances of their direction errors.
 
-    Parameters
-    ----------
-    obs : Observations
-        Stars; their stated direction errors are taken, where there are any.
-    focal_px : float
-        Focal length, px.
+    `obs`: stars; their stated direction errors are taken, where there are any.
     """
 
     def __init__(self, obs: Observations, focal_px: float) -> None:
@@ -346,16 +328,9 @@ class StarModel:
     ) -> tuple[StarErrors, float, FloatArray]:
         """Estimate tau by restricted maximum likelihood, linearised at theta (p,); `scale` (p,) makes parameters alike.
 
-        Attitudes, parameters and sigma are integrated or profiled out; `sigma` is a first value.
-
-        Returns
-        -------
-        errors : StarErrors
-            Size of the errors.
-        sigma : float
-            Noise of the images themselves.
-        spread : (p, p) array
-            What the errors add to the covariance of the estimate that takes images as independent, px units.
+        Attitudes, parameters and sigma are integrated or profiled out; `sigma` is a first value. Returns the errors,
+        the noise of the images themselves, and what the errors add to the covariance (p, p) of the estimate that takes
+        images as independent, px units.
         """
         from scipy.optimize import minimize_scalar
 
@@ -440,20 +415,9 @@ class StarLikelihood(MarginalLikelihood):
     they and the attitudes leave is that of these residuals. Beyond the attitudes' volume, determinants do not depend on
     theta enough to matter (1e-3 nat).
 
-    Parameters
-    ----------
-    obs : Observations
-        Data.
-    model_name : str
-        Distortion model.
-    theta : (p,) array
-        Estimate, px units.
-    rotations : (K, 3, 3) array
-        Attitudes there.
-    errors : StarErrors
-        Errors of the stars.
-    sigma : float
-        Noise that they are relative to.
+    `theta` (p,): estimate, px units.
+    `rotations` (K, 3, 3): attitudes there.
+    `sigma`: noise that they are relative to.
     """
 
     def __init__(

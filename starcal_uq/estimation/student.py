@@ -48,13 +48,7 @@ _STARS_AT_ONCE = 8192
 
 
 def parse_dof(dof: float | str | None, error: type[StarcalError]) -> float | None:
-    """The degrees of freedom of a setting: None for "free", `DEFAULT_DOF` for None.
-
-    Raises
-    ------
-    error
-        For anything but "free" or a number in `DOF_RANGE`.
-    """
+    """The degrees of freedom of a setting: None for "free", `DEFAULT_DOF` for None, else a number in `DOF_RANGE`."""
     low, high = DOF_RANGE
     if dof is None:
         return DEFAULT_DOF
@@ -94,18 +88,9 @@ class StudentState:
 class StudentLikelihood:
     """Exact log likelihood of a table of observations.
 
-    Parameters
-    ----------
-    frames : StarFrames
-        Data.
-    model_name : str
-        Distortion model.
-    theta : (p,) array
-        Parameters near to the ones to evaluate, px units; they say how wide the field is.
-    rotations : (K, 3, 3) array
-        Attitudes to start from: good to a fraction of a degree, and not led astray by wrong stars.
-    usable : (N,) array of bool, optional
-        Stars of frames that have an attitude; all by default.
+    `theta` (p,): parameters near to the ones to evaluate, px units; they say how wide the field is.
+    `rotations` (K, 3, 3): attitudes to start from: good to a fraction of a degree, and not led astray by wrong stars.
+    `usable` (N,): stars of frames that have an attitude; all by default.
     """
 
     def __init__(

@@ -36,17 +36,11 @@ EXPLAINED = (
 def open_parameters(matrix: FloatArray, noise: float, camera: Camera, limit: float = _OPEN) -> tuple[str, ...]:
     """Names of the parameters of all directions that data leave open.
 
-    Parameters
-    ----------
-    matrix : (p, p) array
-        Gauss-Newton matrix of the marginal likelihood, px units.
-    noise : float
-        Noise per axis, px, or the factor on the stated noise.
-    camera : Camera
-        Its detector, focal length and model say how large each parameter can be at most: half the detector, the focal
-        length, a displacement of the corner as large as its distance.
-    limit : float
-        Standard deviation, as a fraction of that, from which on a direction is open.
+    `matrix` (p, p): Gauss-Newton matrix of the marginal likelihood, px units.
+    `noise`: noise per axis, px, or the factor on the stated noise.
+    `camera`: its detector, focal length and model say how large each parameter can be at most: half the detector, the
+        focal length, a displacement of the corner as large as its distance.
+    `limit`: standard deviation, as a fraction of that, from which on a direction is open.
     """
     natural = _natural(camera)
     scaled = matrix * np.outer(natural, natural) / noise**2

@@ -82,13 +82,9 @@ def mcse_mean(values: FloatArray) -> float:
 def psis(log_weights: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Pareto-smoothed importance sampling (Vehtari et al. 2024) of rows of the log of target over proposal (..., n).
 
-    Returns
-    -------
-    log_weights : array (..., n)
-        Smoothed, normalised so that the weights of a row sum to one.
-    khat : array (...)
-        Shape of the fitted Pareto tail; below 0.7 the weights can be trusted. 0 where the largest weights are all
-        equal, which leaves no tail to fit.
+    Returns the smoothed logarithms, normalised so that the weights of a row sum to one, and the shape of the fitted
+    Pareto tail (...), below 0.7 of which the weights can be trusted: 0 where the largest weights are all equal, which
+    leaves no tail to fit.
     """
     values = np.array(log_weights, dtype=float)
     n = values.shape[-1]

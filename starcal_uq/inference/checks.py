@@ -99,18 +99,10 @@ def check_compression(
     `_SAMPLE_ERRORS` standard errors on top. That the compressed likelihood holds all frames, as `exact` does, is then
     seen at two points on the surface that no direction is missing in.
 
-    Parameters
-    ----------
-    compressed, exact : callable
-        The log likelihoods.
-    target : Target
-        Its origin is the mode.
-    draws : array (n, p+1) or, where one parameter is added, (n, p+2)
-        Posterior draws.
-    laplace : Laplace
-        Measure of the distance from the mode.
-    sample : FrameSample, optional
-        Where there are too many frames for `exact`.
+    `target`: its origin is the mode.
+    `draws` (n, p+1): posterior draws, (n, p+2) where one parameter is added.
+    `laplace`: measure of the distance from the mode.
+    `sample`: where there are too many frames for `exact`.
     """
     from starcal_uq.inference.arviz import psis
 

@@ -90,12 +90,8 @@ def run_ensembles(
 
     `density` takes whitened points (n, dim). The checkpoint is rewritten while sampling and read at the start; a
     resumed run gives the same draws, bit for bit, as one that was not interrupted. It is left in place, and passed over
-    where the `fingerprint` of data and settings is another. `moves` stand in for those of the settings.
-
-    Raises
-    ------
-    SamplingError
-        If a start is not finite.
+    where the `fingerprint` of data and settings is another. `moves` stand in for those of the settings. SamplingError
+    if a start is not finite.
     """
     import emcee
 

@@ -56,19 +56,8 @@ class ExactMarginal:
 class FrameSample:
     """What the compressed likelihood of a calibration leaves out, told by a sample of its frames.
 
-    Parameters
-    ----------
-    obs : Observations
-        The frames, of which a sample is taken where they are many.
-    cal : Calibration
-        Estimate and expansion.
-    of_frames : int, optional
-        Number of frames that they stand for; their own by default.
-
-    Attributes
-    ----------
-    n_frames, of_frames : int
-        Frames of the sample, and those that it stands for.
+    A sample of `n_frames` is taken of `obs` where its frames are many; they stand for `of_frames`, by default those of
+    `obs`.
     """
 
     def __init__(self, obs: Observations, cal: Calibration, of_frames: int | None = None) -> None:

@@ -110,12 +110,7 @@ def start_target(
     """A target whitened by Fisher information plus prior precision at an estimate.
 
     `information` (p, p) is that of the data at `sigma`; a Gaussian likelihood of `dof` independent residuals has the
-    curvature ``2 dof`` in log sigma.
-
-    Raises
-    ------
-    SamplingError
-        If information and prior together do not determine every parameter.
+    curvature ``2 dof`` in log sigma. SamplingError if information and prior together do not determine every parameter.
     """
     p = len(theta)
     d = p + (not sigma_given) + (extra is not None)
@@ -142,12 +137,8 @@ def start_target(
 def laplace_approximation(start: Target) -> tuple[Target, Laplace]:
     """Newton's method to the mode, re-whitened with the Hessian at every step.
 
-    The target that comes back has its origin at the mode and unit curvature there.
-
-    Raises
-    ------
-    SamplingError
-        If the density is not finite around the start.
+    The target that comes back has its origin at the mode and unit curvature there. SamplingError if the density is not
+    finite around the start.
     """
     target, converged, steps = start, False, 0
     while not converged and steps < _NEWTON_STEPS:

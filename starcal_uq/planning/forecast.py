@@ -174,20 +174,10 @@ def spreads(forms: FloatArray, covariances: FloatArray) -> FloatArray:
 class Forecaster:
     """Forecasts for one set of frames, one mission and one target.
 
-    Parameters
-    ----------
-    information : (M, p, p) array
-        Information of each frame that a campaign may take.
-    n_stars : float
-        Stars per frame on average.
-    mission : FrameSet
-        Frames whose attitudes count.
-    confidence, scope : float, str
-        Probability of the two-axis radius, and one of `SCOPES`.
-    start, start_dof : (p, p) array, float
-        Information that is there already, and the degrees of freedom of those data.
-    n_campaigns : int
-        Campaigns to average over.
+    `information` (M, p, p): information of each frame that a campaign may take.
+    `n_stars`: stars per frame on average.
+    `confidence`, `scope`: probability of the two-axis radius, and one of `SCOPES`.
+    `start` (p, p), `start_dof`: information that is there already, and the degrees of freedom of those data.
     """
 
     def __init__(

@@ -173,12 +173,8 @@ _TRUTH_COLUMNS = {
 def write_frame(frame: RenderedFrame, path: str | os.PathLike[str], force: bool = False) -> None:
     """Write a rendered frame and its truth as FITS; the same frame gives the same bytes.
 
-    Quantised counts become 16-bit integers (``BZERO`` = 32768), others 64-bit floats.
-
-    Raises
-    ------
-    RunFolderError
-        If the file exists and `force` is false, or cannot be written.
+    Quantised counts become 16-bit integers (``BZERO`` = 32768), others 64-bit floats. RunFolderError if the file exists
+    and `force` is false, or cannot be written.
     """
     with extra("images", "FITS images"):
         from astropy.io import fits

@@ -316,10 +316,7 @@ class StudyDefinition:
 def template(name: str) -> str:
     """Text of a commented STUDY.toml that comes with the package.
 
-    Raises
-    ------
-    StudyError
-        For a name that is not one of `TEMPLATES`.
+    StudyError for a name that is not one of `TEMPLATES`.
     """
     if name not in TEMPLATES:
         raise StudyError(f"template {name!r} is unknown: use one of {', '.join(TEMPLATES)}.")

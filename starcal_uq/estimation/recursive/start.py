@@ -57,12 +57,8 @@ def begin(
     """The recursion before its first frame, and the least-squares start of ``samaan``.
 
     ``samaan`` starts where least squares on the first of `frames` ends. It takes only the point from there, and filters
-    these frames as the others, so that none counts twice. The coefficients start from zero.
-
-    Raises
-    ------
-    CalibrationError
-        When the least-squares start fails.
+    these frames as the others, so that none counts twice. The coefficients start from zero. CalibrationError when the
+    least-squares start fails.
     """
     p, q, reference = len(camera.theta), len(prior.deviation), prior.reference_px
     origin, stage = np.concatenate([camera.theta[:3], np.zeros(p - 3)]), None

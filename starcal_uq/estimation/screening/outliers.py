@@ -115,10 +115,7 @@ def truncated_variance(p_value: float) -> float:
 def star_residuals(frames: StarFrames, model_name: str, theta: FloatArray, in_use: BoolArray) -> StarResiduals:
     """Compare every star with the prediction of the other stars in use, at the estimate theta (p,) from those.
 
-    Raises
-    ------
-    CalibrationError
-        When no frame has three stars in use, or the stars in use fit no attitude.
+    CalibrationError when no frame has three stars in use, or the stars in use fit no attitude.
     """
     counts: IntArray = np.add.reduceat(in_use.astype(np.int64), frames.starts[:-1])
     active = counts >= MIN_STARS

@@ -36,17 +36,9 @@ _PER_CELL, _MOST_CELLS, _FEWEST = 25, 12, 5
 def allowed_near(statistic: FloatArray, threshold: FloatArray, expected_false: float) -> tuple[int, int]:
     """Stars rejected just beyond the limit, and how many noise and wrong stars let be there.
 
-    Parameters
-    ----------
-    statistic, threshold : (n,) array
-        Squared distance of each rejected star in units of its variance, infinite for one elsewhere; and its limit.
-    expected_false : float
-        Right stars that the limit lets expect.
-
-    Returns
-    -------
-    near, allowed : int
-        Exceeded with probability `BLAME_P`, if squared distances of wrong stars are even.
+    That is exceeded with probability `BLAME_P`, if squared distances of wrong stars are even. `statistic` (n,) is the
+    squared distance of each rejected star in units of its variance, infinite for one elsewhere, `threshold` its limit,
+    and `expected_false` are the right stars that the limit lets expect.
     """
     from scipy.special import pdtr
 

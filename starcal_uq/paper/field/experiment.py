@@ -79,19 +79,13 @@ def field_experiment(
     methods; the others are identified and solved by QUEST with the uncalibrated sensor, the three calibrations, and
     the truth as a control.
 
-    Parameters
-    ----------
-    out : path
-        Folder to write: ``field.html`` (self-contained), the tables of `FieldExperiment.tables` as CSV, and the figures
-        as PNG in ``figures``, when everything is computed. Until then what is done is kept in the folder, and an
-        interrupted call goes on from it.
-    n_frames, n_calibration_frames, n_replicates : int
-        Frames of the test, of which the paper has 200, and of the calibration, of which it does not say; repetitions
-        with other noise, from which the ranges of the errors come. Each at least 20.
-    reading : {"window", "full"}
-        How the printed sensor is read (`READINGS`).
-    seed, workers, progress, force
-        As in `reproduce`.
+    `out`: folder to write: ``field.html`` (self-contained), the tables of `FieldExperiment.tables` as CSV, and the
+        figures as PNG in ``figures``, when everything is computed. Until then what is done is kept in the folder, and
+        an interrupted call goes on from it.
+    `n_frames`, `n_calibration_frames`, `n_replicates`: frames of the test, of which the paper has 200, and of the
+        calibration, of which it does not say; repetitions with other noise, from which the ranges of the errors come.
+        Each at least 20.
+    `reading`: how the printed sensor is read (`READINGS`).
     """
     if reading not in READINGS:
         raise CalibrationError(f"reading {reading!r} of the field unit is unknown: use one of {', '.join(READINGS)}.")

@@ -89,21 +89,10 @@ def write_frames(frames: Frames, to: str | os.PathLike[str]) -> Path:
 def picture(path: Path, width_px: int, camera: Camera, flat: bool = True) -> bytes:
     """An image as astronomers look at it: limits by zscale, brightness by asinh, no wider than `width_px`; WebP.
 
-    Parameters
-    ----------
-    path : Path
-        The image.
-    width_px : int
-        Width of the picture, at most.
-    camera : Camera
-        Its detector has the size that the image must have.
-    flat : bool
-        Whether the background is taken out, so that stars show; clouds and the Moon then do not.
-
-    Raises
-    ------
-    ImageError
-        If it cannot be read or is of another size.
+    `width_px`: width of the picture, at most.
+    `camera`: its detector has the size that the image must have.
+    `flat`: whether the background is taken out, so that stars show; clouds and the Moon then do not.
+    ImageError if it cannot be read or is of another size.
     """
     with extra("images", "pictures of frames"):
         from astropy.visualization import AsinhStretch, ZScaleInterval

@@ -88,12 +88,7 @@ def write_cells(name: str, parts: Collection[str], folder: str) -> Iterator[tupl
 def executed(cells: Iterator[tuple[str, str]], place: Path, progress: Progress | None = None) -> str:
     """A notebook of these cells, as its file holds it, executed by this Python in the folder `place`.
 
-    Raises
-    ------
-    MissingExtraError
-        If a library is not installed.
-    RunFolderError
-        If a cell fails.
+    MissingExtraError if a library is not installed. RunFolderError if a cell fails.
     """
     with extra("notebook", "executed notebooks"):
         import ipykernel  # noqa: F401

@@ -27,12 +27,7 @@ _SECONDS = 180.0
 def pdf_bytes(page: Path) -> bytes:
     """A page, one file that needs no other, as PDF.
 
-    Raises
-    ------
-    MissingExtraError
-        If there is neither a browser nor WeasyPrint.
-    RunFolderError
-        If what there is makes no PDF of it.
+    MissingExtraError if there is neither a browser nor WeasyPrint. RunFolderError if what there is makes no PDF of it.
     """
     said = ""
     for browser in browsers():
