@@ -46,39 +46,20 @@ _SAID = 3.0
 
 @dataclass(frozen=True, eq=False)
 class Pattern:
-    """Shapes of displacement that the residuals ask for, fitted together.
+    """Shapes of displacement that the residuals ask for, fitted together."""
 
-    Attributes
-    ----------
-    families : tuple of str
-        Names of the tests whose shapes are in it, the strongest first.
-    directions : (q, J) array
-        Combinations of the families' columns, px, that the residuals determine, but for frames by themselves.
-    amplitudes : (J,) array
-        Amplitude of every direction.
-    covariance : (J, J) array
-        Covariance of the amplitudes.
-    parameters : (J, p) array
-        What the calibrated parameters took up of every direction, px units.
-    frame_covariance : (3, 3) array
-        Covariance over frames of scale and of two components of shape, px at the corner; zero where frames agree.
-    variance : float
-        Variance of the noise that is left, px^2, or relative to what stars state.
-    n_frames : int
-        Number of frames behind it.
-    max_cells : int
-        Largest number of field cells along the longer side.
-    """
-
-    families: tuple[str, ...]
+    families: tuple[str, ...]  # Names of the tests whose shapes are in it, the strongest first
+    # (q, J): combinations of the families' columns, px, that the residuals determine, but for frames by themselves.
     directions: FloatArray
-    amplitudes: FloatArray
-    covariance: FloatArray
-    parameters: FloatArray
+    amplitudes: FloatArray  # (J,): amplitude of every direction
+    covariance: FloatArray  # (J, J): covariance of the amplitudes
+    parameters: FloatArray  # (J, p): what the calibrated parameters took up of every direction, px units
+    # (3, 3): covariance over frames of scale and of two components of shape, px at the corner; zero where frames
+    # agree.
     frame_covariance: FloatArray
-    variance: float
-    n_frames: int = 0
-    max_cells: int = MAX_CELLS
+    variance: float  # Variance of the noise that is left, px^2, or relative to what stars state
+    n_frames: int = 0  # Number of frames behind it
+    max_cells: int = MAX_CELLS  # Largest number of field cells along the longer side
 
     SHAPES: ClassVar[Shapes] = {
         **{"directions": ("q", "j"), "amplitudes": ("j",), "covariance": ("j", "j"), "parameters": ("j", "p")},

@@ -35,32 +35,16 @@ _pairs = cache(np.triu_indices)
 
 @dataclass(frozen=True)
 class CompressedLikelihood:
-    """Attitude-marginalised log likelihood around an estimate, at a cost independent of the number of stars.
+    """Attitude-marginalised log likelihood around an estimate, at a cost independent of the number of stars."""
 
-    Attributes
-    ----------
-    theta_hat : (p,) array
-        Point of expansion, px units.
-    whitening : (p, p) array
-        L in ``theta = theta_hat + L z``; lower triangular, ``L L^T`` is the covariance at the estimate.
-    gram : (q, q) array
-        G over the monomials 1, z_a, z_a z_b (a <= b, row-major), q = (p + 1)(p + 2) / 2.
-    log_determinant : float
-        ``sum_k log |A_k^T A_k|`` at theta_hat.
-    log_determinant_slope : (p,) array
-        Derivative of `log_determinant` with respect to z.
-    dof : int
-        ``sum_k (2 m_k - 3)``.
-    n_stars, n_frames : int
-        Size of the data.
-    """
-
-    theta_hat: FloatArray
+    theta_hat: FloatArray  # (p,): point of expansion, px units
+    # (p, p): L in ``theta = theta_hat + L z``; lower triangular, ``L L^T`` is the covariance at the estimate.
     whitening: FloatArray
-    gram: FloatArray
-    log_determinant: float
-    log_determinant_slope: FloatArray
-    dof: int
+    gram: FloatArray  # (q, q): G over the monomials 1, z_a, z_a z_b (a <= b, row-major), q = (p + 1)(p + 2) / 2
+    log_determinant: float  # ``sum_k log |A_k^T A_k|`` at theta_hat
+    log_determinant_slope: FloatArray  # (p,): derivative of `log_determinant` with respect to z
+    dof: int  # ``sum_k (2 m_k - 3)``
+    # `n_stars`, `n_frames`: size of the data.
     n_stars: int
     n_frames: int
 

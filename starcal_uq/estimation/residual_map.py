@@ -17,27 +17,13 @@ _STARS_PER_CELL = 25.0
 
 @dataclass(frozen=True)
 class ResidualMap:
-    """Sums of residuals in square cells of the detector, row by row.
+    """Sums of residuals in square cells of the detector, row by row."""
 
-    Attributes
-    ----------
-    shape : (2,) array of int
-        Rows and columns of cells.
-    cell_px : float
-        Side of a cell.
-    counts : (cells,) array
-        Stars in each.
-    sums : (cells, 2) array
-        Sums of their residuals, px.
-    stated2 : (cells,) array
-        Sums of their squared stated noise, px^2; of ones where they state none.
-    """
-
-    shape: IntArray
-    cell_px: float
-    counts: FloatArray
-    sums: FloatArray
-    stated2: FloatArray
+    shape: IntArray  # (2,): rows and columns of cells
+    cell_px: float  # Side of a cell
+    counts: FloatArray  # (cells,): stars in each
+    sums: FloatArray  # (cells, 2): sums of their residuals, px
+    stated2: FloatArray  # (cells,): sums of their squared stated noise, px^2; of ones where they state none
 
     @classmethod
     def of(
@@ -78,57 +64,31 @@ class ResidualMap:
 
 @dataclass(frozen=True)
 class RicherModel:
-    """A distortion model with more terms, fitted to all stars by one Gauss-Newton step from the calibration.
+    """A distortion model with more terms, fitted to all stars by one Gauss-Newton step from the calibration."""
 
-    Attributes
-    ----------
-    model : str
-        Name of the registry.
-    theta : (q,) array
-        Its estimate, px units.
-    n_terms : int
-        Terms beyond those of the calibration.
-    gain : float
-        Decrease of the sum of squares, in units of the noise variance: chi-square with `n_terms` degrees of freedom
-        where the calibration's model holds.
-    """
-
-    model: str
-    theta: FloatArray
-    n_terms: int
+    model: str  # Name of the registry
+    theta: FloatArray  # (q,): its estimate, px units
+    n_terms: int  # Terms beyond those of the calibration
+    # Decrease of the sum of squares, in units of the noise variance: chi-square with `n_terms` degrees of freedom
+    # where the calibration's model holds.
     gain: float
 
 
 @dataclass(frozen=True)
 class FrameScatter:
-    """How frames scatter about an estimate: sums over frames in scaled parameters ``z = (theta - theta_hat) / scale``.
+    """How frames scatter about an estimate: sums over frames in scaled parameters ``z = (theta - theta_hat) / scale``."""
 
-    Attributes
-    ----------
-    theta, scale : (p,) arrays
-        Estimate, px units, and unit of each parameter.
-    matrix : (p, p) array
-        Gauss-Newton matrix.
-    squares : float
-        Sum of squared whitened residuals.
-    n_frames, dof : int
-        Frames, and their independent numbers ``2 m_k - 3``.
-    steps : (p + 1, p + 1) array
-        Products of (1, z) of the estimates without each frame.
-    scores : (p, p) array
-        Products of the frames' slopes, their leverage corrected.
-    powers : (3, p), inner, middle : (p, p, p) arrays
-        From which the degrees of freedom of `clustered` follow.
-    """
-
+    # `theta`, `scale`, (p,): estimate, px units, and unit of each parameter.
     theta: FloatArray
     scale: FloatArray
-    matrix: FloatArray
-    squares: float
+    matrix: FloatArray  # (p, p): Gauss-Newton matrix
+    squares: float  # Sum of squared whitened residuals
+    # `n_frames`, `dof`: frames, and their independent numbers ``2 m_k - 3``.
     n_frames: int
     dof: int
-    steps: FloatArray
-    scores: FloatArray
+    steps: FloatArray  # (p + 1, p + 1): products of (1, z) of the estimates without each frame
+    scores: FloatArray  # (p, p): products of the frames' slopes, their leverage corrected
+    # `powers` (3, p), `inner` and `middle` (p, p, p): from which the degrees of freedom of `clustered` follow.
     powers: FloatArray
     inner: FloatArray
     middle: FloatArray
@@ -171,40 +131,19 @@ class FrameScatter:
 
 @dataclass(frozen=True)
 class PartitionSums:
-    """What is known of all residuals of a calibration that has kept those of a sample of its frames.
+    """What is known of all residuals of a calibration that has kept those of a sample of its frames."""
 
-    Attributes
-    ----------
-    n_stars, n_frames : (n,) arrays of int
-        Stars and frames of each of n partitions.
-    chi2 : (n,) array
-        Their sums of squared residuals, px^2 (or in units of the stated noise).
-    residuals : ResidualMap
-        Residuals of all stars in cells of the detector.
-    stated2 : float
-        Sum of the squared stated noise of all stars, px^2; their number where they state none.
-    n_beyond : int
-        Stars with a residual beyond 4.5 standard deviations.
-    largest : float
-        Largest residual along an axis, standard deviations.
-    largest_frame : int
-        Frame of the largest.
-    richer : tuple of RicherModel
-        Models of which the calibration's is a special case.
-    scatter : FrameScatter or None
-        How all frames scatter about the estimate; None in a calibration of before.
-    """
-
+    # `n_stars`, `n_frames`, (n,): stars and frames of each of n partitions.
     n_stars: IntArray
     n_frames: IntArray
-    chi2: FloatArray
-    residuals: ResidualMap
-    stated2: float
-    n_beyond: int
-    largest: float
-    largest_frame: int
-    richer: tuple[RicherModel, ...] = ()
-    scatter: FrameScatter | None = None
+    chi2: FloatArray  # (n,): their sums of squared residuals, px^2 (or in units of the stated noise)
+    residuals: ResidualMap  # Residuals of all stars in cells of the detector
+    stated2: float  # Sum of the squared stated noise of all stars, px^2; their number where they state none
+    n_beyond: int  # Stars with a residual beyond 4.5 standard deviations
+    largest: float  # Largest residual along an axis, standard deviations
+    largest_frame: int  # Frame of the largest
+    richer: tuple[RicherModel, ...] = ()  # Models of which the calibration's is a special case
+    scatter: FrameScatter | None = None  # How all frames scatter about the estimate; None in a calibration of before
 
     @classmethod
     def joined(cls, parts: Sequence[PartitionSums]) -> PartitionSums:

@@ -55,26 +55,13 @@ class ImageRow:
 
 @dataclass(frozen=True)
 class ImageRecord(Shown, Saved):
-    """The images of a run.
+    """The images of a run."""
 
-    Attributes
-    ----------
-    rounds : tuple of RoundRecord
-        The first with the nominal camera, the last with what was learnt.
-    rows : tuple of ImageRow
-        Every image, used or not.
-    n_disturbed : int
-        Stars left out because the light of a neighbour displaces them.
-    parity : str
-        "normal" or "mirrored".
-    sources : tuple of str
-        Files and folders that the images came from; empty in runs of versions that did not keep them.
-    """
-
-    rounds: tuple[RoundRecord, ...]
-    rows: tuple[ImageRow, ...]
-    n_disturbed: int
-    parity: str
+    rounds: tuple[RoundRecord, ...]  # The first with the nominal camera, the last with what was learnt
+    rows: tuple[ImageRow, ...]  # Every image, used or not
+    n_disturbed: int  # Stars left out because the light of a neighbour displaces them
+    parity: str  # "normal" or "mirrored"
+    # Files and folders that the images came from; empty in runs of versions that did not keep them.
     sources: tuple[str, ...] = ()
 
     FILE = "a record of images", "run `starcal-uq run IMAGES... -o RUN` again"

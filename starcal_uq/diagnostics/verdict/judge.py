@@ -73,21 +73,12 @@ class Verdict(Shown):
 
 @dataclass(frozen=True)
 class Place:
-    """Where a run is and what made it, so that remedies can be commands to copy.
+    """Where a run is and what made it, so that remedies can be commands to copy."""
 
-    Attributes
-    ----------
-    run : str
-        The folder.
-    words : tuple of str
-        Command line that made all of it, without the program and the folder; empty where it was made step by step.
-    observations : bool
-        Whether the folder holds observations.
-    """
-
-    run: str
+    run: str  # The folder
+    # Command line that made all of it, without the program and the folder; empty where it was made step by step.
     words: tuple[str, ...] = ()
-    observations: bool = True
+    observations: bool = True  # Whether the folder holds observations
 
     def exact(self, check: Check) -> Check:
         """A check whose commands name the files of this run."""

@@ -40,24 +40,15 @@ _MAX_HISTORY = 16_384
 
 @dataclass
 class FrameSums:
-    """Sums over frames of their normal equations about one point, which say what the frames say together.
+    """Sums over frames of their normal equations about one point, which say what the frames say together."""
 
-    Attributes
-    ----------
-    gram : (1 + p, 1 + p) array
-        Sum of `PairNormals.grams`: misfit of the pixels.
-    moments : (s, s) array
-        Sum of products of the frames' entries (gradient and information), from which the scatter of their scores
-        follows for any estimate: the meat of the sandwich.
-    degrees : float
-        Sum of 2 m - 3.
-    weight, squared_weight : float
-        Sums of the frames' weights, which are 1 where nothing is forgotten, and of their squares.
-    """
-
-    gram: FloatArray
+    gram: FloatArray  # (1 + p, 1 + p): sum of `PairNormals.grams`: misfit of the pixels
+    # (s, s): sum of products of the frames' entries (gradient and information), from which the scatter of their
+    # scores follows for any estimate: the meat of the sandwich.
     moments: FloatArray
-    degrees: float = 0.0
+    degrees: float = 0.0  # Sum of 2 m - 3
+    # `weight`, `squared_weight`: sums of the frames' weights, which are 1 where nothing is forgotten, and of their
+    # squares.
     weight: float = 0.0
     squared_weight: float = 0.0
 
@@ -111,22 +102,13 @@ def frame_entries(normals: PairNormals, moved: FloatArray) -> tuple[FloatArray, 
 
 @dataclass
 class History:
-    """Estimates after every frame; of a long stream, after every 2nd, 4th, ... frame.
+    """Estimates after every frame; of a long stream, after every 2nd, 4th, ... frame."""
 
-    Attributes
-    ----------
-    every : int
-        Frames between two entries.
-    estimates, sigmas : lists of (q,) arrays
-        In scaled units.
-    costs : list of float
-        Sum of whitened innovations.
-    """
-
-    every: int = 1
+    every: int = 1  # Frames between two entries
+    # `estimates`, `sigmas`, (q,): in scaled units.
     estimates: list[FloatArray] = field(default_factory=list)
     sigmas: list[FloatArray] = field(default_factory=list)
-    costs: list[float] = field(default_factory=list)
+    costs: list[float] = field(default_factory=list)  # Sum of whitened innovations
 
     def add(self, n_frames: int, estimate: FloatArray, sigmas: FloatArray, cost: float) -> None:
         """The state after `n_frames` frames."""
@@ -176,75 +158,36 @@ class Recursion:
     """State of a filter, and its update.
 
     Offsets are from `origin` in units of `scale`, and covariances in units of the noise variance.
-
-    Attributes
-    ----------
-    model_name : str
-        Distortion model that frames are linearised with, of p parameters.
-    origin, scale : (p,) arrays
-        Start and units, px units.
-    offset : (q,) array
-        Estimate of the first q parameters; the others stay at the origin.
-    point : (q,) array
-        Point at which frames are linearised.
-    covariance : (q, q) array
-        Covariance of the estimate, per noise variance.
-    start_covariance : (q, q) array
-        Covariance at the start, per noise variance.
-    reference_px : float
-        Stated noise: px, or 1 where the stars state their own.
-    pair_covariance : {"full", "diagonal"}
-        Covariance of the interstar angles that is assumed.
-    process : (q,) array or None
-        Variance of each parameter's step from frame to frame, per noise variance.
-    forgetting : float
-        Weight of the frames before against the next.
-    iterations : int
-        Most linearisations of a frame.
-    reach_sigmas : float
-        How far from its point, in sigmas, a linearisation serves.
-    chi2, numbers : float
-        Sum of whitened innovations, and how many they are.
-    n_frames, n_stars : int
-        Frames and stars.
-    settled : bool
-        Whether the last frame's linearisation agrees with its estimate.
-    held : StarFrames or None
-        First frames, which will be taken again with the next one.
-    starting : bool
-        Whether the parameters are not yet determined.
-    sums : FrameSums
-        About the origin.
-    response, noise : (3, p) and (3, 3) arrays
-        Sums over frames of `PairNormals.response` and `PairNormals.noise`.
-    history : History
-        Estimates so far.
     """
 
-    model_name: str
+    model_name: str  # Distortion model that frames are linearised with, of p parameters
+    # `origin`, `scale`, (p,): start and units, px units.
     origin: FloatArray
     scale: FloatArray
-    offset: FloatArray
-    point: FloatArray
-    covariance: FloatArray
-    start_covariance: FloatArray
-    reference_px: float
-    pair_covariance: PairCovariance
-    process: FloatArray | None
-    forgetting: float
-    iterations: int
-    sums: FrameSums
+    offset: FloatArray  # (q,): estimate of the first q parameters; the others stay at the origin
+    point: FloatArray  # (q,): point at which frames are linearised
+    covariance: FloatArray  # (q, q): covariance of the estimate, per noise variance
+    start_covariance: FloatArray  # (q, q): covariance at the start, per noise variance
+    reference_px: float  # Stated noise: px, or 1 where the stars state their own
+    pair_covariance: PairCovariance  # "full" or "diagonal": covariance of the interstar angles that is assumed
+    process: FloatArray | None  # (q,): variance of each parameter's step from frame to frame, per noise variance
+    forgetting: float  # Weight of the frames before against the next
+    iterations: int  # Most linearisations of a frame
+    sums: FrameSums  # About the origin
+    # `response`, `noise`, (3, p) and (3, 3): sums over frames of `PairNormals.response` and `PairNormals.noise`.
     response: FloatArray
     noise: FloatArray
-    reach_sigmas: float
+    reach_sigmas: float  # How far from its point, in sigmas, a linearisation serves
+    # `chi2`, `numbers`: sum of whitened innovations, and how many they are.
     chi2: float = 0.0
     numbers: float = 0.0
+    # `n_frames`, `n_stars`: frames and stars.
     n_frames: int = 0
     n_stars: int = 0
-    settled: bool = True
-    held: StarFrames | None = None
-    starting: bool = True
-    history: History = field(default_factory=History)
+    settled: bool = True  # Whether the last frame's linearisation agrees with its estimate
+    held: StarFrames | None = None  # First frames, which will be taken again with the next one
+    starting: bool = True  # Whether the parameters are not yet determined
+    history: History = field(default_factory=History)  # Estimates so far
 
     @property
     def theta(self) -> FloatArray:
