@@ -76,7 +76,7 @@ class RicherModel:
 
 @dataclass(frozen=True)
 class FrameScatter:
-    """How frames scatter about an estimate: sums over frames in scaled parameters ``z = (theta - theta_hat) / scale``."""
+    """How frames scatter about an estimate: sums over frames in parameters ``z = (theta - theta_hat) / scale``."""
 
     # `theta`, `scale`, (p,): estimate, px units, and unit of each parameter.
     theta: FloatArray
