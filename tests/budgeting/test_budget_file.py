@@ -143,10 +143,7 @@ BAD = {
         "is 100.0, but a confidence lies between 0 and 1, such as 0.997.",
     ),
     "no confidence": ("[budget]\nconfidence = 0\n", "such as 0.997."),
-    "a turn and more": (
-        ROW.replace("0.2", "1296000.1"),
-        "is more than 1296000 arcsec, a full turn; correct the number.",
-    ),
+    "a turn and more": (ROW.replace("0.2", "1296000.1"), "write a number of arcsec from 0 to 1296000, a full turn."),
     "frame twice named": ("[frame.sensor]\nrotation = [0, 0, 0, 1]\n", "give yours another name"),
     "frame without": ("[frame.a]\n", "key rotation is missing"),
     "frame with more": ("[frame.a]\nrotation = [0, 0, 0, 1]\nunit = 1\n", "unit"),
