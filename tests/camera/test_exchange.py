@@ -54,21 +54,26 @@ def test_opencv_reads_its_file_and_projects_alike(camera, tmp_path):
     assert largest(moved - pixels(camera)) > 0.4
 
 
-def test_mrcal_reads_its_file_and_unprojects_alike(camera, tmp_path):
+def test_mrcal_reads_its_files_and_unprojects_alike(tmp_path):
     python = "/usr/bin/python3"
-    if not Path(python).exists() or subprocess.run([python, "-c", "import mrcal"], capture_output=True).returncode:
+    if not Path(python).exists():
         pytest.skip("mrcal is a package of the system, which has none")
-    made = export_camera(camera, "mrcal", tmp_path / "c.cameramodel")
-    np.save(tmp_path / "xy.npy", pixels(camera))
+    made = {name: export_camera(camera, "mrcal", tmp_path / f"{name}.cameramodel") for name, camera in CAMERAS.items()}
+    for name, camera in CAMERAS.items():
+        np.save(tmp_path / f"{name}_xy.npy", pixels(camera))
     code = (
-        "import mrcal, numpy as np; m = mrcal.cameramodel('c.cameramodel'); "
-        "v = mrcal.unproject(np.load('xy.npy'), *m.intrinsics(), normalize=True); np.save('v.npy', v); "
-        "print(*m.imagersize())"
+        "import sys\ntry: import mrcal, numpy as np\nexcept ImportError: sys.exit(77)\nfor name in sys.argv[1:]:\n"
+        " m = mrcal.cameramodel(f'{name}.cameramodel')\n"
+        " v = mrcal.unproject(np.load(f'{name}_xy.npy'), *m.intrinsics(), normalize=True)\n"
+        " np.save(f'{name}_v.npy', v); print(*m.imagersize())"
     )
-    done = subprocess.run([python, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
-    assert done.stdout.split() == [str(camera.width_px), str(camera.height_px)]
-    off = camera.focal_px * (np.load(tmp_path / "v.npy") - unproject(camera, pixels(camera)))
-    assert largest(off) <= made.error_px + 1e-4
+    done = subprocess.run([python, "-c", code, *CAMERAS], cwd=tmp_path, capture_output=True, text=True)
+    if done.returncode == 77:
+        pytest.skip("mrcal is a package of the system, which has none")
+    assert done.stdout.split("\n")[:-1] == [f"{c.width_px} {c.height_px}" for c in CAMERAS.values()], done.stderr
+    for name, camera in CAMERAS.items():
+        off = camera.focal_px * (np.load(tmp_path / f"{name}_v.npy") - unproject(camera, pixels(camera)))
+        assert largest(off) <= made[name].error_px + 1e-4, name
 
 
 def test_tetra3rs_reads_its_file_and_sees_the_same_directions(camera, tmp_path):
