@@ -376,14 +376,14 @@ class AttitudeError(Shown):
             known = CONTRIBUTORS if (INTERACTION, AXES[0]) in rows else _REQUIRED
             chosen = [[rows[contributor, axis] for axis in TOTAL_AXES] for contributor in known]
             table = np.full((len(names), len(CONTRIBUTORS), len(TOTAL_AXES)), np.nan)
-            if "if_model_holds_arcsec" not in chosen[0][0]:
+            first = chosen[0][0]
+            if "if_model_holds_arcsec" not in first:
                 names = tuple(old.get(name, name) for name in names)
             table[:, : len(known)] = [
                 [[float(row[f"{name}_arcsec"] or "nan") for row in line] for line in chosen] for name in names
             ]
             if not np.isfinite(table[:, : len(_REQUIRED)]).all():
                 raise ValueError("a number is missing")
-            first = chosen[0][0]
             counts = {name: int(first[name]) for name in ("n_draws", "n_frames")}
             n_sampled = int(first.get("n_sampled_frames") or 0)
             frames = first.get("frames") or OBSERVED

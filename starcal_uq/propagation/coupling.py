@@ -155,7 +155,7 @@ class Coupling(Shown):
                 "crlb_sigma": self.crlb_sigma,
             }
         )
-        if self.prior_sigma is not None and self.contraction is not None:
+        if self.prior_sigma is not None:
             table["prior_sigma"] = self.prior_sigma
             table["contraction"] = self.contraction
         for index, name in enumerate(self.extended_names):

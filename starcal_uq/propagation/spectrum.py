@@ -38,6 +38,8 @@ MIN_SPECTRUM_FRAMES = 16
 _MAX_GAPS = 0.2
 # Times of a uniform series may be rounded, to milliseconds say; more than this share of a step is another series.
 _UNEVEN = 0.05
+# Averaging times that are tried, evenly in their logarithm.
+_AVERAGES = 60
 
 
 @bounded
@@ -198,10 +200,6 @@ def _autocorrelation(first: FloatArray, step: float) -> tuple[FloatArray, FloatA
     return lag, products / power
 
 
-_AVERAGES = 60
-
-
-# Smaller is rounding.
 @dataclass(frozen=True, eq=False)
 class ErrorSpectrum(Shown, Saved):
     """Spectrum of the frame-dependent attitude error of a calibration along a series of frames.

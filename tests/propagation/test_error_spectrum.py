@@ -250,3 +250,72 @@ def test_a_camera_without_error_has_no_spectrum() -> None:
     assert np.isnan(found.correlation_time_s).all() or (found.rest_arcsec < 1e-6).all()
     assert "no frame-dependent part" in dataclasses.replace(found, variance_arcsec2=np.zeros(3)).text
     found.plot.spectrum()
+
+
+def test_limits_of_a_series() -> None:
+    """Sixteen frames, a fifth of them missing at most, and times off by a twentieth of a step."""
+    post, obs = posterior(40), frames()
+    some = obs.select(obs.frame < 16)
+    assert len(error_spectrum(post, some, np.arange(16.0), n_draws=2).frequency_hz) == 8
+    with pytest.raises(AttitudeProfileError, match="at least 16 frames, not 15"):
+        error_spectrum(post, obs.select(obs.frame < 15), np.arange(15.0), n_draws=2)
+    for off, fine in ((0.045, True), (-0.045, True), (0.055, False), (-0.055, False)):
+        times = np.arange(16.0)
+        times[7] += off
+        if fine:
+            found = error_spectrum(post, some, 3.0 * times, n_draws=2)
+            np.testing.assert_allclose(found.time_s, 3.0 * np.arange(16.0), rtol=1e-12)
+            assert (found.step_s, found.gap_share, found.n_draws) == (3.0, 0.0, 2)
+        else:
+            with pytest.raises(AttitudeProfileError, match="not evenly spaced"):
+                error_spectrum(post, some, times, n_draws=2)
+    for last, fine in ((19, True), (20, False)):
+        times = np.append(np.arange(15.0), last)
+        if fine:
+            assert error_spectrum(post, some, times, n_draws=2).gap_share == pytest.approx(4 / 20)
+        else:
+            with pytest.raises(AttitudeProfileError, match=r"5 of 21 evenly .*longest gap begins at 14 s"):
+                error_spectrum(post, some, times, n_draws=2)
+    with pytest.raises(AttitudeProfileError, match="must be finite"):
+        error_spectrum(post, some, np.append(np.arange(15.0), np.inf))
+
+
+def test_figures_of_a_spectrum_are_those_of_its_numbers() -> None:
+    """A density by hand: shares, averages, crossings and the table."""
+    found = dataclasses.replace(
+        spectrum(),
+        frequency_hz=np.array([0.1, 0.2, 0.3]),
+        psd_arcsec2_hz=np.array([[4.0, 1.0, 0.0], [2.0, 1.0, 0.0], [2.0, 2.0, 0.0]]),
+        nea_psd_arcsec2_hz=np.array([1.0, 2.0, 3.0]),
+        nea_arcsec=np.array([2.0, 1e-6, 1.0]),
+        step_s=1.0,
+        time_s=np.arange(20.0),
+        lag_s=np.array([0.0, 1.0, 2.0]),
+        autocorrelation=np.array([[1.0, 1.0, 0.1], [0.6, 0.5, 0.2], [0.2, 0.4, 0.3]]),
+    )
+    np.testing.assert_allclose(found.share_below(0.2), [0.75, 0.5, np.nan])
+    e = np.exp(-1.0)
+    np.testing.assert_allclose(found.correlation_time_s, [1.0 + (0.6 - e) / 0.4, np.nan, np.nan])
+    assert found.longest_average_s == 5.0 and found.axes == ("pitch", "yaw", "roll")
+    # Four frames: their mean passes a sum of phases over four.
+    phases = np.exp(2j * np.pi * np.outer(found.frequency_hz, np.arange(4.0)))
+    passed = np.abs(phases.mean(axis=1)) ** 2
+    rest, noise = found.averaged_arcsec(4.0)
+    np.testing.assert_allclose(rest, np.sqrt(0.1 * passed @ found.psd_arcsec2_hz), rtol=1e-9)
+    np.testing.assert_allclose(noise, found.nea_arcsec / 2.0, rtol=1e-12)
+    np.testing.assert_allclose(found.dominates_after_s, [np.nan, 1.0, np.nan])
+    for seconds in (1.0 - 1e-12, 5.0 + 1e-12):
+        found.averaged_arcsec(seconds)
+    for seconds in (0.999, 5.001):
+        with pytest.raises(ValueError, match="choose 1 s to 5 s"):
+            found.averaged_arcsec(seconds)
+    # Sixty times, evenly in their logarithm: where noise is overtaken is good to that.
+    level = dataclasses.replace(found, nea_arcsec=np.sqrt(2.0) * found.averaged_arcsec(2.0)[0])
+    times = np.geomspace(1.0, 5.0, 60)
+    later = [next((t for t in times if np.greater(*level.averaged_arcsec(t))[axis]), np.nan) for axis in range(2)]
+    np.testing.assert_array_equal(level.dominates_after_s[:2], later)
+    table = found.to_dataframe()
+    assert table["frequency_hz"].tolist() == [0.1] * 3 + [0.2] * 3 + [0.3] * 3
+    assert table["axis"].tolist() == ["pitch", "yaw", "roll"] * 3
+    assert table["rest_arcsec2_hz"].tolist() == found.psd_arcsec2_hz.ravel().tolist()
+    assert table["nea_arcsec2_hz"].tolist() == [1.0, 2.0, 3.0] * 3
