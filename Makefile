@@ -5,7 +5,7 @@
 #   WORKERS=...     processes that share the tests (0: one, without sharing)
 #   DEMO_OUT=...    the folder that `make demo` writes
 #   BENCH=...       options of `make bench`, such as "--quick" or "--only calibrate"
-#   SUPPLY=...      options of `make supply`, such as "--all" or "--python 3.12"
+#   SUPPLY=...      options of `make supply`, such as "--all", "--python 3.12" or "--only wheel lowest"
 
 PYTHON ?=
 ALT_PYTHON ?=

@@ -1,6 +1,6 @@
 """What users install, tested from empty environments: ``make supply``.
 
-    supply.py [--all] [--python VERSION ...] [--keep FOLDER]
+    supply.py [--all] [--only PART ...] [--python VERSION ...] [--keep FOLDER]
 
 1. The source distribution is built, and the wheel from it; both are compared with what is under version control.
 2. For each Python: the wheel without any extra into an empty environment, at the versions of `constraints.txt`; the
@@ -39,6 +39,7 @@ TESTS = (
 # What tests need beside the package, and extras that are tried by themselves.
 TOOLS = ("pytest", "hypothesis", "jsonschema")
 EXTRAS = ("images", "cluster", "excel", "notebook")
+PARTS = ("wheel", "extras", "sdist", "lowest", "licences")
 # What is under version control and stays at home.
 HOME = re.compile(r"\.ci/|\.git")
 
@@ -114,6 +115,7 @@ def contents(archives: dict[str, Path]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description="Tests what users install.")
     parser.add_argument("--all", action="store_true", help="all fast tests on each Python")
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=PARTS, help="parts to do, instead of all")
     parser.add_argument("--python", nargs="+", default=PYTHONS, help="versions of Python")
     parser.add_argument("--keep", type=Path, help="folder for environments and trees, kept (default: a temporary one)")
     options = parser.parse_args()
@@ -134,32 +136,43 @@ def main() -> None:
         source = unpacked(archives["sdist"], work / "source", package=True)
         # Tests of the project read its source; one call is checked by mypy, which `make test` does.
         chosen = ("tests", "--ignore=tests/test_project.py") if options.all else TESTS
-        inside, plain, pins, wheel = [], [], ROOT / "constraints.txt", str(archives["wheel"])
-        for version, python in pythons.items():
-            say(f"wheel without extras, Python {version}")
-            plain.append(environment(work / f"plain-{version}", python, pins, wheel, *TOOLS))
-            tested(plain[-1], tests, chosen)
-            say(f"wheel with all extras, Python {version}")
-            inside.append(environment(work / f"wheel-{version}", python, pins, f"{wheel}[all,test]"))
-            tested(inside[-1], tests, chosen)
-        version, python = next(iter(pythons.items()))
-        for extra in EXTRAS:
-            say(f"wheel with {extra} and those before it, Python {version}")
-            install(plain[0], pins, f"{wheel}[{extra}]")
-            tested(plain[0], tests, chosen, "-m", "extra and not slow")
-        say(f"source distribution, Python {version}")
-        built = environment(work / "sdist", python, pins, f"{archives['sdist']}[test]")
-        tested(built, source, ("tests/test_project.py", "tests/test_benchmarks.py", "tests/observations"))
-        say(f"lowest versions, Python {version}")
-        lowest = work / "lowest.txt"
-        extras = [f"--extra={name}" for name in (*EXTRAS, "asdf", "compiled", "tetra3rs")]
-        run("uv", "pip", "compile", "--quiet", "--resolution", "lowest-direct", "--python", python, *extras,
-            "pyproject.toml", "--output-file", lowest)  # fmt: skip
-        low = environment(work / "lowest", python, lowest, f"{wheel}[test]")
-        # Old versions are out of date by what came after them.
-        tested(low, tests, chosen, "-W", "ignore::DeprecationWarning")
-        run(sys.executable, ROOT / "scripts" / "licences.py", *inside)
-        say("licences: docs/reference/licences.md")
+        pins, wheel = ROOT / "constraints.txt", str(archives["wheel"])
+
+        def emptied(name: str, said: str, version: str, limits: Path, *what: str) -> Path:
+            say(f"{said}, Python {version}")
+            return environment(work / name, pythons[version], limits, *what)
+
+        if "wheel" in options.only:
+            for version in pythons:
+                plain = emptied(f"plain-{version}", "wheel without extras", version, pins, wheel, *TOOLS)
+                tested(plain, tests, chosen)
+                tested(
+                    emptied(f"all-{version}", "wheel with all extras", version, pins, f"{wheel}[all,test]"),
+                    tests,
+                    chosen,
+                )
+        lowest = next(iter(pythons))
+        if "extras" in options.only:
+            plain = emptied("extras", "wheel alone, then extras", lowest, pins, wheel, *TOOLS)
+            for extra in EXTRAS:
+                say(f"wheel with {extra} and those before it, Python {lowest}")
+                install(plain, pins, f"{wheel}[{extra}]")
+                tested(plain, tests, chosen, "-m", "extra and not slow")
+        if "sdist" in options.only:
+            built = emptied("sdist", "source distribution", lowest, pins, f"{archives['sdist']}[test]")
+            tested(built, source, ("tests/test_project.py", "tests/test_benchmarks.py", "tests/observations"))
+        if "lowest" in options.only:
+            limits = work / "lowest.txt"
+            extras = [f"--extra={name}" for name in (*EXTRAS, "asdf", "compiled", "tetra3rs")]
+            lowered = ("--resolution", "lowest-direct", "--python", pythons[lowest], *extras)
+            run("uv", "pip", "compile", "--quiet", *lowered, "pyproject.toml", "--output-file", limits)
+            low = emptied("lowest", "lowest versions", lowest, limits, f"{wheel}[test]")
+            # Old versions are out of date by what came after them.
+            tested(low, tests, chosen, "-W", "ignore::DeprecationWarning")
+        if "licences" in options.only:
+            found = [emptied(f"users-{v}", "what users get", v, pins, f"{wheel}[all]") for v in pythons]
+            run(sys.executable, ROOT / "scripts" / "licences.py", *found)
+            say("licences: docs/reference/licences.md")
 
 
 if __name__ == "__main__":

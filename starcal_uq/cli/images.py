@@ -261,7 +261,7 @@ def load_images(
             max_mag=settings.max_mag,
             epoch=settings.epoch,
             gain_e_per_count=settings.gain,
-            time_utc=settings.time,
+            time_utc=sky.time,
             bayer=settings.bayer,
             focal_tolerance=0.03 if settings.focal_tolerance is None else settings.focal_tolerance,
             engine=settings.engine or "pyramid",

@@ -7,7 +7,7 @@ import re
 import stat
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 import typer
 
@@ -121,6 +121,33 @@ def parse_velocity(text: str | None) -> tuple[float, float, float] | None:
     return x, y, z
 
 
+def parse_start(text: str | None) -> dict[str, float]:
+    """``NAME=VALUE,...`` as values of a camera to start from."""
+    found = {}
+    for pair in [] if text is None else text.split(","):
+        name, _, value = (part.strip() for part in pair.partition("="))
+        try:
+            found[name] = float(value)
+        except ValueError:
+            name = ""
+        if name not in ("focal_mm", "x0_px", "y0_px"):
+            raise typer.BadParameter(f"{shown(pair)} is no start, such as focal_mm=50.2 or x0_px=511.5,y0_px=511.5.")
+    return found
+
+
+def parse_dof(text: str | None) -> float | Literal["free"] | None:
+    """``free`` or a number of degrees of freedom."""
+    if text is None or text == "free":
+        return None if text is None else "free"
+    from starcal_uq.estimation import student
+
+    try:
+        value = float(text)
+    except ValueError:
+        raise typer.BadParameter(f"{shown(text)} is neither a number nor free.") from None
+    return student.parse_dof(value, typer.BadParameter)
+
+
 def parse_frames(text: str | None) -> list[tuple[int, int]] | None:
     """``0-4,7`` as first and last number of each stretch of frames."""
     if text is None:
@@ -232,7 +259,8 @@ TimeUtc = Annotated[
     typer.Option(
         "--time",
         metavar="UTC",
-        help="Middle of the exposure of files that do not say it; goes before a time in the file's name.",
+        help="Middle of the exposure of images, or rows of a table, that do not say it; goes before a time in an "
+        "image's name.",
         callback=checked(_check_time),
     ),
 ]

@@ -50,7 +50,6 @@ from starcal_uq.core.tasks import one_thread
 from starcal_uq.observations.files import READ
 
 if TYPE_CHECKING:
-    from starcal_uq.core.types import AnyDict
     from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
     from starcal_uq.presentation.report.drawing import Ahead
@@ -144,8 +143,8 @@ def run_command(
     with run.making(command, force=force, words=typed(sys.argv[1:])), Ahead() as ahead:
         if not (run.did("calibrate") and (run.did("images") or not from_images)):
             # Priors may determine what the data leave open.
-            options = estimation.options() | ({"undetermined": True} if sampling.priors is not None else {})
-            _calibrate(run, inputs, camera, from_images, options, sky, images)
+            undetermined = sampling.priors is not None
+            _calibrate(run, inputs, camera, from_images, estimation, undetermined, sky, images)
         show_calibration(run.calibration, run.truth)
         warn_air(run.observations, run.calibration)
         _after_calibration(run, ahead, sampling, draws, budget, **aligning)
@@ -157,7 +156,8 @@ def _calibrate(
     inputs: list[Path],
     camera: Path | None,
     from_images: bool,
-    options: AnyDict,
+    estimation: EstimationSettings,
+    undetermined: bool,
     sky: SkySettings,
     images: ImageSettings,
 ) -> None:
@@ -168,7 +168,8 @@ def _calibrate(
     elif camera is not None:
         obs, nominal = load_table(inputs[0] if len(inputs) == 1 else inputs, camera, sky)
     with progress_bar("passes over the files") as progress:
-        run.calibrate(obs, nominal, progress=progress, **options)
+        nominal = estimation.started(nominal)
+        run.calibrate(obs, nominal, undetermined=undetermined, progress=progress, **estimation.options())
     if from_images:
         run.keep_images(centroids, identified, inputs)
         finished(run.folder.path)

@@ -27,7 +27,9 @@ from starcal_uq.cli.options import (
     TimeUtc,
     checked,
     number,
+    parse_dof,
     parse_frames,
+    parse_start,
     parse_velocity,
     read_file,
 )
@@ -36,6 +38,7 @@ from starcal_uq.core.settings import EPOCH, MAGNITUDES
 from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
+    from starcal_uq.camera.camera import Camera
     from starcal_uq.runs.run import Run
 
 
@@ -78,6 +81,21 @@ class EstimationSettings:
             "the residuals ask for it)."
         ),
     ] = "common"
+    start: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME=VALUE,...",
+            help="Start from these in place of CAMERA's: focal_mm, x0_px, y0_px.",
+            callback=checked(parse_start),
+        ),
+    ] = None
+    max_iterations: Annotated[int | None, number("max_iterations", "Limit for each stage; 200 by default.")] = None
+    accept_inflation: Annotated[
+        bool,
+        typer.Option(
+            "--accept-inflation", help="Multiply sigma by how much more the frames scatter than their noise says."
+        ),
+    ] = False
     duplicates: Duplicates = "refuse"
     scheduler: SchedulerAddress = None
     workers: FileWorkers = None
@@ -93,9 +111,14 @@ class EstimationSettings:
             "duplicates": self.duplicates,
         }
         options |= {"star_errors": True} if self.star_errors else {}
-        spread = {"scheduler": self.scheduler, "workers": self.workers}
-        options |= {name: value for name, value in spread.items() if value is not None}
+        options |= {"accept_inflation": True} if self.accept_inflation else {}
+        given = {"max_iterations": self.max_iterations, "scheduler": self.scheduler, "workers": self.workers}
+        options |= {name: value for name, value in given.items() if value is not None}
         return options | {"likelihood": "student_t"} if self.robust else options
+
+    def started(self, camera: Camera) -> Camera:
+        """The nominal camera with the start that was asked for."""
+        return camera.replace(**parse_start(self.start))
 
 
 @dataclass(frozen=True)
@@ -136,6 +159,7 @@ class PlaceSettings:
 class SkySettings(PlaceSettings):
     """The table, its directions, and how the observer moved."""
 
+    time: TimeUtc = None
     column: Columns = None
     frames: Annotated[
         str | None,
@@ -173,7 +197,6 @@ class ImageSettings:
         number("focal_tolerance", "Relative error of the nominal focal length; 0.03 by default."),
     ] = None
     gain: Annotated[float | None, number("gain_e_per_count", "Electrons per count, where they do not say it.")] = None
-    time: TimeUtc = None
     bayer: BayerMosaic = None
     engine: Annotated[
         settings.Engine | None,
@@ -208,6 +231,17 @@ class SamplingSettings:
     evaluation: Annotated[
         settings.Evaluation, typer.Option(help="auto (compressed, checked against exact), compressed, or exact.")
     ] = "auto"
+    moves: Annotated[
+        settings.Moves, typer.Option(help="mixture, or stretch (emcee's own, for a posterior far from a Gaussian one).")
+    ] = "mixture"
+    dof: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NUMBER|free",
+            help="Degrees of freedom of student_t: free samples them; by default those of the calibration, or 4.",
+            callback=checked(parse_dof),
+        ),
+    ] = None
 
     def options(self, run: Run) -> AnyDict:
         """Keyword arguments of `Run.sample`."""
@@ -221,6 +255,8 @@ class SamplingSettings:
             "n_steps": self.steps,
             "likelihood": self.likelihood,
             "evaluation": self.evaluation,
+            "moves": self.moves,
+            "dof": parse_dof(self.dof),
         }
         return options if self.priors is None else options | {"priors": read_priors(run, self.priors)}
 

@@ -72,6 +72,7 @@ def load_table(
     known |= {
         "columns": parse_columns(sky.column),
         "observer_velocity_km_s": parse_velocity(sky.observer_velocity),
+        "time_utc": sky.time,
     }
     obs: Observations | PartitionedObservations
     chosen = parse_frames(sky.frames)
@@ -196,6 +197,7 @@ def calibrate_command(
     run = sc.Run(out, tell=note)
     check_new_folder(out, force)
     obs, nominal = load_table(observations, camera, sky)
+    nominal = estimation.started(nominal)
     with progress_bar("passes over the files") as progress:
         calibration = run.calibrate(obs, nominal, force=force, progress=progress, **estimation.options())
     if run.screening is not None:

@@ -33,6 +33,7 @@ Mosaic = Literal["RGGB", "BGGR", "GRBG", "GBRG"]
 Bayer = Literal["RGGB", "BGGR", "GRBG", "GBRG", "none"]
 LikelihoodName = Literal["marginal", "pairs", "pairs_naive", "student_t"]
 Evaluation = Literal["auto", "compressed", "exact"]
+Moves = Literal["mixture", "stretch"]
 Sense = Literal["icrs_to_camera", "camera_to_icrs"]
 Scalar = Literal["first", "last"]
 Split = Literal["odd-even", "halves", "random"]
@@ -115,6 +116,7 @@ LIMITS = {
     "n_campaigns": Limit(1, 10**6),
     "n_geometries": Limit(1, 10**6),
     "n_starts": Limit(0, 10**4),
+    "max_iterations": Limit(1, 10**6),
     "n_draws": Limit(1, 10**7),
     "n_samples": Limit(1, 10**9),
     "n_ensembles": Limit(1, 10**4),

@@ -18,7 +18,10 @@ class Status(Enum):
     """How an estimation ended; the value is the remedy, in words."""
 
     CONVERGED = "converged"
-    MAX_ITERATIONS = "the iteration limit was reached first: start closer to the optimum or raise max_iterations"
+    MAX_ITERATIONS = (
+        "the iteration limit was reached first: start closer to the optimum (--start) or raise max_iterations "
+        "(--max-iterations)"
+    )
     SINGULAR = (
         "the data do not determine every parameter: add frames or stars spread over the field, "
         "or choose a distortion model with fewer coefficients"

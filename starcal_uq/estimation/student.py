@@ -21,7 +21,6 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.camera.projection import forward_kernel, forward_root
-from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.maths.linear import COLUMNS, ROWS, inverse_symmetric
 from starcal_uq.observations.frames import StarFrames
@@ -47,7 +46,7 @@ _OUT_OF_FIELD = 1.5
 _STARS_AT_ONCE = 8192
 
 
-def parse_dof(dof: float | str | None, error: type[StarcalError]) -> float | None:
+def parse_dof(dof: float | str | None, error: type[Exception]) -> float | None:
     """The degrees of freedom of a setting: None for "free", `DEFAULT_DOF` for None, else a number in `DOF_RANGE`."""
     low, high = DOF_RANGE
     if dof is None:

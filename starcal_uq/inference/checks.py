@@ -56,10 +56,10 @@ _OPTIONS: dict[str, tuple[str, Any]] = {
     "n_ensembles": ("--ensembles", 4),
     "n_walkers": ("--walkers", 64),
     "n_steps": ("--steps", 200),
-    "moves": ("", "mixture"),
+    "moves": ("--moves", "mixture"),
     "likelihood": ("--likelihood", "marginal"),
     "evaluation": ("--evaluation", "auto"),
-    "dof": ("", DEFAULT_DOF),
+    "dof": ("--dof", DEFAULT_DOF),
 }
 
 
@@ -373,7 +373,7 @@ def _evaluation(post: Posterior) -> Check | None:
     compressed, compared = d.likelihood_used == "compressed", np.isfinite(compression.max_difference)
     if not compressed and not compared:
         return None
-    level, remedy = Level.PASS, ""
+    level, remedy, advice = Level.PASS, "", ""
     value = f"{significant(compression.max_difference)} nat, k-hat {fixed(compression.khat, 2)}" if compared else ""
     if not compressed:
         sentence = f"The exact likelihood was sampled, because the fast one departs from it by {value}."
@@ -381,7 +381,7 @@ def _evaluation(post: Posterior) -> Check | None:
     elif not compared:
         level, value = Level.WARN, "not checked"
         sentence = "The compressed likelihood was not compared with the exact one: the observations were not at hand."
-        remedy = "sc.sample(obs, cal)"
+        remedy, advice = "sc.sample(obs, cal)", "Sample where the observations are at hand."
     elif compression.good:
         sentence = "The fast likelihood equals the exact one wherever the posterior is."
         n_frames, of_frames = d.compressed_frames
@@ -394,7 +394,7 @@ def _evaluation(post: Posterior) -> Check | None:
         level, remedy = Level.FAIL, resample(post, evaluation="exact")
         sentence = "The fast likelihood departs from the exact one: sample the exact one."
     bound = f"≤ {COMPRESSED_BOUND:g} nat, ≤ {KHAT_BOUND:g}"
-    return Check("Likelihood", Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
+    return Check("Likelihood", Question.TRUSTWORTHY, level, value, bound, sentence, remedy, advice)
 
 
 def _likelihood(post: Posterior, notes: Sequence[str]) -> Check | None:
@@ -465,7 +465,7 @@ def _longer(post: Posterior, factor: float = 1.0) -> str:
 
 
 def resample(post: Posterior, **changes: Any) -> str:
-    """Sampling again with some settings changed: a command and a call, or the call alone where no command does it."""
+    """Sampling again with some settings changed: a command and a call; of a likelihood of the user's, the call."""
     settings: Mapping[str, Any] = {**post.provenance.get("settings", {}), **changes}
     kept = {name: settings[name] for name in _OPTIONS if settings.get(name, _OPTIONS[name][1]) != _OPTIONS[name][1]}
     words = {name: repr(value) for name, value in kept.items()}
@@ -474,7 +474,6 @@ def resample(post: Posterior, **changes: Any) -> str:
         words["likelihood"] = "likelihood"
         words.pop("evaluation", None)
     call = f"sc.sample(obs, cal{''.join(f', {name}={word}' for name, word in words.items())})"
-    options = [(_OPTIONS[name][0], kept[name]) for name in words]
-    if words.get("likelihood") == "likelihood" or not all(option for option, _ in options):
+    if words.get("likelihood") == "likelihood":
         return call
-    return f"starcal-uq sample RUN --force{''.join(f' {option} {value}' for option, value in options)} or {call}"
+    return f"starcal-uq sample RUN --force{''.join(f' {_OPTIONS[name][0]} {kept[name]}' for name in words)} or {call}"

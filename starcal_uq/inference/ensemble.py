@@ -8,18 +8,17 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.files import atomic_path, reading
 from starcal_uq.core.records import read_arrays
+from starcal_uq.core.settings import Moves
 from starcal_uq.core.tasks import Progress, interrupt_between_steps
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.inference.target import Density, student_t_log_density
-
-Moves = Literal["mixture", "stretch"]
 
 # Tails a little heavier than normal: most proposals are accepted, and no part of the posterior is out of reach.
 PROPOSAL_DF = 8.0

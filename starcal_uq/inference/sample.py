@@ -17,7 +17,7 @@ from starcal_uq.core.errors import SamplingError
 from starcal_uq.core.formatting import join_words
 from starcal_uq.core.provenance import data_hashes, provenance
 from starcal_uq.core.records import to_plain
-from starcal_uq.core.settings import Evaluation, LikelihoodName, bounded, check_memory
+from starcal_uq.core.settings import Evaluation, LikelihoodName, Moves, bounded, check_memory
 from starcal_uq.core.status import Status
 from starcal_uq.core.tasks import Progress, one_thread
 from starcal_uq.core.types import AnyDict, FloatArray
@@ -25,7 +25,7 @@ from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.undetermined import open_parameters
 from starcal_uq.inference.checks import CompressionCheck, chain_order, check_compression, check_draws, measure
 from starcal_uq.inference.derived import derived_quantities
-from starcal_uq.inference.ensemble import PROPOSAL_DF, Chains, EnsembleSettings, Moves, run_ensembles
+from starcal_uq.inference.ensemble import PROPOSAL_DF, Chains, EnsembleSettings, run_ensembles
 from starcal_uq.inference.named import Source, check_names, find_source, label_of, resolved_dof
 from starcal_uq.inference.posterior import Laplace, Posterior
 from starcal_uq.inference.priors import SIGMA_NAMES, Priors

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from starcal_uq.core.errors import ObservationError
+from starcal_uq.core.times import utc_text
 from starcal_uq.observations.partitions import open_partitions
 from starcal_uq.observations.table import load_observations
 from starcal_uq.sky.site import check_sky
@@ -28,17 +32,21 @@ def observations_from_table(
     observer_velocity_km_s: Sequence[float] | None = None,
     site: Site | None = None,
     in_space: bool = False,
+    time_utc: str | None = None,
 ) -> Observations:
     """Read a table and make its directions apparent as far as the user has declared how.
 
     With directions ``catalogue`` (by default the file's own metadata say what they are), or with an observer velocity
     relative to the Earth's centre (ICRS axes), annual aberration is applied at each row's ``time_utc``. With a `site`
     on the ground, refraction and daily aberration are applied too, and stars lower than ten degrees left out;
-    `in_space`, nothing need be said of refraction. Paths and columns are as `load_observations` takes them.
+    `in_space`, nothing need be said of refraction. Rows without a time are of `time_utc`. Paths and columns are as
+    `load_observations` takes them.
     """
     obs = load_observations(path, camera=camera, columns=columns)
     path = path if isinstance(path, Path) else path[0]
-    return _apparent(obs, path, directions, observer_velocity_km_s, site, in_space)
+    if time_utc is not None and obs.time_utc is not None and bool((obs.time_utc != "").all()):
+        raise ObservationError(f"{path}: every row has a time (column time_utc): leave out --time.", column="time_utc")
+    return _apparent(obs, path, directions, observer_velocity_km_s, site, in_space, time_utc)
 
 
 def partitions_from_folder(
@@ -50,6 +58,7 @@ def partitions_from_folder(
     observer_velocity_km_s: Sequence[float] | None = None,
     site: Site | None = None,
     in_space: bool = False,
+    time_utc: str | None = None,
 ) -> PartitionedObservations:
     """Open a folder of partitions, whose directions are made apparent as `observations_from_table` does, when read."""
     obs = open_partitions(path, camera, columns)
@@ -57,8 +66,6 @@ def partitions_from_folder(
         obs = obs.with_meta(directions=directions)
     if in_space:
         obs = obs.with_meta(observer="space")
-    if obs.meta["directions"] == "undeclared" and observer_velocity_km_s is None and site is None:
-        return obs
     prepare = partial(
         _apparent,
         path=path,
@@ -66,12 +73,16 @@ def partitions_from_folder(
         observer_velocity_km_s=observer_velocity_km_s,
         site=site,
         in_space=in_space,
+        time_utc=time_utc,
     )
+    made = obs.meta["directions"] == "catalogue" or observer_velocity_km_s is not None or site is not None
     if obs.meta["directions"] == "apparent":
-        # Nothing is left to be done but to refuse what contradicts it.
+        # Nothing is left to be done to them but to refuse what contradicts it.
         prepare(obs.reader.load(obs.parts[0]))
+        made = False
+    if not made and time_utc is None:
         return obs
-    return obs.prepared(prepare, directions="apparent")
+    return obs.prepared(prepare, **({"directions": "apparent"} if made else {}))
 
 
 def _apparent(
@@ -81,7 +92,11 @@ def _apparent(
     observer_velocity_km_s: Sequence[float] | None,
     site: Site | None,
     in_space: bool,
+    time_utc: str | None,
 ) -> Observations:
+    if time_utc is not None:
+        there = np.full(len(obs), "") if obs.time_utc is None else obs.time_utc
+        obs = replace(obs, time_utc=np.where(there == "", utc_text(time_utc), there))
     if directions is not None:
         obs = obs.with_meta(directions=directions)
     # A table that says nothing of its directions is taken to hold a catalogue's.

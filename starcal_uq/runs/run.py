@@ -516,6 +516,7 @@ class Run:
         *,
         screening: bool = False,
         undetermined: bool = False,
+        accept_inflation: bool = False,
         force: bool = False,
         progress: Progress | None = None,
         **options: Any,
@@ -533,6 +534,9 @@ class Run:
             others with their reasons, and `screening` of this object all about it.
         undetermined : bool
             Whether to write an estimate that leaves parameters open, to be sampled with priors that determine them.
+        accept_inflation : bool
+            Whether to multiply sigma by how much more the frames scatter than their noise says
+            (`starcal_uq.diagnostics.accept_inflation`).
         force : bool
             Whether to replace what the folder holds.
         progress, **options
@@ -570,6 +574,11 @@ class Run:
         if undetermined and not calibration.status.ok and not calibration.undetermined:
             status = calibration.status
             raise CalibrationError(f"the calibration did not end well ({status.name}): {calibration.remedy}.", status)
+        if accept_inflation:
+            from starcal_uq.diagnostics import jackknife
+
+            found = jackknife.jackknife_of_all(calibration) or jackknife.jackknife_frames(obs, calibration)
+            calibration = jackknife.accept_inflation(calibration, found)
         if not self._making:
             check_new_folder(self.path, force)
         self.write(calibration, obs, screened)

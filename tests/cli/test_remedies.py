@@ -29,6 +29,7 @@ from tests.helpers.outside import campaign
 from tests.helpers.scenes import observations
 
 PACKAGE = Path(sc.__file__).parent
+TIME = "2026-11-25T02:00:00"
 SHORT = {"n_ensembles": 2, "n_walkers": 14, "n_steps": 20}
 
 
@@ -44,9 +45,10 @@ def small(tmp_path_factory):
     camera.save(folder / "CAMERA.toml")
     NOMINAL.save(folder / "GROUND_CAMERA.toml")
     SITE.save(folder / "SITE.toml")
-    ground_frames(sc.load_catalogue(max_mag=6.5, epoch=2026.9), np.linspace(20.0, 80.0, 12)).save(
-        folder / "GROUND_OBS.csv"
-    )
+    altitudes = np.linspace(20.0, 80.0, 12)
+    ground = ground_frames(sc.load_catalogue(max_mag=6.5, epoch=2026.9), altitudes, times=12 * [TIME])
+    # Of tables without times the remedies give the time as well.
+    dataclasses.replace(ground, time_utc=None).save(folder / "GROUND_OBS.csv")
     c = campaign(np.random.default_rng(1), n_frames=12, patch_stars=20, star_sigma_px=0.05)
     patch, sheet = sc.Observations(**c.columns), sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
     c = campaign(np.random.default_rng(2), n_frames=30, sigma_px=lambda radius, mag, frame: 0.03 * (1.0 + 3.0 * radius))
@@ -174,7 +176,9 @@ EXAMPLES = {
         for found in (whole, dataclasses.replace(whole, uneven=None))
     ],
     "diagnostics.verdict.estimate.jackknife": lambda s: [
-        estimate.jackknife(dataclasses.replace(s.jackknife, sandwich_covariance=9.0 * s.jackknife.formal_covariance))
+        estimate.jackknife(found, inflated)
+        for found in [dataclasses.replace(s.jackknife, sandwich_covariance=9.0 * s.jackknife.formal_covariance)]
+        for inflated in (False, True)
     ],
     "diagnostics.verdict.estimate.stars": lambda s: [
         estimate.stars(sc.diagnostics.star_test(s.patch, sc.calibrate(s.patch, s.sheet)))
@@ -334,6 +338,8 @@ def remedies(small):
             # Something to try: a command, a call, or an order of what to do with instrument or data.
             assert check.remedies or check.advice, f"{name} gives nothing to try: {check}"
             assert not check.advice or re.fullmatch(r"[A-Z].*\.", check.advice), check.advice
+            typed = any(remedy.startswith("starcal-uq ") for remedy in check.remedies)
+            assert typed or check.advice, f"{name} gives nothing to type: {check.remedy}"
             found |= dict.fromkeys(check.remedies)
     return list(found)
 
@@ -349,7 +355,7 @@ def execute(small, cli, tmp_path):
         ground = "GROUND_" if "SITE" in words else "PATCH_" if "--star-errors" in words else ""
         files = {"OBS": f"{ground}OBS.csv", "CAMERA": f"{ground}CAMERA.toml", "SITE": "SITE.toml", "FILE": "new.toml"}
         files |= {name: name for name in ("RUN", "RUN_A", "RUN_B", "DIR")}
-        words = [str(folder / files[word]) if word in files else word for word in words]
+        words = [str(folder / files[word]) if word in files else TIME if word == "UTC" else word for word in words]
         if parse:
             typer.main.get_command(app).commands[words[0]].make_context(words[0], words[1:])
             return
@@ -397,6 +403,25 @@ def test_every_argument_in_a_sentence_can_be_given(small):
     names = {"sc": sc, "obs": small.obs, "camera": small.camera, "cal": small.cal}
     for clause, call in ARGUMENTS.items():
         eval(call.format(clause), names)
+
+
+def test_start_limit_and_inflation_are_those_of_the_calibration(small, cli, tmp_path):
+    call = ("calibrate", small.folder / "OBS.csv", small.folder / "CAMERA.toml", "-o")
+    assert cli(*call, "run", "--start", "focal_mm=71,x0_px=500", "--accept-inflation")[0] == 0
+    cal = sc.Run(tmp_path / "run").calibration
+    assert (cal.nominal.focal_mm, cal.nominal.x0_px, cal.nominal.y0_px) == (71.0, 500.0, small.camera.y0_px)
+    assert cal.theta == pytest.approx(small.cal.theta, rel=1e-4)
+    factors = cal.provenance["settings"]["inflation"]
+    assert max(factors.values()) > 1.0
+    assert cal.sigmas == pytest.approx(small.cal.sigmas * list(factors.values()), rel=1e-3)
+    for wrong, words in (
+        (("--max-iterations", 1), "start closer to the optimum (--start) or raise max_iterations (--max-iterations)"),
+        (("--start", "f=70"), "'f=70' is no start, such as focal_mm=50.2"),
+        (("--start", "focal_mm=-1"), "focal"),
+    ):
+        status, _, err = cli(*call, "other", *wrong)
+        assert status == 2 and words in err.splitlines()[-1]
+    assert not (tmp_path / "other").exists()
 
 
 def test_control_a_remedy_that_names_no_option_is_refused(small, execute):

@@ -32,11 +32,12 @@ def ground_frames(
     seed: int = 0,
     site: Site = SITE,
     camera: sc.Camera = CAMERA,
+    times: list[str] | None = None,
 ) -> Observations:
     """Frames at given altitudes and random azimuths: directions of the catalogue, pixels as seen from the site."""
     rng = np.random.default_rng(seed)
     columns: dict[str, list] = {name: [] for name in ("frame", "xy", "star", "time")}
-    for number, (altitude, time) in enumerate(zip(altitudes_deg, night(len(altitudes_deg)), strict=True)):
+    for number, (altitude, time) in enumerate(zip(altitudes_deg, times or night(len(altitudes_deg)), strict=True)):
         zenith, _ = site_among_stars(site, time)
         level = np.linalg.svd(zenith[None])[2][1:]
         angle = rng.uniform(0.0, 2.0 * np.pi)

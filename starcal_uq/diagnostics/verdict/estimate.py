@@ -45,13 +45,15 @@ MISFIT_P, JACKKNIFE_P, STAR_P = ALPHA, 0.01, 0.01
 MISFIT_FAIL_P, STAR_FAIL_P, ESTIMATORS_P, TRUTH_P = 1e-4, 1e-3, 3e-4, 3e-4
 _IPOPT = f"{CALIBRATE} --solver ipopt or sc.calibrate(obs, camera, solver='ipopt')"
 _REMEDIES = {
-    Status.MAX_ITERATIONS: "sc.calibrate(obs, camera, max_iterations=1000)",
+    Status.MAX_ITERATIONS: f"{CALIBRATE} --max-iterations 1000 or sc.calibrate(obs, camera, max_iterations=1000)",
     Status.OUTSIDE_DETECTOR: _IPOPT,
     Status.FOLDED: _IPOPT,
     Status.INCONSISTENT: SCREEN,
     Status.STALLED: f"{CALIBRATE} --solver minpack or sc.calibrate(obs, camera, solver='minpack')",
 }
-_INFLATE = "sc.diagnostics.accept_inflation(cal, sc.diagnostics.jackknife_frames(obs, cal))"
+_INFLATE = (
+    f"{CALIBRATE} --accept-inflation or sc.diagnostics.accept_inflation(cal, sc.diagnostics.jackknife_frames(obs, cal))"
+)
 
 
 def estimation(cal: Calibration, post: Posterior | None = None) -> Check:
@@ -140,12 +142,12 @@ _OF_THE_LENS = ("radius", "azimuth", "field", "field cells")
 _LIKE_NOISE = ("pixel phase in x", "pixel phase in y")
 
 
-def model_checks(diagnosis: Diagnosis) -> list[Check]:
-    """Every check that a diagnosis allows."""
+def model_checks(diagnosis: Diagnosis, inflated: bool) -> list[Check]:
+    """Every check that a diagnosis allows, of a calibration whose inflation may be accepted."""
     fitted = "" if diagnosis.comparison is None else diagnosis.comparison.fitted
     checks = [misfit(diagnosis.misfit, fitted), even_noise(diagnosis.misfit)]
     checks += [] if diagnosis.cameras is None else [one_camera(diagnosis.cameras)]
-    checks += [] if diagnosis.jackknife is None else [jackknife(diagnosis.jackknife)]
+    checks += [] if diagnosis.jackknife is None else [jackknife(diagnosis.jackknife, inflated)]
     checks += [] if diagnosis.stars is None else [stars(diagnosis.stars)]
     checks += [] if diagnosis.comparison is None else [comparison(diagnosis.comparison)]
     return [*checks, predictive(diagnosis.predictive)]
@@ -241,24 +243,27 @@ def disagreeing(found: Jackknife) -> BoolArray:
     return np.asarray((found.p_values * len(found.p_values) < JACKKNIFE_P) & (found.ratio > JACKKNIFE_RATIO))
 
 
-def jackknife(found: Jackknife) -> Check:
+def jackknife(found: Jackknife, inflated: bool = False) -> Check:
     """Do frames scatter as their formal errors say?"""
     worst, bad = int(np.argmax(found.ratio)), disagreeing(found)
     low, high = float(found.ratio.min()), float(found.ratio.max())
     value = f"ratios {fixed(low, 2)} to {fixed(high, 2)} ({found.parameter_names[worst]})"
     chance = found.expected(1.0 - 2.0 * JACKKNIFE_P / len(bad))[1]
     bound = f"≤ {fixed(max(float(chance[worst]), JACKKNIFE_RATIO), 2)}"
+    remedy = advice = ""
     if np.any(bad):
         names = [name for name, flag in zip(found.parameter_names, bad, strict=True) if flag]
+        accepted = "The inflation is accepted: it has multiplied" if inflated else "Accepting the inflation multiplies"
         sentence = (
             f"Frames disagree more than their formal errors allow, in {join_words(names)}: something makes stars of "
-            f"a frame err together. Accepting the inflation multiplies sigma by up to {fixed(high, 2)}."
+            f"a frame err together. {accepted} sigma by up to {fixed(high, 2)}."
         )
+        remedy = "" if inflated else _INFLATE
+        advice = "Use the calibration's sigma: that of the draws is the formal one." if inflated else ""
     else:
         sentence = "Frames scatter as the formal errors say."
-    remedy = _INFLATE if np.any(bad) else ""
     level = pass_or_warn(not np.any(bad))
-    return Check("Jackknife over frames", Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
+    return Check("Jackknife over frames", Question.TRUSTWORTHY, level, value, bound, sentence, remedy, advice)
 
 
 STAR_WIDENING = 1.5
@@ -387,8 +392,9 @@ def starts(found: MultiStart) -> Check:
         advice = "Calibrate again from there, or from a camera file that is nearer to the lens."
         if found.start:
             pairs = zip(("focal_mm", "x0_px", "y0_px"), found.start, strict=True)
-            start = ", ".join(f"{name}={value:.6g}" for name, value in pairs)
-            remedy = f"sc.calibrate(obs, camera.replace({start}))"
+            start = ",".join(f"{name}={value:.6g}" for name, value in pairs)
+            call = f"sc.calibrate(obs, camera.replace({start.replace(',', ', ')}))"
+            remedy = f"{CALIBRATE} --start {start} or {call}"
     elif found.same < found.n:
         stuck = found.n - found.same
         level = Level.WARN

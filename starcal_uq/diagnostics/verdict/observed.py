@@ -71,7 +71,8 @@ def directions(
             )
         return Check(name, Question.TRUSTWORTHY, Level.PASS, declared, bound, sentence)
     sentence = f"{_undeclared(obs)} {aberration_words(cal)}"
-    remedy = f"{_command(obs)} --time UTC" if _untimed_images(obs) else f"{_command(obs)} --directions apparent"
+    time = _time_of(obs) if _from_images(obs) else ""
+    remedy = f"{_command(obs)}{time or ' --directions apparent'}"
     if seen == "unknown":
         sentence, remedy = f"{sentence} {conditional_words(cal)} {REMEDY}", f"{remedy} or {_about_air(obs)}"
     return Check(name, Question.TRUSTWORTHY, Level.WARN, declared, bound, sentence, remedy)
@@ -84,7 +85,7 @@ def air_words(obs: Observations, found: AirTest) -> str:
         f"{significant(found.f_px)} px ({significant(found.f_sigma)} sigma)."
     )
     if not np.isfinite(found.latitude_deg):
-        times = f"--time, or {TIMES_IN_NAMES}" if _from_images(obs) else "column time_utc"
+        times = f"--time, or {TIMES_IN_NAMES if _from_images(obs) else 'column time_utc'}"
         return f"{first} The frames have no times: state the site (--site) and the times ({times})."
     place = Site(found.latitude_deg, found.longitude_deg)
     errors = (significant(error) for error in (found.latitude_std_deg, found.longitude_std_deg))
@@ -105,11 +106,8 @@ def _time_words(obs: Observations, found: TimeTest) -> tuple[str, str, str, str]
         return f"epoch {later}", sentence, "", "Correct the times, or give directions of the epoch of the images."
     if found.cause == "no aberration":
         sentence = f"The residuals hold annual aberration that the directions do not: {effect}."
-        if obs.time_utc is None:
-            if _from_images(obs):
-                return "no aberration", sentence, f"{FROM_IMAGES} --time UTC", ""
-            return "no aberration", sentence, "", "Give the times (column time_utc)."
-        return "no aberration", sentence, f"{_command(obs)} --directions catalogue", ""
+        kind = "" if _from_images(obs) and obs.time_utc is None else " --directions catalogue"
+        return "no aberration", sentence, f"{_command(obs)}{kind}{_time_of(obs)}", ""
     if found.cause == "aberration twice":
         sentence = f"The directions hold annual aberration twice: {effect}."
         return "aberration twice", sentence, f"{_command(obs)} --directions apparent", ""
@@ -139,8 +137,9 @@ def _from_images(obs: Observations) -> bool:
     return str(obs.meta.get("source", "")).startswith("identified in ")
 
 
-def _untimed_images(obs: Observations) -> bool:
-    return _from_images(obs) and (obs.time_utc is None or not bool((obs.time_utc != "").all()))
+def _time_of(obs: Observations) -> str:
+    """The option that gives a time to what has none."""
+    return " --time UTC" if obs.time_utc is None or not bool((obs.time_utc != "").all()) else ""
 
 
 def _command(obs: Observations) -> str:
@@ -149,7 +148,7 @@ def _command(obs: Observations) -> str:
 
 
 def _with_site(obs: Observations) -> str:
-    return f"{_command(obs)} --site SITE{' --time UTC' if _untimed_images(obs) else ''}"
+    return f"{_command(obs)} --site SITE{_time_of(obs)}"
 
 
 def _about_air(obs: Observations) -> str:
