@@ -30,33 +30,17 @@ ONE_THREAD = {
 
 @dataclass(frozen=True)
 class Contestant:
-    """Who is timed.
+    """Who is timed."""
 
-    Attributes
-    ----------
-    label : str
-        Name in the table.
-    call : str
-        ``file:function`` in the folder of contestants.
-    python : {"own", "before", "rivals", "cedar", "system"}
-        Interpreter: this one, this one with the package of before, one of the environments of rivals, the system's.
-    options : dict
-        Keywords of the function.
-    first : bool
-        Whether a first call goes before those that count.
-    environment : dict
-        Variables of the environment.
-    every : int
-        It takes part in every so many turns: a slow one need not be repeated as often.
-    """
-
-    label: str
-    call: str
+    label: str  # Name in the table
+    call: str  # ``file:function`` in the folder of contestants
+    # "own", "before", "rivals", "cedar" or "system": this interpreter, this one with the package of
+    # before, one of the environments of rivals, the system's.
     python: str = "own"
-    options: Mapping[str, Any] = field(default_factory=dict)
-    first: bool = True
-    environment: Mapping[str, str] = field(default_factory=dict)
-    every: int = 1
+    options: Mapping[str, Any] = field(default_factory=dict)  # Keywords of the function
+    first: bool = True  # Whether a first call goes before those that count
+    environment: Mapping[str, str] = field(default_factory=dict)  # Variables of the environment
+    every: int = 1  # It takes part in every so many turns: a slow one need not be repeated as often
 
 
 @dataclass(frozen=True)

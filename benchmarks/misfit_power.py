@@ -40,52 +40,25 @@ Maker = Callable[[int, int], Observations]
 
 @dataclass(frozen=True)
 class Scenario:
-    """Data with one error of the model.
+    """Data with one error of the model."""
 
-    Attributes
-    ----------
-    name : str
-        The error.
-    make : callable
-        ``(n_frames, seed) -> Observations``.
-    test : str
-        Beginning of the name of the test that is made for it; empty where there is no error.
-    """
-
-    name: str
-    make: Maker
-    test: str
+    name: str  # The error
+    make: Maker  # ``(n_frames, seed) -> Observations``
+    test: str  # Beginning of the name of the test that is made for it; empty where there is no error
 
 
 @dataclass(frozen=True)
 class Power:
-    """Shares of replicates in which something was found.
+    """Shares of replicates in which something was found."""
 
-    Attributes
-    ----------
-    name : str
-        The error.
-    n : int
-        Replicates.
-    specific : float
-        Share in which the test made for it rejects by itself at 5 %; without an error, the mean over all tests.
-    overall : float
-        Share in which any test rejects after correction, at 5 %.
-    strongest : str
-        The test that most often had the smallest p-value.
-    error : float
-        Root mean square error of the worst parameter in its stated standard deviations; 1 if all is well.
-    worst : str
-        That parameter.
-    """
-
-    name: str
-    n: int
+    name: str  # The error
+    n: int  # Replicates
+    # Share in which the test made for it rejects by itself at 5 %; without an error, the mean over all tests.
     specific: float
-    overall: float
-    strongest: str
-    error: float
-    worst: str
+    overall: float  # Share in which any test rejects after correction, at 5 %
+    strongest: str  # The test that most often had the smallest p-value
+    error: float  # Root mean square error of the worst parameter in its stated standard deviations; 1 if all is well
+    worst: str  # That parameter
 
 
 def _base(n_frames: int, seed: int, camera: Camera | None = None) -> Observations:
@@ -196,16 +169,7 @@ SCENARIOS = (
 def power(scenario: Scenario, n: int, n_frames: int = 1000, seed: int = 1) -> Power:
     """Simulate, calibrate and test `n` times.
 
-    Parameters
-    ----------
-    scenario : Scenario
-        The error.
-    n : int
-        Replicates.
-    n_frames : int
-        Frames in each.
-    seed : int
-        Of the first replicate; the others follow.
+    `seed`: of the first replicate; the others follow.
     """
     specific, overall, errors, strongest = [], [], [], []
     truth = paper_camera().theta

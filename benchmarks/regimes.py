@@ -56,29 +56,17 @@ STATISTICS_HEAD = (
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one run gave.
+    """What one run gave."""
 
-    Attributes
-    ----------
-    inside : tuple of bool
-        For each parameter whether its 95 % interval holds the truth; empty where there is no estimate.
-    squared : float
-        Squared error (normalised by the stated covariance, over its expectation): 1 on average if that is right.
-    verdict : str
-        One of VERDICTS; "refused" where the chain raised an error, empty where nothing was judged.
-    alarms : tuple of str
-        Checks that did not pass, those of FACTS left out.
-    figures : dict
-        Further numbers by column name; the table shows their medians.
-    shares : dict
-        Further answers by column name; the table shows in how many per cent of the runs they are yes.
-    """
-
+    # For each parameter whether its 95 % interval holds the truth; empty where there is no estimate.
     inside: tuple[bool, ...] = ()
+    # Squared error (normalised by the stated covariance, over its expectation): 1 on average if that is right.
     squared: float = float("nan")
-    verdict: str = ""
-    alarms: tuple[str, ...] = ()
+    verdict: str = ""  # One of VERDICTS; "refused" where the chain raised an error, empty where nothing was judged
+    alarms: tuple[str, ...] = ()  # Checks that did not pass, those of FACTS left out
+    # Further numbers by column name; the table shows their medians.
     figures: Mapping[str, float] = field(default_factory=dict)
+    # Further answers by column name; the table shows in how many per cent of the runs they are yes.
     shares: Mapping[str, bool] = field(default_factory=dict)
 
 

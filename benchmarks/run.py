@@ -98,73 +98,36 @@ Same = Callable[[Mapping[str, Any], Mapping[str, Any]], Agreement]
 
 @dataclass(frozen=True)
 class Target:
-    """What was asked.
+    """What was asked."""
 
-    Attributes
-    ----------
-    words : str
-        As it was asked.
-    rival, factor, of : str, float, str
-        So many times as long as ours the rival takes, or as the contestant `of`.
-    seconds, clock : float, str
-        Limit of ours, on this clock.
-    peak_mb : float
-        Limit of our memory.
-    exponent : float
-        Limit of the growth with the number of frames, fitted through all contestants of the row.
-    """
-
-    words: str
+    words: str  # As it was asked
+    # `rival`, `factor`, `of`: so many times as long as ours the rival takes, or as the contestant `of`.
     rival: str | None = None
     factor: float | None = None
     of: str | None = None
+    # `seconds`, `clock`: limit of ours, on this clock.
     seconds: float | None = None
     clock: str = "wall"
-    peak_mb: float | None = None
+    peak_mb: float | None = None  # Limit of our memory
+    # Limit of the growth with the number of frames, fitted through all contestants of the row.
     exponent: float | None = None
 
 
 @dataclass(frozen=True)
 class Row:
-    """One question.
+    """One question."""
 
-    Attributes
-    ----------
-    name : str
-        Word for ``--only``.
-    what : str
-        Heading in the table.
-    contestants : tuple of Contestant
-        Ours first.
-    same : callable
-        Compares (ours, rival's) results.
-    unit : str
-        What the times are for, where a call does not always do as much.
-    amount : callable
-        How many of it a result holds.
-    frames : int
-        Frames of the data; 0 for none.
-    repeats : int
-        Turns.
-    one_core : bool
-        All contestants on one core and one thread; otherwise as a user would start them.
-    large : bool
-        Runs only when it is asked for.
-    targets : tuple of Target
-        What was asked.
-    """
-
-    name: str
-    what: str
-    contestants: tuple[Contestant, ...]
-    same: Same = lambda ours, rival: Agreement("–", True)
-    unit: str = ""
-    amount: Callable[[Any], float] = lambda result: 1.0
-    frames: int = 0
-    repeats: int = 7
-    one_core: bool = True
-    large: bool = False
-    targets: tuple[Target, ...] = ()
+    name: str  # Word for ``--only``
+    what: str  # Heading in the table
+    contestants: tuple[Contestant, ...]  # Ours first
+    same: Same = lambda ours, rival: Agreement("–", True)  # Compares (ours, rival's) results
+    unit: str = ""  # What the times are for, where a call does not always do as much
+    amount: Callable[[Any], float] = lambda result: 1.0  # How many of it a result holds
+    frames: int = 0  # Frames of the data; 0 for none
+    repeats: int = 7  # Turns
+    one_core: bool = True  # All contestants on one core and one thread; otherwise as a user would start them
+    large: bool = False  # Runs only when it is asked for
+    targets: tuple[Target, ...] = ()  # What was asked
 
 
 # --- the same answer --------------------------------------------------------------------------------------------------

@@ -35,24 +35,12 @@ PREVIOUS = Path(__file__).resolve().parents[1] / "runs" / "data" / "previous"
 
 @dataclass(frozen=True)
 class Sample:
-    """A kind of file.
+    """A kind of file."""
 
-    Attributes
-    ----------
-    file : str
-        Name of the valid file in the folder of samples.
-    load : callable
-        Reads it, as a user does.
-    reads : tuple of str
-        Public names whose files these are.
-    beside : tuple of str
-        Files that must stand beside it.
-    """
-
-    file: str
-    load: Callable[[Path], Any]
-    reads: tuple[str, ...]
-    beside: tuple[str, ...] = ()
+    file: str  # Name of the valid file in the folder of samples
+    load: Callable[[Path], Any]  # Reads it, as a user does
+    reads: tuple[str, ...]  # Public names whose files these are
+    beside: tuple[str, ...] = ()  # Files that must stand beside it
 
     @property
     def ending(self) -> str:
@@ -781,19 +769,12 @@ def _netcdf(data: bytes, rng: random.Random) -> bytes:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a file.
+    """What became of a file."""
 
-    Attributes
-    ----------
-    kind : str
-        ``same`` (the numbers of the valid file), ``other`` (a result with others), ``refused``, ``words`` (refused
-        with a bad sentence), or ``escaped``.
-    detail : str
-        The sentence, or what escaped and where.
-    """
-
+    # ``same`` (the numbers of the valid file), ``other`` (a result with others), ``refused``, ``words`` (refused with
+    # a bad sentence), or ``escaped``.
     kind: str
-    detail: str = ""
+    detail: str = ""  # The sentence, or what escaped and where
 
 
 _CLASS_NAMES = re.compile(r"\b[A-Z]\w*(Error|Exception)\b|NoneType|Traceback|object is not|0x[0-9a-f]{6}|<class ")

@@ -34,18 +34,10 @@ def made_study(
 ) -> Study:
     """A study in which a cell's correlations, the size of its errors (arcsec) and its failures are given.
 
-    Parameters
-    ----------
-    sweep : dict
-        Values of every axis.
-    correlations : callable
-        From a cell's values to the correlations of pairs; all others are zero.
-    size : callable
-        Factor on all sigmas and errors of a cell; the frame-dependent error is this many arcsec.
-    jitter : float
-        Standard deviation that other seeds give the correlations.
-    covered : float, optional
-        Probability that an interval holds the truth; makes the study a simulated one.
+    `correlations`: from a cell's values to the correlations of pairs; all others are zero.
+    `size`: factor on all sigmas and errors of a cell; the frame-dependent error is this many arcsec.
+    `jitter`: standard deviation that other seeds give the correlations.
+    `covered`: probability that an interval holds the truth; makes the study a simulated one.
     """
     rng = np.random.default_rng(1)
     definition = StudyDefinition(

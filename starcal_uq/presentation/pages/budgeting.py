@@ -249,14 +249,8 @@ FORMATS = tuple(_WRITERS)
 def write_budget(budget: Budget, path: str | os.PathLike[str]) -> Path:
     """Write the budget, atomically; overwritten. The ending names the format.
 
-    ``.csv`` holds everything to the last digit and is what `Budget.load` reads; the others are for people.
-
-    Raises
-    ------
-    BudgetError
-        For another ending.
-    RunFolderError
-        If it cannot be written.
+    ``.csv`` holds everything to the last digit and is what `Budget.load` reads; the others are for people. BudgetError
+    for another ending.
     """
     ending = Path(path).suffix.lower()
     if ending not in _WRITERS:

@@ -33,15 +33,7 @@ _PAGE = "comparison.html"
 def write_comparison(comparison: CameraComparison, folder: str | os.PathLike[str]) -> Path:
     """Write the page, the tables, the figure and a lossless file into a folder, in place of those of before.
 
-    Returns
-    -------
-    Path
-        ``comparison.html``, which needs no network and no other file.
-
-    Raises
-    ------
-    RunFolderError
-        If the folder cannot be made or written to.
+    Returns ``comparison.html``, which needs no network and no other file.
     """
     image = svg_bytes(plot_camera_comparison(comparison))
     with making(folder, "compare", _PAGE, force=True) as path:

@@ -59,23 +59,8 @@ def write_plan(
 ) -> Path:
     """Write ``plan.html`` (self-contained), the tables as CSV, ``plan.json`` and the figures into a folder.
 
-    All files count at once, when they are complete.
-
-    Parameters
-    ----------
-    plan : Plan
-        What was forecast.
-    folder : path
-        Folder, made if it is missing; those of a plan of before are replaced.
-    choice : FrameChoice, optional
-        Frames to take, for the page and ``frames.csv``.
-    check : ForecastCheck, optional
-        Forecast against simulation, for the page and ``check.csv``.
-
-    Returns
-    -------
-    Path
-        The page.
+    All files count at once, when they are complete, in place of those of a plan of before. `choice` are the frames to
+    take, for the page and ``frames.csv``, `check` is the forecast against simulation, for the page and ``check.csv``.
     """
     images = plan_figures(plan, choice, check)
     page = render_plan(plan, images, choice, check)

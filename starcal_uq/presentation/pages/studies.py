@@ -80,20 +80,7 @@ _SIMULATED = " Crosses: the posterior's correlation, median and range over seeds
 
 
 def write_study(study: Study, folder: str | os.PathLike[str]) -> Path:
-    """Write ``report.html`` (self-contained) and the figures into a folder.
-
-    Parameters
-    ----------
-    study : Study
-        What was found.
-    folder : path
-        Folder, made if it is missing; files of these names in it are overwritten.
-
-    Returns
-    -------
-    Path
-        The page, which is written last.
-    """
+    """Write ``report.html`` (self-contained), last, and the figures into a folder; files of these names are replaced."""
     path = new_folder(folder)
     images = study_figures(study)
     page = render_study(study, images)
