@@ -80,7 +80,7 @@ _SIMULATED = " Crosses: the posterior's correlation, median and range over seeds
 
 
 def write_study(study: Study, folder: str | os.PathLike[str]) -> Path:
-    """Write ``report.html`` (self-contained), last, and the figures into a folder; files of these names are replaced."""
+    """Write the figures into a folder, then ``report.html`` (self-contained), in place of those of before."""
     path = new_folder(folder)
     images = study_figures(study)
     page = render_study(study, images)
