@@ -88,8 +88,8 @@ def psis(log_weights: FloatArray) -> tuple[FloatArray, FloatArray]:
     """
     values = np.array(log_weights, dtype=float)
     n = values.shape[-1]
-    n_tail = max(5, int(np.ceil(min(n / 5, 3 * np.sqrt(n)))))
-    largest = np.sort(values, axis=-1)[..., -n_tail - 1 :]
+    n_tail = max(5, int(min(n / 5, 3 * np.sqrt(n))))
+    largest = np.sort(values, axis=-1)[..., -n_tail:]
     flat = largest[..., -1] - largest[..., 0] < _EQUAL_WEIGHTS
     khat = np.zeros(values.shape[:-1])
     top = largest[..., -1:]

@@ -110,3 +110,12 @@ def test_tails_are_those_of_five_per_cent() -> None:
 
     assert found == pytest.approx(min(ess(0.05), ess(0.95)), rel=0.05)
     assert found < 0.8 * min(ess(0.1), ess(0.9))
+
+
+@pytest.mark.parametrize(("equal", "fitted"), [(51, False), (50, True)])
+def test_a_tail_of_equal_weights_has_no_shape(equal: int, fitted: bool) -> None:
+    """Of 300 weights the 51 largest are the tail."""
+    low = np.random.default_rng(1).uniform(-3.0, -1.0, 300 - equal)
+    weights, khat = arviz_compat.psis(np.append(low, np.zeros(equal)))
+    assert (khat != 0.0) == fitted
+    assert np.exp(weights).sum() == pytest.approx(1.0, rel=1e-12)
