@@ -13,7 +13,7 @@ import pytest
 from scipy.stats import norm
 
 import starcal_uq as sc
-from starcal_uq.attitude.rotations import left_error, rotation_to_quaternion, rotation_vector
+from starcal_uq.attitude.rotations import left_error, rotation_to_quaternion
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.projection import unproject_theta
 from starcal_uq.core.constants import AXES
@@ -57,25 +57,6 @@ def aligned(post: Any, obs: Observations, phi: np.ndarray) -> np.ndarray:
 def error(n_draws: int = 300) -> AttitudeError:
     obs, cal = scene()
     return propagate(gaussian_posterior(cal), obs, n_draws=n_draws, seed=1)
-
-
-@pytest.mark.parametrize("stated", [False, True])
-def test_rotations_are_those_of_scipy(stated: bool) -> None:
-    from scipy.spatial.transform import Rotation
-
-    obs, cal = scene(stated=stated)
-    post = gaussian_posterior(cal)
-    found = propagate(post, obs, n_draws=4, seed=3)
-    weights = np.ones(obs.n_stars) if obs.sigma_px is None else obs.sigma_px**-2.0
-
-    def attitudes(theta: np.ndarray) -> np.ndarray:
-        b, r = unproject_theta("brown", theta, obs.xy), obs.directions_icrs
-        frames = (slice(*obs.frame_starts[k : k + 2]) for k in range(obs.n_frames))
-        return np.array([Rotation.align_vectors(b[s], r[s], weights=weights[s])[0].as_matrix() for s in frames])
-
-    reference = attitudes(post.mean)
-    phi = np.array([rotation_vector(attitudes(d[:-1]) @ np.swapaxes(reference, 1, 2)) for d in post.thin(4, 3)])
-    np.testing.assert_allclose(found.common_draws_arcsec, aligned(post, obs, phi) * ARCSEC, atol=1e-6)
 
 
 def test_with_all_draws_sigmas_are_plain_standard_deviations() -> None:
