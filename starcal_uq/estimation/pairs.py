@@ -69,13 +69,8 @@ def _block_terms(frames: StarFrames, catalogue: FloatArray, b: FloatArray) -> tu
 class PairObjective:
     """Sum of squared differences of interstar cosines over all pairs of a frame and all frames.
 
-    Parameters
-    ----------
-    frames : StarFrames
-        Data.
-    model_name : str
-        Distortion model; ``none`` for the paper's first stage. Per-star weights are not used: the paper's objective has
-        none.
+    `model_name`: distortion model; ``none`` for the paper's first stage. Per-star weights are not used: the paper's
+    objective has none.
     """
 
     def __init__(self, frames: StarFrames, model_name: str) -> None:

@@ -26,21 +26,11 @@ _EPS, _TINY = float(np.finfo(float).eps), float(np.finfo(float).tiny)
 
 
 class Normal(NamedTuple):
-    """A least-squares cost at one point.
+    """A least-squares cost at one point."""
 
-    Attributes
-    ----------
-    cost : float
-        Sum of squared residuals ``r^T r``; infinite where the model is not defined.
-    gradient : (p,) array
-        ``J^T r``, half the gradient of the cost.
-    matrix : (p, p) array
-        ``J^T J``.
-    """
-
-    cost: float
-    gradient: FloatArray
-    matrix: FloatArray
+    cost: float  # Sum of squared residuals ``r^T r``; infinite where the model is not defined
+    gradient: FloatArray  # (p,): ``J^T r``, half the gradient of the cost
+    matrix: FloatArray  # (p, p): ``J^T J``
 
 
 Evaluate = Callable[[FloatArray], Normal]
@@ -50,46 +40,24 @@ Residuals = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 @dataclass(frozen=True)
 class Solution:
-    """How a solver ended.
+    """How a solver ended."""
 
-    Attributes
-    ----------
-    theta : (p,) array
-        Final parameters.
-    normal : Normal
-        Cost, gradient and Gauss-Newton matrix there, or one unseen step before.
-    trajectory : (n, p) array
-        Accepted points, the start first.
-    costs : (n,) array
-        Costs of the points; that of an unseen one as its step promised.
-    status : Status
-        Converged, or why not.
-    evaluations : int
-        Number of evaluations of the model.
-    """
-
-    theta: FloatArray
-    normal: Normal
-    trajectory: FloatArray
-    costs: FloatArray
-    status: Status
-    evaluations: int
+    theta: FloatArray  # (p,): final parameters
+    normal: Normal  # Cost, gradient and Gauss-Newton matrix there, or one unseen step before
+    trajectory: FloatArray  # (n, p): accepted points, the start first
+    costs: FloatArray  # (n,): costs of the points; that of an unseen one as its step promised
+    status: Status  # Converged, or why not
+    evaluations: int  # Number of evaluations of the model
 
 
 @dataclass(frozen=True)
 class Constraints:
-    """What IPOPT keeps true.
+    """What IPOPT keeps true."""
 
-    Attributes
-    ----------
-    lower, upper : (p,) arrays
-        Bounds.
-    positive : callable, optional
-        From a CasADi vector of parameters to a CasADi vector that must stay positive (monotonic distortion).
-    """
-
+    # `lower`, `upper`, (p,): bounds.
     lower: FloatArray
     upper: FloatArray
+    # From a CasADi vector of parameters to a CasADi vector that must stay positive (monotonic distortion).
     positive: Callable[[Any], Any] | None = None
 
 
@@ -136,26 +104,12 @@ def levenberg_marquardt(
 ) -> Solution:
     """Minimise a sum of squares from its normal equations.
 
-    Parameters
-    ----------
-    evaluate : callable
-        ``theta -> Normal``.
-    start : (p,) array
-        Start values.
-    max_iterations : int
-        Most accepted and refused steps.
-    tolerance : float
-        Converged when the predicted relative reduction of the cost is below this.
-    step_tolerance : float
-        Converged when the trust region is this small against the scaled parameters.
-    last : {"seen", "unseen", "left"}
-        What becomes of a full step that promises no more than `tolerance`: it is taken and the model evaluated there,
-        taken without that, or left to what follows.
-
-    Returns
-    -------
-    Solution
-        With status CONVERGED, MAX_ITERATIONS, SINGULAR, STALLED or NOT_FINITE.
+    `max_iterations`: most accepted and refused steps.
+    `tolerance`: converged when the predicted relative reduction of the cost is below this.
+    `step_tolerance`: converged when the trust region is this small against the scaled parameters.
+    `last`: what becomes of a full step that promises no more than `tolerance`: it is taken and the model evaluated
+        there, taken without that, or left to what follows.
+    It ends CONVERGED, MAX_ITERATIONS, SINGULAR, STALLED or NOT_FINITE.
     """
     theta = np.array(start, dtype=np.float64)
     normal = evaluate(theta)
@@ -246,16 +200,9 @@ def is_singular(matrix: FloatArray) -> bool:
 def minpack(residuals: Residuals, evaluate: Evaluate, start: FloatArray, *, max_iterations: int = 200) -> Solution:
     """Minimise a sum of squares with MINPACK's ``lmder`` on explicit residuals.
 
-    Parameters
-    ----------
-    residuals : callable
-        ``theta -> (r (n,), J (n, p))``.
-    evaluate : callable
-        Function that gives the same cost as normal equations, for the final state and the trajectory.
-    start : (p,) array
-        Start values.
-    max_iterations : int
-        Most evaluations of the residuals.
+    `residuals`: ``theta -> (r (n,), J (n, p))``.
+    `evaluate`: function that gives the same cost as normal equations, for the final state and the trajectory.
+    `max_iterations`: most evaluations of the residuals.
     """
     from scipy.optimize import leastsq
 
