@@ -297,8 +297,8 @@ def test_what_the_model_misses_is_added_to_the_calibration() -> None:
     quantiles = [
         np.array([norm.isf(0.5 * (1.0 - share))] * 3 + [np.sqrt(-2.0 * np.log(1.0 - share))]) for share in (0.95, 0.997)
     ]
-    # The rest and the total have tails a fifth longer than Gaussian ones, the noise a tenth, the interaction three.
-    longer = np.array([1.1, 1.0, 1.2, 1.2, 1.3])[:, None]
+    # The rest and the total have tails a fifth longer than Gaussian ones, the noise a tenth; none is Gaussian.
+    longer = np.array([1.1, 1.15, 1.2, 1.2, 1.3])[:, None]
     p95, p997 = (quantile * longer * sigma for quantile in quantiles)
     misfit = MisfitFound(1.5, np.array([0.3, 0.4, 0.5]), np.array([0.6, 0.6, 0.8]), ())
     held = dataclasses.replace(held, p95_arcsec=p95, p997_arcsec=p997)
@@ -320,7 +320,8 @@ def test_what_the_model_misses_is_added_to_the_calibration() -> None:
         # Of all of the total, that part is the model's own tail, whatever the noise has.
         share_of_both = (1.5 * sigma[3, 0] / both[0]) ** 2
         np.testing.assert_allclose(widths[3, 0], quantile[0] * (1.0 + 0.2 * share_of_both) * both[0], rtol=1e-6)
-        np.testing.assert_allclose(widths[1, :3], quantile[:3] * common, rtol=1e-6)
+        share_of_common = (1.5 * sigma[1, :3] / common) ** 2
+        np.testing.assert_allclose(widths[1, :3], quantile[:3] * (1.0 + 0.15 * share_of_common) * common, rtol=1e-6)
         np.testing.assert_allclose(widths[2, 0], quantile[0] * (1.0 + 0.2 * share) * rest[0], rtol=1e-6)
         np.testing.assert_allclose(widths[2, 3], quantile[3] * (1.0 + 0.2 * share) * rest[0], rtol=1e-6)
 
