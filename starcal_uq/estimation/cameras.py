@@ -16,7 +16,7 @@ import numpy as np
 from starcal_uq.core.formatting import join_words, plural
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
-from starcal_uq.estimation.screening.consensus import focal_ratio, measured_directions
+from starcal_uq.estimation.screening.consensus import frame_focal_ratios, measured_directions
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.splits import one_of_each
 
@@ -131,7 +131,7 @@ def frame_focals(obs: Observations, camera: Camera, *, seed: int = 0) -> FrameFo
         b = measured_directions(camera, frames)
     tangent = b[:2] / b[2]
     theta = np.array([0.0, 0.0, camera.focal_px])
-    log_scale = np.array([-np.log(_ratio(camera, frames, k)) for k in range(frames.n_frames)])
+    log_scale = -np.log(frame_focal_ratios(tangent, frames))
     for _ in range(_STEPS):
         pixel = np.ascontiguousarray(camera.focal_px * tangent * frames.spread(np.exp(log_scale)))
         likelihood = MarginalLikelihood(StarFrames(pixel, frames.r, frames.weight, frames.starts), "none")
@@ -148,11 +148,6 @@ def frame_focals(obs: Observations, camera: Camera, *, seed: int = 0) -> FrameFo
     group, p_value = _grouped(-log_scale, sigma, seed)
     focal = camera.focal_px * np.exp(-log_scale)
     return FrameFocals(some.frame_ids, focal, sigma * focal, group, p_value)
-
-
-def _ratio(camera: Camera, frames: StarFrames, number: int) -> float:
-    ratio = focal_ratio(camera, frames.part(number, number + 1))
-    return ratio if np.isfinite(ratio) and ratio > 0.0 else 1.0
 
 
 def _grouped(value: FloatArray, sigma: FloatArray, seed: int) -> tuple[IntArray, float]:

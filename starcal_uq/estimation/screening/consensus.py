@@ -141,19 +141,23 @@ def focal_ratio(camera: Camera, frames: StarFrames) -> float:
     The mode over pairs of the ratio of measured to catalogue angle: at least a quarter of the pairs must be right, so
     that half of the stars may be wrong.
     """
-    pairs = np.array(pair_trials(frames.starts))
-    first, second = pairs[:, 0].ravel(), pairs[:, 1].ravel()
+    first, second = np.array(pair_trials(frames.starts)).transpose(1, 0, 2).reshape(2, 1, -1)
     catalogue = _angle(frames.r, first, second)
     ratio = 1.0
     for _ in range(3):
         scaled = camera.replace(focal_mm=camera.focal_mm * ratio)
-        measured = _angle(measured_directions(scaled, frames), first, second)
-        usable = np.isfinite(measured) & (measured > 0.0) & (catalogue > 0.0)
-        if not usable.any():
-            return ratio
-        # Close pairs say little about scale.
-        usable[usable] = measured[usable] >= np.median(measured[usable])
-        ratio *= float(np.exp(_mode(np.log(measured[usable] / catalogue[usable]))))
+        ratio *= float(_factors(_angle(measured_directions(scaled, frames), first, second), catalogue)[0])
+    return ratio
+
+
+def frame_focal_ratios(tangent: FloatArray, frames: StarFrames) -> FloatArray:
+    """The same of each frame by itself, (K,), from the tangents (2, N) that a camera measures."""
+    first, second = np.array(pair_trials(frames.starts)).transpose(1, 2, 0)
+    catalogue = _angle(frames.r, first, second)
+    ratio = np.ones(frames.n_frames)
+    for _ in range(3):
+        b = np.concatenate([tangent / frames.spread(ratio), np.ones((1, tangent.shape[1]))])
+        ratio *= _factors(_angle(b / np.linalg.norm(b, axis=0), first, second), catalogue)
     return ratio
 
 
@@ -163,16 +167,37 @@ def _angle(vectors: FloatArray, first: IntArray, second: IntArray) -> FloatArray
     return angle
 
 
-def _mode(values: FloatArray) -> float:
-    """Median of what lies around the shortest interval that holds a quarter of the values."""
-    ordered = np.sort(values)
-    n = max(len(ordered) // 4, 1)
-    widths = ordered[n:] - ordered[: len(ordered) - n]
-    if not len(widths):
-        return float(np.median(ordered))
-    start = int(np.argmin(widths))
-    middle, half = ordered[start] + widths[start] / 2.0, widths[start] / 2.0
-    return float(np.median(ordered[np.abs(ordered - middle) <= 4.0 * half]))
+def _factors(measured: FloatArray, catalogue: FloatArray) -> FloatArray:
+    """Mode of the ratios of angles (K, P) in each row, (K,); 1 where none can be used."""
+    usable = np.isfinite(measured) & (measured > 0.0) & (catalogue > 0.0)
+    n = np.count_nonzero(usable, axis=1)
+    # Close pairs say little about scale.
+    half = _middle(np.sort(np.where(usable, measured, np.inf), axis=1), 0 * n, n)
+    usable &= measured >= half[:, None]
+    ratios = np.divide(measured, catalogue, out=np.ones_like(measured), where=usable)
+    return np.where(n > 0, np.exp(_modes(np.log(ratios), usable)), 1.0)
+
+
+def _modes(values: FloatArray, usable: BoolArray) -> FloatArray:
+    """In each row, the median of what lies around the shortest interval that holds a quarter of its usable values."""
+    ordered = np.sort(np.where(usable, values, np.inf), axis=1)
+    place, count = np.arange(values.shape[1]), np.count_nonzero(usable, axis=1)[:, None]
+    end = place + np.maximum(count // 4, 1)
+    with np.errstate(invalid="ignore"):
+        widths = np.take_along_axis(ordered, np.minimum(end, place[-1]), axis=1) - ordered
+        widths = np.where(end < count, widths, np.inf)
+        start = np.argmin(widths, axis=1)[:, None]
+        half = np.where(count > 1, np.take_along_axis(widths, start, axis=1) / 2.0, 0.0)
+        middle = np.take_along_axis(ordered, start, axis=1) + half
+        near = (np.abs(ordered - middle) <= 4.0 * half) & (place < count)
+    return _middle(ordered, np.argmax(near, axis=1), np.count_nonzero(near, axis=1))
+
+
+def _middle(ordered: FloatArray, first: IntArray, n: IntArray) -> FloatArray:
+    """Median of n values from the first on, of sorted rows; what stands first where there are none."""
+    row, before, after = np.arange(len(ordered)), first + np.maximum(n - 1, 0) // 2, first + n // 2
+    middle: FloatArray = (ordered[row, before] + ordered[row, after]) / 2.0
+    return middle
 
 
 def pre_screen(camera: Camera, frames: StarFrames) -> tuple[BoolArray, Camera]:
