@@ -73,21 +73,11 @@ class FrameFocals:
 
 @dataclass(frozen=True)
 class MixedCameras:
-    """Frames that ask for several cameras.
+    """Frames that ask for several cameras."""
 
-    Attributes
-    ----------
-    n : int
-        Number of cameras.
-    words : str
-        What is known of them, in one clause.
-    frames : str
-        Frames of the largest group, as ``--only-frames`` takes them.
-    """
-
-    n: int
-    words: str
-    frames: str
+    n: int  # Number of cameras
+    words: str  # What is known of them, in one clause
+    frames: str  # Frames of the largest group, as ``--only-frames`` takes them
 
     @classmethod
     def of(cls, obs: Observations, camera: Camera) -> MixedCameras | None:

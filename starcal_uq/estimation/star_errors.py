@@ -261,25 +261,15 @@ class SolvedStars:
 
 @dataclass(frozen=True)
 class StarErrors:
-    """Direction errors of stars that the covariance of a calibration holds.
+    """Direction errors of stars that the covariance of a calibration holds."""
 
-    Attributes
-    ----------
-    tau_px, tau_px_std : float
-        Error of a star per axis beyond what its catalogue states, estimated by restricted maximum likelihood, and its
-        standard error; px at the boresight.
-    stated_px : float
-        Root mean square of what the catalogue states, px; zero where the table states nothing.
-    focal_px : float
-        Focal length that turns directions into these px.
-    n_stars, n_recurring : int
-        Distinct stars, and those seen in more than one frame.
-    """
-
+    # `tau_px`, `tau_px_std`: error of a star per axis beyond what its catalogue states, estimated by restricted
+    # maximum likelihood, and its standard error; px at the boresight.
     tau_px: float
     tau_px_std: float
-    stated_px: float
-    focal_px: float
+    stated_px: float  # Root mean square of what the catalogue states, px; zero where the table states nothing
+    focal_px: float  # Focal length that turns directions into these px
+    # `n_stars`, `n_recurring`: distinct stars, and those seen in more than one frame.
     n_stars: int
     n_recurring: int
 

@@ -92,23 +92,16 @@ class Laplace:
 
 @dataclass(frozen=True)
 class Derived:
-    """One quantity.
+    """One quantity."""
 
-    Attributes
-    ----------
-    name, unit : str
-        Name and unit.
-    mean, sd, mcse : float
-        Moments over the draws, and the Monte Carlo standard error of the mean.
-    rhat, ess_bulk, ess_tail : float
-        Convergence over separately seeded ensembles.
-    """
-
+    # `name`, `unit`: name and unit.
     name: str
     unit: str
+    # `mean`, `sd`, `mcse`: moments over the draws, and the Monte Carlo standard error of the mean.
     mean: float
     sd: float
     mcse: float
+    # `rhat`, `ess_bulk`, `ess_tail`: convergence over separately seeded ensembles.
     rhat: float
     ess_bulk: float
     ess_tail: float

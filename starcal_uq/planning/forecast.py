@@ -55,31 +55,21 @@ class Quantity:
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """What campaigns of n frames will give, for G numbers of frames and Q quantities.
+    """What campaigns of n frames will give, for G numbers of frames and Q quantities."""
 
-    Attributes
-    ----------
-    n_frames : (G,) array of int
-        Frames of a campaign.
-    names : tuple of str
-        The quantities, with their units.
-    sigma, low, high : (G, Q) array
-        Standard deviation that a calibration will state: mean over campaigns, and the range of 90 % of them.
-    radius, radius_low, radius_high : (G,) array
-        Two-axis error across the boresight at the confidence asked for, arcsec: mean and range of 90 %.
-    noise_sigma : (G,) array
-        Relative standard error of the estimated centroid noise.
-    """
-
-    n_frames: IntArray
-    names: tuple[str, ...]
+    n_frames: IntArray  # (G,): frames of a campaign
+    names: tuple[str, ...]  # The quantities, with their units
+    # `sigma`, `low`, `high`, (G, Q): standard deviation that a calibration will state: mean over campaigns, and the
+    # range of 90 % of them.
     sigma: FloatArray
     low: FloatArray
     high: FloatArray
+    # `radius`, `radius_low`, `radius_high`, (G,): two-axis error across the boresight at the confidence asked for,
+    # arcsec: mean and range of 90 %.
     radius: FloatArray
     radius_low: FloatArray
     radius_high: FloatArray
-    noise_sigma: FloatArray
+    noise_sigma: FloatArray  # (G,): relative standard error of the estimated centroid noise
 
     def of(self, name: str) -> FloatArray:
         """Mean standard deviation (G,) of one quantity."""

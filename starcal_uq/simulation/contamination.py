@@ -23,18 +23,10 @@ _SAME_RAD = 1e-6
 
 @dataclass(frozen=True)
 class Contaminated:
-    """Observations with wrong identifications, and which they are.
+    """Observations with wrong identifications, and which they are."""
 
-    Attributes
-    ----------
-    observations : Observations
-        Same rows, some with the direction, name and magnitude of another star.
-    wrong : (N,) bool array
-        Rows that were changed.
-    """
-
-    observations: Observations
-    wrong: BoolArray
+    observations: Observations  # Same rows, some with the direction, name and magnitude of another star
+    wrong: BoolArray  # (N,): rows that were changed
 
 
 @bounded

@@ -42,24 +42,12 @@ MARGINAL = 4.0
 
 @dataclass(frozen=True)
 class ScreeningRound:
-    """One round: calibrate on what is in use, then test.
+    """One round: calibrate on what is in use, then test."""
 
-    Attributes
-    ----------
-    n_in_use : int
-        Stars calibrated on.
-    n_changed : int
-        Stars that the tests then rejected or took back.
-    sigma : float
-        Estimated noise, px (or the factor on the stated noise).
-    theta : (p,) array
-        Estimate.
-    """
-
-    n_in_use: int
-    n_changed: int
-    sigma: float
-    theta: FloatArray
+    n_in_use: int  # Stars calibrated on
+    n_changed: int  # Stars that the tests then rejected or took back
+    sigma: float  # Estimated noise, px (or the factor on the stated noise)
+    theta: FloatArray  # (p,): estimate
 
 
 @dataclass(frozen=True, eq=False, repr=False)
