@@ -93,6 +93,8 @@ def usage_sentence(error: Exception) -> str:
         name = max(parameter.opts, key=len) if parameter.opts[0].startswith("-") else parameter.display_name_raw
         problems: list[AnyDict] = getattr(cause, "errors", list)()
         return f"{name} {_problem(parameter, problems[0]['input']) if problems else error.message}"
+    if isinstance(error, typer.BadParameter):
+        return str(error.message)
     words = getattr(error, "format_message", None)
     message = words() if callable(words) else str(error)
     return f"{message.strip().rstrip('.')}; see `starcal-uq --help`."

@@ -45,8 +45,10 @@ from starcal_uq.cli.settings import (
     refuse_others,
 )
 from starcal_uq.cli.steps import load_table, sample_run
+from starcal_uq.core.errors import PriorError
 from starcal_uq.core.store import finished
 from starcal_uq.core.tasks import one_thread
+from starcal_uq.core.toml import read_section
 from starcal_uq.observations.files import READ
 
 if TYPE_CHECKING:
@@ -122,6 +124,8 @@ def run_command(
     if budget is not None:
         # A mistake in it should not show after the work.
         sc.budgeting.load_budget_file(budget)
+    if sampling.priors is not None:
+        read_section(sampling.priors, "priors", PriorError, alone=False)
     *given, last = inputs
     table = last.suffix.lower() in READ
     other = bool(given) and last.is_file() and not table and not are_images([last])
@@ -131,6 +135,8 @@ def run_command(
     folder = len(inputs) == 1 and inputs[0].is_dir() and any(inputs[0].glob("*.parquet"))
     from_images = not folder and are_images(inputs)
     refuse_others(from_images, sky, images)
+    if cameras := [path for path in given if path.suffix.lower() == ".toml"]:
+        raise typer.BadParameter(f"{cameras[0]} is a camera: give it last.")
     if len(inputs) > 1 and not from_images and not all(path.suffix == ".corr" for path in inputs):
         raise typer.BadParameter(f"{inputs[1]} is no image: give one table, .corr files only, or images only.")
     if camera is None and not from_images:

@@ -73,7 +73,7 @@ def check_new_folder(path: PathLike, force: bool = False) -> None:
 def _refuse_file(path: Path) -> None:
     # os.path, because Path.exists raises in a folder that may not be searched.
     if os.path.exists(path) and not os.path.isdir(path):
-        raise RunFolderError(f"{path}: is a file, not a folder for results; name another folder.")
+        raise RunFolderError(f"{path}: is a file, not a folder; name a folder.")
 
 
 def sweep_temporary(folder: PathLike) -> None:

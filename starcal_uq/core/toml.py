@@ -35,10 +35,12 @@ def read_toml(path: PathLike, name: str, error: type[StarcalError], missing: str
         raise error(f"{where} does not exist; {missing}.") from None
     except OSError as problem:
         raise error(f"{where} cannot be read ({problem.strerror}); check its permissions.") from problem
-    except UnicodeDecodeError:
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as problem:
+        if path.suffix.lower() != ".toml":
+            raise error(f"{path}: is no TOML, as a {name} file is; check the order of the arguments.") from None
+        if isinstance(problem, tomllib.TOMLDecodeError):
+            raise error(f"{where} is not valid TOML: {problem}; correct that line.") from None
         raise error(f"{where} is not UTF-8 text; save it as TOML in UTF-8.") from None
-    except tomllib.TOMLDecodeError as problem:
-        raise error(f"{where} is not valid TOML: {problem}; correct that line.") from None
     except ValueError:
         raise error(f"{where} holds a number with too many digits; correct it.") from None
     except RecursionError:
@@ -51,7 +53,9 @@ def read_section(path: PathLike, name: str, error: type[StarcalError], *, alone:
     write = f"write [{name}] above its keys"
     if name not in content:
         empty = "" if content else f"the {name} file is empty: "
-        raise error(f"{path}: {empty}section [{name}] is missing; {write}.")
+        other = next((f", and [{key}] is there" for key, value in content.items() if isinstance(value, dict)), "")
+        remedy = f"give another file, or {write}" if other else write
+        raise error(f"{path}: {empty}section [{name}] is missing{other}; {remedy}.")
     section = content.pop(name)
     if not isinstance(section, dict):
         raise error(f"{path}: {name} is no section; {write}.")

@@ -197,7 +197,9 @@ def open_partitions(
     if not folder.is_dir():
         raise ObservationError(f"{folder}: is no directory; name one that holds .parquet files.")
     # Files of a simulation that was stopped while they took their places do so now.
-    read_manifest(folder)
+    manifest = read_manifest(folder)
+    if manifest is not None and "calibrate" in manifest.steps:
+        raise ObservationError(f"{folder}: is the folder of a run; name its table, {folder / 'observations.parquet'}.")
     paths = sorted(path.resolve() for path in folder.iterdir() if path.suffix.lower() == ".parquet")
     if not paths:
         raise ObservationError(

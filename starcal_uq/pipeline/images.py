@@ -165,6 +165,8 @@ def observations_from_images(
     centroids = with_time(centroids, time_utc)
     if camera is None:
         centroids = of_one_size(centroids)
+    if centroids.n_left_out == centroids.n_frames and centroids.messages:
+        raise IdentificationError(f"no image can be used: {counted(centroids.messages)[0]}")
     if tell is not None:
         for message in counted(centroids.messages):
             tell(f"note: {message}")

@@ -129,11 +129,11 @@ def _write_netcdf(best: Calibration | Posterior, path: Path) -> str:
     return f"{len(best.draws)} draws, as ArviZ and xarray read them."
 
 
-def _write_table(mark: Callable[[TextTable], str]) -> Callable[[Calibration | Posterior, Path], str]:
+def _write_table(mark: Callable[[TextTable], str], needs: str = "") -> Callable[[Calibration | Posterior, Path], str]:
     def write(best: Calibration | Posterior, path: Path) -> str:
         table = posterior_table(best) if isinstance(best, Posterior) else calibration_table(best)
         atomic_write_text(path, mark(table) + "\n")
-        return f"the table of {len(table.rows)} parameters."
+        return f"the table of {len(table.rows)} parameters{needs}."
 
     return write
 
@@ -143,7 +143,7 @@ _RESULTS = {
     "covariance": _write_covariance,
     "csv": _write_draws,
     "netcdf": _write_netcdf,
-    "latex": _write_table(TextTable.latex),
+    "latex": _write_table(TextTable.latex, ", for the package booktabs"),
     "markdown": _write_table(TextTable.markdown),
 }
 # Format -> ending of its file.

@@ -274,6 +274,28 @@ def test_wrong_options_are_named(cli, inputs, tmp_path, option, value, words):
     assert files(tmp_path) == before
 
 
+WRONG_FILES = {
+    "calibrate camera.toml obs.csv": "obs.csv: is no TOML, as a camera file is; check the order of the arguments.",
+    "calibrate obs.csv site.toml": "site.toml: section [camera] is missing, and [site] is there; give another file, or",
+    "calibrate made camera.toml": "made: is the folder of a run; name its table, made/observations.parquet.",
+    "run camera.toml obs.csv": "camera.toml is a camera: give it last.",
+    "run obs.csv": "a table of stars needs the nominal camera (TOML) after it; only images do without.",
+    "run bad.png camera.toml": "no image can be used: Frame 0 was left out: bad.png: the file is not an image",
+    "run obs.csv camera.toml --priors site.toml": "site.toml: section [priors] is missing, and [site] is there; give",
+}
+
+
+def test_files_of_another_kind_are_named_before_any_work(cli, inputs, tmp_path, monkeypatch):
+    monkeypatch.chdir(inputs)
+    sc.sky.Site(52.0, 4.4, 10.0).save("site.toml")
+    (inputs / "bad.png").write_bytes(b"no image")
+    assert cli("calibrate", "obs.csv", "camera.toml", "-o", "made", "--in-space")[0] == 0
+    for call, words in WRONG_FILES.items():
+        status, _, err = cli(*call.split(), "-o", "run")
+        assert (status, len(err.splitlines())) == (2, 1) and err.startswith(f"error: {words}"), err
+    assert not (inputs / "run").exists()
+
+
 def test_a_calibration_that_fails_leaves_no_folder(cli, inputs, tmp_path):
     rng = np.random.default_rng(0)
     obs = observations()

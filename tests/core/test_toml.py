@@ -60,7 +60,7 @@ def test_a_wrong_key_is_named_with_its_remedy(table: dict[str, Any], words: str)
     ("text", "words"),
     [
         ("", "the site file is empty: section [site] is missing; write [site] above its keys."),
-        ("[sight]\n", "section [site] is missing; write [site] above its keys."),
+        ("[sight]\n", "section [site] is missing, and [sight] is there; give another file, or write [site] above"),
         ("site = 3\n", "site is no section; write [site] above its keys."),
         ("x = 1\n[site]\n", "x stands outside section [site]; remove it or move it below [site]."),
         ("[site\n", "the site file is not valid TOML"),
