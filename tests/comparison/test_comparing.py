@@ -30,6 +30,7 @@ from starcal_uq.presentation.pages.comparison import write_comparison
 from starcal_uq.runs.compare import compare_runs, compare_split
 from starcal_uq.runs.folder import RunFolder
 from tests.helpers.gaussian_camera import COVARIANCE
+from tests.helpers.same import assert_same
 from tests.helpers.scenes import camera, nominal, observations
 
 ARCSEC = 648_000.0 / np.pi
@@ -366,11 +367,7 @@ def test_page_tables_and_file(tmp_path: Path) -> None:
     assert "Monte Carlo" in text
     loaded = CameraComparison.load(tmp_path / "out")
     assert json.dumps(loaded.to_dict()) == json.dumps(found.to_dict())
-    for field in dataclasses.fields(CameraComparison):
-        before, after = getattr(found, field.name), getattr(loaded, field.name)
-        assert type(before) is type(after), field.name
-        if isinstance(before, np.ndarray):
-            np.testing.assert_array_equal(before, after)
+    assert_same(found, loaded)
     table = found.to_dataframe()
     assert list(table["quantity"][:4]) == ["rotation, pitch", "rotation, yaw", "rotation, roll", "map, rms"]
     row = table[table["quantity"] == "map, rms"].iloc[0]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
 import signal
 
 import numpy as np
@@ -24,6 +23,7 @@ from starcal_uq.presentation.figures.diagnostics import plot_validation
 from starcal_uq.presentation.figures.style import png_bytes
 from starcal_uq.simulation.frames import Campaign
 from tests.helpers import validation_controls as controls
+from tests.helpers.same import assert_same
 from tests.helpers.scenes import camera, nominal
 
 # Starts are draws of the Laplace approximation, which is nearly the posterior here: little has to be forgotten.
@@ -416,15 +416,7 @@ def test_save_and_load_lose_nothing(good, tmp_path):
     found = dataclasses.replace(good, failures=("a reason.",))
     found.save(path)
     again = Validation.load(path)
-    for field in dataclasses.fields(Validation):
-        before, after = getattr(found, field.name), getattr(again, field.name)
-        if isinstance(before, np.ndarray):
-            np.testing.assert_array_equal(before, after)
-            assert before.dtype == after.dtype
-        elif field.name == "provenance":
-            assert json.dumps(before) == json.dumps(after)
-        else:
-            assert before == after
+    assert_same(found, again)
     assert again.text == found.text
 
 

@@ -16,6 +16,7 @@ from starcal_uq.core.status import Status
 from starcal_uq.estimation.calibrate import METHODS
 from starcal_uq.estimation.recursive.start import RecursionOptions
 from starcal_uq.estimation.recursive.stream import RecursiveCalibration
+from tests.helpers.same import assert_same
 from tests.helpers.scenes import camera, nominal, observations, with_sigmas
 
 ALL = RecursionOptions(parameters="all")
@@ -156,18 +157,7 @@ def test_a_stream_calibration_saves_itself(tmp_path):
     cal = run(iter(one_by_one(observations())), sc.paper.paper_start(), "samaan")
     cal.save(tmp_path / "calibration.json")
     again = sc.Calibration.load(tmp_path / "calibration.json")
-    for field in dataclasses.fields(cal):
-        ours, theirs = getattr(cal, field.name), getattr(again, field.name)
-        if isinstance(ours, np.ndarray):
-            assert np.array_equal(ours, theirs), field.name
-            assert ours.shape == theirs.shape
-        elif field.name not in ("stages", "compressed"):
-            assert ours == theirs, field.name
-    for ours, theirs in zip(cal.stages, again.stages, strict=True):
-        assert np.array_equal(ours.trajectory, theirs.trajectory)
-        assert (ours.sigmas is None) == (theirs.sigmas is None)
-        assert ours.sigmas is None or np.array_equal(ours.sigmas, theirs.sigmas)
-    assert np.array_equal(cal.compressed.gram, again.compressed.gram)
+    assert_same(cal, again)
     assert (again.n_stars, again.n_frames) == (cal.n_stars, 60)
     assert "focal length" in again._repr_html_()
     with pytest.raises(CalibrationError, match="kept no residuals"):

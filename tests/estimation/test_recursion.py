@@ -21,6 +21,7 @@ from starcal_uq.estimation.recursive.start import RecursionOptions
 from starcal_uq.estimation.recursive.stream import RecursiveCalibration
 from starcal_uq.estimation.solvers import levenberg_marquardt
 from starcal_uq.observations.frames import StarFrames
+from tests.helpers.same import assert_same
 from tests.helpers.scenes import camera, nominal, observations, with_sigmas
 
 SCALES = {"f": 1.0, "k1": 1e-9, "k2": 1e-14, "k3": 1e-20, "p1": 1e-6, "p2": 1e-6, "x0": 1.0, "y0": 1.0}
@@ -317,17 +318,6 @@ def test_sharing_linearisations_changes_nothing_that_counts(monkeypatch):
     assert shared < 0.7 * sum(calls)
 
 
-def same_state(a, b):
-    for field in dataclasses.fields(a):
-        ours, theirs = getattr(a, field.name), getattr(b, field.name)
-        if dataclasses.is_dataclass(ours):
-            same_state(ours, theirs)
-        elif isinstance(ours, np.ndarray | list):
-            assert np.array_equal(ours, theirs), field.name
-        else:
-            assert ours == theirs, field.name
-
-
 CASES = [
     ("griffith", {}),
     ("griffith", {"parameters": "all", "forgetting": 0.99}),
@@ -356,7 +346,7 @@ def test_saved_and_resumed_equals_uninterrupted(tmp_path, method, options, cut):
     assert np.array_equal(again.theta, last.theta)
     assert np.array_equal(again.covariance, last.covariance)
     assert (again.sigma, again.chi2, again.n_frames, again.n_stars) == (last.sigma, last.chi2, 60, obs.n_stars)
-    same_state(second._recursion, whole._recursion)
+    assert_same(second._recursion, whole._recursion)
     ours, theirs = second.result(throw=False), whole.result(throw=False)
     for field in dataclasses.fields(ours):
         if isinstance(getattr(ours, field.name), np.ndarray):
@@ -376,7 +366,7 @@ def test_grouping_of_frames_does_not_matter(method, options):
             steps.update(obs.select_frames(obs.frame_ids[first : first + size]))
         states.append(steps)
     for other in states[1:]:
-        same_state(states[0]._recursion, other._recursion)
+        assert_same(states[0]._recursion, other._recursion)
         assert states[0]._digest == other._digest
     # Control: another order of the same frames is another computation.
     backwards = RecursiveCalibration(sc.paper.paper_start(), method, RecursionOptions(**options))

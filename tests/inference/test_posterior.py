@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +15,7 @@ from starcal_uq.inference import arviz as arviz_compat
 from starcal_uq.inference.posterior import DRAW_ORDER, Posterior
 from starcal_uq.inference.sample import sample
 from tests.helpers.gaussian_camera import gaussian_calibration
+from tests.helpers.same import assert_same
 
 
 @pytest.fixture(scope="module")
@@ -26,22 +26,6 @@ def post() -> Posterior:
 @pytest.fixture(scope="module")
 def given() -> Posterior:
     return sample(None, gaussian_calibration(), sigma=0.05, n_walkers=16, n_steps=20, seed=7, evaluation="compressed")
-
-
-def assert_same(a: object, b: object) -> None:
-    """Equal to the last bit, arrays and nested records included."""
-    if isinstance(a, np.ndarray):
-        assert isinstance(b, np.ndarray)
-        assert np.array_equal(a, b, equal_nan=True)
-        assert a.dtype == b.dtype
-    elif isinstance(a, float):
-        assert a == b or (np.isnan(a) and np.isnan(b))  # type: ignore[arg-type]
-    elif dataclasses.is_dataclass(a):
-        assert type(a) is type(b)
-        for field in dataclasses.fields(a):
-            assert_same(getattr(a, field.name), getattr(b, field.name))
-    else:
-        assert a == b
 
 
 @pytest.mark.parametrize("which", ["post", "given"])
