@@ -109,10 +109,14 @@ def settle_noise(obs: Observations, cal: Calibration) -> Observations:
 
 
 def with_noise_floor(obs: Observations, floor: NoiseFloor) -> Observations:
-    """The observations with the floor in every star's noise, where it is needed; ``meta["noise_floor_px"]`` says it."""
+    """The observations with the floor in every star's noise, where it is needed; ``meta["noise_floor_px"]`` says it.
+
+    A factor on the stated noise that is more than one is left to the calibration; a smaller one, which a floor above
+    all noise stated leaves unknown, is taken up here, so that the noise is the scatter seen.
+    """
     if not floor.needed or obs.sigma_px is None:
         return obs
-    raised: FloatArray = np.hypot(obs.sigma_px, floor.floor_px / floor.scale)
+    raised: FloatArray = np.hypot(obs.sigma_px, floor.floor_px / floor.scale) * min(floor.scale, 1.0)
     return replace(obs, sigma_px=raised, meta={**obs.meta, "noise_floor_px": floor.floor_px})
 
 

@@ -36,6 +36,14 @@ def test_floor_and_scale_are_found(floor_px: float, scale: float) -> None:
     assert _pulls(sc.calibrate(obs, nominal(camera())), obs, bright) > 1.5
 
 
+def test_noise_below_the_floor_is_not_blown_up() -> None:
+    """Where stars state far too much, as of JPEG images, the noise is the scatter seen, and no factor is left over."""
+    settled = settle_noise(obs := measured(0.2, 0.05), sc.calibrate(obs, nominal(camera())))
+    assert settled.sigma_px is not None
+    assert np.median(settled.sigma_px) == pytest.approx(0.2, rel=0.05)
+    assert sc.calibrate(settled, nominal(camera())).sigma == pytest.approx(1.0, abs=0.03)
+
+
 def _pulls(cal: sc.Calibration, obs: sc.Observations, chosen: np.ndarray) -> float:
     """Mean squared deleted residual of some stars over what the calibration expects."""
     found = star_residuals(StarFrames.from_observations(obs), "brown", cal.theta, np.ones(obs.n_stars, bool))
