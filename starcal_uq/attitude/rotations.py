@@ -48,7 +48,7 @@ def _of_quaternion(x: FloatArray, y: FloatArray, z: FloatArray, w: FloatArray) -
     if np.any(norm2 == 0.0):
         raise ValueError("a quaternion of norm zero is not a rotation.")
     s = 2.0 / norm2
-    matrix = np.empty((*norm2.shape, 3, 3))
+    matrix = np.empty((*np.shape(norm2), 3, 3))
     matrix[..., 0, 0] = 1.0 - s * (y * y + z * z)
     matrix[..., 1, 1] = 1.0 - s * (x * x + z * z)
     matrix[..., 2, 2] = 1.0 - s * (x * x + y * y)
@@ -100,7 +100,7 @@ def exp_rotation(phi: FloatArray) -> FloatArray:
     v = np.asarray(phi, dtype=float)
     if v.shape[-1:] != (3,):
         raise ValueError(f"rotation vectors have shape (..., 3), not {v.shape}.")
-    x, y, z = np.moveaxis(v, -1, 0)
+    x, y, z = v.tolist() if v.ndim == 1 else np.moveaxis(v, -1, 0)
     half = 0.5 * np.sqrt(x * x + y * y + z * z)
     along = np.sinc(half / np.pi)
     return _of_quaternion(0.5 * x * along, 0.5 * y * along, 0.5 * z * along, np.cos(half))

@@ -12,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from starcal_uq.core.types import BoolArray, FloatArray
+from starcal_uq.maths.intervals import median_of
 
 # Colours, variability and the band of the sensor are not in the catalogue: brightness is never taken as better known.
 _LEAST_SCATTER_MAG = 0.2
@@ -51,9 +52,9 @@ def unlike_brightness(difference_mag: FloatArray, misfit: FloatArray) -> BoolArr
     m = int(known.sum())
     if m < _LEAST_STARS:
         return np.zeros(len(difference_mag), dtype=np.bool_)
-    off = np.where(known, difference_mag - np.median(difference_mag[known]), 0.0)
+    off = np.where(known, difference_mag - median_of(difference_mag[known]), 0.0)
     # The median deviation of few stars is often too small by chance.
-    scatter = max(1.4826 * float(np.median(np.abs(off[known]))) * (1.0 + 2.0 / m), _LEAST_SCATTER_MAG)
+    scatter = max(1.4826 * float(median_of(np.abs(off[known]))) * (1.0 + 2.0 / m), _LEAST_SCATTER_MAG)
     z = np.abs(off) / scatter
     cost = np.minimum((_TAIL + 1.0) * np.log1p(z * z / _TAIL), _MOST)
     much_brighter = (off < -_MUCH_BRIGHTER) & (z > 2.0 * _UNLIKE)

@@ -22,6 +22,7 @@ from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.identification.brightness import unlike_brightness
 from starcal_uq.identification.nearby import NearbyStars
 from starcal_uq.identification.pyramid import SIGMAS, CameraTolerance, FieldGeometry, Hypothesis
+from starcal_uq.maths.intervals import median_of
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -111,7 +112,7 @@ def match_frame(
     bias = g.relative_bias(tolerance)
     # Each centroid has its own gate: a faint star may be farther off than a bright one.
     final = SIGMAS * np.maximum(sigma_px, _LEAST_GATE_SIGMA_PX)
-    typical = float(np.median(final))
+    typical = float(median_of(final))
     wide = 2.0 * typical + 0.5 * bias * g.corner_px
     predicted = _predict(start, r, g)[0]
     predicted = predicted[_on_detector(predicted, g)]
@@ -119,7 +120,11 @@ def match_frame(
     # One look at what is near a centroid, where a match takes four fits.
     if np.isfinite(tree.query(predicted, distance_upper_bound=_WIDER * wide)[0]).sum() < enough:
         return None
-    gates = (1.5 * final, final) if polished else (wide + 0.0 * final, 0.5 * (wide + final), 1.5 * final, final)
+    gates = (1.5 * final, final)
+    if not polished:
+        # One between them, where the first is much wider than the others.
+        between = (0.5 * (wide + final),) if wide > _MUCH_WIDER * typical else ()
+        gates = (wide + 0.0 * final, *between, *gates)
     state, noise_scale = start, 1.0
     centroid = star = np.empty(0, dtype=np.int64)
     for number, gate in enumerate(gates):
@@ -166,6 +171,7 @@ def match_frame(
     )
 
 
+_MUCH_WIDER = 3.0
 # At the start stars may lie this many times the first gate away, and this part of those wanted must be seen.
 _WIDER, _SEEN = 1.5, 0.7
 
@@ -279,11 +285,11 @@ def _fit(state: CameraState, linear: _Linear, prior: FloatArray) -> tuple[Camera
     """One damped Gauss-Newton step, and the residuals (m, 2) that it predicts."""
     e, j, weight, a = linear
     normal = a.T @ a
-    normal[np.diag_indices(len(normal))] += prior
+    normal.flat[:: len(normal) + 1] += prior
     gradient = a.T @ (e * weight).ravel()
     gradient[3:] -= prior[3:] * state.shared
-    scale = 1.0 / np.sqrt(np.diag(normal))
-    step = scale * np.linalg.solve(normal * np.outer(scale, scale), gradient * scale)
+    scale = 1.0 / np.sqrt(normal.diagonal())
+    step = scale * np.linalg.solve(normal * scale * scale[:, None], gradient * scale)
     left = e - j @ step
     return CameraState(exp_rotation(step[:3]) @ state.rotation, state.shared + step[3:]), left.T
 
@@ -308,7 +314,7 @@ def _noise_scale(e: FloatArray, sigma_px: FloatArray) -> float:
     squared = np.sum(e * e, axis=1) / sigma_px**2
     # Chi-square with two degrees of freedom has the median 2 ln 2; seven parameters were fitted, damped.
     share = max(1.0 - 5.0 / (2.0 * m), 0.3)
-    noise = float(np.sqrt(np.median(squared) / (2.0 * np.log(2.0) * share)))
+    noise = float(np.sqrt(median_of(squared) / (2.0 * np.log(2.0) * share)))
     noise /= 1.0 + 0.5 / (np.log(2.0) * np.sqrt(m))
     return min(max(noise, 1.0), 4.0) if m >= 6 else 1.0
 
@@ -322,9 +328,13 @@ def _mutual(
     """
     farthest = float(limit_px.max()) * (1.0 + 1e-9)
     nearest_centroid = tree.query(predicted, distance_upper_bound=farthest)[1]
-    rows = np.unique(nearest_centroid[nearest_centroid < len(u)])
+    near = np.flatnonzero(nearest_centroid < len(u))
+    rows = np.unique(nearest_centroid[near])
     if not len(rows):
         return rows.astype(np.int64), rows.astype(np.int64), 0
+    if distinct_px2 is None:
+        # A star without a centroid near it is not the nearest one of any.
+        predicted, nearest_centroid = predicted[near], nearest_centroid[near]
     d2 = (u[rows, 0, None] - predicted[:, 0]) ** 2 + (u[rows, 1, None] - predicted[:, 1]) ** 2
     star = np.argmin(d2, axis=1)
     nearest = d2[np.arange(len(rows)), star]
@@ -335,4 +345,5 @@ def _mutual(
         next_centroid = tree.query(predicted[star], k=[2])[0][:, 0] ** 2
         ambiguous = mutual & (np.minimum(next_star, next_centroid) - nearest < distinct_px2[rows])
     keep = mutual & ~ambiguous
+    star = star if distinct_px2 is not None else near[star]
     return rows[keep].astype(np.int64), star[keep].astype(np.int64), int(ambiguous.sum())
