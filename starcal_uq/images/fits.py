@@ -187,13 +187,13 @@ def fit_stars(
 
 
 def fit_widths(
-    stamps: Stamps, x: FloatArray, y: FloatArray, sigma_px: FloatArray, left_moving: float
+    stamps: Stamps, x: FloatArray, y: FloatArray, sigma_px: FloatArray, last_step: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Fit the width of each star as well: its position, flux and width, (n,) each.
 
-    `left_moving` is the part of the stars that need not have settled, where a median is all that is wanted.
+    A median is all that is wanted: the fit ends with the step that changes that of the widths by less than this part.
     """
-    u, v, flux, log_sigma = _settled(stamps, x, y, sigma_px, free_sigma=True, left_moving=left_moving)
+    u, v, flux, log_sigma = _settled(stamps, x, y, sigma_px, free_sigma=True, last_step=last_step)
     return u + stamps.x0, v + stamps.y0, flux, np.exp(log_sigma)
 
 
@@ -205,11 +205,13 @@ def _settled(
     *,
     free_sigma: bool = False,
     pairs: Any = None,
-    left_moving: float = 0.0,
+    left_moving: float = _LEFT_MOVING,
+    last_step: float = 0.0,
 ) -> FloatArray:
     """Places in the stamps, fluxes and logarithms of the widths, (4, n).
 
-    A star is left alone once its own steps are small and those of the stars in its stamp.
+    A star is left alone once its own steps are small and those of the stars in its stamp; with `free_sigma`, all are
+    when the median of the logarithms moves by less than `last_step`.
     """
     n, m = stamps.counts.shape[:2]
     state = np.stack([x - stamps.x0, y - stamps.y0, np.zeros(n), np.zeros(n) + np.log(sigma_px)])
@@ -251,7 +253,10 @@ def _settled(
         state[:3, moving] += step[:3]
         if free_sigma:
             wider = log_sigma + np.clip(step[3], -0.3, 0.3)
+            before = np.median(state[3])
             state[3, moving] = wider.clip(np.log(0.15), np.log(0.5 * m))
+            if abs(np.median(state[3]) - before) < last_step:
+                break
         step[2] /= np.where(flux == 0.0, 1.0, flux)
         done |= np.abs(step).max(axis=0) < _TOLERANCE
         if done.any():
@@ -365,18 +370,19 @@ def _inverse(normal: FloatArray) -> FloatArray:
     return np.where(determined, inverse, np.inf).transpose(2, 0, 1)
 
 
-def near_pairs(x: FloatArray, y: FloatArray, reach: float) -> IntArray:
-    """Pairs (i, j), in both orders, of positions closer than `reach`."""
+def near_pairs(x: FloatArray, y: FloatArray, reach: float | FloatArray) -> IntArray:
+    """Pairs (i, j) of positions of which j is not farther than `reach`, or that of i, from i."""
     order = np.argsort(x, kind="stable")
-    along = x[order]
-    # Those behind each one along x that are near enough, and of them those that are near.
-    count = np.searchsorted(along, along + reach, side="right") - np.arange(1, len(x) + 1)
+    along, wide = x[order], np.broadcast_to(reach, x.shape)[order]
+    # Those near enough along x, and of them those that are near.
+    start = np.searchsorted(along, along - wide)
+    count = np.searchsorted(along, along + wide, side="right") - start
     first = np.repeat(np.arange(len(x)), count)
-    second = np.arange(1, len(first) + 1) + first - np.repeat(np.cumsum(count) - count, count)
-    i, j = order[first], order[second]
-    near = np.hypot(x[i] - x[j], y[i] - y[j]) <= reach
-    pairs = np.column_stack([i[near], j[near]]).astype(np.int64)
-    return np.concatenate([pairs, pairs[:, ::-1]])
+    second = np.arange(len(first)) + np.repeat(start - np.cumsum(count) + count, count)
+    near = (np.hypot(along[first] - along[second], y[order[first]] - y[order[second]]) <= wide[first]) & (
+        first != second
+    )
+    return np.column_stack([order[first[near]], order[second[near]]]).astype(np.int64)
 
 
 # Wide enough to bridge the pixels of an undersampled image.
@@ -469,9 +475,8 @@ def windowed(frame: PreparedImage, fit: StarFit) -> StarFit:
     near = near_pairs(fit.x_px, fit.y_px, 4.0 * float(window.max(initial=0.0)))
     use = whole & (light > 0.0) & (np.hypot(x - fit.x_px, y - fit.y_px) < 1.0) & stamps.good.all((1, 2))
     use[near[fit.flux[near[:, 1]] > 0.01 * fit.flux[near[:, 0]], 0]] = False
-    gradient = _window_gradient(sums, window, fit, use)
     noise = spread / np.where(light > 0.0, light, np.inf)[:, None, None] ** 2
-    inverse = np.linalg.inv(gradient)
+    inverse = np.linalg.inv(_window_gradient(sums, window, fit, use))
     covariance = fit.covariance.copy()
     covariance[:, :2, :2] = inverse @ noise @ inverse.transpose(0, 2, 1)
     x, y = np.where(use, x, fit.x_px), np.where(use, y, fit.y_px)
@@ -493,7 +498,9 @@ def _window_gradient(sums: FloatArray, window: FloatArray, fit: StarFit, alone: 
     noise.
     """
     bright = alone & (fit.flux > _GRADIENT_SNR * np.sqrt(fit.covariance[:, 2, 2]))
-    star = fit.sigma_px**2 + 1.0 / 12.0
+    # Stars of one width, mostly all, have one answer.
+    _, first, which = np.unique(fit.sigma_px, return_index=True, return_inverse=True)
+    star, window = fit.sigma_px[first] ** 2 + 1.0 / 12.0, window[first]
     moments = (star * window**2 / (star + window**2))[:, None, None] * np.eye(2)
     if np.count_nonzero(bright) >= _GRADIENT_STARS:
         second = _second_moments(sums[bright]) / sums[bright, :1, :1]
@@ -501,4 +508,4 @@ def _window_gradient(sums: FloatArray, window: FloatArray, fit: StarFit, alone: 
     # Light without a peak does not hold the window; the floor keeps the errors finite.
     values, axes = np.linalg.eigh(np.eye(2) - moments / window[:, None, None] ** 2)
     gradient: FloatArray = (axes * np.maximum(values, _LEAST_GRADIENT)[:, None, :]) @ axes.transpose(0, 2, 1)
-    return gradient
+    return gradient[which]
