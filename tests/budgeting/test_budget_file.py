@@ -305,7 +305,12 @@ def test_frames_are_rotations_that_requirements_name(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.frames["payload"][0], [0.0, 0.0, 1.0], atol=1e-9)
     assert found.requirements[0].frame == "payload"
     # A quaternion of any length, and a matrix that was rounded to six digits.
-    for rotation in ("[0, 3, 0, 3]", "[0, 9e5, 0, 9e5]", "[[1, 0, 0], [0, 1.000004, 0], [0, 0, 1]]"):
+    for rotation in (
+        "[0, 3, 0, 3]",
+        "[0, 9e5, 0, 9e5]",
+        "[[1, 0, 0], [0, 1.000004, 0], [0, 0, 1]]",
+        "[[1, 0, 0], [0, 0.999996, 0], [0, 0, 1]]",
+    ):
         again = load_budget_file(written(tmp_path, f"[frame.payload]\nrotation = {rotation}\n")).frames["payload"]
         np.testing.assert_allclose(again @ again.T, np.eye(3), atol=1e-5)
     for rotation, words in (
