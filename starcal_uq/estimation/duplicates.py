@@ -81,7 +81,8 @@ def repeating_frames(calibration: Calibration, duplicates: str) -> IntArray:
         raise RepeatedFramesError(
             f"{repeated('measurement', pairs, len(later))}: their stars differ by far less than "
             "their noise, and would count twice; leave the later ones out (duplicates='drop', "
-            "--duplicates drop), or, if you know them to be exposures of their own, keep them (duplicates='keep').",
+            "--duplicates drop), or, if you know them to be exposures of their own, keep them (duplicates='keep', "
+            "--duplicates keep).",
             pairs=pairs.tolist(),
         )
     return later
