@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from itertools import pairwise
 
 import numpy as np
@@ -300,23 +299,6 @@ def test_wrong_arguments_are_named() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             quest(*arguments, **keywords)
-
-
-def test_is_much_faster_than_scipy() -> None:
-    b, r, starts, _ = frames([12] * 20_000, 12.0, 1e-5, seed=22)
-
-    def seconds(n_frames: int) -> float:
-        begin = time.perf_counter()
-        if n_frames == len(starts) - 1:
-            quest(b, r, starts)
-        else:
-            for i, j in pairwise(starts[: n_frames + 1]):
-                Rotation.align_vectors(b[i:j], r[i:j])
-        return time.perf_counter() - begin
-
-    ours = min(seconds(20_000) for _ in range(5)) / 20_000
-    scipy = min(seconds(200) for _ in range(5)) / 200
-    assert scipy > 20.0 * ours
 
 
 def test_takes_a_fraction_of_as_many_decompositions() -> None:

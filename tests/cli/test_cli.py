@@ -257,9 +257,6 @@ def test_wrong_calls_end_with_status_2(cli, arguments, words):
 @pytest.mark.parametrize(
     ("option", "value", "words"),
     [
-        ("--solver", "magic", "solver"),
-        ("--method", "magic", "method"),
-        ("--directions", "left", "directions"),
         ("--directions", "catalogue", "time_utc"),
         ("--observer-velocity", "1,2", "three numbers"),
         ("--column", "ra_deg", "NAME=IN_FILE"),

@@ -379,12 +379,9 @@ def test_validate_from_the_camera_alone():
     ("options", "words"),
     [
         ({"truth": "posterior"}, "truth 'posterior' is unknown"),
-        ({"n_replicates": 0}, "n_replicates is 0"),
-        ({"n_frames": 0}, "n_frames is 0"),
         ({"min_stars": 2}, "min_stars is 2"),
         ({"sigma_px": 0.0}, "sigma_px is 0"),
         ({"sigma_px": float("nan")}, "sigma_px is nan"),
-        ({"workers": -1}, "workers is -1"),
         ({"likelihood": "student_t"}, "'student_t' cannot be validated"),
         ({"assumed_sigma_px": -1.0}, "assumed_sigma_px is -1"),
     ],

@@ -206,10 +206,8 @@ def test_a_method_that_fails_is_counted(monkeypatch):
         ({"start": camera("none")}, "give both the same model"),
         ({"truth": camera("none"), "start": camera("none")}, "with coefficients"),
         ({"n_replicates": 1}, "n_replicates is 1"),
-        ({"n_frames": 0}, "n_frames is 0"),
         ({"min_stars": 3}, "min_stars is 3"),
         ({"sigma_px": 0.0}, "sigma_px is 0"),
-        ({"workers": -1}, "workers is -1"),
     ],
 )
 def test_bad_settings_are_one_sentence(options, words):

@@ -319,11 +319,9 @@ def test_interrupt_before_the_first_result_is_an_interrupt(monkeypatch):
         ({"methods": METHODS[:1] * 2}, "several methods have the label 'least squares'"),
         ({"start": camera("none")}, "give both the same"),
         ({"n_replicates": 1}, "n_replicates is 1"),
-        ({"n_frames": 0}, "n_frames is 0"),
         ({"min_stars": 2}, "min_stars is 2"),
         ({"sigma_px": 0.0}, "sigma_px is 0"),
         ({"sigma_px": float("nan")}, "sigma_px is nan"),
-        ({"workers": -1}, "workers is -1"),
     ],
 )
 def test_bad_settings_are_one_sentence(options, words):

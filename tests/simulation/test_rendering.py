@@ -409,7 +409,6 @@ def test_a_bad_sensor_file_is_named_with_its_key(tmp_path: Path, text: str, mess
         ({"rotation": np.zeros((3, 3))}, "no rotation"),
         ({"rate_rad_s": [1.0, 2.0]}, "three finite numbers"),
         ({"rate_rad_s": [10.0, 0.0, 0.0]}, "more than the detector"),
-        ({"seed": -1}, "seed is -1"),
         ({"time_utc": "tonight"}, "no time"),
     ],
 )
@@ -508,7 +507,6 @@ def test_times_and_rates_go_to_their_frames(tmp_path: Path) -> None:
         ({"times_utc": times[:1]}, "1 times for 2 frames"),
         ({"times_utc": ["noon", "night"]}, "no time"),
         ({"times_utc": [times[0], "2026-11-21T01:02:04+01:00"]}, "time zone"),
-        ({"seed": -1}, "seed is -1"),
     ):
         with pytest.raises((SensorError, SettingError), match=message):
             render_frames(sky, SMALL, tmp_path / "b", **kwargs, **bad)
