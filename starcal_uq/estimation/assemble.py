@@ -20,7 +20,7 @@ from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.compressed import compress, optimum, settled, unit_covariance
 from starcal_uq.estimation.fingerprints import Fingerprints
-from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.marginal import TURN_RAD, MarginalLikelihood
 from starcal_uq.estimation.solvers import is_singular
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.estimation.star_errors import StarLikelihood, StarModel
@@ -65,7 +65,7 @@ def assemble(
     p = len(theta)
     if not status.ok and not np.isfinite(noise_px(likelihood, theta)):
         raise failed(likelihood, nominal.theta, nominal, status)
-    normal = likelihood.evaluate(theta)
+    normal = likelihood.sums(theta, tolerance=TURN_RAD)[0].normal
     if not np.isfinite(normal.cost) or is_singular(normal.matrix):
         reason = status if not status.ok else Status.SINGULAR if np.isfinite(normal.cost) else Status.NOT_FINITE
         raise failed(likelihood, theta, nominal, reason)

@@ -79,7 +79,7 @@ _STARS_WORTH_PROCESSES = 1_000_000
 _SAMPLE_FRAMES, _SAMPLE_STARS, _SAMPLE_TOLERANCE = 150, 2500, 1e-4
 # Standard deviations of the last step: of the estimate from interstar angles of all frames, which is then known to a
 # thousandth of that, and of the refinement, which is left to Newton's method on the expansion: a few 1e-9 of them.
-_LAST_PAIR_STEP, _LAST_STEP = 0.05, 0.003
+_LAST_PAIR_STEP, _LAST_STEP = 0.05, 0.006
 
 
 @bounded

@@ -22,7 +22,7 @@ from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import FloatArray, Shapes
 from starcal_uq.estimation.loops import gram_loop, kernels
-from starcal_uq.estimation.marginal import MarginalLikelihood
+from starcal_uq.estimation.marginal import TURN_RAD, MarginalLikelihood
 from starcal_uq.estimation.star_errors import StarSums
 from starcal_uq.estimation.sums import ATTITUDE_STEPS, ATTITUDE_TOLERANCE_RAD, Attitudes, NormalSums, settled_sums
 from starcal_uq.maths.linear import COLUMNS, ROWS, inverse_symmetric, scaled_cholesky, symmetric_inverse
@@ -314,7 +314,7 @@ def compress(
     whitening, theta = scaled_cholesky(covariance), np.asarray(theta_hat, dtype=np.float64)
     frames, model_name = likelihood.frames, likelihood.model_name
     known = likelihood.last_sums
-    if known is not None and not (np.array_equal(known[1].theta, theta) and known[0].turn < ATTITUDE_TOLERANCE_RAD):
+    if known is not None and not (np.array_equal(known[1].theta, theta) and known[0].turn < TURN_RAD):
         known = None
     if rotations is None:
         # Of use to the NumPy path alone, where sums are known.

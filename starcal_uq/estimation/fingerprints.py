@@ -110,7 +110,8 @@ def _most_central(distance: FloatArray, starts: IntArray, sizes: IntArray) -> In
     # Whole numbers that are nearly in order sort in a tenth of the time: 2^40 distances, and above them the frame.
     near = (distance * (2.0**39 / max(float(np.max(distance, initial=0.0)), 1e-300))).astype(np.int64)
     order = np.argsort((frame << 40) + near, kind="stable")
-    return np.asarray(order[np.arange(len(order)) - np.repeat(starts, sizes) < _MARKS])
+    kept = np.minimum(sizes, _MARKS)
+    return np.asarray(order[np.arange(kept.sum()) + np.repeat(starts - (np.cumsum(kept) - kept), kept)])
 
 
 def _unsmooth(xy: FloatArray, residuals: FloatArray, rows: IntArray, at: FloatArray) -> FloatArray:

@@ -31,11 +31,11 @@ from numba import float64, int64, njit, types
 
 P, STRIDE, CHUNK, GRAM_CHUNK, ROWS, EXPLICIT = {p}, {stride}, {chunk}, 64, {rows}, {explicit}
 DEGENERATE = {degenerate}
-# Sums in another order and fused products, nothing that changes what is done with NaN and infinity.
+# Sums in another order, fused products, shared reciprocals: nothing that changes what becomes of NaN and infinity.
 HELPER = dict(no_cpython_wrapper=True, no_cfunc_wrapper=True)
 ORDERED = dict(nogil=True, cache=True, error_model="numpy", fastmath={{"contract"}})
-FAST = dict(nogil=True, cache=True, error_model="numpy", fastmath={{"contract", "reassoc", "nsz"}})
-INLINE = dict(nogil=True, inline="always", error_model="numpy", fastmath={{"contract", "reassoc", "nsz"}})
+FAST = dict(nogil=True, cache=True, error_model="numpy", fastmath={{"contract", "reassoc", "nsz", "arcp"}})
+INLINE = dict(nogil=True, inline="always", error_model="numpy", fastmath={{"contract", "reassoc", "nsz", "arcp"}})
 
 ONE, TWO, THREE = float64[::1], float64[:, ::1], float64[:, :, ::1]
 GIVEN, TABLE, BLOCKS = (types.Array(float64, n, "C", readonly=True) for n in (1, 2, 3))
@@ -43,6 +43,7 @@ THETA = types.UniTuple(float64, P)
 STARS = (*[GIVEN] * 6, types.Array(int64, 1, "C", readonly=True), BLOCKS)
 FRAME_SUMS = types.void(THETA, *STARS, TWO, TWO, TWO, THREE, THREE, ONE)
 FRAMED = (*[GIVEN] * 5, types.Array(int64, 1, "C", readonly=True))
+TURNED = types.void(TABLE, BLOCKS, THREE)
 ATTITUDES = types.int64(THETA, *FRAMED, THREE)
 PAIR_SUMS = types.float64(THETA, *FRAMED, BLOCKS, TWO, TWO)
 GRAM_SUMS = types.void(THETA, types.UniTuple(float64, P * P), *STARS, TABLE, BLOCKS, BLOCKS, TWO, ONE)
@@ -290,6 +291,20 @@ def fill_rotation(x, y, z, w, rotations, f):
     rotations[f, 2, 2], rotations[f, 2, 1] = 1.0 - 2.0 * (x * x + y * y), 2.0 * (y * z + x * w)
     rotations[f, 0, 2], rotations[f, 1, 2] = 2.0 * (x * z + y * w), 2.0 * (y * z - x * w)
     rotations[f, 2, 0] = 2.0 * (x * z - y * w)
+
+
+@njit(TURNED, **ORDERED)
+def turned(steps, rotations, out):
+    turn = np.empty((1, 3, 3))
+    for f in range(len(rotations)):
+        x, y, z = 0.5 * steps[0, f], 0.5 * steps[1, f], 0.5 * steps[2, f]
+        half = np.sqrt(x * x + y * y + z * z)
+        along = np.sin(half) / half if half > 0.0 else 1.0
+        fill_rotation(x * along, y * along, z * along, np.cos(half), turn, 0)
+        for i in range(3):
+            a, b, c = turn[0, i, 0], turn[0, i, 1], turn[0, i, 2]
+            for k in range(3):
+                out[f, i, k] = a * rotations[f, 0, k] + b * rotations[f, 1, k] + c * rotations[f, 2, k]
 
 
 @njit(ATTITUDES, **FAST)
@@ -637,12 +652,14 @@ def _expansion_sources(model_name: str, p: int) -> list[str]:
                 column += 1
             loop(body)
         sources.append("@njit(**FAST, **HELPER)\n" + "\n".join(lines) + "\n")
-    for c in range(3):
+    for part in range(3):
         sums: _Sums = [
-            (f"acc[{c}, {n}]", [(a + 2 * c + x, out + 2 * (1 + p + n) + x) for x in range(2)]) for n in range(q - p - 1)
+            (f"acc[{c}, {n}]", [(a + 2 * c + x, out + 2 * (1 + p + n) + x) for x in range(2)])
+            for n in range(part, q - p - 1, 3)
+            for c in range(3)
         ]
         sources.append(
-            "@njit(**ORDERED, **HELPER)\n" + _sums_source(f"second_{c}", "buf, j, end, acc", "j", "end", sums)
+            "@njit(**ORDERED, **HELPER)\n" + _sums_source(f"second_{part}", "buf, j, end, acc", "j", "end", sums)
         )
     return sources
 
@@ -713,6 +730,14 @@ def attitude_loop(frames: StarFrames, model_name: str, theta: FloatArray) -> tup
     loops = compiled.load(model_name, source(model_name))
     sound = loops.attitudes(tuple(theta.tolist()), *frames.pixel, *frames.r, frames.starts, rotations)
     return rotations, sound == frames.n_frames
+
+
+def turned_loop(model_name: str, steps: FloatArray, rotations: FloatArray) -> FloatArray:
+    """Rotations (K, 3, 3) after small ones, of vectors (3, K) in the camera frame."""
+    out = np.empty(rotations.shape)
+    loops = compiled.load(model_name, source(model_name))
+    loops.turned(np.ascontiguousarray(steps), np.ascontiguousarray(rotations), out)
+    return out
 
 
 def pair_loop(

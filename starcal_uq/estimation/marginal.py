@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
 
 # Attitudes that are wrong by this much cost a likelihood nothing that is left after their elimination to first order.
-_TURN_RAD = 1e-8
+TURN_RAD = 1e-8
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ class MarginalLikelihood:
 
     def log_likelihood(self, theta: FloatArray, sigma: float) -> float:
         """Log likelihood at theta (p,) and sigma (px, or the common factor on stated noise)."""
-        sums, _ = self.sums(theta, tolerance=_TURN_RAD)
+        sums, _ = self.sums(theta, tolerance=TURN_RAD)
         if not np.isfinite(sums.cost):
             return -np.inf
         return float(-0.5 * sums.cost / sigma**2 - self.dof * np.log(sigma) - 0.5 * sums.log_determinant)

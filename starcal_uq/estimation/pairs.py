@@ -28,6 +28,8 @@ _BLOCK_STARS = 4096
 # The objective does not depend on how the catalogue is turned; a turn that is right to within this many pixels keeps E
 # small enough for eleven digits of the cost.
 _TURN_AGAIN_PX = 30.0
+# A turn from which the attitudes of a refinement need no step of their own, with that of the parameters.
+_NEAR_RAD = 8e-5
 
 
 # Where the entries of a symmetric matrix stand among its six unique ones.
@@ -98,9 +100,9 @@ class PairObjective:
         return None if self._turned_at is None else self._rotations
 
     def rotations_at(self, theta: FloatArray) -> FloatArray | None:
-        """As `rotations`, at theta itself where loops find them faster than a refinement takes the step they save."""
+        """As `rotations`, nearer to theta where loops find them faster than a refinement takes the step they save."""
         with np.errstate(all="ignore"):
-            self._turn(theta, 0.0 if self._compiled else _TURN_AGAIN_PX)
+            self._turn(theta, _NEAR_RAD * theta[2] if self._compiled else _TURN_AGAIN_PX)
         return self.rotations
 
     def directions(self, theta: FloatArray, frames: StarFrames) -> tuple[FloatArray, FloatArray]:

@@ -172,12 +172,12 @@ def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> S
     model = get_model(camera.distortion)
     f = theta[2]
     offset = frames.pixel - theta[:2, None]
-    direction = np.vstack([offset, np.full(frames.n_stars, f)])
-    b = (direction / np.linalg.norm(direction, axis=0)).T
     found = attitude_loop(frames, "none", theta[:3]) if kernels("none", frames.n_stars) == "numba" else None
     if found is not None and found[1]:
         rotations = found[0]
     else:
+        direction = np.vstack([offset, np.full(frames.n_stars, f)])
+        b = (direction / np.linalg.norm(direction, axis=0)).T
         rotations = quest(b, frames.r.T, frames.starts, covariance=False).rotations
     b = frames.rotated(rotations)
     ideal = f * b[:2] / b[2]
@@ -185,11 +185,11 @@ def distortion_stage(frames: StarFrames, camera: Camera, theta: FloatArray) -> S
     forward = model.direction == "forward"
     at, target = (ideal, offset - ideal) if forward else (offset, ideal - offset)
     n = len(model.coefficients)
-    columns = [np.concatenate(model.displacement(at[0], at[1], tuple(unit))) for unit in np.eye(n)]
-    design = np.stack(columns, axis=1)
-    scale = np.linalg.norm(design, axis=0)
-    k = np.linalg.lstsq(design / scale, target.ravel(), rcond=None)[0] / scale
-    cost = [float(np.sum(target**2)), float(np.sum((target.ravel() - design @ k) ** 2))]
+    design = np.array([model.displacement(at[0], at[1], tuple(unit)) for unit in np.eye(n)]).reshape(n, -1)
+    matrix, shift = design @ design.T, design @ target.ravel()
+    scale = np.sqrt(np.diag(matrix))
+    k = np.linalg.lstsq(matrix / np.outer(scale, scale), shift / scale, rcond=None)[0] / scale
+    cost = [float(np.sum(target**2)), float(np.sum((target.ravel() - k @ design) ** 2))]
     trajectory = np.array([np.concatenate([theta[:3], np.zeros(n)]), np.concatenate([theta[:3], k])])
     return Stage("distortion", trajectory, np.array(cost), Status.CONVERGED, 1, perf_counter() - began)
 

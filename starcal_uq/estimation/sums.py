@@ -119,6 +119,8 @@ class Attitudes:
         Inverse of A^T A per frame.
     log_determinant : (K,) array
         log |A^T A|.
+    loops : str or None
+        Distortion model whose loops made them; None where NumPy did.
     """
 
     theta: FloatArray
@@ -127,10 +129,13 @@ class Attitudes:
     response: FloatArray
     inverse: FloatArray
     log_determinant: FloatArray
+    loops: str | None = None
 
     def at(self, theta: FloatArray) -> FloatArray:
         """Best attitudes (K, 3, 3) at theta (p,), to first order."""
         step = self.shift + np.einsum("ipk,p->ik", self.response, theta - self.theta)
+        if self.loops is not None:
+            return loops.turned_loop(self.loops, step, self.rotations)
         return np.asarray(exp_rotation(step.T) @ self.rotations)
 
 
@@ -214,7 +219,8 @@ def frame_sums(
         What stays with the part.
     """
     theta = np.asarray(theta, dtype=np.float64)
-    path = loops.frame_loop if loops.kernels(model_name, frames.n_stars) == "numba" else _frame_blocks
+    fast = loops.kernels(model_name, frames.n_stars) == "numba"
+    path = loops.frame_loop if fast else _frame_blocks
     with np.errstate(all="ignore"):
         gram, shift, response, inverse, volume = path(frames, model_name, theta, rotations, residuals)
         sums = NormalSums(
@@ -226,7 +232,7 @@ def frame_sums(
             n_stars=frames.n_stars,
             n_frames=frames.n_frames,
         )
-    return sums, Attitudes(theta, rotations, shift, response, inverse, volume)
+    return sums, Attitudes(theta, rotations, shift, response, inverse, volume, model_name if fast else None)
 
 
 def _frame_blocks(

@@ -95,11 +95,12 @@ class StarFrames:
 
     def select(self, mask: BoolArray) -> StarFrames:
         """The stars of a mask (N,); frames that keep none are left out."""
-        sizes = self.sum(mask.astype(np.float64)).astype(np.int64)
+        rows = np.flatnonzero(mask)
+        sizes = np.diff(np.searchsorted(rows, self.starts))
         return StarFrames(
-            pixel=np.ascontiguousarray(self.pixel[:, mask]),
-            r=np.ascontiguousarray(self.r[:, mask]),
-            weight=None if self.weight is None else self.weight[mask],
+            pixel=np.take(self.pixel, rows, axis=1),
+            r=np.take(self.r, rows, axis=1),
+            weight=None if self.weight is None else self.weight[rows],
             starts=np.concatenate([[0], np.cumsum(sizes[sizes > 0])]).astype(np.int64),
         )
 
