@@ -75,7 +75,9 @@ def output_of(line: str, folder: Path) -> str:
     )
     if run.returncode not in (0, 1):
         raise RuntimeError(f"{line}\nstatus {run.returncode}: {run.stdout}")
-    lines = run.stdout.replace(f"{folder}/", "").rstrip().splitlines()
+    # A run of the shared night names its files where they were made.
+    shown = run.stdout.replace(f"{folder}/", "").replace(f"{_temporary()}/night/", "")
+    lines = shown.rstrip().splitlines()
     return "\n".join(
         part for each in lines for part in textwrap.wrap(each.rstrip(), WIDTH, subsequent_indent="  ") or [""]
     )

@@ -88,11 +88,8 @@ def misfit_notes(attitude: AttitudeError) -> tuple[str, ...]:
             f"The model was not tested: the calibration rows hold {IF_MODEL_HOLDS}, and what they are "
             f"{WITH_MISFIT_FOUND} is not assessed (run `starcal-uq diagnose RUN`).",
         )
-    notes = tuple(
-        f"The row {name!r} is inflated: {'; '.join(reasons)}."
-        for name, reasons in ((COMMON, found.common_reasons), (REST, found.rest_reasons))
-        if reasons
-    ) or (
+    rows = [name for name, why in ((COMMON, found.common_reasons), (REST, found.rest_reasons)) if why]
+    notes = tuple(f"The row {name!r} is inflated by what the tests of the model found." for name in rows) or (
         "The tests of the model found nothing that inflates the calibration rows; what they cannot see is not in them.",
     )
     return (*notes, *found.notes)

@@ -96,12 +96,18 @@ def print_table(table: TextTable) -> None:
     columns = [[head, *cells] for head, *cells in zip(table.heads, *table.rows, strict=True)]
     least = [max((len(word) for cell in column for word in cell.split()), default=1) for column in columns]
     wide = sum(least) + 3 * len(least) + 1 > out.width
-    look: AnyDict = {"box": SIMPLE_HEAD, "padding": (0, 1, 0, 0), "pad_edge": False} if wide else {}
+    widths = [max(map(len, column)) for column in columns]
+    gap = int(sum(least) + 2 * len(least) - 1 <= out.width)
+    spare = out.width - ((1 + gap) * len(least) - 1 if wide else 3 * len(least) + 1)
+    while sum(widths) > spare:  # the console's own shares would be cut off at its edge; words break last
+        place = max(range(len(least)), key=lambda i: (widths[i] - least[i], widths[i]))
+        widths[place] -= 1
+    look: AnyDict = {"box": SIMPLE_HEAD, "padding": (0, gap, 0, 0), "show_edge": False} if wide else {}
     drawn = Table(title=table.title or None, title_justify="left", **look)
     for place, (head, side) in enumerate(zip(table.heads, table.align, strict=True)):
         style = "bold" if place == 0 and side == "l" else None
         justify: Any = "right" if side == "r" else "left"
-        drawn.add_column(head, justify=justify, style=style, min_width=least[place], overflow="fold")
+        drawn.add_column(head, justify=justify, style=style, width=widths[place], overflow="fold")
     styles = {"total": "bold", "warning": "yellow", "fail": "red"}
     for row, mark in zip(table.rows, table.marks or ("",) * len(table.rows), strict=True):
         drawn.add_row(*row, style=styles.get(mark))

@@ -112,7 +112,7 @@ def diagnose_command(
 
     with progress_bar("diagnosis") as progress:
         found = sc.Run(run, tell=note).diagnose(n_starts=starts, seed=seed, force=force, progress=progress)
-    print_table(misfit_table(found.misfit))
+    print_table(misfit_table(found.misfit, found_only=True))
     if found.jackknife is not None:
         print_table(jackknife_table(found.jackknife))
     if found.stars is not None:

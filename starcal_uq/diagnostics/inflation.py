@@ -82,6 +82,8 @@ def _pattern(
     names = join_words(list(pattern.families))
 
     def said(value: FloatArray, upper: FloatArray) -> tuple[str, ...]:
+        if not upper.any():
+            return ()
         pairs = zip(value, upper, strict=True)
         values = ", ".join(f"{significant(float(v))} (at most {significant(float(u))})" for v, u in pairs)
         return (f"misfit, {names}, through the attitudes of these frames: {values} arcsec of {join_words(list(AXES))}",)

@@ -99,7 +99,7 @@ def test_run_from_images_to_report(cli, frames, tmp_path):
     assert status in (0, 1), err
     assert "with the nominal camera" in err
     run = sc.runs.RunFolder(tmp_path / "run")
-    assert "identified anew" in run.report.read_text("utf-8")
+    assert "They were identified twice" in run.report.read_text("utf-8")
     assert len(pd.read_csv(run.path / "identification.csv")) == N_IMAGES
     assert sc.images.Centroids.load(run.path / "centroids.parquet").n_frames == N_IMAGES
     cal, truth = sc.Calibration.load(run.calibration), sc.paper.paper_camera().theta

@@ -521,3 +521,16 @@ def test_the_first_page_on_paper_names_failures_before_warnings_and_leaves_comma
     table = rest[rest.index('<table class="checks">') :]
     found = re.findall(r'<tr><td class="key">.*?<span class="badge (\w+)', table)
     assert found == sorted(found, key=["fail", "warning", "pass"].index)
+
+
+def test_a_table_that_just_fits_the_terminal_keeps_its_last_column(monkeypatch, capsys):
+    from rich.console import Console
+
+    from starcal_uq.cli import console
+    from starcal_uq.presentation.tables import TextTable
+
+    heads = ("quantity", "unit", "coverage 95", "coverage low", "coverage high", "coverage p", "rank p")
+    row = ("log_likelihood", "arcsec", "0.945", "0.904", "0.972", "0.744", "0.0231")
+    monkeypatch.setattr(console, "out", Console(width=80))
+    console.print_table(TextTable(heads, (row,)))
+    assert "0.0231" in capsys.readouterr().out

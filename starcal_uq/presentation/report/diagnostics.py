@@ -35,7 +35,9 @@ def diagnosis_context(diagnosis: Diagnosis | None, cal: Calibration) -> dict[str
         "misfit_sentence": f"{_misfit_sentence(diagnosis)} {sensitivity(diagnosis)}".strip(),
         "jackknife_table": None if jackknife is None else jackknife_table(jackknife, parameters(cal.camera.distortion)),
         "jackknife_sentence": "" if jackknife is None else jackknife_text(jackknife),
-        "star_table": None if stars is None else star_table(stars, parameters(cal.camera.distortion)),
+        "star_table": None
+        if stars is None or not stars.applicable
+        else star_table(stars, parameters(cal.camera.distortion)),
         "star_sentence": "" if stars is None else star_sentence(stars),
         "models_table": None if models is None else models_table(models, unit, "this report"),
         "models_sentence": "" if models is None else models_sentence(models),

@@ -144,14 +144,11 @@ def _answer(checks: tuple[Check, ...]) -> str:
     """The outcome of some checks in one line; what failed is explained elsewhere."""
     if worst(checks) is Level.PASS:
         every = "Both" if len(checks) == 2 else f"All {len(checks)}"
-        return f"{every} checks passed: {_listed(checks)}."
+        return f"{every} checks passed."
     parts = []
     for level, verb in ((Level.FAIL, "failed"), (Level.WARN, "raised a warning"), (Level.PASS, "passed")):
         found = tuple(check for check in checks if check.level is level)
         if found:
-            parts.append(f"{len(found)} of {len(checks)} {verb}: {_listed(found)}.")
+            names = "" if level is Level.PASS else f": {join_words([check.phrase for check in found])}"
+            parts.append(f"{len(found)} of {len(checks)} {verb}{names}.")
     return " ".join(parts)
-
-
-def _listed(checks: tuple[Check, ...]) -> str:
-    return join_words([check.phrase for check in checks])

@@ -180,7 +180,8 @@ def _not_passed(results: Results) -> str:
     for level, verb in ((Level.WARN, "gave a warning"), (Level.FAIL, "failed")):
         if found := results.verdict.at(level):
             said.append(f"{join_words([check.phrase for check in found])} {verb}")
-    return f"{'; '.join(said)}." if said else ""
+    words = "; ".join(said)
+    return f"{words[0].upper()}{words[1:]}." if said else ""
 
 
 CITATIONS = (

@@ -294,8 +294,10 @@ def _listing(left_out: int) -> str:
 
 
 def _round_rows(record: ImageRecord, cal: Calibration) -> list[Row]:
-    """One row per quantity, with its value after the first and after the last round."""
+    """One row per quantity, after the first and the last round; none where both have the same stars."""
     first, last = record.rounds[0], record.rounds[-1]
+    if last.n_stars and not (last.new or last.given_up):
+        return []
     rows: list[Row] = [
         {"name": "images identified", "values": [count(r.n_frames) for r in (first, last)], "change": "", "unit": ""},
         {

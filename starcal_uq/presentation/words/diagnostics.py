@@ -48,8 +48,8 @@ def misfit_text(found: Misfit) -> str:
     return f"{tests}: {join_words(rejected)}." if rejected else f"{tests}: no unexplained structure."
 
 
-def misfit_table(found: Misfit) -> TextTable:
-    """One row per test; what found something is marked."""
+def misfit_table(found: Misfit, *, found_only: bool = False) -> TextTable:
+    """One row per test; what found something is marked, and alone has amplitudes where so asked."""
     rows = tuple(
         (
             test.name[0].upper() + test.name[1:],
@@ -61,7 +61,7 @@ def misfit_table(found: Misfit) -> TextTable:
             significant(test.p_holm),
             "" if np.isnan(test.size_px) else significant(test.size_px),
             "" if np.isnan(test.visible) else percent(test.visible),
-            "; ".join(map(str, test.amplitudes)),
+            "" if found_only and test.p_holm >= MISFIT_P else "; ".join(map(str, test.amplitudes)),
         )
         for test in found.tests
     )

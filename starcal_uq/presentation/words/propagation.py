@@ -9,7 +9,7 @@ import pandas as pd
 
 from starcal_uq.camera.distortion import Parameter
 from starcal_uq.core.constants import AXES, TOTAL_AXES
-from starcal_uq.core.formatting import fixed, join_words, percent, pretty_unit, significant
+from starcal_uq.core.formatting import fixed, join_words, percent, pretty_unit, significant, with_sigma
 from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.propagation.attitude_error import (
@@ -84,7 +84,12 @@ def misfit_sentence(error: AttitudeError) -> str:
     found = error.misfit
     if not found.reasons:
         return f"The tests of the model found nothing: an error {WITH_MISFIT_FOUND} is that {IF_MODEL_HOLDS}."
-    parts = (("common rotation", found.common_reasons), ("rest", found.rest_reasons))
+    common, rest = found.common_reasons, found.rest_reasons
+    parts = (
+        ("common rotation", [reason for reason in common if reason not in rest]),
+        ("rest", [reason for reason in rest if reason not in common]),
+        ("common rotation and the rest", [reason for reason in common if reason in rest]),
+    )
     return " ".join(f"Found for the {name}: {'; '.join(reasons)}." for name, reasons in parts if reasons)
 
 
@@ -204,8 +209,8 @@ def corner_sentence(curve: DistortionCurve) -> str:
     scale = float(curve.arcsec_per_px[-1])
     where = "" if len(curve.mean_px) == 1 else f" at {curve.azimuth_deg[row]:g}° from the x axis"
     return (
-        f"At {curve.radius_px[-1]:.0f} px{where} the distortion is {significant(value, 4)} ± {significant(sd)} px "
-        f"({significant(value * scale, 4)} ± {significant(sd * scale)} arcsec)."
+        f"At {curve.radius_px[-1]:.0f} px{where} the distortion is {with_sigma(value, sd)} ± {significant(sd)} px "
+        f"({with_sigma(value * scale, sd * scale)} ± {significant(sd * scale)} arcsec)."
     )
 
 
