@@ -509,6 +509,19 @@ def commands(ours: str, before: str) -> list[Row]:
             repeats=3,
             targets=(Target("3 times as fast as before", before, 3.0),),
         ),
+        Row(
+            name="frames",
+            what="ESA's night-sky frames one by one, centroids and identification with a sheet, per frame",
+            contestants=(
+                Contestant(ours, "ours:frames", options=identified),
+                Contestant("cedar-solve", "images_cedar:frames", "cedar", identified),
+                Contestant("tetra3rs", "images_tetra3rs:frames", "rivals", identified),
+            ),
+            same=same_frames(table, 11.42),
+            unit="for a frame",
+            amount=lambda result: float(len(result["frames"])),
+            repeats=3,
+        ),
         *(
             Row(
                 name=f"identify-{name}",
@@ -544,6 +557,56 @@ def commands(ours: str, before: str) -> list[Row]:
             )
         ),
     ]
+
+
+def same_frames(table: Path, field: float) -> Same:
+    """Frames found and wrong (field of view 2 % off), scatter of the centroids, median and worst times of both steps.
+
+    Times are of the processor. Scatter is of the stars that both measured, of those of a table of catalogue places,
+    about a cubic polynomial of the places in each frame, which takes up attitude, lens and which pixel counts first.
+    """
+
+    def words(result: Mapping[str, Any], rms: float) -> str:
+        frames = result["frames"]
+        found = [f["field"] for f in frames if f["field"] is not None]
+        wrong = sum(abs(f / field - 1.0) > 0.02 for f in found)
+        steps = 1e3 * np.diff([f["clock"] for f in frames], axis=1)
+        (c, i), (slow_c, slow_i) = np.median(steps, axis=0), np.max(steps, axis=0)
+        return (
+            f"{len(found) - wrong} of {len(frames)} frames, {wrong} wrong, {rms:.3f} px, centroids {c:.1f} ms (worst "
+            f"{slow_c:.1f}), identification {i:.1f} ms (worst {slow_i:.1f})"
+        )
+
+    def compare(ours: Mapping[str, Any], rival: Mapping[str, Any]) -> Agreement:
+        rms = scatter(table, [[f["points"] for f in result["frames"]] for result in (ours, rival)])
+        return Agreement(f"{words(rival, rms[1])}; ours {words(ours, rms[0])}", True)
+
+    return compare
+
+
+def scatter(table: Path, measured: Sequence[Sequence[Any]]) -> list[float]:
+    """Scatter per axis, px, of each list of places by frame (n, 2), of the stars that all lists have."""
+    from scipy.spatial import cKDTree
+
+    stars = np.genfromtxt(table, delimiter=",", names=True, usecols=range(10), dtype=None, encoding="utf-8")
+    left: list[list[Any]] = [[] for _ in measured]
+    for k in np.unique(stars["frame"]):
+        own = stars[stars["frame"] == k]
+        near = [cKDTree(places[k]).query(np.column_stack([own["x_px"], own["y_px"]])) for places in measured]
+        all_have = np.all([distance < 2.0 for distance, _ in near], axis=0)
+        ra, dec = np.radians(own["ra_apparent_deg"]), np.radians(own["dec_apparent_deg"])
+        r = np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+        axes = np.linalg.svd(r)[2]
+        x, y = (r @ axes[1:].T / (r @ axes[0])[:, None]).T * 10.0
+        terms = np.column_stack([x**i * y**j for i in range(4) for j in range(4 - i)])[all_have]
+        rest = []
+        for (_, index), places in zip(near, measured, strict=True):
+            at = np.asarray(places[k])[index[all_have]]
+            rest.append(at - terms @ np.linalg.lstsq(terms, at, rcond=None)[0])
+        factor = np.sqrt(len(terms) / (len(terms) - terms.shape[1]))
+        for parts, e in zip(left, rest, strict=True):
+            parts.append(e * factor)
+    return [float(np.sqrt(np.mean(np.concatenate(parts) ** 2))) for parts in left]
 
 
 def counted(words: str) -> Same:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from time import process_time
 from typing import Any
 
 import tetra3
@@ -43,6 +44,26 @@ def identify(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
             solver.solve_from_centroids(p, size, fov_estimate=field, fov_max_error=0.03 * field) for p, size in points
         ]
         return {"frames": len(loaded), "found": sum(f["RA"] is not None for f in found)}
+
+    return run
+
+
+def frames(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
+    """Images to attitudes, one by one; places are counted from the middle of the first pixel."""
+    loaded, field = _images(images), 11.42
+    solver = tetra3.Tetra3("default_database")
+
+    def run() -> Result:
+        done = []
+        for image in loaded:
+            clock = [process_time()]
+            points = tetra3.get_centroids_from_image(image)
+            clock.append(process_time())
+            size = image.height, image.width
+            found = solver.solve_from_centroids(points, size, fov_estimate=field, fov_max_error=0.03 * field)
+            clock.append(process_time())
+            done.append({"clock": clock, "field": found["FOV"], "points": (points[:, ::-1] - 0.5).tolist()})
+        return {"frames": done}
 
     return run
 

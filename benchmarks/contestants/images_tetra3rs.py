@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from time import process_time
 from typing import Any
 
 import cv2
@@ -33,13 +34,40 @@ def centroids(folder: Path, *, images: str) -> Callable[[], Result]:
     return run
 
 
+def _database(field: float) -> Any:
+    return tetra3rs.SolverDatabase.generate_from_gaia(
+        max_fov_deg=1.05 * field, min_fov_deg=0.95 * field, star_max_magnitude=7.0, epoch_proper_motion_year=2019.6
+    )
+
+
+def frames(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
+    """Images to attitudes, one by one; places are counted from the middle of the first pixel."""
+    loaded, field = _images(images), 11.42
+    database = _database(field)
+
+    def run() -> Result:
+        done = []
+        for image in loaded:
+            height, width = image.shape
+            clock = [process_time()]
+            points = tetra3rs.extract_centroids(image, threads=1).centroids
+            clock.append(process_time())
+            found = database.solve_from_centroids(
+                points, fov_estimate_deg=field, image_width=width, image_height=height, fov_max_error_deg=0.03 * field
+            )
+            clock.append(process_time())
+            places = [(p.x + 0.5 * (width - 1), p.y + 0.5 * (height - 1)) for p in points]
+            done.append({"clock": clock, "field": float(found.fov_deg) if found else None, "points": places})
+        return {"frames": done}
+
+    return run
+
+
 def identify(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
     """`solve_from_centroids`, of its own centroids; the field is known to 3 %."""
     loaded = _images(images)
     field = 11.42
-    database = tetra3rs.SolverDatabase.generate_from_gaia(
-        max_fov_deg=1.05 * field, min_fov_deg=0.95 * field, star_max_magnitude=7.0, epoch_proper_motion_year=2019.6
-    )
+    database = _database(field)
     points = [tetra3rs.extract_centroids(image, threads=1).centroids for image in loaded]
     height, width = loaded[0].shape
 

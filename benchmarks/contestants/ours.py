@@ -222,3 +222,26 @@ def identify(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
         return {"frames": len(done.frames), "found": sum(f.status == "identified" for f in done.frames)}
 
     return run
+
+
+def frames(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
+    """Images to attitudes, one by one."""
+    if not Path(images).is_dir():
+        raise Missing(f"{images} is not on this machine")
+    loaded = [sc.images.read_image(path) for path in sorted(Path(images).glob("*.tif*"))]
+    nominal, stars = sc.Camera.load(camera), sc.load_catalogue(max_mag=7.0, epoch=2019.6)
+
+    def run() -> Result:
+        done = []
+        for image in loaded:
+            clock = [time.process_time()]
+            found = sc.images.extract_centroids(image)
+            clock.append(time.process_time())
+            result = sc.identification.identify(found, nominal, stars, cache=False)
+            clock.append(time.process_time())
+            field = result.camera.fov_deg[0] if result.n_identified else None
+            places = np.column_stack([found.x_px, found.y_px]).tolist()
+            done.append({"clock": clock, "field": field, "points": places})
+        return {"frames": done}
+
+    return run
