@@ -18,27 +18,13 @@ Displacement = Callable[[Any, Any, Sequence[Any]], tuple[Any, Any]]
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter as people see it.
+    """A parameter as people see it."""
 
-    Attributes
-    ----------
-    name : str
-        Name in files, tables and draws.
-    unit : str
-        Unit of the value used in computations.
-    scale : float
-        Stored and printed values are ``value / scale``: diagnostics lose tiny numbers otherwise.
-    scaled_unit : str
-        Unit of the scaled value.
-    description : str
-        Meaning, in words.
-    """
-
-    name: str
-    unit: str
-    scale: float
-    scaled_unit: str
-    description: str
+    name: str  # Name in files, tables and draws
+    unit: str  # Unit of the value used in computations
+    scale: float  # Stored and printed values are ``value / scale``: diagnostics lose tiny numbers otherwise
+    scaled_unit: str  # Unit of the scaled value
+    description: str  # Meaning, in words
 
 
 @dataclass(frozen=True)

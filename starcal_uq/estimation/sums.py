@@ -48,29 +48,14 @@ ATTITUDE_TOLERANCE_RAD = 1e-9
 
 @dataclass(frozen=True)
 class NormalSums:
-    """Normal equations of some frames; they add up.
+    """Normal equations of some frames; they add up."""
 
-    Attributes
-    ----------
-    cost : float
-        Sum of squared whitened residuals, each frame's attitude best to first order.
-    gradient : (p,) array
-        Half its derivative with respect to theta.
-    matrix : (p, p) array
-        Gauss-Newton matrix.
-    log_determinant : float
-        ``sum_k log |A^T A|_k``.
-    turn : float
-        Largest attitude step that is left, rad.
-    n_stars, n_frames : int
-        What was summed.
-    """
-
-    cost: float
-    gradient: FloatArray
-    matrix: FloatArray
-    log_determinant: float
-    turn: float
+    cost: float  # Sum of squared whitened residuals, each frame's attitude best to first order
+    gradient: FloatArray  # (p,): half its derivative with respect to theta
+    matrix: FloatArray  # (p, p): Gauss-Newton matrix
+    log_determinant: float  # ``sum_k log |A^T A|_k``
+    turn: float  # Largest attitude step that is left, rad
+    # `n_stars`, `n_frames`: what was summed.
     n_stars: int
     n_frames: int
 
@@ -103,33 +88,15 @@ def sum_of(parts: Sequence[T]) -> T:
 
 @dataclass(frozen=True)
 class Attitudes:
-    """Attitudes of K frames, and how the best ones follow the parameters.
+    """Attitudes of K frames, and how the best ones follow the parameters."""
 
-    Attributes
-    ----------
-    theta : (p,) array
-        Where the sums were taken, px units.
-    rotations : (K, 3, 3) array
-        R_cam_icrs there.
-    shift : (3, K) array
-        Rotation vectors from them to the best ones, rad.
-    response : (3, p, K) array
-        Derivative of the best ones with respect to theta.
-    inverse : (3, 3, K) array
-        Inverse of A^T A per frame.
-    log_determinant : (K,) array
-        log |A^T A|.
-    loops : str or None
-        Distortion model whose loops made them; None where NumPy did.
-    """
-
-    theta: FloatArray
-    rotations: FloatArray
-    shift: FloatArray
-    response: FloatArray
-    inverse: FloatArray
-    log_determinant: FloatArray
-    loops: str | None = None
+    theta: FloatArray  # (p,): where the sums were taken, px units
+    rotations: FloatArray  # (K, 3, 3): R_cam_icrs there
+    shift: FloatArray  # (3, K): rotation vectors from them to the best ones, rad
+    response: FloatArray  # (3, p, K): derivative of the best ones with respect to theta
+    inverse: FloatArray  # (3, 3, K): inverse of A^T A per frame
+    log_determinant: FloatArray  # (K,): log |A^T A|
+    loops: str | None = None  # Distortion model whose loops made them; None where NumPy did
 
     def at(self, theta: FloatArray) -> FloatArray:
         """Best attitudes (K, 3, 3) at theta (p,), to first order."""
@@ -198,25 +165,9 @@ def frame_sums(
 ) -> tuple[NormalSums, Attitudes]:
     """Normal equations of some frames, attitudes eliminated, in one pass.
 
-    Parameters
-    ----------
-    frames : StarFrames
-        The part.
-    model_name : str
-        Distortion model.
-    theta : (p,) array
-        Parameters, px units.
-    rotations : (K, 3, 3) array
-        R_cam_icrs: the best ones to first order or better, as `Attitudes.at` gives them.
-    residuals : (2, N) array, optional
-        Filled with the whitened residuals at `rotations`.
-
-    Returns
-    -------
-    NormalSums
-        What adds up over parts; not finite where the model is not.
-    Attitudes
-        What stays with the part.
+    `rotations` (K, 3, 3) are R_cam_icrs, the best ones to first order or better, as `Attitudes.at` gives them, and
+    `residuals` (2, N) is filled with the whitened ones there. Returns what adds up over parts, not finite where the
+    model is not, and what stays with the part.
     """
     theta = np.asarray(theta, dtype=np.float64)
     fast = loops.kernels(model_name, frames.n_stars) == "numba"
@@ -301,14 +252,8 @@ def frame_normals(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Normal equations of every single frame, attitudes eliminated, in one pass.
 
-    Returns
-    -------
-    gram : (K, p + 1, p + 1) array
-        Products of e and H without what the frame's attitude can reproduce.
-    shift : (3, K) array
-        Rotation vectors to the best attitudes, rad.
-    log_determinant : (K,) array
-        log |A^T A|.
+    Returns products (K, p + 1, p + 1) of e and H without what the frame's attitude can reproduce, rotation vectors
+    (3, K) to the best attitudes, rad, and log |A^T A| (K,).
     """
     p, k = len(theta), frames.n_frames
     rows = p + 4

@@ -23,26 +23,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class TextTable:
-    """Rows of finished text under their heads.
+    """Rows of finished text under their heads."""
 
-    Attributes
-    ----------
-    heads : tuple of str
-        One for each column.
-    rows : tuple of tuple of str
-        Cells, plain text; digits are chosen already.
-    title : str
-        What the table shows; may be empty.
-    align : str
-        One letter a column: ``l`` for words, ``r`` for numbers.
-    marks : tuple of str
-        One for each row: empty, or ``total``, ``warning``, ``fail``; may be left out altogether.
-    """
-
-    heads: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    title: str = ""
-    align: str = ""
+    heads: tuple[str, ...]  # One for each column
+    rows: tuple[tuple[str, ...], ...]  # Cells, plain text; digits are chosen already
+    title: str = ""  # What the table shows; may be empty
+    align: str = ""  # One letter a column: ``l`` for words, ``r`` for numbers
+    # One for each row: empty, or ``total``, ``warning``, ``fail``; may be left out altogether.
     marks: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

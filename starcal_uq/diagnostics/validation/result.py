@@ -27,22 +27,13 @@ ENOUGH_REPLICATES = 100
 
 
 class Finding(NamedTuple):
-    """One test.
+    """One test."""
 
-    Attributes
-    ----------
-    quantity, test : str
-        ``ranks``, ``coverage`` or ``NEES`` of what.
-    p_value : float
-        Probability of a result at least as far off when all is well.
-    rejected : bool
-        Holm's procedure over all tests of the validation, at an overall level of 1 %.
-    """
-
+    # `quantity`, `test`: ``ranks``, ``coverage`` or ``NEES`` of what.
     quantity: str
     test: str
-    p_value: float
-    rejected: bool
+    p_value: float  # Probability of a result at least as far off when all is well
+    rejected: bool  # Holm's procedure over all tests of the validation, at an overall level of 1 %
 
 
 @dataclass(frozen=True, eq=False)
