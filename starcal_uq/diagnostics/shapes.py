@@ -91,7 +91,8 @@ def shapes(
     warmth = _standardised(obs.temperature_c, seen.temperature_c, like)
     magnitude = _standardised(obs.mag, seen.mag, star)
     if clock is not None:
-        found.append(_drift(clock, called))
+        # The clock runs from -1 to 1: twice the amplitude is the change over the run.
+        found.append(_focal_against(clock, "linear drift of f", called, ("change of f over the run", "px"), 0.5))
     if warmth is not None and obs.temperature_c is not None:
         spread = float(np.nanstd(obs.temperature_c))
         found.append(_focal_against(warmth, "focal length with temperature", "temperature", ("df/dT", "px/K"), spread))
@@ -235,11 +236,6 @@ def _focal_against(clock: FloatArray, name: str, against: str, label: tuple[str,
         return view.parameter_columns[2:3] * clock[view.rows]
 
     return Shape(name, against, 1, columns, (label,), (1.0 / spread,))
-
-
-def _drift(clock: FloatArray, called: str) -> Shape:
-    # The clock runs from -1 to 1: twice the amplitude is the change over the run.
-    return _focal_against(clock, "linear drift of f", called, ("change of f over the run", "px"), 0.5)
 
 
 def _radius(camera: Camera) -> Shape:

@@ -16,7 +16,6 @@ the prior, decide.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, get_args
 
@@ -163,7 +162,8 @@ def validate_study(
     good = [o for o in outcomes if not o.failure]
     failures = tuple(o.failure for o in outcomes if o.failure)
     if not good:
-        raise CalibrationError(f"no replicate gave a result; the commonest reason: {_commonest(failures)}")
+        commonest = Counter(failures).most_common(1)[0][0]
+        raise CalibrationError(f"no replicate gave a result; the commonest reason: {commonest}")
     sampling = {name: getattr(study, name) for name in ("n_walkers", "n_steps", "n_burn", "thin")}
     return Validation(
         quantities=study.quantities,
@@ -231,10 +231,6 @@ def _check(study: Replication, n_replicates: int, workers: int | None) -> None:
             f"the priors are on {', '.join(study.priors.names)}, but the camera has "
             f"{', '.join(study.camera.parameter_names)} and sigma: make them with Priors.default of this camera."
         )
-
-
-def _commonest(reasons: Sequence[str]) -> str:
-    return Counter(reasons).most_common(1)[0][0]
 
 
 _CHUNK = 8
