@@ -155,7 +155,9 @@ def predictive_table(found: PredictiveCheck) -> TextTable:
     for s in found.statistics:
         decimals = decimals_for(s.replicated_high - s.replicated_low)
         low, high = fixed(s.replicated_low, decimals), fixed(s.replicated_high, decimals)
-        rows.append((s.name, fixed(s.observed, decimals), f"{low} to {high}", significant(s.p_value)))
+        least = 1.0 / found.n_draws
+        p = {0.0: f"< {significant(least, 1)}", 1.0: f"> {1.0 - least:.3g}"}.get(s.p_value, significant(s.p_value))
+        rows.append((s.name, fixed(s.observed, decimals), f"{low} to {high}", p))
     return TextTable(("Statistic", "Data", "Replicates (95 %)", "p"), tuple(rows), "Predictive checks")
 
 
