@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -11,7 +12,7 @@ import numpy as np
 from starcal_uq.core.errors import ImageError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.formatting import plural
-from starcal_uq.core.types import AnyDict, BoolArray, FloatArray, IntArray
+from starcal_uq.core.types import AnyDict, BoolArray, IntArray
 from starcal_uq.images.background import PreparedImage, prepare_image
 from starcal_uq.images.fits import (
     Stamps,
@@ -128,22 +129,38 @@ def _detect(frame: PreparedImage, name: str, sigma: float, options: DetectionOpt
         left *= _mosaic_noise(line)
     filtered = _filtered(frame.counts, (line / line.sum()).astype(np.float32))
     threshold = np.float32(options.threshold_sigma * left)
-    above = _above(filtered, frame.noise, threshold)
-    limit = threshold * frame.noise.ravel()[above]
-    most = sep.get_extract_pixstack()
+    # Whatever is found is among these, rounding included.
+    above = np.flatnonzero(filtered > np.float32(0.9999) * threshold * frame.noise)
+    n_above = len(above)
+
+    def extract(image: Any, noise: Any, levels: int) -> tuple[Any, Any]:
+        # sep prepares a list for all pixels that it may have to keep, which takes longer than a small image.
+        most = sep.get_extract_pixstack()
+        sep.set_extract_pixstack(min(most, n_above + _PIXELS_MORE, image.size + _PIXELS_MORE))
+        try:
+            found: tuple[Any, Any] = sep.extract(
+                image,
+                threshold,
+                err=noise,
+                minarea=options.min_pixels,
+                filter_kernel=None,
+                segmentation_map=True,
+                deblend_nthresh=levels,
+            )
+        finally:
+            sep.set_extract_pixstack(most)
+        return found
+
     try:
-        if len(above) > most:
-            raise MemoryError
-        objects, label = _connected(filtered, limit, above, options.min_pixels)
-        objects, label = _taken_apart(filtered, frame.noise, threshold, options.min_pixels, objects, label, above)
+        objects, labels = _taken_apart(filtered, frame.noise, *extract(filtered, frame.noise, 1), extract, above)
     except Exception as error:  # sep raises bare exceptions when its buffers are full
         raise ImageError(
             f"{name}: there are too many bright pixels to tell stars apart; raise the threshold, or leave the image "
             "out."
         ) from error
-    finally:
-        sep.set_extract_pixstack(most)
-    objects["flux"] = np.bincount(label + 1, frame.counts.ravel()[above], minlength=len(objects) + 1)[1:]
+    labels = labels.ravel()
+    inside = above[labels[above] != 0]
+    objects["flux"] = np.bincount(labels[inside], frame.counts.ravel()[inside], minlength=len(objects) + 1)[1:]
     objects = objects[np.isfinite(objects["x"]) & np.isfinite(objects["y"])]
     return objects[np.argsort(-objects["cflux"], kind="stable")][:_MAX_DETECTIONS]
 
@@ -161,134 +178,21 @@ def _mosaic_noise(line: Any) -> float:
     return float(np.sqrt(worst / np.sum(weights**2)))
 
 
-_OBJECT = np.dtype(
-    [(name, np.float64) for name in ("x", "y", "a", "b", "flux", "cflux")]
-    + [(name, np.int64) for name in ("xmin", "xmax", "ymin", "ymax", "flag")]
-)
-# SExtractor's: below which determinant of their moments pixels lie on a line, and to how many widths wings reach.
-_ON_A_LINE, _WINGS = 0.00694, 10.0
-
-
-def _above(image: Any, noise: Any, threshold: Any) -> IntArray:
-    """Places, in the image row by row, of the pixels above the threshold."""
-    parts = []
-    for first in range(0, len(image), _ROWS):
-        rows = slice(first, first + _ROWS)
-        parts.append(np.flatnonzero(image[rows] > threshold * noise[rows]) + first * image.shape[1])
-    return np.concatenate(parts)
-
-
-def _connected(image: Any, limit: Any, above: IntArray, min_pixels: int) -> tuple[Any, IntArray]:
-    """Objects of touching pixels, and the object's number of each pixel `above` its `limit`, -1 for none.
-
-    SExtractor's, before it takes any apart; it looks at all pixels for them, and few are above.
-    """
-    with extra("images", "star images"):
-        import sep
-
-    height, width = image.shape
-    row, column = np.divmod(above, width)
-    label = _labels(above, column, width) if len(above) else above
-    count = np.bincount(label)
-    label, count = _numbered(label, count >= min_pixels), count[count >= min_pixels]
-    objects = np.zeros(len(count), dtype=_OBJECT)
-    if not len(objects):
-        return objects, label
-    inside = np.argsort(label, kind="stable")[np.count_nonzero(label < 0) :]
-    own, starts = label[inside], np.cumsum(count) - count
-
-    def total(values: Any) -> FloatArray:
-        summed: FloatArray = np.add.reduceat(values, starts, dtype=np.float64)
-        return summed
-
-    u, v, value = column[inside], row[inside], image.ravel()[above[inside]].astype(np.float64)
-    objects["xmin"], objects["xmax"] = np.minimum.reduceat(u, starts), np.maximum.reduceat(u, starts)
-    objects["ymin"], objects["ymax"] = v[starts], v[starts + count - 1]
-    u, v = u - objects["xmin"][own], v - objects["ymin"][own]
-    flux = total(value)
-    x, y, xx, yy, xy = (total(value * q) / flux for q in (u, v, u * u, v * v, u * v))
-    xx, yy, xy = xx - x * x, yy - y * y, xy - x * y
-    line = xx * yy - xy * xy < _ON_A_LINE
-    xx, yy = xx + line / 12.0, yy + line / 12.0
-    mean, half = 0.5 * (xx + yy), np.hypot(0.5 * (xx - yy), xy)
-    objects["a"], objects["b"] = np.sqrt(mean + half), np.sqrt(mean - half)
-    objects["x"], objects["y"], objects["cflux"] = x + objects["xmin"], y + objects["ymin"], flux
-    objects["flag"] = sep.OBJ_SINGU * line | sep.OBJ_TRUNC * _at_border(objects, height, width)
-    lowest = limit[inside]
-    level, excess = total(lowest) / count, value - lowest
-    middle = 0.5 * (level + np.maximum.reduceat(value, starts))
-    core = np.minimum(total(value > middle[own]) - total(value > level[own]), -1.0)
-    area = np.pi * objects["a"] * objects["b"]
-    part = np.minimum(core / (2.0 * area * np.log(np.where(level < middle, level / middle, 0.99))), 1.0)
-    peak = flux / (2.0 * area * part)
-    wings = peak, (peak / level - 1.0) * area / count, np.stack([yy, xx, -2.0 * xy]) / (xx * yy - xy * xy)
-    # SExtractor's code, which this is to agree with, passes over one pixel of each.
-    passed = (starts + min_pixels)[count > min_pixels]
-    excess[passed] = -np.inf
-    keep = _kept(objects, *wings, excess[np.lexsort((-excess, own))[starts + min_pixels - 1]])
-    return objects[keep], _numbered(label, keep)
-
-
-def _labels(above: IntArray, column: IntArray, width: int) -> IntArray:
-    """Number of the object that each pixel is of, corners touching too."""
-    # Runs of pixels in a row, and those in the next row that touch them.
-    start = np.flatnonzero(np.append(True, (np.diff(above) > 1) | (column[1:] == 0)))
-    end = np.append(start[1:], len(above)) - 1
-    low = np.searchsorted(above[end], above[start] + width - (column[start] > 0))
-    high = np.searchsorted(above[start], above[end] + width + (column[end] < width - 1), side="right")
-    count = np.maximum(high - low, 0)
-    one = np.repeat(np.arange(len(start)), count)
-    other = np.arange(len(one)) + np.repeat(low - np.cumsum(count) + count, count)
-    label = np.arange(len(start))
-    while (label[one] != label[other]).any():
-        lowest = np.minimum(label[one], label[other])
-        for run in (label[one], label[other]):
-            np.minimum.at(label, run, lowest)
-        label = label[label]
-    return np.repeat((np.cumsum(label == np.arange(len(label))) - 1)[label], end - start + 1)
-
-
-def _numbered(label: IntArray, keep: BoolArray) -> IntArray:
-    """Numbers of the objects that are kept, -1 for the others."""
-    numbers: IntArray = np.append(np.where(keep, np.cumsum(keep) - 1, -1), -1)[label]
-    return numbers
-
-
-def _at_border(objects: Any, height: int, width: int) -> BoolArray:
-    """Which objects touch the border of the image."""
-    low, high = (objects["xmin"] == 0) | (objects["ymin"] == 0), (objects["xmax"] == width - 1)
-    cut: BoolArray = low | high | (objects["ymax"] == height - 1)
-    return cut
-
-
-def _kept(objects: Any, peak: FloatArray, fall: FloatArray, shape: FloatArray, excess: FloatArray) -> BoolArray:
-    """Which objects are not wings of brighter ones, as SExtractor cleans its list.
-
-    The light of an object is taken to be `peak` / (1 + `fall` d^2), d being distance by the inverse of its moments,
-    `shape` (3, n); what does not exceed its own limit by more, `excess` (n,), goes.
-    """
-    keep, a = np.ones(len(objects), dtype=np.bool_), objects["a"]
-    with np.errstate(all="ignore"):
-        reach = np.where(fall > 0.0, a * np.sqrt((peak / excess.min() - 1.0) / fall), 0.0)
-    i, j = near_pairs(objects["x"], objects["y"], np.fmin(reach, _WINGS * (a + a.max()))).T
-    dx, dy = objects["x"][i] - objects["x"][j], objects["y"][i] - objects["y"][j]
-    light = peak[i] / (1.0 + fall[i] * (shape[0, i] * dx * dx + shape[1, i] * dy * dy + shape[2, i] * dx * dy))
-    brighter = objects["cflux"][i] > objects["cflux"][j]
-    eaten = brighter & (light > excess[j]) & (np.hypot(dx, dy) <= _WINGS * (a[i] + a[j]))
-    i, j = i[eaten], j[eaten]
-    for k in np.argsort(-objects["cflux"][i], kind="stable"):
-        keep[j[k]] &= ~keep[i[k]]
-    return keep
-
-
+# The list of pixels is longer than those above the threshold by so many.
+_PIXELS_MORE = 100
 # Brightness levels at which SExtractor looks for objects that fall apart.
 _LEVELS = 32
 
 
 def _taken_apart(
-    image: Any, noise: Any, threshold: Any, min_pixels: int, objects: Any, label: IntArray, above: IntArray
-) -> tuple[Any, IntArray]:
-    """Objects and their numbers by pixels `above`, with those taken apart that have several peaks.
+    image: Any,
+    noise: Any,
+    objects: Any,
+    labels: Any,
+    extract: Callable[[Any, Any, int], tuple[Any, Any]],
+    above: IntArray,
+) -> tuple[Any, Any]:
+    """Objects and their map of numbers, zero but in pixels `above`, with those taken apart that have several peaks.
 
     No other can fall apart, and to look for it in all takes as long as all the rest.
     """
@@ -296,47 +200,41 @@ def _taken_apart(
         import sep
 
     height, width = image.shape
-    inside = np.flatnonzero(label >= 0)
-    row, column = np.divmod(above, width)
-    rows = [(row[inside] + step).clip(0, height - 1) * width for step in (-1, 0, 1)]
-    columns = [(column[inside] + step).clip(0, width - 1) for step in (-1, 0, 1)]
+    inside = above[labels.ravel()[above] != 0]
+    row, column = np.divmod(inside, width)
+    rows = [(row + step).clip(0, height - 1) * width for step in (-1, 0, 1)]
+    columns = [(column + step).clip(0, width - 1) for step in (-1, 0, 1)]
     flat, highest = image.ravel(), np.ones(len(inside), dtype=np.bool_)
-    own = flat[above[inside]]
     for first, second in product(rows, columns):
-        highest &= own >= flat[first + second]
-    peaks = np.bincount(label[inside[highest]], minlength=len(objects))
+        highest &= flat[inside] >= flat[first + second]
+    peaks = np.bincount(labels.ravel()[inside[highest]], minlength=len(objects) + 1)
     kept = [objects]
     n = len(objects)
-    for number in np.flatnonzero(peaks > 1):
-        whole, pixels = objects[number], np.flatnonzero(label == number)
+    for label in np.flatnonzero(peaks > 1):
+        whole = objects[label - 1]
+        box = slice(whole["ymin"], whole["ymax"] + 1), slice(whole["xmin"], whole["xmax"] + 1)
+        own = labels[box] == label
         # A margin, so that no part is taken for cut off by the border of the image.
-        x, y = whole["xmin"] - 1, whole["ymin"] - 1
-        at = row[pixels] - y, column[pixels] - x
-        alone = np.zeros((whole["ymax"] - y + 2, whole["xmax"] - x + 2), dtype=np.float32)
+        alone = np.zeros((own.shape[0] + 2, own.shape[1] + 2), dtype=np.float32)
+        np.copyto(alone[1:-1, 1:-1], image[box], where=own)
         around = np.ones_like(alone)
-        alone[at], around[at] = flat[above[pixels]], noise.ravel()[above[pixels]]
-        # For all pixels that it may have to keep, it prepares a list, which takes longer than these few.
-        sep.set_extract_pixstack(alone.size)
-        found, numbers = sep.extract(
-            alone,
-            threshold,
-            err=around,
-            minarea=min_pixels,
-            filter_kernel=None,
-            segmentation_map=True,
-            deblend_nthresh=_LEVELS,
-        )
-        if len(found) < 2:
+        around[1:-1, 1:-1] = noise[box]
+        parts, numbers = extract(alone, around, _LEVELS)
+        if len(parts) < 2:
             continue
-        parts = np.zeros(len(found), dtype=_OBJECT)
-        for name in _OBJECT.names or ():
-            parts[name] = found[name] + (x if name[0] == "x" else y if name[0] == "y" else 0)
-        parts["flag"] |= sep.OBJ_TRUNC * _at_border(parts, height, width)
-        label[pixels] = np.where(numbers[at] > 0, n - 1 + numbers[at], -1)
-        objects["x"][number] = np.nan
+        for axis, first in (("x", whole["xmin"] - 1), ("y", whole["ymin"] - 1)):
+            for name in (axis, f"{axis}min", f"{axis}max"):
+                parts[name] += first
+        ends = (
+            (parts["xmin"] == 0) | (parts["ymin"] == 0) | (parts["xmax"] == width - 1) | (parts["ymax"] == height - 1)
+        )
+        parts["flag"][ends] |= sep.OBJ_TRUNC
+        numbers = numbers[1:-1, 1:-1]
+        labels[box][own] = np.where(numbers > 0, n + numbers, 0)[own]
+        objects["x"][label - 1] = np.nan
         kept.append(parts)
         n += len(parts)
-    return np.concatenate(kept), label
+    return np.concatenate(kept), labels
 
 
 # Rows that are filtered together, what stays in the processor's caches, and numbers that one product gives in a line.

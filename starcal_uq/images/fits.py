@@ -370,19 +370,18 @@ def _inverse(normal: FloatArray) -> FloatArray:
     return np.where(determined, inverse, np.inf).transpose(2, 0, 1)
 
 
-def near_pairs(x: FloatArray, y: FloatArray, reach: float | FloatArray) -> IntArray:
-    """Pairs (i, j) of positions of which j is not farther than `reach`, or that of i, from i."""
+def near_pairs(x: FloatArray, y: FloatArray, reach: float) -> IntArray:
+    """Pairs (i, j), in both orders, of positions closer than `reach`."""
     order = np.argsort(x, kind="stable")
-    along, wide = x[order], np.broadcast_to(reach, x.shape)[order]
-    # Those near enough along x, and of them those that are near.
-    start = np.searchsorted(along, along - wide)
-    count = np.searchsorted(along, along + wide, side="right") - start
+    along = x[order]
+    # Those behind each one along x that are near enough, and of them those that are near.
+    count = np.searchsorted(along, along + reach, side="right") - np.arange(1, len(x) + 1)
     first = np.repeat(np.arange(len(x)), count)
-    second = np.arange(len(first)) + np.repeat(start - np.cumsum(count) + count, count)
-    near = (np.hypot(along[first] - along[second], y[order[first]] - y[order[second]]) <= wide[first]) & (
-        first != second
-    )
-    return np.column_stack([order[first[near]], order[second[near]]]).astype(np.int64)
+    second = np.arange(1, len(first) + 1) + first - np.repeat(np.cumsum(count) - count, count)
+    i, j = order[first], order[second]
+    near = np.hypot(x[i] - x[j], y[i] - y[j]) <= reach
+    pairs = np.column_stack([i[near], j[near]]).astype(np.int64)
+    return np.concatenate([pairs, pairs[:, ::-1]])
 
 
 # Wide enough to bridge the pixels of an undersampled image.

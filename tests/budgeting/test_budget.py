@@ -811,9 +811,8 @@ def test_rows_of_the_posterior_to_every_field() -> None:
     first = posterior_rows(plain, nameless)[6]  # type: ignore[arg-type]
     assert (first.axis_correlation, first.tail_997, first.sigma_arcsec) == ((), GAUSSIAN_997, 0.0)
     assert first.provenance == "posterior of 1 draw"
-    assert misfit_notes(error) == (
-        f"The row {COMMON!r} is inflated: why one.",
-        f"The row {REST!r} is inflated: a; b.",
+    assert misfit_notes(error) == tuple(
+        f"The row {name!r} is inflated by what the tests of the model found." for name in (COMMON, REST)
     )
     quiet = MisfitFound(1.0, np.zeros(3), np.zeros(3), notes=("more",))
     assert len(misfit_notes(attitude(misfit=quiet))) == 2 and misfit_notes(attitude(misfit=quiet))[1] == "more"
