@@ -636,6 +636,9 @@ def table(found: list[dict[str, Any]]) -> str:
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for one in found:
+        if len(one["first"]) < 0.4 * len(one["keys"]):
+            # A few say nothing yet.
+            continue
         first, last = [*one["first"].values()], Counter(one["last"].values())
         n, late, survived = len(first), first.count("timeout"), first.count("survived")
         low, high = binomial_interval(n - survived, n)
