@@ -187,13 +187,13 @@ def fit_stars(
 
 
 def fit_widths(
-    stamps: Stamps, x: FloatArray, y: FloatArray, sigma_px: FloatArray, last_step: float
+    stamps: Stamps, x: FloatArray, y: FloatArray, sigma_px: FloatArray, left_moving: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Fit the width of each star as well: its position, flux and width, (n,) each.
 
-    A median is all that is wanted: the fit ends with the step that changes that of the widths by less than this part.
+    `left_moving` is the part of the stars that need not have settled, where a median is all that is wanted.
     """
-    u, v, flux, log_sigma = _settled(stamps, x, y, sigma_px, free_sigma=True, last_step=last_step)
+    u, v, flux, log_sigma = _settled(stamps, x, y, sigma_px, free_sigma=True, left_moving=left_moving)
     return u + stamps.x0, v + stamps.y0, flux, np.exp(log_sigma)
 
 
@@ -205,13 +205,11 @@ def _settled(
     *,
     free_sigma: bool = False,
     pairs: Any = None,
-    left_moving: float = _LEFT_MOVING,
-    last_step: float = 0.0,
+    left_moving: float = 0.0,
 ) -> FloatArray:
     """Places in the stamps, fluxes and logarithms of the widths, (4, n).
 
-    A star is left alone once its own steps are small and those of the stars in its stamp; with `free_sigma`, all are
-    when the median of the logarithms moves by less than `last_step`.
+    A star is left alone once its own steps are small and those of the stars in its stamp.
     """
     n, m = stamps.counts.shape[:2]
     state = np.stack([x - stamps.x0, y - stamps.y0, np.zeros(n), np.zeros(n) + np.log(sigma_px)])
@@ -253,10 +251,7 @@ def _settled(
         state[:3, moving] += step[:3]
         if free_sigma:
             wider = log_sigma + np.clip(step[3], -0.3, 0.3)
-            before = np.median(state[3])
             state[3, moving] = wider.clip(np.log(0.15), np.log(0.5 * m))
-            if abs(np.median(state[3]) - before) < last_step:
-                break
         step[2] /= np.where(flux == 0.0, 1.0, flux)
         done |= np.abs(step).max(axis=0) < _TOLERANCE
         if done.any():
@@ -474,8 +469,9 @@ def windowed(frame: PreparedImage, fit: StarFit) -> StarFit:
     near = near_pairs(fit.x_px, fit.y_px, 4.0 * float(window.max(initial=0.0)))
     use = whole & (light > 0.0) & (np.hypot(x - fit.x_px, y - fit.y_px) < 1.0) & stamps.good.all((1, 2))
     use[near[fit.flux[near[:, 1]] > 0.01 * fit.flux[near[:, 0]], 0]] = False
+    gradient = _window_gradient(sums, window, fit, use)
     noise = spread / np.where(light > 0.0, light, np.inf)[:, None, None] ** 2
-    inverse = np.linalg.inv(_window_gradient(sums, window, fit, use))
+    inverse = np.linalg.inv(gradient)
     covariance = fit.covariance.copy()
     covariance[:, :2, :2] = inverse @ noise @ inverse.transpose(0, 2, 1)
     x, y = np.where(use, x, fit.x_px), np.where(use, y, fit.y_px)

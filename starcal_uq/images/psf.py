@@ -18,8 +18,8 @@ _WIDTHS = (0.25, 15.0)
 # Star images with this part of their light beyond the Gaussian, or so much longer than wide, are no round Gaussians.
 _MISFIT, _ELONGATED = 0.1, 1.2
 _MOMENT_WINDOW_PX = 1.5
-# The fit of the width ends with a step of this part of it: for the size of stamps, and for the width itself.
-_LAST_STEPS = (0.03, 1e-3)
+# The fits of this part of the stars need not have converged: for the size of stamps, and for a median.
+_LEFT_MOVING = (0.8, 0.15)
 
 
 @dataclass(frozen=True)
@@ -71,12 +71,12 @@ def measure_psf(frame: PreparedImage, objects: Any) -> Psf | None:
     most = _PSF_STARS if clear else 5 * _PSF_STARS
     # Moments are of the filtered image, in which stars are wider.
     x, y, widths = chosen["x"].astype(np.float64), chosen["y"].astype(np.float64), np.full(len(chosen), 0.8 * sigma)
-    for last_step in _LAST_STEPS:
+    for left_moving in _LEFT_MOVING:
         clean, stamps = _clean_stamps(frame, chosen, sigma, most)
         if not len(clean):
             return None
         chosen = chosen[clean]
-        x, y, flux, widths = fit_widths(stamps, x[clean], y[clean], widths[clean], last_step)
+        x, y, flux, widths = fit_widths(stamps, x[clean], y[clean], widths[clean], left_moving)
         good = (np.hypot(x - chosen["x"], y - chosen["y"]) < 1.0 + sigma) & (flux > 0.0)
         if not good.any():
             return None
@@ -88,7 +88,7 @@ def measure_psf(frame: PreparedImage, objects: Any) -> Psf | None:
     stamps = cut_stamps(frame.counts, frame.usable, x, y, half_stamp_px(sigma), frame.noise, 0.0, frame.parity)
     width = sigma
     if frame.counts_per_e:
-        x, y, _, widths = fit_widths(stamps, x, y, widths, last_step)
+        x, y, _, widths = fit_widths(stamps, x, y, widths, left_moving)
         width = float(np.clip(np.median(widths[good]), *_WIDTHS))
     fit = fit_stars(stamps, x, y, width, once=True)
     # Fainter stars that are found are those whose noise adds light.
