@@ -104,7 +104,8 @@ def command(folder: Path, *, arguments: list[str], needs: str | None = None) -> 
     """A command of the package in a fresh process; ``{data}`` is the folder of the data, ``{out}`` a new one."""
     if needs is not None and not Path(needs).exists():
         raise Missing(f"{needs} is not on this machine")
-    program = [sys.executable, "-c", "from starcal_uq.cli.app import main; main()"]
+    # -P: else the package in the folder where the benchmark was started goes before the one that is asked for.
+    program = [sys.executable, "-P", "-c", "from starcal_uq.cli.app import main; main()"]
 
     def run() -> Result:
         peak = 0.0
@@ -144,7 +145,7 @@ def imported(folder: Path, *, code: str) -> Callable[[], Result]:
     """A line of Python in a fresh process."""
 
     def run() -> Result:
-        subprocess.run([sys.executable, "-c", code], check=True)
+        subprocess.run([sys.executable, "-P", "-c", code], check=True)
         return {}
 
     return run

@@ -276,7 +276,13 @@ class PhysicalPriors(Priors):
         object.__setattr__(self, "principal_point_centre_px", centre)
         for name in _POSITIVE:
             object.__setattr__(self, name, positive_number(name, getattr(self, name)))
-        get_model(self.distortion)
+        with np.errstate(all="ignore"):
+            variance = np.diag(self.theta_moments()[1])
+        if not (np.isfinite(variance).all() and (variance > 0.0).all()):
+            raise PriorError(
+                "the prior's widths leave no number for a parameter: look at 'corner_radius_px' "
+                f"({self.corner_radius_px:g}), 'distortion_corner_px' and 'focal_px'."
+            )
 
     @classmethod
     def around(cls, camera: Camera, per_star_sigma: bool = False) -> PhysicalPriors:
@@ -301,7 +307,7 @@ class PhysicalPriors(Priors):
         x0, y0 = self.principal_point_centre_px
         coefficients = get_model(self.distortion).coefficients
         sd = [self.principal_point_px, self.principal_point_px, self.focal_fraction * self.focal_px]
-        sd += [self.distortion_corner_px / self.corner_radius_px**c.order for c in coefficients]
+        sd += [self.distortion_corner_px / np.float64(self.corner_radius_px) ** c.order for c in coefficients]
         return np.array([x0, y0, self.focal_px, *(0.0 for _ in coefficients)]), np.diag(np.square(sd))
 
     def to_dict(self) -> dict[str, Any]:

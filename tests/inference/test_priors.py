@@ -90,6 +90,8 @@ def test_dictionary_round_trip() -> None:
         ({"focal_px": float("nan")}, "finite"),
         ({"principal_point_centre_px": (1.0, float("nan"))}, "two finite numbers"),
         ({"k1": 1.0}, "no prior named 'k1'"),
+        ({"corner_radius_px": 1e300}, "leave no number"),
+        ({"corner_radius_px": 1e-300}, "leave no number"),
     ],
 )
 def test_improper_priors_are_refused(change: dict[str, object], match: str) -> None:
