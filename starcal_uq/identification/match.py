@@ -328,13 +328,12 @@ def _mutual(
     """
     farthest = float(limit_px.max()) * (1.0 + 1e-9)
     nearest_centroid = tree.query(predicted, distance_upper_bound=farthest)[1]
-    near = np.flatnonzero(nearest_centroid < len(u))
-    rows = np.unique(nearest_centroid[near])
+    # A star without a centroid near it is not the nearest one of any, but may make another ambiguous.
+    near = np.flatnonzero((nearest_centroid < len(u)) | (distinct_px2 is not None))
+    predicted, nearest_centroid = predicted[near], nearest_centroid[near]
+    rows = np.unique(nearest_centroid[nearest_centroid < len(u)])
     if not len(rows):
         return rows.astype(np.int64), rows.astype(np.int64), 0
-    if distinct_px2 is None:
-        # A star without a centroid near it is not the nearest one of any.
-        predicted, nearest_centroid = predicted[near], nearest_centroid[near]
     d2 = (u[rows, 0, None] - predicted[:, 0]) ** 2 + (u[rows, 1, None] - predicted[:, 1]) ** 2
     star = np.argmin(d2, axis=1)
     nearest = d2[np.arange(len(rows)), star]
@@ -345,5 +344,4 @@ def _mutual(
         next_centroid = tree.query(predicted[star], k=[2])[0][:, 0] ** 2
         ambiguous = mutual & (np.minimum(next_star, next_centroid) - nearest < distinct_px2[rows])
     keep = mutual & ~ambiguous
-    star = star if distinct_px2 is not None else near[star]
-    return rows[keep].astype(np.int64), star[keep].astype(np.int64), int(ambiguous.sum())
+    return rows[keep].astype(np.int64), near[star[keep]].astype(np.int64), int(ambiguous.sum())
