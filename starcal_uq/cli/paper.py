@@ -95,12 +95,11 @@ def reproduce_field_command(
 
 def _readable(published: pd.DataFrame) -> pd.DataFrame:
     """The columns that fit a terminal, each number with the digits that its spread leaves it."""
-    from starcal_uq.core.formatting import significant, with_sigma
+    from starcal_uq.core.formatting import plus_minus
 
     table = published[["place", "method", "quantity", "printed"]].copy()
     table["ours"] = [
-        f"{with_sigma(mean, spread)} ± {significant(spread)}"
-        for mean, spread in zip(published["main_mean"], published["main_spread"], strict=True)
+        plus_minus(mean, spread) for mean, spread in zip(published["main_mean"], published["main_spread"], strict=True)
     ]
     table["z"] = published["main_z"]
     table["outcome"] = published["outcome"]

@@ -58,6 +58,17 @@ def with_sigma(value: float, sigma: float, digits: int = 2) -> str:
     return fixed(value, decimals_for(sigma, digits))
 
 
+def plus_minus(value: float, sigma: float) -> str:
+    """`value` with the digits that `sigma` leaves significant, and sigma.
+
+    Examples
+    --------
+    >>> plus_minus(499.87234, 0.1512)
+    '499.87 ± 0.15'
+    """
+    return f"{with_sigma(value, sigma)} ± {significant(sigma)}"
+
+
 def significant(value: float, digits: int = 2) -> str:
     """A number with `digits` significant digits, with a power of ten where zeros would pile up."""
     if value == 0.0 or not math.isfinite(value):

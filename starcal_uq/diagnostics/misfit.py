@@ -20,7 +20,7 @@ import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.display import Shown
-from starcal_uq.core.formatting import significant, with_sigma
+from starcal_uq.core.formatting import plus_minus
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.diagnostics.pattern import Fit, Pattern, frame_covariance
 from starcal_uq.diagnostics.shapes import (
@@ -77,7 +77,7 @@ class Amplitude:
     sigma: float
 
     def __str__(self) -> str:
-        return f"{self.name} {with_sigma(self.value, self.sigma)} ± {significant(self.sigma)} {self.unit}"
+        return f"{self.name} {plus_minus(self.value, self.sigma)} {self.unit}"
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from starcal_uq.core.formatting import (
     join_words,
     percent,
     plural,
+    plus_minus,
     pretty_unit,
     significant,
     with_sigma,
@@ -66,7 +67,7 @@ def _spread(value: float, spread: float, quantity: str = "") -> str:
     scale = _unit(quantity)[0]
     if not np.isfinite(spread) or spread <= 1e-9 * abs(value):
         return significant(value / scale, 3) if np.isfinite(value) else "–"
-    return f"{with_sigma(value / scale, spread / scale)} ± {significant(spread / scale)}"
+    return plus_minus(value / scale, spread / scale)
 
 
 def signed(z: float) -> str:
@@ -254,7 +255,7 @@ def replicates(found: Replicates) -> TextTable:
         sizes = (significant(size) for size in (spread, bound, row["rmse_over_crlb"]))
         efficiency = "–" if row["biased"] else fixed(row["efficiency"], 2)
         claims = (f"{claimed} ({low} to {high})", fixed(textbook, 2) if np.isfinite(textbook) else "–")
-        mean = f"{with_sigma(bias, bias_se)} ± {significant(bias_se)}"
+        mean = plus_minus(bias, bias_se)
         rows.append((*what, mean, *sizes, efficiency, *claims, percent(row["coverage95"], 3), row["verdict"]))
     return TextTable(
         (

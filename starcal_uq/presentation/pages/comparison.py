@@ -10,7 +10,7 @@ import numpy as np
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.comparison.result import CameraComparison
 from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, write_csv
-from starcal_uq.core.formatting import fixed, percent, pretty_unit, significant, with_sigma
+from starcal_uq.core.formatting import fixed, percent, plus_minus, pretty_unit, significant
 from starcal_uq.core.manifest import making
 from starcal_uq.presentation.figures.comparison import plot_camera_comparison
 from starcal_uq.presentation.figures.style import svg_bytes
@@ -113,9 +113,9 @@ def _parameter_table(found: CameraComparison) -> TextTable:
         rows.append(
             (
                 name,
-                f"{with_sigma(a, sd_a)} ± {significant(sd_a)}",
-                f"{with_sigma(b, sd_b)} ± {significant(sd_b)}",
-                f"{with_sigma(b - a, sd)} ± {significant(sd)}" if known else significant(b - a),
+                plus_minus(a, sd_a),
+                plus_minus(b, sd_b),
+                plus_minus(b - a, sd) if known else significant(b - a),
                 fixed((b - a) / sd, 1) if known else "",
                 pretty_unit(spec.scaled_unit),
             )

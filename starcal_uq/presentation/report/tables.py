@@ -9,7 +9,17 @@ import numpy as np
 
 from starcal_uq.camera.distortion import Parameter, parameters, sigma_parameter
 from starcal_uq.core.constants import INTERACTION
-from starcal_uq.core.formatting import count, decimals_for, fixed, percent, plural, pretty_unit, significant, with_sigma
+from starcal_uq.core.formatting import (
+    count,
+    decimals_for,
+    fixed,
+    percent,
+    plural,
+    plus_minus,
+    pretty_unit,
+    significant,
+    with_sigma,
+)
 from starcal_uq.diagnostics.verdict.estimate import truth_z
 from starcal_uq.presentation.html import symbol
 from starcal_uq.presentation.tables import TextTable, with_units
@@ -82,7 +92,7 @@ def _parameter_row(
         if parameter.name.startswith("sigma"):
             prior_text = "log-normal, below"
         else:
-            prior_text = f"{with_sigma(prior[0] / scale, prior[1] / scale)} ± {significant(prior[1] / scale)}"
+            prior_text = plus_minus(prior[0] / scale, prior[1] / scale)
     return {
         "name": parameter.name,
         "symbol": symbol(parameter.name),
@@ -245,8 +255,8 @@ def pair_table(cal: Calibration) -> TextTable:
     rows = tuple(
         (
             p.name,
-            _with_error(float(cal.pair_theta[i]) / p.scale, float(pair_sigmas[i]) / p.scale),
-            _with_error(float(cal.theta[i]) / p.scale, float(cal.sigmas[i]) / p.scale),
+            plus_minus(float(cal.pair_theta[i]) / p.scale, float(pair_sigmas[i]) / p.scale),
+            plus_minus(float(cal.theta[i]) / p.scale, float(cal.sigmas[i]) / p.scale),
             fixed(float(pair_sigmas[i] / cal.sigmas[i]) ** 2, 2),
         )
         for i, p in enumerate(specs)
@@ -260,7 +270,7 @@ def noise_table(cal: Calibration) -> TextTable | None:
     if (model := cal.fitted_noise) is None:
         return None
     rows = [
-        (term.replace("^2", "²"), f"{with_sigma(float(value), float(error))} ± {significant(float(error))}")
+        (term.replace("^2", "²"), plus_minus(float(value), float(error)))
         for term, value, error in zip(model.terms, model.coefficients, model.errors, strict=True)
     ]
     if model.frame_dof is not None:
@@ -315,7 +325,7 @@ def _round_rows(record: ImageRecord, cal: Calibration) -> list[Row]:
         rows.append(
             {
                 "name": symbol(parameter.name),
-                "values": [_with_error(old / scale, old_sigma / scale), _with_error(new / scale, sigma / scale)],
+                "values": [plus_minus(old / scale, old_sigma / scale), plus_minus(new / scale, sigma / scale)],
                 "change": f"{fixed((new - old) / sigma, 1)} σ" if sigma > 0.0 else "",
                 "unit": pretty_unit(parameter.scaled_unit),
             }
@@ -325,7 +335,3 @@ def _round_rows(record: ImageRecord, cal: Calibration) -> list[Row]:
         {"name": "noise", "values": [significant(r.sigma, 3) for r in (first, last)], "change": "", "unit": unit}
     )
     return rows
-
-
-def _with_error(value: float, sigma: float) -> str:
-    return f"{with_sigma(value, sigma)} ± {significant(sigma)}"

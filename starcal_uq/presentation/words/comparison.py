@@ -6,7 +6,7 @@ import numpy as np
 
 from starcal_uq.comparison.result import CameraComparison
 from starcal_uq.core.constants import AXES
-from starcal_uq.core.formatting import fixed, plural, significant, with_sigma
+from starcal_uq.core.formatting import fixed, plural, plus_minus, significant
 from starcal_uq.presentation.tables import TextTable
 
 _SMALLEST_P = 1e-12
@@ -57,7 +57,7 @@ def _value(value: float, sigma: float) -> str:
         return significant(value) if abs(value) >= _NOTHING else "0"
     if sigma < 5e-4:
         return f"{fixed(value, 3)} ± 0.000"
-    return f"{with_sigma(value, sigma)} ± {significant(sigma)}"
+    return plus_minus(value, sigma)
 
 
 def comparison_text(found: CameraComparison) -> str:

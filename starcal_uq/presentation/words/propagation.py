@@ -9,7 +9,7 @@ import pandas as pd
 
 from starcal_uq.camera.distortion import Parameter
 from starcal_uq.core.constants import AXES, TOTAL_AXES
-from starcal_uq.core.formatting import fixed, join_words, percent, pretty_unit, significant, with_sigma
+from starcal_uq.core.formatting import fixed, join_words, percent, plus_minus, pretty_unit, significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.propagation.attitude_error import (
@@ -209,8 +209,8 @@ def corner_sentence(curve: DistortionCurve) -> str:
     scale = float(curve.arcsec_per_px[-1])
     where = "" if len(curve.mean_px) == 1 else f" at {curve.azimuth_deg[row]:g}° from the x axis"
     return (
-        f"At {curve.radius_px[-1]:.0f} px{where} the distortion is {with_sigma(value, sd)} ± {significant(sd)} px "
-        f"({with_sigma(value * scale, sd * scale)} ± {significant(sd * scale)} arcsec)."
+        f"At {curve.radius_px[-1]:.0f} px{where} the distortion is {plus_minus(value, sd)} px "
+        f"({plus_minus(value * scale, sd * scale)} arcsec)."
     )
 
 
