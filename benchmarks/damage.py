@@ -2,10 +2,11 @@
 
     python benchmarks/damage.py [--text 100000] [--binary 10000] [--only NAME ...] [--processes 2] [--show] [--write]
 
-Every kind of file that the package reads (`tests/helpers/mutants.py`) is damaged that many times, a seed each, and
-loaded. What was done is kept in `.bench/damage`, a file for every few thousand seeds: a campaign that is stopped goes
-on, and a larger one takes in a smaller one. A process may take 1 GB beyond what it has before, and a file 20 s; one
-that dies is counted with its seed. ``--show`` prints what was wrong, ``--write`` puts the table into the documentation
+Every kind of file that the package reads (`tests/helpers/mutants.py`) is damaged, a seed each, and loaded: binary kinds
+that many times, and the kinds of text that one function reads that many times together. What was done is kept in
+`.bench/damage`, a file for every few thousand seeds: a campaign that is stopped goes on, and a larger one takes in a
+smaller one. A process may take 1 GB beyond what it has before, and a file 20 s; one that dies is counted with its seed.
+``--show`` prints what was wrong, ``--write`` puts the table into the documentation
 (`docs/explanation/reliability.md`). Without ``--text`` and ``--binary`` nothing new is tried.
 """
 
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import random
 import resource
@@ -37,7 +39,7 @@ from tests.helpers.mutants import LAST, SAMPLES, Bench, Outcome, Sample, write_s
 OUT = ROOT / ".bench" / "damage"
 PAGE = ROOT / "docs" / "explanation" / "reliability.md"
 # A process takes seconds to load what it needs.
-FIRST, CHUNK = (0, 1000, 10_000), 30_000
+FIRST, CHUNK = (0, 1000, 10_000), 15_000
 LONGEST_S, MOST_BYTES = 20.0, 2**30
 KINDS = ("refused", "same", "other", "wrong")
 BAD = ("words", "escaped", "slow", "died")
@@ -142,11 +144,13 @@ def campaign(samples: Sequence[Sample], text: int, binary: int, processes: int, 
         write_samples(out / "valid")
     # All kinds a little first: whoever looks early sees something of each.
     edges = [*FIRST, *range(FIRST[-1] + CHUNK, max(text, binary) + CHUNK, CHUNK)]
+    kinds = Counter(sample.reads[0] for sample in SAMPLES if not sample.binary)
+    wanted = {s.file: binary if s.binary else math.ceil(text / kinds[s.reads[0]]) for s in samples}
     jobs = [
-        (sample.file, first, min(last, wanted))
+        (sample.file, first, min(last, wanted[sample.file]))
         for first, last in pairwise(edges)
         for sample in samples
-        if first < (wanted := binary if sample.binary else text)
+        if first < wanted[sample.file]
     ]
     start = time.monotonic()
     with ThreadPoolExecutor(processes) as pool:
@@ -203,7 +207,7 @@ def table(results: dict[str, dict[str, Any]]) -> str:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--text", type=int, default=0, help="damaged files of each kind of text")
+    parser.add_argument("--text", type=int, default=0, help="damaged files of each reader of text")
     parser.add_argument("--binary", type=int, default=0, help="damaged files of each binary kind")
     parser.add_argument("--only", nargs="+", default=[], help="files, or parts of their names")
     parser.add_argument("--processes", type=int, default=os.cpu_count())
