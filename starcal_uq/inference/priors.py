@@ -280,8 +280,9 @@ class PhysicalPriors(Priors):
             variance = np.diag(self.theta_moments()[1])
         if not (np.isfinite(variance).all() and (variance > 0.0).all()):
             raise PriorError(
-                "the prior's widths leave no number for a parameter: look at 'corner_radius_px' "
-                f"({self.corner_radius_px:g}), 'distortion_corner_px' and 'focal_px'."
+                "the prior's widths leave no number for a parameter: look at 'focal_px' "
+                f"({self.focal_px:g}), 'focal_fraction' ({self.focal_fraction:g}), 'distortion_corner_px' "
+                f"({self.distortion_corner_px:g}) and 'corner_radius_px' ({self.corner_radius_px:g})."
             )
 
     @classmethod
@@ -341,8 +342,12 @@ def priors_from_table(
     path: str | Path, table: Mapping[str, Any], camera: Camera, per_star_sigma: bool = False
 ) -> PhysicalPriors:
     """Priors from the entries of a ``[priors]`` table; `path` is for messages."""
-    values = PRIORS.check(table, f"{path}, section [priors]")
-    return PhysicalPriors.around(camera, per_star_sigma).replace(**values)
+    where = f"{path}, section [priors]"
+    values = PRIORS.check(table, where)
+    try:
+        return PhysicalPriors.around(camera, per_star_sigma).replace(**values)
+    except PriorError as error:
+        raise PriorError(f"{where}: {error}") from None
 
 
 KIND = "gaussian"

@@ -122,6 +122,7 @@ def test_toml_overrides_defaults(tmp_path: Path) -> None:
         ("[priors]\nfocal_fraction = true\n", "focal_fraction is True; write a number above zero"),
         ("[priors]\nprincipal_point_centre_px = 500\n", "principal_point_centre_px is 500; write two numbers"),
         ("[priors]\nfocal_fraction = -0.1\n", "above zero"),
+        ("[priors]\ndistortion_corner_px = 1e-300\n", "leave no number"),
         ("[priors\n", "not valid TOML"),
     ],
 )
