@@ -22,6 +22,7 @@ from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import unproject
 from starcal_uq.core.errors import IdentificationError
 from starcal_uq.core.settings import Engine, bounded
+from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray
 from starcal_uq.identification.blind import AGREEMENT, FOCAL_RANGE, find_optics
 from starcal_uq.identification.match import CameraState, Match
@@ -98,6 +99,7 @@ class CalibratedCamera(Protocol):
 
 
 @bounded
+@one_thread()
 def identify(
     centroids: CentroidTable,
     camera: Camera | None,

@@ -13,8 +13,9 @@ from starcal_uq.identification.pyramid import FieldGeometry
 
 # Centroids are compared with the catalogue down to where a field holds this many stars for each, and some more.
 _STARS_PER_CENTROID, _STARS_MORE = 2.0, 20
-# Below so many stars no tree is made.
-_FEW = 20_000
+# All stars are looked at sooner than a tree gives its list, where they are so few; where they are more, making the tree
+# takes as long as so many looks at all of them.
+_FEW, _LOOKS = 20_000, 300
 
 
 class NearbyStars:
@@ -26,6 +27,7 @@ class NearbyStars:
         self.mag = mag[self.rows]
         self.geometry = geometry
         self._trees: dict[int, Any] = {}
+        self._looks: dict[int, int] = {}
 
     def depth(self, n_centroids: int) -> int:
         """Number of stars on the whole sky that a frame with so many centroids is compared with."""
@@ -44,8 +46,8 @@ class NearbyStars:
         """Stars, by brightness rank, within an angle of a direction."""
         from scipy.spatial import cKDTree
 
-        if depth < _FEW:
-            # All of few stars are looked at sooner than a tree gives its list.
+        looks = self._looks[depth] = self._looks.get(depth, 0) + 1
+        if depth < _FEW or looks < _LOOKS:
             return np.flatnonzero(self.directions[:depth] @ boresight > np.cos(radius_rad))
         if depth not in self._trees:
             self._trees[depth] = cKDTree(self.directions[:depth])
