@@ -238,7 +238,7 @@ def _taken_apart(
 
 
 # Rows that are filtered together, what stays in the processor's caches, and numbers that one product gives in a line.
-_ROWS, _BAND = 128, 16
+_ROWS, _BAND = 96, 24
 
 
 def _filtered(counts: Any, line: Any) -> Any:

@@ -18,7 +18,7 @@ from starcal_uq.core.errors import ImageError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.settings import Bayer, bounded
 from starcal_uq.core.store import Kept
-from starcal_uq.core.tasks import Progress, processors, run_tasks
+from starcal_uq.core.tasks import Progress, one_thread, processors, run_tasks
 from starcal_uq.core.types import AnyDict
 from starcal_uq.images.centroids import COLUMNS, FRAME_COLUMNS, Centroids
 from starcal_uq.images.detection import DetectionOptions, FrameStars, find_stars
@@ -43,6 +43,7 @@ Source = Image | str | os.PathLike[str]
 
 
 @bounded
+@one_thread()
 def extract_centroids(
     images: Source | Iterable[Source],
     *,

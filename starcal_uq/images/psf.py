@@ -10,6 +10,7 @@ import numpy as np
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.images.background import PreparedImage
 from starcal_uq.images.fits import Stamps, StarFit, cut_stamps, explained, fit_stars, fit_widths
+from starcal_uq.maths.intervals import median_of
 
 FIRST_SIGMA_PX = 1.2
 _STAMP_HALF_SIGMAS = 4.0
@@ -70,7 +71,8 @@ def measure_psf(frame: PreparedImage, objects: Any) -> Psf | None:
     clear = np.count_nonzero(snr[bright] > 4.0 * _PSF_SNR) >= _PSF_STARS
     most = _PSF_STARS if clear else 5 * _PSF_STARS
     # Moments are of the filtered image, in which stars are wider.
-    x, y, widths = chosen["x"].astype(np.float64), chosen["y"].astype(np.float64), np.full(len(chosen), 0.8 * sigma)
+    first = max(float(np.sqrt(max(sigma**2 - FIRST_SIGMA_PX**2, 0.0))), 0.6 * sigma)
+    x, y, widths = chosen["x"].astype(np.float64), chosen["y"].astype(np.float64), np.full(len(chosen), first)
     for left_moving in _LEFT_MOVING:
         clean, stamps = _clean_stamps(frame, chosen, sigma, most)
         if not len(clean):
@@ -80,7 +82,7 @@ def measure_psf(frame: PreparedImage, objects: Any) -> Psf | None:
         good = (np.hypot(x - chosen["x"], y - chosen["y"]) < 1.0 + sigma) & (flux > 0.0)
         if not good.any():
             return None
-        sigma = float(np.clip(np.median(widths[good]), *_WIDTHS))
+        sigma = float(np.clip(median_of(widths[good]), *_WIDTHS))
         # The second fit, of stamps that suit the width, starts where the first has ended.
         x, y = np.where(good, x, chosen["x"]), np.where(good, y, chosen["y"])
         widths = np.where(good, widths, sigma)
@@ -88,8 +90,8 @@ def measure_psf(frame: PreparedImage, objects: Any) -> Psf | None:
     stamps = cut_stamps(frame.counts, frame.usable, x, y, half_stamp_px(sigma), frame.noise, 0.0, frame.parity)
     width = sigma
     if frame.counts_per_e:
-        x, y, _, widths = fit_widths(stamps, x, y, widths, left_moving)
-        width = float(np.clip(np.median(widths[good]), *_WIDTHS))
+        x, y, _, widths = fit_widths(stamps, x, y, widths, _LEFT_MOVING[0])
+        width = float(np.clip(median_of(widths[good]), *_WIDTHS))
     fit = fit_stars(stamps, x, y, width, once=True)
     # Fainter stars that are found are those whose noise adds light.
     good &= stamps.fine.all((1, 2)) & (fit.flux > _MISFIT_SNR * np.sqrt(fit.covariance[:, 2, 2]))
@@ -102,21 +104,21 @@ def measure_psf(frame: PreparedImage, objects: Any) -> Psf | None:
 
 def _significant(values: FloatArray) -> float:
     """Median of numbers, 0 where their scatter explains it."""
-    middle = float(np.median(values))
-    error = 1.9 * float(np.median(np.abs(values - middle))) / np.sqrt(len(values))
+    middle = float(median_of(values))
+    error = 1.9 * float(median_of(np.abs(values - middle))) / np.sqrt(len(values))
     return middle if abs(middle) > 3.0 * error else 0.0
 
 
 def _elongation(stamps: Stamps, fit: StarFit, good: BoolArray) -> float:
     """Length over width of the star images by their second moments in a window, whose part is taken out."""
-    window = max(_MOMENT_WINDOW_PX, 1.2 * float(np.median(fit.sigma_px)))
+    window = max(_MOMENT_WINDOW_PX, 1.2 * float(median_of(fit.sigma_px)))
     steps = np.arange(stamps.counts.shape[1])
     u, v = (steps - (fit.x_px - stamps.x0)[good, None]), (steps - (fit.y_px - stamps.y0)[good, None])
     light = stamps.counts[good] * np.exp(-0.5 * (v[:, :, None] ** 2 + u[:, None, :] ** 2) / window**2)
     total = light.sum((1, 2))
     xx, yy = np.sum(light.sum(1) * u**2, 1) / total, np.sum(light.sum(2) * v**2, 1) / total
     xy = np.einsum("nhw,nh,nw->n", light, v, u) / total
-    mean, half, cross = 0.5 * float(np.median(xx + yy)), _significant(0.5 * (xx - yy)), _significant(xy)
+    mean, half, cross = 0.5 * float(median_of(xx + yy)), _significant(0.5 * (xx - yy)), _significant(xy)
     apart = float(np.hypot(half, cross))
     if not apart < mean < window**2 - apart:
         return 1.0
