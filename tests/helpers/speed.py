@@ -20,5 +20,8 @@ def times_as_long(run: Callable[[], object], reference: Callable[[], object], re
 
 
 def sort_a_million() -> None:
-    """A reference that is NumPy's own work: some 60 ms on a core of 2020."""
-    np.sort(np.random.default_rng(0).random(1_000_000))
+    """A reference that is NumPy's own work: some 100 ms on a core of 2020.
+
+    Its stable sort is the same on every processor; the other one takes a tenth where there are instructions for it.
+    """
+    np.sort(np.random.default_rng(0).random(1_000_000), kind="stable")
