@@ -153,7 +153,9 @@ def _within(one: Any, other: Any) -> bool:
 
 
 def is_efficient(result: Any) -> bool:
-    """True for estimates by the attitude-marginalised Gaussian likelihood."""
+    """True for estimates by the attitude-marginalised Gaussian likelihood, where frames scatter as it says."""
+    if getattr(result, "inflation", None) is not None:
+        return False
     diagnostics = getattr(result, "diagnostics", None)
     if diagnostics is not None:
         return bool(diagnostics.likelihood == "marginal")

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from starcal_uq.observations.table import Observations
     from starcal_uq.propagation.attitude_error import AttitudeError
 
+# Factors that differ by less are the same.
+_ROUNDING = 1e-6
+
 
 def with_misfit(error: AttitudeError, diagnosis: Diagnosis, post: Posterior, obs: Observations) -> AttitudeError:
     """The attitude error with what the tests of the model found.
@@ -29,7 +32,8 @@ def with_misfit(error: AttitudeError, diagnosis: Diagnosis, post: Posterior, obs
     - A distortion model that predicts as well, but moves the attitudes by more than the standard deviation within the
       fitted one, counts with that difference; every one does if the fitted model is rejected.
       Pattern and model are two views of one error, of which the larger counts.
-    - Frames that disagree more than their formal errors allow multiply common rotation and rest by the jackknife ratio.
+    - Frames that disagree more than their formal errors allow multiply common rotation and rest by the jackknife ratio,
+      over what of it the draws hold already.
 
     Parameters
     ----------
@@ -50,7 +54,7 @@ def with_misfit(error: AttitudeError, diagnosis: Diagnosis, post: Posterior, obs
         return error
     pattern, pattern_reasons = _pattern(error, diagnosis, post, obs)
     common_shift, rest_shift, common_models, rest_models = _models(error, diagnosis)
-    factor, frames = _frames(diagnosis)
+    factor, frames = _frames(diagnosis, post)
     phase = [name for name in diagnosis.misfit.pattern.families if "pixel phase" in name]
     notes: tuple[str, ...] = ()
     if phase:
@@ -119,7 +123,7 @@ def _models(
     return common, rest, reasons[0], reasons[1]
 
 
-def _frames(diagnosis: Diagnosis) -> tuple[float, tuple[str, ...]]:
+def _frames(diagnosis: Diagnosis, post: Posterior) -> tuple[float, tuple[str, ...]]:
     """Factor by which frames disagree more than their formal errors allow."""
     found = diagnosis.jackknife
     if found is None:
@@ -127,5 +131,8 @@ def _frames(diagnosis: Diagnosis) -> tuple[float, tuple[str, ...]]:
     flagged = disagreeing(found)
     if not flagged.any():
         return 1.0, ()
-    factor = float(found.ratio[flagged].max())
+    held = 1.0 if post.inflation is None else post.inflation[flagged]
+    factor = float(np.max(found.ratio[flagged] / held))
+    if factor <= 1.0 + _ROUNDING:
+        return 1.0, ()
     return factor, (f"frames disagree {significant(factor, 3)} times as much as their formal errors allow (jackknife)",)

@@ -210,13 +210,15 @@ def _jackknife(found: FrameScatter, cal: Calibration, left_out: FloatArray) -> J
 
 
 def accept_inflation(cal: Calibration, jackknife: Jackknife) -> Calibration:
-    """The calibration with the inflated covariance; provenance says so.
+    """The calibration with the inflated covariance; provenance says so, and draws made from it are as wide.
 
     Raises
     ------
     CalibrationError
-        When the jackknife is of another model.
+        When the jackknife is of another model, or the calibration is inflated already.
     """
+    if cal.inflation is not None:
+        raise CalibrationError("the calibration's sigmas are inflated already: give the one that was estimated.")
     if jackknife.parameter_names != cal.parameter_names:
         raise CalibrationError(
             f"the jackknife is of the parameters {', '.join(jackknife.parameter_names)}, the calibration of "

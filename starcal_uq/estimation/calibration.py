@@ -199,6 +199,12 @@ class Calibration(Shown):
         return model if model is not None and model.varies else None
 
     @property
+    def inflation(self) -> FloatArray | None:
+        """Factors (p,) that `covariance` was accepted to be wider by, per sigma; None for that of the likelihood."""
+        factors = self.provenance.get("settings", {}).get("inflation")
+        return None if factors is None else np.array([factors[name] for name in self.parameter_names])
+
+    @property
     def n_stars(self) -> int:
         """Number of stars."""
         return self.compressed.n_stars if self.partitions else len(self.residuals_px) or self.compressed.n_stars

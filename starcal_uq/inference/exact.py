@@ -6,6 +6,8 @@ number of frames, with the standard error that batches of them show. The cost is
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from copy import copy
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -77,9 +79,17 @@ class FrameSample:
             likelihood = MarginalLikelihood(batch, cal.camera.distortion)
             expanded = compress(likelihood, self._whole.theta_hat, covariance, start)
             self._batches.append((exact, expanded, self.of_frames / batch.n_frames))
+        self._at: Callable[[FloatArray], FloatArray] = np.asarray
+
+    def evaluated(self, at: Callable[[FloatArray], FloatArray]) -> FrameSample:
+        """The same of a likelihood that is evaluated at ``at(theta)``."""
+        other = copy(self)
+        other._at = at
+        return other
 
     def left_out(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
         """Exact less compressed log likelihood of all frames, as every batch by itself has it, (B, n)."""
+        theta = self._at(theta)
         return np.array(
             [
                 (exact.log_likelihood(theta, sigma) - expanded.log_likelihood(theta, sigma)) * stands_for
@@ -90,4 +100,4 @@ class FrameSample:
     def log_likelihood(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
         """The compressed log likelihood of all frames, and what it leaves out (n,)."""
         left_out: FloatArray = self.left_out(theta, sigma).mean(axis=0)
-        return self._whole.log_likelihood(theta, sigma) + left_out
+        return self._whole.log_likelihood(self._at(theta), sigma) + left_out

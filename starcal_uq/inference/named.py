@@ -57,6 +57,8 @@ class Source:
     checks: tuple[Check, ...] = ()  # Checks that need no draws
     # What `fast` leaves out, told by some of the frames; None where `exact` itself is compared.
     sample: FrameSample | None = None
+    scatters: bool = False  # True where the scatter of the frames is in the likelihood already
+    inflation: FloatArray | None = None  # (p,): factors on sigma that it holds, of a calibration that has accepted some
 
 
 def check_names(likelihood: Any, evaluation: Any, dof: Any, has_observations: bool) -> None:
@@ -100,6 +102,8 @@ def find_source(
         at = (cal.theta, cal.information, cal.sigma, float(cal.dof))
         return Source(label_of(likelihood), *at, exact=likelihood.log_likelihood, fast=None)
     source = _named_source(likelihood, obs, cal, dof)
+    if cal.inflation is not None:
+        source = _inflated(source, np.ones_like(cal.theta) if source.scatters else cal.inflation)
     if (ignored := _settings(cal).get("ignored_distortion")) is None:
         return source
     sentence = (
@@ -116,6 +120,29 @@ def find_source(
         f"{CALIBRATE} or sc.calibrate(obs, camera)",
     )
     return replace(source, checks=(check,))
+
+
+def _inflated(source: Source, factors: FloatArray) -> Source:
+    """The likelihood that is wider by `factors` (p,) on each sigma, its maximum and correlations the same.
+
+    It is evaluated at ``theta_hat + D^-1 (theta - theta_hat)``, as composite ones are (Ribatet, Cooley & Davison 2012).
+    Tempering would take one factor for all parameters, and would widen sigma, too.
+    """
+
+    def at(theta: FloatArray) -> FloatArray:
+        return np.asarray(source.theta + (theta - source.theta) / factors)
+
+    def wider(log_likelihood: LogLikelihood) -> LogLikelihood:
+        return lambda theta, *rest: log_likelihood(at(theta), *rest)
+
+    return replace(
+        source,
+        information=source.information / np.outer(factors, factors),
+        exact=None if source.exact is None else wider(source.exact),
+        fast=None if source.fast is None else wider(source.fast),
+        sample=None if source.sample is None else source.sample.evaluated(at),
+        inflation=factors,
+    )
 
 
 def _named_source(likelihood: str, obs: Observations | None, cal: Calibration, dof: float | str | None) -> Source:
@@ -224,6 +251,7 @@ def _pairs(obs: Observations, cal: Calibration, adjusted: bool) -> Source:
         exact=expanded.exact_log_likelihood,
         fast=expanded.log_likelihood,
         notes=notes,
+        scatters=adjusted and expanded.variability == "empirical",
     )
 
 

@@ -306,6 +306,12 @@ class Posterior(Shown):
         return np.asarray(self.draws.std(axis=0, ddof=1))
 
     @property
+    def inflation(self) -> FloatArray | None:
+        """Factors (p,) of an accepted inflation that the draws hold; None where there is none, or they do not."""
+        factors = self.provenance.get("inflation")
+        return None if factors is None else np.array([factors[name] for name in self.camera_names])
+
+    @property
     def sampled(self) -> tuple[int, ...]:
         """Columns of `draws` that were sampled."""
         return tuple(range(len(self.parameter_names) - (not self.sigma_sampled)))

@@ -85,7 +85,8 @@ def sample(
         The stars of the calibration. None leaves the compressed likelihood unchecked; of partitioned ones, the sample
         of frames that the calibration has kept checks it, its error counted for all frames.
     cal : Calibration
-        Start, Fisher information and compressed likelihood.
+        Start, Fisher information and compressed likelihood. An inflation that it has accepted widens the likelihood as
+        much, priors and the given object of a likelihood are as they are.
     priors : Priors, optional
         ``Priors.default`` of the nominal camera otherwise.
     sigma : "sampled" or float
@@ -162,6 +163,8 @@ def sample(
         record["partitions"] = cal.provenance["partitions"]
     if cal.noise_model is not None:
         record["noise_model"] = cal.noise_model.record(frames=False)
+    if source.inflation is not None:
+        record["inflation"] = dict(zip(cal.parameter_names, source.inflation.tolist(), strict=True))
     run = _Run(cal, source, priors, settings, n_ensembles, seed, sigma, progress, record)
     if isinstance(likelihood, str):
         outcome, compression = _with_fallback(run, evaluation, checkpoint)

@@ -536,7 +536,7 @@ class Run:
             Whether to write an estimate that leaves parameters open, to be sampled with priors that determine them.
         accept_inflation : bool
             Whether to multiply sigma by how much more the frames scatter than their noise says
-            (`starcal_uq.diagnostics.accept_inflation`).
+            (`starcal_uq.diagnostics.accept_inflation`); draws are as wide.
         force : bool
             Whether to replace what the folder holds.
         progress, **options

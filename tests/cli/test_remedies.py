@@ -176,7 +176,7 @@ EXAMPLES = {
         for found in (whole, dataclasses.replace(whole, uneven=None))
     ],
     "diagnostics.verdict.estimate.jackknife": lambda s: [
-        estimate.jackknife(found, inflated)
+        estimate.jackknife(found, inflated, s.post)
         for found in [dataclasses.replace(s.jackknife, sandwich_covariance=9.0 * s.jackknife.formal_covariance)]
         for inflated in (False, True)
     ],

@@ -13,10 +13,12 @@ from scipy import stats
 
 import starcal_uq as sc
 from starcal_uq.core.records import to_plain
+from starcal_uq.core.status import Level
 from starcal_uq.diagnostics.diagnose import Diagnosis, diagnose, diagnose_apart, multi_start
 from starcal_uq.diagnostics.jackknife import Jackknife, accept_inflation, jackknife_frames
 from starcal_uq.diagnostics.models import ModelComparison, closed_form, compare_models
 from starcal_uq.diagnostics.predictive import PredictiveCheck, predictive_check
+from starcal_uq.diagnostics.verdict.judge import judge
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.normals import FrameNormals
 from starcal_uq.runs.folder import DIAGNOSIS_TABLES
@@ -164,6 +166,38 @@ def test_accepting_inflation_is_on_record_and_never_shrinks(obs, cal):
     with pytest.raises(sc.errors.CalibrationError, match="three or more"):
         two = obs.select_frames(obs.frame_ids[:2])
         jackknife_frames(two, sc.calibrate(two, sc.paper.paper_start()))
+
+
+def test_every_step_of_a_run_has_the_inflation_that_was_accepted(obs, tmp_path):
+    """Common rotation and verdict of draws with an accepted inflation; those of formal errors are the control."""
+    bad, common, checks = clustered(obs), {}, {}
+    for name, accept in (("formal", False), ("accepted", True)):
+        run = sc.Run(tmp_path / name)
+        cal = run.calibrate(bad, sc.paper.paper_start(), accept_inflation=accept)
+        post = run.sample(seed=1, n_ensembles=2, n_steps=100)
+        run.diagnose(n_starts=0)
+        run.propagate(seed=1)
+        held, found = run.attitude.if_model_holds_arcsec, run.budget()
+        response = np.rad2deg(cal.rotation_per_theta) * 3600.0
+        common[name] = np.sqrt(np.diag(response @ cal.covariance @ response.T))
+        assert held[1, :2] == pytest.approx(common[name][:2], rel=0.1)
+        assert post.sd[:-1] == pytest.approx(cal.sigmas, rel=0.1)
+        rows = [row for row in found.rows if row.name == "calibration, common rotation"]
+        checks[name] = next(c for c in run.verdict.checks if c.name == "Jackknife over frames")
+        assert any("jackknife" in row.conditions for row in rows) == (not accept)
+    factors = jackknife_frames(bad, sc.calibrate(bad, sc.paper.paper_start())).factors
+    assert min(common["accepted"][:2] / common["formal"][:2]) > 1.1 and max(factors) > 1.5
+    assert checks["formal"].level is Level.WARN and "--accept-inflation" in checks["formal"].remedy
+    assert checks["accepted"].level is Level.PASS and "has multiplied" in checks["accepted"].sentence
+    # Draws of a version before have the formal errors.
+    old = sc.Run(tmp_path / "accepted")
+    record = {name: value for name, value in old.posterior.provenance.items() if name != "inflation"}
+    post = dataclasses.replace(old.posterior, provenance=record)
+    verdict = judge(old.observations, old.calibration, post, diagnosis=old.diagnosis)
+    check = next(c for c in verdict.checks if c.name == "Jackknife over frames")
+    assert (
+        check.level is Level.WARN and "sample RUN --force" in check.remedy and "not that of the draws" in check.sentence
+    )
 
 
 # --- comparison of models --------------------------------------------------------------------------------------------

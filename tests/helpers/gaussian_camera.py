@@ -59,6 +59,7 @@ def gaussian_calibration(dof: int = 25_000, sigma: float = 0.05, **changes: Any)
         "provenance": {"data_sha256": "0" * 64},
         "star_errors": None,
         "noise_model": None,
+        "inflation": None,
         "undetermined": (),
     }
     values |= changes

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from starcal_uq.core.errors import SamplingError, SettingError
+from starcal_uq.core.errors import CalibrationError, SamplingError, SettingError
 from starcal_uq.core.status import Level, Status
+from starcal_uq.diagnostics.jackknife import accept_inflation, jackknife_frames
 from starcal_uq.estimation.calibrate import calibrate
 from starcal_uq.estimation.student import DEFAULT_DOF
 from starcal_uq.inference import named
@@ -172,10 +173,12 @@ def test_a_checkpoint_that_is_stale_or_damaged_is_passed_over(tmp_path: Path) ->
         sample(None, cal, **QUICK, evaluation="compressed", checkpoint=checkpoint, progress=interrupt)
     content = checkpoint.read_bytes()
     other = {**QUICK, "seed": 4}
-    for stale, settings in ((content, other), (content[:-100], QUICK), (b"not a checkpoint", QUICK)):
+    wider = SimpleNamespace(**{**vars(cal), "inflation": np.full(5, 1.7)})
+    cases = ((content, cal, other), (content, wider, QUICK), (content[:-100], cal, QUICK), (b"nothing", cal, QUICK))
+    for stale, calibration, settings in cases:
         checkpoint.write_bytes(stale)
-        found = sample(None, cal, **settings, evaluation="compressed", checkpoint=checkpoint)
-        assert np.array_equal(found.draws, sample(None, cal, **settings, evaluation="compressed").draws)
+        found = sample(None, calibration, **settings, evaluation="compressed", checkpoint=checkpoint)
+        assert np.array_equal(found.draws, sample(None, calibration, **settings, evaluation="compressed").draws)
 
 
 def test_given_noise_fills_the_last_column() -> None:
@@ -468,6 +471,69 @@ def test_frames_in_batches_say_what_the_expansion_leaves_out() -> None:
     # Of frames that stand for more, the expansion is that of all, and what is left out grows with them.
     more = FrameSample(obs, cal, of_frames=40)
     np.testing.assert_allclose(more.left_out(theta, sigma), 2.0 * batches.left_out(theta, sigma))
+
+
+FACTORS = np.array([1.7, 1.0, 2.5, 1.7, 1.7])
+
+
+@pytest.fixture(scope="module")
+def accepted() -> Any:
+    """A calibration that has accepted `FACTORS`, and the one before."""
+    obs = observations(n_frames=20)
+    cal = calibrate(obs, nominal(camera()))
+    found = jackknife_frames(obs, cal)
+    wide = found.formal_covariance * np.outer(FACTORS, FACTORS)
+    return accept_inflation(cal, dataclasses.replace(found, sandwich_covariance=wide)), cal
+
+
+@pytest.mark.parametrize(
+    ("likelihood", "evaluation"),
+    [("marginal", "compressed"), ("marginal", "exact"), ("student_t", "auto"), ("pairs", "auto")],
+)
+def test_draws_are_as_wide_as_an_accepted_inflation(accepted: Any, likelihood: Any, evaluation: Any) -> None:
+    obs, (cal, before) = observations(n_frames=20), accepted
+    how = {**QUICK, "likelihood": likelihood, "evaluation": evaluation}
+    post, formal = sample(obs, cal, **how), sample(obs, before, **how)
+    assert post.sd[:-1] / formal.sd[:-1] == pytest.approx(FACTORS, rel=0.05)
+    assert post.sd[-1] == pytest.approx(formal.sd[-1], rel=0.05)
+    assert np.max(np.abs(post.mean - formal.mean) / cal.sigmas) < 0.1
+    assert post.inflation == pytest.approx(FACTORS) and formal.inflation is None
+    assert post.diagnostics.likelihood_used == formal.diagnostics.likelihood_used
+    assert post.diagnostics.psis_khat < 0.7
+    if likelihood == "marginal":
+        assert post.sd[:-1] / cal.sigmas == pytest.approx(1.0, rel=0.1)
+        # The control: draws of the formal errors are as much narrower than the calibration as was accepted.
+        assert cal.sigmas / formal.sd[:-1] == pytest.approx(FACTORS, rel=0.1)
+
+
+def test_an_accepted_inflation_widens_no_prior_and_nothing_twice(accepted: Any) -> None:
+    obs, (cal, before) = observations(n_frames=20), accepted
+    # A prior that knows f as well as the formal errors do is as narrow beside the wider ones.
+    tight = dataclasses.replace(
+        Priors.default(cal.nominal), focal_px=cal.theta[2], focal_fraction=before.sigmas[2] / cal.theta[2]
+    )
+    post = sample(obs, cal, tight, **QUICK)
+    information = before.information / np.outer(FACTORS, FACTORS)
+    both = symmetric_inverse(information + tight.precision(cal.parameter_names))
+    assert post.sd[:-1] == pytest.approx(np.sqrt(np.diag(both)), rel=0.1)
+    assert both[2, 2] < 0.2 * cal.covariance[2, 2]
+    own = sample(obs, cal, likelihood=ExactMarginal(obs, before), **QUICK)
+    assert own.inflation is None and own.sd[:-1] == pytest.approx(before.sigmas, rel=0.1)
+    with pytest.raises(CalibrationError, match="inflated already"):
+        accept_inflation(cal, jackknife_frames(obs, cal))
+
+
+def test_a_sample_of_frames_checks_the_wider_likelihood(accepted: Any) -> None:
+    obs, (cal, _) = observations(n_frames=20), accepted
+    plain = dataclasses.replace(named.find_source("marginal", obs, accepted[1], None), sample=FrameSample(obs, cal))
+    source = named._inflated(plain, FACTORS)
+    steps = np.random.default_rng(1).standard_normal((4, 5)) * cal.sigmas
+    sigma = np.full(4, cal.sigma)
+    assert source.sample is not None and plain.sample is not None and source.fast is not None and plain.fast is not None
+    far, near = cal.theta + steps * FACTORS, cal.theta + steps
+    for wide, narrow in ((source.sample.left_out, plain.sample.left_out), (source.fast, plain.fast)):
+        np.testing.assert_allclose(wide(far, sigma), narrow(near, sigma), rtol=1e-6, atol=1e-6)
+    assert np.abs(plain.fast(far, sigma) - plain.fast(near, sigma)).max() > 1.0
 
 
 def test_degrees_of_freedom_are_the_callers_or_the_calibrations() -> None:

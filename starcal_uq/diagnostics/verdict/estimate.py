@@ -24,6 +24,8 @@ from starcal_uq.diagnostics.misfit import ALPHA
 from starcal_uq.diagnostics.verdict.observed import NOISE, ROBUST, SCREEN, richer
 from starcal_uq.estimation.fallback import fallback_words
 from starcal_uq.estimation.undetermined import what_is_open
+from starcal_uq.inference.checks import resample
+from starcal_uq.inference.named import LIKELIHOODS
 from starcal_uq.maths.intervals import student_quantile
 
 if TYPE_CHECKING:
@@ -142,12 +144,12 @@ _OF_THE_LENS = ("radius", "azimuth", "field", "field cells")
 _LIKE_NOISE = ("pixel phase in x", "pixel phase in y")
 
 
-def model_checks(diagnosis: Diagnosis, inflated: bool) -> list[Check]:
-    """Every check that a diagnosis allows, of a calibration whose inflation may be accepted."""
+def model_checks(diagnosis: Diagnosis, inflated: bool, post: Posterior | None = None) -> list[Check]:
+    """Every check that a diagnosis allows, of a calibration whose inflation may be accepted, and of its draws."""
     fitted = "" if diagnosis.comparison is None else diagnosis.comparison.fitted
-    checks = [misfit(diagnosis.misfit, fitted), even_noise(diagnosis.misfit)]
+    checks = [misfit(diagnosis.misfit, fitted), even_noise(diagnosis.misfit, inflated)]
     checks += [] if diagnosis.cameras is None else [one_camera(diagnosis.cameras)]
-    checks += [] if diagnosis.jackknife is None else [jackknife(diagnosis.jackknife, inflated)]
+    checks += [] if diagnosis.jackknife is None else [jackknife(diagnosis.jackknife, inflated, post)]
     checks += [] if diagnosis.stars is None else [stars(diagnosis.stars)]
     checks += [] if diagnosis.comparison is None else [comparison(diagnosis.comparison)]
     return [*checks, predictive(diagnosis.predictive)]
@@ -193,7 +195,7 @@ def misfit(found: Misfit, fitted: str = "") -> Check:
     return Check(name, Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
 
 
-def even_noise(found: Misfit) -> Check:
+def even_noise(found: Misfit, inflated: bool = False) -> Check:
     """Is the noise what the weights of the stars say?"""
     tests = [test for test in found.tests if test.is_of_noise]
     rejected = [test for test in found.found(MISFIT_P) if test.is_of_noise]
@@ -203,6 +205,9 @@ def even_noise(found: Misfit) -> Check:
         sentence = "The noise does not change with radius, magnitude, time or frame beyond what the weights know of it."
         return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, sentence)
     changes = f"The residuals hold {join_words([test.name for test in rejected])}"
+    if found.uneven is None and inflated:
+        sentence = f"{changes}, which the weights of the stars do not know; the accepted inflation holds it."
+        return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, sentence)
     if found.uneven is None:
         sentence = f"{changes}, which the weights of the stars do not know: the stated sigmas may be wrong."
         return Check(name, Question.TRUSTWORTHY, Level.WARN, value, bound, sentence, _INFLATE)
@@ -243,27 +248,34 @@ def disagreeing(found: Jackknife) -> BoolArray:
     return np.asarray((found.p_values * len(found.p_values) < JACKKNIFE_P) & (found.ratio > JACKKNIFE_RATIO))
 
 
-def jackknife(found: Jackknife, inflated: bool = False) -> Check:
+def jackknife(found: Jackknife, inflated: bool = False, post: Posterior | None = None) -> Check:
     """Do frames scatter as their formal errors say?"""
     worst, bad = int(np.argmax(found.ratio)), disagreeing(found)
     low, high = float(found.ratio.min()), float(found.ratio.max())
     value = f"ratios {fixed(low, 2)} to {fixed(high, 2)} ({found.parameter_names[worst]})"
     chance = found.expected(1.0 - 2.0 * JACKKNIFE_P / len(bad))[1]
     bound = f"≤ {fixed(max(float(chance[worst]), JACKKNIFE_RATIO), 2)}"
-    remedy = advice = ""
+    remedy, formal = "", inflated and post is not None and post.inflation is None
     if np.any(bad):
         names = [name for name, flag in zip(found.parameter_names, bad, strict=True) if flag]
         accepted = "The inflation is accepted: it has multiplied" if inflated else "Accepting the inflation multiplies"
+        draws = ", but not that of the draws" if formal else ""
         sentence = (
             f"Frames disagree more than their formal errors allow, in {join_words(names)}: something makes stars of "
-            f"a frame err together. {accepted} sigma by up to {fixed(high, 2)}."
+            f"a frame err together. {accepted} sigma by up to {fixed(high, 2)}{draws}."
         )
-        remedy = "" if inflated else _INFLATE
-        advice = "Use the calibration's sigma: that of the draws is the formal one." if inflated else ""
+        remedy = _INFLATE
+        if inflated:
+            remedy = _resample(post) if formal and post is not None else ""
     else:
         sentence = "Frames scatter as the formal errors say."
-    level = pass_or_warn(not np.any(bad))
-    return Check("Jackknife over frames", Question.TRUSTWORTHY, level, value, bound, sentence, remedy, advice)
+    level = pass_or_warn(not remedy)
+    return Check("Jackknife over frames", Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
+
+
+def _resample(post: Posterior) -> str:
+    """Sampling again; by the default likelihood where it was an object of the user's, which is used as it is."""
+    return resample(post) if post.diagnostics.likelihood in LIKELIHOODS else resample(post, likelihood="marginal")
 
 
 STAR_WIDENING = 1.5
