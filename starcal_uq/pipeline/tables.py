@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -44,8 +44,8 @@ def observations_from_table(
     """
     obs = load_observations(path, camera=camera, columns=columns)
     path = path if isinstance(path, Path) else path[0]
-    if time_utc is not None and obs.time_utc is not None and bool((obs.time_utc != "").all()):
-        raise ObservationError(f"{path}: every row has a time (column time_utc): leave out --time.", column="time_utc")
+    if time_utc is not None:
+        _refuse_timed(path, [obs])
     return _apparent(obs, path, directions, observer_velocity_km_s, site, in_space, time_utc)
 
 
@@ -66,6 +66,8 @@ def partitions_from_folder(
         obs = obs.with_meta(directions=directions)
     if in_space:
         obs = obs.with_meta(observer="space")
+    if time_utc is not None:
+        _refuse_timed(path, map(obs.prepared(lambda table: table).reader.load, obs.parts))
     prepare = partial(
         _apparent,
         path=path,
@@ -83,6 +85,12 @@ def partitions_from_folder(
     if not made and time_utc is None:
         return obs
     return obs.prepared(prepare, **({"directions": "apparent"} if made else {}))
+
+
+def _refuse_timed(path: Path, tables: Iterable[Observations]) -> None:
+    """Refuse a time for rows all of which have one; no table is asked for beyond the first that lacks some."""
+    if all(table.time_utc is not None and (table.time_utc != "").all() for table in tables):
+        raise ObservationError(f"{path}: every row has a time (column time_utc): leave out --time.", column="time_utc")
 
 
 def _apparent(

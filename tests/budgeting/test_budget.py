@@ -39,6 +39,7 @@ from starcal_uq.diagnostics.misfit import Misfit, MisfitTest
 from starcal_uq.diagnostics.pattern import Pattern
 from starcal_uq.presentation.pages.budgeting import budget_context, write_budget
 from starcal_uq.presentation.tables import tex
+from starcal_uq.presentation.words.budgeting import explanations
 from starcal_uq.propagation.attitude_error import AttitudeError, MisfitFound
 from tests.helpers.scenes import observations
 
@@ -318,6 +319,24 @@ def test_frames_that_disagree_multiply_both_calibration_rows() -> None:
     for held, factor in ((1.5, 1.0), (1.2, 1.25)):
         post: Any = SimpleNamespace(**{**vars(POST), "inflation": np.array([1.0, held])})
         assert with_misfit(attitude(), diagnosis(jackknife=flagged), post, OBS).misfit.factor == pytest.approx(factor)
+
+
+def test_reasons_that_differ_in_numbers_alone_are_told_once() -> None:
+    texts = [
+        f"The rule is {size} % below: the sigma of {name} reaches 3.35."
+        for size, name in zip(
+            (11, 9.5, 14, 12, 11), ("'row 1'", "'row 1'", "'row 1'", "'row 2'", '"user\'s 1"'), strict=True
+        )
+    ]
+    whole = made()
+    totals = [total for total in whole.totals if total.interpretation == "mixed"][:5]
+    few = [dataclasses.replace(total, explanation=text) for total, text in zip(totals, texts, strict=True)]
+    told = explanations(dataclasses.replace(whole, totals=tuple(few)))
+    assert [line.partition(": ")[2] for line in told] == [
+        "The rule is 9.5 to 14 % below: the sigma of 'row 1' reaches 3.35.",
+        *texts[3:],
+    ]
+    assert told[0].startswith("X (pitch), before alignment; Y (yaw), before alignment; Z (roll), before alignment: ")
 
 
 # --- every key of the file has an effect ---

@@ -38,5 +38,14 @@ def test_a_time_beside_the_table_is_that_of_its_rows(tmp_path: Path) -> None:
         np.testing.assert_array_equal(found.ra_deg, wanted.ra_deg)
     undeclared = partitions_from_folder(tmp_path / "parts", camera, time_utc=TIME)
     assert undeclared.meta["directions"] == "undeclared" and set(undeclared.sample().time_utc) == {TIME}
-    with pytest.raises(sc.errors.ObservationError, match=r"every row has a time \(column time_utc\): leave out --time"):
-        observations_from_table(timed, camera, time_utc=TIME)
+    # With a file beside it whose rows have times a folder is as it was; where all have, the time means nothing.
+    full = tmp_path / "full"
+    full.mkdir()
+    for number, folder in enumerate((full, full, tmp_path / "parts"), 1):
+        dataclasses.replace(obs, frame=obs.frame + 100 * number).save(folder / f"{number}.parquet")
+    assert partitions_from_folder(tmp_path / "parts", camera, time_utc=TIME).n_stars == 24
+    for path, read in ((timed, observations_from_table), (full, partitions_from_folder)):
+        with pytest.raises(
+            sc.errors.ObservationError, match=rf"{path}: every row has a time \(column time_utc\): leave out --time"
+        ):
+            read(path, camera, time_utc=TIME)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import Any
 
 from starcal_uq.budgeting.file import SENSOR, Requirement
@@ -19,6 +20,8 @@ Row = dict[str, Any]
 NOT_RESOLVED = "not resolved"
 # Above what rounding makes of 2.968.
 _GAUSSIAN_TAIL = 2.98
+# A number, or a name in quotes with whatever numbers it has.
+_NUMBER = re.compile(r"'[^']*'|\"[^\"]*\"|\d+(?:\.\d+)?")
 _MIXED, *_OTHERS = ("mixed", "ensemble", "temporal")
 
 _MEANING = {
@@ -234,13 +237,37 @@ def _requirement_row(outcome: Outcome) -> Row:
 
 
 def explanations(budget: Budget) -> list[str]:
-    """Why rule and sampling differ, one line per distinct reason, for the mixed interpretation."""
-    found: dict[str, list[str]] = {}
+    """Why rule and sampling differ, one line per distinct reason, for the mixed interpretation.
+
+    Sentences that differ in their numbers alone are one, with the ranges of these.
+    """
+    found: dict[str, tuple[list[str], list[str]]] = {}
     for entry in budget.totals:
         if entry.interpretation == _MIXED and entry.explanation:
-            found.setdefault(entry.explanation, []).append(f"{AXIS_LABELS[entry.axis]}, {entry.scope}")
+            where, texts = found.setdefault(_NUMBER.sub(_quoted, entry.explanation), ([], []))
+            where.append(f"{AXIS_LABELS[entry.axis]}, {entry.scope}")
+            texts.append(entry.explanation)
     every = len(SCOPES) * len(TOTAL_AXES)
-    return [f"{'All totals' if len(where) == every else '; '.join(where)}: {text}" for text, where in found.items()]
+    return [
+        f"{'All totals' if len(where) == every else '; '.join(where)}: {_ranged(texts)}"
+        for where, texts in found.values()
+    ]
+
+
+def _quoted(match: re.Match[str]) -> str:
+    """A name in quotes as it is, and one sign for any number."""
+    return match[0] if match[0][0] in "'\"" else "#"
+
+
+def _ranged(texts: list[str]) -> str:
+    """Sentences that differ in numbers alone as one."""
+    columns = zip(*(_NUMBER.findall(text) for text in texts), strict=True)
+    shown = iter([values[0] if len(set(values)) == 1 else _range(values) for values in columns])
+    return _NUMBER.sub(lambda _: next(shown), texts[0])
+
+
+def _range(values: tuple[str, ...]) -> str:
+    return f"{min(values, key=float)} to {max(values, key=float)}"
 
 
 def factor_sentence(budget: Budget) -> str:
