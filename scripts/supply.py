@@ -34,7 +34,12 @@ TESTS = (
     *("tests/camera", "tests/observations", "tests/core/test_cluster.py", "tests/images/test_centroids.py"),
     *("tests/sky/test_catalogue.py", "tests/estimation/test_sums.py", "tests/inference/test_arviz_compat.py"),
     *("tests/inference/test_sampler.py", "tests/budgeting/test_budget.py", "tests/runs/test_previous_files.py"),
-    *("tests/presentation/test_plots.py", "tests/cli/test_cli.py", "tests/core/test_extras.py"),
+    *(
+        "tests/presentation/test_plots.py",
+        "tests/cli/test_cli.py",
+        "tests/cli/test_schemas.py",
+        "tests/core/test_extras.py",
+    ),
 )
 # What tests need beside the package, and extras that are tried by themselves.
 TOOLS = ("pytest", "hypothesis", "jsonschema")

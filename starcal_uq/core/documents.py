@@ -95,6 +95,9 @@ def part_of(record: type) -> type[Part]:
 def _kind(hint: Any) -> Any:
     """The type in JSON of an annotation of a record."""
     origin, args = get_origin(hint), get_args(hint)
+    if hasattr(origin, "__value__"):
+        # NumPy 2.5 declares NDArray by a type statement where Python has one.
+        return _kind(origin.__value__)
     if hint is float or hint is np.float64:
         return Number
     if origin in (Union, UnionType):

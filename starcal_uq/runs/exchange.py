@@ -96,15 +96,14 @@ def _camera_of(best: Calibration | Posterior) -> Camera:
 
 def _write_covariance(best: Calibration | Posterior, path: Path) -> str:
     """Parameters with their units and covariance, px units, as a filter takes them for its state."""
-    posterior = isinstance(best, Posterior)
     specs = parameters(best.camera.distortion)
     content: AnyDict = {
         "format": COVARIANCE,
-        "source": "posterior" if posterior else "estimate",
+        "source": "posterior" if isinstance(best, Posterior) else "estimate",
         "distortion": best.camera.distortion,
         "parameter_names": [p.name for p in specs],
         "units": [p.unit for p in specs],
-        "mean": _camera_of(best).theta.tolist(),
+        "mean": (best.calibrated_camera if isinstance(best, Posterior) else best).theta.tolist(),
         "covariance": best.covariance.tolist(),
         "data_sha256": best.provenance.get("data_sha256"),
         "versions": best.provenance.get("versions"),

@@ -780,7 +780,7 @@ class Outcome:
     detail: str = ""  # The sentence, or what escaped and where
 
 
-_CLASS_NAMES = re.compile(r"\b[A-Z]\w*(Error|Exception)\b|NoneType|Traceback|object is not|0x[0-9a-f]{6}|<class ")
+_CLASS_NAMES = re.compile(r"\b[A-Z]\w*(Error|Exception)\b|NoneType|Traceback|object is not| at 0x[0-9a-f]{6}|<class ")
 
 
 def faults(message: str, path: Path) -> Iterator[str]:
