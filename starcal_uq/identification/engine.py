@@ -188,7 +188,7 @@ def identify(
             found = _with(sheet, tolerance, optics, told)
             other = _Attempt(centroids, catalogue, *found, prepare, share_camera, optics.mirrored)
             other.run(progress, False)
-            if other.n_solved > attempt.n_solved:
+            if other.n_solved > attempt.n_solved or not told:
                 attempt = other
     if told or optics is not None:
         rich = max(map(len, attempt.field.xy), default=0) >= _RICH_STARS
@@ -304,7 +304,8 @@ class _Attempt:
             if _solved(other.values()) > self.n_solved:
                 self.parity, self.field, self._search = "mirrored", flipped, mirror
                 self.results = {k: other[k] if k in other else mirror.frame(flipped, k) for k in self.results}
-        failed = self._failed()
+        # Two attitudes that explain a frame are not told apart by knowing less.
+        failed = [k for k in self._failed() if self.results[k].status != "ambiguous"]
         if len(failed) > self.n_solved:
             worse = self.search.widened(_WORSE_LENS)
             other = _retry(worse, self.field, failed)

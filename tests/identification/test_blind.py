@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from starcal_uq.identification.pairs import angle_between
 from starcal_uq.identification.search import NOT_SEARCHED, Search
 from starcal_uq.images.centroids import Centroids
 from starcal_uq.images.extract import extract_centroids
+from starcal_uq.images.image import Image
 from starcal_uq.images.optics import optics_of
 from starcal_uq.sky.catalogue import StarCatalogue
 from starcal_uq.sky.positions import unit_vectors
@@ -172,6 +174,110 @@ def test_same_stars_at_another_principal_point_are_no_rival(tmp_path: Path, monk
     monkeypatch.setattr(_Attempt, "finish", lambda *_, **__: None)
     found = identify(table, square_camera(12.0), bright, cache_dir=tmp_path, search_focal=False, **options)
     assert [f.status for f in found.frames] == ["ambiguous", "ambiguous"]
+
+
+WIDTH, HEIGHT, FOCAL = 720, 540, 1624.0
+
+
+def virgo(stars: StarCatalogue, faintest: float, decentring_px: float, seed: int) -> tuple[Image, Any, Any]:
+    """A picture of Virgo, 25 degrees wide, by NumPy alone; the places of its stars and their rows of the catalogue.
+
+    A gnomonic projection about a place in the sky, the lens bent by 6 px in the corner and decentred, its axis 9 px off
+    the middle; the faintest stars have a signal-to-noise ratio of about 12.
+    """
+    rng = np.random.default_rng(seed)
+    ra, dec = np.radians(stars.ra_deg - 195.0), np.radians(stars.dec_deg)
+    dec0, roll, corner = np.radians(2.0), np.radians(23.0), 0.5 * np.hypot(WIDTH, HEIGHT)
+    depth = np.sin(dec0) * np.sin(dec) + np.cos(dec0) * np.cos(dec) * np.cos(ra)
+    rows = np.flatnonzero((depth > 0.9) & (stars.mag < faintest))
+    ra, dec, depth = ra[rows], dec[rows], depth[rows]
+    east = FOCAL / depth * np.cos(dec) * np.sin(ra)
+    north = FOCAL / depth * (np.cos(dec0) * np.sin(dec) - np.sin(dec0) * np.cos(dec) * np.cos(ra))
+    # North is up and east to the left.
+    u, v = -(east * np.cos(roll) + north * np.sin(roll)), east * np.sin(roll) - north * np.cos(roll)
+    u, v = (w * (1.0 + 6.0 * (u * u + v * v) / corner**3) for w in (u, v))
+    u, v = u + decentring_px * (3.0 * u * u + v * v) / corner**2, v + decentring_px * 2.0 * u * v / corner**2
+    x, y = 0.5 * (WIDTH - 1) + u, 0.5 * (HEIGHT - 1) - 9.0 + v
+    expected = np.full((HEIGHT, WIDTH), 100.0)
+    # Light in the middle of nine parts of a pixel along each axis.
+    parts = (np.arange(9) - 4.0) / 9.0
+    for at_x, at_y, flux in zip(x, y, 500.0 * 10.0 ** (-0.4 * (stars.mag[rows] - faintest)), strict=True):
+        along, down = (
+            np.exp(-0.5 * (np.arange(n)[:, None] + parts - at) ** 2).mean(axis=1)
+            for n, at in ((WIDTH, at_x), (HEIGHT, at_y))
+        )
+        expected += flux / (2.0 * np.pi) * np.outer(down, along)
+    counts = rng.poisson(expected) + rng.normal(0.0, 3.0, expected.shape)
+    return Image(counts.clip(0.0, 65535.0).astype(np.uint16), "Virgo"), np.column_stack([x, y]), rows
+
+
+def sheet(focal_error: float) -> sc.Camera:
+    return sc.Camera(WIDTH, HEIGHT, 5.0, 0.005 * FOCAL * focal_error, 0.5 * (WIDTH - 1), 0.5 * (HEIGHT - 1))
+
+
+@pytest.mark.parametrize("camera", [None, sheet(1.1)], ids=["no sheet", "10 % off"])
+def test_virgo_has_a_rival_with_the_same_stars(
+    stars: StarCatalogue, camera: sc.Camera | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A lens that no model fits: attitudes half a degree apart, with other principal points, name the same stars.
+
+    Told apart by their attitudes, they refuse the picture.
+    """
+    image, places, rows = virgo(stars, 5.6, 5.0, 0)
+    met: list[Match] = []
+    accepted = Search._accepted
+
+    def seen(*arguments: Any) -> Iterator[Match]:
+        for match in accepted(*arguments):
+            met.append(match)
+            yield match
+
+    monkeypatch.setattr(Search, "_accepted", seen)
+    found = identify(extract_centroids(image), camera, stars, cache=False)
+    assert [f.status for f in found.frames] == ["identified"]
+    apart = [
+        np.degrees(angle_between(one.state.rotation[2], other.state.rotation[2]))
+        for one, other in combinations(met, 2)
+        if len({*zip(one.centroid, one.star, strict=True)} & {*zip(other.centroid, other.star, strict=True)})
+        == min(len(one), len(other))
+    ]
+    assert max(apart) > 0.3
+    o = found.observations
+    distance = np.hypot(o.x_px[:, None] - places[:, 0], o.y_px[:, None] - places[:, 1])
+    assert distance.min(axis=1).max() < 1.0
+    assert o.star_id.tolist() == stars.star_id[rows[distance.argmin(axis=1)]].tolist()
+    assert len(o) > 0.7 * np.count_nonzero(np.all((places > 0.0) & (places < (WIDTH, HEIGHT)), axis=1))
+
+    def by_attitude(one: Match, other: Match) -> bool:
+        return bool(np.degrees(angle_between(one.state.rotation[2], other.state.rotation[2])) > 0.3)
+
+    monkeypatch.setattr("starcal_uq.identification.search._other_stars", by_attitude)
+    refused = identify(extract_centroids(image), camera, stars, cache=False)
+    assert refused.n_identified == 0
+
+
+@pytest.mark.parametrize("faintest", [4.0, 4.3])
+def test_a_field_that_two_places_of_the_sky_explain_is_ambiguous(stars: StarCatalogue, faintest: float) -> None:
+    """Six stars of Virgo are identified; with the same stars a second time, 120 degrees further on, they are not."""
+    image, *_ = virgo(stars, faintest, 0.0, 1)
+    table, camera = extract_centroids(image), sheet(1.02)
+    assert [f.status for f in identify(table, camera, stars, cache=False).frames] == ["identified"]
+    near = np.abs(stars.dec_deg - 2.0) < 25.0
+    here, there = (near & (np.abs(stars.ra_deg - ra) < 25.0) for ra in (195.0, 315.0))
+    rows = np.concatenate([np.flatnonzero(~there), np.flatnonzero(here)])
+    rows = rows[np.argsort(stars.mag[rows], kind="stable")]
+    # The second of each star is the copy.
+    copy = np.zeros(len(rows), dtype=np.bool_)
+    copy[np.setdiff1d(np.arange(len(rows)), np.unique(rows, return_index=True)[1])] = True
+    columns = {
+        name: getattr(stars, name)[rows]
+        for name in ("star_id", "ra_deg", "dec_deg", "mag", "pm_ra_mas_yr", "pm_dec_mas_yr", "has_proper_motion")
+    }
+    columns["ra_deg"] = columns["ra_deg"] + 120.0 * copy
+    columns["star_id"] = np.where(copy, np.char.add("copy of ", columns["star_id"]), columns["star_id"])
+    found = identify(table, camera, replace(stars, **columns), cache=False)
+    assert [f.status for f in found.frames] == ["ambiguous"]
+    assert len(found.observations) == 0
 
 
 def test_failure_is_bounded_in_count(stars: StarCatalogue, monkeypatch: pytest.MonkeyPatch) -> None:
