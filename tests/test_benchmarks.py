@@ -175,6 +175,33 @@ def test_mutants_change_mathematics_and_leave_sentences(tmp_path, monkeypatch):
     assert {old for old, _ in changed} == {condition, returned, "def f(x: int, n=3):"}
 
 
+def test_frames_are_judged_by_their_stars_and_their_middle(tmp_path):
+    rng = np.random.default_rng(0)
+    xy = np.column_stack([rng.uniform(0.0, 1023.0, 40), rng.uniform(0.0, 767.0, 40)])
+    # Rays of a camera that looks at right ascension 0, declination 0.
+    x, y = ((xy - (511.5, 383.5)) / 5000.0).T
+    ra, dec = np.degrees(np.arctan(x)), np.degrees(np.arctan2(y, np.hypot(1.0, x)))
+    rows = [f"0,{u},{v},{a},{d},s,5.0,20.0,{a},{d}" for (u, v), a, d in zip(xy, ra, dec, strict=True)]
+    table = tmp_path / "stars.csv"
+    table.write_text(
+        "\n".join(["frame,x_px,y_px,ra_deg,dec_deg,star_id,mag,snr,ra_apparent_deg,dec_apparent_deg", *rows])
+    )
+    stars = np.column_stack([xy, ra, dec])
+    right = {"middle": [1.0, 0.0, 0.0], "stars": stars.tolist()}
+    # A star of another name is 4 px off; the camera looks 0.1 degrees past, or away from its stars.
+    other = stars + np.where(np.arange(40)[:, None] < 3, [0.0, 0.0, np.degrees(4.0 / 5000.0), 0.0], 0.0)
+    past = [np.cos(np.radians(0.1)), np.sin(np.radians(0.1)), 0.0]
+
+    def judged(**changes):
+        return bench.judged_frames(table, [right | changes])
+
+    assert judged() == [(pytest.approx(0.0, abs=1e-4), 40, 40)]
+    assert judged(stars=other.tolist()) == [(pytest.approx(0.0, abs=1e-4), 37, 40)]
+    assert judged(middle=past) == [(pytest.approx(0.1, abs=1e-3), 40, 40)]
+    assert judged(middle=[-1.0, 0.0, 0.0])[0][0] > 90.0
+    assert judged(middle=None, stars=[]) == []
+
+
 def test_a_function_becomes_its_mutant_wherever_it_is_held(tmp_path, monkeypatch):
     """Behind a cache, as a method and in a list; a change outside functions has to be imported anew."""
     monkeypatch.setattr(mutation, "ROOT", tmp_path)

@@ -7,6 +7,7 @@ from pathlib import Path
 from time import process_time
 from typing import Any
 
+import numpy as np
 import tetra3
 from PIL import Image
 from worker import Missing
@@ -60,9 +61,17 @@ def frames(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
             points = tetra3.get_centroids_from_image(image)
             clock.append(process_time())
             size = image.height, image.width
-            found = solver.solve_from_centroids(points, size, fov_estimate=field, fov_max_error=0.03 * field)
+            found = solver.solve_from_centroids(
+                points, size, fov_estimate=field, fov_max_error=0.03 * field, return_matches=True
+            )
             clock.append(process_time())
-            done.append({"clock": clock, "field": found["FOV"], "points": (points[:, ::-1] - 0.5).tolist()})
+            middle, named = None, []
+            if found["RA"] is not None:
+                ra, dec = np.radians([found["RA"], found["Dec"]])
+                middle = [np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]
+                at = np.array(found["matched_centroids"])[:, ::-1] - 0.5
+                named = np.hstack([at, np.array(found["matched_stars"])[:, :2]]).tolist()
+            done.append({"clock": clock, "middle": middle, "points": (points[:, ::-1] - 0.5).tolist(), "stars": named})
         return {"frames": done}
 
     return run

@@ -57,7 +57,13 @@ def frames(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
             )
             clock.append(process_time())
             places = [(p.x + 0.5 * (width - 1), p.y + 0.5 * (height - 1)) for p in points]
-            done.append({"clock": clock, "field": float(found.fov_deg) if found else None, "points": places})
+            middle, named = None, []
+            if found:
+                middle = np.asarray(found.rotation_matrix_icrs_to_camera, dtype=float)[2].tolist()
+                stars = [database.get_star_by_id(int(i)) for i in found.matched_catalog_ids]
+                at = [places[int(i)] for i in found.matched_centroids]
+                named = [[*place, s.ra_deg, s.dec_deg] for place, s in zip(at, stars, strict=True)]
+            done.append({"clock": clock, "middle": middle, "points": places, "stars": named})
         return {"frames": done}
 
     return run

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from worker import Missing
 
 import starcal_uq as sc
@@ -240,9 +241,14 @@ def frames(folder: Path, *, images: str, camera: str) -> Callable[[], Result]:
             clock.append(time.process_time())
             result = sc.identification.identify(found, nominal, stars, cache=False)
             clock.append(time.process_time())
-            field = result.camera.fov_deg[0] if result.n_identified else None
-            places = np.column_stack([found.x_px, found.y_px]).tolist()
-            done.append({"clock": clock, "field": field, "points": places})
+            middle, o = None, result.observations
+            if (quaternion := result.frames[0].quaternion) is not None:
+                centre = np.array([[0.5 * (nominal.width_px - 1), 0.5 * (nominal.height_px - 1)]])
+                seen = sc.camera.unproject(result.camera, centre)[0]
+                middle = Rotation.from_quat(quaternion).apply(seen, inverse=True).tolist()
+            places = np.column_stack([found.x_px, found.y_px])
+            named = np.column_stack([o.x_px, o.y_px, o.ra_deg, o.dec_deg])
+            done.append({"clock": clock, "middle": middle, "points": places.tolist(), "stars": named.tolist()})
         return {"frames": done}
 
     return run
