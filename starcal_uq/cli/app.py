@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gc
 import os
+import shlex
 import signal
 import sys
 import threading
@@ -70,13 +71,22 @@ def _main() -> None:
         if isinstance(error, TyperException):
             _fail(usage_sentence(error), 2)
         if isinstance(error, StarcalError):
-            _fail(str(error), 2)
+            _fail(_own_words(str(error)), 2)
         if isinstance(error, MemoryError):
             _fail("there is not enough memory for this: ask for fewer draws, frames or samples.", 2)
         if isinstance(error, OSError):
             place = f"{error.filename}: " if error.filename else ""
             _fail(f"{place}{error.strerror or error}; check the path, its permissions and the space on the disk.", 2)
         raise
+
+
+def _own_words(sentence: str) -> str:
+    """A sentence whose command for a calibration is the one that was given, and what it asks for."""
+    from starcal_uq.core.status import CALIBRATE
+
+    given = shlex.join(["starcal-uq", *sys.argv[1:]])
+    made = sys.argv[1:2] in (["calibrate"], ["run"])
+    return sentence.replace(CALIBRATE.removesuffix(" --force"), given) if made else sentence
 
 
 def _catch(handler: Callable[[int, Any], None] | signal.Handlers) -> dict[signal.Signals, Any]:

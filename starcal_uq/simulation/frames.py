@@ -193,7 +193,7 @@ def choose_attitudes(
         if hopeless or tries > _MAX_TRIES_PER_FRAME * (len(frames) + 1):
             raise CatalogueError(
                 f"only {len(frames)} of {tries} random attitudes show {min_stars} stars of the catalogue: "
-                "raise max_mag, or lower min_stars."
+                "raise max_mag (--max-mag), or lower min_stars (--min-stars)."
             )
     return np.concatenate(chosen)[:n_frames], frames[:n_frames]
 

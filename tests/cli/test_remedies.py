@@ -431,3 +431,13 @@ def test_control_a_remedy_that_names_no_option_is_refused(small, execute):
         execute("sample RUN --force --likelihood exact")
     with pytest.raises(typer.BadParameter, match="exact"):
         execute("sample RUN --force --likelihood exact", parse=True)
+
+
+def test_an_error_of_wrong_stars_ends_with_the_command_that_was_given(small, cli, tmp_path):
+    wrong = np.random.default_rng(1).random(small.obs.n_stars) < 0.05
+    dataclasses.replace(small.obs, dec_deg=small.obs.dec_deg + 0.8 * wrong).save(tmp_path / "wrong ones.csv")
+    call = ("run", "wrong ones.csv", small.folder / "CAMERA.toml", "-o", "new")
+    status, _, err = cli(*call)
+    command = re.search(r"`starcal-uq (.*)`", err.splitlines()[-1])[1]
+    assert status == 2 and shlex.split(command) == [*map(str, call), "--screen"]
+    assert cli(*shlex.split(command), "--draws", 50, "--steps", 20)[0] in (0, 1)

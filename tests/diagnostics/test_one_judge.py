@@ -12,7 +12,7 @@ from rich.console import Console
 import starcal_uq as sc
 from starcal_uq.cli import console
 from starcal_uq.core.records import from_plain, to_plain
-from starcal_uq.core.status import Check, Level, Question, worst
+from starcal_uq.core.status import CALIBRATE, Check, Level, Question, worst
 from starcal_uq.diagnostics.verdict.judge import Place, judge
 from starcal_uq.diagnostics.verdict.observed import FROM_IMAGES, SCREEN
 from starcal_uq.inference.checks import check_draws
@@ -117,6 +117,21 @@ def test_numbers_are_judged_with_their_monte_carlo_error(short):
         assert check.level is level
 
 
+def test_what_a_run_was_made_with_is_no_remedy():
+    both = f"{CALIBRATE} --noise model or sc.calibrate(obs, camera, noise='model') or {CALIBRATE} --robust"
+    asked = Check("A", Question.TRUSTWORTHY, Level.WARN, "9", "0", "Uneven.", both)
+    words = ("run", "obs.csv", "camera.toml", "--noise")
+    found = Place("r", (*words, "model")).exact(asked)
+    assert found.remedies == ("starcal-uq run obs.csv camera.toml --noise model -o r --robust --force",)
+    assert found.advice == ""
+    alone = Place("r", (*words, "model", "--robust")).exact(asked)
+    assert alone.remedy == "" and alone.advice.endswith("the run was made with --robust already.")
+    # Another value of the option, or no option at all, is something else.
+    assert len(Place("r", (*words, "common")).exact(asked).remedies) == 3
+    whole = dataclasses.replace(asked, remedy=CALIBRATE)
+    assert Place("r", (*words, "model")).exact(whole).remedy.endswith("--noise model -o r --force")
+
+
 def test_remedies_name_the_files_of_the_run():
     """By the command that made the run where there was one, else by what the run holds; calls in Python stay."""
     check = Check("Outliers", Question.TRUSTWORTHY, Level.WARN, "9", "0", "Wrong stars.", SCREEN)
@@ -131,5 +146,8 @@ def test_remedies_name_the_files_of_the_run():
     assert Place("r").command("starcal-uq sample RUN --force --steps 400") == "starcal-uq sample r --force --steps 400"
     images = Place("r", ("run", "/data/images", "--screen")).command(f"{FROM_IMAGES} --site SITE")
     assert images == "starcal-uq run /data/images --screen -o r --site site.toml --force"
+    apparent = Place("r", ("run", "obs.csv", "camera.toml", "--directions", "apparent"))
+    given = "starcal-uq run obs.csv camera.toml --directions apparent -o r"
+    assert apparent.command(f"{CALIBRATE} --site SITE") == f"{given} --site site.toml --directions catalogue --force"
     # Without stars there is nothing to calibrate on.
     assert Place("r", observations=False).exact(check).remedies[0].startswith("starcal-uq calibrate OBS CAMERA -o r")

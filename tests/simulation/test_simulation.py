@@ -93,7 +93,7 @@ def test_a_field_that_hardly_ever_shows_enough_stars_is_refused_at_once(monkeypa
         return views(self, rotations)
 
     monkeypatch.setattr(Sky, "views", counted)
-    with pytest.raises(sc.errors.CatalogueError, match="raise max_mag, or lower min_stars"):
+    with pytest.raises(sc.errors.CatalogueError, match=r"raise max_mag \(--max-mag\), or lower min_stars"):
         sc.simulate(stars, narrow, n_frames=3000, min_stars=5, seed=1)
     # For three thousand frames, more than a million would have to be tried.
     assert sum(tried) < 10_000

@@ -71,6 +71,9 @@ class Verdict(Shown):
         return tuple(check for check in self.checks if check.level is level)
 
 
+_STARTS = (CALIBRATE, FROM_IMAGES)
+
+
 @dataclass(frozen=True)
 class Place:
     """Where a run is and what made it, so that remedies can be commands to copy."""
@@ -81,16 +84,32 @@ class Place:
     observations: bool = True  # Whether the folder holds observations
 
     def exact(self, check: Check) -> Check:
-        """A check whose commands name the files of this run."""
-        remedy = " or ".join(self.command(one) for one in check.remedies)
-        return check if remedy == check.remedy else replace(check, remedy=remedy)
+        """A check whose commands name the files of this run, without those that made it."""
+        kept, done = [], ""
+        for one in check.remedies:
+            done = self._given(one) or (done if one.startswith("sc.") else "")
+            kept += [] if done else [self.command(one)]
+        advice = check.advice
+        if check.remedy and not kept and not advice:
+            advice = f"Look for the cause in the instrument or the data: the run was made with {done} already."
+        remedy = " or ".join(kept)
+        return check if remedy == check.remedy else replace(check, remedy=remedy, advice=advice)
+
+    def _given(self, text: str) -> str:
+        """The options of a command for a calibration if this run was made with them; a call follows its command."""
+        options = next((text.removeprefix(words).split() for words in _STARTS if text.startswith(words)), [])
+        places = range(len(self.words) - len(options) + 1)
+        return " ".join(options) if any([*self.words[i : i + len(options)]] == options for i in places) else ""
 
     def command(self, text: str) -> str:
         """A command with the files of this run in place of OBS, CAMERA, SITE and RUN; a call in Python as it is."""
         if not text.startswith("starcal-uq"):
             return text
-        start = next((words for words in (CALIBRATE, FROM_IMAGES) if text.startswith(words)), "")
+        start = next((words for words in _STARTS if text.startswith(words)), "")
         if start and self.words[:1] == ("run",):
+            if " --site " in text and "apparent" in self.words:
+                # Directions are made apparent at a site, and must not be declared so.
+                text += " --directions catalogue"
             # Everything that was asked for then, and this; of an option that is given twice the last one holds.
             made = shlex.join([*self.words, "-o", self.run])
             text = f"starcal-uq {made}{text.removeprefix(start)} --force"

@@ -51,7 +51,8 @@ def directions(
     seen = air(obs)
     wrong = [] if times is None else [_time_words(obs, times)]
     if found is not None and found.is_air:
-        wrong.append((f"refraction, p = {significant(found.p_value)}", air_words(obs, found), _with_site(obs), ""))
+        order = "Give the directions of a catalogue, or apparent ones that hold refraction." if seen == "none" else ""
+        wrong.append((f"refraction, p = {significant(found.p_value)}", air_words(obs, found), _with_site(obs), order))
     if wrong:
         values, sentences, remedies, orders = zip(*wrong, strict=True)
         remedy, advice = next(filter(None, remedies), ""), " ".join(filter(None, orders))
