@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 
+from starcal_uq.attitude.rotations import exp_rotation
 from starcal_uq.attitude.wahba import quest
 from starcal_uq.camera.distortion import get_model
 from starcal_uq.camera.projection import backward_kernel, backward_root, unproject_theta
@@ -28,8 +29,6 @@ _BLOCK_STARS = 4096
 # The objective does not depend on how the catalogue is turned; a turn that is right to within this many pixels keeps E
 # small enough for eleven digits of the cost.
 _TURN_AGAIN_PX = 30.0
-# A turn from which the attitudes of a refinement need no step of their own, with that of the parameters.
-_NEAR_RAD = 8e-5
 
 
 # Where the entries of a symmetric matrix stand among its six unique ones.
@@ -100,10 +99,13 @@ class PairObjective:
         return None if self._turned_at is None else self._rotations
 
     def rotations_at(self, theta: FloatArray) -> FloatArray | None:
-        """As `rotations`, nearer to theta where loops find them faster than a refinement takes the step they save."""
+        """As `rotations`, near enough to theta for a refinement to begin: all of them follow the principal point."""
         with np.errstate(all="ignore"):
-            self._turn(theta, _NEAR_RAD * theta[2] if self._compiled else _TURN_AGAIN_PX)
-        return self.rotations
+            self._turn(theta)
+        if self._turned_at is None:
+            return None
+        x, y = (theta[:2] - self._turned_at[:2]) / theta[2]
+        return np.asarray(exp_rotation(np.array([y, -x, 0.0])) @ self._rotations)
 
     def directions(self, theta: FloatArray, frames: StarFrames) -> tuple[FloatArray, FloatArray]:
         """Measured unit vectors (3, N) and their derivatives (p, 3, N)."""
@@ -111,9 +113,9 @@ class PairObjective:
         b, db = backward_kernel(self.model_name, True)(frames.n_stars, theta, frames.pixel, root)
         return b, db
 
-    def _turn(self, theta: FloatArray, within_px: float = _TURN_AGAIN_PX) -> FloatArray:
+    def _turn(self, theta: FloatArray) -> FloatArray:
         """Attitudes (K, 3, 3) that turn the catalogue nearly into the camera frame; new ones if these are too far."""
-        if self._turned_at is not None and np.max(np.abs(theta[:3] - self._turned_at)) <= within_px:
+        if self._turned_at is not None and np.max(np.abs(theta[:3] - self._turned_at)) <= _TURN_AGAIN_PX:
             return self._rotations
         frames = self.frames
         found = attitude_loop(frames, self.model_name, theta) if self._compiled else None

@@ -125,13 +125,15 @@ class Observations(FrameRows, Shown):
     @cached_property
     def frame_ids(self) -> IntArray:
         """Frame numbers that occur, ascending, shape (K,)."""
-        return locked(np.unique(self.frame))
+        later = self.frame[1:]
+        return locked(np.concatenate([self.frame[:1], later[later != self.frame[:-1]]]))
 
     @cached_property
     def directions_icrs(self) -> FloatArray:
         """Unit vectors of the directions, shape (N, 3), ICRS axes."""
         ra, dec = np.radians(self.ra_deg), np.radians(self.dec_deg)
-        return locked(np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)]))
+        level = np.cos(dec)
+        return locked(np.column_stack([level * np.cos(ra), level * np.sin(ra), np.sin(dec)]))
 
     @property
     def directions_declared(self) -> bool:
@@ -376,7 +378,7 @@ def _marked(texts: StrArray) -> bytes:
     length = (there @ np.ones(width, dtype=np.float32)).astype(np.int64)
     rows[:, :4] = np.take(np.array([list(mark) for mark in marks], dtype=np.uint8), length, axis=0)
     rows[:, 4:] = letters
-    return bytes(rows[rows != 0])
+    return rows.tobytes().replace(b"\0", b"")
 
 
 def _all_missing(values: Any) -> bool:
