@@ -21,6 +21,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.display import Shown
 from starcal_uq.core.formatting import plus_minus
+from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.diagnostics.pattern import Fit, Pattern, frame_covariance
 from starcal_uq.diagnostics.shapes import (
@@ -194,6 +195,7 @@ class Misfit(Shown):
         return pd.DataFrame(rows).rename(columns={"name": "test"})
 
 
+@one_thread()
 def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CELLS) -> Misfit:
     """Test the residuals of a calibration for unexplained structure.
 

@@ -14,6 +14,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.display import Shown
 from starcal_uq.core.settings import bounded
+from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.marginal import MarginalLikelihood, Profile
 from starcal_uq.estimation.noise_model import weighed
@@ -90,6 +91,7 @@ class PredictiveCheck(Shown):
 
 
 @bounded
+@one_thread()
 def predictive_check(
     obs: Observations, cal: Calibration, post: Posterior | None = None, *, n_draws: int = 500, seed: int = 0
 ) -> PredictiveCheck:
