@@ -112,7 +112,8 @@ def check_compression(
     def differences(points: FloatArray) -> FloatArray:
         arguments = target.arguments(np.concatenate([mode, points]))
         found = exact(*arguments) - compressed(*arguments)
-        return np.asarray(found[1:] - found[0])
+        # Of other stars than those of the calibration the exact one may be nothing.
+        return np.asarray(found[1:] - found[0]) if np.isfinite(found).all() else np.full(len(points), np.inf)
 
     def known(points: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Differences (n,) and what they may be larger by."""
@@ -131,6 +132,8 @@ def check_compression(
     if sample is not None:
         diagonal = np.full((1, target.dim), _REACH_SD / np.sqrt(target.dim))
         whole = float(np.max(np.abs(differences(target.natural(np.concatenate([diagonal, -diagonal]))))))
+    if not np.isfinite([on_surface, whole]).all():
+        return CompressionCheck(np.inf, np.inf, *frames)
     if max(on_surface, whole) <= _EQUAL:
         return CompressionCheck(max(on_surface, whole), 0.0, *frames)
     theta = target.arguments(draws)[0]
@@ -370,7 +373,7 @@ def _evaluation(post: Posterior) -> Check | None:
     """Was the compressed likelihood good enough, where it was used or tried?"""
     d = post.diagnostics
     compression = CompressionCheck(d.compressed_max_difference, d.compressed_khat)
-    compressed, compared = d.likelihood_used == "compressed", np.isfinite(compression.max_difference)
+    compressed, compared = d.likelihood_used == "compressed", not np.isnan(compression.max_difference)
     if not compressed and not compared:
         return None
     level, remedy, advice = Level.PASS, "", ""

@@ -179,8 +179,8 @@ def _derivatives(density: Density, d: int) -> tuple[float, FloatArray, FloatArra
     values = density(np.concatenate([np.zeros((1, d)), unit, -unit, both, -both, cross, -cross]))
     if not np.all(np.isfinite(values)):
         raise SamplingError(
-            "the posterior density is not finite around the calibrated camera: check that the calibration converged "
-            "and that the priors allow its estimate."
+            "the posterior density is not finite around the calibrated camera: check that the calibration converged, "
+            "that the observations are its own and that the priors allow its estimate."
         )
     centre, plus, minus = values[0], values[1 : d + 1], values[d + 1 : 2 * d + 1]
     pp, mm, pm, mp = values[2 * d + 1 :].reshape(4, -1)

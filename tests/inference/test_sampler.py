@@ -20,6 +20,7 @@ from starcal_uq.estimation.student import DEFAULT_DOF
 from starcal_uq.inference import named
 from starcal_uq.inference.checks import _OPTIONS, check_compression
 from starcal_uq.inference.exact import ExactMarginal, FrameSample
+from starcal_uq.inference.posterior import Posterior
 from starcal_uq.inference.priors import Priors
 from starcal_uq.inference.sample import sample
 from starcal_uq.inference.target import importance_check, laplace_approximation, start_target
@@ -452,6 +453,17 @@ def test_every_distortion_model_and_stated_noise(model: str) -> None:
     assert post.diagnostics.likelihood_used == "compressed"
     assert np.max(np.abs(post.mean - cal.theta) / cal.sigmas) < 0.3
     assert np.allclose(post.sd[:-1], cal.sigmas, rtol=0.2)
+
+
+def test_stars_of_another_table_are_no_check_that_passes(tmp_path: Path) -> None:
+    """Where the exact likelihood is not even finite, the compressed one is not taken for unchecked."""
+    cal, others = calibrate(observations(n_frames=20), nominal(camera())), observations(n_frames=20, seed=4)
+    with pytest.raises(SamplingError, match="that the observations are its own"):
+        sample(others, cal, **QUICK)
+    post = sample(others, cal, evaluation="compressed", **QUICK)
+    assert "departs from the exact one" in sentence_of(post, "Likelihood", Level.FAIL)
+    post.save(tmp_path / "posterior.nc")
+    assert Posterior.load(tmp_path / "posterior.nc").diagnostics.compressed_max_difference == np.inf
 
 
 def test_frames_in_batches_say_what_the_expansion_leaves_out() -> None:
