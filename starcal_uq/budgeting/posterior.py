@@ -21,7 +21,7 @@ from starcal_uq.budgeting.rows import (
     not_assessed,
 )
 from starcal_uq.core.constants import AXES
-from starcal_uq.core.formatting import plural
+from starcal_uq.core.formatting import join_words, plural
 from starcal_uq.core.types import FloatArray
 from starcal_uq.propagation.attitude_error import CONTRIBUTORS, IF_MODEL_HOLDS, WITH_MISFIT_FOUND
 
@@ -89,10 +89,11 @@ def misfit_notes(attitude: AttitudeError) -> tuple[str, ...]:
             f"{WITH_MISFIT_FOUND} is not assessed (run `starcal-uq diagnose RUN`).",
         )
     rows = [name for name, why in ((COMMON, found.common_reasons), (REST, found.rest_reasons)) if why]
-    notes = tuple(f"The row {name!r} is inflated by what the tests of the model found." for name in rows) or (
-        "The tests of the model found nothing that inflates the calibration rows; what they cannot see is not in them.",
+    note = f"Inflated by what the tests of the model found: {join_words([repr(name) for name in rows])}."
+    none = (
+        "The tests of the model found nothing that inflates the calibration rows; what they cannot see is not in them."
     )
-    return (*notes, *found.notes)
+    return (note if rows else none, *found.notes)
 
 
 def axis_correlations(covariance: FloatArray, scale: FloatArray) -> tuple[tuple[float, ...], ...]:

@@ -80,6 +80,23 @@ def significant(value: float, digits: int = 2) -> str:
     return f"{mantissa.replace('-', MINUS)}×10{superscript(exponent)}"
 
 
+# Where a tail means nothing any more.
+SMALLEST_P = 1e-12
+
+
+def p_value(p: float, least: float = SMALLEST_P) -> str:
+    """``0.31``, or a bound where p is nearer to 0 than `least` can tell, or to 1 than the digits."""
+    if p < least:
+        return f"< {significant(least, 1).removeprefix('1×')}"
+    return f"> {1.0 - least:.3g}" if p > 1.0 - least and least > SMALLEST_P else significant(p)
+
+
+def p_words(p: float, least: float = SMALLEST_P) -> str:
+    """``p = 0.31``, or a bound as of `p_value`."""
+    text = p_value(p, least)
+    return f"p {text}" if text[0] in "<>n" else f"p = {text}"
+
+
 def percent(fraction: float, digits: int = 2) -> str:
     """A fraction in per cent."""
     return f"{significant(100.0 * fraction, digits)}\N{NO-BREAK SPACE}%"

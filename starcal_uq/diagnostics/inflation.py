@@ -118,8 +118,8 @@ def _models(
             if counted.any():
                 total[:] = np.maximum(total, np.where(counted, shift, 0.0))
                 which.add(score.model)
-    how = "is the better model, and moves it" if rejected else "predicts as well, and moves it by more than its sigma"
-    reasons = [(f"distortion model {join_words(sorted(which))!r} {how}",) if which else () for which in names]
+    how = "better than the fitted one, and moves it" if rejected else "as well, and moves it by more than its sigma"
+    reasons = [(f"distortion model {' or '.join(map(repr, sorted(w)))} predicts {how}",) if w else () for w in names]
     return common, rest, reasons[0], reasons[1]
 
 

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, get_args
 import numpy as np
 
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.formatting import fixed, join_words, significant
+from starcal_uq.core.formatting import fixed, significant
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.settings import NoiseKind
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
@@ -108,15 +108,16 @@ class NoiseModel:
         if "magnitude" in self.terms:
             low, high = (float(mag) for mag in self.mag_range)
             bright, faint = (self._noise(0.0, mag) for mag in (low, high))
+            least, most = sorted(((bright, fixed(low, 1)), (faint, fixed(high, 1))))
             parts.append(
-                f"{significant(faint / bright)} times as much at magnitude {fixed(high, 1)} as at {fixed(low, 1)}"
+                f"{significant(most[0] / least[0])} times as much at magnitude {most[1]} as at {least[1]}"
                 if parts
                 else f"{significant(bright)}{unit} at magnitude {fixed(low, 1)} and {significant(faint)} at "
                 f"{fixed(high, 1)}"
             )
         if self.frame_dof is not None:
             parts.append("a factor of its own in every frame" + self._frame_words())
-        return join_words(parts)
+        return ", and ".join(filter(None, (", ".join(parts[:-1]), parts[-1])))
 
     def _frame_words(self) -> str:
         if not len(self.frame_factors):

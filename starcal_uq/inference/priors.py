@@ -318,10 +318,11 @@ class PhysicalPriors(Priors):
     def _statement(self, name: str) -> str:
         if name in ("x0", "y0"):
             centre = self.principal_point_centre_px["xy".index(name[0])]
-            return f"normal, {centre:g} px with sd {self.principal_point_px:g} px"
+            return f"normal, {centre:g} px with sd {self.principal_point_px:.4g} px"
         if name == "f":
             return f"normal, {self.focal_px:g} px with sd {100 * self.focal_fraction:g} %"
-        return f"normal, displacement 0 with sd {self.distortion_corner_px:g} px at {self.corner_radius_px:g} px"
+        sd, radius = self.distortion_corner_px, self.corner_radius_px
+        return f"normal, displacement 0 with sd {sd:.3g} px at {radius:.4g} px"
 
 
 _FIELDS = tuple(field.name for field in dataclasses.fields(PhysicalPriors))

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 def card(title: str, text: str, *tables: TextTable) -> str:
     """A result in a notebook: what it is, what it says, and its tables."""
-    said = f": {escape(text)}" if text else ""
+    said = re.sub(r"`([^`]+)`", r"<code>\1</code>", f": {escape(text)}" if text else "")
     return f"<p><b>{escape(title)}</b>{said}</p>" + "".join(table.html() for table in tables)
 
 

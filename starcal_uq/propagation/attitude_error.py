@@ -421,11 +421,11 @@ class AttitudeError(Shown):
 
 
 def two_figures(with_misfit_found: float, if_model_holds: float) -> str:
-    """One error by its two names, arcsec, for a sentence."""
-    first = f"{significant(float(if_model_holds))}{{}} {IF_MODEL_HOLDS}"
+    """One error by its two names, arcsec, for a sentence; once, where both print alike."""
+    found, held = significant(float(with_misfit_found)), significant(float(if_model_holds))
     if np.isnan(with_misfit_found):
-        return f"{first.format(' arcsec')} ({WITH_MISFIT_FOUND}: {NOT_ASSESSED})"
-    return f"{significant(float(with_misfit_found))} arcsec {WITH_MISFIT_FOUND} ({first.format('')})"
+        return f"{held} arcsec {IF_MODEL_HOLDS} ({WITH_MISFIT_FOUND}: {NOT_ASSESSED})"
+    return f"{held} arcsec" if found == held else f"{found} arcsec {WITH_MISFIT_FOUND} ({held} {IF_MODEL_HOLDS})"
 
 
 def _gaussian_tails(sigmas: FloatArray, confidence: float, one_axis: float) -> FloatArray:

@@ -271,7 +271,7 @@ def test_what_a_misfit_adds_is_in_the_row_with_its_reason(tmp_path: Path, factor
     assert rows[COMMON, "pitch"].inflated == (factor > 1.0) and not rows[NEA, "pitch"].inflated
     if factor > 1.0:
         return
-    assert any(REST in note and "inflated" in note for note in made_of.notes)
+    assert any(REST in note and "Inflated" in note for note in made_of.notes)
     # A file of the version before has the sigma of inflated rows alone.
     made_of.save(tmp_path / "budget.csv")
     older = pd.read_csv(tmp_path / "budget.csv", dtype=str, keep_default_na=False).drop(
@@ -835,9 +835,7 @@ def test_rows_of_the_posterior_to_every_field() -> None:
     first = posterior_rows(plain, nameless)[6]  # type: ignore[arg-type]
     assert (first.axis_correlation, first.tail_997, first.sigma_arcsec) == ((), GAUSSIAN_997, 0.0)
     assert first.provenance == "posterior of 1 draw"
-    assert misfit_notes(error) == tuple(
-        f"The row {name!r} is inflated by what the tests of the model found." for name in (COMMON, REST)
-    )
+    assert misfit_notes(error) == (f"Inflated by what the tests of the model found: {COMMON!r} and {REST!r}.",)
     quiet = MisfitFound(1.0, np.zeros(3), np.zeros(3), notes=("more",))
     assert len(misfit_notes(attitude(misfit=quiet))) == 2 and misfit_notes(attitude(misfit=quiet))[1] == "more"
 

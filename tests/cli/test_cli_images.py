@@ -114,7 +114,7 @@ def _frames_are_shown(cli, run, images):
     """In the report, with their pixels, and by `inspect`, which says so where the images have moved."""
     report = run.report.read_text("utf-8")
     assert report.count("<figcaption>\n<h4>") == 12
-    assert report.count("data:image/webp;base64,") == 12
+    assert report.count("data:image/jpeg;base64,") == 12
     assert "12 frames of 16" in report
     held = sc.Run(run.path)
     table = held.frames.to_dataframe()
@@ -130,7 +130,7 @@ def _frames_are_shown(cli, run, images):
     assert (status, err) == (0, "")
     found = json.loads(out)
     assert (found["text"], found["page"]) == ("16 frames; 16 of them took part in the calibration.", "run/frames.html")
-    assert run.inspection.read_text("utf-8").count("data:image/webp") == N_IMAGES
+    assert run.inspection.read_text("utf-8").count("data:image/jpeg") == N_IMAGES
     assert cli("inspect", "run")[0] == 2
     name = held.images.rows[3].image
     status, out, err = cli("inspect", "run", name, "0", "-o", "two.html", "--images", run.path)

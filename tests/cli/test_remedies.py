@@ -162,7 +162,9 @@ EXAMPLES = {
         ),
     ],
     "diagnostics.verdict.estimate.predictive": lambda s: [
-        estimate.predictive(SimpleNamespace(statistics=[SimpleNamespace(name="tails", p_value=0.0, extreme=True)]))
+        estimate.predictive(
+            SimpleNamespace(statistics=[SimpleNamespace(name="tails", p_value=0.0, extreme=True)], n_draws=500)
+        )
     ],
     "diagnostics.verdict.estimate.one_camera": lambda s: [
         estimate.one_camera(MixedCameras(2, "the frames are of 2 cameras", "0-5,8"))

@@ -11,6 +11,7 @@ from starcal_uq.core.formatting import (
     decimals_for,
     fixed,
     join_words,
+    p_words,
     percent,
     plural,
     pretty_unit,
@@ -72,5 +73,8 @@ def test_units_and_words():
     assert percent(0.0512) == "5.1\N{NO-BREAK SPACE}%"
     assert count(17927) == "17\N{NARROW NO-BREAK SPACE}927"
     assert plural(1, "frame") == "1 frame"
+    ps = (0.314, 4.3e-68, 0.0, 1.0, math.nan)
+    assert [p_words(p) for p in ps] == ["p = 0.31", "p < 10⁻¹²", "p < 10⁻¹²", "p = 1.0", "p not known"]
+    assert [p_words(p, 1 / 500) for p in (0.0, 0.002, 1.0)] == ["p < 0.002", "p = 0.0020", "p > 0.998"]
     assert plural(0, "frame") == "0 frames"
     assert [join_words(w) for w in ([], ["a"], ["a", "b"], ["a", "b", "c"])] == ["", "a", "a and b", "a, b and c"]

@@ -180,7 +180,7 @@ def test_the_page_shows_every_frame_with_its_reason_and_what_to_do(frames: Frame
     legend = page.partition('<ul class="marks">')[2].partition("</ul>")[0]
     assert len(set(re.findall(r'<path class="[iluem]" d="([^"]+)"/></svg>', legend))) == 5
     # One of the images is there; the others are said not to be.
-    assert page.count("data:image/webp") == 1
+    assert page.count("data:image/jpeg") == 1
     assert "3 of these images are not where the run found them" in page
     assert "in 0.012 s" in page.replace("</dt><dd>", " ")
 
@@ -189,7 +189,7 @@ def test_pictures_are_small_and_of_this_image_only(frames: Frames, tmp_path: Pat
     camera, path = frames.camera, frames.paths[0]
     for flat in (True, False):
         shown = Image.open(io.BytesIO(picture(path, 320, camera, flat)))
-        assert (shown.format, shown.width) == ("WEBP", 320)
+        assert (shown.format, shown.width) == ("JPEG", 320)
     with pytest.raises(sc.errors.ImageError, match=r"and the camera has 10 x 10 px"):
         picture(path, 320, camera.replace(width_px=10, height_px=10))
     # An image that is not what it was is named, and the marks are drawn.

@@ -305,6 +305,7 @@ def test_what_is_taken_where_nothing_is_said() -> None:
     found = MisfitFound(1.0, sigma, sigma, ("a", "b"), ("b", "c"))
     assert found.reasons == ("a", "b", "c") and found.notes == ()
     assert two_figures(2.0, 1.0) == "2.0 arcsec with the misfit found (1.0 if the model holds)"
+    assert two_figures(1.001, 1.0) == "1.0 arcsec"
     assert two_figures(np.nan, 1.0) == "1.0 arcsec if the model holds (with the misfit found: not assessed)"
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.camera.distortion import get_model, next_simpler
-from starcal_uq.core.formatting import count, fixed, join_words, plural, significant
+from starcal_uq.core.formatting import count, fixed, join_words, p_words, plural, significant
 from starcal_uq.core.status import (
     CALIBRATE,
     PLAN,
@@ -166,7 +166,7 @@ def misfit(found: Misfit, fitted: str = "") -> Check:
     """Is there structure in the residuals that the model `fitted` leaves?"""
     name, bound = "Unexplained structure", f"p ≥ {MISFIT_P:g}"
     patterns = [test.p_holm for test in found.tests if not test.is_of_noise]
-    value = f"p = {significant(min(patterns, default=1.0))}, corrected for {plural(len(found.tests), 'test')}"
+    value = f"{p_words(min(patterns, default=1.0))}, corrected for {plural(len(found.tests), 'test')}"
     rejected = [test for test in found.found(MISFIT_P) if not test.is_of_noise]
     if not rejected:
         sentence = "The residuals show no structure beyond noise, in any of the ways that were looked for."
@@ -175,7 +175,7 @@ def misfit(found: Misfit, fitted: str = "") -> Check:
     words = []
     for test in rejected[:3]:
         size = "" if np.isnan(test.size_px) else f", {significant(test.size_px)} px"
-        words.append(f"{test.name} (p = {significant(test.p_holm)}{size})")
+        words.append(f"{test.name} ({p_words(test.p_holm)}{size})")
     more = "" if len(rejected) <= 3 else f" and {plural(len(rejected) - 3, 'other test')}"
     sentence = f"The residuals hold more than noise: {join_words(words)}{more}. "
     if bending:
@@ -200,7 +200,7 @@ def even_noise(found: Misfit, inflated: bool = False) -> Check:
     tests = [test for test in found.tests if test.is_of_noise]
     rejected = [test for test in found.found(MISFIT_P) if test.is_of_noise]
     name, bound = "Evenness of the noise", f"p ≥ {MISFIT_P:g}"
-    value = f"p = {significant(min((test.p_holm for test in tests), default=1.0))}"
+    value = p_words(min((test.p_holm for test in tests), default=1.0))
     if not rejected:
         sentence = "The noise does not change with radius, magnitude, time or frame beyond what the weights know of it."
         return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, sentence)
@@ -217,9 +217,9 @@ def even_noise(found: Misfit, inflated: bool = False) -> Check:
         return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, sentence)
     worst = int(np.argmax(np.abs(np.log(uneven.ratios))))
     sentence = (
-        f"{changes}: {uneven.model}. The stated sigmas rest on one noise for all stars and are wrong: that of "
-        f"{uneven.parameter_names[worst]} should be {fixed(float(uneven.ratios[worst]), 2)} times as large, and with "
-        "fitted weights the estimate itself would be more precise."
+        f"{changes}: {uneven.model}. The stated sigmas do not know it: that of {uneven.parameter_names[worst]} should "
+        f"be {significant(float(uneven.ratios[worst]))} times as large; with fitted weights the estimate itself would "
+        "be more precise."
     )
     return Check(name, Question.TRUSTWORTHY, Level.WARN, value, bound, sentence, NOISE)
 
@@ -383,7 +383,7 @@ def predictive(found: PredictiveCheck) -> Check:
     """Do replicated data look like the measured ones?"""
     extreme = [s for s in found.statistics if s.extreme]
     low = min(found.statistics, key=lambda s: min(s.p_value, 1.0 - s.p_value))
-    value = f"most extreme p = {significant(low.p_value)}"
+    value = f"most extreme {p_words(low.p_value, 1.0 / found.n_draws)}"
     if extreme:
         sentence = f"Data made by the model differ from the measured ones in: {join_words([s.name for s in extreme])}."
     else:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from starcal_uq.camera.distortion import parameters, sigma_parameter
-from starcal_uq.core.formatting import fixed, significant
+from starcal_uq.core.formatting import SMALLEST_P, fixed, significant
 from starcal_uq.core.types import FloatArray
 from starcal_uq.diagnostics.misfit import ALPHA
 from starcal_uq.diagnostics.residuals import Profile1D, residual_profiles
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.observations.table import Observations
 
-_SMALLEST_P = 1e-12
 # Mean width of a letter of a tick label.
 _LETTER_IN = 0.065
 
@@ -38,7 +37,7 @@ def plot_misfit(misfit: Misfit, ax: Axes | None = None, *, alpha: float = ALPHA)
         ax = style.new_axes(7.2, 0.27 * len(misfit.tests) + 1.0)
     style.dress(ax, grid=True)
     tests = misfit.tests[::-1]
-    p = np.maximum([test.p_holm for test in tests], _SMALLEST_P)
+    p = np.maximum([test.p_holm for test in tests], SMALLEST_P)
     rows = np.arange(len(tests))
     for chosen, colour, marker in ((p >= alpha, style.BLUE, "o"), (p < alpha, style.VERMILLION, "D")):
         ax.scatter(p[chosen], rows[chosen], color=colour, marker=marker, s=30, zorder=3)

@@ -10,13 +10,13 @@ import numpy as np
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.comparison.result import CameraComparison
 from starcal_uq.core.files import atomic_write_bytes, atomic_write_text, write_csv
-from starcal_uq.core.formatting import fixed, percent, plus_minus, pretty_unit, significant
+from starcal_uq.core.formatting import fixed, p_words, percent, plus_minus, pretty_unit, significant
 from starcal_uq.core.manifest import making
 from starcal_uq.presentation.figures.comparison import plot_camera_comparison
 from starcal_uq.presentation.figures.style import svg_bytes
 from starcal_uq.presentation.html import template_environment
 from starcal_uq.presentation.tables import TextTable
-from starcal_uq.presentation.words.comparison import headline, p_words, rotation_words
+from starcal_uq.presentation.words.comparison import headline, rotation_words
 
 _LEVELS = {"agree": "pass", "parameters differ": "warning", "maps differ": "fail", "not tested": "warning"}
 _BADGES = {

@@ -87,7 +87,9 @@ def write_frames(frames: Frames, to: str | os.PathLike[str]) -> Path:
 
 
 def picture(path: Path, width_px: int, camera: Camera, flat: bool = True) -> bytes:
-    """An image as astronomers look at it: limits by zscale, brightness by asinh, no wider than `width_px`; WebP.
+    """An image as astronomers look at it: limits by zscale, brightness by asinh, no wider than `width_px`.
+
+    JPEG, which a PDF holds as it is; any other format it would hold pixel by pixel.
 
     `width_px`: width of the picture, at most.
     `camera`: its detector has the size that the image must have.
@@ -120,7 +122,7 @@ def picture(path: Path, width_px: int, camera: Camera, flat: bool = True) -> byt
     floor, span = -_BLACK * low, max(_SPAN * (high - low), 1e-12)
     bright = AsinhStretch(_BEND)(np.clip((sky - floor) / span, 0.0, 1.0))
     out = io.BytesIO()
-    Image.fromarray((255.0 * bright).astype(np.uint8)).save(out, "WEBP", quality=_QUALITY, method=2)
+    Image.fromarray((255.0 * bright).astype(np.uint8)).save(out, "JPEG", quality=_QUALITY, optimize=True)
     return out.getvalue()
 
 
@@ -194,7 +196,7 @@ def _drawing(frame: InspectedFrame, frames: Frames, factor: float) -> str:
             data = base64.b64encode(picture(frame.path, widest, frames.camera, flat=frame.solved))
             parts.append(
                 f'<image x="-0.5" y="-0.5" width="{width}" height="{height}" preserveAspectRatio="none" '
-                f'href="data:image/webp;base64,{data.decode("ascii")}"/>'
+                f'href="data:image/jpeg;base64,{data.decode("ascii")}"/>'
             )
         except (ImageError, MissingExtraError) as error:
             parts.append(f'<text x="{width / 2:g}" y="{height / 2:g}" class="middle">{escape(str(error))}</text>')

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from starcal_uq.camera.distortion import parameters
-from starcal_uq.core.formatting import count, decimals_for, fixed, percent, plural, significant
+from starcal_uq.core.formatting import count, decimals_for, fixed, p_words, percent, significant
 from starcal_uq.diagnostics.verdict.estimate import MISFIT_P, models_sentence, sensitivity, star_sentence
 from starcal_uq.inference.derived import derived_quantities
 from starcal_uq.presentation.tables import TextTable
@@ -47,8 +47,8 @@ def diagnosis_context(diagnosis: Diagnosis | None, cal: Calibration) -> dict[str
 
 def _misfit_sentence(diagnosis: Diagnosis) -> str:
     rejected = diagnosis.misfit.found(MISFIT_P)
-    several = f"{plural(len(diagnosis.misfit.tests), 'test')}, overall p = {significant(diagnosis.misfit.p_value)}"
-    return f"{len(rejected)} of {several}." if rejected else f"None found anything ({several})."
+    said = f"of the {len(diagnosis.misfit.tests)} tests found {'some' if rejected else 'any'}"
+    return f"{len(rejected) or 'None'} {said} (overall {p_words(diagnosis.misfit.p_value)})."
 
 
 def derived_table(post: Posterior) -> TextTable:

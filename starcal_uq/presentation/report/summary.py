@@ -86,6 +86,8 @@ def attitude_summary(error: AttitudeError) -> TextTable:
     )
     heads = tuple(f"{where}, {kind}" for where in ("Across", "Roll") for kind in kinds)
     said = "" if tested else f" {WITH_MISFIT_FOUND[0].upper()}{WITH_MISFIT_FOUND[1:]}: {NOT_ASSESSED}."
+    if tested and all(found == held for _, *cells in rows for found, held in zip(cells[::2], cells[1::2], strict=True)):
+        heads, rows = ("Across the boresight", "Roll"), tuple((name, across, roll) for name, across, _, roll, _ in rows)
     title = f"arcsec, 1 sigma; across the boresight per axis. {_PARTS_SAID}{said}"
     return TextTable(("Contribution", *heads), rows, title)
 
@@ -172,7 +174,7 @@ def methods_paragraph(results: Results) -> str:
     parts.append(f"Of {plural(every, 'check')}, {passed} passed. {_not_passed(results)}".strip())
     with_versions = ", ".join(f"{n} {v}" for n, v in versions.items() if v and n not in ("starcal_uq", "emcee"))
     parts.append(f"Software: {with_versions}. Data: SHA-256 {cal.data_hash_of(obs)[:16]}.")
-    return " ".join(" ".join(parts).split())
+    return " ".join(filter(None, " ".join(parts).split(" ")))
 
 
 def _not_passed(results: Results) -> str:
@@ -210,7 +212,8 @@ def terminal_summary(results: Results) -> list[str]:
             cells = [_both(error, part, axis) for axis in (3, 2)]
             lines.append(f"  {name.lower():<30}{cells[0]:>25}{cells[1]:>19}".rstrip())
         untested = f"{IF_MODEL_HOLDS}; {WITH_MISFIT_FOUND}: {NOT_ASSESSED}"
-        lines.append(f"  {untested if error.misfit is None else f'{WITH_MISFIT_FOUND}; in brackets {IF_MODEL_HOLDS}'}")
+        differ = f"{WITH_MISFIT_FOUND}; in brackets {IF_MODEL_HOLDS}, where that differs"
+        lines.append(f"  {untested if error.misfit is None else differ}")
     if (budget := results.budget) is not None:
         table = budget_summary(budget)
         lines.append("Budget" if budget.outcomes else f"Budget at {confidence_text(budget.confidence)}, arcsec")
@@ -239,9 +242,8 @@ _COUNTED = ((Level.PASS, "passed"), (Level.WARN, "gave a warning"), (Level.FAIL,
 
 def _both(error: AttitudeError, row: int, axis: int) -> str:
     held = significant(float(error.if_model_holds_arcsec[row, axis]))
-    if error.misfit is None:
-        return held
-    return f"{significant(float(error.with_misfit_found_arcsec[row, axis]))} ({held})"
+    found = held if error.misfit is None else significant(float(error.with_misfit_found_arcsec[row, axis]))
+    return held if found == held else f"{found} ({held})"
 
 
 def _told(check: Check) -> list[str]:

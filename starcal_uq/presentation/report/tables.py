@@ -132,6 +132,8 @@ def attitude_rows(error: AttitudeError) -> list[Row]:
                 for head, start in (("sigma", ""), ("p95", "p95_"), ("p997", "p997_"))
             }
             figures.append({"name": name, "untested": untested, **values})
+        if all(figures[0][head] == figures[1][head] for head in ("sigma", "p95", "p997")):
+            figures = [{**figures[0], "name": "both"}]
         if group["if_model_holds_arcsec"].isna().any():
             note = "not sampled by the version that wrote this run"
         absorbed = str(group["absorbed_by_alignment"].iloc[0])

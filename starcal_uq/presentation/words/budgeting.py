@@ -131,7 +131,7 @@ def _sigma(row: Contributor | None) -> str:
 
 
 def _figures(axes: dict[str, Contributor]) -> list[tuple[str, list[str]]]:
-    """What the posterior fills, by the two names that every attitude error has; empty for other rows."""
+    """What the posterior fills, by the two names that every attitude error has; empty where there is one figure."""
     rows = list(axes.values())
     if any(math.isnan(row.if_model_holds_arcsec) for row in rows):
         return []
@@ -139,7 +139,8 @@ def _figures(axes: dict[str, Contributor]) -> list[tuple[str, list[str]]]:
         (WITH_MISFIT_FOUND, [row.with_misfit_found_arcsec for row in rows]),
         (IF_MODEL_HOLDS, [row.if_model_holds_arcsec for row in rows]),
     )
-    return [(name, [NOT_ASSESSED if math.isnan(v) else significant(v) for v in values]) for name, values in pairs]
+    told = [(name, [NOT_ASSESSED if math.isnan(v) else significant(v) for v in values]) for name, values in pairs]
+    return told if told[0][1] != told[1][1] else []
 
 
 def _means(axes: dict[str, Contributor]) -> str:

@@ -6,21 +6,11 @@ import numpy as np
 
 from starcal_uq.comparison.result import CameraComparison
 from starcal_uq.core.constants import AXES
-from starcal_uq.core.formatting import fixed, plural, plus_minus, significant
+from starcal_uq.core.formatting import fixed, p_words, plural, plus_minus, significant
 from starcal_uq.presentation.tables import TextTable
 
-_SMALLEST_P = 1e-12
 # Below this, arcsec, no one can tell a difference from none.
 _NOTHING = 1e-6
-
-
-def p_words(p: float) -> str:
-    """``p = 0.31``, or a bound where the Gaussian tail means nothing any more."""
-    if np.isnan(p):
-        return "p not known"
-    if p < _SMALLEST_P:
-        return "p < 10⁻¹²"
-    return f"p = {significant(p)}"
 
 
 def headline(found: CameraComparison) -> str:

@@ -9,7 +9,17 @@ from pathlib import Path
 import numpy as np
 
 from starcal_uq.camera.distortion import Parameter
-from starcal_uq.core.formatting import count, decimals_for, fixed, join_words, percent, plural, significant
+from starcal_uq.core.formatting import (
+    count,
+    decimals_for,
+    fixed,
+    join_words,
+    p_value,
+    p_words,
+    percent,
+    plural,
+    significant,
+)
 from starcal_uq.diagnostics.diagnose import Diagnosis
 from starcal_uq.diagnostics.jackknife import Jackknife
 from starcal_uq.diagnostics.misfit import Misfit
@@ -43,7 +53,7 @@ def verdict_notes(verdict: Verdict) -> list[str]:
 
 def misfit_text(found: Misfit) -> str:
     """How many tests there are, and what they found."""
-    tests = f"{plural(len(found.tests), 'test')}, overall p = {significant(found.p_value)}"
+    tests = f"{plural(len(found.tests), 'test')}, overall {p_words(found.p_value)}"
     rejected = [test.name for test in found.found()]
     return f"{tests}: {join_words(rejected)}." if rejected else f"{tests}: no unexplained structure."
 
@@ -57,8 +67,8 @@ def misfit_table(found: Misfit, *, found_only: bool = False) -> TextTable:
             f"F({count(test.dof)}, {count(test.dof_residual)}) = {fixed(test.statistic, 2)}"
             if test.dof
             else f"z = {fixed(test.statistic, 2)}",
-            significant(test.p_value),
-            significant(test.p_holm),
+            p_value(test.p_value),
+            p_value(test.p_holm),
             "" if np.isnan(test.size_px) else significant(test.size_px),
             "" if np.isnan(test.visible) else percent(test.visible),
             "" if found_only and test.p_holm >= MISFIT_P else "; ".join(map(str, test.amplitudes)),
@@ -155,8 +165,7 @@ def predictive_table(found: PredictiveCheck) -> TextTable:
     for s in found.statistics:
         decimals = decimals_for(s.replicated_high - s.replicated_low)
         low, high = fixed(s.replicated_low, decimals), fixed(s.replicated_high, decimals)
-        least = 1.0 / found.n_draws
-        p = {0.0: f"< {significant(least, 1)}", 1.0: f"> {1.0 - least:.3g}"}.get(s.p_value, significant(s.p_value))
+        p = p_value(s.p_value, 1.0 / found.n_draws)
         rows.append((s.name, fixed(s.observed, decimals), f"{low} to {high}", p))
     return TextTable(("Statistic", "Data", "Replicates (95 %)", "p"), tuple(rows), "Predictive checks")
 

@@ -20,7 +20,7 @@ def focal_length(cal: Calibration) -> str:
     """The focal length with its sigma, mm."""
     sigma = cal.sigmas[2] * cal.camera.pixel_um * 1e-3
     decimals = decimals_for(sigma)
-    return f"{fixed(cal.camera.focal_mm, decimals)} +- {fixed(sigma, decimals)} mm"
+    return f"{fixed(cal.camera.focal_mm, decimals)} ± {fixed(sigma, decimals)} mm"
 
 
 def noise_kind(cal: Calibration) -> str:

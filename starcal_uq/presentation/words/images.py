@@ -9,7 +9,7 @@ from shlex import quote
 import numpy as np
 
 from starcal_uq.camera.camera import Camera
-from starcal_uq.core.formatting import count, plural
+from starcal_uq.core.formatting import count, plural, superscript
 from starcal_uq.identification.result import STATUSES, FoundOptics, FrameStatus, Identification
 from starcal_uq.images.centroids import Centroids
 from starcal_uq.pipeline.images import FAINTEST
@@ -81,7 +81,7 @@ def optics_text(optics: FoundOptics, camera: Camera) -> str:
     return (
         f"The stars alone tell the camera: a field of {width:.3g} x {height:.3g} degrees, f = {camera.focal_px:.5g} px "
         f"({camera.focal_mm:.4g} mm if its pixels are {camera.pixel_um:.4g} um wide); {agree}, by chance once in "
-        f"10^{-optics.log10_expected_false:.0f}."
+        f"10{superscript(round(-optics.log10_expected_false))}."
     )
 
 

@@ -119,14 +119,17 @@ def attitude_table(error: AttitudeError) -> TextTable:
     absorbed = error.to_dataframe().groupby("contributor", sort=False)["absorbed_by_alignment"].first()
     rows: list[tuple[str, ...]] = []
     for place, (contributor, words) in enumerate(absorbed.items()):
-        rows.append((str(contributor), *[""] * 5, str(words)))
+        figures = []
         for name, sigma, width in zip((WITH_MISFIT_FOUND, IF_MODEL_HOLDS), (found, held), widths, strict=True):
-            # The interaction is not known of runs of old; what the misfit makes of an error is another question.
-            missing = NOT_ASSESSED if name == WITH_MISFIT_FOUND and error.misfit is None else "not known"
             values = [*sigma[place], width[place, 3]]
-            rows.append((f"  {name}", *(missing if np.isnan(v) else significant(float(v)) for v in values), ""))
+            # The interaction is not known of runs of old.
+            figures.append((f"  {name}", *("not known" if np.isnan(v) else significant(float(v)) for v in values), ""))
+        once = error.misfit is None or figures[0][1:] == figures[1][1:]
+        rows.append((str(contributor), *(figures[1][1:-1] if once else [""] * 5), str(words)))
+        rows += [] if once else figures
     heads = ("contributor", *TOTAL_AXES, "two-axis 95 %", "absorbed by alignment")
-    return TextTable(heads, tuple(rows), "Attitude error, arcsec, 1 sigma", "lrrrrrl")
+    which = f", {IF_MODEL_HOLDS}" if error.misfit is None else ""
+    return TextTable(heads, tuple(rows), f"Attitude error, arcsec, 1 sigma{which}", "lrrrrrl")
 
 
 def coupling_text(coupling: Coupling) -> str:
