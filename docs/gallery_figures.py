@@ -116,7 +116,9 @@ halves = sc.comparison.compare_halves(obs, camera)""",
         """\
 plan = sc.plan(camera, stars, target_arcsec=20.0, n_geometries=300, n_campaigns=40)
 choice = sc.planning.choose_frames(camera, stars, n_frames=8, candidates=500, n_geometries=200)
-check = sc.planning.check_forecast(camera, stars, n_frames=(10, 30), n_campaigns=10, n_geometries=300, workers=0)""",
+check = sc.planning.check_forecast(
+    camera, stars, n_frames=(10, 30), n_campaigns=10, n_geometries=300, workers=0
+)""",
         {
             "Plan.forecast": ("How many frames does the target take?", "plan.plot.forecast()"),
             "Plan.sweeps": ("What else would help?", "plan.plot.sweeps()"),
@@ -164,7 +166,8 @@ simulated = sc.study("simulated.toml", workers=0)""",
         "The paper's experiments, here with fewer repetitions than [the page on it](explanation/paper.md).",
         """\
 paper = sc.paper.reproduce("paper", n_replicates=8, n_frames=50, study=False, workers=0)
-sizes = {"fields_deg": (7.0, 15.0), "frames": (12, 48), "max_mags": (5.5, 6.5), "n_replicates": 3, "n_frames": 12}
+sizes = {"fields_deg": (7.0, 15.0), "frames": (12, 48), "max_mags": (5.5, 6.5)}
+sizes |= {"n_replicates": 3, "n_frames": 12}
 bias = sc.paper.interaction_study(distortion_scales=(0.0, 0.1, 1.0, 10.0), workers=0, **sizes)""",
         {
             "Reproduction.trajectories": ("The paper's figure 3", "paper.plot.trajectories()"),
