@@ -76,7 +76,7 @@ bench-rivals: .bench/.installed ## an environment for the rivals that are not in
 	@/usr/bin/python3 -c "import mrcal" 2>/dev/null || echo "mrcal is not there: apt-get install python3-mrcal (Debian, Ubuntu)"
 
 clean: ## remove everything that the other targets made
-	rm -rf .venv .venv-alt .supply .bench docs/_build docs/gallery docs/gallery.md docs/notebooks docs/reference/_commands.txt docs/reference/_schemas.md docs/reference/api starcal-demo dist
+	rm -rf .venv .venv-alt .supply .bench docs/_build docs/gallery docs/gallery.md docs/notebooks docs/reference/_commands.md docs/reference/_schemas.md docs/reference/api starcal-demo dist
 	rm -rf .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 

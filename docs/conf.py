@@ -36,7 +36,7 @@ extensions = [
     "example",
 ]
 copybutton_prompt_text = "$ "
-exclude_patterns = ["_build", "reference/_schemas.md"]
+exclude_patterns = ["_build", "reference/_commands.md", "reference/_schemas.md"]
 source_suffix = {".md": "myst-nb", ".ipynb": "myst-nb"}
 # Notebooks are executed on every build, each in a folder of its own; one that fails fails the build.
 nb_execution_mode = "force"
@@ -116,13 +116,12 @@ def write_command_help(_app: object) -> None:
     command = str(Path(sys.executable).with_name("starcal-uq"))
     environment = {**os.environ, "COLUMNS": "100", "NO_COLOR": "1", "TERM": "dumb"}
     texts = []
-    for arguments in ([], *([name] for name in command_names())):
-        run = subprocess.run(
-            [command, *arguments, "--help"], env=environment, capture_output=True, text=True, check=True
-        )
+    for name in ("", *command_names()):
+        arguments = [name, "--help"] if name else ["--help"]
+        run = subprocess.run([command, *arguments], env=environment, capture_output=True, text=True, check=True)
         lines = [line.rstrip() for line in run.stdout.strip().splitlines()]
-        texts.append("\n".join([" ".join(["$ starcal-uq", *arguments, "--help"]), "", *lines]))
-    (HERE / "reference" / "_commands.txt").write_text("\n\n\n".join(texts) + "\n", encoding="utf-8")
+        texts += [f"## {name}\n" if name else "", "```text", *lines, "```\n"]
+    (HERE / "reference" / "_commands.md").write_text("\n".join(texts), encoding="utf-8")
 
 
 def public_objects() -> dict[str, dict[str, Any]]:
@@ -177,7 +176,8 @@ def write_reference(_app: object) -> None:
             rows.append(f"| [`{prefix}{name}`]({pages[-1]}.md) | {told} |")
         if wing == "core":
             pages.append(f"{place.name}/errors")
-            errors = "# sc.errors\n\n```{eval-rst}\n.. automodule:: starcal_uq.core.errors\n```\n"
+            directive = ".. automodule:: starcal_uq.core.errors\n   :exclude-members: printable, register_reason"
+            errors = f"# sc.errors\n\n```{{eval-rst}}\n{directive}\n```\n"
             (place / "errors.md").write_text(errors, encoding="utf-8")
             rows.append(f"| [`sc.errors`]({pages[-1]}.md) | Errors that a user can act on. |")
         told = (importlib.import_module(module).__doc__ or "").strip() if wing else "What a day's work needs."
