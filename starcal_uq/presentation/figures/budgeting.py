@@ -40,7 +40,7 @@ def plot_budget(budget: Budget) -> Figure:
     for ax, (axis, title) in zip(panels, _PANELS, strict=True):
         _panel(ax, budget, names, axis)
         style.label(ax, title, f"|mean| + n sigma at {confidence_text(budget.confidence)} [arcsec]{missing}")
-    style.legend_above(figure, _handles(budget))
+    style.legend_above(figure, _handles(budget), columnspacing=1.2, handlelength=1.6)
     return figure
 
 
