@@ -65,7 +65,7 @@ def work(folder: Path, name: str, first: int, last: int) -> None:
     counts: Counter[str] = Counter()
     bad: list[tuple[int, str, str]] = []
     place = os.open(folder / "seed", os.O_WRONLY | os.O_CREAT)
-    slowest, before = 0.0, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    slowest = 0.0
     for seed in range(first, last):
         # Where it was, if the process dies.
         os.pwrite(place, f"{seed:12d}".encode(), 0)
@@ -81,8 +81,7 @@ def work(folder: Path, name: str, first: int, last: int) -> None:
         counts[outcome.kind] += 1
         if outcome.kind in BAD:
             bad.append((seed, outcome.kind, outcome.detail))
-    memory = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) // 1024
-    print(json.dumps({"counts": counts, "bad": bad[:50], "slowest_s": round(slowest, 3), "memory_mb": memory}))
+    print(json.dumps({"counts": counts, "bad": bad[:50], "slowest_s": round(slowest, 3)}))
 
 
 def tried(name: str, first: int, last: int, out: Path) -> dict[str, Any]:
@@ -119,7 +118,6 @@ def _tried(name: str, first: int, last: int, out: Path, folder: Path) -> dict[st
         "counts": {"died": 1},
         "bad": [(seed, "died", f"{process.returncode}: {words}")],
         "slowest_s": 0,
-        "memory_mb": 0,
     }
     for part in ((first, seed), (seed + 1, last)):
         if part[0] < part[1]:
@@ -132,7 +130,6 @@ def _sum(parts: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "counts": dict(sum((Counter(part["counts"]) for part in parts), Counter())),
         "bad": [tuple(bad) for part in parts for bad in part["bad"]],
         "slowest_s": max(part["slowest_s"] for part in parts),
-        "memory_mb": max(part["memory_mb"] for part in parts),
     }
 
 
@@ -185,8 +182,8 @@ def _judged(counts: dict[str, int]) -> Counter[str]:
 def table(results: dict[str, dict[str, Any]]) -> str:
     """The results in Markdown."""
     lines = [
-        "| File | Read by | Damaged | Refused | Same content | Other content | Wrong | Slowest, s | Memory, MB |",
-        "|---|---|" + "---:|" * 7,
+        "| File | Read by | Damaged | Refused | Same content | Other content | Wrong | Slowest, s |",
+        "|---|---|" + "---:|" * 6,
     ]
     total: Counter[str] = Counter()
     for sample in SAMPLES:
@@ -196,12 +193,9 @@ def table(results: dict[str, dict[str, Any]]) -> str:
             total += counts
             numbers = " | ".join(f"{counts[kind]:,}" for kind in KINDS)
             reads = ", ".join(f"`{name}`" for name in sample.reads)
-            lines.append(
-                f"| {sample.file} | {reads} | {sum(counts.values()):,} | {numbers} | {one['slowest_s']:.2f} | "
-                f"{one['memory_mb']:,} |"
-            )
+            lines.append(f"| {sample.file} | {reads} | {sum(counts.values()):,} | {numbers} | {one['slowest_s']:.2f} |")
     numbers = " | ".join(f"{total[kind]:,}" for kind in KINDS)
-    lines.append(f"| **all** | | {sum(total.values()):,} | {numbers} | | |")
+    lines.append(f"| **all** | | {sum(total.values()):,} | {numbers} | |")
     return "\n".join(lines)
 
 
