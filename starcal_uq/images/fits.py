@@ -16,6 +16,7 @@ import numpy as np
 
 from starcal_uq.core.types import BoolArray, FloatArray, IntArray
 from starcal_uq.images.background import PreparedImage
+from starcal_uq.maths.intervals import median_of
 
 _ITERATIONS = 10
 # A star is left alone when its step is this small, in standard deviations, or in px, parts of its flux and log width.
@@ -44,8 +45,8 @@ class Stamps:
 
     def subset(self, chosen: Any) -> Stamps:
         """The stamps of some of the stars."""
-        names = ("x0", "y0", "counts", "good", "fine", "variance")
-        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
+        counts, good, fine = self.counts[chosen], self.good[chosen], self.fine[chosen]
+        return Stamps(self.x0[chosen], self.y0[chosen], counts, good, fine, self.variance[chosen], self.counts_per_e)
 
 
 @dataclass(frozen=True)
@@ -250,8 +251,9 @@ def _settled(
         step[shape] = _to_their_end(step[shape], last, moving)
         state[:3, moving] += step[:3]
         if free_sigma:
-            wider = log_sigma + np.clip(step[3], -0.3, 0.3)
-            state[3, moving] = wider.clip(np.log(0.15), np.log(0.5 * m))
+            # NumPy's `clip` takes longer than so few numbers.
+            wider = log_sigma + np.minimum(np.maximum(step[3], -0.3), 0.3)
+            state[3, moving] = np.minimum(np.maximum(wider, np.log(0.15)), np.log(0.5 * m))
         step[2] /= np.where(flux == 0.0, 1.0, flux)
         done |= np.abs(step).max(axis=0) < _TOLERANCE
         if done.any():
@@ -271,8 +273,10 @@ def _to_their_end(step: FloatArray, last: FloatArray, moving: IntArray) -> Float
     `last` (q, n) are the steps before, and become these.
     """
     before = last[:, moving]
-    ratio = _ratio(np.einsum("qk,qk->k", step, before), np.einsum("qk,qk->k", before, before))
-    last[:, moving] = longer = step / (1.0 - np.minimum(np.maximum(ratio, -1.0), 0.5))
+    size = np.einsum("qk,qk->k", before, before)
+    ratio = np.einsum("qk,qk->k", step, before) / np.where(size > 0.0, size, 1.0)
+    longer: FloatArray = step / (1.0 - np.minimum(np.maximum(ratio, -1.0), 0.5))
+    last[:, moving] = longer
     return longer
 
 
@@ -405,35 +409,36 @@ def window_positions(
     suit a window as wide as the star, and swing in a wider one. The last steps are shorter than `step_px` (n,).
     `stamps` of an image of this shape reach to where the windows end.
     """
-    x, y = x.copy(), y.copy()
     good = np.isfinite(x) & np.isfinite(y)
     if not len(x):
         return x, y, good
     half, moving, counts = stamps.counts.shape[1] // 2, np.flatnonzero(good), stamps.counts
     steps, factor = np.arange(2 * half + 1), 1.0 + (star_px**2 + 1.0 / 12.0) / window_px**2
-    small, last = np.zeros(len(x)) + step_px**2, np.zeros((2, len(x)))
+    small, fall = np.zeros(len(x)) + step_px**2, -0.5 / window_px**2
+    at, last = np.stack([x - stamps.x0, y - stamps.y0]), np.zeros((2, len(x)))
     if len(moving) < len(x):
         counts = counts[moving]
     for _ in range(_WINDOW_ITERATIONS):
-        centre = np.concatenate([x[moving] - stamps.x0[moving], y[moving] - stamps.y0[moving]])
-        w = steps - centre[:, None]
-        rows = np.empty((len(w), 2, len(steps)))
-        np.exp(np.tile(-0.5 / window_px[moving] ** 2, 2)[:, None] * w * w, out=rows[:, 0])
-        np.multiply(rows[:, 0], w, out=rows[:, 1])
-        moments = _contracted(rows[: len(moving)], counts, rows[len(moving) :])
+        here = at[:, moving]
+        w = steps - here[:, :, None]
+        rows = np.empty((2, len(moving), 2, len(steps)))
+        np.exp(fall[moving, None] * w * w, out=rows[:, :, 0])
+        np.multiply(rows[:, :, 0], w, out=rows[:, :, 1])
+        moments = _contracted(rows[0], counts, rows[1])
         light = moments[:, 0, 0]
         lit = light > 0.0
         scale = factor[moving] / np.where(lit, light, np.inf)
-        dx, dy = _to_their_end(np.stack([scale * moments[:, 0, 1], scale * moments[:, 1, 0]]), last, moving)
-        x[moving] += dx
-        y[moving] += dy
+        step = _to_their_end(scale * np.stack([moments[:, 0, 1], moments[:, 1, 0]]), last, moving)
+        here += step
+        at[:, moving] = here
         # A window that has left its square has run away.
-        fine = lit & (np.abs(centre + np.concatenate([dx, dy]) - half).reshape(2, -1).max(axis=0) < 2.0)
+        fine = lit & (np.abs(here - half).max(axis=0) < 2.0)
         good[moving[~fine]] = False
-        on = fine & (dx * dx + dy * dy > small[moving])
+        on = fine & (np.einsum("qk,qk->k", step, step) > small[moving])
         if not on.any():
             break
         moving, counts = moving[on], counts[on]
+    x, y = at[0] + stamps.x0, at[1] + stamps.y0
     height, width = shape
     radius = _WINDOW_SIGMAS * window_px
     good &= (x - radius >= -0.5) & (x + radius <= width - 0.5) & (y - radius >= -0.5) & (y + radius <= height - 0.5)
@@ -499,7 +504,7 @@ def _window_gradient(sums: FloatArray, window: FloatArray, fit: StarFit, alone: 
     moments = (star * window**2 / (star + window**2))[:, None, None] * np.eye(2)
     if np.count_nonzero(bright) >= _GRADIENT_STARS:
         second = _second_moments(sums[bright]) / sums[bright, :1, :1]
-        moments = np.broadcast_to(np.median(second, axis=0), moments.shape)
+        moments = np.broadcast_to(median_of(np.moveaxis(second, 0, -1)), moments.shape)
     # Light without a peak does not hold the window; the floor keeps the errors finite.
     values, axes = np.linalg.eigh(np.eye(2) - moments / window[:, None, None] ** 2)
     gradient: FloatArray = (axes * np.maximum(values, _LEAST_GRADIENT)[:, None, :]) @ axes.transpose(0, 2, 1)

@@ -161,7 +161,8 @@ def half_stamp_px(sigma: float) -> int:
 def _single_pixels(stamps: Stamps) -> BoolArray:
     """Stamps in which one pixel holds more than its eight neighbours together: hot pixels."""
     c = stamps.counts.shape[1] // 2
-    core = (stamps.counts * stamps.good)[:, c - 1 : c + 2, c - 1 : c + 2]
+    box = slice(None), slice(c - 1, c + 2), slice(c - 1, c + 2)
+    core = stamps.counts[box] * stamps.good[box]
     highest = core.max((1, 2))
     hot: BoolArray = highest > 0.6 * core.sum((1, 2))
     return hot
