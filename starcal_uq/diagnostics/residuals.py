@@ -9,7 +9,7 @@ import numpy as np
 
 from starcal_uq.core.types import FloatArray
 from starcal_uq.estimation.noise_model import weighed
-from starcal_uq.estimation.residual_map import ResidualMap
+from starcal_uq.estimation.residual_map import OUTLIER_SIGMA, ResidualMap
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
@@ -59,15 +59,22 @@ class BinnedResiduals:
 def bin_residuals(cal: Calibration, obs: Observations) -> BinnedResiduals:
     """Mean residual vectors in cells that hold about 25 stars each (4 to 12 cells along the longer side).
 
-    Of partitioned observations they are those of all stars, of which `obs` is a sample.
+    Of partitioned observations they are those of all stars, of which `obs` is a sample; of an estimate with Student-t
+    tails those of stars within 4.5 sigma.
     """
     if cal.partitions is not None:
         found, scale2 = cal.partitions.residuals, _unit_scale(cal, cal.n_stars) ** 2
     else:
         obs = weighed(obs, cal)
         stated = np.ones(obs.n_stars) if obs.sigma_px is None else np.asarray(obs.sigma_px)
-        found = ResidualMap.of(cal.camera, obs.n_stars, obs.xy.T, np.asarray(cal.residuals_px).T, stated)
+        residuals, use = np.asarray(cal.residuals_px), np.ones(obs.n_stars, dtype=bool)
         scale2 = _unit_scale(cal, obs.n_stars) ** 2
+        if cal.provenance.get("settings", {}).get("likelihood") == "student_t":
+            # Stars that hardly had a say are in no mean, and the scale of the t is not the scatter of the others.
+            z = residuals / stated[:, None]
+            use = np.all(np.abs(z) < OUTLIER_SIGMA * cal.sigma, axis=1)
+            scale2 = float(np.mean(z[use] ** 2))
+        found = ResidualMap.of(cal.camera, obs.n_stars, obs.xy[use].T, residuals[use].T, stated[use])
     cell, nx = found.cell_px, int(found.shape[1])
     keep = found.counts >= _MIN_STARS
     counts, sums, variance = found.counts[keep], found.sums[keep], found.stated2[keep] * scale2

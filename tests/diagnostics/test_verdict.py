@@ -288,6 +288,21 @@ def test_a_pattern_in_the_residuals_is_found_and_sized(run):
     assert outcome("Pattern in the residuals", run.obs, weak).level is Level.WARN
 
 
+def test_wrong_stars_of_a_robust_estimate_are_no_pattern(run):
+    rng = np.random.default_rng(2)
+    wrong = rng.random(run.obs.n_stars) < 0.05
+    obs = dataclasses.replace(run.obs, dec_deg=run.obs.dec_deg + 0.8 * wrong * rng.choice([-1.0, 1.0], run.obs.n_stars))
+    cal = sc.calibrate(obs, sc.paper.paper_start(), likelihood="student_t")
+    assert outcome("Pattern in the residuals", obs, cal).level is Level.PASS
+    assert outcome("Outliers", obs, cal).level is not Level.PASS
+    # A pattern of the others is found, and their mean is one with the wrong stars where no tails were asked for.
+    pattern = 0.05 * np.stack([np.sin(obs.x_px / 200.0), np.cos(obs.y_px / 200.0)], axis=1)
+    bent = dataclasses.replace(cal, residuals_px=cal.residuals_px + pattern)
+    assert bin_residuals(bent, obs).pattern_px == pytest.approx(0.05 / np.sqrt(2.0), rel=0.2)
+    plain = dataclasses.replace(cal, provenance={})
+    assert outcome("Pattern in the residuals", obs, plain).level is Level.FAIL
+
+
 def test_the_pattern_test_raises_no_more_false_alarms_than_it_says(run):
     """Residuals that are noise alone, 400 times: the share of p below 5 % is 5 % within its own error."""
     rng = np.random.default_rng(5)
