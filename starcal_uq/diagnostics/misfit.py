@@ -24,6 +24,7 @@ from starcal_uq.core.formatting import plus_minus
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.diagnostics.pattern import Fit, Pattern, frame_covariance
+from starcal_uq.diagnostics.residuals import of_heard
 from starcal_uq.diagnostics.shapes import (
     FRAME_BY_FRAME,
     MAX_CELLS,
@@ -210,9 +211,10 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
     Returns
     -------
     Misfit
-        With a false-alarm rate that is the nominal one for each test, and at most that for all of them together.
+        With a false-alarm rate that is the nominal one for each test, and at most that for all of them together. Of an
+        estimate with Student-t tails it is about the stars within 4.5 sigma.
     """
-    obs = weighed(obs, cal)
+    obs, cal = of_heard(weighed(obs, cal), cal)
     families = shapes(obs, cal.camera, max_cells=max_cells)
     sums = _Sums.over(obs, cal, families)
     tests = [test for test in (sums.family(index) for index in range(len(families))) if test is not None]

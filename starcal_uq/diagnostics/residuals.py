@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from starcal_uq.core.types import FloatArray
+from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.residual_map import OUTLIER_SIGMA, ResidualMap
 
@@ -67,13 +67,11 @@ def bin_residuals(cal: Calibration, obs: Observations) -> BinnedResiduals:
     else:
         obs = weighed(obs, cal)
         stated = np.ones(obs.n_stars) if obs.sigma_px is None else np.asarray(obs.sigma_px)
-        residuals, use = np.asarray(cal.residuals_px), np.ones(obs.n_stars, dtype=bool)
+        residuals, use = np.asarray(cal.residuals_px), heard(obs, cal)
         scale2 = _unit_scale(cal, obs.n_stars) ** 2
-        if cal.provenance.get("settings", {}).get("likelihood") == "student_t":
-            # Stars that hardly had a say are in no mean, and the scale of the t is not the scatter of the others.
-            z = residuals / stated[:, None]
-            use = np.all(np.abs(z) < OUTLIER_SIGMA * cal.sigma, axis=1)
-            scale2 = float(np.mean(z[use] ** 2))
+        if not use.all():
+            # The scale of the t is not the scatter of those that it hears.
+            scale2 = float(np.mean((residuals / stated[:, None])[use] ** 2))
         found = ResidualMap.of(cal.camera, obs.n_stars, obs.xy[use].T, residuals[use].T, stated[use])
     cell, nx = found.cell_px, int(found.shape[1])
     keep = found.counts >= _MIN_STARS
@@ -89,6 +87,29 @@ def bin_residuals(cal: Calibration, obs: Observations) -> BinnedResiduals:
         cell_px=cell,
         n_empty=int(np.count_nonzero(~keep)),
     )
+
+
+def heard(obs: Observations, cal: Calibration) -> BoolArray:
+    """Stars (N,) that had a say in an estimate: of one with Student-t tails those within 4.5 sigma, else all."""
+    if cal.provenance.get("settings", {}).get("likelihood") != "student_t":
+        return np.ones(obs.n_stars, dtype=bool)
+    stated = 1.0 if obs.sigma_px is None else np.asarray(obs.sigma_px)[:, None]
+    size = np.max(np.abs(cal.residuals_px / stated), axis=1)
+    # Stars that the likelihood leaves out, such as those of a frame without an attitude, have none.
+    return np.asarray((size > 0.0) & (size < OUTLIER_SIGMA * cal.sigma))
+
+
+def of_heard(obs: Observations, cal: Calibration) -> tuple[Observations, Calibration]:
+    """The stars that were heard, in frames that keep three of them, and the estimate with their residuals alone."""
+    use = heard(obs, cal)
+    if use.all():
+        return obs, cal
+    order = np.searchsorted(cal.frame_ids, obs.frame)
+    left = np.bincount(order, use, len(cal.frame_ids)) >= 3
+    use &= left[order]
+    frames, quaternions = cal.frame_ids[left], cal.quaternions[left]
+    kept = replace(cal, residuals_px=cal.residuals_px[use], frame_ids=frames, quaternions=quaternions)
+    return obs.select(use), kept
 
 
 def residual_scale(cal: Calibration, obs: Observations) -> FloatArray:

@@ -13,7 +13,7 @@ from starcal_uq.core.formatting import significant
 from starcal_uq.core.status import Level, Question
 from starcal_uq.diagnostics.diagnose import diagnose
 from starcal_uq.diagnostics.models import REJECT_P
-from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals, residual_scale
+from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals, of_heard, residual_scale
 from starcal_uq.diagnostics.verdict import estimate
 from starcal_uq.diagnostics.verdict.draws import propagation_difference
 from starcal_uq.diagnostics.verdict.judge import judge
@@ -301,6 +301,15 @@ def test_wrong_stars_of_a_robust_estimate_are_no_pattern(run):
     assert bin_residuals(bent, obs).pattern_px == pytest.approx(0.05 / np.sqrt(2.0), rel=0.2)
     plain = dataclasses.replace(cal, provenance={})
     assert outcome("Pattern in the residuals", obs, plain).level is Level.FAIL
+    # So it is with the tests of the model, in frames that keep three stars.
+    first = obs.frame == obs.frame_ids[0]
+    obs = dataclasses.replace(obs, dec_deg=run.obs.dec_deg + 0.8 * (wrong & ~first | first & (np.cumsum(first) == 3)))
+    obs = obs.select(~first | (np.cumsum(first) <= 3))
+    cal = sc.calibrate(obs, sc.paper.paper_start(), likelihood="student_t")
+    assert of_heard(obs, cal)[0].n_frames < obs.n_frames
+    tests, control = (sc.diagnostics.misfit_tests(obs, c) for c in (cal, dataclasses.replace(cal, provenance={})))
+    assert estimate.misfit(tests).level is estimate.even_noise(tests).level is Level.PASS
+    assert estimate.even_noise(control).level is Level.WARN
 
 
 def test_the_pattern_test_raises_no_more_false_alarms_than_it_says(run):
