@@ -102,7 +102,7 @@ def _contributor_row(name: str, axes: dict[str, Contributor]) -> Row:
         "ecss_class": listed([row.ecss_class for row in every]),
         "sigma": [_sigma(axes.get(axis)) for axis in AXES],
         "figures": figures,
-        "figures_text": "; ".join(f"{name}: {', '.join(values)} arcsec" for name, values in figures),
+        "figures_text": "; ".join(f"{name}: {_listed(values)}" for name, values in figures),
         "mean": _means(axes),
         "missing": [axis in axes and not axes[axis].assessed for axis in AXES],
         "distribution": " / ".join(
@@ -141,6 +141,10 @@ def _figures(axes: dict[str, Contributor]) -> list[tuple[str, list[str]]]:
     )
     told = [(name, [NOT_ASSESSED if math.isnan(v) else significant(v) for v in values]) for name, values in pairs]
     return told if told[0][1] != told[1][1] else []
+
+
+def _listed(values: list[str]) -> str:
+    return NOT_ASSESSED if set(values) == {NOT_ASSESSED} else f"{', '.join(values)} arcsec"
 
 
 def _means(axes: dict[str, Contributor]) -> str:
