@@ -22,10 +22,10 @@ _OPEN = 0.3
 WEAK = 0.05
 # Part of a direction below which a parameter does not count as one of those that it mixes.
 _PART = 0.15
-# Principal points known better than this do not depend on whether there is distortion.
-_POINT = 0.03
-# Squared length, in standard deviations, up to which distortion may be none.
-_INSIGNIFICANT = 30.0
+# Distortion that none explains with more probability than this may be none; the estimate has looked for it all around.
+_NONE_P = 3e-7
+# Part that is left of the point's standard deviation where the coma of a distortion that may be none tells it.
+_FROM_COMA = 0.8
 # Ends that undetermined parameters explain.
 EXPLAINED = (
     *(Status.CONVERGED, Status.MAX_ITERATIONS, Status.SINGULAR, Status.STALLED),
@@ -66,23 +66,28 @@ def undetermined(
     """Names of the parameters that the data leave open at an estimate theta (p,), if that can explain the status.
 
     The coma of the distortion tells where the principal point is, and in narrow fields nothing else does: where the
-    distortion may be none, the data must determine the point without it.
+    distortion may be none, the data must determine the point without it, and about as well.
     """
+    from scipy.special import fdtrc
+
     if status not in EXPLAINED or not noise > 0.0:
         return ()
     found = open_parameters(matrix, noise, camera)
     if found or len(theta) == 3:
         return found
     covariance = scaled_inverse(matrix) * noise**2
-    point = np.sqrt(np.diag(covariance))[:2] / _natural(camera)[:2]
-    k = theta[3:]
-    if np.max(point) < _POINT or float(k @ scaled_inverse(covariance[3:, 3:]) @ k) > _INSIGNIFICANT:
+    point, k, dof = np.sqrt(np.diag(covariance))[:2], theta[3:], max(likelihood.dof - len(theta), 1)
+    if fdtrc(len(k), dof, float(k @ scaled_inverse(covariance[3:, 3:]) @ k) / len(k)) < _NONE_P:
         return ()
     without = MarginalLikelihood(likelihood.frames, likelihood.model_name)
     if likelihood.rotations is not None:
         without.use_rotations(likelihood.rotations)
     plain = np.concatenate([theta[:3], np.zeros(len(k))])
-    return open_parameters(without.evaluate(plain).matrix, noise, camera)
+    matrix = without.evaluate(plain).matrix
+    if found := open_parameters(matrix, noise, camera):
+        return found
+    told = np.sqrt(np.diag(scaled_inverse(matrix)))[:2] * noise
+    return tuple(name for name, part in zip(camera.parameter_names, point / told, strict=False) if part < _FROM_COMA)
 
 
 def what_is_open(names: tuple[str, ...]) -> str:
