@@ -24,6 +24,8 @@ WEAK = 0.05
 _PART = 0.15
 # Distortion that none explains with more probability than this may be none; the estimate has looked for it all around.
 _NONE_P = 3e-7
+# Principal points known to this part of half the detector without distortion do not depend on whether there is some.
+_POINT = 0.03
 # Part that is left of the point's standard deviation where the coma of a distortion that may be none tells it.
 _FROM_COMA = 0.8
 # Ends that undetermined parameters explain.
@@ -87,7 +89,8 @@ def undetermined(
     if found := open_parameters(matrix, noise, camera):
         return found
     told = np.sqrt(np.diag(scaled_inverse(matrix)))[:2] * noise
-    return tuple(name for name, part in zip(camera.parameter_names, point / told, strict=False) if part < _FROM_COMA)
+    by_coma = (told > _POINT * _natural(camera)[:2]) & (point < _FROM_COMA * told)
+    return tuple(name for name, flag in zip(camera.parameter_names, by_coma, strict=False) if flag)
 
 
 def what_is_open(names: tuple[str, ...]) -> str:
