@@ -541,7 +541,7 @@ def test_estimate_and_coverage_with_wrong_identifications(kind: str, fraction: f
         z.append((cal.theta - TRUTH.theta) / cal.sigmas)
         if seed < 15:
             try:
-                plain = sc.calibrate(dirty, nominal, throw=False)
+                plain = sc.calibrate(dirty, nominal, model=nominal.distortion, throw=False)
                 z_control.append(np.abs(plain.theta - clean.theta) / clean.sigmas)
             except sc.errors.CalibrationError:
                 z_control.append(np.full(5, np.inf))
