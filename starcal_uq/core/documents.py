@@ -21,7 +21,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, create_model, model_validator
 from pydantic_core import CoreSchema
 
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.types import AnyDict, unaliased
 
 Number = float | None
 PREFIX = "starcal-uq/"
@@ -94,10 +94,8 @@ def part_of(record: type) -> type[Part]:
 
 def _kind(hint: Any) -> Any:
     """The type in JSON of an annotation of a record."""
+    hint = unaliased(hint)
     origin, args = get_origin(hint), get_args(hint)
-    if hasattr(origin, "__value__"):
-        # NumPy 2.5 declares NDArray by a type statement where Python has one.
-        return _kind(origin.__value__)
     if hint is float or hint is np.float64:
         return Number
     if origin in (Union, UnionType):

@@ -21,7 +21,7 @@ from typing import IO, Any, ClassVar, Literal, TypeVar, Union, get_args, get_ori
 import numpy as np
 
 from starcal_uq.core.files import PathLike, atomic_path, atomic_write_text, check_size, reading, shown
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.types import AnyDict, unaliased
 
 Record = TypeVar("Record")
 S = TypeVar("S", bound="Saved")
@@ -97,10 +97,8 @@ def from_plain(cls: type[Record], data: Any, arrays: Arrays | None = None) -> Re
 
 
 def _value(hint: Any, data: Any, arrays: Arrays, name: str) -> Any:
+    hint = unaliased(hint)
     origin, args = get_origin(hint), get_args(hint)
-    if hasattr(origin, "__value__"):
-        # NumPy 2.5 declares NDArray by a type statement where Python has one.
-        return _value(origin.__value__[args], data, arrays, name)
     if hint is Any:
         return data
     if hint in _SCALARS:

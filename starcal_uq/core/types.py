@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, get_args, get_origin
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,3 +15,9 @@ StrArray: TypeAlias = NDArray[np.str_]
 AnyDict: TypeAlias = dict[str, Any]
 # Sizes of the arrays of a record, by field; see `starcal_uq.core.records`.
 Shapes: TypeAlias = Mapping[str, tuple[int | str, ...]]
+
+
+def unaliased(hint: Any) -> Any:
+    """An annotation without the type statement by which NumPy 2.5 declares NDArray, where Python has one."""
+    origin = get_origin(hint)
+    return origin.__value__[get_args(hint)] if hasattr(origin, "__value__") else hint
