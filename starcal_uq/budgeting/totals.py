@@ -12,9 +12,10 @@ What counts as random depends on what the confidence is about:
 
 A row that is random over both differs from sensor to sensor and from moment to moment: it spreads in all three, with
 its sigma as that of the worst sensor, or of the worst moment. Worst cases are half-widths at the confidence, and add
-linearly, as the standard has it. That all of them meet in one sensor is an upper bound. Beside it stands what one
-sensor (or moment) in 1 / (1 - confidence) reaches, with the worst cases in squares, or sampled: only that can violate a
-limit.
+linearly, as the standard has it; rows of a correlation group have one worst case, in which their signs count. That all
+of them meet in one sensor is an upper bound. Beside it stands what one sensor (or moment) in 1 / (1 - confidence)
+reaches, with the worst cases in squares, or sampled. The smaller of both is what the error reaches at the least: only
+that can violate a limit.
 """
 
 from __future__ import annotations
@@ -52,6 +53,8 @@ _DOMINANT = 0.5
 # Bounds that differ by less agree.
 _AGREE = 0.02
 _BOUNDED = ("uniform", "arcsine")
+# Gaussian deviates on the way of a group from one end to the other; the ends are those of bounded rows to rounding.
+_ON_THE_WAY = np.linspace(-8.0, 8.0, 801)
 # A mean of this many sigmas moves the bounds apart.
 _MEAN_COUNTS = 0.05
 # Rounding of a rotation: an axis with less of another's error sees nothing of it.
@@ -86,7 +89,7 @@ class Total:
         Standard error of the sampled bound.
     rule_least_arcsec, sampled_least_arcsec : float
         Bounds if worst cases of different rows do not meet, and alignment absorbs all of what it absorbs in part: only
-        a limit below is violated. Those above where there is neither.
+        a limit below is violated. That by the rule is never above the sampled one, where there is one.
     not_assessed : tuple of str
         Contributors that are missing: with any, the bounds are "at least".
     dominant : str
@@ -244,6 +247,7 @@ def total(
     if len(certain) < len(counted):
         at_least = _bounds(certain, samples, AFTER_AT_LEAST, along, interpretation, confidence)
     dominant, share = _dominant(counted, along, confidence)
+    sampled_least = min(at_least.sampled_least, here.sampled)
     result = Total(
         scope=scope,
         axis=axis,
@@ -256,8 +260,9 @@ def total(
         rule_arcsec=here.rule,
         sampled_arcsec=here.sampled,
         sampled_se_arcsec=here.error,
-        rule_least_arcsec=min(at_least.rule_least, here.rule),
-        sampled_least_arcsec=min(at_least.sampled_least, here.sampled),
+        # Samples that do not resolve the confidence are no bound: `min` keeps what stands before a NaN.
+        rule_least_arcsec=min(at_least.rule_least, here.rule, sampled_least),
+        sampled_least_arcsec=sampled_least,
         not_assessed=missing,
         dominant=dominant.name if share > _DOMINANT else "",
         dominant_share=share,
@@ -440,19 +445,18 @@ def _worst_kinds(interpretation: str) -> tuple[str, ...]:
 
 
 def _worst(rows: Sequence[Contributor], along: FloatArray, confidence: float, *, by_shape: bool) -> tuple[float, float]:
-    """Half-widths of the contributors, added linearly, and in squares: groups err together in both.
+    """Half-widths of what errs alone, added linearly, and in squares; a group reaches as far as the sum of its rows.
 
     Half-widths are those of the distributions themselves, or take the rule's Gaussian factor where they are unbounded.
     """
-    by_name: dict[str, list[Contributor]] = {}
+    alone: dict[str, list[Contributor]] = {}
+    together: dict[str, list[Contributor]] = {}
     for row in rows:
-        by_name.setdefault(row.name, []).append(row)
-    apart: dict[tuple[str, str], float] = {}
-    for name, members in by_name.items():
-        group, _ = members[0].group
-        key = ("group", group) if group else ("row", name)
-        apart[key] = apart.get(key, 0.0) + _reach(members, along, confidence, by_shape=by_shape)
-    return sum(apart.values(), start=0.0), math.hypot(*apart.values())
+        group, _ = row.group
+        (together if group else alone).setdefault(group or row.name, []).append(row)
+    reached = [_reach(members, along, confidence, by_shape=by_shape) for members in alone.values()]
+    reached += [_reach_together(members, along, confidence, by_shape=by_shape) for members in together.values()]
+    return sum(reached, start=0.0), math.hypot(*reached)
 
 
 def _reach(rows: Sequence[Contributor], along: FloatArray, confidence: float, *, by_shape: bool) -> float:
@@ -466,6 +470,22 @@ def _reach(rows: Sequence[Contributor], along: FloatArray, confidence: float, *,
     spread = along @ covariance(gaussian) @ along.T
     # Seen from other axes, ends of several axes meet in a corner.
     return _radius(confidence, spread, tail) + float(np.linalg.norm(np.abs(along) @ bounded))
+
+
+def _reach_together(rows: Sequence[Contributor], along: FloatArray, confidence: float, *, by_shape: bool) -> float:
+    """Furthest that the rows of a group reach: one probability moves all, each to its own half-width at most.
+
+    Where their signs and shapes differ, that may be on the way and not at an end.
+    """
+    from scipy.special import ndtr
+
+    uniform = ndtr(_ON_THE_WAY)
+    errors = np.zeros((3, len(uniform)))
+    for row in rows:
+        end = half_width(row.distribution, confidence, row.tail_997 if by_shape else GAUSSIAN_997)
+        deviate = deviates(row.distribution, uniform, uniform, GAUSSIAN_997)
+        errors[AXES.index(row.axis)] += row.group[1] * row.sigma_arcsec * np.clip(deviate, -end, end)
+    return float(_size(along @ errors).max())
 
 
 def _meeting(mean: FloatArray, worst: float, chance: FloatArray) -> FloatArray:

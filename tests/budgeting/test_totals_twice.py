@@ -109,6 +109,20 @@ def group_of(entry: Contributor) -> tuple[str, float]:
     return text.removeprefix("-").strip(), -1.0 if text.startswith("-") else 1.0
 
 
+def group_reach(rows: list[Contributor], axes: list[int]) -> float:
+    """Largest error of rows that share their probability, over all of it; Gaussian rows end at their half-width."""
+    probability = np.concatenate((np.linspace(0.0, 1.0, 4001), [0.5 + 0.5 * CONFIDENCE]))
+    limit = stats.norm.ppf(0.5 + 0.5 * CONFIDENCE)
+    shapes = {
+        "gaussian": np.clip(stats.norm.ppf(probability), -limit, limit),
+        "arcsine": -math.sqrt(2.0) * np.cos(np.pi * probability),
+    }
+    errors = np.zeros((3, len(probability)))
+    for entry in rows:
+        errors[AXES.index(entry.axis)] += group_of(entry)[1] * entry.sigma_arcsec * shapes[entry.distribution]
+    return float(np.linalg.norm(errors[axes], axis=0).max())
+
+
 def correlation(one: Contributor, other: Contributor) -> float:
     if group_of(one)[0] or group_of(other)[0]:
         return group_of(one)[1] * group_of(other)[1] * (group_of(one)[0] == group_of(other)[0])
@@ -188,14 +202,18 @@ def bounds(
     worst: dict[bool, dict[str, float]] = {False: {}, True: {}}
     for by_shape, name in itertools.product((False, True), dict.fromkeys(entry.name for entry in rows)):
         own = [entry for entry, yes in zip(rows, spreads, strict=True) if entry.name == name and not yes]
+        own = [entry for entry in own if not group_of(entry)[0]]
         if not own:
             continue
         gaussian = [entry for entry in own if entry.distribution == "gaussian"]
         tail = max([GAUSSIAN_997, *(entry.tail_997 for entry in gaussian)]) if by_shape else GAUSSIAN_997
         size = reach(covariance(gaussian)[np.ix_(axes, axes)], tail)
         size += math.hypot(*(ENDS[e.distribution] * e.sigma_arcsec for e in own if e.distribution != "gaussian"))
-        group = f"group {group_of(own[0])[0]}" if group_of(own[0])[0] else name
-        worst[by_shape][group] = worst[by_shape].get(group, 0.0) + size
+        worst[by_shape][name] = size
+    for by_shape, group in itertools.product((False, True), dict.fromkeys(group_of(entry)[0] for entry in rows)):
+        own = [e for e, yes in zip(rows, spreads, strict=True) if group and group_of(e)[0] == group and not yes]
+        if own:
+            worst[by_shape][f"group {group}"] = group_reach(own, axes)
     chance, rest = np.zeros((len(axes), SAMPLES)), np.zeros((len(axes), SAMPLES))
     for entry, error, yes in zip(rows, errors, spreads, strict=True):
         if error is not None:
@@ -241,6 +259,8 @@ def second(rows: list[Contributor], errors: list[np.ndarray | None], scope: str,
     at_least = bounds([e for e, _ in sure], [s for _, s in sure], names, kind)
     for name in ("rule_least_arcsec", "sampled_least_arcsec"):
         found[name] = min(at_least[name], found[name.replace("_least", "")])
+    # The rule may call nothing least that samples do not reach.
+    found["rule_least_arcsec"] = min(found["rule_least_arcsec"], found["sampled_least_arcsec"])
     weight: dict[str, float] = {}
     for entry, _ in counted:
         size = reach(np.array([[entry.sigma_arcsec**2]]), entry.tail_997)
