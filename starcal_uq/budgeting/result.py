@@ -20,6 +20,7 @@ from starcal_uq.core.constants import AXES, CROSS_BORESIGHT
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.files import atomic_path, cell_content, cell_text, reading
+from starcal_uq.core.status import Level
 from starcal_uq.core.types import AnyDict, FloatArray
 
 if TYPE_CHECKING:
@@ -80,6 +81,11 @@ class Outcome(Shown):
             return "violated"
         # No row at all is assessed, or the samples end too early: the margin is not a number.
         return "met" if self.margin_arcsec >= 0.0 and not self.total.at_least else "open"
+
+    @property
+    def level(self) -> Level:
+        """The verdict as the outcome of a check."""
+        return {"violated": Level.FAIL, "open": Level.WARN, "met": Level.PASS}[self.verdict]
 
     @property
     def between(self) -> bool:

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 _IN_NOTEBOOK = "JPY_PARENT_PID" in os.environ
 # What is no terminal has no width of its own: tables get the room that they need there, or what COLUMNS says.
 _WIDTH = None if (sys.stdout.isatty() and not _IN_NOTEBOOK) or "COLUMNS" in os.environ else 110
-_STYLES = {Level.PASS: "green", Level.WARN: "yellow", Level.FAIL: "red"}
+STYLES = {Level.PASS: "green", Level.WARN: "yellow", Level.FAIL: "red"}
 # Names of files, runs and requirements may hold square brackets and colons, which are no markup.
 out = Console(width=_WIDTH, markup=False, emoji=False, highlight=False)
 err = Console(stderr=True, markup=False, emoji=False, highlight=False)
@@ -82,7 +82,7 @@ def show_posterior(posterior: Posterior) -> None:
     print_table(posterior_table(posterior))
     diagnostics = posterior.diagnostics
     for check in diagnostics.checks:
-        say(f"- {check}", style=_STYLES[check.level])
+        say(f"- {check}", style=STYLES[check.level])
 
 
 def note(message: str) -> None:
@@ -148,7 +148,7 @@ def show_summary(run: Run, page: Path) -> None:
     results = run.results
     for line in ("", *terminal_summary(results), f"Report: {page.resolve()}"):
         say(line)
-    style = _STYLES[results.verdict.level]
+    style = STYLES[results.verdict.level]
     for line in verdict_lines(results.verdict):
         say(line, style=style)
 

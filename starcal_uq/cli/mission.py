@@ -9,7 +9,7 @@ import typer
 
 import starcal_uq as sc
 from starcal_uq.cli.answers import Answer
-from starcal_uq.cli.console import note, print_table, progress_bar, say, tell
+from starcal_uq.cli.console import STYLES, note, print_table, progress_bar, say, tell
 from starcal_uq.cli.options import (
     LEAST_SIGMA_PX,
     CameraFile,
@@ -115,7 +115,9 @@ def budget_command(
     show_budget(found)
     files = [run / "budget.csv", *(out or [])]
     say(f"Budget: {', '.join(map(str, files))}")
-    return Answer({"run": run, "files": files, "template": None, "budget": found}, tell_violations(found))
+    tell_violations(found)
+    results = {"run": run, "files": files, "template": None, "budget": found}
+    return Answer(results, int(bool(found.violations)))
 
 
 def show_budget(found: Budget) -> None:
@@ -127,16 +129,14 @@ def show_budget(found: Budget) -> None:
     for sentence in (*explanations(found), *found.notes):
         say(sentence)
     for outcome in found.outcomes:
-        style = {"violated": "red", "met": "green"}.get(outcome.verdict, "yellow")
-        say(outcome.text, style=style)
+        say(outcome.text, style=STYLES[outcome.level])
     say(found.text)
 
 
-def tell_violations(found: Budget) -> int:
-    """Say which requirements are violated; exit status 1 where any is."""
+def tell_violations(found: Budget) -> None:
+    """Say which requirements are violated."""
     for outcome in found.violations:
         tell(f"violated: {outcome.text}")
-    return int(bool(found.violations))
 
 
 def compare_command(

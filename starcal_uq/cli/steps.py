@@ -303,7 +303,10 @@ def report_command(
     ] = "html",
     force: Force = False,
 ) -> Answer:
-    """Write RUN/report.html, one self-contained file, from whatever the run holds; as PDF too, or a notebook."""
+    """Write RUN/report.html, one self-contained file, from whatever the run holds; as PDF too, or a notebook.
+
+    Status 1 when a check failed or a requirement is violated.
+    """
     held = sc.Run(run, tell=note)
     if out is not None and not notebook:
         raise typer.BadParameter("--out names a notebook: add --notebook; the report has its place in RUN.")
@@ -317,7 +320,7 @@ def report_command(
         with progress_bar("figures") as bar:
             page = held.pdf(force=force) if format == "pdf" else held.report(force=force, progress=bar)
         show_summary(held, page)
-    return Answer({"run": run, "report": page})
+    return Answer({"run": run, "report": page}, held.verdict.level.exit_status)
 
 
 def export_command(

@@ -71,10 +71,11 @@ class Level(Enum):
 
 
 class Question(Enum):
-    """What a check helps to answer: did it converge, and can it be trusted?"""
+    """What a check helps to answer: did it converge, can it be trusted, and is it enough for the mission?"""
 
     CONVERGED = "converged"
     TRUSTWORTHY = "trustworthy"
+    REQUIRED = "required"
 
 
 @dataclass(frozen=True)

@@ -97,6 +97,42 @@ def test_violated_requirement_is_named_and_ends_with_status_1(cli, run, tmp_path
     assert "R-1 impossible" in text
 
 
+def test_requirements_are_checks_of_verdict_banner_first_page_and_status(cli, run, tmp_path):
+    (tmp_path / "mission.toml").write_text(REQUIREMENTS)
+    assert cli("budget", "run", "--budget", "mission.toml")[0] == 1
+    status, out, _ = cli("report", "run")
+    assert status == 1
+    assert "Verdict (fail): Violated: requirement 'R-1 impossible'." in out
+    assert "Reduce 'centroid noise (NEA)', or relax the limit" in " ".join(out.split())
+    page = (run / "report.html").read_text("utf-8")
+    banner, first_page = page[page.index('<div class="verdict') :].split("</header>")[0], page.split('id="appendix"')[0]
+    assert banner.startswith('<div class="verdict fail"') and "requirement &#39;R-1 impossible&#39;" in banner
+    assert "<b>Requirement &#39;R-1 impossible&#39;.</b>" in first_page
+    assert "requirement &#39;R-1 impossible&#39; is violated" in first_page
+    document = json.loads((run / "verdict.json").read_text())
+    levels = {check["name"]: check["level"] for check in document["checks"] if check["question"] == "required"}
+    assert levels == {"Requirement 'R-1 impossible'": "fail", "Requirement 'R-2 generous'": "warning"}
+    assert document["level"] == "fail" and document["exit_status"] == 1
+    # What is violated is the mission's: the numbers of the camera stay what they are.
+    verdict = sc.Run(run).verdict
+    assert "Do not use these numbers" not in verdict.headline
+    # Control: without the requirement that is violated, nothing failed.
+    (tmp_path / "kind.toml").write_text(REQUIREMENTS.replace("0.001", "1e4"))
+    assert cli("budget", "run", "--budget", "kind.toml", "--force")[0] == 0
+    status, out, _ = cli("report", "run")
+    assert status == 0 and "Open: requirement 'R-1 impossible' and requirement 'R-2 generous'." in " ".join(out.split())
+
+
+def test_a_run_that_violates_a_requirement_fails(cli, inputs, tmp_path):
+    (tmp_path / "mission.toml").write_text(REQUIREMENTS)
+    words = ["run", inputs / "obs.csv", inputs / "camera.toml", "-o", "new", "--budget", "mission.toml"]
+    status, out, err = cli(*words, "--draws", "50", "--steps", "60", "--json")
+    document = json.loads(out)
+    assert status == document["exit_status"] == 1 and document["verdict"]["level"] == "fail"
+    failed = [check["name"] for check in document["verdict"]["checks"] if check["level"] == "fail"]
+    assert "Requirement 'R-1 impossible'" in failed and "violated: 'R-1 impossible'" in err
+
+
 def test_run_refuses_a_wrong_budget_file_before_any_work(cli, inputs, tmp_path):
     (tmp_path / "wrong.toml").write_text("[[contributor]]\nname = 3\n")
     status, _, err = cli("run", inputs / "obs.csv", inputs / "camera.toml", "-o", "new", "--budget", "wrong.toml")

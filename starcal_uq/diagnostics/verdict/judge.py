@@ -7,6 +7,7 @@ may be used by someone who has read it.
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar
 
@@ -130,10 +131,12 @@ def judge(
     attitude: AttitudeError | None = None,
     diagnosis: Diagnosis | None = None,
     place: Place | None = None,
+    requirements: Sequence[Check] = (),
 ) -> Verdict:
     """Check a run: everything that is known of it; `truth` is the camera of a simulation.
 
-    With its place, remedies are commands that name its files.
+    With its place, remedies are commands that name its files. The requirements of its budget are checks like the
+    others.
     """
     checks: list[Check | None] = [estimate.estimation(cal, post), estimate.determined(cal)]
     checks += [estimate.estimators_agree(cal)]
@@ -152,11 +155,23 @@ def judge(
         checks += [draws.propagation(attitude)]
     if truth is not None and truth.parameter_names == cal.parameter_names:
         checks += [estimate.against_truth(cal, truth, post)]
+    checks += requirements
     found = tuple(check if place is None else place.exact(check) for check in checks if check is not None)
     return Verdict(found, _headline(found, post is not None))
 
 
 def _headline(checks: tuple[Check, ...], sampled: bool) -> str:
+    """What becomes of the requirements, and whether the numbers can be used."""
+    required = [check for check in checks if check.question is Question.REQUIRED]
+    violated = [check.phrase for check in required if check.level is Level.FAIL]
+    still_open = [check.phrase for check in required if check.level is Level.WARN]
+    sentences = [f"Violated: {join_words(violated)}."] if violated else []
+    sentences += [_usable([check for check in checks if check not in required], sampled)]
+    sentences += [f"Open: {join_words(still_open)}."] if still_open else []
+    return " ".join(sentences)
+
+
+def _usable(checks: Sequence[Check], sampled: bool) -> str:
     failed = [c.phrase for c in checks if c.level is Level.FAIL]
     warned = [c.phrase for c in checks if c.level is Level.WARN]
     if failed:

@@ -14,6 +14,7 @@ from starcal_uq.budgeting.totals import Total
 from starcal_uq.core.errors import BudgetError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.files import atomic_path, atomic_write_text, cell_text
+from starcal_uq.core.status import Level
 from starcal_uq.presentation.figures.budgeting import plot_budget
 from starcal_uq.presentation.figures.style import svg_bytes
 from starcal_uq.presentation.html import template_environment
@@ -172,7 +173,7 @@ def _requirements(sheet: Worksheet, budget: Budget) -> None:
                 *(outcome.verdict, outcome_text(outcome)),
             ]
         )
-    colours = [{"violated": _RED, "open": _AMBER, "met": _GREEN}[outcome.verdict] for outcome in budget.outcomes]
+    colours = [{Level.FAIL: _RED, Level.WARN: _AMBER, Level.PASS: _GREEN}[outcome.level] for outcome in budget.outcomes]
     _table(sheet, header, rows, [34, 17, 17, 13, 12, 12, 14, 14, 12, 14, 12, 12, 70], colours)
 
 

@@ -77,6 +77,7 @@ def context(results: Results) -> dict[str, Any]:
         "Level": Level,
         "converged_level": worst(converged),
         "trust_level": worst(trust),
+        "required_level": worst(verdict.of(Question.REQUIRED)),
         "converged_words": _answer(converged),
         "trust_words": _answer(trust),
         "limits": limits(obs, cal, results.coupling, results.attitude, results.diagnosis),

@@ -11,6 +11,7 @@ from starcal_uq.camera.camera import Camera
 from starcal_uq.core.display import Shown
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.observations.table import Observations
+from starcal_uq.presentation.words.budgeting import requirement_checks
 
 if TYPE_CHECKING:
     from starcal_uq.budgeting.result import Budget
@@ -60,7 +61,8 @@ class Results(Shown):
         from starcal_uq.diagnostics.verdict.judge import judge
 
         known = (self.observations, self.calibration, self.posterior, self.truth, self.attitude)
-        return judge(*known, diagnosis=self.diagnosis, place=self.place)
+        required = requirement_checks(self.budget)
+        return judge(*known, diagnosis=self.diagnosis, place=self.place, requirements=required)
 
     def command(self, text: str) -> str:
         """A command with the files of this run in place of its words in capitals."""

@@ -41,7 +41,12 @@ def uses(results: Results) -> tuple[list[str], list[str]]:
     """What of the run can be used, and what cannot or only with care; sentences."""
     verdict, error, budget = results.verdict, results.attitude, results.budget
     usable, unusable = [], []
-    failed, warned = (join_words([c.phrase for c in verdict.at(level)]) for level in (Level.FAIL, Level.WARN))
+    violated, failed, warned = (
+        join_words([check.phrase for check in verdict.at(level) if (check.question is Question.REQUIRED) == required])
+        for level, required in ((Level.FAIL, True), (Level.FAIL, False), (Level.WARN, False))
+    )
+    if violated:
+        unusable.append(f"The sensor with this budget: {violated} is violated.")
     if failed:
         unusable.append(f"Parameters, intervals and attitude error: {failed} failed.")
         if worst(verdict.of(Question.CONVERGED)) is Level.FAIL:
@@ -105,7 +110,7 @@ def budget_summary(budget: Budget) -> TextTable:
             )
             for o in budget.outcomes
         )
-        marks = tuple({"violated": "fail", "open": "warning"}.get(o.verdict, "pass") for o in budget.outcomes)
+        marks = tuple(o.level.value for o in budget.outcomes)
         return TextTable(
             ("Requirement", "Of", "Limit [arcsec]", "Reached [arcsec]", "Outcome"), asked, "", "llrrl", marks
         )

@@ -13,6 +13,7 @@ from starcal_uq.budgeting.shapes import one_axis_factor, two_axis_radius
 from starcal_uq.budgeting.totals import Total
 from starcal_uq.core.constants import AXES, TOTAL_AXES
 from starcal_uq.core.formatting import decimals_for, fixed, join_words, plural, significant
+from starcal_uq.core.status import Check, Level, Question
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND
 
@@ -236,7 +237,7 @@ def _requirement_row(outcome: Outcome) -> Row:
         "margin": "–" if math.isnan(outcome.margin_arcsec) else significant(outcome.margin_arcsec, 3),
         "judged_by": {"both": "the larger"}.get(asked.judged_by, asked.judged_by),
         "verdict": outcome.verdict,
-        "level": {"violated": "fail", "open": "warning", "met": "pass"}[outcome.verdict],
+        "level": outcome.level.value,
         "sentence": outcome_text(outcome),
     }
 
@@ -316,6 +317,38 @@ def outcome_text(outcome: Outcome) -> str:
         missing = f"{count} contributors are" if count > 1 else "1 contributor is"
         return f"{asked.name!r} ({what}) is open: {numbers} so far, but {missing} not assessed."
     return f"{asked.name!r} ({what}) is met: {numbers}, margin {significant(outcome.margin_arcsec, 3)} arcsec."
+
+
+def requirement_checks(budget: Budget | None) -> tuple[Check, ...]:
+    """The requirements of a budget as checks of a run's verdict; none without a budget."""
+    return tuple(_requirement_check(outcome) for outcome in (() if budget is None else budget.outcomes))
+
+
+def _requirement_check(outcome: Outcome) -> Check:
+    asked, total = outcome.requirement, outcome.total
+    reached = outcome.least_arcsec if outcome.level is Level.FAIL else outcome.bound_arcsec
+    return Check(
+        name=f"Requirement {asked.name!r}",
+        question=Question.REQUIRED,
+        level=outcome.level,
+        value=NOT_RESOLVED if outcome.unresolved else f"{bound(reached, total.at_least)} arcsec",
+        bound=f"at most {significant(asked.limit_arcsec, 3)} arcsec",
+        sentence=outcome_text(outcome),
+        advice=_requirement_advice(outcome),
+    )
+
+
+def _requirement_advice(outcome: Outcome) -> str:
+    """What brings a requirement nearer to being met."""
+    missing = outcome.total.not_assessed
+    if outcome.level is Level.PASS:
+        return ""
+    if outcome.unresolved:
+        return "Let the rule judge it alone, or state a confidence that the samples resolve."
+    if outcome.level is Level.WARN and not outcome.between:
+        return f"State in the budget file what is missing: {join_words(missing)}."
+    largest = repr(outcome.total.dominant) if outcome.total.dominant else "the largest contributors"
+    return f"Reduce {largest}, or relax the limit in the budget file."
 
 
 def contributors_table(budget: Budget) -> TextTable:
