@@ -23,7 +23,7 @@ from starcal_uq.budgeting.rows import (
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import join_words, plural
 from starcal_uq.core.types import FloatArray
-from starcal_uq.propagation.attitude_error import CONTRIBUTORS, IF_MODEL_HOLDS, WITH_MISFIT_FOUND
+from starcal_uq.propagation.attitude_error import CONTRIBUTORS, IF_MODEL_HOLDS, WITH_MISFIT_FOUND, choice_words
 
 if TYPE_CHECKING:
     from starcal_uq.inference.posterior import Posterior
@@ -93,7 +93,7 @@ def misfit_notes(attitude: AttitudeError) -> tuple[str, ...]:
     none = (
         "The tests of the model found nothing that inflates the calibration rows; what they cannot see is not in them."
     )
-    return (note if rows else none, *found.notes)
+    return tuple(filter(None, (note if rows else none, choice_words(attitude), *found.notes)))
 
 
 def axis_correlations(covariance: FloatArray, scale: FloatArray) -> tuple[tuple[float, ...], ...]:

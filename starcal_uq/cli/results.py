@@ -142,6 +142,7 @@ class AttitudeRow(Part):
     p997_if_model_holds_arcsec: Number = says("Half-width that holds 99.7 %")
     p997_with_misfit_found_arcsec: Number = says("The same with the misfit found")
     first_order_arcsec: Number = says("Standard deviation by first-order propagation")
+    choice_of_model_arcsec: Number = says("Shift by models as good, in no other figure; null: not assessed")
     absorbed_by_alignment: str = says("yes, no or in part")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,9 +29,10 @@ def with_misfit(error: AttitudeError, diagnosis: Diagnosis, post: Posterior, obs
 
     - The pattern that the misfit tests found goes through the geometry of the frames: what it does to their attitudes
       counts, as common rotation and rest, the noise of its amplitudes taken off.
-    - A distortion model that predicts as well, but moves the attitudes by more than the standard deviation within the
-      fitted one, counts with that difference; every one does if the fitted model is rejected.
-      Pattern and model are two views of one error, of which the larger counts.
+    - A distortion model that the data prefer to the fitted one counts by how far it moves the attitudes, in squares
+      as far as they prefer it (`ModelScore.preferred`); every one that is not rejected does in full if the fitted
+      model is. Pattern and model are two views of one error, of which the larger counts. What is left of a move that
+      exceeds the standard deviation within the fitted model is the choice of the model: stated beside the error.
     - Frames that disagree more than their formal errors allow multiply common rotation and rest by the jackknife ratio,
       over what of it the draws hold already.
 
@@ -53,7 +54,7 @@ def with_misfit(error: AttitudeError, diagnosis: Diagnosis, post: Posterior, obs
         # Of an earlier version: what was found has no shape there.
         return error
     pattern, pattern_reasons = _pattern(error, diagnosis, post, obs)
-    common_shift, rest_shift, common_models, rest_models = _models(error, diagnosis)
+    models = _Models.of(error, diagnosis)
     factor, frames = _frames(diagnosis, post)
     phase = [name for name in diagnosis.misfit.pattern.families if "pixel phase" in name]
     notes: tuple[str, ...] = ()
@@ -64,11 +65,14 @@ def with_misfit(error: AttitudeError, diagnosis: Diagnosis, post: Posterior, obs
         )
     found = MisfitFound(
         factor=factor,
-        common_arcsec=np.maximum(pattern.common_arcsec, common_shift),
-        rest_arcsec=np.maximum(pattern.rest_arcsec, rest_shift),
-        common_reasons=(*pattern_reasons[0], *frames, *common_models),
-        rest_reasons=(*pattern_reasons[1], *frames, *rest_models),
+        common_arcsec=np.maximum(pattern.common_arcsec, models.booked[0]),
+        rest_arcsec=np.maximum(pattern.rest_arcsec, models.booked[1]),
+        common_reasons=(*pattern_reasons[0], *frames, *models.reasons),
+        rest_reasons=(*pattern_reasons[1], *frames, *models.reasons),
         notes=notes,
+        choice_models=tuple(sorted(models.choice_names)),
+        choice_common_arcsec=models.choice[0],
+        choice_rest_arcsec=models.choice[1],
     )
     return replace(error, misfit=found)
 
@@ -96,31 +100,48 @@ def _pattern(
     return found, reasons
 
 
-def _models(
-    attitude: AttitudeError, diagnosis: Diagnosis
-) -> tuple[FloatArray, FloatArray, tuple[str, ...], tuple[str, ...]]:
-    """Largest shift by models that predict as well: of the common rotation and of the rest, arcsec per axis."""
-    common, rest = np.zeros(3), np.zeros(3)
-    names: tuple[set[str], set[str]] = (set(), set())
-    found = diagnosis.comparison
-    if found is None:
-        return common, rest, (), ()
-    mine = found.of(found.fitted)
-    rejected = mine is not None and mine.rejected
-    for score in found.scores:
-        if score.rejected or score.model == found.fitted:
-            continue
-        shifts = (np.abs(score.common_arcsec), np.abs(score.rest_arcsec))
+@dataclass(frozen=True, eq=False)
+class _Models:
+    """How other distortion models move the common rotation and the rest (2, 3), arcsec per axis."""
+
+    booked: FloatArray  # What the data prefer of it
+    choice: FloatArray  # What they do not
+    # Models behind each.
+    booked_names: set[str]
+    choice_names: set[str]
+
+    @classmethod
+    def of(cls, attitude: AttitudeError, diagnosis: Diagnosis) -> _Models:
+        """The largest moves by any model that is not rejected."""
+        made = cls(np.zeros((2, 3)), np.zeros((2, 3)), set(), set())
+        found = diagnosis.comparison
+        if found is None:
+            return made
+        mine = found.of(found.fitted)
+        rejected = mine is not None and mine.rejected
         # A sample of the frames sees no shift below the sigma that it would give by itself.
-        sigmas = [sigma / np.sqrt(found.share) for sigma in (attitude.common_arcsec, attitude.rest_arcsec)]
-        for total, shift, sigma, which in zip((common, rest), shifts, sigmas, names, strict=True):
-            counted = (shift > sigma) | rejected
-            if counted.any():
-                total[:] = np.maximum(total, np.where(counted, shift, 0.0))
-                which.add(score.model)
-    how = "better than the fitted one, and moves it" if rejected else "as well, and moves it by more than its sigma"
-    reasons = [(f"distortion model {' or '.join(map(repr, sorted(w)))} predicts {how}",) if w else () for w in names]
-    return common, rest, reasons[0], reasons[1]
+        sigma = np.stack((attitude.common_arcsec, attitude.rest_arcsec)) / np.sqrt(found.share)
+        for score in found.scores:
+            if score.rejected or score.model == found.fitted:
+                continue
+            weight = 1.0 if rejected else score.preferred
+            shift = np.abs((score.common_arcsec, score.rest_arcsec))
+            choice = np.where(shift > sigma, shift * np.sqrt(1.0 - weight), 0.0)
+            if choice.any():
+                np.maximum(made.choice, choice, out=made.choice)
+                made.choice_names.add(score.model)
+            if weight > 0.0:
+                np.maximum(made.booked, shift * np.sqrt(weight), out=made.booked)
+                made.booked_names.add(score.model)
+        return made
+
+    @property
+    def reasons(self) -> tuple[str, ...]:
+        """Why `booked` counts."""
+        if not self.booked_names:
+            return ()
+        names = " or ".join(map(repr, sorted(self.booked_names)))
+        return (f"distortion model {names} predicts better than the fitted one, and moves it",)
 
 
 def _frames(diagnosis: Diagnosis, post: Posterior) -> tuple[float, tuple[str, ...]]:

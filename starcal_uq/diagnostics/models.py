@@ -77,6 +77,9 @@ class ModelScore:
         Root mean square over frames of what is left of the rotation.
     rejected : bool
         True if another model predicts better beyond doubt.
+    preferred : float
+        How far the data prefer this model to the fitted one: 0 up to one standard error of the difference of their
+        scores, 1 where the fitted one is rejected against it, linear between. 0 of an earlier version.
     """
 
     model: str
@@ -92,6 +95,7 @@ class ModelScore:
     common_arcsec: tuple[float, float, float]
     rest_arcsec: tuple[float, float, float]
     rejected: bool
+    preferred: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -191,13 +195,11 @@ def compare_models(
     found_scores = {name: _leave_out(normals, n_draws, rng) for name, normals in fits.items()}
     best = max(found_scores, key=lambda name: float(np.sum(found_scores[name].pointwise)))
     reference = found_scores[best].pointwise
-    beyond_doubt = student_quantile(1.0 - 2.0 * REJECT_P, len(reference) - 1)
+    mine = found_scores.get(cal.camera.distortion)
     scores = []
     for name, normals in fits.items():
         loo = found_scores[name]
-        difference = loo.pointwise - reference
-        spread = float(np.sqrt(len(difference)) * np.std(difference, ddof=1))
-        total = float(np.sum(difference))
+        total, spread, doubt = _difference(loo.pointwise - reference)
         common, rest = _moved(cal, normals)
         scores.append(
             ModelScore(
@@ -213,7 +215,8 @@ def compare_models(
                 n_replaced=loo.n_replaced,
                 common_arcsec=common,
                 rest_arcsec=rest,
-                rejected=bool(-total > max(beyond_doubt * spread, REJECT_ELPD)),
+                rejected=-total > doubt,
+                preferred=0.0 if mine is None else _preference(loo.pointwise - mine.pointwise),
             )
         )
     scores.sort(key=lambda score: -score.elpd)
@@ -221,6 +224,19 @@ def compare_models(
     return ModelComparison(
         tuple(scores), cal.camera.distortion, failed, n_frames=obs.n_frames, n_sampled_frames=sampled
     )
+
+
+def _difference(pointwise: FloatArray) -> tuple[float, float, float]:
+    """Difference of two scores from that of every frame (K,), its standard error, and what it is beyond doubt."""
+    spread = float(np.sqrt(len(pointwise)) * np.std(pointwise, ddof=1))
+    quantile = student_quantile(1.0 - 2.0 * REJECT_P, len(pointwise) - 1)
+    return float(np.sum(pointwise)), spread, max(quantile * spread, REJECT_ELPD)
+
+
+def _preference(pointwise: FloatArray) -> float:
+    """`ModelScore.preferred` of a model from its scores less those of the fitted one, frame by frame (K,)."""
+    gain, spread, doubt = _difference(pointwise)
+    return float(np.clip((gain - spread) / (doubt - spread), 0.0, 1.0))
 
 
 def of_all_stars(found: ModelComparison, obs: Observations, cal: Calibration) -> ModelComparison:

@@ -19,7 +19,7 @@ import numpy as np
 from starcal_uq.core.constants import AXES, INTERACTION, TOTAL_AXES
 from starcal_uq.core.display import Shown
 from starcal_uq.core.files import reading, write_csv
-from starcal_uq.core.formatting import count, plural, significant
+from starcal_uq.core.formatting import count, join_words, plural, significant
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.types import BoolArray, FloatArray
 from starcal_uq.maths.circular import mixture_radius
@@ -50,6 +50,7 @@ _SMALLEST_ARCSEC = 1e-6
 
 IF_MODEL_HOLDS, WITH_MISFIT_FOUND = "if the model holds", "with the misfit found"
 NOT_ASSESSED = "not assessed"
+CHOICE_OF_MODEL = "choice of model"
 # Confidences of the half-widths, and the two-sided quantiles of a Gaussian error.
 _CONFIDENCES = (0.95, 0.997)
 _GAUSSIAN = (HALF_WIDTH_95, HALF_WIDTH_997)
@@ -106,6 +107,11 @@ class MisfitFound:
         Reasons for each of the two; empty if nothing was found.
     notes : tuple of str
         Further sentences for the reader.
+    choice_models : tuple of str
+        Distortion models that the data do not prefer but do not reject either, and that move either by more than its
+        standard deviation.
+    choice_common_arcsec, choice_rest_arcsec : (3,) array
+        How far these models move the common rotation and the rest, arcsec: a choice, which no error here holds.
     """
 
     factor: float
@@ -114,6 +120,9 @@ class MisfitFound:
     common_reasons: tuple[str, ...] = ()
     rest_reasons: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    choice_models: tuple[str, ...] = ()
+    choice_common_arcsec: FloatArray = field(default_factory=lambda: np.zeros(3))
+    choice_rest_arcsec: FloatArray = field(default_factory=lambda: np.zeros(3))
 
     @property
     def reasons(self) -> tuple[str, ...]:
@@ -271,6 +280,20 @@ class AttitudeError(Shown):
         return np.stack([held[0], *calibration, held[4]])
 
     @property
+    def choice_of_model_arcsec(self) -> FloatArray:
+        """How far models move attitudes that the data neither prefer nor reject (5, 4); in no other figure.
+
+        0 where no model moves them by more than the standard deviation; NaN as long as the model was not tested.
+        """
+        made = np.full((len(CONTRIBUTORS), len(TOTAL_AXES)), np.nan)
+        if (found := self.misfit) is not None:
+            common, rest = found.choice_common_arcsec, found.choice_rest_arcsec
+            nothing = np.zeros(3)
+            rows = (nothing, common, rest, np.hypot(common, rest), nothing)
+            made[:] = [with_cross(row) for row in rows]
+        return made
+
+    @property
     def headline_arcsec(self) -> FloatArray:
         """Standard deviations (5, 4) with the misfit found; those if the model holds where that is not assessed."""
         return self.if_model_holds_arcsec if self.misfit is None else self.with_misfit_found_arcsec
@@ -299,7 +322,8 @@ class AttitudeError(Shown):
         Columns are ``contributor``, ``axis``, the standard deviations ``if_model_holds_arcsec`` and
         ``with_misfit_found_arcsec`` (NaN: not assessed), the half-widths ``p95_if_model_holds_arcsec``,
         ``p95_with_misfit_found_arcsec`` and the same for ``p997``, ``first_order_arcsec`` (sigma by first-order
-        propagation) and ``absorbed_by_alignment`` (yes, no, in part). The cross-boresight rows hold the root mean
+        propagation), ``choice_of_model_arcsec`` (in no other column) and ``absorbed_by_alignment`` (yes, no, in part).
+        The cross-boresight rows hold the root mean
         square of the sigmas of pitch and yaw.
         """
         import pandas as pd
@@ -325,6 +349,7 @@ class AttitudeError(Shown):
                 "p997_if_model_holds_arcsec": self.p997_arcsec.ravel(),
                 "p997_with_misfit_found_arcsec": p997.ravel(),
                 "first_order_arcsec": np.concatenate([with_cross(values) for values in analytic]),
+                "choice_of_model_arcsec": self.choice_of_model_arcsec.ravel(),
                 "absorbed_by_alignment": np.repeat(_ABSORBED, len(TOTAL_AXES)).astype(object),
             }
         )
@@ -426,6 +451,22 @@ def two_figures(with_misfit_found: float, if_model_holds: float) -> str:
     if np.isnan(with_misfit_found):
         return f"{held} arcsec {IF_MODEL_HOLDS} ({WITH_MISFIT_FOUND}: {NOT_ASSESSED})"
     return f"{held} arcsec" if found == held else f"{found} arcsec {WITH_MISFIT_FOUND} ({held} {IF_MODEL_HOLDS})"
+
+
+def choice_words(error: AttitudeError) -> str:
+    """What other models that the data do not reject would do to attitudes, in a sentence; empty where it is little."""
+    if error.misfit is None or not error.misfit.choice_models:
+        return ""
+    names = join_words([repr(name) for name in error.misfit.choice_models])
+    verb = "predicts" if len(error.misfit.choice_models) == 1 else "predict"
+    common, rest = (
+        f"{significant(float(row[3]))} arcsec across the boresight and {significant(float(row[2]))} in roll"
+        for row in error.choice_of_model_arcsec[1:3]
+    )
+    return (
+        f"{CHOICE_OF_MODEL[0].upper()}{CHOICE_OF_MODEL[1:]}, in none of these errors: {names} {verb} about as well as "
+        f"the fitted model, and would move the common rotation by up to {common}, the rest by up to {rest}."
+    )
 
 
 def _gaussian_tails(sigmas: FloatArray, confidence: float, one_axis: float) -> FloatArray:

@@ -285,11 +285,15 @@ def test_what_a_misfit_adds_is_in_the_row_with_its_reason(tmp_path: Path, factor
     assert read[0].if_model_holds_arcsec == 0.006
 
 
-def comparison(rejected: bool) -> Any:
+def score(model: str, rejected: bool, common: Any, rest: Any, preferred: float = 0.0) -> Any:
+    return SimpleNamespace(model=model, rejected=rejected, common_arcsec=common, rest_arcsec=rest, preferred=preferred)
+
+
+def comparison(rejected: bool, preferred: float = 0.0) -> Any:
     scores = [
-        SimpleNamespace(model="brown3", rejected=False, common_arcsec=(9.0, 0.1, 0.0), rest_arcsec=(0.001, 0.02, 0.0)),
-        SimpleNamespace(model="brown", rejected=rejected, common_arcsec=(0.0,) * 3, rest_arcsec=(0.0,) * 3),
-        SimpleNamespace(model="none", rejected=True, common_arcsec=(99.0,) * 3, rest_arcsec=(99.0,) * 3),
+        score("brown3", False, (9.0, 0.1, 0.0), (0.001, 0.02, 0.0), preferred),
+        score("brown", rejected, (0.0,) * 3, (0.0,) * 3),
+        score("none", True, (99.0,) * 3, (99.0,) * 3),
     ]
     return SimpleNamespace(
         scores=tuple(scores),
@@ -299,9 +303,17 @@ def comparison(rejected: bool) -> Any:
     )
 
 
-def test_models_that_predict_as_well_count_where_they_differ_by_more_than_sigma() -> None:
+def test_models_count_as_far_as_the_data_prefer_them() -> None:
     found = with_misfit(attitude(), diagnosis(comparison=comparison(False)), POST, OBS).misfit  # type: ignore[arg-type]
-    assert found.common_arcsec.tolist() == [9.0, 0.0, 0.0] and found.rest_arcsec.tolist() == [0.0, 0.02, 0.0]
+    assert not found.common_arcsec.any() and not found.rest_arcsec.any() and not found.reasons
+    # Beside the error, where it exceeds the standard deviation.
+    assert found.choice_models == ("brown3",)
+    assert found.choice_common_arcsec.tolist() == [9.0, 0.0, 0.0]
+    assert found.choice_rest_arcsec.tolist() == [0.0, 0.02, 0.0]
+    half: Any = diagnosis(comparison=comparison(False, preferred=0.25))
+    found = with_misfit(attitude(), half, POST, OBS).misfit
+    np.testing.assert_allclose(found.common_arcsec, [4.5, 0.05, 0.0])
+    np.testing.assert_allclose(found.choice_common_arcsec, [9.0 * 0.75**0.5, 0.0, 0.0])
     assert "brown3" in found.common_reasons[0] and "none" not in found.common_reasons[0]
     worse = with_misfit(attitude(), diagnosis(comparison=comparison(True)), POST, OBS).misfit  # type: ignore[arg-type]
     assert worse.common_arcsec.tolist() == [9.0, 0.1, 0.0] and worse.rest_arcsec.tolist() == [0.001, 0.02, 0.0]

@@ -339,6 +339,7 @@ def test_table_has_one_row_per_contributor_and_axis() -> None:
         "p997_if_model_holds_arcsec",
         "p997_with_misfit_found_arcsec",
         "first_order_arcsec",
+        "choice_of_model_arcsec",
         "absorbed_by_alignment",
     ]
     assert list(table["axis"]) == [*AXES, "cross-boresight"] * 5

@@ -11,7 +11,7 @@ from starcal_uq.core.formatting import significant
 from starcal_uq.diagnostics.residuals import bin_residuals
 from starcal_uq.diagnostics.verdict.estimate import MISFIT_P
 from starcal_uq.diagnostics.verdict.observed import PATTERN_P, air
-from starcal_uq.propagation.attitude_error import two_figures
+from starcal_uq.propagation.attitude_error import choice_words, two_figures
 
 if TYPE_CHECKING:
     from starcal_uq.diagnostics.diagnose import Diagnosis
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from starcal_uq.propagation.coupling import Coupling
 
 _STRONG = 0.7
-# A shift within two standard deviations is what noise in the further parameters gives.
-_MODEL_SIGMAS = 2.0
 
 
 def limits(
@@ -34,8 +32,8 @@ def limits(
 ) -> tuple[str, ...]:
     """What limits the result, the most important first; one sentence each."""
     found = [_systematic(obs, cal)]
-    found += [_structure(cal, diagnosis), _model_choice(cal, diagnosis)] if diagnosis is not None else []
-    found += [_attitude(attitude)] if attitude is not None else []
+    found += [_structure(cal, diagnosis)] if diagnosis is not None else []
+    found += [choice_words(attitude), _attitude(attitude)] if attitude is not None else []
     found += [_coupled(coupling)] if coupling is not None else []
     return tuple(sentence for sentence in found if sentence)
 
@@ -64,27 +62,6 @@ def _structure(cal: Calibration, diagnosis: Diagnosis) -> str:
     return (
         f"The model: the largest structure that it leaves in the residuals is {worst.name}, "
         f"{significant(worst.size_px)} px ({significant(arcsec)} arcsec) per star."
-    )
-
-
-def _model_choice(cal: Calibration, diagnosis: Diagnosis) -> str:
-    """How far attitudes move under models that fit as well, where that is more than the uncertainty within one."""
-    if diagnosis.comparison is None:
-        return ""
-    others = [score for score in diagnosis.comparison.accepted if score.model != diagnosis.comparison.fitted]
-    if not others:
-        return ""
-    score = max(others, key=lambda s: float(np.hypot(*s.common_arcsec[:2])))
-    # Per axis, as the attitude error is stated.
-    moved = float(np.hypot(*score.common_arcsec[:2])) / np.sqrt(2.0)
-    covariance = cal.rotation_per_theta @ cal.covariance @ cal.rotation_per_theta.T
-    within = float(np.sqrt(0.5 * np.trace(covariance[:2, :2]))) * ARCSEC
-    if moved <= _MODEL_SIGMAS * within / np.sqrt(diagnosis.comparison.share):
-        return ""
-    return (
-        f"The choice of the distortion model: {score.model!r} fits as well and moves attitudes by {significant(moved)} "
-        f"arcsec per axis in common across the boresight; the uncertainty within {cal.camera.distortion!r} is "
-        f"{significant(within)} arcsec."
     )
 
 

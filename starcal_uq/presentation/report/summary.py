@@ -17,7 +17,13 @@ from starcal_uq.core.status import Check, Level, Question, worst
 from starcal_uq.presentation.report.tables import parameter_rows
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.budgeting import axis_label, bound
-from starcal_uq.propagation.attitude_error import IF_MODEL_HOLDS, NOT_ASSESSED, WITH_MISFIT_FOUND, two_figures
+from starcal_uq.propagation.attitude_error import (
+    IF_MODEL_HOLDS,
+    NOT_ASSESSED,
+    WITH_MISFIT_FOUND,
+    choice_words,
+    two_figures,
+)
 
 if TYPE_CHECKING:
     from starcal_uq.budgeting.result import Budget
@@ -219,6 +225,7 @@ def terminal_summary(results: Results) -> list[str]:
         untested = f"{IF_MODEL_HOLDS}; {WITH_MISFIT_FOUND}: {NOT_ASSESSED}"
         differ = f"{WITH_MISFIT_FOUND}; in brackets {IF_MODEL_HOLDS}, where that differs"
         lines.append(f"  {untested if error.misfit is None else differ}")
+        lines += _wrapped(choice_words(error), "  ")
     if (budget := results.budget) is not None:
         table = budget_summary(budget)
         lines.append("Budget" if budget.outcomes else f"Budget at {confidence_text(budget.confidence)}, arcsec")

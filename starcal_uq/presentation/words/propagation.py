@@ -13,11 +13,14 @@ from starcal_uq.core.formatting import fixed, join_words, percent, plus_minus, p
 from starcal_uq.core.types import FloatArray
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.propagation.attitude_error import (
+    CHOICE_OF_MODEL,
     IF_MODEL_HOLDS,
     NOT_ASSESSED,
     WITH_MISFIT_FOUND,
     Agreement,
     AttitudeError,
+    MisfitFound,
+    choice_words,
     two_figures,
 )
 from starcal_uq.propagation.coupling import Coupling
@@ -81,7 +84,10 @@ def misfit_sentence(error: AttitudeError) -> str:
             f"What the errors are {WITH_MISFIT_FOUND} is {NOT_ASSESSED}: the model was not tested "
             "(`starcal-uq diagnose RUN`)."
         )
-    found = error.misfit
+    return " ".join(filter(None, (_found_sentence(error.misfit), choice_words(error))))
+
+
+def _found_sentence(found: MisfitFound) -> str:
     if not found.reasons:
         return f"The tests of the model found nothing: an error {WITH_MISFIT_FOUND} is that {IF_MODEL_HOLDS}."
     common, rest = found.common_reasons, found.rest_reasons
@@ -127,6 +133,8 @@ def attitude_table(error: AttitudeError) -> TextTable:
         once = error.misfit is None or figures[0][1:] == figures[1][1:]
         rows.append((str(contributor), *(figures[1][1:-1] if once else [""] * 5), str(words)))
         rows += [] if once else figures
+        if (choice := error.choice_of_model_arcsec[place]).any() and error.misfit is not None:
+            rows.append((f"  {CHOICE_OF_MODEL}", *(significant(float(v)) for v in choice), "", ""))
     heads = ("contributor", *TOTAL_AXES, "two-axis 95 %", "absorbed by alignment")
     which = f", {IF_MODEL_HOLDS}" if error.misfit is None else ""
     return TextTable(heads, tuple(rows), f"Attitude error, arcsec, 1 sigma{which}", "lrrrrrl")
