@@ -42,6 +42,8 @@ KHAT_BOUND = 0.7
 # A model is rejected when another one predicts better beyond the Student quantile for so many frames, and by more than
 # chance between equal models (Sivula et al. 2020: below four, a difference of elpd says nothing).
 REJECT_P, REJECT_ELPD = 0.005, 4.0
+# Up to the quantile of this probability a difference is no preference.
+_CHANCE_P = 0.05
 _DRAWS = 1000
 # Frames whose densities are sampled as well; the closed form, which is exact for the same model, costs nothing.
 _SAMPLED_FRAMES = 100
@@ -78,8 +80,9 @@ class ModelScore:
     rejected : bool
         True if another model predicts better beyond doubt.
     preferred : float
-        How far the data prefer this model to the fitted one: 0 up to one standard error of the difference of their
-        scores, 1 where the fitted one is rejected against it, linear between. 0 of an earlier version.
+        How far the data prefer this model to the fitted one: 0 up to a difference of their scores that its own error
+        gives in one case of twenty, 1 where the fitted one is rejected against it, linear between. 0 of an earlier
+        version.
     """
 
     model: str
@@ -199,7 +202,8 @@ def compare_models(
     scores = []
     for name, normals in fits.items():
         loo = found_scores[name]
-        total, spread, doubt = _difference(loo.pointwise - reference)
+        difference = loo.pointwise - reference
+        total = float(np.sum(difference))
         common, rest = _moved(cal, normals)
         scores.append(
             ModelScore(
@@ -208,14 +212,14 @@ def compare_models(
                 sigma=cal.sigma if name == cal.camera.distortion else float(np.sqrt(normals.variance)),
                 elpd=float(np.sum(loo.pointwise)),
                 difference=total,
-                difference_se=spread,
+                difference_se=_spread(difference),
                 effective_parameters=float(np.sum(loo.in_sample - loo.pointwise)),
                 closed_form=float(np.sum(loo.closed_form)),
                 max_khat=loo.max_khat,
                 n_replaced=loo.n_replaced,
                 common_arcsec=common,
                 rest_arcsec=rest,
-                rejected=-total > doubt,
+                rejected=-total > _beyond_doubt(difference),
                 preferred=0.0 if mine is None else _preference(loo.pointwise - mine.pointwise),
             )
         )
@@ -226,17 +230,20 @@ def compare_models(
     )
 
 
-def _difference(pointwise: FloatArray) -> tuple[float, float, float]:
-    """Difference of two scores from that of every frame (K,), its standard error, and what it is beyond doubt."""
-    spread = float(np.sqrt(len(pointwise)) * np.std(pointwise, ddof=1))
-    quantile = student_quantile(1.0 - 2.0 * REJECT_P, len(pointwise) - 1)
-    return float(np.sum(pointwise)), spread, max(quantile * spread, REJECT_ELPD)
+def _spread(pointwise: FloatArray) -> float:
+    """Standard error of a difference of scores from that of every frame (K,)."""
+    return float(np.sqrt(len(pointwise)) * np.std(pointwise, ddof=1))
+
+
+def _beyond_doubt(pointwise: FloatArray) -> float:
+    return max(student_quantile(1.0 - 2.0 * REJECT_P, len(pointwise) - 1) * _spread(pointwise), REJECT_ELPD)
 
 
 def _preference(pointwise: FloatArray) -> float:
     """`ModelScore.preferred` of a model from its scores less those of the fitted one, frame by frame (K,)."""
-    gain, spread, doubt = _difference(pointwise)
-    return float(np.clip((gain - spread) / (doubt - spread), 0.0, 1.0))
+    chance = student_quantile(1.0 - 2.0 * _CHANCE_P, len(pointwise) - 1) * _spread(pointwise)
+    share = (float(np.sum(pointwise)) - chance) / (_beyond_doubt(pointwise) - chance)
+    return float(np.clip(share, 0.0, 1.0))
 
 
 def of_all_stars(found: ModelComparison, obs: Observations, cal: Calibration) -> ModelComparison:
