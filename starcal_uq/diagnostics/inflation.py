@@ -53,7 +53,11 @@ def with_misfit(error: AttitudeError, diagnosis: Diagnosis, post: Posterior, obs
     if diagnosis.misfit.pattern is None:
         # Of an earlier version: what was found has no shape there.
         return error
-    pattern, pattern_reasons = _pattern(error, diagnosis, post, obs)
+    try:
+        pattern, pattern_reasons = _pattern(error, diagnosis, post, obs)
+    except LookupError:
+        # Of an earlier version, which had other shapes.
+        return error
     models = _Models.of(error, diagnosis)
     factor, frames = _frames(diagnosis, post)
     phase = [name for name in diagnosis.misfit.pattern.families if "pixel phase" in name]

@@ -24,7 +24,7 @@ from starcal_uq.core.formatting import plus_minus
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray, IntArray
 from starcal_uq.diagnostics.pattern import Fit, Pattern, frame_covariance
-from starcal_uq.diagnostics.residuals import of_heard
+from starcal_uq.diagnostics.residuals import heard, of_heard
 from starcal_uq.diagnostics.shapes import (
     FRAME_BY_FRAME,
     MAX_CELLS,
@@ -214,7 +214,9 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
         With a false-alarm rate that is the nominal one for each test, and at most that for all of them together. Of an
         estimate with Student-t tails it is about the stars within 4.5 sigma.
     """
-    obs, cal = of_heard(weighed(obs, cal), cal)
+    obs = weighed(obs, cal)
+    left_out = tuple(np.flatnonzero(~heard(obs, cal)).tolist())
+    obs, cal = of_heard(obs, cal)
     families = shapes(obs, cal.camera, max_cells=max_cells)
     sums = _Sums.over(obs, cal, families)
     tests = [test for test in (sums.family(index) for index in range(len(families))) if test is not None]
@@ -238,9 +240,9 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
         model, _ = fit_noise(obs, cal.camera, rounds=_NOISE_ROUNDS)
         uneven = UnevenNoise(model, cal.parameter_names, sigma_ratios(obs, cal.camera, model, cal.sigma))
     pattern = sums.pattern([test.name for test in tests if test.dof > 0 and test.p_holm < ALPHA], len(tests))
-    pattern = replace(pattern, n_frames=obs.n_frames, max_cells=max_cells)
+    pattern = replace(pattern, n_frames=obs.n_frames, max_cells=max_cells, left_out=left_out)
     if FRAME_BY_FRAME in pattern.families:
-        pattern = replace(pattern, frame_covariance=frame_covariance(pattern, obs, cal))
+        pattern = replace(pattern, frame_covariance=frame_covariance(pattern, families, obs, cal))
     sigma = float(np.sqrt(sums.rss / sums.dof))
     return Misfit(tuple(tests), sigma, obs.n_stars, obs.n_frames, uneven, pattern)
 

@@ -22,7 +22,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.types import FloatArray, Shapes
-from starcal_uq.diagnostics.shapes import FRAME_BY_FRAME, MAX_CELLS, View, frame_shapes, shapes
+from starcal_uq.diagnostics.shapes import FRAME_BY_FRAME, MAX_CELLS, Shape, View, frame_shapes, shapes
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.propagation.alignment import alignment_weights
@@ -60,11 +60,18 @@ class Pattern:
     variance: float  # Variance of the noise that is left, px^2, or relative to what stars state
     n_frames: int = 0  # Number of frames behind it
     max_cells: int = MAX_CELLS  # Largest number of field cells along the longer side
+    left_out: tuple[int, ...] = ()  # Rows of the table that had no say in the fit, and in the families' columns
 
     SHAPES: ClassVar[Shapes] = {
         **{"directions": ("q", "j"), "amplitudes": ("j",), "covariance": ("j", "j"), "parameters": ("j", "p")},
         "frame_covariance": (3, 3),
     }
+
+
+    def among(self, families: Sequence[Shape]) -> list[Shape]:
+        """Its own families, in the order of the rows of `directions`; LookupError where one is not among these."""
+        known = {family.name: family for family in families}
+        return [known[name] for name in self.families if name != FRAME_BY_FRAME]
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +107,12 @@ def response(
     `seen`, `aligned`: frames of the mission, and those of its alignment, which decide what is common; `seen` if they
         are not given. Where frames have no time, temperature or magnitudes, they get those of the calibration's frames
         and stars.
+    LookupError if the data do not offer a shape of the pattern, which then is not of them.
     """
+    if pattern.left_out:
+        # Which shapes there are, and their scales, follow from the stars that they were fitted to.
+        fitted = obs.select(~np.isin(np.arange(obs.n_stars), pattern.left_out))
+        seen, aligned, obs = fitted if seen is obs else seen, fitted if aligned is obs else aligned, fitted
     camera = post.camera.with_theta(np.asarray(theta, dtype=np.float64))
     here = _Turned.of(pattern, camera, post, obs, seen)
     there = here if aligned is None or aligned is seen else _Turned.of(pattern, camera, post, obs, aligned)
@@ -138,8 +150,7 @@ class _Turned:
 
     @classmethod
     def of(cls, pattern: Pattern, camera: Camera, post: Posterior, obs: Observations, frames: Observations) -> _Turned:
-        families = {f.name: f for f in shapes(obs, camera, max_cells=pattern.max_cells, seen=frames)}
-        chosen = [families[name] for name in pattern.families if name in families]
+        chosen = pattern.among(shapes(obs, camera, max_cells=pattern.max_cells, seen=frames))
         geometry = FrameGeometry.of(post, frames)
         turns = geometry.noise_response / geometry.noise_px[:, None]
         likelihood = MarginalLikelihood(frames, camera.distortion)
@@ -323,13 +334,14 @@ def _gain(rss: float, explained: float, dof: int, rank: int, alpha: float) -> fl
     return dof * float(np.log(rss / (rss - explained))) - 2.0 * rank
 
 
-def frame_covariance(pattern: Pattern, obs: Observations, cal: Calibration) -> FloatArray:
+def frame_covariance(
+    pattern: Pattern, families: Sequence[Shape], obs: Observations, cal: Calibration
+) -> FloatArray:
     """Covariance (3, 3) over frames of their own scale and shape, beside the rest of a pattern, px at the corner.
 
     By moments: with w = C^T e of a frame and L = C^T C, both without its attitude, E[w w^T] = L S L + variance L.
     """
-    families = {family.name: family for family in shapes(obs, cal.camera, max_cells=pattern.max_cells)}
-    chosen = [families[name] for name in pattern.families if name in families]
+    chosen = pattern.among(families)
     own = frame_shapes(cal.camera)
     likelihood = MarginalLikelihood(obs, cal.camera.distortion)
     rotations, starts = quaternion_to_rotation(cal.quaternions), likelihood.frames.starts

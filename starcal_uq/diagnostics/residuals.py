@@ -90,23 +90,26 @@ def bin_residuals(cal: Calibration, obs: Observations) -> BinnedResiduals:
 
 
 def heard(obs: Observations, cal: Calibration) -> BoolArray:
-    """Stars (N,) that had a say in an estimate: of one with Student-t tails those within 4.5 sigma, else all."""
+    """Stars (N,) that had a say in an estimate: of one with Student-t tails those within 4.5 sigma, else all.
+
+    Frames keep at least three of them, or none.
+    """
     if cal.provenance.get("settings", {}).get("likelihood") != "student_t":
         return np.ones(obs.n_stars, dtype=bool)
     stated = 1.0 if obs.sigma_px is None else np.asarray(obs.sigma_px)[:, None]
     size = np.max(np.abs(cal.residuals_px / stated), axis=1)
     # Stars that the likelihood leaves out, such as those of a frame without an attitude, have none.
-    return np.asarray((size > 0.0) & (size < OUTLIER_SIGMA * cal.sigma))
+    use = np.asarray((size > 0.0) & (size < OUTLIER_SIGMA * cal.sigma))
+    order = np.searchsorted(cal.frame_ids, obs.frame)
+    return np.asarray(use & (np.bincount(order, use, len(cal.frame_ids)) >= 3)[order])
 
 
 def of_heard(obs: Observations, cal: Calibration) -> tuple[Observations, Calibration]:
-    """The stars that were heard, in frames that keep three of them, and the estimate with their residuals alone."""
+    """The stars that were heard, and the estimate with their residuals and frames alone."""
     use = heard(obs, cal)
     if use.all():
         return obs, cal
-    order = np.searchsorted(cal.frame_ids, obs.frame)
-    left = np.bincount(order, use, len(cal.frame_ids)) >= 3
-    use &= left[order]
+    left = np.isin(cal.frame_ids, obs.frame[use])
     frames, quaternions = cal.frame_ids[left], cal.quaternions[left]
     kept = replace(cal, residuals_px=cal.residuals_px[use], frame_ids=frames, quaternions=quaternions)
     return obs.select(use), kept

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -65,7 +66,7 @@ def table(c: Campaign, planted: str) -> sc.Observations:
 
 
 def calibrated(planted: str, seed: int = 1) -> SimpleNamespace:
-    """A campaign with the misfit, its calibration, and the tests of it; the posterior is the normal approximation."""
+    """A campaign with the misfit, its calibration, and the tests of it."""
     options = PLANTED[planted]
     c, clean = (campaign(np.random.default_rng(seed), n_frames=200, **more) for more in (options, {}))
     obs, start = table(c, planted), sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0))  # type: ignore[arg-type]
@@ -73,6 +74,11 @@ def calibrated(planted: str, seed: int = 1) -> SimpleNamespace:
     # What the same noise does without the misfit is no part of it. What scales of frames do to the parameters is
     # chance, for which the jackknife stands.
     bias = cal.theta - sc.calibrate(table(clean, ""), start).theta if "displaced" in options else 0.0
+    return SimpleNamespace(**vars(questioned(obs, cal)), options=options, theta=c.theta + bias, seed=seed)
+
+
+def questioned(obs: sc.Observations, cal: sc.Calibration) -> SimpleNamespace:
+    """A calibration with its tests; the posterior is the normal approximation."""
     post = SimpleNamespace(
         camera=cal.camera,
         mean=cal.theta,
@@ -85,8 +91,7 @@ def calibrated(planted: str, seed: int = 1) -> SimpleNamespace:
     diagnosis = SimpleNamespace(
         misfit=misfit_tests(obs, cal), jackknife=None, comparison=None, theta=cal.theta.tolist()
     )
-    found = {"obs": obs, "cal": cal, "post": post, "diagnosis": diagnosis}
-    return SimpleNamespace(**found, options=options, theta=c.theta + bias, seed=seed)
+    return SimpleNamespace(obs=obs, cal=cal, post=post, diagnosis=diagnosis)
 
 
 def mission(run: SimpleNamespace, where: str, seed: int) -> Campaign:
@@ -159,3 +164,25 @@ def test_nothing_found_adds_nothing_and_an_old_diagnosis_is_not_an_assessment() 
     assert clean.misfit is not None and clean.misfit.reasons == ()
     diagnosis.misfit = Misfit(found.tests, found.sigma, found.n_stars, found.n_frames)
     assert with_misfit(error, diagnosis, post, obs).misfit is None  # type: ignore[arg-type]
+
+
+def test_a_pattern_of_an_estimate_with_student_t_tails_is_that_of_the_stars_in_its_fit() -> None:
+    """Stars that the fit leaves out change the number of cells and the scale of magnitudes, and with them the shapes."""
+    rng = np.random.default_rng(4)
+    waves = {"displaced": lambda uv, xy, mag, frame: 0.2 * np.sin(uv / 90.0) + magnitude(uv, xy, mag, frame)}
+    c = campaign(rng, n_frames=27, stars_per_frame=15, **waves)
+    obs = table(c, "")
+    start = sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0))  # type: ignore[arg-type]
+    # One star of each frame is another one, and said to be far brighter than any.
+    first = np.flatnonzero(np.diff(obs.frame, prepend=-1))
+    x, mag = obs.x_px.copy(), obs.mag.copy()
+    x[first] += rng.uniform(5.0, 15.0, len(first))
+    mag[first] = -20.0
+    wrong = replace(obs, x_px=x, mag=mag)
+    said = {}
+    tables: dict[str, Any] = {"marginal": obs.select(x == obs.x_px), "student_t": wrong}
+    for likelihood, data in tables.items():
+        run = questioned(data, sc.calibrate(data, start, likelihood=likelihood))
+        assert {"field cells", "magnitude"} <= {test.against for test in run.diagnosis.misfit.found()}, likelihood
+        said[likelihood] = stated(run, data)
+    assert said["student_t"] == pytest.approx(said["marginal"], rel=0.2)
