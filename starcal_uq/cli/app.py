@@ -1,8 +1,8 @@
 """The command line's entry, which catches what comes out of the commands.
 
-Exit status 0 when all is well, 1 when a result is there but should not be trusted, 2 for bad input, and 130 or 143 when
-Ctrl-C or SIGTERM has ended the work; but for 0, always with one sentence that says what to do. Nothing that takes time
-is loaded before the signals are caught.
+Exit status 0 when all is well, 1 when a result is there but should not be trusted, 2 for bad input, 70 for a fault of
+the program, and 130 or 143 when Ctrl-C or SIGTERM has ended the work; but for 0, always with one sentence that says
+what to do. Nothing that takes time is loaded before the signals are caught.
 """
 
 from __future__ import annotations
@@ -13,10 +13,13 @@ import shlex
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Callable
 from typing import Any, NoReturn
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+# An internal software error, as `sysexits.h` numbers it.
+FAULT = 70
 
 
 def program() -> NoReturn:
@@ -77,7 +80,9 @@ def _main() -> None:
         if isinstance(error, OSError):
             place = f"{error.filename}: " if error.filename else ""
             _fail(f"{place}{error.strerror or error}; check the path, its permissions and the space on the disk.", 2)
-        raise
+        traceback.print_exception(error)
+        words = "this is a fault of starcal-uq and not of the input: report it with the lines above and the command."
+        _fail(f"{type(error).__name__}: {words}", FAULT)
 
 
 def _own_words(sentence: str) -> str:

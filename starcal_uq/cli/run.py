@@ -42,7 +42,9 @@ from starcal_uq.cli.settings import (
     SamplingSettings,
     SkySettings,
     command_of,
+    refuse_conflicts,
     refuse_others,
+    settings_of,
 )
 from starcal_uq.cli.steps import load_table, sample_run
 from starcal_uq.core.errors import PriorError
@@ -142,6 +144,7 @@ def run_command(
     if camera is None and not from_images:
         raise typer.BadParameter("a table of stars needs the nominal camera (TOML) after it; only images do without.")
     aligning = {"alignment": alignment, "alignment_frames": alignment_frames}
+    refuse_conflicts(settings_of(estimation, sky, sampling, partitioned=folder, **aligning))
     settings = {"estimation": estimation, "sky": sky, "images": images, "sampling": sampling, "draws": draws}
     files = {f"input {number}": path for number, path in enumerate(inputs)}
     files |= {} if camera is None else {"camera": camera}

@@ -82,7 +82,8 @@ SCHEMAS: Mapping[str, tuple[int, type[Part]]] = {
 _HEAD = {
     "schema": "Name of the schema",
     "version": "Its version",
-    "exit_status": "0, 1 for a result that should not be trusted, 2 for bad input, 130 or 143 after an interrupt",
+    "exit_status": "0, 1 for a result that should not be trusted, 2 for bad input, 70 for a fault of the program, 130 "
+    "or 143 after an interrupt",
 }
 
 

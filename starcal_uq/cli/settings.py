@@ -34,6 +34,7 @@ from starcal_uq.cli.options import (
     read_file,
 )
 from starcal_uq.core import settings
+from starcal_uq.core.conflicts import conflict
 from starcal_uq.core.settings import EPOCH, MAGNITUDES
 from starcal_uq.core.types import AnyDict
 
@@ -272,6 +273,54 @@ def refuse_others(images: bool, sky: SkySettings, of_images: ImageSettings) -> N
     for name, value in given.items():
         if value not in (None, []):
             raise typer.BadParameter(f"--{name.replace('_', '-')} belongs to {kind}: leave it out.")
+
+
+# Options that have another name on the command line than in Python, or stand for a value.
+_SPELT = {
+    "likelihood": "--robust",
+    "sampled": "--likelihood",
+    "sampled_dof": "--dof",
+    "screening": "--screen",
+    "frames": "--only-frames",
+}
+
+
+def settings_of(
+    estimation: EstimationSettings,
+    sky: SkySettings,
+    sampling: SamplingSettings | None = None,
+    *,
+    partitioned: bool = False,
+    **aligning: Any,
+) -> AnyDict:
+    """Options of one call by the names that `starcal_uq.core.conflicts` has for them."""
+    settings = {**vars(estimation), **vars(sky), **estimation.options(), **aligning, "partitioned": partitioned}
+    if sampling is not None:
+        settings["sampled"] = sampling.likelihood or settings.get("likelihood")
+        settings["sampled_dof"] = sampling.dof
+    return settings
+
+
+def refuse_conflicts(settings: AnyDict) -> None:
+    """Refuse options that cannot be given together, before anything is done, in the words of the command line."""
+    rule = conflict(settings)
+    if rule is None:
+        return
+    given, other = spelt(rule.name, settings[rule.name]), settings.get(rule.other)
+    if rule.other == "partitioned":
+        words = f"needs a folder of partitions: leave {given} out." if True in rule.allowed else ""
+        raise typer.BadParameter(f"{given} {words or f'needs one table, and no folder: leave {given} out.'}")
+    if other in (None, False):
+        raise typer.BadParameter(
+            f"{given} needs {spelt(rule.other, rule.allowed[0])}: give both, or leave {given} out."
+        )
+    raise typer.BadParameter(f"{given} and {spelt(rule.other, other)} exclude each other: leave one of them out.")
+
+
+def spelt(name: str, value: object) -> str:
+    """An option of `settings_of` as it is typed."""
+    option = _SPELT.get(name, f"--{name.replace('_', '-')}")
+    return option if value is True or name == "likelihood" else f"{option} {value}"
 
 
 def command_of(name: str, settings: Mapping[str, Any], files: Mapping[str, Path]) -> AnyDict:

@@ -49,7 +49,13 @@ from starcal_uq.cli.options import (
     write_file,
     write_path,
 )
-from starcal_uq.cli.settings import EstimationSettings, SamplingSettings, SkySettings
+from starcal_uq.cli.settings import (
+    EstimationSettings,
+    SamplingSettings,
+    SkySettings,
+    refuse_conflicts,
+    settings_of,
+)
 from starcal_uq.core import settings
 from starcal_uq.core.files import check_new_folder, ensure_new, table_ending
 from starcal_uq.core.settings import EPOCH, MAGNITUDES
@@ -77,8 +83,6 @@ def load_table(
     obs: Observations | PartitionedObservations
     chosen = parse_frames(sky.frames)
     if isinstance(path, Path) and path.is_dir():
-        if chosen is not None:
-            raise typer.BadParameter("--only-frames belongs to one table: leave files out of the folder instead.")
         obs = partitions_from_folder(path, camera, **known)
     else:
         obs = observations_from_table(path, camera, **known)
@@ -195,6 +199,7 @@ def calibrate_command(
 ) -> Answer:
     """Estimate optics and distortion: three stages and refinement, with covariance."""
     run = sc.Run(out, tell=note)
+    refuse_conflicts(settings_of(estimation, sky, partitioned=observations.is_dir()))
     check_new_folder(out, force)
     obs, nominal = load_table(observations, camera, sky)
     nominal = estimation.started(nominal)

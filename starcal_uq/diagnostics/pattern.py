@@ -67,7 +67,6 @@ class Pattern:
         "frame_covariance": (3, 3),
     }
 
-
     def among(self, families: Sequence[Shape]) -> list[Shape]:
         """Its own families, in the order of the rows of `directions`; LookupError where one is not among these."""
         known = {family.name: family for family in families}
@@ -334,9 +333,7 @@ def _gain(rss: float, explained: float, dof: int, rank: int, alpha: float) -> fl
     return dof * float(np.log(rss / (rss - explained))) - 2.0 * rank
 
 
-def frame_covariance(
-    pattern: Pattern, families: Sequence[Shape], obs: Observations, cal: Calibration
-) -> FloatArray:
+def frame_covariance(pattern: Pattern, families: Sequence[Shape], obs: Observations, cal: Calibration) -> FloatArray:
     """Covariance (3, 3) over frames of their own scale and shape, beside the rest of a pattern, px at the corner.
 
     By moments: with w = C^T e of a frame and L = C^T C, both without its attitude, E[w w^T] = L S L + variance L.

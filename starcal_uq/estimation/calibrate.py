@@ -13,6 +13,7 @@ from starcal_uq.camera import compiled
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model, sigma_parameter
 from starcal_uq.core.cluster import Scheduler, cluster
+from starcal_uq.core.conflicts import refuse_conflicts
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.settings import Method, Solver, bounded
@@ -191,39 +192,21 @@ def calibrate(
     if likelihood not in LIKELIHOODS:
         raise CalibrationError(f"likelihood {likelihood!r} is unknown: use one of {', '.join(LIKELIHOODS)}.")
     nu = parse_dof(dof, CalibrationError)
-    if likelihood == "marginal" and dof is not None:
-        raise CalibrationError("degrees of freedom (dof) belong to likelihood='student_t': leave dof out, or use that.")
-    if likelihood == "student_t" and method != "efficient":
-        raise CalibrationError(
-            f"method {method!r} has no Student-t likelihood: use method='efficient', or likelihood='marginal'."
-        )
     if noise not in NOISES:
         raise CalibrationError(f"noise {noise!r} is unknown: use one of {', '.join(NOISES)}.")
-    if noise == "model" and (method != "efficient" or likelihood != "marginal"):
-        raise CalibrationError(
-            "noise='model' weighs the stars in the Gaussian likelihood of their pixels: use method='efficient' and "
-            "likelihood='marginal', or noise='common'."
-        )
-    if star_errors and (method != "efficient" or likelihood != "marginal"):
-        raise CalibrationError("errors of the stars (star_errors) need method='efficient' and likelihood='marginal'.")
-    if recursion is not None and method not in RECURSIVE_METHODS:
-        raise CalibrationError(f"method {method!r} is not recursive: leave recursion out, or use samaan or griffith.")
-    if not (scheduler is None and workers is None) and not isinstance(obs, PartitionedObservations):
-        raise CalibrationError(
-            "a Dask scheduler, or workers, are of use to partitioned observations (sc.observations.open_partitions, a "
-            "folder of Parquet files): leave them out."
-        )
+    refuse_conflicts(
+        method=method,
+        likelihood=likelihood,
+        dof=dof,
+        recursion=recursion,
+        noise=noise,
+        star_errors=star_errors,
+        duplicates=duplicates,
+        scheduler=scheduler,
+        workers=workers,
+        partitioned=isinstance(obs, PartitionedObservations),
+    )
     if isinstance(obs, PartitionedObservations) and method not in RECURSIVE_METHODS:
-        if (method, likelihood, noise, star_errors) != ("efficient", "marginal", "common", False):
-            raise CalibrationError(
-                "partitioned observations are calibrated by the efficient method on the Gaussian likelihood, with one "
-                "noise: leave out the other options, or calibrate the frames of `obs.sample()` with them."
-            )
-        if duplicates == "drop":
-            raise CalibrationError(
-                "repeated frames of partitioned observations cannot be dropped: remove them from the files, or use "
-                "duplicates='keep'."
-            )
         sample = obs.sample()
         # What is compiled is compiled here, before other processes ask for it.
         with compiled.using(kernels(camera.distortion, obs.n_stars)):

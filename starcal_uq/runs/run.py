@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import sigma_parameter
+from starcal_uq.core.conflicts import refuse_conflicts
 from starcal_uq.core.errors import CalibrationError, RunFolderError, StarcalError
 from starcal_uq.core.files import (
     PathLike,
@@ -551,15 +552,11 @@ class Run:
         """
         screened: Screening | None = None
         options |= {"throw": False} if undetermined else {}
+        refuse_conflicts(screening=screening, partitioned=isinstance(obs, PartitionedObservations))
         if screening:
             from starcal_uq.estimation.screening.screening import screen
 
-            if isinstance(obs, PartitionedObservations):
-                raise CalibrationError(
-                    "partitioned observations cannot be screened: leave wrong identifications out of the files, or "
-                    "screen the frames of `obs.sample()`."
-                )
-
+            assert isinstance(obs, Observations)
             screened = screen(obs, camera, **options)
             obs, calibration = screened.observations, screened.calibration
         else:

@@ -335,8 +335,11 @@ def test_folder_of_partitions_from_simulation_to_posterior(cli, inputs):
     assert cli("sample", "run", *SMALL)[0] in (0, 1)
     for words, arguments in (
         ("give --partition-frames", (*made, "--workers", "2", "--force")),
-        ("leave them out", ("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "no", "--workers", "2")),
-        ("cannot be screened", ("calibrate", "frames", inputs / "camera.toml", "-o", "no", "--screen")),
+        (
+            "needs a folder of partitions",
+            ("calibrate", inputs / "obs.csv", inputs / "camera.toml", "-o", "no", "--workers", "2"),
+        ),
+        ("--screen needs one table", ("calibrate", "frames", inputs / "camera.toml", "-o", "no", "--screen")),
         ("not empty; name another", (*made, "--partition-frames", "20", "--seed", "9")),
     ):
         status, _, err = cli(*arguments)

@@ -54,7 +54,7 @@ PATHS = ("", LONG, CONTROLS, "/dev/zero", "missing", "folder", "OBS/below")
 WRITTEN = {"out", "template", "images"}
 
 
-class BeginsError(Exception):
+class BeginsError(BaseException):
     """The work of a command would begin here."""
 
 

@@ -167,7 +167,7 @@ def test_nothing_found_adds_nothing_and_an_old_diagnosis_is_not_an_assessment() 
 
 
 def test_a_pattern_of_an_estimate_with_student_t_tails_is_that_of_the_stars_in_its_fit() -> None:
-    """Stars that the fit leaves out change the number of cells and the scale of magnitudes, and with them the shapes."""
+    """Stars that the fit leaves out change the number of cells and the scale of magnitudes, and so the shapes."""
     rng = np.random.default_rng(4)
     waves = {"displaced": lambda uv, xy, mag, frame: 0.2 * np.sin(uv / 90.0) + magnitude(uv, xy, mag, frame)}
     c = campaign(rng, n_frames=27, stars_per_frame=15, **waves)

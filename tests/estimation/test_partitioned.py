@@ -227,7 +227,7 @@ def test_what_partitions_cannot_do_is_said(small) -> None:
     for options in ({"method": "three_stage"}, {"likelihood": "student_t"}, {"noise": "model"}, {"duplicates": "drop"}):
         with pytest.raises(CalibrationError, match="partitioned observations"):
             sc.calibrate(parts, camera, **options)
-    with pytest.raises(CalibrationError, match="of use to partitioned"):
+    with pytest.raises(CalibrationError, match="needs partitioned observations"):
         sc.calibrate(obs, camera, scheduler="tcp://127.0.0.1:1")
     assert sc.calibrate(parts, camera, method="griffith").n_frames == 90
 

@@ -217,8 +217,8 @@ def test_robust_estimate_saves_itself(tmp_path: Path) -> None:
         ({"likelihood": "cauchy"}, "marginal, student_t"),
         ({"likelihood": "student_t", "dof": 0.1}, "from 2 to 200"),
         ({"likelihood": "student_t", "dof": "many"}, "'free'"),
-        ({"dof": 4.0}, "belong to likelihood='student_t'"),
-        ({"likelihood": "student_t", "method": "three_stage"}, "no Student-t likelihood"),
+        ({"dof": 4.0}, "dof=4.0 needs likelihood='student_t', and likelihood is 'marginal'"),
+        ({"likelihood": "student_t", "method": "three_stage"}, "likelihood='student_t' needs method='efficient'"),
     ],
 )
 def test_settings_without_meaning_are_refused(options: dict[str, Any], match: str) -> None:

@@ -1,0 +1,96 @@
+"""Options that exclude each other: one table for functions, the command line and the remedies of checks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from starcal_uq.core.errors import CalibrationError
+
+_RECURSIVE = ("samaan", "griffith")
+_IN_MEMORY = ("three_stage", "least_squares")
+_COMPOSITE = ("pairs", "pairs_naive")
+
+
+@dataclass(frozen=True)
+class Rule:
+    """What an option needs of another one.
+
+    Attributes
+    ----------
+    name : str
+        The option.
+    values : tuple
+        Values of it that the rule is about; any that is given where empty.
+    other : str
+        The other option; "partitioned" stands for observations that are a folder of files.
+    allowed : tuple
+        Values of the other one with which it makes sense; None stands for its default.
+    """
+
+    name: str
+    values: tuple[object, ...]
+    other: str
+    allowed: tuple[object, ...]
+
+    def broken(self, settings: Mapping[str, object]) -> bool:
+        """Whether settings, by the names of their options, are against it; what they lack is not given."""
+        value = settings.get(self.name)
+        concerned = value in self.values if self.values else value not in (None, False)
+        return concerned and settings.get(self.other) not in self.allowed
+
+
+# "likelihood" and "dof" are those of the estimate; "sampled" and "sampled_dof" those of the draws.
+RULES = (
+    Rule("likelihood", ("student_t",), "method", (None, "efficient")),
+    Rule("noise", ("model",), "method", (None, "efficient")),
+    Rule("noise", ("model",), "likelihood", (None, "marginal")),
+    Rule("star_errors", (True,), "method", (None, "efficient")),
+    Rule("star_errors", (True,), "likelihood", (None, "marginal")),
+    Rule("dof", (), "likelihood", ("student_t",)),
+    Rule("recursion", (), "method", _RECURSIVE),
+    Rule("method", _IN_MEMORY, "partitioned", (None, False)),
+    Rule("likelihood", ("student_t",), "partitioned", (None, False)),
+    Rule("noise", ("model",), "partitioned", (None, False)),
+    Rule("star_errors", (True,), "partitioned", (None, False)),
+    Rule("duplicates", ("drop",), "partitioned", (None, False)),
+    Rule("screening", (True,), "partitioned", (None, False)),
+    Rule("frames", (), "partitioned", (None, False)),
+    Rule("scheduler", (), "partitioned", (True,)),
+    Rule("workers", (), "partitioned", (True,)),
+    Rule("sampled_dof", (), "sampled", ("student_t",)),
+    Rule("sampled", ("marginal",), "likelihood", (None, "marginal")),
+    Rule("sampled", (*_COMPOSITE, "student_t"), "star_errors", (None, False)),
+    Rule("sampled", (*_COMPOSITE, "student_t"), "partitioned", (None, False)),
+    Rule("sampled", _COMPOSITE, "method", (None, "efficient", *_IN_MEMORY)),
+    Rule("site", (), "in_space", (None, False)),
+    Rule("site", (), "observer_velocity", (None,)),
+    Rule("site", (), "directions", (None, "catalogue")),
+    Rule("alignment_frames", (), "alignment", (None, "random")),
+)
+
+
+def conflict(settings: Mapping[str, object]) -> Rule | None:
+    """The first rule that settings break, None where they can be given together."""
+    return next((rule for rule in RULES if rule.broken(settings)), None)
+
+
+def refuse_conflicts(**settings: object) -> None:
+    """CalibrationError, in the words of Python, where arguments cannot be given together."""
+    rule = conflict(settings)
+    if rule is None:
+        return
+    value = settings[rule.name]
+    given = f"{rule.name}={value!r}" if isinstance(value, str | int | float) else rule.name
+    if rule.other == "partitioned" and True in rule.allowed:
+        needed = "needs partitioned observations (sc.observations.open_partitions, a folder of Parquet files): leave"
+        raise CalibrationError(f"{given} {needed} it out.")
+    if rule.other == "partitioned":
+        raise CalibrationError(
+            f"{given} and partitioned observations exclude each other: leave it out, or calibrate the frames of "
+            "`obs.sample()` with it."
+        )
+    wanted = " or ".join(repr(allowed) for allowed in rule.allowed if allowed is not None)
+    raise CalibrationError(
+        f"{given} needs {rule.other}={wanted}, and {rule.other} is {settings.get(rule.other)!r}: change one of them."
+    )

@@ -1,0 +1,211 @@
+"""Options of `run` given together, generated from its declaration: they work, or are refused in words."""
+
+from __future__ import annotations
+
+import itertools
+import re
+
+import numpy as np
+import pytest
+import typer
+
+import starcal_uq as sc
+from starcal_uq.cli.app import FAULT
+from starcal_uq.cli.commands import app
+from starcal_uq.presentation.report import drawing
+from tests.helpers.ground_scenes import SITE
+from tests.helpers.outside import campaign
+
+KINDS = ("plain.csv", "rich.csv", "space.ecsv", "parts")
+# Values of each option, None where it stands alone. Files are made by `tables`.
+VALUES = {
+    "--model": ("none", "k1", "brown_tangential", "inverse"),
+    "--method": ("three_stage", "least_squares", "samaan", "griffith"),
+    "--solver": ("minpack", "ipopt"),
+    "--screen": (None,),
+    "--robust": (None,),
+    "--star-errors": (None,),
+    "--noise": ("model",),
+    "--start": ("x0_px=500",),
+    "--max-iterations": ("500",),
+    "--accept-inflation": (None,),
+    "--duplicates": ("drop", "keep"),
+    "--scheduler": ("tcp://127.0.0.1:9",),
+    "--workers": ("0",),
+    "--directions": ("apparent", "catalogue", "undeclared"),
+    "--site": ("site.toml",),
+    "--in-space": (None,),
+    "--time": ("2026-11-25T02:00:00",),
+    "--column": ("sigma_px=x_px / 10000",),
+    "--only-frames": ("0-3", "9"),
+    "--observer-velocity": ("7.5,0,0",),
+    "--max-mag": ("5",),
+    "--epoch": ("2020",),
+    "--focal-tolerance": ("0.1",),
+    "--gain": ("2",),
+    "--bayer": ("RGGB",),
+    "--engine": ("pyramid",),
+    "--seed": ("3",),
+    "--sigma": ("0.05",),
+    "--priors": ("priors.toml",),
+    "--likelihood": ("marginal", "pairs", "pairs_naive", "student_t"),
+    "--evaluation": ("compressed", "exact"),
+    "--moves": ("stretch",),
+    "--dof": ("free", "5"),
+    "--alignment": ("observed", "rich.csv"),
+    "--alignment-frames": ("20",),
+    "--budget": ("budget.toml",),
+    "--json": (None,),
+}
+# These say how large a run is and where it stands.
+ALWAYS = {"--out": "out", "--force": None, "--ensembles": "2", "--walkers": "14", "--steps": "20", "--draws": "50"}
+# What a sentence for the command line has no words of: arguments, calls and attributes of Python.
+PYTHON = re.compile(r"[a-z_]+='|[a-z_]+=(True|None)|\bsc\.|obs\.|, not both\.$|\(throw|Traceback")
+COMBINATIONS = [(name, value) for name, values in VALUES.items() for value in values]
+
+
+@pytest.fixture
+def tables(tmp_path):
+    """Six frames of twelve stars, without and with all that a table can state, declared, and in two files."""
+    c = campaign(np.random.default_rng(5), n_frames=6, stars_per_frame=12, patch_stars=14)
+    columns = dict(c.columns)
+    sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)).save(tmp_path / "camera.toml")
+    plain = sc.Observations(**{name: columns[name] for name in ("frame", "x_px", "y_px", "ra_deg", "dec_deg")})
+    plain.save(tmp_path / "plain.csv")
+    frame = columns["frame"]
+    stated = {"sigma_px": np.full(len(frame), 0.05), "temperature_c": np.linspace(5.0, 25.0, 6)[frame]}
+    times = np.array([f"2026-11-25T02:{minute:02d}:00" for minute in frame])
+    sc.Observations(**columns, **stated, time_utc=times).save(tmp_path / "rich.csv")
+    sc.Observations(**columns, meta={"directions": "apparent", "observer": "space"}).save(tmp_path / "space.ecsv")
+    (tmp_path / "parts").mkdir()
+    for name, some in (("a", frame < 3), ("b", frame >= 3)):
+        plain.select(some).save(tmp_path / "parts" / f"{name}.parquet")
+    SITE.save(tmp_path / "site.toml")
+    (tmp_path / "priors.toml").write_text("[priors]\nfocal_fraction = 0.05\n", encoding="utf-8")
+    (tmp_path / "budget.toml").write_text("", encoding="utf-8")
+    return tmp_path
+
+
+@pytest.fixture
+def unreported(monkeypatch):
+    """Runs whose reports have no figures, which take most of the time and no option."""
+    monkeypatch.setattr(drawing, "draw_figures", lambda _results, names, _progress: dict.fromkeys(names, b"<svg/>"))
+
+
+def command(kind, given):
+    words = ["run", kind, "camera.toml"]
+    for name, value in (ALWAYS | dict(given)).items():
+        words += [name] if value is None else [name, value]
+    return words
+
+
+def check_ending(words, status, err):
+    """Status 0, 1, or 2 with one sentence in the words of the command line."""
+    call = " ".join(words)
+    assert status in (0, 1, 2), (call, status, err)
+    if status == 2:
+        said = [line for line in err.splitlines() if line.startswith("error: ")]
+        assert len(said) == 1 and err.splitlines()[-1] == said[0] and said[0].endswith("."), (call, err)
+        # Both worlds are served where a column is named.
+        assert not PYTHON.search(said[0].replace(" or columns={...}", "")), (call, said[0])
+
+
+def test_every_option_has_values():
+    options = {
+        max(parameter.opts, key=len)
+        for parameter in typer.main.get_command(app).commands["run"].params
+        if parameter.opts[0].startswith("-")
+    }
+    assert options - {"--help"} == VALUES.keys() | ALWAYS.keys()
+
+
+class ReachedError(BaseException):
+    """The table is read, and nothing stands against the options; no error of the program."""
+
+
+@pytest.fixture
+def asked(tables, cli, monkeypatch):
+    """Whether a run begins to calibrate with these options of this kind of table, or else ends with a sentence."""
+
+    def reached(*_args, **_options):
+        raise ReachedError
+
+    def begins(kind, given):
+        words = command(kind, given)
+        with monkeypatch.context() as patch:
+            patch.setattr(sc.Run, "calibrate", reached)
+            try:
+                status, _, err = cli(*words)
+            except ReachedError:
+                return True
+        check_ending(words, status, err)
+        return False
+
+    return begins
+
+
+def different(combination):
+    return len({name for name, _ in combination}) == len(combination)
+
+
+def test_some_pairs_of_options_work_or_are_refused_in_words(asked):
+    pairs = [pair for pair in itertools.combinations(COMBINATIONS, 2) if different(pair)]
+    rng = np.random.default_rng(1)
+    begun = [asked(rng.choice(KINDS), pairs[place]) for place in rng.choice(len(pairs), 120, replace=False)]
+    # Neither is everything refused, nor nothing.
+    assert 20 < np.sum(begun) < 100
+    # Controls: these are known.
+    assert asked("plain.csv", [("--robust", None), ("--model", "k1")])
+    assert not asked("plain.csv", [("--robust", None), ("--noise", "model")])
+    assert not asked("plain.csv", [("--star-errors", None), ("--method", "samaan")])
+    assert not asked("parts", [("--star-errors", None)])
+
+
+@pytest.mark.slow
+def test_every_pair_and_many_triples_of_options_work_or_are_refused_in_words(asked):
+    rng = np.random.default_rng(2)
+    for names in itertools.combinations(VALUES, 2):
+        asked(rng.choice(KINDS), [(name, rng.choice(VALUES[name])) for name in names])
+    triples = list(itertools.combinations(VALUES, 3))
+    for place in rng.choice(len(triples), 300, replace=False):
+        asked(rng.choice(KINDS), [(name, rng.choice(VALUES[name])) for name in triples[place]])
+
+
+def test_a_fault_of_the_program_has_a_status_of_its_own(tables, cli, monkeypatch):
+    def wrong(*_args, **_options):
+        raise ValueError("operands could not be broadcast together")
+
+    monkeypatch.setattr(sc.Run, "calibrate", wrong)
+    status, _, err = cli(*command("plain.csv", []))
+    assert status == FAULT and "Traceback" in err
+    assert err.splitlines()[-1].startswith("error: ValueError: this is a fault of starcal-uq")
+
+
+@pytest.mark.slow
+def test_runs_with_every_two_options_that_begin_end_well_too(asked, cli, unreported):
+    """Options in rows such that each two of them, of each kind of table, are together in at least one."""
+    begins = {kind: {choice for choice in COMBINATIONS if asked(kind, [choice])} for kind in KINDS}
+    rows, missing = [], set()
+    for kind in KINDS:
+        both = itertools.combinations(sorted(begins[kind], key=str), 2)
+        missing |= {(kind, pair) for pair in both if different(pair) and asked(kind, pair)}
+    possible = frozenset(missing)
+    rng = np.random.default_rng(3)
+    while missing:
+        kind, row = min(missing, key=str)
+        row = list(row)
+        for place in rng.permutation(len(COMBINATIONS)):
+            more = COMBINATIONS[place]
+            with_all = [(kind, tuple(sorted((more, one), key=str))) for one in row]
+            if more not in row and possible.issuperset(with_all) and not missing.isdisjoint(with_all):
+                row.append(more)
+        missing -= {(kind, tuple(sorted(pair, key=str))) for pair in itertools.combinations(row, 2)}
+        rows.append((kind, row))
+    ended = []
+    for kind, row in rows:
+        words = command(kind, row)
+        status, _, err = cli(*words)
+        check_ending(words, status, err)
+        ended.append(status)
+    # Few are refused after the work has begun: by the data, which then do not allow it.
+    assert np.mean(np.array(ended) < 2) > 0.7, list(zip(ended, rows, strict=True))
