@@ -1,7 +1,8 @@
 """The run folder: its file names, the rule by which steps replace results, and the check that a file is of this run.
 
 The rule. What a run holds is kept unless it is forced to go. A step that is done again removes what rests on its
-result, and names it first. All files of a step are replaced at once; files that the run has not written are left alone.
+result, and names it first; a budget is a further result, and makes a report older. All files of a step are replaced at
+once; files that the run has not written are left alone.
 """
 
 from __future__ import annotations
@@ -71,6 +72,8 @@ REST_ON: dict[str, tuple[str, ...]] = {
     "pdf": (),
     "notebook": (),
 }
+# A further result of the run replaces nothing but a file of its name: what rests on it stays, and is older.
+_ADDED = ("budget",)
 # Files that have no name of their own in a run.
 _OTHERS = {
     **dict.fromkeys(DIAGNOSIS_TABLES.values(), "diagnose"),
@@ -214,7 +217,13 @@ class RunFolder:
 
     def resting_on(self, step: str) -> list[str]:
         """Files that go when a step is done again, because they rest on its result."""
-        return [name for name, entry in self.manifest.files.items() if entry.step in REST_ON[step]]
+        gone = () if step in _ADDED else REST_ON[step]
+        return [name for name, entry in self.manifest.files.items() if entry.step in gone]
+
+    def is_older(self, step: str) -> bool:
+        """Whether a step is done, and something that it rests on was done after it."""
+        steps = list(self.manifest.steps)
+        return step in steps and any(step in REST_ON[later] for later in steps[steps.index(step) + 1 :])
 
     @contextmanager
     def writing(self, *, make: bool = False) -> Iterator[None]:
@@ -249,7 +258,7 @@ class RunFolder:
                 name: entry_of(path, old.files[name].step if name in old.files else step)
                 for name, path in files_in(stage).items()
             }
-            stale = (step, *REST_ON[step])
+            stale = () if step in _ADDED else (step, *REST_ON[step])
             kept = {name: entry for name, entry in old.files.items() if entry.step not in stale}
             gone = [name for name in self.resting_on(step) if name not in made]
             if gone and tell is not None:
@@ -257,7 +266,8 @@ class RunFolder:
             if step == "calibrate":
                 remove_checkpoints(self.path)
                 shutil.rmtree(self.path / NEW, ignore_errors=True)
-            steps = {name: content for name, content in old.steps.items() if name not in stale} | {step: record}
+            steps = {name: content for name, content in old.steps.items() if name not in (step, *stale)}
+            steps[step] = record
             new = replace(old, files=kept | made, steps=steps, stage=STEP)
             if not making:
                 words = () if step == "calibrate" else new.words

@@ -5,6 +5,8 @@ A step takes results and gives one, and writes it. `RunFolder` has the rule by w
 
 from __future__ import annotations
 
+import itertools
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -808,14 +810,16 @@ class Run:
     ) -> Budget:
         """Make the attitude error budget and write it.
 
-        The attitude errors are those of ``attitude.csv``, with the misfit found if the run was diagnosed.
+        The attitude errors are those of ``attitude.csv``, with the misfit found if the run was diagnosed. A report
+        stays, and is older than the budget until it is made again; the verdict has the new requirements at once.
 
         Parameters
         ----------
         file, confidence, seed
             As for `starcal_uq.budget`.
         force : bool
-            Whether to replace the budget of before.
+            Whether a budget that was made with another file goes. It is kept as ``budget-1.csv``, or the next free
+            number, otherwise.
 
         Raises
         ------
@@ -827,7 +831,6 @@ class Run:
         from starcal_uq.budgeting.budget import budget
         from starcal_uq.budgeting.file import BudgetFile, load_budget_file
 
-        self._keep("budget", force)
         stated = file if isinstance(file, BudgetFile) or file is None else load_budget_file(file)
         posterior, attitude = self.posterior, self.attitude
         made = budget(
@@ -840,7 +843,13 @@ class Run:
         )
         with self._step("budget", seed, {"file": file, "confidence": confidence}) as files:
             made.save(files.budget)
+            if not force and self.has("budget") and not _of_one_file(made, self.error_budget):
+                shutil.copyfile(self.folder.budget, files.path / self._free_name("budget-{}.csv"))
+            if self.has("verdict"):
+                write_json(replace(self.results, budget=made).verdict.to_dict(), files.verdict)
         self.error_budget = made
+        if self.folder.is_older("report") and self._tell is not None:
+            self._tell(f"report.html is older than the budget; run `starcal-uq report {self.path}` to make it again.")
         return made
 
     def report(
@@ -852,7 +861,8 @@ class Run:
     ) -> Path:
         """Write ``RUN/report.html`` of whatever the run holds, and the figures in ``RUN/figures``.
 
-        A report follows from the rest of the run, and goes when that changes: one that is there is left as it is.
+        A report follows from the rest of the run, and goes when that changes: one that is there is left as it is, if
+        no budget was made after it.
 
         Parameters
         ----------
@@ -869,7 +879,7 @@ class Run:
         RunFolderError
             If there is no calibration, or a file cannot be read or is not of this run.
         """
-        if force or not self.has("report"):
+        if force or not self.has("report") or self.folder.is_older("report"):
             from starcal_uq.presentation.report.drawing import FIGURES, GALLERY, draw_figures, draw_gallery
             from starcal_uq.presentation.report.page import prepared
 
@@ -957,6 +967,11 @@ class Run:
         merged = record.get("merge", {}).get("has_observations") is False
         return not merged and not record["settings"].get("stream", False)
 
+    def _free_name(self, name: str) -> str:
+        """The first name of numbered ones that no file of the folder has."""
+        numbered = (name.format(number) for number in itertools.count(1))
+        return next(one for one in numbered if not (self.folder.path / one).exists())
+
     def _keep(self, name: str, force: bool) -> None:
         """Refuse to do a step again whose result is there."""
         if self.has(name) and not force:
@@ -971,6 +986,12 @@ class Run:
 
 # What is loaded when it is first asked for.
 _LOADED = tuple(name for name, value in vars(Run).items() if isinstance(value, cached_property))
+
+
+def _of_one_file(one: Budget, other: Budget) -> bool:
+    """Whether the second of two budgets holds no file of the user's that the first does not hold."""
+    first, second = (made.provenance["settings"].get("file", "") for made in (one, other))
+    return not second or Path(first).resolve() == Path(second).resolve()
 
 
 def as_setting(value: object) -> object:
