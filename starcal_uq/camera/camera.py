@@ -38,10 +38,10 @@ class Camera(Shown):
     ----------
     width_px, height_px : int
         Size of the detector, pixels.
-    pixel_um : float
-        Pixel pitch, micrometres.
-    focal_mm : float
-        Focal length, millimetres.
+    pixel_um : float or None
+        Pixel pitch, micrometres; None where it is unknown, and then nothing has millimetres.
+    focal_mm : float or None
+        Focal length, millimetres; None where the pitch is unknown. It may be left to `focal_px`.
     x0_px, y0_px : float
         Principal point, pixels; it may lie outside the detector.
     distortion : str
@@ -50,22 +50,26 @@ class Camera(Shown):
         Coefficients of that model in its order, on offsets in pixels; zeros by default.
     name : str
         Free text.
+    focal_px : float
+        Focal length, pixels: that of `focal_mm` and `pixel_um` where both are given.
 
     Raises
     ------
     CameraError
-        If a value is not finite, a size is not positive, or the coefficients do not fit the distortion model.
+        If a value is not finite, the focal length is neither given in pixels nor with the pitch, a size is not
+        positive, or the coefficients do not fit the distortion model.
     """
 
     width_px: int
     height_px: int
-    pixel_um: float
-    focal_mm: float
+    pixel_um: float | None
+    focal_mm: float | None
     x0_px: float
     y0_px: float
     distortion: str = "brown"
     coefficients: tuple[float, ...] = ()
     name: str = ""
+    focal_px: float = 0.0
 
     def __post_init__(self) -> None:
         try:
@@ -74,11 +78,24 @@ class Camera(Shown):
             raise CameraError(f"camera: {error}") from None
         for key in ("width_px", "height_px"):
             self._set(key, _whole(key, getattr(self, key)))
-        for key in ("pixel_um", "focal_mm", "x0_px", "y0_px"):
+        lengths = ["focal_px" if self.focal_mm is None else "focal_mm"]
+        if self.pixel_um is not None:
+            lengths.append("pixel_um")
+        for key in (*lengths, "x0_px", "y0_px"):
             self._set(key, _finite(key, getattr(self, key)))
-        for key in ("width_px", "height_px", "pixel_um", "focal_mm"):
+        for key in ("width_px", "height_px", *lengths):
             if getattr(self, key) <= 0:
                 raise CameraError(f"camera: {key} is {getattr(self, key)!r}; it must be above 0.")
+        if self.focal_mm is None:
+            if self.pixel_um is not None:
+                self._set("focal_mm", self.length_mm(self.focal_px))
+        elif self.pixel_um is None:
+            raise CameraError(
+                f"camera: focal_mm is {self.focal_mm!r}, but the pixel pitch is unknown: give pixel_um as well, or "
+                "focal_px in its place."
+            )
+        if self.focal_mm is not None and self.pixel_um is not None:
+            self._set("focal_px", self.focal_mm * 1000.0 / self.pixel_um)
         names = [c.name for c in model.coefficients]
         given = tuple(self.coefficients) or (0.0,) * len(names)
         if len(given) != len(names):
@@ -90,11 +107,6 @@ class Camera(Shown):
 
     def _set(self, key: str, value: object) -> None:
         object.__setattr__(self, key, value)
-
-    @property
-    def focal_px(self) -> float:
-        """Focal length, pixels."""
-        return self.focal_mm * 1000.0 / self.pixel_um
 
     @property
     def theta(self) -> FloatArray:
@@ -132,6 +144,24 @@ class Camera(Shown):
         """Half of the detector's diagonal, pixels: the corner's distance from the centre."""
         return 0.5 * math.hypot(self.width_px, self.height_px)
 
+    def length_mm(self, length_px: float) -> float:
+        """Millimetres of a length on the detector.
+
+        Raises
+        ------
+        CameraError
+            If the pixel pitch is unknown.
+        """
+        if self.pixel_um is None:
+            raise CameraError("camera: nothing is in millimetres, because the pixel pitch is unknown; state pixel_um.")
+        return length_px * self.pixel_um / 1000.0
+
+    def length_text(self, length_px: float, digits: int) -> str:
+        """A length on the detector, such as the focal length: in millimetres, or in pixels of unknown pitch."""
+        if self.pixel_um is None:
+            return f"{length_px:.{digits}g} px"
+        return f"{self.length_mm(length_px):.{digits}g} mm"
+
     def contains(self, xy: ArrayLike) -> BoolArray:
         """Whether each point lies on the detector, edges included.
 
@@ -164,8 +194,7 @@ class Camera(Shown):
                 f"({', '.join(self.parameter_names)})."
             )
         x0, y0, f, *coefficients = values.tolist()
-        focal_mm = f * self.pixel_um / 1000.0
-        return self.replace(x0_px=x0, y0_px=y0, focal_mm=focal_mm, coefficients=tuple(coefficients))
+        return self.replace(x0_px=x0, y0_px=y0, focal_px=f, coefficients=tuple(coefficients))
 
     def data_sheet(self) -> Camera:
         """The camera as its data sheet gives it: principal point in the centre, no distortion."""
@@ -176,7 +205,8 @@ class Camera(Shown):
         """A copy with some attributes changed.
 
         With another `distortion` and no `coefficients`, those of the same name are kept and the others are
-        zero; between a forward and an inverse model nothing can be kept.
+        zero; between a forward and an inverse model nothing can be kept. A `pixel_um` where there was none keeps
+        `focal_px`, and so does None.
         """
         if "distortion" in changes and "coefficients" not in changes:
             try:
@@ -191,12 +221,15 @@ class Camera(Shown):
         known = {field.name for field in dataclasses.fields(self)}
         if unknown := sorted(set(changes) - known):
             raise CameraError(f"camera: no attribute {unknown[0]!r}; use one of {', '.join(sorted(known))}.")
+        if "focal_px" in changes or None in (self.pixel_um, changes.get("pixel_um", self.pixel_um)):
+            changes.setdefault("focal_mm", None)
         return dataclasses.replace(self, **changes)
 
     def to_dict(self) -> dict[str, Any]:
         """The [camera] table: plain values, coefficients under their own names."""
         table = dataclasses.asdict(self)
-        del table["coefficients"]
+        for key in ("coefficients", *(("focal_px",) if self.pixel_um is not None else ("pixel_um", "focal_mm"))):
+            del table[key]
         name = table.pop("name")
         names = (c.name for c in get_model(self.distortion).coefficients)
         table.update(zip(names, self.coefficients, strict=True))
@@ -230,8 +263,6 @@ class Camera(Shown):
     def _of_others(cls, path: str | os.PathLike[str]) -> Camera:
         with reading(path, "a camera of OpenCV, ROS, Kalibr or mrcal", "check the file", CameraError):
             held = read_pinhole(Path(path).read_text(encoding="utf-8"))
-        if held.pixel_um is None:
-            raise CameraError(f"{path}: states no pixel pitch; write # pixel_um: 6.9 at its top (micrometres).")
         try:
             return cls.from_opencv(
                 held.matrix, held.dist_coeffs, held.width_px, held.height_px, held.pixel_um, name=held.name
@@ -276,7 +307,7 @@ class Camera(Shown):
         dist_coeffs: ArrayLike | None,
         width_px: int,
         height_px: int,
-        pixel_um: float,
+        pixel_um: float | None,
         *,
         distortion: str | None = None,
         name: str = "",
@@ -290,7 +321,7 @@ class Camera(Shown):
         dist_coeffs
             k1, k2[, p1, p2[, k3]], any shape; None or empty for none. Further coefficients must be zero.
         width_px, height_px, pixel_um
-            The detector, of which OpenCV keeps no record.
+            The detector, of which OpenCV keeps no record; the pitch may be None.
         distortion
             Distortion model to use; by default the smallest of brown, brown3 and brown_tangential that
             holds the coefficients.
@@ -305,7 +336,8 @@ class Camera(Shown):
             width_px=width_px,
             height_px=height_px,
             pixel_um=pixel_um,
-            focal_mm=theta[2] * pixel_um / 1000.0,
+            focal_mm=None,
+            focal_px=theta[2],
             x0_px=theta[0],
             y0_px=theta[1],
             distortion=model,
@@ -339,6 +371,7 @@ _HEADER = """\
 # Pixels: x to the right, y down; (0, 0) is the centre of the first pixel, so that the detector spans
 # -0.5 ... width_px - 0.5 along x and -0.5 ... height_px - 0.5 along y.
 # width_px, height_px, x0_px, y0_px: pixels. pixel_um: micrometres. focal_mm: millimetres.
+# Where the pixel pitch is unknown, focal_px (pixels) stands in the place of pixel_um and focal_mm.
 # x0_px, y0_px: principal point. Distortion coefficients act on offsets in pixels from it:
 # k1 px^-2, k2 px^-4, k3 px^-6, p1 and p2 px^-1.
 """
@@ -351,8 +384,9 @@ _DIRECTION = {
 _WORDS = {
     "width_px": "the width of the detector in pixels",
     "height_px": "the height of the detector in pixels",
-    "pixel_um": "the pitch of the square pixels in micrometres",
+    "pixel_um": "the pitch of the square pixels in micrometres (if it is unknown, focal_px in place of focal_mm)",
     "focal_mm": "the focal length in millimetres",
+    "focal_px": "the focal length in pixels",
     "x0_px": "the principal point along x in pixels",
     "y0_px": "the principal point along y in pixels",
 }
@@ -372,6 +406,8 @@ class _CameraSection(Section):
     def unknown(self, key: str) -> str:
         own = [c.name for c in get_model(self.distortion).coefficients]
         models = [n for n in model_names() if key in {c.name for c in get_model(n).coefficients}]
+        if key == "focal_mm":
+            return "keys focal_mm and focal_px both state the focal length; remove one"
         if not models:
             return unknown_key(key, self.keys)
         return (
@@ -381,9 +417,13 @@ class _CameraSection(Section):
 
 
 @lru_cache
-def _section(distortion: str) -> Section:
+def _section(distortion: str, in_pixels: bool) -> Section:
+    """Schema for a focal length in pixels, where the pitch may be unknown, or in millimetres."""
+    keys = {name: key for name, key in _KEYS.items() if name != ("focal_mm" if in_pixels else "focal_px")}
+    if in_pixels:
+        keys["pixel_um"] = Key.number(KEYS["pixel_um"], _WORDS["pixel_um"])
     own = {c.name: Key.number(KEYS["coefficient"], "the coefficient") for c in get_model(distortion).coefficients}
-    return _CameraSection({**_KEYS, **own}, CameraError, distortion)
+    return _CameraSection({**keys, **own}, CameraError, distortion)
 
 
 def _checked(table: Mapping[str, Any], where: str) -> dict[str, Any]:
@@ -395,6 +435,7 @@ def _checked(table: Mapping[str, Any], where: str) -> dict[str, Any]:
         coefficients = get_model(distortion).coefficients
     except DistortionError as error:
         raise CameraError(f"{where}: key distortion: {error}") from None
-    values = _section(distortion).check(table, where)
+    values = _section(distortion, "focal_px" in table).check(table, where)
+    values = {"pixel_um": None, "focal_mm": None, **values}
     values["coefficients"] = tuple(values.pop(c.name, 0.0) for c in coefficients)
     return values

@@ -46,7 +46,7 @@ def write_pinhole(camera: Pinhole, to: str) -> str:
     f, x0, y0 = (repr(float(camera.matrix[i])) for i in ((0, 0), (0, 2), (1, 2)))
     width, height, d = camera.width_px, camera.height_px, [repr(float(value)) for value in camera.dist_coeffs]
     matrix = f"{f}, 0.0, {x0}, 0.0, {f}, {y0}, 0.0, 0.0, 1.0"
-    pitch = f"# pixel_um: {camera.pixel_um!r}\n"
+    pitch = "" if camera.pixel_um is None else f"# pixel_um: {camera.pixel_um!r}\n"
     # A name is free text; these files get what cannot end a line or a quotation.
     name = re.sub(r"[^\w .+-]", "_", camera.name, flags=re.ASCII) or "star_camera"
     if to == "opencv":

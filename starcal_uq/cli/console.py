@@ -68,9 +68,12 @@ def show_calibration(calibration: Calibration, truth: Camera | None = None) -> N
     """Table of start, estimate and sigma; with a truth, also truth and z."""
     from starcal_uq.estimation.fallback import fallback_words
     from starcal_uq.presentation.words.estimation import calibration_table, fitted_noise_text, focal_length
+    from starcal_uq.presentation.words.inputs import PITCH_UNKNOWN
 
     print_table(calibration_table(calibration, truth))
     say(f"Focal length {focal_length(calibration)}. Status: {calibration.status.name.lower()}.")
+    if calibration.camera.pixel_um is None:
+        say(PITCH_UNKNOWN)
     for words in filter(None, (fitted_noise_text(calibration).strip(), fallback_words(calibration))):
         say(words)
 

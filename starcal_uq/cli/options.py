@@ -130,7 +130,7 @@ def parse_start(text: str | None) -> dict[str, float]:
             found[name] = float(value)
         except ValueError:
             name = ""
-        if name not in ("focal_mm", "x0_px", "y0_px"):
+        if name not in ("focal_mm", "focal_px", "x0_px", "y0_px"):
             raise typer.BadParameter(f"{shown(pair)} is no start, such as focal_mm=50.2 or x0_px=511.5,y0_px=511.5.")
     return found
 
@@ -315,11 +315,17 @@ MaxMag = Annotated[float, number(MAGNITUDES, "Magnitude limit, Gaia G.")]
 def check_same_sensor(calibrated: Camera, run: Path, sheet: Camera, path: Path) -> None:
     """Refuse a run whose camera cannot be that of the file: another detector, or a focal length 10 % off."""
     same = (calibrated.width_px, calibrated.height_px) == (sheet.width_px, sheet.height_px)
-    pixels = abs(calibrated.pixel_um / sheet.pixel_um - 1.0)
+    pixels = 0.0
+    if calibrated.pixel_um is not None and sheet.pixel_um is not None:
+        pixels = abs(calibrated.pixel_um / sheet.pixel_um - 1.0)
     focal = abs(calibrated.focal_px / sheet.focal_px - 1.0)
     if not same or pixels > 1e-6 or focal > 0.1:
+        own, its = (_size_words(camera) for camera in (calibrated, sheet))
         raise typer.BadParameter(
-            f"{run}: its camera ({calibrated.width_px} x {calibrated.height_px} px, f = {calibrated.focal_mm:.4g} mm) "
-            f"is not that of {path} ({sheet.width_px} x {sheet.height_px} px, f = {sheet.focal_mm:.4g} mm): give the "
-            "file and the run of one sensor."
+            f"{run}: its camera ({own}) is not that of {path} ({its}): give the file and the run of one sensor."
         )
+
+
+def _size_words(camera: Camera) -> str:
+    focal = camera.length_text(camera.focal_px, 4)
+    return f"{camera.width_px} x {camera.height_px} px, f = {focal}"

@@ -33,8 +33,8 @@ class Calibration(Part):
     n_stars: int = says("Stars in pixels")
     n_frames: int = says("Frames")
     camera: AnyDict = says("The calibrated camera, with the keys of a camera file")
-    focal_mm: Number = says("Focal length")
-    focal_sigma_mm: Number = says("Its standard deviation")
+    focal_mm: Number = says("Focal length; null where the pixel pitch is unknown")
+    focal_sigma_mm: Number = says("Its standard deviation; null where the pixel pitch is unknown")
     parameters: list[Estimate] = says("Parameters in order")
     notes: list[str] = says("Sentences on noise and model, where there is something to say")
 
@@ -46,6 +46,7 @@ class Calibration(Part):
         cal, truth = result if isinstance(result, list) else (result, None)
         table = cal.to_dataframe()
         true = {} if truth is None else dict(zip(cal.parameter_names, truth.theta, strict=True))
+        pitch = cal.camera.pixel_um
         table["truth"] = [true.get(name) for name in table["parameter"]]
         table["z"] = (table["estimate"] - table["truth"].astype(float)) / table["sigma"]
         return {
@@ -53,7 +54,7 @@ class Calibration(Part):
             "status": cal.status.name,
             "camera": cal.camera.to_dict(),
             "focal_mm": cal.camera.focal_mm,
-            "focal_sigma_mm": cal.sigmas[2] * cal.camera.pixel_um * 1e-3,
+            "focal_sigma_mm": None if pitch is None else cal.sigmas[2] * pitch * 1e-3,
             "parameters": table,
             "notes": [words for words in (fitted_noise_text(cal).strip(), fallback_words(cal)) if words],
         }

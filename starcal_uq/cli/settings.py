@@ -35,7 +35,7 @@ from starcal_uq.cli.options import (
 )
 from starcal_uq.core import settings
 from starcal_uq.core.conflicts import conflict
-from starcal_uq.core.settings import EPOCH, MAGNITUDES
+from starcal_uq.core.settings import EPOCH, KEYS, MAGNITUDES
 from starcal_uq.core.types import AnyDict
 
 if TYPE_CHECKING:
@@ -86,9 +86,12 @@ class EstimationSettings:
         str | None,
         typer.Option(
             metavar="NAME=VALUE,...",
-            help="Start from these in place of CAMERA's: focal_mm, x0_px, y0_px.",
+            help="Start from these in place of CAMERA's: focal_mm (or focal_px), x0_px, y0_px.",
             callback=checked(parse_start),
         ),
+    ] = None
+    pixel_um: Annotated[
+        float | None, number(KEYS["pixel_um"], "Pixel pitch, um, where neither CAMERA nor the images state it.")
     ] = None
     max_iterations: Annotated[int | None, number("max_iterations", "Limit for each stage; 200 by default.")] = None
     accept_inflation: Annotated[
@@ -118,8 +121,20 @@ class EstimationSettings:
         return options | {"likelihood": "student_t"} if self.robust else options
 
     def started(self, camera: Camera) -> Camera:
-        """The nominal camera with the start that was asked for."""
-        return camera.replace(**parse_start(self.start))
+        """The nominal camera with the pitch and the start that were asked for."""
+        if self.pixel_um is not None:
+            if camera.pixel_um not in (None, self.pixel_um):
+                raise typer.BadParameter(
+                    f"--pixel-um is {self.pixel_um:g}, but the pixel pitch is stated as {camera.pixel_um:g} um: leave "
+                    "the option out, or correct the camera file."
+                )
+            camera = camera.replace(pixel_um=self.pixel_um)
+        start = parse_start(self.start)
+        if camera.pixel_um is None and "focal_mm" in start:
+            raise typer.BadParameter("--start focal_mm needs the pixel pitch: add --pixel-um UM, or give focal_px.")
+        if "focal_mm" in start and "focal_px" in start:
+            raise typer.BadParameter("--start has focal_mm and focal_px: give one of them.")
+        return camera.replace(**start)
 
 
 @dataclass(frozen=True)

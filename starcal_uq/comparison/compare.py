@@ -263,9 +263,10 @@ def _messages(a: Any, b: Any, labels: tuple[str, str], rule: Rule, tests: Differ
                 f"{tests.outside:.2g} arcsec rms of the difference cannot come from errors of the parameters: the "
                 "two models cannot agree that well."
             )
-    if cameras[0].pixel_um != cameras[1].pixel_um:
+    pitches = [camera.pixel_um for camera in cameras if camera.pixel_um is not None]
+    if len(set(pitches)) > 1:
         messages.append(
-            f"The pixel pitch differs ({cameras[0].pixel_um:g} and {cameras[1].pixel_um:g} µm): directions are "
+            f"The pixel pitch differs ({pitches[0]:g} and {pitches[1]:g} µm): directions are "
             "compared pixel by pixel, in which the pitch has no part."
         )
     if rule.signs is not None and np.isnan(tests.p_map):

@@ -144,6 +144,7 @@ KEYS = {
     "height_px": Limit(1, 10**6),
     "pixel_um": Limit(0.01, 1e4, whole=False),
     "focal_mm": Limit(1e-3, 1e7, whole=False),
+    "focal_px": Limit(1e-2, 1e9, whole=False),
     "x0_px": Limit(-1e6, 1e6, whole=False),
     "y0_px": Limit(-1e6, 1e6, whole=False),
     "coefficient": Limit(-1.0, 1.0, whole=False),

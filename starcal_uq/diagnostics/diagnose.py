@@ -67,8 +67,10 @@ class MultiStart:
     of_frames : int
         Frames of the calibration.
     start : tuple of float
-        Start that reached the best optimum, where that is a better one: focal length (mm), principal point (px); else
+        Start that reached the best optimum, where that is a better one: focal length, principal point (px); else
         empty.
+    focal_unit : str
+        Unit of its focal length: "mm", or "px" where the pixel pitch is unknown.
     """
 
     n: int
@@ -79,6 +81,7 @@ class MultiStart:
     n_frames: int = 0
     of_frames: int = 0
     start: tuple[float, ...] = ()
+    focal_unit: str = "mm"
 
 
 @dataclass(frozen=True)
@@ -266,7 +269,7 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
     for _ in range(n):
         shift = rng.standard_normal(3)
         start = nominal.replace(
-            focal_mm=nominal.focal_mm * float(np.exp(_START_FOCAL * shift[0])),
+            focal_px=nominal.focal_px * float(np.exp(_START_FOCAL * shift[0])),
             x0_px=float(np.clip(nominal.x0_px + side * shift[1], 0.0, nominal.width_px - 1.0)),
             y0_px=float(np.clip(nominal.y0_px + side * shift[2], 0.0, nominal.height_px - 1.0)),
         )
@@ -281,8 +284,9 @@ def multi_start(obs: Observations, cal: Calibration, n: int, seed: int = 0) -> M
             largest = max(largest, difference)
         elif chi2 < lowest * (1.0 - _BETTER):
             better += 1
-            best = min(best, (chi2, (start.focal_mm, start.x0_px, start.y0_px)))
-    return MultiStart(n, same, better, failed, largest, some.n_frames, obs.n_frames, best[1])
+            best = min(best, (chi2, (start.focal_mm or start.focal_px, start.x0_px, start.y0_px)))
+    unit = "px" if nominal.focal_mm is None else "mm"
+    return MultiStart(n, same, better, failed, largest, some.n_frames, obs.n_frames, best[1], unit)
 
 
 def _few(obs: Observations) -> Observations:

@@ -62,8 +62,8 @@ class FrameFocals:
         told = []
         for number in range(self.n_groups):
             mine = self.group == number
-            focal_mm = float(np.median(self.focal_px[mine])) * camera.pixel_um * 1e-3
-            told.append(f"{focal_mm:.4g} mm in {_listed(self.frame_ids[mine])}")
+            focal = camera.length_text(float(np.median(self.focal_px[mine])), 4)
+            told.append(f"{focal} in {_listed(self.frame_ids[mine])}")
         chosen = self.largest if self.largest.count(",") < _WORDS else "LIST"
         return (
             f"the frames are of {plural(self.n_groups, 'camera')}, or some are wrong: focal length {join_words(told)}; "

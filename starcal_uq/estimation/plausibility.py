@@ -190,8 +190,8 @@ def _fit(table: _Table, camera: Camera, wider: float = 1.0) -> _Fit:
     frames = table.frames
     size = max(camera.width_px, camera.height_px)
     focal_px = 0.5 * size / np.tan(0.5 * _FIELD_RAD)
-    found = camera.replace(focal_mm=focal_px * camera.pixel_um * 1e-3)
-    found = found.replace(focal_mm=found.focal_mm * focal_ratio(found, frames))
+    found = camera.replace(focal_px=focal_px)
+    found = found.replace(focal_px=focal_px * focal_ratio(found, frames))
     tolerance_px = wider * _tolerance_px(camera)
     b = measured_directions(found, frames)
     best = consensus(b, frames.r, frames.starts, tolerance_px / found.focal_px)
@@ -301,23 +301,29 @@ def _wrong_focal(plain: _Fit, camera: Camera) -> str | None:
     ratio = plain.focal_px / camera.focal_px
     if 1.0 / _SAME_CAMERA < ratio < _SAME_CAMERA:
         return None
-    asked = significant(plain.focal_px * camera.pixel_um * 1e-3, 3)
-    reasons = {
-        1e-3: f"pixel_um looks like millimetres ({camera.pixel_um:g}): multiply it by 1000"
-        if camera.pixel_um < 0.5
-        else f"focal_mm looks like micrometres ({camera.focal_mm:g}): divide it by 1000",
+    for unit, reason in _other_units(camera).items():
+        if 1.0 / _SAME_UNIT < ratio / unit < _SAME_UNIT:
+            return reason
+    return (
+        f"the stars ask for a focal length of about {camera.length_text(plain.focal_px, 3)}, not "
+        f"{camera.length_text(camera.focal_px, 6)}: start from that, or give the camera that took the images"
+    )
+
+
+def _other_units(camera: Camera) -> dict[float, str]:
+    """What the lengths of a camera file look like when they are off by these factors."""
+    if camera.pixel_um is None or camera.focal_mm is None:
+        return {}
+    short = f"focal_mm looks like micrometres ({camera.focal_mm:g}): divide it by 1000"
+    if camera.pixel_um < 0.5:
+        short = f"pixel_um looks like millimetres ({camera.pixel_um:g}): multiply it by 1000"
+    return {
+        1e-3: short,
         1e3: f"focal_mm looks like metres ({camera.focal_mm:g}): multiply it by 1000",
         1e-3 * camera.pixel_um: f"focal_mm looks like pixels ({camera.focal_mm:g}): multiply it by the pixel pitch, "
         f"{1e-3 * camera.pixel_um:g} mm",
         25.4: f"focal_mm looks like inches ({camera.focal_mm:g}): multiply it by 25.4",
     }
-    for unit, reason in reasons.items():
-        if 1.0 / _SAME_UNIT < ratio / unit < _SAME_UNIT:
-            return reason
-    return (
-        f"the stars ask for a focal length of about {asked} mm, not {camera.focal_mm:g}: start from that, or give the "
-        "camera that took the images"
-    )
 
 
 def _as_it_is(plain: _Fit, camera: Camera, status: Status, screened: bool) -> str | None:

@@ -61,9 +61,8 @@ _RICH_STARS, _FEW_TRIANGLES = 8, 40
 _NEAR = 2.0
 # Error of the principal point that is allowed for: a part of the detector's width, but not more than so many pixels.
 _CENTRE, _LARGEST_CENTRE_PX = 0.02, 20.0
-# Where images say neither: the pixel pitch, without which the focal length has no millimetres, and a focal length in
-# detector widths to begin with.
-ASSUMED_PIXEL_UM, _ASSUMED_FOCAL = 5.0, 5.0
+# Where images do not say it: a focal length in detector widths to begin with.
+_ASSUMED_FOCAL = 5.0
 
 
 class StarsByDepth(Protocol):
@@ -342,12 +341,9 @@ def sheet_of(centroids: CentroidTable) -> tuple[Camera, bool]:
     pixel, focal_mm, focal_px = said.get("pixel_um"), said.get("focal_mm"), said.get("focal_px")
     if focal_px is None and pixel and focal_mm:
         focal_px = 1000.0 * focal_mm / pixel
-    if pixel is None:
-        pixel = 1000.0 * focal_mm / focal_px if focal_mm and focal_px else ASSUMED_PIXEL_UM
     focal = focal_px if focal_px else _ASSUMED_FOCAL * width
-    name = "camera of the images" + ("" if pixel in said.values() else ", pixel pitch assumed")
     centre = (width - 1) / 2.0, (height - 1) / 2.0
-    camera = Camera(width, height, pixel, focal * pixel / 1000.0, *centre, name=name)
+    camera = Camera(width, height, pixel, None, *centre, name="camera of the images", focal_px=focal)
     return camera, bool(focal_px)
 
 
@@ -369,9 +365,8 @@ def _with(sheet: Camera, tolerance: CameraTolerance, optics: FoundOptics, told: 
     if told and abs(optics.focal_px / sheet.focal_px - 1.0) < tolerance.focal:
         camera = sheet
     else:
-        focal_mm = optics.focal_px * sheet.pixel_um / 1000.0
         name = f"{sheet.name}, " if sheet.name else ""
-        camera = sheet.replace(focal_mm=focal_mm, name=f"{name}focal length from the stars")
+        camera = sheet.replace(focal_px=optics.focal_px, name=f"{name}focal length from the stars")
         tolerance = replace(tolerance, focal=min(tolerance.focal, AGREEMENT))
     if told:
         return camera, tolerance
@@ -442,7 +437,7 @@ def _moved(camera: Camera, shared: FloatArray) -> Camera:
         names = [c.name for c in get_model(camera.distortion).coefficients]
         coefficients[names.index("k1")] += kappa / camera.corner_radius_px**3
     return camera.replace(
-        focal_mm=camera.focal_mm * float(np.exp(log_scale)),
+        focal_px=camera.focal_px * float(np.exp(log_scale)),
         x0_px=camera.x0_px + dx,
         y0_px=camera.y0_px + dy,
         coefficients=tuple(coefficients),

@@ -282,7 +282,7 @@ def _derived(post: Posterior, derived: Sequence[Derived]) -> Check:
     sentence = (
         f"{late[0].capitalize()} has not converged: raise n_steps."
         if late
-        else "Focal length in mm, displacement at the corner and common rotation have converged too."
+        else "Focal length, displacement at the corner and common rotation have converged too."
     )
     return _converged(post, "Derived quantities", rhat, ess, sentence)
 

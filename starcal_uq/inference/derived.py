@@ -16,10 +16,15 @@ from starcal_uq.inference.posterior import Derived, Posterior
 
 
 def derived_quantities(post: Posterior) -> tuple[Derived, ...]:
-    """Focal length in mm, displacement by the distortion at the corner, and the common rotation about each axis."""
+    """Displacement by the distortion at the corner, the common rotation about each axis, and the focal length in mm.
+
+    That in mm is left out where the pixel pitch is unknown.
+    """
     draws = post.theta_draws
     rotation = (draws - post.mean) @ post.rotation_per_theta.T * ARCSEC
-    values: dict[tuple[str, str], FloatArray] = {("focal length", "mm"): draws[:, 2] * post.camera.pixel_um / 1000.0}
+    values: dict[tuple[str, str], FloatArray] = {}
+    if post.camera.pixel_um is not None:
+        values["focal length", "mm"] = draws[:, 2] * post.camera.pixel_um / 1000.0
     if draws.shape[1] > 3:
         values["distortion at the corner", "px"] = corner_displacement_px(post)
     for i, axis in enumerate(AXES):

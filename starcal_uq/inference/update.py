@@ -155,7 +155,7 @@ def check_chain(priors: Priors, camera: Camera, data_sha256: Collection[str] = (
         )
 
 
-def _detector(camera: Camera) -> list[float]:
+def _detector(camera: Camera) -> list[float | None]:
     return [camera.width_px, camera.height_px, camera.pixel_um]
 
 

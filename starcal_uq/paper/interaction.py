@@ -259,9 +259,9 @@ def _distorted(base: Condition, scale: float) -> Condition:
 def _with_field(base: Condition, field_deg: float, sky: StarCatalogue) -> Condition:
     """The same detector with another focal length, and as many stars in a frame."""
     truth = _focal_for(base.truth, field_deg)
-    if np.isclose(truth.focal_mm, base.truth.focal_mm, rtol=1e-6):
+    if np.isclose(truth.focal_px, base.truth.focal_px, rtol=1e-6):
         return base
-    start = base.start.replace(focal_mm=truth.focal_mm * base.start.focal_mm / base.truth.focal_mm)
+    start = base.start.replace(focal_px=truth.focal_px * base.start.focal_px / base.truth.focal_px)
     n_stars = _count(sky, base.campaign.max_mag) * solid_angle_sr(base.truth) / solid_angle_sr(truth)
     limit = float(np.sort(sky.mag)[round(n_stars) - 1])
     return _with_campaign(dataclasses.replace(base, truth=truth, start=start), max_mag=limit)
@@ -274,8 +274,7 @@ def _with_mag(base: Condition, max_mag: float, sky: StarCatalogue) -> Condition:
 
 
 def _focal_for(camera: Camera, field_deg: float) -> Camera:
-    half_mm = 0.5e-3 * camera.width_px * camera.pixel_um
-    return camera.replace(focal_mm=float(half_mm / np.tan(np.radians(0.5 * field_deg))))
+    return camera.replace(focal_px=float(0.5 * camera.width_px / np.tan(np.radians(0.5 * field_deg))))
 
 
 def solid_angle_sr(camera: Camera) -> float:

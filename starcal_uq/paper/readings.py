@@ -274,7 +274,7 @@ def measured(scene: Scene, reading: str, estimates: Estimates) -> dict[Key, floa
     for method, camera in estimates.items():
         if camera is None:
             continue
-        values = {"x0_px": camera.x0_px, "y0_px": camera.y0_px, "f_mm": camera.focal_mm}
+        values = {"x0_px": camera.x0_px, "y0_px": camera.y0_px, "f_mm": camera.length_mm(camera.focal_px)}
         values |= dict(zip(("k1", "k2"), camera.coefficients, strict=False))
         values["y0_error_px"] = abs(camera.y0_px - scene.truth.y0_px)
         found |= {Key(reading, method, quantity, ""): float(value) for quantity, value in values.items()}

@@ -122,7 +122,7 @@ def run_paper(*, convention: str = "eq14", n_frames: int = N_FRAMES, seed: int =
 
 def per_px(camera: Camera, parameter: str) -> float:
     """Factor from px units to the unit of the printed quantity: the focal length is printed in mm."""
-    return camera.pixel_um / 1000.0 if parameter == "f" else 1.0
+    return camera.length_mm(1.0) if parameter == "f" else 1.0
 
 
 def replicate_draws(replicates: Replicates, number: Printed, pair_covariance: str = "full") -> FloatArray:

@@ -98,7 +98,8 @@ def quantities(mission: FrameSet) -> tuple[Quantity, ...]:
     p = len(known)
     unit = np.eye(p)
     chosen = [_quantity(f"{k.name}_{_suffix(k.unit)}", unit[i : i + 1]) for i, k in enumerate(known)]
-    chosen.append(_quantity("f_mm", unit[2:3] * camera.pixel_um / 1000.0))
+    if camera.pixel_um is not None:
+        chosen.append(_quantity("f_mm", unit[2:3] * camera.pixel_um / 1000.0))
     if p > 3:
         chosen.append(_quantity("distortion_corner_px", _corner_displacement(mission)))
     for axis, name in enumerate(AXES):

@@ -153,9 +153,11 @@ SENSOR_KEYS = {
     "hot_pixel_seed": ("HOTSEED", "seed of the hot pixels"),
 }
 
+# Of the lengths, those that a camera has.
 _CAMERA_KEYS = {
     "pixel_um": ("PIXUM", "[um] pixel pitch"),
     "focal_mm": ("FOCALMM", "[mm] focal length"),
+    "focal_px": ("FOCALPX", "[px] focal length; the pixel pitch is unknown"),
     "x0_px": ("X0PX", "[px] principal point; 0 = centre of first pixel"),
     "y0_px": ("Y0PX", "[px] principal point, y downwards"),
 }
@@ -217,7 +219,8 @@ def _cards(truth: FrameTruth) -> list[tuple[str, Any, str]]:
         for axis, value in zip("XYZ", truth.rate_rad_s, strict=True)
     ]
     cards.append(("CAMNAME", camera.name.encode("ascii", "replace").decode("ascii"), "camera"))
-    cards += [(keyword, getattr(camera, key), text) for key, (keyword, text) in _CAMERA_KEYS.items()]
+    table = camera.to_dict()
+    cards += [(keyword, table[key], text) for key, (keyword, text) in _CAMERA_KEYS.items() if key in table]
     cards.append(("DISTORT", camera.distortion, "distortion model"))
     cards += [
         (coefficient.name.upper(), value, f"[{coefficient.unit}] distortion")
@@ -254,9 +257,10 @@ def read_truth(path: str | os.PathLike[str]) -> FrameTruth:
                 star_id = np.array(table["star_id"], dtype=np.str_)
                 size = header["NAXIS1"], header["NAXIS2"]
         model = get_model(header["DISTORT"])
+        lengths = {"pixel_um": None, "focal_mm": None}
         camera = Camera(
             *size,
-            **{key: header[keyword] for key, (keyword, _) in _CAMERA_KEYS.items()},
+            **lengths | {key: header[keyword] for key, (keyword, _) in _CAMERA_KEYS.items() if keyword in header},
             distortion=model.name,
             coefficients=tuple(header[coefficient.name.upper()] for coefficient in model.coefficients),
             name=header["CAMNAME"],

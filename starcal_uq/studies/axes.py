@@ -119,10 +119,11 @@ def camera_of(base: Camera, settings: Mapping[str, Any]) -> Camera:
         n = settings["pixels"]
         camera = _resampled(camera, n / camera.width_px, n, n)
     if "pixel_um" in settings:
+        if camera.pixel_um is None:
+            raise StudyError("the axis pixel_um needs the pitch of the camera: state pixel_um under [camera].")
         camera = _resampled(camera, camera.pixel_um / settings["pixel_um"], camera.width_px, camera.height_px)
     if "fov_deg" in settings:
-        focal_px = camera.width_px / (2.0 * math.tan(0.5 * math.radians(settings["fov_deg"])))
-        camera = camera.replace(focal_mm=focal_px * camera.pixel_um / 1000.0)
+        camera = camera.replace(focal_px=camera.width_px / (2.0 * math.tan(0.5 * math.radians(settings["fov_deg"]))))
     if "focal_mm" in settings:
         camera = camera.replace(focal_mm=settings["focal_mm"])
     if "x0_offset_px" in settings:
@@ -150,7 +151,8 @@ def _resampled(camera: Camera, finer: float, width: int, height: int) -> Camera:
     new = camera.replace(
         width_px=width,
         height_px=height,
-        pixel_um=camera.pixel_um / finer,
+        pixel_um=None if camera.pixel_um is None else camera.pixel_um / finer,
+        focal_px=camera.focal_px * finer,
         coefficients=tuple(k * finer ** (1 - n) for k, n in zip(camera.coefficients, orders, strict=True)),
     )
     x, y = camera.centre_px

@@ -156,7 +156,6 @@ def test_no_camera_is_lost_or_made_up(tmp_path):
     assert np.allclose(sc.Camera.load(path).theta, camera.theta, rtol=1e-14)
     text = path.read_text()
     for old, new, said in (
-        ("# pixel_um: 6.9\n", "", "states no pixel pitch"),
         ("plumb_bob", "equidistant", "distortion model is 'equidistant'"),
         ("camera_matrix", "matrix", "has none of camera_matrix"),
         ("image_width: 1024", "image_width: wide", "is not a camera of OpenCV"),

@@ -55,6 +55,9 @@ def test_simulated_images_go_through_the_commands_one_by_one(cli, tmp_path):
     status, out, err = cli("identify", "centroids.parquet", "-o", "alone.csv", "--max-mag", 6)
     assert status == 0, err
     assert "The stars alone tell the camera" in out
+    # The images do not state the pitch of their pixels, and nobody makes one up.
+    assert re.search(r"\dmm| mm\b|\bum\b", out) is None
+    assert sc.Camera.load(tmp_path / "alone.toml").pixel_um is None
     alone = sc.load_observations(tmp_path / "alone.csv")
     pairs = set(zip(alone.frame.tolist(), alone.star_id.tolist(), strict=True))
     assert len(pairs.intersection(zip(found.frame.tolist(), found.star_id.tolist(), strict=True))) > 0.9 * found.n_stars

@@ -67,7 +67,9 @@ def test_real_frames_of_an_unknown_camera(esa: Centroids, stars: StarCatalogue, 
     assert found.optics.n_frames > 1
     assert found.nominal.focal_px == pytest.approx(found.optics.focal_px)
     assert "The stars alone tell the camera: a field of 11.4 x 8.59 degrees" in found.text
-    assert "pixel pitch assumed" in found.nominal.name
+    # The pictures do not state the pitch.
+    assert found.nominal.pixel_um is None
+    assert "mm" not in found.text
 
 
 @pytest.mark.parametrize(

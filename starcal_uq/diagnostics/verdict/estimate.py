@@ -403,7 +403,7 @@ def starts(found: MultiStart) -> Check:
         level, sentence = Level.FAIL, "A start elsewhere reached a better optimum."
         advice = "Calibrate again from there, or from a camera file that is nearer to the lens."
         if found.start:
-            pairs = zip(("focal_mm", "x0_px", "y0_px"), found.start, strict=True)
+            pairs = zip((f"focal_{found.focal_unit}", "x0_px", "y0_px"), found.start, strict=True)
             start = ",".join(f"{name}={value:.6g}" for name, value in pairs)
             call = f"sc.calibrate(obs, camera.replace({start.replace(',', ', ')}))"
             remedy = f"{CALIBRATE} --start {start} or {call}"

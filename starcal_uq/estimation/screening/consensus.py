@@ -145,7 +145,7 @@ def focal_ratio(camera: Camera, frames: StarFrames) -> float:
     catalogue = _angle(frames.r, first, second)
     ratio = 1.0
     for _ in range(3):
-        scaled = camera.replace(focal_mm=camera.focal_mm * ratio)
+        scaled = camera.replace(focal_px=camera.focal_px * ratio)
         ratio *= float(_factors(_angle(measured_directions(scaled, frames), first, second), catalogue)[0])
     return ratio
 
@@ -208,7 +208,7 @@ def pre_screen(camera: Camera, frames: StarFrames) -> tuple[BoolArray, Camera]:
     """
     if not np.isfinite(measured_directions(camera, frames)).all():
         camera = camera.replace(coefficients=(0.0,) * len(camera.coefficients))
-    camera = camera.replace(focal_mm=camera.focal_mm * focal_ratio(camera, frames))
+    camera = camera.replace(focal_px=camera.focal_px * focal_ratio(camera, frames))
     b = measured_directions(camera, frames)
     wide_rad = _WIDE_FRACTION * max(camera.width_px, camera.height_px) / camera.focal_px
     wide = consensus(b, frames.r, frames.starts, wide_rad)

@@ -209,7 +209,7 @@ def screen(
         frame_count=residuals.frame_count,
         taste=taste,
         taste_p_value=taste_p,
-        focal_ratio=start.focal_mm / camera.focal_mm,
+        focal_ratio=start.focal_px / camera.focal_px,
         n_pre_screened=found_before,
         stable=stable,
         warnings=(blame,) if blame else warnings_about(obs, calibration.camera, use, table),

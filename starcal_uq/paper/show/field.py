@@ -124,7 +124,7 @@ def data_sheets(found: FieldExperiment) -> TextTable:
 
 def cameras(found: FieldExperiment) -> TextTable:
     """The cameras with claimed standard deviations."""
-    shown = {"x0": (1.0, 2), "y0": (1.0, 2), "f": (found.reading.truth.pixel_um / 1000.0, 4)}
+    shown = {"x0": (1.0, 2), "y0": (1.0, 2), "f": (found.reading.truth.length_mm(1.0), 4)}
     shown |= {"k1": (1e9, 2), "k2": (1e16, 1)}
     rows = []
     for name, group in found.camera_table().groupby("camera", sort=False):

@@ -38,11 +38,12 @@ def plot_convergence(cal: Calibration, truth: Camera | None = None) -> Figure:
     grid = style.panels(figure, 2, len(parameters), (0.9, 0.12, 0.5, 0.72), (0.56, 0.18))
     axes = grid.subplots(sharex=True, squeeze=False)
     iteration = np.arange(len(values))
-    to_mm = cal.camera.pixel_um / 1000.0
+    pixel_um = cal.camera.pixel_um
     for i, parameter in enumerate(parameters):
         upper, lower = (style.dress(ax) for ax in axes[:, i])
-        factor = to_mm if parameter.name == "f" else 1.0 / parameter.scale
-        unit = "mm" if parameter.name == "f" else pretty_unit(parameter.scaled_unit)
+        factor, unit = 1.0 / parameter.scale, pretty_unit(parameter.scaled_unit)
+        if parameter.name == "f" and pixel_um is not None:
+            factor, unit = pixel_um / 1000.0, "mm"
         for ax in (upper, lower):
             _mark_stages(ax, starts, len(values))
         upper.plot(iteration, values[:, i] * factor, color=style.BLUE, marker="o", markersize=3.2, linewidth=1.2)

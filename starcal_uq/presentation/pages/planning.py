@@ -47,7 +47,13 @@ _FRAMES_SHOWN = 30
 _GROUPS = (
     (
         "Parameters",
-        (("x0_px", "x₀ [px]"), ("y0_px", "y₀ [px]"), ("f_mm", "f [mm]"), ("distortion_corner_px", "Corner [px]")),
+        (
+            ("x0_px", "x₀ [px]"),
+            ("y0_px", "y₀ [px]"),
+            ("f_px", "f [px]"),
+            ("f_mm", "f [mm]"),
+            ("distortion_corner_px", "Corner [px]"),
+        ),
     ),
     ("Common rotation [arcsec]", tuple((f"common_{axis}_arcsec", axis) for axis in AXES)),
     ("Rest [arcsec]", tuple((f"rest_{axis}_arcsec", axis) for axis in AXES)),
@@ -187,6 +193,8 @@ def _needs_table(plan: Plan) -> TextTable:
 
 def _context(plan: Plan, images: Mapping[str, bytes]) -> dict[str, Any]:
     table = plan.to_dataframe()
+    # The focal length once: in millimetres where the pitch is known.
+    table = table.drop(columns="f_px") if "f_mm" in table else table
     groups = [(name, [pair for pair in columns if pair[0] in table]) for name, columns in _GROUPS]
     shown = [pair for _, pairs in groups for pair in pairs]
     edges = {pairs[0][0] for _, pairs in groups}

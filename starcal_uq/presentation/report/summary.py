@@ -17,6 +17,7 @@ from starcal_uq.core.status import Check, Level, Question, worst
 from starcal_uq.presentation.report.tables import parameter_rows
 from starcal_uq.presentation.tables import TextTable
 from starcal_uq.presentation.words.budgeting import axis_label, bound
+from starcal_uq.presentation.words.inputs import detector_words
 from starcal_uq.propagation.attitude_error import (
     IF_MODEL_HOLDS,
     NOT_ASSESSED,
@@ -151,7 +152,7 @@ def methods_paragraph(results: Results) -> str:
     kind = "simulated " if obs.meta.get("source") == "simulated" else ""
     noise = "fitted with the camera" if cal.fitted_noise is not None else "a free parameter"
     parts = [
-        f"The camera ({camera.width_px} × {camera.height_px} pixels of {camera.pixel_um:g} µm, distortion model "
+        f"The camera ({detector_words(camera)}, distortion model "
         f"“{camera.distortion}”) was calibrated with starcal_uq {versions.get('starcal_uq') or ''} on "
         f"{plural(cal.n_stars, f'{kind}identified star')} in {plural(cal.n_frames, 'frame')}. Start values came from "
         "the angles between stars in three stages (Ye & Yang 2017); the estimate maximises the likelihood of the pixel "

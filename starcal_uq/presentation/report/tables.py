@@ -63,9 +63,8 @@ def parameter_rows(results: Results) -> list[Row]:
     for i, parameter in enumerate(all_parameters(results)):
         numbers = (mean[i], sd[i], low[i], high[i], prior[i], start[i], true[i], z[i])
         rows.append(_parameter_row(parameter, parameter.scaled_unit, parameter.scale, *numbers))
-        if parameter.name == "f":
-            per_mm = 1000.0 / cal.camera.pixel_um
-            rows.append(_parameter_row(parameter, "mm", per_mm, *numbers))
+        if parameter.name == "f" and cal.camera.pixel_um is not None:
+            rows.append(_parameter_row(parameter, "mm", 1000.0 / cal.camera.pixel_um, *numbers))
             rows[-1]["description"] = "the same in millimetres"
     return rows
 

@@ -14,6 +14,7 @@ from starcal_uq.diagnostics.verdict.observed import air, conditional_words, corr
 from starcal_uq.presentation.html import card, listed
 from starcal_uq.presentation.words.estimation import calibration_table, noise_kind
 from starcal_uq.presentation.words.inference import posterior_table
+from starcal_uq.presentation.words.inputs import PITCH_UNKNOWN, detector_words
 from starcal_uq.presentation.words.propagation import equivalent_shift, one_number_sentence
 
 if TYPE_CHECKING:
@@ -66,10 +67,12 @@ def data_sentence(results: Results) -> str:
         unique = f", {count(len(np.unique(obs.star_id)))} different stars"
     camera = cal.camera
     horizontal, vertical = camera.fov_deg
+    pitch = f" {PITCH_UNKNOWN}" if camera.pixel_um is None else ""
     return (
-        f"{source}{stars}{unique}, with {_directions(obs)}. Camera: {camera.width_px} × {camera.height_px} pixels of "
-        f"{camera.pixel_um:g} µm, {fixed(horizontal, 1)}° × {fixed(vertical, 1)}° field, distortion model "
-        f"“{camera.distortion}”. Centroid noise was {_noise_words(results)}.{_air_words(results)}"
+        f"{source}{stars}{unique}, with {_directions(obs)}. Camera: {detector_words(camera)}, "
+        f"{fixed(horizontal, 1)}° × {fixed(vertical, 1)}° field, distortion model "
+        f"“{camera.distortion}”. Centroid noise was {_noise_words(results)}.{pitch}"
+        f"{_air_words(results)}"
     )
 
 

@@ -17,10 +17,12 @@ _SHOWN_ROWS = 30
 
 
 def focal_length(cal: Calibration) -> str:
-    """The focal length with its sigma, mm."""
-    sigma = cal.sigmas[2] * cal.camera.pixel_um * 1e-3
+    """The focal length with its sigma, mm, or px where the pixel pitch is unknown."""
+    focal, sigma, unit = cal.camera.focal_px, float(cal.sigmas[2]), "px"
+    if cal.camera.pixel_um is not None and cal.camera.focal_mm is not None:
+        focal, sigma, unit = cal.camera.focal_mm, sigma * cal.camera.pixel_um * 1e-3, "mm"
     decimals = decimals_for(sigma)
-    return f"{fixed(cal.camera.focal_mm, decimals)} ± {fixed(sigma, decimals)} mm"
+    return f"{fixed(focal, decimals)} ± {fixed(sigma, decimals)} {unit}"
 
 
 def noise_kind(cal: Calibration) -> str:

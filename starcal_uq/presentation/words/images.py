@@ -17,6 +17,7 @@ from starcal_uq.pipeline.inspection import IDENTIFIED, Frames, InspectedFrame
 from starcal_uq.pipeline.record import ImageRecord
 from starcal_uq.pipeline.refine import ImageCalibration, identified_pairs
 from starcal_uq.presentation.tables import TextTable
+from starcal_uq.presentation.words.inputs import focal_words
 
 _MIRRORED = " The images are mirror images of the sky: x is counted from the right edge."
 _REASONS: dict[FrameStatus, str] = {
@@ -79,8 +80,8 @@ def optics_text(optics: FoundOptics, camera: Camera) -> str:
     width, height = camera.fov_deg
     agree = f"{plural(optics.n_frames, 'frame says', 'frames say')} so"
     return (
-        f"The stars alone tell the camera: a field of {width:.3g} x {height:.3g} degrees, f = {camera.focal_px:.5g} px "
-        f"({camera.focal_mm:.4g} mm if its pixels are {camera.pixel_um:.4g} um wide); {agree}, by chance once in "
+        f"The stars alone tell the camera: a field of {width:.3g} x {height:.3g} degrees, f = {focal_words(camera)}; "
+        f"{agree}, by chance once in "
         f"10{superscript(round(-optics.log10_expected_false))}."
     )
 

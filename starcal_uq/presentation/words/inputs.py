@@ -18,19 +18,39 @@ from starcal_uq.sky.catalogue import StarCatalogue
 _FIRST_ROWS = 5
 
 
+# What a result says beside a focal length in pixels.
+PITCH_UNKNOWN = (
+    "The pixel pitch is unknown, so that nothing is in millimetres: state it with --pixel-um UM, or as pixel_um in the "
+    "camera file."
+)
+
+
+def detector_words(camera: Camera) -> str:
+    """Size of the detector, and of its pixels where it is known."""
+    size = f"{camera.width_px} × {camera.height_px} pixels"
+    return f"{size} of unknown pitch" if camera.pixel_um is None else f"{size} of {camera.pixel_um:g} µm"
+
+
+def focal_words(camera: Camera) -> str:
+    """Focal length in pixels, and in millimetres where the pitch is known."""
+    pixels = f"{camera.focal_px:.5g} px"
+    return pixels if camera.pixel_um is None else f"{pixels} ({camera.length_text(camera.focal_px, 4)})"
+
+
 def camera_text(camera: Camera) -> str:
     """Name, focal length and field."""
     horizontal, vertical = camera.fov_deg
     name = f"{camera.name}, " if camera.name else ""
-    return f"{name}{camera.focal_mm:.6g} mm, {horizontal:.3f} x {vertical:.3f} deg."
+    return f"{name}{camera.length_text(camera.focal_px, 6)}, {horizontal:.3f} x {vertical:.3f} deg."
 
 
 def camera_table(camera: Camera) -> TextTable:
     """Detector, optics and distortion."""
     coefficients = get_model(camera.distortion).coefficients
     rows = [
-        ("detector", f"{camera.width_px} x {camera.height_px} px of {camera.pixel_um:g} µm"),
-        ("focal length", f"{camera.focal_mm:.6g} mm = {camera.focal_px:.3f} px"),
+        ("detector", detector_words(camera)),
+        ("focal length", f"{camera.focal_px:.3f} px"),
+        *(() if camera.focal_mm is None else (("focal length", f"{camera.focal_mm:.6g} mm"),)),
         ("principal point", f"({camera.x0_px:.3f}, {camera.y0_px:.3f}) px"),
         ("distortion", camera.distortion),
         *((c.name, f"{k:.6g} {pretty_unit(c.unit)}") for c, k in zip(coefficients, camera.coefficients, strict=True)),

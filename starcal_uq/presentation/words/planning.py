@@ -200,7 +200,8 @@ def check_text(check: ForecastCheck) -> str:
 
 def plan_table(plan: Plan) -> TextTable:
     """The forecast by number of frames."""
-    columns = ("n_frames", "x0_px", "f_mm", "common_pitch_arcsec", "rest_pitch_arcsec", "nea_pitch_arcsec")
+    focal = "f_px" if plan.camera.pixel_um is None else "f_mm"
+    columns = ("n_frames", "x0_px", focal, "common_pitch_arcsec", "rest_pitch_arcsec", "nea_pitch_arcsec")
     title = "Forecast, standard deviations; the radius holds the stated confidence"
     spread = () if plan.distortion is None else ("radius_least_arcsec", "radius_most_arcsec")
     return TextTable.of(plan.to_dataframe(), title, (*columns, "radius_arcsec", *spread))
