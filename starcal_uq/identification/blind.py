@@ -16,13 +16,15 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import chain, combinations, pairwise
-from math import log10, pi
+from math import exp, log10, pi
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from starcal_uq.camera.camera import Camera
 from starcal_uq.core.types import FloatArray, IntArray
-from starcal_uq.identification.match import Match, match_frame, start_state
+from starcal_uq.identification.growth import Patch, grow
+from starcal_uq.identification.match import match_frame, start_state
 from starcal_uq.identification.nearby import NearbyStars
 from starcal_uq.identification.pairs import angle_between
 from starcal_uq.identification.pyramid import SIGMAS, CameraTolerance, FieldGeometry, Hypothesis, axes_of
@@ -48,19 +50,21 @@ _CODE_TOLERANCE = 0.012
 # The frame's brightest stars that a pattern's attitude must explain, and how well, as a part of their distance.
 _EXPLAINED, _BEND = 24, 0.008
 # Patterns are flat in narrow fields; those above 30 degrees are seen with these focal lengths, in detector widths.
-_FLAT, _FOCAL_STEPS = 1.7, (1.85, 1.45, 1.15, 0.92, 0.75, 0.61, 0.5)
+_FLAT, _FOCAL_STEPS = 1.7, (1.85, 1.45, 1.15, 0.92, 0.75, 0.61, 0.5, 0.42)
 _FOCAL_STEP = 1.17
 # Candidates of a frame and parity that are matched with all stars, and the camera tolerances then.
 _MATCHED = 12
 _FOCAL, _CENTRE, _DISTORTION = 0.02, 0.02, 0.004
+# Candidates that explain as much as chance does less often than this, log10, are tried with a lens that bends.
+_WORTH_GROWING = -5.0
 # Decimal logarithms of the wrong attitudes expected for a frame to count, and to count alone.
 _COUNTS, _ALONE = -4.0, -9.0
 # Frames that are searched, those of them that must agree where they can, and the stars that one must have.
 _PROBES, _ENOUGH, _LEAST_STARS = 10, 3, 5
 # Frames of one camera agree in their focal length to this.
 AGREEMENT = 0.02
-# Focal lengths of fields of view from 90 to 0.5 degrees, in detector widths.
-FOCAL_RANGE = (0.5, 115.0)
+# Focal lengths of fields of view from 105 to 0.5 degrees, in detector widths.
+FOCAL_RANGE = (0.38, 115.0)
 # The search for a focal length anywhere, instead of within the tolerance of a match.
 _ANYWHERE = log10(np.log(180.0) / (2.0 * _FOCAL))
 
@@ -158,11 +162,25 @@ class Levels:
 
 @dataclass(frozen=True, eq=False)
 class _Seen:
-    """Candidates of a frame: attitudes (c, 3, 3), focal lengths (c,), and how unlikely what they explain is, log10."""
+    """Candidates of a frame: attitudes (c, 3, 3), focal lengths (c,), and how unlikely what they explain is, log10.
+
+    Of their patterns the points (c, 4) and directions (c, 4, 3).
+    """
 
     rotation: FloatArray
     focal_px: FloatArray
     log10_chance: FloatArray
+    points: IntArray
+    directions: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """A frame's stars that are matched, how often chance does so with any focal length, log10, and the lens's bend."""
+
+    patch: Patch
+    log10_false: float
+    bend_px: float
 
 
 class BlindSearch:
@@ -187,7 +205,8 @@ class BlindSearch:
         ]
         parts = [self._explained(u, sigma_px, *part) for part in found]
         if not parts:
-            return _Seen(np.empty((0, 3, 3)), np.empty(0), np.empty(0))
+            none = np.empty(0)
+            return _Seen(np.empty((0, 3, 3)), none, none, np.empty((0, 4), dtype=np.int64), np.empty((0, 4, 3)))
         return _Seen(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
     def _focal_steps(self, focal_px: tuple[float, float]) -> Iterator[tuple[float, float, float]]:
@@ -233,8 +252,8 @@ class BlindSearch:
 
     def _explained(
         self, u: FloatArray, sigma_px: FloatArray, level: Level, mine: IntArray, theirs: IntArray, focal: FloatArray
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Attitudes and focal lengths of like patterns, and the odds that they explain other stars by chance."""
+    ) -> tuple[FloatArray, FloatArray, FloatArray, IntArray, FloatArray]:
+        """Columns of `_Seen`: like patterns, and the odds that their attitudes explain other stars by chance."""
         m = min(len(u), _EXPLAINED)
         b = _rays(u, focal)
         rows = np.arange(len(mine))[:, None]
@@ -251,18 +270,18 @@ class BlindSearch:
         chance = np.clip(density[:, None] * pi * gate**2, 1e-9, 1.0)
         # The sum of the logarithms, less that of the choices among the stars that might have been explained.
         log10_chance = np.where(near, np.log10(chance * m), 0.0).sum(axis=1)
-        return rotation, focal, log10_chance
+        return rotation, focal, log10_chance, mine, level.directions[theirs]
 
     def solve(
         self, u: FloatArray, sigma_px: FloatArray, sizes: list[int], focal_px: tuple[float, float]
-    ) -> tuple[float, Match] | None:
-        """The best focal length of a frame and its match, where there is one that counts."""
+    ) -> Solved | None:
+        """The best attitude of a frame and focal length of the camera, where there is one that counts."""
         from scipy.spatial import cKDTree
 
         if len(u) < _LEAST_STARS:
             return None
         seen = self.candidates(u, sigma_px, sizes, focal_px)
-        best: tuple[float, Match] | None = None
+        best: Solved | None = None
         tree = cKDTree(u)
         tried: list[tuple[float, FloatArray]] = []
         for row in np.argsort(seen.log10_chance, kind="stable"):
@@ -273,19 +292,35 @@ class BlindSearch:
             if any(abs(f / focal - 1.0) < 0.01 and np.abs(r - rotation).max() < 0.01 for f, r in tried):
                 continue
             tried.append((focal, rotation))
-            match = self._match(u, tree, sigma_px, focal, rotation)
-            if match is not None and (best is None or match.log10_false < best[1].log10_false):
-                best = focal * float(np.exp(match.state.shared[0])), match
-                if match.log10_false + _ANYWHERE < _ALONE:
+            solved = self._match(u, tree, sigma_px, focal, rotation)
+            if solved is None and seen.log10_chance[row] < _WORTH_GROWING:
+                solved = self._grow(u, sigma_px, Patch(rotation, focal, seen.points[row], seen.directions[row]))
+            if solved is not None and (best is None or solved.log10_false < best.log10_false):
+                best = solved
+                if solved.log10_false < _ALONE:
                     break
-        return best if best is not None and best[1].log10_false + _ANYWHERE < _COUNTS else None
+        return best if best is not None and best.log10_false < _COUNTS else None
 
     def _match(
         self, u: FloatArray, tree: cKDTree, sigma_px: FloatArray, focal: float, rotation: FloatArray
-    ) -> Match | None:
+    ) -> Solved | None:
+        """What a lens that hardly bends explains."""
         sky = self.sky.seen_by(replace(self.geometry, focal_px=focal))
         start = start_state(Hypothesis(rotation, 1.0))
-        return match_frame(u, tree, sigma_px, sky, start, self.tolerance, log10_wanted=_COUNTS - _ANYWHERE)
+        match = match_frame(u, tree, sigma_px, sky, start, self.tolerance, log10_wanted=_COUNTS - _ANYWHERE)
+        if match is None:
+            return None
+        log_scale, _, _, kappa = match.state.shared.tolist()
+        directions = self.stars.directions_icrs[match.star]
+        patch = Patch(match.state.rotation, focal * exp(log_scale), match.centroid, directions)
+        return Solved(patch, match.log10_false + _ANYWHERE, kappa)
+
+    def _grow(self, u: FloatArray, sigma_px: FloatArray, pattern: Patch) -> Solved | None:
+        """What a lens that bends explains."""
+        middle = np.array([0.5 * (self.width - 1.0), 0.5 * (self.height - 1.0)])
+        camera = Camera(int(self.width), int(self.height), 1.0, pattern.focal_px / 1000.0, *middle.tolist())
+        grown = grow(u + middle, sigma_px, pattern, self.sky, camera)
+        return None if grown is None else Solved(grown.patch, grown.log10_false + _ANYWHERE, grown.bend_px)
 
 
 def _frame_quads(u: FloatArray) -> IntArray:
@@ -310,10 +345,12 @@ def _rays(u: FloatArray, focal_px: FloatArray) -> FloatArray:
 @dataclass(frozen=True)
 class _Vote:
     frame: int
-    focal_px: float
     mirrored: bool
-    log10_false: float
-    kappa_px: float
+    solved: Solved
+
+    @property
+    def focal_px(self) -> float:
+        return self.solved.patch.focal_px
 
 
 def find_optics(
@@ -322,8 +359,8 @@ def find_optics(
     width_px: int,
     height_px: int,
     ranges: Sequence[tuple[float, float]],
-) -> FoundOptics | None:
-    """The focal length that frames agree on; None where there is none.
+) -> tuple[FoundOptics, int, Patch] | None:
+    """The focal length that frames agree on, and the surest frame with its stars; None where there is none.
 
     A frame is points (n, 2) from the detector's middle, brightest first, and their noise (n,), px. `stars` gives a
     catalogue of at least so many stars of the whole sky, or of all that there are. `ranges` are focal lengths, px, to
@@ -370,7 +407,7 @@ def _agreed(
     probes: Sequence[int],
     sizes: list[int],
     limits: tuple[float, float],
-) -> FoundOptics | None:
+) -> tuple[FoundOptics, int, Patch] | None:
     """What frames agree on, with the patterns of these levels."""
     votes: list[_Vote] = []
     for k in probes:
@@ -386,12 +423,14 @@ def _agreed(
                 break
             second = _vote(search, frames[other], other, sizes, near, (vote.mirrored,))
             same += [] if second is None else [second]
-        if len(same) > 1 or vote.log10_false < _ALONE:
+        if len(same) > 1 or vote.solved.log10_false < _ALONE:
             # The median of two is one of them, so that it is a focal length that was seen.
             focal = sorted(v.focal_px for v in same)[(len(same) - 1) // 2]
-            kappa = max(abs(v.kappa_px) for v in same)
-            best = min(v.log10_false for v in same)
-            return FoundOptics(focal, vote.mirrored, len(same), len(probes), kappa, best)
+            bend = max(abs(v.solved.bend_px) for v in same)
+            best = min(same, key=lambda v: v.solved.log10_false)
+            odds = best.solved.log10_false
+            optics = FoundOptics(focal, vote.mirrored, len(same), len(probes), bend, odds)
+            return optics, best.frame, best.solved.patch
     return None
 
 
@@ -407,6 +446,5 @@ def _vote(
     for mirrored in parities:
         solved = search.solve(points * [-1.0, 1.0] if mirrored else points, sigma, sizes, limits)
         if solved is not None:
-            focal, match = solved
-            return _Vote(number, focal, mirrored, match.log10_false + _ANYWHERE, float(match.state.shared[3]))
+            return _Vote(number, mirrored, solved)
     return None

@@ -8,6 +8,7 @@ say together about the camera narrows the tolerances for a second pass over all 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from copy import copy
 from dataclasses import astuple, dataclass, replace
 from functools import partial
 from os import PathLike
@@ -25,7 +26,9 @@ from starcal_uq.core.settings import Engine, bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray
 from starcal_uq.identification.blind import AGREEMENT, FOCAL_RANGE, find_optics
+from starcal_uq.identification.growth import GrownField, Patch, grow
 from starcal_uq.identification.match import CameraState, Match
+from starcal_uq.identification.nearby import NearbyStars
 from starcal_uq.identification.proposers import Proposer, prepare_engine
 from starcal_uq.identification.pyramid import CameraTolerance
 from starcal_uq.identification.result import FoundOptics, FrameIdentification, Identification, Parity
@@ -38,6 +41,7 @@ from starcal_uq.identification.search import (
     FrameTable,
     Search,
     field_geometry,
+    flipped,
     has_radial,
 )
 from starcal_uq.observations.table import Observations
@@ -59,6 +63,11 @@ _CAMERA_STARS = 7
 _RICH_STARS, _FEW_TRIANGLES = 8, 40
 # A focal length is looked for within this factor of the camera's before it is looked for anywhere.
 _NEAR = 2.0
+# A frame says what the lens is where chance does so less often, log10.
+_SURE = -9.0
+# A lens that bends is worth a second look at all frames where it explains so many times the stars of one, or where so
+# many frames are missed.
+_MORE, _MISSED = 1.1, 0.1
 # Error of the principal point that is allowed for: a part of the detector's width, but not more than so many pixels.
 _CENTRE, _LARGEST_CENTRE_PX = 0.02, 20.0
 # Where images do not say it: a focal length in detector widths to begin with.
@@ -180,12 +189,25 @@ def identify(
     searching = search_focal and calibration is None
     if told:
         attempt.run(progress, searching)
+        if searching and share_camera:
+            attempt = attempt.filled(progress)
     optics = None
     if searching and not attempt.good:
-        optics = _found_optics(attempt.field, catalogue, sheet, told)
-        if optics is not None:
-            found = _with(sheet, tolerance, optics, told)
-            other = _Attempt(centroids, catalogue, *found, prepare, share_camera, optics.mirrored)
+        alone = _found_optics(attempt.field, catalogue, sheet, told)
+        if alone is not None:
+            optics, frame, patch = alone
+            other = _Attempt(
+                centroids,
+                catalogue,
+                *_with(sheet, tolerance, optics, told),
+                prepare,
+                share_camera,
+                optics.mirrored,
+            )
+            grown = other.grown(frame, patch)
+            if grown is not None:
+                optics = replace(optics, focal_px=grown.camera.focal_px, distortion_px=abs(grown.bend_px))
+                other = other.bent(grown, _with(sheet, tolerance, optics, told)[0])
             other.run(progress, False)
             if other.n_solved > attempt.n_solved or not told:
                 attempt = other
@@ -209,7 +231,7 @@ class _Attempt:
         mirrored: bool = False,
     ) -> None:
         self.centroids, self.camera, self.prepare, self.share_camera = centroids, camera, prepare, share_camera
-        self.stars, self.tolerance = catalogue.for_camera(camera), tolerance
+        self.nominal, self.stars, self.tolerance = camera, catalogue.for_camera(camera), tolerance
         self.parity: Parity = "mirrored" if mirrored else "normal"
         self.field = FrameTable(centroids, camera, mirrored)
         self.results: dict[int, Found] = {}
@@ -230,9 +252,56 @@ class _Attempt:
         return _solved(self.results.values())
 
     @property
+    def n_stars(self) -> int:
+        """Stars identified in all frames."""
+        return sum(len(f.match) for f in self.results.values() if f.match is not None)
+
+    @property
     def good(self) -> bool:
         """Whether all frames were searched, and half of them are found."""
         return len(self.results) == len(self.field.ids) and len(self._failed()) <= self.n_solved
+
+    def grown(self, k: int, patch: Patch) -> GrownField | None:
+        """What a frame shows of the lens around its matched stars, where that is beyond doubt."""
+        sky = NearbyStars(self.stars.directions_icrs, self.stars.mag, field_geometry(self.field.camera))
+        found = grow(self.field.xy[k], self.field.sigma[k], patch, sky, self.field.camera)
+        return found if found is not None and found.log10_false < _SURE else None
+
+    def bent(self, grown: GrownField, nominal: Camera) -> _Attempt:
+        """The same frames, to be searched with a lens that one of them shows."""
+        other = copy(self)
+        mirrored = self.parity == "mirrored"
+        largest = _bending(self.tolerance, self.camera, grown.bend_px)
+        other.camera = flipped(grown.camera) if mirrored else grown.camera
+        other.nominal, other.tolerance = nominal, calibrated_tolerance(grown, largest)
+        other.field = FrameTable(self.centroids, other.camera, mirrored)
+        other.results, other._narrowed, other._search = {}, {}, None
+        return other
+
+    def filled(self, progress: Callable[[int, int], None] | None) -> _Attempt:
+        """The frames with the lens that the best of them shows, where that explains more than this camera does.
+
+        All frames are looked at again where that one shows many more stars, where many others are not identified, or
+        where the lens bends by more than is allowed for.
+        """
+        solved = [(k, found.match) for k, found in self.results.items() if found.match is not None]
+        if not solved:
+            return self
+        k, match = max(solved, key=lambda one: len(one[1]))
+        focal = self.field.camera.focal_px * float(np.exp(match.state.shared[0]))
+        patch = Patch(match.state.rotation, focal, match.centroid, self.stars.directions_icrs[match.star])
+        grown = self.grown(k, patch)
+        if grown is None:
+            return self
+        other = self.bent(grown, self.nominal)
+        more = len(grown.patch.centroid) > _MORE * len(match)
+        missed = len(self._failed()) > _MISSED * len(self.results)
+        beyond = self.tolerance.distortion_px + other.tolerance.distortion_px
+        bends = not any(self.camera.coefficients) and abs(grown.bend_px) > beyond
+        if not (more or missed or bends):
+            return self
+        other.run(progress, False)
+        return other if other.n_stars > self.n_stars else self
 
     def _failed(self) -> list[int]:
         return _failed(self.results, self.field)
@@ -297,12 +366,12 @@ class _Attempt:
         failed = self._failed()
         if len(failed) > self.n_solved and self.n_solved < 2 and self.parity == "normal" and not hopeless:
             # Every frame of a camera has one handedness: the one that more frames have.
-            flipped = FrameTable(self.centroids, self.camera, mirrored=True)
-            mirror = Search(flipped.camera, self.stars, self.tolerance, self.search.proposer)
-            other = _retry(mirror, flipped, failed)
+            field = FrameTable(self.centroids, self.camera, mirrored=True)
+            mirror = Search(field.camera, self.stars, self.tolerance, self.search.proposer)
+            other = _retry(mirror, field, failed)
             if _solved(other.values()) > self.n_solved:
-                self.parity, self.field, self._search = "mirrored", flipped, mirror
-                self.results = {k: other[k] if k in other else mirror.frame(flipped, k) for k in self.results}
+                self.parity, self.field, self._search = "mirrored", field, mirror
+                self.results = {k: other[k] if k in other else mirror.frame(field, k) for k in self.results}
         # Two attitudes that explain a frame are not told apart by knowing less.
         failed = [k for k in self._failed() if self.results[k].status != "ambiguous"]
         if len(failed) > self.n_solved:
@@ -327,7 +396,8 @@ class _Attempt:
                 refined = _moved(refined, second.common_camera(useful)[0])
         elif useful:
             refined = _moved(refined, self.search.common_camera(useful)[0])
-        return _result(self.field, results, refined, self.stars, self.parity, self.centroids, optics)
+        nominal = flipped(self.nominal) if self.parity == "mirrored" else self.nominal
+        return _result(self.field, results, refined, nominal, self.stars, self.parity, self.centroids, optics)
 
 
 def sheet_of(centroids: CentroidTable) -> tuple[Camera, bool]:
@@ -347,8 +417,10 @@ def sheet_of(centroids: CentroidTable) -> tuple[Camera, bool]:
     return camera, bool(focal_px)
 
 
-def _found_optics(field: FrameTable, catalogue: StarsByDepth, sheet: Camera, told: bool) -> FoundOptics | None:
-    """What the stars alone say of the lens."""
+def _found_optics(
+    field: FrameTable, catalogue: StarsByDepth, sheet: Camera, told: bool
+) -> tuple[FoundOptics, int, Patch] | None:
+    """What the stars alone say of the lens, and which of one frame say so."""
     frames = []
     for xy, sigma in zip(field.xy, field.sigma, strict=True):
         frames.append((xy - np.array(sheet.centre_px), sigma))
@@ -370,10 +442,15 @@ def _with(sheet: Camera, tolerance: CameraTolerance, optics: FoundOptics, told: 
         tolerance = replace(tolerance, focal=min(tolerance.focal, AGREEMENT))
     if told:
         return camera, tolerance
-    return camera, replace(
+    return camera, _bending(tolerance, sheet, optics.distortion_px)
+
+
+def _bending(tolerance: CameraTolerance, camera: Camera, bend_px: float) -> CameraTolerance:
+    """Tolerances for a lens that bends by so much at the corner, whatever is said of that."""
+    return replace(
         tolerance,
-        centre_px=max(tolerance.centre_px, _CENTRE * sheet.width_px),
-        distortion_px=max(tolerance.distortion_px, 1.5 * optics.distortion_px),
+        centre_px=max(tolerance.centre_px, _CENTRE * camera.width_px),
+        distortion_px=max(tolerance.distortion_px, 1.5 * abs(bend_px)),
     )
 
 
@@ -448,6 +525,7 @@ def _result(
     field: FrameTable,
     results: list[Found],
     camera: Camera,
+    nominal: Camera,
     stars: StarCatalogue,
     parity: Parity,
     table: CentroidTable,
@@ -513,7 +591,7 @@ def _result(
     # Not every table says which frames were left out.
     problems = getattr(table, "problem", [""] * len(records))
     n_left_out = sum(bool(problems[k]) and record.status == "too few stars" for k, record in enumerate(records))
-    return Identification(observations, tuple(records), camera, field.camera, parity, n_left_out, optics)
+    return Identification(observations, tuple(records), camera, nominal, parity, n_left_out, optics)
 
 
 def _check(table: CentroidTable, camera: Camera, stars: StarCatalogue) -> None:

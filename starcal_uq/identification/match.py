@@ -221,9 +221,13 @@ def log10_false_matches(
     bias = geometry.relative_bias(tolerance)
     area = pi * (gate_px**2 + (0.5 * bias * length) ** 2)
     ring = 2.0 * pi * length**2 * 2.0 * (tolerance.focal + bias + gate_px / length)
-    choices = lgamma(n + 1) - lgamma(m + 1) - lgamma(n - m + 1)
     hit = min(density_px2 * area, 1.0)
-    return (log(n_sky) + log(density_px2 * ring) + choices + (m - 2) * log(hit)) / log(10.0)
+    return (log(n_sky) + log(density_px2 * ring) + (m - 2) * log(hit)) / log(10.0) + log10_choices(n, m)
+
+
+def log10_choices(n: int, m: int) -> float:
+    """Log10 of the ways to choose m of n."""
+    return (lgamma(n + 1) - lgamma(m + 1) - lgamma(n - m + 1)) / log(10.0)
 
 
 def _prior(tolerance: CameraTolerance, radial: bool) -> FloatArray:

@@ -82,7 +82,7 @@ class FrameTable:
     """Centroids frame by frame, brightest first, as pixels and as ideal pixels of one camera."""
 
     def __init__(self, table: CentroidTable, camera: Camera, mirrored: bool = False) -> None:
-        self.camera = camera.replace(x0_px=camera.width_px - 1 - camera.x0_px) if mirrored else camera
+        self.camera = flipped(camera) if mirrored else camera
         self.ids = [int(i) for i in table.frame_ids]
         x = np.asarray(table.x_px, dtype=np.float64)
         xy = np.column_stack([camera.width_px - 1 - x if mirrored else x, np.asarray(table.y_px, dtype=np.float64)])
@@ -253,6 +253,11 @@ def _other_stars(one: Match, other: Match) -> bool:
     pairs = set(zip(one.centroid.tolist(), one.star.tolist(), strict=True))
     common = pairs.intersection(zip(other.centroid.tolist(), other.star.tolist(), strict=True))
     return 2 * len(common) < min(len(one), len(other))
+
+
+def flipped(camera: Camera) -> Camera:
+    """The camera with x counted from the right edge."""
+    return camera.replace(x0_px=camera.width_px - 1 - camera.x0_px)
 
 
 def field_geometry(camera: Camera) -> FieldGeometry:

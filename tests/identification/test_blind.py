@@ -223,8 +223,11 @@ def test_virgo_has_a_rival_with_the_same_stars(
 ) -> None:
     """A lens that no model fits: attitudes half a degree apart, with other principal points, name the same stars.
 
-    Told apart by their attitudes, they refuse the picture.
+    Told apart by their attitudes, they refuse the picture. A lens that is learnt from the middle outwards leaves no
+    such freedom, so that the search is done without it.
     """
+    for module in ("blind", "engine"):
+        monkeypatch.setattr(f"starcal_uq.identification.{module}.grow", lambda *_: None)
     image, places, rows = virgo(stars, 5.6, 5.0, 0)
     met: list[Match] = []
     accepted = Search._accepted
