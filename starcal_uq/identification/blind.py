@@ -318,7 +318,7 @@ class BlindSearch:
     def _grow(self, u: FloatArray, sigma_px: FloatArray, pattern: Patch) -> Solved | None:
         """What a lens that bends explains."""
         middle = np.array([0.5 * (self.width - 1.0), 0.5 * (self.height - 1.0)])
-        camera = Camera(int(self.width), int(self.height), 1.0, pattern.focal_px / 1000.0, *middle.tolist())
+        camera = Camera(int(self.width), int(self.height), None, None, middle[0], middle[1], focal_px=pattern.focal_px)
         grown = grow(u + middle, sigma_px, pattern, self.sky, camera)
         return None if grown is None else Solved(grown.patch, grown.log10_false + _ANYWHERE, grown.bend_px)
 

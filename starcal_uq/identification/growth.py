@@ -110,7 +110,7 @@ def grow(xy: FloatArray, sigma_px: FloatArray, patch: Patch, sky: NearbyStars, c
     grown = camera.replace(
         x0_px=float(fit.theta[0]),
         y0_px=float(fit.theta[1]),
-        focal_mm=float(fit.theta[2]) * camera.pixel_um / 1000.0,
+        focal_px=float(fit.theta[2]),
         distortion=_MODEL,
         coefficients=tuple(fit.theta[3:].tolist()),
     )
