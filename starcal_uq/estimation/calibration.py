@@ -12,7 +12,9 @@ import numpy as np
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import parameters
 from starcal_uq.core.display import Shown
+from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import atomic_path, reading
+from starcal_uq.core.manifest import digest
 from starcal_uq.core.records import Arrays, from_plain, read_arrays, to_plain, write_json
 from starcal_uq.core.status import Status
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray, Shapes
@@ -23,7 +25,7 @@ from starcal_uq.estimation.stages import Stage
 from starcal_uq.estimation.star_errors import StarErrors
 from starcal_uq.estimation.undetermined import remedy_of
 from starcal_uq.maths.intervals import student_quantile
-from starcal_uq.maths.linear import correlation_of
+from starcal_uq.maths.linear import correlation_of, is_positive
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -39,6 +41,8 @@ _DOCUMENT = (
     *("theta", "covariance", "information", "rotation_per_theta", "attitude_noise", "pair_theta", "pair_covariance"),
     *("camera", "nominal", "stages", "compressed", "fingerprints", "star_errors", "partitions", "undetermined"),
 )
+# Hash of the archive that belongs to the document.
+_ARCHIVE = "archive_sha256"
 # What the document says of a stage; its last estimate is there for readers.
 _STAGE = ("name", "status", "iterations", "evaluations", "seconds", "theta")
 
@@ -273,10 +277,12 @@ class Calibration(Shown):
         for stage, kept in zip(self.stages, plain["stages"], strict=True):
             kept |= {"iterations": stage.iterations, "theta": stage.theta.tolist()}
         plain["stages"] = [{name: kept[name] for name in _STAGE} for kept in plain["stages"]]
-        with atomic_path(path.with_suffix(".npz")) as temporary, temporary.open("wb") as stream:
-            np.savez_compressed(stream, allow_pickle=False, **arrays)
+        with atomic_path(path.with_suffix(".npz")) as temporary:
+            with temporary.open("wb") as stream:
+                np.savez_compressed(stream, allow_pickle=False, **arrays)
+            archive = digest(temporary)
         kept = {name: plain[name] for name in _DOCUMENT if plain[name] is not None and plain[name] != []}
-        write_json(kept, path)
+        write_json(kept | {_ARCHIVE: archive}, path)
 
     @classmethod
     def load(cls, path: str | Path) -> Calibration:
@@ -285,12 +291,25 @@ class Calibration(Shown):
         Raises
         ------
         RunFolderError
-            When a file is missing or not a calibration.
+            When a file is missing or not a calibration, when the two are not of one calibration, or when the
+            information matrix is not positive definite.
         """
         path, remedy = Path(path), "run `starcal-uq calibrate` again"
+        beside = path.with_suffix(".npz")
         with reading(path, "a calibration", remedy):
             document = json.loads(path.read_text(encoding="utf-8"))
-        with reading(path.with_suffix(".npz"), "the archive of a calibration", remedy):
-            arrays = read_arrays(path.with_suffix(".npz"))
+        with reading(beside, "the archive of a calibration", remedy):
+            arrays = read_arrays(beside)
+            archive = digest(beside)
         with reading(path, "a calibration", remedy):
-            return from_plain(cls, document, arrays)
+            # Files of versions before this one do not name their archive.
+            if document.pop(_ARCHIVE, archive) != archive:
+                raise RunFolderError(
+                    f"{path}: is not of the same calibration as {beside.name} beside it; read it again if it is being "
+                    f"written, or {remedy}."
+                )
+            found = from_plain(cls, document, arrays)
+            # What the data leave open has no information.
+            if not is_positive(found.information, strictly=not found.undetermined):
+                raise ValueError("its information matrix is not positive definite")
+            return found

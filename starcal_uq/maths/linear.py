@@ -11,6 +11,8 @@ ROWS = (0, 0, 0, 1, 1, 2)
 COLUMNS = (0, 1, 2, 1, 2, 2)
 # Worse than this, digits are lost in the inverse.
 _WORST_CONDITION = 1e13
+# What rounding may make of an entry of a matrix with a unit diagonal.
+_ROUNDING = 1e-9
 
 
 def inverse_symmetric(packed: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -75,6 +77,14 @@ def scaled_cholesky(covariance: FloatArray) -> FloatArray:
     """Lower Cholesky factor (p, p) of a covariance whose units span many powers of ten."""
     correlation, sd = correlation_of(covariance)
     return np.asarray(sd[:, None] * np.linalg.cholesky(correlation))
+
+
+def is_positive(matrix: FloatArray, *, strictly: bool = True) -> bool:
+    """Whether a matrix (p, p) is symmetric to rounding, and positive definite, or else semidefinite."""
+    scale = np.sqrt(np.abs(np.diag(matrix)))
+    unit = matrix / np.where(np.outer(scale, scale) > 0.0, np.outer(scale, scale), 1.0)
+    least = float(np.linalg.eigvalsh(unit)[0])
+    return np.allclose(unit, unit.T, atol=_ROUNDING) and (least > 0.0 if strictly else least > -_ROUNDING)
 
 
 def inverses(information: FloatArray) -> FloatArray:

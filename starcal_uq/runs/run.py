@@ -30,6 +30,7 @@ from starcal_uq.core.files import (
     reading,
     write_csv,
 )
+from starcal_uq.core.manifest import entry_of
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import write_json
 from starcal_uq.core.settings import bounded
@@ -198,7 +199,21 @@ class Run:
     def calibration(self) -> Calibration:
         """The estimate."""
         self.folder.require("arrays")
-        return Calibration.load(self.folder.require("calibration"))
+        found = Calibration.load(self.folder.require("calibration"))
+        if self.camera_changed and self._tell is not None:
+            self._tell(self.camera_changed)
+        return found
+
+    @property
+    def camera_changed(self) -> str:
+        """That the file of the nominal camera was changed after the run was made, in one sentence; empty if not."""
+        known = self.folder.manifest.files.get(RunFolder.camera.name)
+        if known is None or not self.has("camera") or known == entry_of(self.folder.camera, known.step):
+            return ""
+        return (
+            f"{self.folder.camera}: was changed after the run was made; its results are of the camera as it was, not "
+            "of this file."
+        )
 
     @cached_property
     def observations(self) -> Observations:
@@ -454,6 +469,7 @@ class Run:
             field_map=self.field_map if self.has("field_map") else None,
             diagnosis=self.diagnosis,
             images=self.images,
+            camera_changed=self.camera_changed,
             budget=self.error_budget if self.has("budget") else None,
             missing=self.missing,
         )

@@ -38,7 +38,8 @@ class Results(Shown):
     """Everything that a report is made from; None for what the run does not hold.
 
     The couplings are those of the posterior if there is one, else of the estimate; `truth` is the camera of a
-    simulation, `place` where the run is.
+    simulation, `place` where the run is. That the file of the nominal camera was changed after the run was made is a
+    sentence in `camera_changed`, empty if not.
     """
 
     name: str
@@ -53,6 +54,7 @@ class Results(Shown):
     images: ImageRecord | None = None
     budget: Budget | None = None
     missing: tuple[Missing, ...] = ()
+    camera_changed: str = ""
     place: Place | None = None
 
     @cached_property

@@ -209,6 +209,8 @@ def provenance_rows(results: Results) -> list[tuple[str, str]]:
     source = results.observations.meta.get("source")
     if source:
         rows.append(("Source of the data", str(source)))
+    if results.camera_changed:
+        rows.append(("Nominal camera", results.camera_changed))
     steps: list[tuple[str, Mapping[str, Any]]] = [("Calibration", results.calibration.provenance)]
     if results.posterior is not None:
         steps.append(("Sampling", results.posterior.provenance))
