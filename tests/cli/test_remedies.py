@@ -156,10 +156,12 @@ EXAMPLES = {
         )
     ],
     "diagnostics.verdict.estimate.misfit": lambda s: [
-        estimate.misfit(sc.diagnostics.misfit_tests(s.bent, sc.calibrate(s.bent, s.sheet, model="none")), "none"),
-        estimate.misfit(
-            SimpleNamespace(tests=[PHASE], found=lambda level: [PHASE]),
-        ),
+        estimate.misfit(found, cal)
+        for cal in (sc.calibrate(s.bent, s.sheet, model="none"),)
+        for found in (
+            sc.diagnostics.misfit_tests(s.bent, cal),
+            SimpleNamespace(tests=[PHASE], found=lambda level: [PHASE], pattern=None),
+        )
     ],
     "diagnostics.verdict.estimate.predictive": lambda s: [
         estimate.predictive(

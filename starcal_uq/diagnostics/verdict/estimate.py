@@ -21,6 +21,7 @@ from starcal_uq.core.status import (
 )
 from starcal_uq.core.types import BoolArray
 from starcal_uq.diagnostics.misfit import ALPHA
+from starcal_uq.diagnostics.verdict.effect import largest, of_pattern, on_attitudes, on_directions
 from starcal_uq.diagnostics.verdict.observed import NOISE, ROBUST, SCREEN, richer
 from starcal_uq.estimation.fallback import fallback_words
 from starcal_uq.estimation.undetermined import what_is_open
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.estimation.cameras import MixedCameras
     from starcal_uq.inference.posterior import Posterior
+    from starcal_uq.propagation.attitude_error import AttitudeError
 
 # False alarms by design. A run whose model holds is warned of in at most 5 % of cases and failed in at most 1 %: the
 # sizes of all checks that ask noise a question (these, and PATTERN_P and OUTLIER_P) add up to less, whatever the data.
@@ -139,19 +141,19 @@ def truth_z(cal: Calibration, truth: Camera, post: Posterior | None = None) -> F
 
 # Frames that scatter by less than this beyond the formal errors are of no consequence, however sure.
 JACKKNIFE_RATIO = 1.1
-# Patterns that repeat on the scale of a pixel act like more noise; they do not bend the map of the field.
 _OF_THE_LENS = ("radius", "azimuth", "field", "field cells")
-_LIKE_NOISE = ("pixel phase in x", "pixel phase in y")
 
 
-def model_checks(diagnosis: Diagnosis, inflated: bool, post: Posterior | None = None) -> list[Check]:
+def model_checks(
+    diagnosis: Diagnosis, cal: Calibration, post: Posterior | None = None, attitude: AttitudeError | None = None
+) -> list[Check]:
     """Every check that a diagnosis allows, of a calibration whose inflation may be accepted, and of its draws."""
-    fitted = "" if diagnosis.comparison is None else diagnosis.comparison.fitted
-    checks = [misfit(diagnosis.misfit, fitted), even_noise(diagnosis.misfit, inflated)]
+    inflated = cal.inflation is not None
+    checks = [misfit(diagnosis.misfit, cal, attitude), even_noise(diagnosis.misfit, inflated)]
     checks += [] if diagnosis.cameras is None else [one_camera(diagnosis.cameras)]
     checks += [] if diagnosis.jackknife is None else [jackknife(diagnosis.jackknife, inflated, post)]
     checks += [] if diagnosis.stars is None else [stars(diagnosis.stars)]
-    checks += [] if diagnosis.comparison is None else [comparison(diagnosis.comparison)]
+    checks += [] if diagnosis.comparison is None else [comparison(diagnosis.comparison, attitude)]
     return [*checks, predictive(diagnosis.predictive)]
 
 
@@ -162,8 +164,8 @@ def one_camera(found: MixedCameras) -> Check:
     return Check("One camera", Question.TRUSTWORTHY, Level.FAIL, f"{found.n} cameras", "1", sentence, remedy)
 
 
-def misfit(found: Misfit, fitted: str = "") -> Check:
-    """Is there structure in the residuals that the model `fitted` leaves?"""
+def misfit(found: Misfit, cal: Calibration, attitude: AttitudeError | None = None) -> Check:
+    """Is there structure in the residuals, and does it do more than is stated?"""
     name, bound = "Unexplained structure", f"p ≥ {MISFIT_P:g}"
     patterns = [test.p_holm for test in found.tests if not test.is_of_noise]
     value = f"{p_words(min(patterns, default=1.0))}, corrected for {plural(len(found.tests), 'test')}"
@@ -171,27 +173,17 @@ def misfit(found: Misfit, fitted: str = "") -> Check:
     if not rejected:
         sentence = "The residuals show no structure beyond noise, in any of the ways that were looked for."
         return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, sentence)
-    bending = [t for t in rejected if t.against not in _LIKE_NOISE and t.p_holm < MISFIT_FAIL_P]
     words = []
     for test in rejected[:3]:
         size = "" if np.isnan(test.size_px) else f", {significant(test.size_px)} px"
         words.append(f"{test.name} ({p_words(test.p_holm)}{size})")
     more = "" if len(rejected) <= 3 else f" and {plural(len(rejected) - 3, 'other test')}"
-    sentence = f"The residuals hold more than noise: {join_words(words)}{more}. "
-    if bending:
-        sentence += "The model is wrong; no interval of this report holds that."
-    elif all(t.against in _LIKE_NOISE for t in rejected):
-        sentence += "This acts like more noise, unevenly spread."
-    else:
-        sentence += "No interval of this report holds that."
-    if (largest := max(rejected, key=lambda t: np.nan_to_num(t.moved_sigma))).moved_name:
-        sentence += (
-            f" Fitting {largest.name} as well would move {largest.moved_name} by "
-            f"{significant(largest.moved_sigma)} sigma, the other parameters by less."
-        )
-    level = Level.FAIL if bending else Level.WARN
+    booked = on_attitudes(attitude) if found.pattern is not None and found.pattern.families else []
+    effect = largest([*of_pattern(found.pattern, rejected, cal), *booked])
+    sentence = f"The residuals hold more than noise: {join_words(words)}{more}. {effect}"
+    level = effect.level if min(patterns) < MISFIT_FAIL_P else Level.WARN
     # A lens can follow what keeps its place in the field; what does not is at best counted as noise.
-    remedy = model_remedy(richer(fitted)) if any(t.against in _OF_THE_LENS for t in rejected) else NOISE
+    remedy = model_remedy(richer(cal.camera.distortion)) if any(t.against in _OF_THE_LENS for t in rejected) else NOISE
     return Check(name, Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
 
 
@@ -330,17 +322,20 @@ def star_sentence(found: StarTest) -> str:
     )
 
 
-def comparison(models: ModelComparison) -> Check:
-    """Does another distortion model predict left-out frames better?"""
+def comparison(models: ModelComparison, attitude: AttitudeError | None = None) -> Check:
+    """Does another distortion model predict left-out frames better, and would it move more than is stated?"""
     mine = models.of(models.fitted)
-    rejected = mine is not None and mine.rejected
     if mine is None or mine.difference == 0.0:
         value = f"{models.fitted!r} predicts best"
     else:
         value = f"{fixed(mine.difference, 1)} ± {fixed(mine.difference_se, 1)} nat from {models.scores[0].model!r}"
-    level = Level.FAIL if rejected else Level.PASS
-    remedy = model_remedy(models.simplest.model) if rejected else ""
-    sentence = models_sentence(models)
+    level, remedy, sentence = Level.PASS, "", models_sentence(models)
+    if mine is not None and mine.rejected:
+        # A gain of one nat is what a displacement gives whose square is two units of the noise.
+        bent = on_directions(-2.0 * mine.difference, mine.n_parameters)
+        effect = largest([bent, *on_attitudes(attitude)])
+        level, remedy = effect.level, model_remedy(models.simplest.model)
+        sentence = f"{sentence} {effect}"
     return Check("Distortion model", Question.TRUSTWORTHY, level, value, "not rejected", sentence, remedy)
 
 

@@ -150,7 +150,7 @@ def judge(
     checks += [observed.residual_pattern(used, cal), observed.outliers(used, cal), observed.screening(obs)]
     checks += [observed.noise(used, cal), observed.partitions(cal), observed.terms(cal), observed.coverage(used, cal)]
     if diagnosis is not None:
-        checks += estimate.model_checks(diagnosis, cal.inflation is not None, post)
+        checks += estimate.model_checks(diagnosis, cal, post, attitude)
     if attitude is not None:
         checks += [draws.propagation(attitude)]
     if truth is not None and truth.parameter_names == cal.parameter_names:

@@ -11,6 +11,7 @@ from starcal_uq.core.formatting import fixed, percent, plural, significant
 from starcal_uq.core.status import CALIBRATE, MORE, PLAN, Check, Level, Question, model_remedy, pass_or_warn
 from starcal_uq.core.times import TIMES_IN_NAMES
 from starcal_uq.diagnostics.residuals import bin_residuals, normalised_residuals
+from starcal_uq.diagnostics.verdict.effect import on_directions
 from starcal_uq.estimation.residual_map import OUTLIER_SIGMA
 from starcal_uq.sky.refraction import refraction_constants, shrinking
 from starcal_uq.sky.site import HOUR_DEG, Site
@@ -28,7 +29,6 @@ ABERRATION_RAD = 9.94e-5
 PLAUSIBLE_NOISE_PX = (0.003, 0.5)
 PLAUSIBLE_SCALE = (0.7, 1.5)
 PATTERN_P, OUTLIER_P = 1e-3, 1e-3
-PATTERN_FAIL_SIGMA = 0.5
 COVERED_SHARE = 0.85
 # Stated noise that is magnitudes: a small factor on it, its range, and what it stays below.
 _FAR_BELOW, _MAGNITUDES = 0.2, (1.5, 20.0)
@@ -176,16 +176,17 @@ def residual_pattern(obs: Observations, cal: Calibration) -> Check:
     """Do mean residuals over the field show more than noise?"""
     binned = bin_residuals(cal, obs)
     p_value, pattern = binned.p_value, binned.pattern_px
-    share = pattern / _noise_px(obs, cal)
     cells = len(binned.counts)
     if p_value >= PATTERN_P:
         level, sentence = Level.PASS, f"Mean residuals in {plural(cells, 'cell')} of the field are what noise gives."
     else:
-        level = Level.FAIL if share > PATTERN_FAIL_SIGMA else Level.WARN
+        seen = 2.0 * float(binned.counts.sum()) * (pattern / _noise_px(obs, cal)) ** 2
+        effect = on_directions(seen, len(cal.theta))
+        level = effect.level
         arcsec = pattern / cal.camera.focal_px * ARCSEC
         sentence = (
             f"The residuals show a pattern of {significant(pattern)} px per axis ({significant(arcsec)} arcsec) that "
-            "the model does not explain; it is not in any interval of this report."
+            f"the model does not explain; it is not in any interval of this report. {effect}"
         )
     value = f"p = {significant(p_value)}" + (f", pattern {significant(pattern)} px" if pattern > 0.0 else "")
     remedy = "" if level is Level.PASS else model_remedy(richer(cal.camera.distortion))
