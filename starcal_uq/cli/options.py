@@ -215,9 +215,9 @@ ObsFile = Annotated[
     Path,
     typer.Argument(
         metavar="OBS",
-        help="Stars in pixels: CSV, ECSV or Parquet with columns frame, x_px, y_px, ra_deg, dec_deg and optionally "
-        "sigma_px, star_id, mag, direction_mas, time_utc, temperature_c; or a folder of Parquet files of whole frames, "
-        "which may exceed memory.",
+        help="Stars in pixels: CSV, ECSV, Parquet or a FITS binary table with columns frame, x_px, y_px, ra_deg, "
+        "dec_deg and optionally sigma_px, star_id, mag, direction_mas, time_utc, temperature_c; a .corr file of "
+        "astrometry.net, or matches (.json); or a folder of Parquet files of whole frames, which may exceed memory.",
         parser=read_path,
     ),
 ]

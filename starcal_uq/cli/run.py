@@ -94,7 +94,8 @@ def run_command(
         list[Path],
         typer.Argument(
             metavar="OBS|IMAGES... [CAMERA]",
-            help="A table of identified stars or a folder of partitions (see `calibrate`), or images (FITS, TIFF, PNG, "
+            help="A table of identified stars (CSV, ECSV, Parquet, a FITS binary table and others, see `calibrate`) "
+            "or a folder of partitions, or images (FITS, TIFF, PNG, "
             "JPEG) or folders of them, whose stars are then found and identified; then the nominal camera (TOML with a "
             "[camera] table), which images can do without: the stars tell the focal length.",
             parser=read_path,

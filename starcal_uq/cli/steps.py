@@ -100,7 +100,7 @@ def simulate_command(
             "-o",
             "--out",
             metavar="OBS",
-            help="Table to write (.csv, .ecsv, .parquet), or folder of partitions.",
+            help="Table to write (.csv, .ecsv, .parquet, .fits), or folder of partitions.",
             parser=write_path,
         ),
     ],

@@ -180,9 +180,9 @@ def _read(path: Path, data: bytes, ending: str, wanted: set[str]) -> RawTable:
     if ending == ".parquet":
         return _read_parquet(path, data, wanted)
     if ending in (".fits", ".corr", ".json"):
-        columns, meta = (read_json if ending == ".json" else read_fits)(path, data)
+        columns, meta, units = (*read_json(path, data), {}) if ending == ".json" else read_fits(path, data)
         n = len(next(iter(columns.values()), ()))
-        return RawTable(columns, list(columns), np.arange(1, n + 1), "row", meta)
+        return RawTable(columns, list(columns), np.arange(1, n + 1), "row", meta, units)
     return _read_text(path, data, ecsv=ending == ".ecsv")
 
 
@@ -226,8 +226,13 @@ def convert_columns(
             if kind != "number":
                 raise ObservationError(f"{path}: column {name} holds no quantities; give the name of a column alone.")
             converted[name] = factor, shift
+        # Whoever states a factor has left the unit of the file behind.
+        unit = raw.units.get(own, "") if factor == 1.0 else ""
         if isinstance(cells, np.ndarray):
-            if kind == "number" or (kind == "whole" and cells.dtype.kind in "iu"):
+            if kind == "number":
+                columns[name] = _to_unit(path, name, cells, unit)
+                continue
+            if kind == "whole" and cells.dtype.kind in "iu":
                 columns[name] = cells
                 continue
             cells = [str(value) for value in cells.tolist()]
@@ -241,7 +246,7 @@ def convert_columns(
             if raw.decimal_comma:
                 cells = [cell.replace(",", ".") for cell in cells]
             values, bad = parse_numbers(name, cells)
-            columns[name] = _to_unit(path, name, values, raw.units.get(own, ""))
+            columns[name] = _to_unit(path, name, values, unit)
         elif kind == "time":
             columns[name], bad = parse_times(name, cells)
         else:
@@ -255,7 +260,7 @@ def convert_columns(
 
 
 def _to_unit(path: Path, name: str, values: FloatArray, unit: str) -> FloatArray:
-    """`values` of an ECSV column in the unit that the name of the column states."""
+    """`values` of a column that states its unit, as in ECSV and FITS, in the unit that its name stands for."""
     wanted = COLUMNS[name].unit
     if unit in ("", wanted) or name == "mag":
         return values
@@ -263,7 +268,12 @@ def _to_unit(path: Path, name: str, values: FloatArray, unit: str) -> FloatArray
         from astropy import units as u
 
     try:
-        converted: FloatArray = u.Unit(unit).to(u.Unit(wanted), values, equivalencies=u.temperature())
+        try:
+            stated = u.Unit(unit)
+        except ValueError:
+            # Written out, as astrometry.net has its pixels and degrees.
+            stated = u.Unit(unit.lower().removesuffix("s"))
+        converted: FloatArray = stated.to(u.Unit(wanted), values, equivalencies=u.temperature())
     except (u.UnitConversionError, ValueError, TypeError):
         raise ObservationError(
             f"{path}: column {name} has the unit {unit!r}; give it in {wanted}.", column=name

@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 # Centre of the first pixel in FITS, and from the corner of the image.
 _FITS_PIXEL, _CORNER_PIXEL = 1.0, 0.5
 _NAME, _META = "OBSERVATIONS", "SCMETA"
+# Bytes in which the headers before a table end, and the card that ends each.
+_HEADERS, _END = 100 * 2880, b"END".ljust(80)
 _UNITS = {"pix": "pixel", "deg_C": ""}
 # Ours to those of a .corr file, which has no column for the others.
 _CORR = {"x_px": "field_x", "y_px": "field_y", "ra_deg": "index_ra", "dec_deg": "index_dec"}
@@ -105,17 +107,32 @@ def _written(columns: Mapping[str, tuple[Any, str]], meta: AnyDict, **cards: Any
 
 
 def is_fits_table(path: Path) -> bool:
-    """Whether a file is a FITS table of observations, and no image."""
+    """Whether a file is a FITS binary table without an image before it, be it compressed in a table."""
     try:
         with open(path, "rb") as file:
-            head = file.read(28_800)
+            head = file.read(_HEADERS)
     except OSError:
         return False
-    return head.startswith(b"SIMPLE") and f"EXTNAME = '{_NAME}".encode() in head
+    cards = [head[place : place + 80] for place in range(0, len(head), 80)]
+    if not head.startswith(b"SIMPLE") or _END not in cards or _value(cards, b"NAXIS") != b"0":
+        return False
+    # A file starts without data of its own, in blocks of 36 cards; the next header is that of the table.
+    second = cards[36 * (cards.index(_END) // 36 + 1) :]
+    return _value(second, b"XTENSION").strip(b"' ") == b"BINTABLE" and _value(second, b"ZIMAGE") != b"T"
 
 
-def read_fits(path: Path, data: bytes) -> tuple[dict[str, Any], AnyDict]:
-    """Columns under our names, and metadata, of a FITS table or ``.corr`` file: texts as lists, numbers as arrays."""
+def _value(cards: Sequence[bytes], key: bytes) -> bytes:
+    """What the first header among cards states, as it is written; empty where it does not."""
+    for card in cards:
+        if card == _END:
+            break
+        if card.startswith(key.ljust(8) + b"="):
+            return card[9:].partition(b"/")[0].strip()
+    return b""
+
+
+def read_fits(path: Path, data: bytes) -> tuple[dict[str, Any], AnyDict, dict[str, str]]:
+    """Columns under our names, metadata and units of a FITS table or ``.corr`` file; texts as lists, or else arrays."""
     with extra("images", "FITS tables"):
         from astropy.io import fits
 
@@ -127,6 +144,7 @@ def read_fits(path: Path, data: bytes) -> tuple[dict[str, Any], AnyDict]:
         header, rows = tables[0].header, tables[0].data
         check_size(int(header["NAXIS1"]) * int(header["NAXIS2"]), len(data))
         columns: dict[str, Any] = {}
+        units = {column.name.lower(): str(column.unit or "").strip() for column in rows.columns}
         for name in rows.names:
             values = np.asarray(rows[name])
             plain = values.dtype.newbyteorder("=")
@@ -139,9 +157,10 @@ def read_fits(path: Path, data: bytes) -> tuple[dict[str, Any], AnyDict]:
         for own, other in _CORR.items():
             if other in columns:
                 columns[own] = columns[other] - (_FITS_PIXEL if own in ("x_px", "y_px") else 0.0)
+                units[own] = units[other]
         columns["frame"] = np.full(len(rows), frame, dtype=np.int64)
         columns = {name: values for name, values in columns.items() if name not in _CORR_NAMES}
-    return columns, meta
+    return columns, meta, units
 
 
 def read_json(path: Path, data: bytes) -> tuple[dict[str, Any], AnyDict]:

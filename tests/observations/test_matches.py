@@ -73,6 +73,87 @@ def test_astropy_finds_columns_units_and_comments_in_a_fits_table(tmp_path, obs)
     assert fits.getheader(tmp_path / "obs.fits", 1)["EXTNAME"] == "OBSERVATIONS"
 
 
+UNITS = {
+    # Column, unit, what one of it is in the unit of the column's name; None where that is nothing.
+    "pixels": ("x_px", "pixels", 1.0),
+    "arcsec": ("ra_deg", "arcsec", 1.0 / 3600.0),
+    "hours": ("ra_deg", "hourangle", 15.0),
+    "degrees": ("dec_deg", "degrees", 1.0),
+    "arcsec of a star": ("direction_mas", "arcsec", 1000.0),
+    "kelvin": ("temperature_c", "K", 1.0),
+    "micrometres": ("sigma_px", "um", None),
+    "millimetres": ("x_px", "mm", None),
+    "seconds": ("dec_deg", "s", None),
+    "nonsense": ("y_px", "furlongs", None),
+}
+
+
+@pytest.mark.parametrize("ending", [".fits", ".ecsv"])
+@pytest.mark.parametrize("case", UNITS)
+def test_units_are_converted_or_refused_by_one_rule_in_all_formats(tmp_path, obs, ending, case):
+    name, unit, one = UNITS[case]
+    columns = obs.columns | {"sigma_px": np.full(24, 0.1), "direction_mas": np.full(24, 7.0)}
+    columns = {key: columns[key] for key in ("frame", "x_px", "y_px", "ra_deg", "dec_deg", name)}
+    wanted = columns[name]
+    table = Table(columns)
+    shift = 273.15 if unit == "K" else 0.0
+    table[name] = (wanted + shift) / (one or 1.0)
+    path = tmp_path / f"obs{ending}"
+    if ending == ".fits":
+        hdu = fits.BinTableHDU(table)
+        hdu.header[f"TUNIT{table.colnames.index(name) + 1}"] = unit
+        hdu.writeto(path)
+    else:
+        table.write(path, format="ascii.ecsv", delimiter=",")
+        path.write_text(path.read_text().replace(f"name: {name},", f"name: {name}, unit: {unit},", 1))
+        assert f"unit: {unit}" in path.read_text()
+    if one is None:
+        with pytest.raises(ObservationError, match=rf"column {name} has the unit '{unit}'; give it in "):
+            load_observations(path)
+        return
+    np.testing.assert_allclose(load_observations(path).columns[name], wanted, rtol=1e-12, atol=1e-11)
+    # Control: as plain numbers, without a unit, the values are others.
+    if one != 1.0 or shift:
+        table.write(tmp_path / "plain.fits", format="fits")
+        with pytest.raises((AssertionError, ObservationError)):
+            np.testing.assert_allclose(load_observations(tmp_path / "plain.fits").columns[name], wanted, rtol=1e-9)
+
+
+def test_a_stated_factor_goes_before_the_unit_of_the_file(tmp_path, obs):
+    table = Table({name: obs.columns[name] for name in ("frame", "x_px", "y_px", "dec_deg")})
+    table["RA"] = obs.ra_deg / 15.0
+    hdu = fits.BinTableHDU(table)
+    hdu.header["TUNIT5"] = "h"
+    hdu.writeto(tmp_path / "hours.fits")
+    back = load_observations(tmp_path / "hours.fits", columns={"ra_deg": "ra * 15"})
+    np.testing.assert_allclose(back.ra_deg, obs.ra_deg, rtol=1e-14)
+    with pytest.raises(ObservationError, match="column ra_deg has the unit 'h'; give it in deg"):
+        load_observations(tmp_path / "hours.fits", columns={"ra_deg": "ra"})
+
+
+def test_a_fits_table_of_another_program_is_no_image(tmp_path, obs):
+    """By what the headers say: tables of any name, with long headers; images, plain or compressed in a table."""
+    table = Table({name: values for name, values in obs.columns.items() if values.dtype.kind != "U"})
+    table.write(tmp_path / "table.fits")
+    hdu = fits.BinTableHDU(table, name="STARS")
+    for number in range(500):
+        hdu.header[f"HIERARCH NOTE {number}"] = "x" * 30
+    long_one = fits.PrimaryHDU()
+    for number in range(500):
+        long_one.header["HISTORY"] = f"step {number}"
+    fits.HDUList([long_one, hdu]).writeto(tmp_path / "long.fits")
+    for name in ("table.fits", "long.fits"):
+        assert load_observations(tmp_path / name).n_stars == 24
+        assert not are_images([tmp_path / name])
+    pixels = np.zeros((32, 32), dtype=np.int16)
+    fits.PrimaryHDU(pixels).writeto(tmp_path / "plain.fits")
+    fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(pixels)]).writeto(tmp_path / "second.fits")
+    fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(pixels)]).writeto(tmp_path / "packed.fits")
+    (tmp_path / "cut.fits").write_bytes((tmp_path / "table.fits").read_bytes()[:2000])
+    for name in ("plain.fits", "second.fits", "packed.fits", "cut.fits"):
+        assert are_images([tmp_path / name])
+
+
 def test_corr_files_are_as_astrometry_net_writes_them(tmp_path, obs):
     """By astropy's world coordinates with pixels counted from one: field and index differ where a star was moved."""
     moved = obs.x_px.copy()
