@@ -36,7 +36,7 @@ from starcal_uq.diagnostics.verdict.judge import judge  # noqa: E402
 from starcal_uq.estimation.pairs import PairObjective  # noqa: E402
 from starcal_uq.maths.intervals import binomial_interval  # noqa: E402
 from starcal_uq.observations.frames import StarFrames  # noqa: E402
-from tests.diagnostics import test_pattern  # noqa: E402
+from tests.diagnostics import test_air, test_pattern  # noqa: E402
 from tests.helpers.outside import Campaign, campaign, measured_again  # noqa: E402
 
 # A fact of the data and no test: few frames and empty corners are warned of in every run of such a regime.
@@ -201,6 +201,9 @@ def by_frame(radius: np.ndarray, mag: np.ndarray, frame: np.ndarray) -> np.ndarr
     return 0.05 * np.exp(0.4 * factors[frame])
 
 
+STARING: dict[str, Any] = {"n_frames": 40, "pointings": 1, "drift_px": 3.3}
+
+
 def uneven(name: str, *, noise: str = "common", runs: int = 100, **options: Any) -> Regime:
     """Noise that varies over 40 frames, calibrated with one noise or with the fitted model."""
     steps = {"calibrate": {"noise": noise}, "models": (), "n_starts": 0}
@@ -220,6 +223,35 @@ def misfit_to_attitude(rng: np.random.Generator, planted: str) -> Outcome:
                 if where == "random":
                     found[f"whole size, {part}"] = float(np.mean(whole[at]))
     return Outcome(figures=found)
+
+
+def refraction(rng: np.random.Generator, **options: Any) -> Outcome:
+    """Is refraction named in frames without times, and does f come back with what is said of it?"""
+    while True:
+        try:
+            c, obs, cal = test_air.outside(int(rng.integers(2**31)), **options)
+            break
+        except sc.StarcalError:
+            # Few stars may leave a frame with two of them: another campaign.
+            continue
+    return _named(sc.diagnostics.air_test(obs, cal), c.theta[2] - cal.theta[2])
+
+
+def refraction_at_night(rng: np.random.Generator, **options: Any) -> Outcome:
+    """The same of frames with times, one place."""
+    obs, cal, focal = test_air.night(int(rng.integers(2**31)), **options)
+    return _named(sc.diagnostics.air_test(obs, cal), focal - cal.theta[2])
+
+
+def _named(found: sc.diagnostics.AirTest | None, short_px: float) -> Outcome:
+    named, open_ = (found is not None and flag for flag in (found and found.is_air, found and found.like_others))
+    figures = {"Of f too short, found": found.f_px / short_px} if found is not None and named else {}
+    return Outcome(figures=figures, shares={"Named": bool(named), "Not to be told from the lens": bool(open_)})
+
+
+def air(name: str, runs: int, **options: Any) -> Regime:
+    """A regime of the test for refraction."""
+    return Regime(name, partial(refraction, **options), runs, "air")
 
 
 REGIMES: list[Regime] = [
@@ -268,6 +300,25 @@ REGIMES: list[Regime] = [
         Regime(f"misfit planted: {name}", partial(misfit_to_attitude, planted=name), 4, "attitude")
         for name in test_pattern.PLANTED
     ),
+    air("no air: 60 frames of 40 stars", 60, **PATCH),
+    air("no air: 40 stars with errors of 0.03 px", 60, star_sigma_px=0.03, **PATCH),
+    air("no air: the same, with `--star-errors`", 60, star_sigma_px=0.03, star_errors=True, **PATCH),
+    air("no air: 15 stars in 20 frames, with errors of 0.03 px", 60, **FEW),
+    air("no air: one field, drifting by 3.3 px a frame, star errors of 0.03 px", 60, star_sigma_px=0.03, **STARING),
+    air("no air: the same 40 stars, noise three times larger at the edge", 40, sigma_px=worse_outside, **PATCH),
+    Regime("no air: frames with times", partial(refraction_at_night, air=0.0), 60, "air"),
+    *(air(f"no air, 30 frames: {name}", 24, **options) for name, options in test_air.LOOKALIKES.items()),
+    air("no air, 30 frames: axes that differ by 0.3 px at the corner", 24, displaced=test_air.SKEWED),
+    air("air: a zenith of its own in each of 30 frames", 24, air="each"),
+    air("air: the same, 0.1 px of noise", 24, air="each", sigma_px=0.1),
+    air("air: the same, 0.2 px of noise", 24, air="each", sigma_px=0.2),
+    air("air: the same, 10 frames", 24, air="each", n_frames=10),
+    air("air: the same, field of 5°", 24, air="each", field_deg=5.0),
+    air("air: the same, field of 30°", 24, air="each", field_deg=30.0),
+    air("air: the same, 60 frames of 40 stars with errors of 0.03 px", 24, air="each", star_sigma_px=0.03, **PATCH),
+    air("air: one moment, 60 frames of 40 stars with errors of 0.03 px", 24, air="one", star_sigma_px=0.03, **PATCH),
+    air("air: 30 frames, horizon fixed in the camera", 24, air="fixed"),
+    Regime("air: frames with times", partial(refraction_at_night), 24, "air"),
 ]
 
 
@@ -316,7 +367,8 @@ def markdown(rows: Sequence[Mapping[str, str]]) -> str:
 
 def page(name: str) -> tuple[Path, str]:
     """The page of a table, and the word between its markers."""
-    return ROOT / "docs" / "explanation" / f"{name}.md", "regimes" if name == "statistics" else f"{name} regimes"
+    page_name = "misfit" if name == "air" else name
+    return ROOT / "docs" / "explanation" / f"{page_name}.md", "regimes" if name == "statistics" else f"{name} regimes"
 
 
 def stored(name: str) -> list[dict[str, str]]:

@@ -4,42 +4,63 @@ Air raises a star at zenith distance z by about A tan z: what the attitude and t
 compression towards the zenith that grows with z. Where frames have times, a place on the Earth has one zenith for each;
 without times all frames are taken to be of one moment. For places all over the globe from which every star was
 above the horizon, the amplitude of refraction is fitted in units of the standard air's; the largest amplitude in its
-sigmas is held against the largest of as many that noise gives, which are as correlated as their shapes.
+sigmas is held against the largest of as many that noise gives, which are as correlated as their shapes. Frames without
+times that are not of one moment get a zenith each.
+
+Noise is that of the calibration: its model of the images' noise, and the direction errors of stars that it fitted or,
+where it fitted none, that the stars which recur show. Terms that the lens may lack are fitted beside the air. What
+these explain as well as air does cannot be told from it.
 """
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.errors import StarcalError
 from starcal_uq.core.settings import bounded
+from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray
-from starcal_uq.diagnostics.shapes import View, frame_shapes
+from starcal_uq.diagnostics.residuals import of_heard
+from starcal_uq.diagnostics.shapes import View, focal_drift, frame_shapes, lens_shapes
+from starcal_uq.diagnostics.stars import StarTest, star_test
 from starcal_uq.estimation.marginal import MarginalLikelihood
-from starcal_uq.estimation.noise_model import weighed
+from starcal_uq.estimation.noise_model import fit_noise, weighed
+from starcal_uq.estimation.star_errors import StarErrors, StarLikelihood
 from starcal_uq.observations.splits import one_of_each
 from starcal_uq.sky.refraction import refraction_constants, site_among_stars
 from starcal_uq.sky.site import Site
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from starcal_uq.camera.camera import Camera
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.observations.table import Observations
 
 # False alarms where there is no air.
 AIR_P = 1e-3
-# The standard air at sea level, and up to 4 km.
-_DENSITIES = (1.0, 0.85, 0.7)
-# What leaves all of these with less probability is another misfit: chi-square of the amplitude.
-_AIR_CHI2 = 10.8
+# Density of the air in that of the standard air at sea level: its spread before any data, least (4 km) and most.
+_DENSITY_SPREAD, _THIN, _THICK = 0.2, 0.64, 1.06
+# What leaves all of these with less probability is another misfit: chi-square of the amplitude, or a share of what air
+# explains that refraction by two constants may leave.
+_AIR_CHI2, _INEXACT = 10.8, 0.01
 _PLACES, _DRAWS, _FRAMES, _STARS = 600, 4000, 200, 4000
 # Sine of the lowest altitude that is taken for possible.
 _LOWEST = np.sin(np.radians(5.0))
-_STEPS, _STEP_RAD = 8, 1e-3
+# Damped steps towards the best zeniths, until chi-square falls by less than a tenth.
+_STEPS, _STEP_RAD, _LONGEST_RAD, _SETTLED = 24, 1e-3, 0.2, 0.1
+# Zeniths that are tried for a frame by itself: distances from its boresight, degrees, and directions. Tangents of a
+# distance common to all frames from which the search starts, and its rounds.
+_DISTANCES_DEG, _AROUND, _TANGENTS, _ROUNDS = np.arange(5.0, 81.0, 7.5), 16, (0.4, 1.0, 2.0), 6
+# A share of a shape's square that is not there, where all of the rest is absorbed.
+_ABSORBED = 1e-8
+# No observer of these sees through air.
+_NO_AIR = ("space", "rendered")
 
 
 @dataclass(frozen=True)
@@ -49,9 +70,11 @@ class AirTest:
     Attributes
     ----------
     p_value : float
-        Probability of so large an amplitude anywhere if there is no refraction.
+        Probability of so large an amplitude anywhere, or of so much explained by a zenith for each frame, if there is
+        no refraction, whatever terms the lens lacks.
     amplitude, amplitude_std : float
-        Amplitude in units of standard air, at the best of the places tried, and its standard error.
+        Amplitude in units of standard air and its standard error: the density of the air found, or where there is
+        none the largest amplitude in its errors of the places tried.
     is_air : bool
         Whether it is significant (`AIR_P`), the air of one place, as dense as from the sea to 4 km, explains as much,
         and frames have no more scale and shape of their own than that gives them.
@@ -63,6 +86,10 @@ class AirTest:
         How much too short f is without refraction, px and in its standard deviations; NaN where there is none.
     n_frames : int
         Frames that were looked at.
+    like_others : bool
+        Whether air explains what is left, and terms that the lens may lack or a drift of f explain it as well: where
+        the horizon keeps its place in the camera, refraction is a scale and skew of the axes. Then `f_px` is what
+        would hold if it is air.
     """
 
     p_value: float
@@ -76,10 +103,12 @@ class AirTest:
     f_px: float
     f_sigma: float
     n_frames: int
+    like_others: bool = False
 
 
 @bounded
-def air_test(obs: Observations, cal: Calibration, *, seed: int = 0, rest: Remainder | None = None) -> AirTest | None:
+@one_thread()
+def air_test(obs: Observations, cal: Calibration, *, seed: int = 0, stars: StarTest | None = None) -> AirTest | None:
     """Look for refraction in the residuals of a calibration.
 
     Parameters
@@ -88,70 +117,104 @@ def air_test(obs: Observations, cal: Calibration, *, seed: int = 0, rest: Remain
         The data and the estimate made from them.
     seed : int
         Seed of the draws of noise.
-    rest : Remainder, optional
-        What is left of the residuals, where it is known already.
+    stars : StarTest, optional
+        Errors that stars bring along, where they are known already.
 
     Returns
     -------
     AirTest or None
-        None where from no place all stars were above the horizon.
+        None where the camera was in space, or where from no place all stars were above the horizon.
     """
-    rest = rest or Remainder(obs, cal, seed)
-    air = _Air(rest, cal.camera)
-    places = air.possible(_sphere(_PLACES))
-    if not len(places):
+    if obs.meta.get("observer") in _NO_AIR:
         return None
-    columns, _ = air.columns(places)
-    length = np.linalg.norm(columns, axis=1)
-    z = columns @ rest.residuals / length / rest.sigma
-    best = int(np.argmax(z))
-    rng = np.random.default_rng(seed)
-    values, vectors = np.linalg.eigh(columns @ columns.T / np.outer(length, length))
-    kept = values > 1e-10 * values[-1]
-    noise = rng.standard_normal((_DRAWS, int(np.count_nonzero(kept)))) @ (vectors[:, kept] * np.sqrt(values[kept])).T
-    noise /= np.sqrt(rng.chisquare(rest.dof, _DRAWS) / rest.dof)[:, None]
-    p_value = (1.0 + float(np.count_nonzero(noise.max(axis=1) >= z[best]))) / (_DRAWS + 1.0)
+    stars = star_test(obs, cal) if stars is None else stars
+    obs, cal = of_heard(weighed(obs, cal), cal)
+    found = _looked_for(obs, cal, seed, stars, cal.sigma)
+    if found is not None and (found.is_air or found.like_others) and cal.noise_model is None:
+        # Noise that grows towards the edge looks like scale and shape of single frames.
+        model, _ = fit_noise(obs, cal.camera, rounds=1)
+        if model.varies:
+            found = _looked_for(obs.weighted(model.sigma_px(obs)), cal, seed, stars, 1.0)
+    return found
+
+
+def _looked_for(obs: Observations, cal: Calibration, seed: int, stars: StarTest, sigma: float) -> AirTest | None:
+    """The test with the noise of the images as the table has it, `sigma` a common factor."""
+    rest = Remainder(obs, cal, seed, _star_noise(obs, cal, stars, sigma))
+    air = _Air(rest, cal.camera)
+    found = air.of_one_place(seed)
+    if not air.timed and (found is None or not found.is_air):
+        apiece = air.of_each_frame()
+        if apiece is not None and (found is None or apiece.is_air or apiece.like_others):
+            found = apiece
+    if found is None:
+        return None
     nothing = float("nan")
-    found = dict.fromkeys(("latitude_deg", "longitude_deg", "latitude_std_deg", "longitude_std_deg"), nothing)
-    found |= {"f_px": nothing, "f_sigma": nothing}
-    is_air = False
-    for density in _DENSITIES if p_value < AIR_P else ():
-        gain = 2.0 * density * columns @ rest.residuals - (density * length) ** 2
-        place, gained, covariance = air.settled(places[np.argmax(gain)], density)
-        is_air = bool(z[best] ** 2 - gained < _AIR_CHI2) and air.left_by_frame(place, density) > AIR_P
-        if is_air:
-            break
-    if is_air:
-        _, absorbed = air.columns(place[None])
-        shift = -density * float(absorbed[0, 2])
-        found |= {"f_px": shift, "f_sigma": shift / float(cal.sigmas[2])}
-    if is_air and air.timed:
-        latitude, longitude = np.arcsin(place[2]), np.arctan2(place[1], place[0])
-        std = np.degrees(np.sqrt(np.diag(covariance)))
-        found |= {"latitude_deg": float(np.degrees(latitude)), "longitude_deg": float(np.degrees(longitude))}
-        found |= {"latitude_std_deg": float(std[0]), "longitude_std_deg": float(std[1] / max(np.cos(latitude), 1e-3))}
-    size, error = float(z[best] * rest.sigma / length[best]), float(rest.sigma / length[best])
-    return AirTest(p_value, size, error, is_air, n_frames=rest.obs.n_frames, **found)
+    place = dict.fromkeys(("latitude_deg", "longitude_deg", "latitude_std_deg", "longitude_std_deg"), nothing)
+    if found.is_air and found.place is not None:
+        direction, std = found.place
+        latitude, longitude = np.arcsin(direction[2]), np.arctan2(direction[1], direction[0])
+        place = {"latitude_deg": float(np.degrees(latitude)), "longitude_deg": float(np.degrees(longitude))}
+        place |= {"latitude_std_deg": float(std[0]), "longitude_std_deg": float(std[1] / max(np.cos(latitude), 1e-3))}
+    shift = found.f_px if found.is_air or found.like_others else nothing
+    return AirTest(
+        found.p_value,
+        found.amplitude,
+        found.amplitude_std,
+        found.is_air,
+        f_px=shift,
+        f_sigma=shift / float(cal.sigmas[2]),
+        n_frames=rest.obs.n_frames,
+        like_others=found.like_others,
+        **place,
+    )
+
+
+def _star_noise(obs: Observations, cal: Calibration, found: StarTest, sigma: float) -> tuple[StarErrors, float] | None:
+    """Direction errors of the stars and the noise of their images: those fitted, or those that recurring stars show."""
+    errors = cal.star_errors
+    if errors is None:
+        if not found.tau_px > 0.0:
+            return None
+        numbers = found.n_stars, found.n_recurring
+        errors = StarErrors(found.tau_px, found.tau_px_std, 0.0, float(cal.theta[2]), *numbers)
+    elif sigma == cal.sigma:
+        return errors, sigma
+    # A factor on all of the noise holds both.
+    of_stars = errors.total_px**2 * float(np.mean(1.0 if obs.sigma_px is None else obs.sigma_px**-2.0))
+    return errors, float(np.sqrt(max(sigma**2 - of_stars, 0.1 * sigma**2)))
 
 
 class Remainder:
     """Residuals of some frames, and of what displaces stars that part which attitudes and parameters cannot take up.
 
-    `residuals` (2 N,) are whitened, x of all stars before y, with `dof` degrees of freedom and scatter `sigma`.
+    `obs` has the noise of its stars as the estimate weighs them. `residuals` (m,) are whitened, with `dof` degrees of
+    freedom and scatter `sigma`: m = 2 N, x of all stars before y, and where stars bring errors along, which `errors`
+    holds with the noise of images, two more for each star.
     """
 
-    def __init__(self, obs: Observations, cal: Calibration, seed: int) -> None:
-        obs = weighed(obs, cal)
+    def __init__(
+        self, obs: Observations, cal: Calibration, seed: int, errors: tuple[StarErrors, float] | None = None
+    ) -> None:
         chosen = one_of_each(obs.n_frames, min(_FRAMES, max(_STARS * obs.n_frames // obs.n_stars, 3)), seed)
         self.obs = obs if len(chosen) == obs.n_frames else obs.select_frames(obs.frame_ids[chosen])
-        self.likelihood = MarginalLikelihood(self.obs, cal.camera.distortion)
-        self.state, _ = self.likelihood.profile(cal.theta, quaternion_to_rotation(cal.quaternions[chosen]))
-        slopes = self.likelihood.project_out(self.state, self.likelihood.derivatives(cal.theta, self.state))
-        self.basis, self._triangle = np.linalg.qr(slopes.reshape(len(slopes), -1).T)
-        e = self.likelihood.project_out(self.state, self.state.e[None]).reshape(-1)
+        model, rotations = cal.camera.distortion, quaternion_to_rotation(cal.quaternions[chosen])
+        self.likelihood = MarginalLikelihood(self.obs, model)
+        if errors is not None:
+            self.likelihood = StarLikelihood(self.obs, model, cal.theta, rotations, *errors)
+        self.state, _ = self.likelihood.profile(cal.theta, rotations)
+        slopes = self.likelihood.whitened(self.state, self.likelihood.derivatives(cal.theta, self.state))
+        self.basis, self._triangle = np.linalg.qr(slopes.T)
+        e = self.likelihood.whitened(self.state, self.state.e[None])[0]
         self.residuals: FloatArray = e - self.basis @ (self.basis.T @ e)
         self.dof = max(self.likelihood.dof - len(cal.theta), 1)
-        self.sigma = float(np.sqrt(self.residuals @ self.residuals / self.dof))
+        # Errors of few stars are known less well than the noise of their images.
+        self.least_dof = self.dof if errors is None else max(2 * errors[0].n_recurring - 3 - len(cal.theta), 1)
+
+    @property
+    def sigma(self) -> float:
+        """Scatter of the residuals."""
+        return float(np.sqrt(self.residuals @ self.residuals / self.dof))
 
     def shift(self, moved: FloatArray) -> FloatArray:
         """Whitened shifts (2, N) of images by small moves (3, N) of the stars, camera frame, rad."""
@@ -159,21 +222,101 @@ class Remainder:
         return shifts
 
     def left(self, shifts: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """What is left (g, 2 N) of shifts (g, 2, N), and what parameters took up (g, p)."""
-        flat = self.likelihood.project_out(self.state, shifts).reshape(len(shifts), -1)
+        """What is left (g, m) of shifts (g, 2, N), and what parameters took up (g, p)."""
+        flat = self.likelihood.whitened(self.state, shifts)
         along = flat @ self.basis
-        return flat - along @ self.basis.T, np.linalg.solve(self._triangle, along.T).T
+        taken = np.linalg.solve(self._triangle, along[:, : len(self._triangle)].T).T
+        return flat - along @ self.basis.T, taken
+
+    def cleared(self, columns: FloatArray) -> FloatArray:
+        """Columns (g, m) without what is fitted."""
+        left: FloatArray = columns - (columns @ self.basis) @ self.basis.T
+        return left
+
+    def beside(self, shifts: FloatArray) -> Remainder:
+        """The same where shifts (g, 2, N) are fitted as well."""
+        flat = self.left(shifts)[0] / np.linalg.norm(shifts.reshape(len(shifts), -1), axis=1)[:, None]
+        more = _orthonormal(flat)
+        found = copy(self)
+        found.basis = np.concatenate([self.basis, more.T], axis=1)
+        found.residuals = self.residuals - (more @ self.residuals) @ more
+        found.dof = max(self.dof - len(more), 1)
+        return found
+
+
+def _orthonormal(rows: FloatArray, least: float = 1e-6) -> FloatArray:
+    """Directions (r, m) of rows (g, m) whose squares are above `least` of the rows'."""
+    values, vectors = np.linalg.eigh(rows @ rows.T)
+    kept = values > least
+    found: FloatArray = (vectors[:, kept] / np.sqrt(values[kept])).T @ rows
+    return found
+
+
+class _Found(NamedTuple):
+    """What air explains; the place is its direction and the standard errors to north and east, degrees."""
+
+    p_value: float
+    amplitude: float
+    amplitude_std: float
+    is_air: bool
+    like_others: bool
+    f_px: float
+    place: tuple[FloatArray, FloatArray] | None = None
+
+
+class _Settled(NamedTuple):
+    """Zeniths (n, 3) whose air explains the most, its density, shifts (2, N) by it, what is left of these (m,)."""
+
+    zeniths: FloatArray
+    density: float
+    shift: FloatArray
+    column: FloatArray
+    errors: FloatArray  # Standard errors: of moves of the zeniths along their tangents, rad, and of the density
 
 
 class _Air:
     """Refraction of some frames from any place."""
 
     def __init__(self, rest: Remainder, camera: Camera) -> None:
-        self._rest, self._camera = rest, camera
+        # Air is looked for beside terms that the lens may lack and a drift of f; `_alone` is without these.
+        likelihood, state = rest.likelihood, rest.state
+        view = View.of(likelihood, state, camera.theta, slice(0, likelihood.frames.n_stars))
+        weight = 1.0 if likelihood.frames.weight is None else likelihood.frames.weight
+        others = (*lens_shapes(camera), *focal_drift(rest.obs))
+        shifts = np.concatenate([shape.columns(view) for shape in others]) * weight
+        self._alone, self._rest = rest, rest.beside(shifts)
+        own = self._apart(frame_shapes(camera).columns(view) * weight)
+        self._own = own.reshape(3, -1, *own.shape[1:])
+        self._theta, self._focal = camera.theta, camera.focal_px
         self._axes, self.timed = _earth(rest.obs)
         self._constants = refraction_constants(Site(45.0, 0.0))
 
-    def possible(self, places: FloatArray) -> FloatArray:
+    def _apart(self, shifts: FloatArray) -> FloatArray:
+        """Shifts (q, 2, N) of each frame by itself, (q K, 2, N)."""
+        frames = self._rest.likelihood.frames
+        number = np.repeat(np.arange(frames.n_frames), frames.sizes)
+        spread = np.zeros((len(shifts), frames.n_frames, 2, frames.n_stars))
+        spread[:, number, :, np.arange(frames.n_stars)] = shifts.transpose(2, 0, 1)
+        return spread.reshape(-1, 2, frames.n_stars)
+
+    def _raised(self, zenith: FloatArray) -> FloatArray:
+        """Whitened shifts (2, N) by standard air below zeniths (3, N), camera frame."""
+        a, b = self._constants
+        sine = np.maximum(np.sum(zenith * self._rest.state.b, axis=0), _LOWEST)
+        return self._rest.shift(zenith * ((a + b * (1.0 / sine**2 - 1.0)) / sine))
+
+    def _above(self, places: FloatArray) -> FloatArray:
+        """Zeniths (K, 3) of the frames, camera frame, at one place (1, 3)."""
+        found: FloatArray = np.einsum(
+            "kij,akj,a->ki", self._rest.state.rotations, self._axes.transpose(1, 0, 2), places[0]
+        )
+        return found
+
+    def _shift(self, zeniths: FloatArray) -> FloatArray:
+        """Whitened shifts (2, N) by standard air below zeniths (K, 3) of the frames, camera frame."""
+        return self._raised(self._rest.likelihood.frames.spread(np.ascontiguousarray(zeniths.T)))
+
+    def _possible(self, places: FloatArray) -> FloatArray:
         """Those places (g, 3) from which all stars were above the horizon."""
         frames = self._rest.likelihood.frames
         turned = [frames.spread(np.ascontiguousarray(self._axes[:, axis].T)) for axis in range(3)]
@@ -181,60 +324,177 @@ class _Air:
         found: FloatArray = places[np.min(places @ seen, axis=1) > _LOWEST]
         return found
 
-    def columns(self, places: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Whitened shifts (g, 2 N) by standard air as seen from places (g, 3), and what parameters took up (g, p)."""
-        a, b = self._constants
-        frames, state = self._rest.likelihood.frames, self._rest.state
-        shifts = np.empty((len(places), 2, frames.n_stars))
-        for number, place in enumerate(places):
-            zenith = np.einsum("kij,akj,a->ik", state.rotations, self._axes.transpose(1, 0, 2), place)
-            up = frames.spread(np.ascontiguousarray(zenith))
-            sine = np.maximum(np.sum(up * state.b, axis=0), _LOWEST)
-            shifts[number] = self._rest.shift(up * ((a + b * (1.0 / sine**2 - 1.0)) / sine))
-        return self._rest.left(shifts)
+    def of_one_place(self, seed: int) -> _Found | None:
+        """The air of one place; None where from no place all stars were above the horizon."""
+        places = self._possible(_sphere(_PLACES))
+        if not len(places):
+            return None
+        alone, _ = self._alone.left(np.stack([self._shift(self._above(place[None])) for place in places]))
+        rest, columns = self._rest, self._rest.cleared(alone)
+        p_value, amplitude, std = _largest(rest, columns, seed)
+        found = _Found(p_value, amplitude, std, False, False, np.nan)
+        if p_value >= AIR_P:
+            if _largest(self._alone, alone, seed)[0] >= AIR_P:
+                return found
+            rest, columns = self._alone, alone
+        gain = 2.0 * columns @ rest.residuals - np.sum(columns**2, axis=1)
+        settled = self._settled(rest, places[np.argmax(gain)][None], self._above)
+        gained, most = _gained(rest, settled.column), _most(rest, columns)
+        good = most - gained < max(_AIR_CHI2, _INEXACT * most) and self._nothing_else(rest, settled.column)
+        place = (settled.zeniths[0], np.degrees(settled.errors[:2])) if self.timed else None
+        return self._of(settled, found, rest, good)._replace(place=place)
 
-    def left_by_frame(self, place: FloatArray, density: float) -> float:
-        """Probability that frames by themselves, without that air, differ so much in scale and shape by noise."""
-        from scipy.special import fdtrc
+    def of_each_frame(self) -> _Found | None:
+        """Air with a zenith for every frame; None where frames by themselves hold no scale and shape."""
+        found = self._of_each_frame(self._rest)
+        return self._of_each_frame(self._alone) if found is None or found.p_value >= AIR_P else found
 
-        frames, theta = self._rest.likelihood.frames, self._camera.theta
-        view = View.of(self._rest.likelihood, self._rest.state, theta, slice(0, frames.n_stars))
-        weight = 1.0 if frames.weight is None else frames.weight
-        own = self._rest.likelihood.project_out(self._rest.state, frame_shapes(self._camera).columns(view) * weight)
-        number = np.repeat(np.arange(frames.n_frames), frames.sizes)
-        spread = np.zeros((3, frames.n_frames, 2, frames.n_stars))
-        spread[:, number, :, np.arange(frames.n_stars)] = own.transpose(2, 0, 1)
-        flat = spread.reshape(3 * frames.n_frames, -1)
-        flat -= (flat @ self._rest.basis) @ self._rest.basis.T
-        left = self._rest.residuals - self.columns(place[None])[0][0] * density
-        values, vectors = np.linalg.eigh(flat @ flat.T)
-        kept = values > 1e-8 * values[-1]
-        explained = float(np.sum((vectors[:, kept].T @ (flat @ left)) ** 2 / values[kept]))
-        rank = int(np.count_nonzero(kept))
-        dof = self._rest.dof - rank
-        if dof < 1:
-            return 1.0
-        return float(fdtrc(rank, dof, explained / rank / ((float(left @ left) - explained) / dof)))
+    def _of_each_frame(self, rest: Remainder) -> _Found | None:
+        own, k = self._own_shapes(rest), rest.obs.n_frames
+        if _f_tail(_explained(rest, own), len(own), rest) >= AIR_P:
+            return None
+        settled = self._settled(rest, self._zeniths_apiece(), lambda zeniths: zeniths)
+        gained = _gained(rest, settled.column)
+        p_value = _f_tail(gained * rest.sigma**2, len(own), rest)
+        good = p_value < AIR_P and self._nothing_else(rest, settled.column, k)
+        if rest is not self._alone:
+            # A focal length of each frame, or a shape without the scale of air, is not air: that has to explain more
+            # than either, even with all that noise gives to what that one leaves out.
+            for first, last in ((0, 1), (1, 3)):
+                one = _explained(rest, self._own_shapes(rest, slice(first, last))) / rest.sigma**2
+                good = good and gained > one + (3 - last + first) * k + _AIR_CHI2
+        return self._of(settled, _Found(p_value, np.nan, np.nan, False, False, np.nan), rest, good)
 
-    def settled(self, place: FloatArray, density: float) -> tuple[FloatArray, float, FloatArray]:
-        """The place (3,) near to one whose air explains the most, chi-square gained, covariance (2, 2), rad.
+    def _of(self, settled: _Settled, found: _Found, rest: Remainder, good: bool) -> _Found:
+        """What was found, with the air that explains it where it is good; beside terms of the lens or alone."""
+        if not good and np.isfinite(found.amplitude):
+            return found
+        found = found._replace(amplitude=settled.density, amplitude_std=float(settled.errors[-1]))
+        f_px = -float(self._alone.left(settled.shift[None])[1][0, 2])
+        return found._replace(is_air=good and rest is self._rest, like_others=good and rest is self._alone, f_px=f_px)
 
-        The covariance is that of moves to the north and to the east.
+    def _own_shapes(self, rest: Remainder, which: slice = slice(None)) -> FloatArray:
+        """What is left of scale and shape of each frame by itself, as orthonormal rows; `which` of the three."""
+        shifts = self._own[which].reshape(-1, *self._own.shape[2:])
+        rows, _ = rest.left(shifts)
+        return _orthonormal(rows / np.linalg.norm(shifts.reshape(len(rows), -1), axis=1)[:, None], _ABSORBED)
+
+    def _nothing_else(self, rest: Remainder, column: FloatArray, fitted: int = 0) -> bool:
+        """Whether frames by themselves, without that air, differ in scale and shape no more than by noise.
+
+        `fitted` is how many numbers of the air the frames' own shapes have determined.
         """
-        scale = self._rest.sigma**2
+        left, rows = rest.residuals - column, self._own_shapes(rest)
+        explained = float(np.sum((rows @ left) ** 2))
+        tail = _f_tail(explained, max(len(rows) - fitted, 1), rest, float(left @ left))
+        return tail > AIR_P or explained < _INEXACT * float(column @ column)
+
+    def _settled(self, rest: Remainder, zeniths: FloatArray, above: Callable[[FloatArray], FloatArray]) -> _Settled:
+        """The zeniths (n, 3) near to these whose air explains the most; `above` makes the frames' (K, 3) of them.
+
+        Levenberg's damped steps; the density of the air is fitted as well, with what is known of it.
+        """
+        scale, damping, least = rest.sigma**2, 1e-3, np.inf
+        known, density, trial, trial_density = zeniths, 1.0, zeniths, 1.0
         for _ in range(_STEPS):
-            north, east = _tangents(place)
-            beside = [_unit(place + _STEP_RAD * way) for way in (north, east)]
-            here, *moved = self.columns(np.stack([place, *beside]))[0] * density
-            slopes = (np.stack(moved) - here) / _STEP_RAD
-            covariance = np.linalg.inv(slopes @ slopes.T) * scale
-            step = covariance @ slopes @ (self._rest.residuals - here) / scale
-            size = float(np.hypot(*step))
-            place = _unit(place + min(1.0, 0.2 / max(size, 1e-12)) * (step[0] * north + step[1] * east))
-            if size < _STEP_RAD:
-                break
-        last = self.columns(place[None])[0][0] * density
-        return place, float(2.0 * last @ self._rest.residuals - last @ last) / scale, covariance
+            shift = trial_density * self._shift(above(trial))
+            column = rest.left(shift[None])[0][0]
+            away = (trial_density - 1.0) / _DENSITY_SPREAD
+            cost = float(np.sum((rest.residuals - column) ** 2)) / scale + away**2
+            if cost < least:
+                gained, least, damping = least - cost, cost, 0.2 * damping
+                known, density, found = trial, trial_density, (shift, column)
+                tangents = _tangents(known)
+                moved = [self._shift(above(_unit(known + _STEP_RAD * way))) * density for way in tangents]
+                slopes = (np.stack(moved) - shift) / _STEP_RAD
+                if len(known) > 1:
+                    slopes = self._apart(slopes)
+                rows = np.concatenate([rest.left(slopes)[0], column[None] / density])
+                matrix, pull = rows @ rows.T / scale, rows @ (rest.residuals - column) / scale
+                matrix[-1, -1] += _DENSITY_SPREAD**-2
+                pull[-1] -= away / _DENSITY_SPREAD
+                if gained < _SETTLED:
+                    break
+            else:
+                damping *= 10.0
+            diagonal = np.diag(matrix)
+            step = np.linalg.solve(matrix + np.diag(damping * (diagonal + 1e-9 * diagonal.max())), pull)
+            turn = step[:-1].reshape(2, -1)
+            turn = turn * np.minimum(1.0, _LONGEST_RAD / np.maximum(np.hypot(*turn), 1e-12))
+            trial = _unit(known + turn[0][:, None] * tangents[0] + turn[1][:, None] * tangents[1])
+            trial_density = float(np.clip(density + step[-1], _THIN, _THICK))
+        return _Settled(known, density, *found, np.sqrt(np.diag(np.linalg.pinv(matrix, hermitian=True))))
+
+    def _zeniths_apiece(self) -> FloatArray:
+        """Zeniths (K, 3), camera frame, that explain the most of each frame by itself, from a grid.
+
+        What all frames take up together, most of all the focal length, is fitted in turn with them.
+        """
+        likelihood, state = self._rest.likelihood, self._rest.state
+        frames, n = likelihood.frames, likelihood.frames.n_stars
+        grid = _around(_DISTANCES_DEG)
+        shifts = np.stack([self._raised(np.broadcast_to(zenith[:, None], (3, n))) for zenith in grid])
+        lowest = np.minimum.reduceat(grid @ state.b, frames.starts[:-1], axis=1)
+        columns = likelihood.project_out(state, shifts)
+        size = np.where(lowest > _LOWEST, frames.sum(np.sum(columns**2, axis=1)), np.inf)
+        h = likelihood.project_out(state, likelihood.derivatives(self._theta, state))
+        e = likelihood.project_out(state, state.e[None])[0]
+        basis = np.linalg.qr(h.reshape(len(h), -1).T)[0]
+        number, star = np.repeat(np.arange(frames.n_frames), frames.sizes), np.arange(n)
+        best, least = np.zeros(frames.n_frames, dtype=np.int64), np.inf
+        for tangent in _TANGENTS:
+            left = e - h[2] * (self._focal * self._constants[0] * (1.0 + 0.5 * tangent**2))
+            for _ in range(_ROUNDS):
+                gain = 2.0 * frames.sum(np.sum(columns * left, axis=1)) - size
+                chosen = np.argmax(gain, axis=0)
+                total = columns[chosen[number], :, star].T
+                left = e - (basis @ (basis.T @ (e - total).ravel())).reshape(2, -1)
+                cost = float(np.sum((left - total) ** 2))
+                if cost < least:
+                    best, least = chosen, cost
+        return grid[best]
+
+
+def _largest(rest: Remainder, columns: FloatArray, seed: int) -> tuple[float, float, float]:
+    """Probability that noise gives so large an amplitude of one of columns (g, m); that amplitude and its error."""
+    length = np.maximum(np.linalg.norm(columns, axis=1), 1e-300)
+    z = columns @ rest.residuals / length / rest.sigma
+    best = int(np.argmax(z))
+    rng = np.random.default_rng(seed)
+    values, vectors = np.linalg.eigh(columns @ columns.T / np.outer(length, length))
+    kept = values > 1e-10 * values[-1]
+    noise = rng.standard_normal((_DRAWS, int(np.count_nonzero(kept)))) @ (vectors[:, kept] * np.sqrt(values[kept])).T
+    dof = min(rest.dof, rest.least_dof)
+    noise /= np.sqrt(rng.chisquare(dof, _DRAWS) / dof)[:, None]
+    p_value = (1.0 + float(np.count_nonzero(noise.max(axis=1) >= z[best]))) / (_DRAWS + 1.0)
+    return p_value, float(z[best] * rest.sigma / length[best]), float(rest.sigma / length[best])
+
+
+def _explained(rest: Remainder, rows: FloatArray) -> float:
+    """Sum of squares that orthonormal rows (r, m) explain."""
+    return float(np.sum((rows @ rest.residuals) ** 2))
+
+
+def _gained(rest: Remainder, column: FloatArray) -> float:
+    """Chi-square that a column (m,) explains as it stands."""
+    return float(2.0 * column @ rest.residuals - column @ column) / rest.sigma**2
+
+
+def _most(rest: Remainder, columns: FloatArray) -> float:
+    """Chi-square that the best of columns (g, m) explains with an amplitude of its own."""
+    along = np.maximum(columns @ rest.residuals, 0.0)
+    return float(np.max(along**2 / np.maximum(np.sum(columns**2, axis=1), 1e-300))) / rest.sigma**2
+
+
+def _f_tail(explained: float, rank: int, rest: Remainder, total: float | None = None) -> float:
+    """Probability that noise gives so much of a sum of squares `total`, that of the residuals, to `rank` numbers."""
+    from scipy.special import fdtrc
+
+    dof = rest.dof - rank
+    if dof < 1 or rank < 1:
+        return 1.0
+    total = float(rest.residuals @ rest.residuals) if total is None else total
+    return float(fdtrc(rank, dof, max(explained, 0.0) / rank / ((total - explained) / dof)))
 
 
 def _earth(obs: Observations) -> tuple[FloatArray, bool]:
@@ -262,13 +522,24 @@ def _sphere(n: int) -> FloatArray:
     return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
 
 
-def _tangents(place: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Unit vectors to the north and to the east of a place."""
-    east = np.array([-place[1], place[0], 0.0]) if np.hypot(*place[:2]) > 1e-6 else np.array([0.0, 1.0, 0.0])
+def _around(distances_deg: FloatArray) -> FloatArray:
+    """Directions (g, 3) at some distances from +z, all around."""
+    distance, angle = (
+        grid.ravel()
+        for grid in np.meshgrid(np.radians(distances_deg), 2.0 * np.pi / _AROUND * np.arange(_AROUND), indexing="ij")
+    )
+    return np.column_stack([np.sin(distance) * np.cos(angle), np.sin(distance) * np.sin(angle), np.cos(distance)])
+
+
+def _tangents(places: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unit vectors (n, 3) to the north and to the east of places (n, 3)."""
+    east = np.column_stack([-places[:, 1], places[:, 0], np.zeros(len(places))])
+    at_pole = np.hypot(*places[:, :2].T) < 1e-6
+    east[at_pole] = (0.0, 1.0, 0.0)
     east = _unit(east)
-    return np.cross(place, east), east
+    return np.cross(places, east), east
 
 
-def _unit(vector: FloatArray) -> FloatArray:
-    found: FloatArray = vector / np.linalg.norm(vector)
+def _unit(vectors: FloatArray) -> FloatArray:
+    found: FloatArray = vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
     return found

@@ -20,7 +20,7 @@ from starcal_uq.core.records import Saved
 from starcal_uq.core.settings import bounded
 from starcal_uq.core.tasks import Progress, one_thread
 from starcal_uq.core.types import AnyDict, FloatArray
-from starcal_uq.diagnostics.air import AirTest, Remainder, air_test
+from starcal_uq.diagnostics.air import AirTest, air_test
 from starcal_uq.diagnostics.jackknife import Jackknife, jackknife_frames, jackknife_of_all
 from starcal_uq.diagnostics.misfit import Misfit, misfit_tests
 from starcal_uq.diagnostics.models import MODELS, ModelComparison, compare_models, of_all_stars
@@ -154,14 +154,14 @@ def diagnose_apart(
 
     `whole` is the calibration that partitioned observations have, where `cal` is that of their sample.
     """
-    rest = Remainder(obs, cal, seed)
+    stars = star_test(obs, cal)
     return Apart(
         misfit=misfit_tests(obs, whole or cal),
         starts=multi_start(obs, cal, n_starts, seed) if n_starts > 0 else None,
-        stars=star_test(obs, cal),
-        air=air_test(obs, cal, seed=seed, rest=rest),
+        stars=stars,
+        air=air_test(obs, cal, seed=seed, stars=stars),
         cameras=MixedCameras.of(obs, cal.camera),
-        times=time_test(obs, cal, seed=seed, rest=rest),
+        times=time_test(obs, cal, seed=seed),
     )
 
 

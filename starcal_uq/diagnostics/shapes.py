@@ -77,7 +77,7 @@ def shapes(
         of a frame and its temperature together, the magnitude of a star by itself.
     """
     seen = obs if seen is None else seen
-    found = [*_missing_terms(camera), _axes(camera), _aberration()]
+    found = [*lens_shapes(camera), _aberration()]
     clock, called = run_clock(obs)
     like: Any = slice(None)
     if seen is not obs:
@@ -91,8 +91,7 @@ def shapes(
     warmth = _standardised(obs.temperature_c, seen.temperature_c, like)
     magnitude = _standardised(obs.mag, seen.mag, star)
     if clock is not None:
-        # The clock runs from -1 to 1: twice the amplitude is the change over the run.
-        found.append(_focal_against(clock, "linear drift of f", called, ("change of f over the run", "px"), 0.5))
+        found.append(_drift(clock, called))
     if warmth is not None and obs.temperature_c is not None:
         spread = float(np.nanstd(obs.temperature_c))
         found.append(_focal_against(warmth, "focal length with temperature", "temperature", ("df/dT", "px/K"), spread))
@@ -102,6 +101,22 @@ def shapes(
     if clock is not None:
         found.append(_over_time(clock, called))
     return (*found, _cells(obs, camera, max_cells))
+
+
+def lens_shapes(camera: Camera) -> tuple[Shape, ...]:
+    """Terms that the lens of the fitted model lacks: of the other models, and scale and skew of the axes."""
+    return *_missing_terms(camera), _axes(camera)
+
+
+def focal_drift(obs: Observations) -> tuple[Shape, ...]:
+    """Linear drift of f over the run, where there is more than one frame."""
+    clock, called = run_clock(obs)
+    return () if clock is None else (_drift(clock, called),)
+
+
+def _drift(clock: FloatArray, called: str) -> Shape:
+    # The clock runs from -1 to 1: twice the amplitude is the change over the run.
+    return _focal_against(clock, "linear drift of f", called, ("change of f over the run", "px"), 0.5)
 
 
 def run_clock(obs: Observations) -> tuple[FloatArray | None, str]:

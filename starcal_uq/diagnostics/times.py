@@ -20,6 +20,7 @@ from starcal_uq.core.settings import bounded
 from starcal_uq.core.times import FIRST_YEAR, LAST_YEAR
 from starcal_uq.core.types import FloatArray, IntArray, StrArray
 from starcal_uq.diagnostics.air import Remainder
+from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.star_errors import star_numbers
 from starcal_uq.sky.apparent import earth_velocity_km_s
 from starcal_uq.sky.catalogue import load_catalogue
@@ -83,7 +84,7 @@ class _Moved:
 
 
 @bounded
-def time_test(obs: Observations, cal: Calibration, *, seed: int = 0, rest: Remainder | None = None) -> TimeTest | None:
+def time_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> TimeTest | None:
     """Look for a wrong time in the residuals of a calibration.
 
     Parameters
@@ -92,15 +93,13 @@ def time_test(obs: Observations, cal: Calibration, *, seed: int = 0, rest: Remai
         The data and the estimate made from them.
     seed : int
         Seed of the choice of frames, where there are many.
-    rest : Remainder, optional
-        What is left of the residuals, where it is known already.
 
     Returns
     -------
     TimeTest or None
         The slip that explains most; None where none is seen.
     """
-    rest = rest or Remainder(obs, cal, seed)
+    rest = Remainder(weighed(obs, cal), cal, seed)
     numbers = star_numbers(rest.obs, cal.camera.focal_px)
     frames = np.repeat(np.arange(rest.obs.n_frames), rest.likelihood.frames.sizes)
     best, most = None, 0.0

@@ -197,6 +197,10 @@ class MarginalLikelihood:
         remainder: FloatArray = columns - sum(response[:, i, None, :] * a[i] for i in range(3))
         return remainder
 
+    def whitened(self, state: Profile, columns: FloatArray) -> FloatArray:
+        """Turn columns (q, 2, N) into (q, m) with products by the covariance of the data, attitudes eliminated."""
+        return self.project_out(state, columns).reshape(len(columns), -1)
+
     def evaluate(self, theta: FloatArray) -> Normal:
         """Cost S, gradient and Gauss-Newton matrix with the attitudes eliminated (variable projection)."""
         return self.sums(theta)[0].normal

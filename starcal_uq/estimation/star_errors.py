@@ -436,6 +436,11 @@ class StarLikelihood(MarginalLikelihood):
         offsets = self._solved.offsets(cross.reshape(-1, q))
         return projected - self.project_out(state, self.offset_shifts(state, offsets)), offsets
 
+    def whitened(self, state: Profile, columns: FloatArray) -> FloatArray:
+        rest, offsets = self.conditioned(state, columns)
+        scaled = offsets / np.sqrt(self._solved.ratio)[:, None]
+        return np.concatenate([rest.reshape(len(columns), -1), scaled.T], axis=1)
+
     def offset_shifts(self, state: Profile, offsets: FloatArray) -> FloatArray:
         """Whitened shifts (q, 2, N) of all images by offsets (2 S, q), px."""
         z = self._sums.columns(self, state, slice(None))

@@ -12,7 +12,8 @@ import starcal_uq as sc
 from starcal_uq.core.status import Level
 from starcal_uq.diagnostics.air import air_test
 from starcal_uq.diagnostics.verdict import observed
-from tests.helpers.outside import cap, frame_at
+from starcal_uq.diagnostics.verdict.judge import judge
+from tests.helpers.outside import campaign, cap, frame_at, random_unit, through_air, zeniths_of_frames
 
 LATITUDE, LONGITUDE = 38.0, -70.0
 
@@ -87,6 +88,105 @@ def test_frames_of_a_moment_need_no_times():
     assert "--time" in check.sentence and "column" not in check.sentence
     assert "--in-space" in observed.directions(seen, cal).remedy
     assert "calibrate" not in observed.directions(seen, cal).remedy
+
+
+PATCH = {"n_frames": 60, "patch_stars": 40, "star_sigma_px": 0.03}
+
+
+def bent(px, bend):
+    """A shift of so many px, by the position in the field, in units of the half diagonal, and the frame."""
+    return lambda uv, xy, mag, frame: px * bend(*(uv / 724.0), frame)
+
+
+def edge(radius, mag, frame):
+    return 0.05 * (1.0 + 2.0 * (radius / 0.75) ** 4)
+
+
+def outside(seed, *, air=None, star_errors=False, noise="common", meta=None, **options):
+    """Frames without times from the simulator of another make, calibrated; `air` is where the zenith is."""
+    rng = np.random.default_rng([seed, 26])
+    c = campaign(rng, **{"n_frames": 30} | options)
+    if air == "one":
+        towards = np.array([0.3, -0.5, 0.8]) / np.sqrt(0.98)
+        across = np.cross(towards, random_unit(rng))
+        zenith = 0.6 * towards + 0.8 * across / np.linalg.norm(across)
+        c = through_air(c, np.broadcast_to(zenith, (len(c.attitudes), 3)))
+    elif air is not None:
+        turned = air == "each"
+        c = through_air(c, zeniths_of_frames(rng, c, (20.0, 60.0) if turned else (45.0, 45.0), turned))
+    obs = sc.Observations(**c.columns, meta={"directions": "apparent"} | (meta or {}))
+    camera = sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0))
+    return c, obs, sc.calibrate(obs, camera, star_errors=star_errors, noise=noise, duplicates="keep")
+
+
+@pytest.mark.parametrize("star_errors", [False, True])
+def test_errors_of_stars_are_not_refraction(star_errors):
+    for seed in range(4):
+        _, obs, cal = outside(seed, star_errors=star_errors, **PATCH)
+        found = air_test(obs, cal)
+        assert not found.is_air and not found.like_others
+        assert found.p_value > 1e-3
+    # The control: refraction beside the errors of the stars.
+    c, obs, cal = outside(0, air="one", star_errors=star_errors, **PATCH)
+    found = air_test(obs, cal)
+    assert found.is_air
+    assert abs(cal.theta[2] + found.f_px - c.theta[2]) < 4.0 * cal.sigmas[2] < 0.5 * found.f_px
+
+
+def test_in_space_there_is_no_air():
+    _, obs, cal = outside(1, air="each")
+    assert air_test(obs, cal).is_air
+    for observer in ("space", "rendered"):
+        assert air_test(obs.with_meta(observer=observer), cal) is None
+
+
+@pytest.mark.parametrize("options", [{}, {"sigma_px": 0.1}, {"field_deg": 5.0}, {"field_deg": 30.0}], ids=str)
+def test_refraction_of_frames_without_times(options):
+    c, obs, cal = outside(2, air="each", meta={"observer": "unknown"}, **options)
+    found = air_test(obs, cal)
+    assert found.is_air and found.p_value < 1e-6 and np.isnan(found.latitude_deg)
+    # Not known is the density of the air, which is that of any place up to 4 km.
+    assert abs(cal.theta[2] + found.f_px - c.theta[2]) < 0.3 * found.f_px + 3.0 * cal.sigmas[2]
+    verdict = judge(obs, cal, diagnosis=sc.diagnose(obs, cal, models=(), n_starts=0))
+    first = verdict.at(Level.FAIL)[0]
+    assert first.name == "Catalogue directions" and "f is too short" in first.sentence
+    assert "--site SITE --time UTC" in first.remedy
+
+
+SKEWED = bent(0.3, lambda u, v, frame: np.array([u, -v]))
+LOOKALIKES = {
+    "clean": {},
+    "focal lengths": {"frame_focal": 3e-4},
+    "focal lengths, hardly seen": {"frame_focal": 7e-5},
+    "frames of their own shape": {
+        "displaced": bent(0.05, lambda u, v, frame: np.array([u, -v]) * np.sin(2.4 * frame**2))
+    },
+    "drift of f": {"displaced": bent(0.3, lambda u, v, frame: np.array([u, v]) * (frame / 30.0 - 0.5))},
+    "radial": {"displaced": bent(1.0, lambda u, v, frame: np.array([u, v]) * np.hypot(u, v) ** 6)},
+    "decentred": {"displaced": bent(0.5, lambda u, v, frame: np.array([3.0 * u**2 + v**2, 2.0 * u * v]))},
+    "waves": {"displaced": bent(0.1, lambda u, v, frame: np.array([np.sin(9.0 * v), np.cos(8.0 * u)]))},
+    "noise at the edge": {"sigma_px": edge},
+}
+
+
+@pytest.mark.parametrize("where", [{}, {"patch_stars": 40}, {"pointings": 1, "drift_px": 3.3}], ids=str)
+@pytest.mark.parametrize("name", LOOKALIKES)
+def test_without_times_what_is_not_refraction_is_not_named(name, where):
+    _, obs, cal = outside(3, **LOOKALIKES[name], **where)
+    found = air_test(obs, cal)
+    assert found is None or not found.is_air
+
+
+def test_a_horizon_fixed_in_the_camera_is_like_axes_of_different_scale():
+    for options in ({"air": "fixed"}, {"displaced": SKEWED}):
+        _, obs, cal = outside(4, meta={"observer": "unknown"}, **options)
+        found = air_test(obs, cal)
+        assert found.like_others and not found.is_air
+        check = observed.directions(obs, cal, found)
+        assert check.level is Level.WARN and "cannot be told apart" in check.sentence
+        assert "--site" in check.remedy
+    _, obs, cal = outside(4, meta={"observer": "unknown"})
+    assert "cannot be told apart" not in observed.directions(obs, cal, air_test(obs, cal)).sentence
 
 
 def test_thinner_air_is_air():

@@ -7,7 +7,7 @@ err with their star, noise that varies with radius, magnitude or frame, frames t
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -142,6 +142,35 @@ def campaign(
     return Campaign(columns, np.array([x0, y0, focal, k1, k2]), np.array(attitudes), size_px)
 
 
+def zeniths_of_frames(
+    rng: np.random.Generator, c: Campaign, high_deg: tuple[float, float] = (20.0, 60.0), turned: bool = True
+) -> np.ndarray:
+    """Zeniths (K, 3) at some distances from the boresights, in any direction or, not `turned`, at one in the camera."""
+    distance = np.radians(rng.uniform(*high_deg, len(c.attitudes)))
+    angle = rng.uniform(0.0, 2.0 * np.pi, len(c.attitudes)) if turned else np.full(len(c.attitudes), 0.7)
+    up = [np.sin(distance) * np.cos(angle), np.sin(distance) * np.sin(angle), np.cos(distance)]
+    return np.einsum("ik,kij->kj", np.array(up), c.attitudes)
+
+
+def through_air(c: Campaign, zeniths: np.ndarray, arcsec: float = 58.0) -> Campaign:
+    """The same images with directions that lack `arcsec` tan z of refraction towards zeniths (K, 3)."""
+    zenith, r = zeniths[c.columns["frame"]], _directions(c)
+    sine = np.sum(r * zenith, axis=1, keepdims=True)
+    # The way to the zenith is as long as the cosine of the altitude.
+    return _redirected(c, r - np.radians(arcsec / 3600.0) * (zenith - sine * r) / sine)
+
+
+def _directions(c: Campaign) -> np.ndarray:
+    ra, dec = np.radians(c.columns["ra_deg"]), np.radians(c.columns["dec_deg"])
+    return np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+
+
+def _redirected(c: Campaign, directions: np.ndarray) -> Campaign:
+    r = directions / np.linalg.norm(directions, axis=1)[:, None]
+    ra, dec = np.degrees(np.arctan2(r[:, 1], r[:, 0])) % 360.0, np.degrees(np.arcsin(r[:, 2]))
+    return replace(c, columns=c.columns | {"ra_deg": ra, "dec_deg": dec})
+
+
 def measured_again(
     rng: np.random.Generator,
     columns: dict[str, np.ndarray],
@@ -184,8 +213,7 @@ def attitude_errors(c: Campaign, theta: np.ndarray) -> np.ndarray:
         ideal = d / (1.0 + k1 * r2 + k2 * r2**2)
     b = np.column_stack([ideal.T, np.full(d.shape[1], f)])
     b /= np.linalg.norm(b, axis=1)[:, None]
-    ra, dec = np.radians(c.columns["ra_deg"]), np.radians(c.columns["dec_deg"])
-    r = np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
+    r = _directions(c)
     errors = []
     for frame, truth in enumerate(c.attitudes):
         mine = c.columns["frame"] == frame

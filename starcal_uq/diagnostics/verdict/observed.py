@@ -60,7 +60,7 @@ def directions(
         level = Level.WARN if small else Level.FAIL
         return Check(name, Question.TRUSTWORTHY, level, "; ".join(values), bound, " ".join(sentences), remedy, advice)
     if declared == "apparent" and seen == "unknown":
-        sentence = f"Aberration is in the directions, refraction is not. {conditional_words(cal)} {REMEDY}"
+        sentence = f"Aberration is in the directions, refraction is not. {_unsure(cal, found)} {REMEDY}"
         return Check(name, Question.TRUSTWORTHY, Level.WARN, "without refraction", bound, sentence, _about_air(obs))
     if declared == "apparent":
         sentence = "The directions are declared as apparent: aberration is in them."
@@ -75,7 +75,7 @@ def directions(
     time = _time_of(obs) if _from_images(obs) else ""
     remedy = f"{_command(obs)}{time or ' --directions apparent'}"
     if seen == "unknown":
-        sentence, remedy = f"{sentence} {conditional_words(cal)} {REMEDY}", f"{remedy} or {_about_air(obs)}"
+        sentence, remedy = f"{sentence} {_unsure(cal, found)} {REMEDY}", f"{remedy} or {_about_air(obs)}"
     return Check(name, Question.TRUSTWORTHY, Level.WARN, declared, bound, sentence, remedy)
 
 
@@ -94,6 +94,16 @@ def air_words(obs: Observations, found: AirTest) -> str:
     seen = {"corrected": "Check site, pressure and times", "none": "They are declared to hold all there is: check that"}
     asked = seen.get(air(obs), "State the site (--site)")
     return f"{first} {asked}; the residuals point to {place.words} ({ends})."
+
+
+def _unsure(cal: Calibration, found: AirTest | None) -> str:
+    """That f is conditional on refraction, and where the residuals leave open whether there is any."""
+    if found is None or not found.like_others:
+        return conditional_words(cal)
+    return (
+        f"{conditional_words(cal)} The residuals hold what refraction would leave if the zenith kept its place in the "
+        "camera, and so would axes of different scale, skewed axes or a drift of f: these cannot be told apart here."
+    )
 
 
 def _time_words(obs: Observations, found: TimeTest) -> tuple[str, str, str, str]:
