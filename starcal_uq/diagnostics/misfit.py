@@ -109,6 +109,8 @@ class MisfitTest:
         fitted.
     moved_name : str
         That parameter.
+    moved_std : float
+        Standard error of that change, in the same unit: large where the shapes can hardly be told from the parameter.
     detectable_px : float
         Root mean square per axis of a pattern that the test finds nine times in ten, at level ALPHA of all tests
         together, px; NaN for unequal noise.
@@ -127,6 +129,7 @@ class MisfitTest:
     moved_sigma: float = float("nan")
     moved_name: str = ""
     detectable_px: float = float("nan")
+    moved_std: float = float("nan")
 
     @property
     def is_of_noise(self) -> bool:
@@ -490,20 +493,24 @@ class _Sums:
         visible = float(np.trace(left) / max(np.count_nonzero(present), 1))
         # What fitting the shapes takes from the parameters, in units of their standard deviations.
         fitted = vectors[:, kept] @ (scores / values[kept]) / norm
-        moved = np.abs(self.projection @ cross.T @ fitted) / np.sqrt(np.diag(self.projection) * self.rss / self.dof)
+        unit = np.sqrt(np.diag(self.projection) * self.rss / self.dof)
+        moved = np.abs(self.projection @ cross.T @ fitted) / unit
         worst = int(np.argmax(moved))
+        turned = self.projection[worst] @ (cross / norm[:, None]).T @ (vectors[:, kept] / np.sqrt(values[kept]))
+        error = float(np.sqrt((self.rss - explained) / (self.dof - rank)) * np.linalg.norm(turned) / unit[worst])
         amplitudes: tuple[Amplitude, ...] = ()
         if family.labels and rank == family.size:
             inverse = (vectors / values) @ vectors.T
             variance = (self.rss - explained) / (self.dof - rank)
             unit = np.array(family.per_amplitude) / norm
-            best, error = inverse @ (slope / norm) * unit, np.sqrt(variance * np.diag(inverse)) * unit
+            best, errors = inverse @ (slope / norm) * unit, np.sqrt(variance * np.diag(inverse)) * unit
             amplitudes = tuple(
                 Amplitude(name, u, float(value), float(sigma))
-                for (name, u), value, sigma in zip(family.labels, best, error, strict=True)
+                for (name, u), value, sigma in zip(family.labels, best, errors, strict=True)
             )
         largest, name = float(moved[worst]), self.names[worst]
-        return replace(test, visible=visible, amplitudes=amplitudes, moved_sigma=largest, moved_name=name)
+        test = replace(test, visible=visible, amplitudes=amplitudes)
+        return replace(test, moved_sigma=largest, moved_name=name, moved_std=error)
 
     def frame_by_frame(self) -> MisfitTest | None:
         """Does scale or shape change from frame to frame?"""

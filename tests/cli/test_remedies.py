@@ -81,6 +81,7 @@ PHASE = SimpleNamespace(
     p_holm=1e-9,
     size_px=0.1,
     moved_sigma=0.0,
+    moved_std=0.0,
     moved_name="",
 )
 

@@ -15,9 +15,11 @@ from benchmarks.misfit_power import SCENARIOS, main, power
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.diagnostics.misfit import ALPHA, Misfit, _Columns, misfit_tests
 from starcal_uq.diagnostics.shapes import View, shapes
+from starcal_uq.diagnostics.verdict.estimate import misfit
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.maths.intervals import holm
 from starcal_uq.observations.frames import StarFrames
+from tests.helpers.outside import campaign
 from tests.helpers.scenes import COEFFICIENTS, camera, nominal, observations, with_sigmas
 
 N_NULL = 100
@@ -175,6 +177,28 @@ def test_aberration_is_measured_as_a_velocity():
 
 def _angles(r):
     return np.arctan2(r[:, 1], r[:, 0]), np.arcsin(r[:, 2])
+
+
+def test_what_the_data_hardly_tell_apart_is_said_to_be_so():
+    """On one patch of sky, aberration is nearly a focal length; errors of stars make its test reject."""
+    c = campaign(np.random.default_rng(1), n_frames=60, patch_stars=40, star_sigma_px=0.03)
+    obs = sc.Observations(**c.columns, meta={"directions": "apparent"})
+    cal = sc.calibrate(obs, sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)))
+    found = misfit_tests(obs, cal)
+    test = named(found, "aberration")
+    assert test.p_holm < ALPHA and test.moved_name == "f" and test.moved_sigma > 30.0
+    # The velocity that it would be is hundreds of times less certain than the Earth's is small.
+    assert test.moved_sigma < 3.0 * test.moved_std
+    sentence = misfit(dataclasses.replace(found, tests=(test,)), cal).sentence
+    assert "hardly tell aberration of a constant velocity from f" in sentence
+    # The control: frames all over the sky tell them apart.
+    c = campaign(np.random.default_rng(1), n_frames=60)
+    obs = sc.Observations(**c.columns, meta={"directions": "apparent"})
+    cal = sc.calibrate(obs, sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)))
+    test = named(misfit_tests(obs, cal), "aberration")
+    assert test.moved_std < 1.0
+    sentence = misfit(dataclasses.replace(found, tests=(dataclasses.replace(test, p_holm=1e-9),)), cal).sentence
+    assert "more than noise" in sentence and "hardly tell" not in sentence
 
 
 def test_drift_follows_time_where_there_is_time_and_temperature_where_there_is_temperature():
