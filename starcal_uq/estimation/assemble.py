@@ -24,7 +24,14 @@ from starcal_uq.estimation.marginal import TURN_RAD, MarginalLikelihood
 from starcal_uq.estimation.solvers import is_singular
 from starcal_uq.estimation.stages import Stage
 from starcal_uq.estimation.star_errors import StarLikelihood, StarModel
-from starcal_uq.estimation.undetermined import EXPLAINED, WEAK, open_parameters, remedy_of, undetermined
+from starcal_uq.estimation.undetermined import (
+    EXPLAINED,
+    WEAK,
+    coma_record,
+    open_parameters,
+    remedy_of,
+    undetermined,
+)
 from starcal_uq.maths.linear import scaled_inverse, symmetric_inverse
 
 if TYPE_CHECKING:
@@ -72,7 +79,8 @@ def assemble(
     dof = likelihood.dof - p
     sigma = float(np.sqrt(normal.cost / dof))
     status = check_camera(nominal.with_theta(theta), status)
-    if names := undetermined(likelihood, theta, normal.matrix, sigma, nominal, status):
+    names, factors = undetermined(likelihood, theta, normal.matrix, sigma, nominal, status)
+    if names:
         status = Status.SINGULAR
     efficient, information = scaled_inverse(normal.matrix) * sigma**2, normal.matrix / sigma**2
     compressed = compress(likelihood, theta, efficient)
@@ -102,7 +110,7 @@ def assemble(
         method=method,
         solver=solver,
         theta=theta,
-        covariance=efficient if refined else pair_covariance,
+        covariance=(efficient if refined else pair_covariance) * np.outer(factors, factors),
         sigma=sigma,
         sigma_std=sigma / float(np.sqrt(2.0 * dof)),
         sigma_name=sigma_parameter(likelihood.frames.weight is not None).name,
@@ -118,9 +126,11 @@ def assemble(
         rotation_per_theta=np.mean(attitudes.response, axis=2),
         attitude_noise=np.mean(attitudes.inverse, axis=2) * sigma**2,
         pair_theta=pair_theta,
-        pair_covariance=pair_covariance,
+        pair_covariance=pair_covariance * np.outer(factors, factors),
         compressed=compressed,
-        provenance=provenance(None, record | (settings or {}), obs.data_hash) | {"kernels": likelihood.kernels},
+        provenance=provenance(None, record | (settings or {}), obs.data_hash)
+        | {"kernels": likelihood.kernels}
+        | coma_record(nominal, factors),
         fingerprints=Fingerprints.of(obs, residuals, nominal.centre_px),
     )
 
@@ -157,6 +167,7 @@ def with_star_errors(obs: Observations, cal: Calibration) -> Calibration:
         )
     errors, sigma, spread = model.estimate(likelihood, cal.theta, cal.sigmas, cal.sigma)
     theta, covariance = cal.theta, cal.covariance
+    factors = np.ones(len(theta)) if cal.coma_factors is None else cal.coma_factors
     trajectory, cost = [theta], []
     rotations = likelihood.rotations_at(theta)
     for _ in range(2):
@@ -185,7 +196,7 @@ def with_star_errors(obs: Observations, cal: Calibration) -> Calibration:
         cal,
         camera=camera,
         theta=theta,
-        covariance=covariance,
+        covariance=covariance * np.outer(factors, factors),
         sigma=sigma,
         sigma_std=sigma / float(np.sqrt(2.0 * found.dof)),
         stages=(*cal.stages, stage),

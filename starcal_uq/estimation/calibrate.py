@@ -59,7 +59,7 @@ from starcal_uq.estimation.stages import (
     refinement_stage,
 )
 from starcal_uq.estimation.student import parse_dof
-from starcal_uq.estimation.undetermined import EXPLAINED, undetermined
+from starcal_uq.estimation.undetermined import EXPLAINED, coma_record, undetermined
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.partitions import PartitionedObservations
@@ -184,6 +184,7 @@ def calibrate(
         When frames hold the same measurement, and `duplicates` is ``refuse``.
     """
     check_duplicates(duplicates)
+    nominal = camera
     camera = camera if model is None else camera.replace(distortion=model)
     if method not in METHODS:
         raise CalibrationError(f"method {method!r} is unknown: use one of {', '.join(METHODS)}.")
@@ -241,16 +242,17 @@ def calibrate(
         obs = replace(obs, stated_px=None) if obs.stated_px is not None and noise == "common" else obs
         frames = StarFrames.from_observations(obs)
 
-        def fitted(nominal: Camera) -> Calibration:
-            gaussian = MarginalLikelihood(frames, nominal.distortion)
-            check_count(gaussian, nominal)
+        def fitted(start: Camera) -> Calibration:
+            gaussian = MarginalLikelihood(frames, start.distortion)
+            check_count(gaussian, start)
             if noise == "model":
-                return _with_noise_model(obs.unweighted, nominal, method, solver, max_iterations)
+                return _with_noise_model(obs.unweighted, start, method, solver, max_iterations)
             if likelihood == "student_t":
-                return _robust(obs, nominal, frames, solver, max_iterations, nu)
-            return _gaussian(obs, nominal, gaussian, method, solver, max_iterations)
+                return _robust(obs, start, frames, solver, max_iterations, nu)
+            return _gaussian(obs, start, gaussian, method, solver, max_iterations)
 
-        calibration = fit_determined(obs, camera, fitted, asked=model is not None, throw=throw)
+        sheet = nominal.distortion
+        calibration = fit_determined(obs, camera, fitted, sheet=sheet, asked=model is not None, throw=throw)
         if star_errors and calibration.status.ok:
             calibration = with_star_errors(weighed(obs, calibration), calibration)
     if throw:
@@ -260,7 +262,7 @@ def calibrate(
         return calibration
     rest = calibrate(
         obs.select_frames(np.setdiff1d(obs.frame_ids, repeating)),
-        camera,
+        nominal,
         model=model,
         method=method,
         solver=solver,
@@ -470,11 +472,12 @@ def _robust(
     result = camera.with_theta(theta)
     status = check_camera(result, status)
     gaussian, matrix = MarginalLikelihood(start.frames, model), scaled_inverse(found.covariance) * sigma**2
-    if names := undetermined(gaussian, theta, matrix, sigma, camera, status):
+    names, factors = undetermined(gaussian, theta, matrix, sigma, camera, status)
+    if names:
         status = Status.SINGULAR
     settings: dict[str, object] = {"method": "efficient", "solver": solver, "distortion": model}
     settings |= {"likelihood": "student_t", "dof": "free" if nu is None else nu}
-    record = provenance(None, settings, obs.data_hash)
+    record = provenance(None, settings, obs.data_hash) | coma_record(camera, factors)
     residuals = frames.in_pixels(state.e).T
     record["student_t"] = {"dof": found.nu, "dof_std": found.nu_std, "stars_out_of_field": int(np.sum(~state.seen))}
     return Calibration(
@@ -483,7 +486,7 @@ def _robust(
         method="efficient",
         solver=solver,
         theta=theta,
-        covariance=found.covariance,
+        covariance=found.covariance * np.outer(factors, factors),
         sigma=sigma,
         sigma_std=found.sigma_std,
         sigma_name=sigma_parameter(frames.weight is not None).name,

@@ -209,6 +209,12 @@ class Calibration(Shown):
         return None if factors is None else np.array([factors[name] for name in self.parameter_names])
 
     @property
+    def coma_factors(self) -> FloatArray | None:
+        """Factors (p,) on the sigmas of the likelihood that leave out the coma of a distortion that may be none."""
+        factors = self.provenance.get("without_coma")
+        return None if factors is None else np.array([factors[name] for name in self.parameter_names])
+
+    @property
     def n_stars(self) -> int:
         """Number of stars."""
         return self.compressed.n_stars if self.partitions else len(self.residuals_px) or self.compressed.n_stars

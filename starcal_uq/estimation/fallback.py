@@ -2,6 +2,7 @@
 
 One rule: what is asked for by name (``model="brown"``, ``--model brown``) is fitted or refused, and the refusal names
 the model that would converge; the model of a camera's sheet is a start, and a simpler one is taken where it fails.
+Where the simpler model is asked for, it leaves out as much: its record is the same.
 """
 
 from __future__ import annotations
@@ -15,14 +16,14 @@ from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.camera.camera import Camera
 from starcal_uq.camera.distortion import get_model, simpler_models
 from starcal_uq.core.errors import CalibrationError
-from starcal_uq.core.formatting import join_words
+from starcal_uq.core.formatting import join_words, significant
 from starcal_uq.core.status import Status
-from starcal_uq.core.types import AnyDict
+from starcal_uq.core.types import AnyDict, FloatArray
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.noise_model import weighed
 from starcal_uq.estimation.plausibility import find_reason
-from starcal_uq.estimation.undetermined import EXPLAINED, remedy_of, what_is_open
+from starcal_uq.estimation.undetermined import COMA_MATTERS, EXPLAINED, open_parameters, remedy_of, what_is_open
 from starcal_uq.observations.table import Observations
 
 # Ends that a better start may mend.
@@ -33,12 +34,19 @@ _ABSORBED = 1e-12
 
 
 def fit_determined(
-    obs: Observations, camera: Camera, fit: Callable[[Camera], Calibration], *, asked: bool, throw: bool = True
+    obs: Observations,
+    camera: Camera,
+    fit: Callable[[Camera], Calibration],
+    *,
+    sheet: str,
+    asked: bool,
+    throw: bool = True,
 ) -> Calibration:
     """The calibration by `fit` with the model of a camera, or with the richest simpler one that the data determine.
 
     `camera`: nominal, with the model wanted.
     `fit`: nominal camera to calibration; it may raise `CalibrationError`.
+    `sheet`: model of the camera's sheet.
     `asked`: whether the model was asked for by name: then it is that or, with `throw`, an error naming one that
         converges.
     `throw`: whether a calibration that did not end well is of no use.
@@ -66,15 +74,41 @@ def fit_determined(
                     names,
                     found,
                 ) from failure
-            because = "the stars are too few" if status is Status.SINGULAR else f"the fit ended in {status.name}"
-            because = f"{what_is_open(names) if names else because} with the latter"
-            record: AnyDict = {"model": camera.distortion, "used": used, "status": status.name}
-            record |= {"undetermined": list(names), "because": because}
-            return replace(simpler, provenance=simpler.provenance | {"fallback": record})
+            return _conditional(simpler, camera.distortion, status, names)
     if failure is not None:
         raise failure
     assert found is not None
+    if asked and status.ok and camera.distortion in simpler_models(sheet):
+        left_open = _left_open(obs, found, sheet)
+        if left_open is not None:
+            return _conditional(found, sheet, Status.SINGULAR, left_open)
     return found
+
+
+def _conditional(cal: Calibration, model: str, status: Status, names: tuple[str, ...]) -> Calibration:
+    """The calibration with the record of the richer model that the data do not determine, and why."""
+    because = "the stars are too few" if status is Status.SINGULAR else f"the fit ended in {status.name}"
+    because = f"{what_is_open(names) if names else because} with the latter"
+    record: AnyDict = {"model": model, "used": cal.camera.distortion, "status": status.name}
+    record |= {"undetermined": list(names), "because": because}
+    return replace(cal, provenance=cal.provenance | {"fallback": record})
+
+
+def _left_open(obs: Observations, cal: Calibration, richer: str) -> tuple[str, ...] | None:
+    """What the data leave open of a richer model around a calibration; None where they determine all of it."""
+    likelihood, theta = _as_richer(obs, cal, richer)
+    if likelihood.dof < len(theta):
+        return ()
+    camera = cal.nominal.replace(distortion=richer, coefficients=(0.0,) * (len(theta) - 3))
+    return open_parameters(likelihood.evaluate(theta).matrix, cal.sigma, camera) or None
+
+
+def _as_richer(obs: Observations, cal: Calibration, richer: str) -> tuple[MarginalLikelihood, FloatArray]:
+    """The likelihood of a richer model, and the estimate of a calibration in it: what it lacks is zero."""
+    likelihood = MarginalLikelihood(weighed(obs, cal), richer)
+    likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
+    extra = len(get_model(richer).coefficients) - len(get_model(cal.camera.distortion).coefficients)
+    return likelihood, np.concatenate([cal.theta, np.zeros(extra)])
 
 
 def _simpler(
@@ -113,10 +147,8 @@ def _wanted(obs: Observations, cal: Calibration, richer: str) -> bool:
     if cal.provenance["settings"].get("likelihood") == "student_t":
         # Of wrong stars a Gaussian test would ask for anything.
         return False
-    likelihood = MarginalLikelihood(weighed(obs, cal), richer)
-    likelihood.use_rotations(quaternion_to_rotation(cal.quaternions))
-    extra = len(get_model(richer).coefficients) - len(get_model(cal.camera.distortion).coefficients)
-    normal = likelihood.evaluate(np.concatenate([cal.theta, np.zeros(extra)]))
+    likelihood, theta = _as_richer(obs, cal, richer)
+    normal = likelihood.evaluate(theta)
     scale = 1.0 / np.sqrt(np.diag(normal.matrix))
     values, vectors = np.linalg.eigh(normal.matrix * np.outer(scale, scale))
     kept = values > _ABSORBED
@@ -128,14 +160,25 @@ def _wanted(obs: Observations, cal: Calibration, richer: str) -> bool:
 
 
 def fallback_words(cal: Calibration) -> str:
-    """That another model was fitted than the camera's, why, and what the sigmas rest on; empty where it was not."""
+    """What the data do not determine of the camera's model, and what the sigmas rest on; empty where they do."""
     record = cal.provenance.get("fallback")
     if not record:
-        return ""
+        return _coma_words(cal)
     left_out = [c.name for c in get_model(record["model"]).coefficients]
     left_out = [name for name in left_out if name not in cal.parameter_names]
     verb = "is" if len(left_out) == 1 else "are"
     return (
         f"Distortion model {record['used']!r} in place of {record['model']!r}: {record['because']}. The sigmas hold if "
         f"{join_words(left_out)} {verb} zero."
+    )
+
+
+def _coma_words(cal: Calibration) -> str:
+    factors = cal.coma_factors
+    if factors is None or np.max(factors) < COMA_MATTERS:
+        return ""
+    x0, y0 = (significant(float(sigma)) for sigma in cal.sigmas[:2])
+    return (
+        f"The distortion may be none, and without its coma the stars tell the principal point to {x0} and {y0} px "
+        f"only: sigmas hold that, and are up to {significant(float(np.max(factors)))} times as large as with it."
     )

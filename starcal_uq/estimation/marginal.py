@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 # Attitudes that are wrong by this much cost a likelihood nothing that is left after their elimination to first order.
 TURN_RAD = 1e-8
+# The same of a table of a few hundred stars, whose likelihood is then known to 1e-5.
+_NEAR_RAD = 1e-6
 
 
 @dataclass(frozen=True)
@@ -81,9 +83,12 @@ class MarginalLikelihood:
     def _quest_weights(self) -> FloatArray | None:
         return None if self.frames.weight is None else self.frames.weight**2
 
-    def profile(self, theta: FloatArray, rotations: FloatArray | None = None) -> tuple[Profile, float]:
+    def profile(
+        self, theta: FloatArray, rotations: FloatArray | None = None, tolerance: float = ATTITUDE_TOLERANCE_RAD
+    ) -> tuple[Profile, float]:
         """The model at the best attitudes for theta (p,), px units, searched from `rotations` (K, 3, 3) or QUEST's.
 
+        With `rotations`, theta may be that of every star, (p, N). Attitudes are the best ones to `tolerance`, rad.
         The second value is the sum of squared whitened residuals S(theta); infinite when the model is not finite.
         """
         theta, frames = np.asarray(theta, dtype=np.float64), self.frames
@@ -103,11 +108,20 @@ class MarginalLikelihood:
             # Blocks whose arrays stay in the cache while their attitudes are searched.
             for first, last in frames.parts(BLOCK_STARS):
                 stars = slice(int(frames.starts[first]), int(frames.starts[last]))
-                total += self._settle(state, slice(first, last), stars, theta, rotations[first:last])
+                own = theta if theta.ndim == 1 else theta[:, stars]
+                total += self._settle(state, slice(first, last), stars, own, rotations[first:last], tolerance)
         # Noise-free data leave rounding, of either sign.
         return state, max(total, 0.0) if np.isfinite(total) else float("inf")
 
-    def _settle(self, state: Profile, which: slice, stars: slice, theta: FloatArray, rotations: FloatArray) -> float:
+    def _settle(
+        self,
+        state: Profile,
+        which: slice,
+        stars: slice,
+        theta: FloatArray,
+        rotations: FloatArray,
+        tolerance: float,
+    ) -> float:
         """Search the attitudes of some frames and write the model at them into `state`; the sum of squares, or NaN."""
         part = self.frames.part(which.start, which.stop)
         n = part.n_stars
@@ -127,7 +141,7 @@ class MarginalLikelihood:
             left = float(np.sum(e * e) - np.sum(step * slope))
             if not np.isfinite(left):
                 break
-            if np.max(np.abs(step)) < ATTITUDE_TOLERANCE_RAD:
+            if np.max(np.abs(step)) < tolerance:
                 cost = left
                 break
             # Stars that fit no attitude never come here for the last time: nothing there is a minimum.
@@ -175,6 +189,35 @@ class MarginalLikelihood:
         if not np.isfinite(sums.cost):
             return -np.inf
         return float(-0.5 * sums.cost / sigma**2 - self.dof * np.log(sigma) - 0.5 * sums.log_determinant)
+
+    def log_likelihoods(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
+        """Log likelihood (n,) at theta (n, p) and sigma (n,), many points of a small table at a time.
+
+        A pass over a few hundred stars spends its time between the arrays: the table is repeated for as many points as
+        fill a block, and attitudes start from those that follow from the last sums.
+        """
+        frames, last = self.frames, self._last
+        together = BLOCK_STARS // frames.n_stars
+        if last is None or together < 2:
+            return np.array([self.log_likelihood(t, float(s)) for t, s in zip(theta, sigma, strict=True)])
+        values = np.empty(len(theta))
+        for first in range(0, len(theta), together):
+            some = slice(first, min(first + together, len(theta)))
+            points = theta[some]
+            n = len(points)
+            rotations = np.concatenate([last[1].at(point) for point in points])
+            copies = MarginalLikelihood(StarFrames.joined([frames] * n), self.model_name)
+            own = np.repeat(points.T, frames.n_stars, axis=1)
+            state, cost = copies.profile(own, rotations, _NEAR_RAD)
+            if not np.isfinite(cost):
+                # One point without attitudes leaves those of the others unsettled.
+                values[some] = [self.log_likelihood(t, float(s)) for t, s in zip(points, sigma[some], strict=True)]
+                continue
+            left = copies.project_out(state, state.e[None])[0]
+            squares = np.sum(left**2, axis=0).reshape(n, -1).sum(axis=1)
+            volume = state.log_determinant.reshape(n, -1).sum(axis=1)
+            values[some] = -0.5 * squares / sigma[some] ** 2 - self.dof * np.log(sigma[some]) - 0.5 * volume
+        return values
 
     def derivatives(self, theta: FloatArray, state: Profile) -> FloatArray:
         """Derivative (p, 2, N) of the whitened prediction with respect to theta at fixed attitudes."""

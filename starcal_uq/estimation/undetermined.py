@@ -14,7 +14,7 @@ from starcal_uq.maths.linear import scaled_inverse
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
-    from starcal_uq.core.types import FloatArray
+    from starcal_uq.core.types import AnyDict, FloatArray
 
 # A standard deviation of a third of its natural size (`_natural`) is no knowledge: the likelihood bends before that.
 _OPEN = 0.3
@@ -26,8 +26,8 @@ _PART = 0.15
 _NONE_P = 3e-7
 # Principal points known to this part of half the detector without distortion do not depend on whether there is some.
 _POINT = 0.03
-# Part that is left of the point's standard deviation where the coma of a distortion that may be none tells it.
-_FROM_COMA = 0.8
+# A factor on standard deviations, without the coma of a distortion that may be none, that is worth a warning.
+COMA_MATTERS = 1.25
 # Ends that undetermined parameters explain.
 EXPLAINED = (
     *(Status.CONVERGED, Status.MAX_ITERATIONS, Status.SINGULAR, Status.STALLED),
@@ -64,33 +64,71 @@ def _natural(camera: Camera) -> FloatArray:
 
 def undetermined(
     likelihood: MarginalLikelihood, theta: FloatArray, matrix: FloatArray, noise: float, camera: Camera, status: Status
-) -> tuple[str, ...]:
-    """Names of the parameters that the data leave open at an estimate theta (p,), if that can explain the status.
+) -> tuple[tuple[str, ...], FloatArray]:
+    """What the data leave open at an estimate theta (p,), and what coma of noise seems to tell.
 
-    The coma of the distortion tells where the principal point is, and in narrow fields nothing else does: where the
-    distortion may be none, the data must determine the point without it, and about as well.
+    The coma of the distortion tells where the principal point is, and in narrow fields nothing else does. Where the
+    distortion may be none, coma of noise tells nothing: the data must determine the point without it.
+
+    Returns
+    -------
+    names : tuple of str
+        Parameters that the data leave open, if that can explain the status.
+    factors : (p,) array
+        Standard deviations without the coma over those of the matrix; ones where the coma does not matter.
     """
     from scipy.special import fdtrc
 
+    as_found = np.ones(len(theta))
     if status not in EXPLAINED or not noise > 0.0:
-        return ()
+        return (), as_found
     found = open_parameters(matrix, noise, camera)
     if found or len(theta) == 3:
-        return found
+        return found, as_found
     covariance = scaled_inverse(matrix) * noise**2
-    point, k, dof = np.sqrt(np.diag(covariance))[:2], theta[3:], max(likelihood.dof - len(theta), 1)
-    if fdtrc(len(k), dof, float(k @ scaled_inverse(covariance[3:, 3:]) @ k) / len(k)) < _NONE_P:
-        return ()
+    k, dof = theta[3:], max(likelihood.dof - len(theta), 1)
+    # Chi-square of no distortion.
+    size = float(k @ scaled_inverse(covariance[3:, 3:]) @ k)
+    if fdtrc(len(k), dof, size / len(k)) < _NONE_P:
+        return (), as_found
     without = MarginalLikelihood(likelihood.frames, likelihood.model_name)
     if likelihood.rotations is not None:
         without.use_rotations(likelihood.rotations)
     plain = np.concatenate([theta[:3], np.zeros(len(k))])
     matrix = without.evaluate(plain).matrix
     if found := open_parameters(matrix, noise, camera):
-        return found
-    told = np.sqrt(np.diag(scaled_inverse(matrix)))[:2] * noise
-    by_coma = (told > _POINT * _natural(camera)[:2]) & (point < _FROM_COMA * told)
-    return tuple(name for name, flag in zip(camera.parameter_names, by_coma, strict=False) if flag)
+        return found, as_found
+    told = scaled_inverse(matrix) * noise**2
+    unsure = np.sqrt(np.diag(told)) > _POINT * _natural(camera)
+    factors = _without_coma(covariance, told, size)
+    by_coma = unsure[:2] & (factors[:2] > COMA_MATTERS)
+    if by_coma.any() and not status.ok:
+        # It is then also why no optimum was found.
+        return tuple(name for name, flag in zip(camera.parameter_names, by_coma, strict=False) if flag), as_found
+    return (), factors if unsure[:2].any() else as_found
+
+
+def _without_coma(covariance: FloatArray, told: FloatArray, size: float) -> FloatArray:
+    """Factors (p,), at least 1, on the standard deviations of an estimate whose distortion may be none.
+
+    `covariance` (p, p): that of the estimate; `told` (p, p): that without distortion, which leaves the point to the
+    tilt of the field. A distortion of noise has noise for a coma: of the point it knows nothing, and a point that is
+    free to follow it makes it larger. What the coma seems to know of the point, in units of what is known without it,
+    is the chi-square of the distortion (`size`) times the relative variance that the point's own adds to the
+    coefficients; f follows them by regression.
+    """
+    seeming = np.diag(told)[:2] / np.diag(covariance)[:2] - 1.0
+    growth = float(np.sum(np.maximum(seeming, 0.0))) / size
+    by_coefficients = told[:, 3:] @ scaled_inverse(told[3:, 3:]) @ told[3:]
+    variance = np.diag(told + growth * by_coefficients)
+    return np.maximum(np.sqrt(variance / np.diag(covariance)), 1.0)
+
+
+def coma_record(camera: Camera, factors: FloatArray) -> AnyDict:
+    """What a provenance keeps of the factors (p,) of `undetermined`; empty where the coma does not matter."""
+    if not np.any(factors > 1.0):
+        return {}
+    return {"without_coma": dict(zip(camera.parameter_names, factors.tolist(), strict=True))}
 
 
 def what_is_open(names: tuple[str, ...]) -> str:

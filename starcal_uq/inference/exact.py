@@ -52,7 +52,7 @@ class ExactMarginal:
 
     def log_likelihood(self, theta: FloatArray, sigma: FloatArray) -> FloatArray:
         """Log likelihood (n,) at theta (n, p) and sigma (n,)."""
-        return np.array([self._one.log_likelihood(t, float(s)) for t, s in zip(theta, sigma, strict=True)])
+        return self._one.log_likelihoods(theta, sigma)
 
 
 class FrameSample:

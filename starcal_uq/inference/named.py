@@ -102,8 +102,14 @@ def find_source(
         at = (cal.theta, cal.information, cal.sigma, float(cal.dof))
         return Source(label_of(likelihood), *at, exact=likelihood.log_likelihood, fast=None)
     source = _named_source(likelihood, obs, cal, dof)
-    if cal.inflation is not None:
-        source = _inflated(source, np.ones_like(cal.theta) if source.scatters else cal.inflation)
+    if cal.inflation is not None or cal.coma_factors is not None:
+        unchanged = np.ones_like(cal.theta)
+        accepted = cal.inflation
+        if accepted is not None and source.scatters:
+            accepted = unchanged
+        coma = unchanged if cal.coma_factors is None else cal.coma_factors
+        wider = _inflated(source, coma if accepted is None else coma * accepted)
+        source = replace(wider, inflation=accepted)
     if (ignored := _settings(cal).get("ignored_distortion")) is None:
         return source
     sentence = (
@@ -141,7 +147,6 @@ def _inflated(source: Source, factors: FloatArray) -> Source:
         exact=None if source.exact is None else wider(source.exact),
         fast=None if source.fast is None else wider(source.fast),
         sample=None if source.sample is None else source.sample.evaluated(at),
-        inflation=factors,
     )
 
 

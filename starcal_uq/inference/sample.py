@@ -53,7 +53,7 @@ _N_CHECKED = 300
 _N_IMPORTANCE = {"compressed": 20_000}
 _N_IMPORTANCE_SLOW = 2_000
 # Degrees of the polynomial that stands for a likelihood without a compressed form; the second is tried where the first
-# is not good enough.
+# is not good enough, and where a compressed form is not.
 _DEGREES = (3, 4)
 
 
@@ -208,7 +208,12 @@ class _Run:
     def polynomial(self, exact: LogLikelihood, degree: int) -> LogLikelihood | None:
         if self._mode is None:
             self._mode, _ = laplace_approximation(self.start(exact))
-        fitted = fit_polynomial(self._mode, degree, np.random.default_rng(self.design_seed))
+        try:
+            fitted = fit_polynomial(self._mode, degree, np.random.default_rng(self.design_seed))
+        except SamplingError:
+            if self.source.fast is None:
+                raise
+            return None
         return None if fitted is None else fitted.log_likelihood
 
     def fingerprint(self, target: Target, name: str) -> str:
@@ -258,8 +263,8 @@ def _with_fallback(
         return run.sample("exact", exact, checkpoint), CompressionCheck()
     files: list[str] = []
     outcome, compression = None, CompressionCheck()
-    for degree in _DEGREES if fast is None else (0,):
-        compressed = run.polynomial(exact, degree) if fast is None else fast
+    for degree in _degrees(run, evaluation):
+        compressed = fast if degree == 0 else run.polynomial(exact, degree)
         if compressed is None:
             continue
         # Each attempt has its own file: on resuming, the finished ones must still be found complete.
@@ -274,6 +279,16 @@ def _with_fallback(
     for path in files[:-1]:
         Path(path).unlink(missing_ok=True)
     return outcome, compression
+
+
+def _degrees(run: _Run, evaluation: Evaluation) -> tuple[int, ...]:
+    """Degrees of the polynomials to try one after the other; 0 is the compressed likelihood."""
+    if run.source.fast is None:
+        return _DEGREES
+    if evaluation == "auto" and run.source.sample is None:
+        # Of few stars with much noise the expansion misses little, and chains of the exact one take minutes.
+        return (0, _DEGREES[-1])
+    return (0,)
 
 
 def _present(fast: LogLikelihood | None) -> LogLikelihood:

@@ -60,6 +60,7 @@ def gaussian_calibration(dof: int = 25_000, sigma: float = 0.05, **changes: Any)
         "star_errors": None,
         "noise_model": None,
         "inflation": None,
+        "coma_factors": None,
         "undetermined": (),
     }
     values |= changes

@@ -12,10 +12,12 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
+from starcal_uq.camera.camera import Camera
 from starcal_uq.core.errors import CalibrationError, SamplingError, SettingError
 from starcal_uq.core.status import Level, Status
 from starcal_uq.diagnostics.jackknife import accept_inflation, jackknife_frames
 from starcal_uq.estimation.calibrate import calibrate
+from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.student import DEFAULT_DOF
 from starcal_uq.inference import named
 from starcal_uq.inference.checks import _OPTIONS, check_compression
@@ -25,7 +27,9 @@ from starcal_uq.inference.priors import Priors
 from starcal_uq.inference.sample import sample
 from starcal_uq.inference.target import importance_check, laplace_approximation, start_target
 from starcal_uq.maths.linear import symmetric_inverse
+from starcal_uq.observations.table import Observations
 from tests.helpers.gaussian_camera import COVARIANCE, SD, GaussianLikelihood, gaussian_calibration
+from tests.helpers.outside import campaign
 from tests.helpers.scenes import camera, nominal, observations, with_sigmas
 
 QUICK: dict[str, Any] = {"n_ensembles": 2, "n_walkers": 16, "n_steps": 60, "n_burn": 5, "seed": 3}
@@ -341,6 +345,8 @@ def test_a_check_by_a_sample_costs_the_same_at_any_number_of_frames(monkeypatch:
     from starcal_uq.estimation.marginal import MarginalLikelihood
 
     monkeypatch.setattr("starcal_uq.inference.exact.SAMPLED_FRAMES", 20)
+    # One point at a time, so that visits are counted.
+    monkeypatch.setattr("starcal_uq.estimation.marginal.BLOCK_STARS", 1)
     visited: list[int] = []
     sums = MarginalLikelihood.sums
 
@@ -405,8 +411,16 @@ def spoilt(cal: Any) -> Any:
     return dataclasses.replace(cal, compressed=dataclasses.replace(cal.compressed, gram=1.5 * cal.compressed.gram))
 
 
-@pytest.fixture(scope="module")
-def replaced(few_frames: tuple[Any, Any]) -> Any:
+@pytest.fixture
+def no_polynomial() -> Any:
+    """Chains of the exact likelihood follow those of a compressed one that is not good."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("starcal_uq.inference.sample._degrees", lambda run, evaluation: (0,))
+        yield
+
+
+@pytest.fixture
+def replaced(few_frames: tuple[Any, Any], no_polynomial: Any) -> Any:
     obs, cal = few_frames
     return sample(obs, spoilt(cal), **QUICKER)
 
@@ -420,7 +434,7 @@ def test_a_wrong_compressed_likelihood_is_replaced(few_frames: tuple[Any, Any], 
     assert "departs from the exact one" in sentence_of(kept, "Likelihood", Level.FAIL)
 
 
-@pytest.mark.usefixtures("few_importance_draws")
+@pytest.mark.usefixtures("few_importance_draws", "no_polynomial")
 @pytest.mark.parametrize("stop", [20, 70])
 def test_a_replaced_likelihood_is_resumed(
     few_frames: tuple[Any, Any], replaced: Any, tmp_path: Path, stop: int
@@ -464,6 +478,44 @@ def test_stars_of_another_table_are_no_check_that_passes(tmp_path: Path) -> None
     assert "departs from the exact one" in sentence_of(post, "Likelihood", Level.FAIL)
     post.save(tmp_path / "posterior.nc")
     assert Posterior.load(tmp_path / "posterior.nc").diagnostics.compressed_max_difference == np.inf
+
+
+def test_points_together_and_one_by_one() -> None:
+    """Few stars are evaluated at many points at a time; what it gives is the same."""
+    obs = observations(n_frames=20)
+    cal = calibrate(obs, nominal(camera()))
+    theta = cal.theta + 3.0 * cal.sigmas * np.random.default_rng(1).standard_normal((50, 5))
+    sigma = np.linspace(0.9, 1.1, 50) * cal.sigma
+    likelihood = MarginalLikelihood(obs, "brown")
+    one_by_one = np.array([likelihood.log_likelihood(t, s) for t, s in zip(theta, sigma, strict=True)])
+    exact = ExactMarginal(obs, cal)
+    np.testing.assert_allclose(exact.log_likelihood(theta, sigma), one_by_one, rtol=0.0, atol=1e-5)
+    # A point that no camera can have is nothing, and spoils no other.
+    theta[7, 2] = np.nan
+    found = exact.log_likelihood(theta, sigma)
+    others = np.arange(50) != 7
+    assert not np.isfinite(found[7])
+    np.testing.assert_allclose(found[others], one_by_one[others], rtol=0.0, atol=1e-5)
+
+
+def test_noisy_stars_do_not_take_chains_of_the_exact_likelihood(monkeypatch) -> None:
+    """Where the expansion misses a little, a polynomial holds it: thousands of exact evaluations, not tens of them."""
+    c = campaign(np.random.default_rng(1), n_frames=20, stars_per_frame=32, sigma_px=5.0)
+    obs, sheet = Observations(**c.columns), Camera(**c.camera_toml())
+    cal = calibrate(obs, sheet)
+    points = []
+    whole = MarginalLikelihood.log_likelihoods
+
+    def counted(self, theta, sigma):
+        points.append(len(theta))
+        return whole(self, theta, sigma)
+
+    monkeypatch.setattr(MarginalLikelihood, "log_likelihoods", counted)
+    post = sample(obs, cal, seed=0)
+    assert post.diagnostics.likelihood_used == "compressed" and sum(points) < 5000
+    assert post.diagnostics.compressed_khat < 0.7
+    level = [check.level for check in post.diagnostics.checks if check.name == "Likelihood"]
+    assert level == [Level.PASS]
 
 
 def test_frames_in_batches_say_what_the_expansion_leaves_out() -> None:

@@ -83,13 +83,16 @@ def estimation(cal: Calibration, post: Posterior | None = None) -> Check:
 
 
 def determined(cal: Calibration) -> Check | None:
-    """Was the model of the camera left for a simpler one, because the data do not determine it?"""
+    """Do the data determine the model of the camera, without a simpler one and without the coma of noise?"""
     record, sentence = cal.provenance.get("fallback"), fallback_words(cal)
-    if not record:
+    if record:
+        value, bound = str(record["used"]), str(record["model"])
+    elif sentence:
+        value, bound = "principal point from coma alone", "without"
+    else:
         return None
-    used, asked = str(record["used"]), str(record["model"])
-    name, remedy = "Model that the data determine", model_remedy(used)
-    return Check(name, Question.TRUSTWORTHY, Level.WARN, used, asked, sentence, remedy)
+    # To ask for what was fitted would determine nothing.
+    return Check("Model that the data determine", Question.TRUSTWORTHY, Level.WARN, value, bound, sentence, PLAN)
 
 
 def estimators_agree(cal: Calibration) -> Check | None:
