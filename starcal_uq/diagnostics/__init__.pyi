@@ -13,5 +13,7 @@ from .predictive import predictive_check as predictive_check
 from .stars import StarTest as StarTest
 from .stars import star_test as star_test
 from .times import TimeTest as TimeTest
+from .times import UnseenAberration as UnseenAberration
 from .times import time_test as time_test
+from .times import unseen_aberration as unseen_aberration
 from .validation.result import Validation as Validation

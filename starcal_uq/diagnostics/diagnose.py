@@ -26,7 +26,7 @@ from starcal_uq.diagnostics.misfit import Misfit, misfit_tests
 from starcal_uq.diagnostics.models import MODELS, ModelComparison, compare_models, of_all_stars
 from starcal_uq.diagnostics.predictive import PredictiveCheck, predictive_check
 from starcal_uq.diagnostics.stars import StarTest, star_test
-from starcal_uq.diagnostics.times import TimeTest, time_test
+from starcal_uq.diagnostics.times import TimeTest, UnseenAberration, time_test, unseen_aberration
 from starcal_uq.estimation.calibrate import METHODS, calibrate, fit
 from starcal_uq.estimation.calibration import Calibration
 from starcal_uq.estimation.cameras import MixedCameras
@@ -112,6 +112,9 @@ class Diagnosis(Shown, Saved):
         Several cameras, where the frames' own focal lengths ask for them.
     times : TimeTest or None
         Another time or epoch, where the residuals ask for one.
+    aberration : UnseenAberration or None
+        What aberration that is left out or applied twice would do to f unseen; None where it would be seen, or in a
+        diagnosis of an earlier version.
     """
 
     misfit: Misfit
@@ -125,6 +128,7 @@ class Diagnosis(Shown, Saved):
     air: AirTest | None = None
     cameras: MixedCameras | None = None
     times: TimeTest | None = None
+    aberration: UnseenAberration | None = None
 
     FILE = "a diagnosis", "run `starcal-uq diagnose RUN --force` to write it again"
 
@@ -144,6 +148,7 @@ class Apart:
     air: AirTest | None
     cameras: MixedCameras | None
     times: TimeTest | None
+    aberration: UnseenAberration | None
 
 
 @one_thread()
@@ -162,6 +167,7 @@ def diagnose_apart(
         air=air_test(obs, cal, seed=seed, stars=stars),
         cameras=MixedCameras.of(obs, cal.camera),
         times=time_test(obs, cal, seed=seed),
+        aberration=unseen_aberration(obs, cal, seed=seed),
     )
 
 
@@ -228,6 +234,7 @@ def diagnose(
         air=rest.air,
         cameras=rest.cameras,
         times=rest.times,
+        aberration=rest.aberration,
     )
 
 

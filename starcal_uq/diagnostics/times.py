@@ -75,6 +75,28 @@ class TimeTest:
 
 
 @dataclass(frozen=True)
+class UnseenAberration:
+    """What annual aberration does to f if it was left out of the directions or applied twice, and nothing shows it.
+
+    Frames near one direction and date stretch by it alike, which is what a focal length does.
+
+    Attributes
+    ----------
+    f_px, f_sigma : float
+        How far f would move, px and in its standard deviations; of frames without times at the worst date.
+    visible : float
+        How many of its standard errors the residuals would be off by.
+    dated : bool
+        Whether the frames have times, which the velocity of the Earth is of.
+    """
+
+    f_px: float
+    f_sigma: float
+    visible: float
+    dated: bool
+
+
+@dataclass(frozen=True)
 class _Moved:
     """A cause with the moves of the stars for each offset: shifts (g, 2, N) of images, offsets (g,)."""
 
@@ -133,6 +155,34 @@ def time_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> TimeTest
     return best
 
 
+def unseen_aberration(obs: Observations, cal: Calibration, *, seed: int = 0) -> UnseenAberration | None:
+    """Ask how far annual aberration would move f without being seen in the residuals of a calibration.
+
+    Parameters
+    ----------
+    obs, cal
+        The data and the estimate made from them.
+    seed : int
+        Seed of the choice of frames, where there are many.
+
+    Returns
+    -------
+    UnseenAberration or None
+        None where `time_test` would see it, or it moves f by less than a standard deviation.
+    """
+    rest = Remainder(weighed(obs, cal), cal, seed)
+    numbers = star_numbers(rest.obs, cal.camera.focal_px)
+    frames = np.repeat(np.arange(rest.obs.n_frames), rest.likelihood.frames.sizes)
+    # The first cause is that aberration is missing.
+    columns, absorbed = rest.left(next(_causes(rest)).shifts)
+    worst = int(np.argmax(np.abs(absorbed[:, 2])))
+    f_px = float(abs(absorbed[worst, 2]))
+    visible = 1.0 / _fitted(columns[worst], rest, (numbers, frames))[1]
+    if f_px < float(cal.sigmas[2]) or visible > _SIGNIFICANT:
+        return None
+    return UnseenAberration(f_px, f_px / float(cal.sigmas[2]), visible, len(columns) == 1)
+
+
 def _fitted(
     column: FloatArray, rest: Remainder, groups: tuple[IntArray, ...], residuals: FloatArray | None = None
 ) -> tuple[float, float, float]:
@@ -174,7 +224,6 @@ def _causes(rest: Remainder) -> Iterator[_Moved]:
         turned = rest.state.rotations[np.repeat(np.arange(frames.n_frames), frames.sizes)]
         return rest.shift(np.einsum("nij,jn->in", turned, moves))
 
-    yield _Moved("epoch", seen(_proper_motion(obs))[None], np.zeros(1))
     # One and the same for all stars of a frame, so that three columns hold the velocities of all candidates.
     basis = np.stack([seen(np.repeat(np.eye(3)[:, i : i + 1], frames.n_stars, axis=1)) for i in range(3)])
 
@@ -199,6 +248,7 @@ def _causes(rest: Remainder) -> Iterator[_Moved]:
         yield aberrated("date", velocities - now, _DATES)
     if "site" in obs.meta and apparent and timed:
         yield from _other_hours(rest, Site.from_dict(obs.meta["site"]), stated)
+    yield _Moved("epoch", seen(_proper_motion(obs))[None], np.zeros(1))
 
 
 def _proper_motion(obs: Observations) -> FloatArray:

@@ -11,11 +11,13 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.core.errors import CalibrationError
+from starcal_uq.core.formatting import significant
 from starcal_uq.core.status import Level
-from starcal_uq.diagnostics import time_test
+from starcal_uq.diagnostics import time_test, unseen_aberration
 from starcal_uq.diagnostics.verdict import observed
+from starcal_uq.diagnostics.verdict.judge import judge
 from starcal_uq.sky.apparent import make_apparent
-from tests.helpers.outside import frame_at
+from tests.helpers.outside import aberrated, campaign, frame_at
 
 DAYS, LATITUDE, LONGITUDE, EPOCH = 9813.0, 38.0, -70.0, 2026.87
 SITE = sc.sky.Site(LATITUDE, LONGITUDE)
@@ -124,6 +126,50 @@ def test_a_fit_that_fails_by_a_wrong_time_says_so(sigma_px, n_frames, years):
     told = "First, by proper motion the stars are those of an epoch 100 ± 7.5 years earlier" in str(caught.value)
     # Too much noise is the fault of no time.
     assert told == ("First" in str(caught.value)) == bool(years)
+
+
+def field(seed, *, twice, dated=True, **options):
+    """Frames of another make with directions that are apparent, or aberrated once more; calibrated."""
+    c = campaign(np.random.default_rng([seed, 6]), **{"n_frames": 25} | options)
+    shown = aberrated(c, earth(DAYS)) if twice else c
+    columns = dict(shown.columns)
+    if dated:
+        columns["time_utc"] = np.full(len(columns["frame"]), "2026-11-13T12:00:00")
+    obs = sc.Observations(**columns, meta={"directions": "apparent", "observer": "space"})
+    cal = sc.calibrate(obs, sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)), duplicates="keep")
+    return c, obs, cal
+
+
+STARING = {"pointings": 1, "drift_px": 3.3}
+
+
+@pytest.mark.parametrize("dated", [True, False])
+def test_f_of_one_field_rests_on_aberration(dated):
+    _, obs, cal = field(8, twice=False, dated=dated, **STARING)
+    found = unseen_aberration(obs, cal)
+    _, again, wrong = field(8, twice=True, dated=dated, **STARING)
+    moved = abs(wrong.theta[2] - cal.theta[2])
+    # Without times it is the largest of the year.
+    assert moved == pytest.approx(found.f_px, rel=0.05) if dated else moved < found.f_px < 1.5 * moved
+    assert found.f_sigma == pytest.approx(found.f_px / cal.sigmas[2]) and found.f_sigma > 1.5
+    assert time_test(again, wrong) is None
+    for table, made in ((obs, cal), (again, wrong)):
+        verdict = judge(table, made, diagnosis=sc.diagnose(table, made, models=(), n_starts=0))
+        check = next(check for check in verdict.checks if check.name == "Catalogue directions")
+        for text in (verdict.headline, check.sentence):
+            assert "rests on annual aberration" in text and f"{significant(found.f_px)} px" in text
+    assert check.level is Level.PASS
+    # Data of a simulation know no aberration.
+    assert not observed.rests_on_aberration(obs.with_meta(source="simulated"), found)
+
+
+def test_f_of_the_whole_sky_does_not_rest_on_aberration():
+    _, obs, cal = field(2, twice=False, n_frames=40)
+    assert unseen_aberration(obs, cal) is None
+    _, again, wrong = field(2, twice=True, n_frames=40)
+    assert time_test(again, wrong).cause == "aberration twice"
+    verdict = judge(obs, cal, diagnosis=sc.diagnose(obs, cal, models=(), n_starts=0))
+    assert "rests on" not in verdict.headline
 
 
 def hard(obs, kind, rng):

@@ -160,6 +160,11 @@ def through_air(c: Campaign, zeniths: np.ndarray, arcsec: float = 58.0) -> Campa
     return _redirected(c, r - np.radians(arcsec / 3600.0) * (zenith - sine * r) / sine)
 
 
+def aberrated(c: Campaign, velocity_km_s: np.ndarray) -> Campaign:
+    """The same images with directions that are aberrated by this velocity, ICRS axes; a negative one takes it off."""
+    return _redirected(c, _directions(c) + velocity_km_s / 299792.458)
+
+
 def _directions(c: Campaign) -> np.ndarray:
     ra, dec = np.radians(c.columns["ra_deg"]), np.radians(c.columns["dec_deg"])
     return np.column_stack([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])

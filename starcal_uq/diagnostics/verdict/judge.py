@@ -146,7 +146,9 @@ def judge(
         checks += [draws.same_data(post, cal.data_hash_of(obs)), *post.diagnostics.checks]
     used = weighed(obs, cal)
     asked = (None, None) if diagnosis is None else (diagnosis.air, diagnosis.times)
-    checks += [observed.directions(used, cal, *asked)]
+    unseen = None if diagnosis is None or diagnosis.times is not None else diagnosis.aberration
+    rests = observed.rests_on_aberration(used, unseen)
+    checks += [observed.directions(used, cal, *asked, rests)]
     checks += [observed.residual_pattern(used, cal), observed.outliers(used, cal), observed.screening(obs)]
     checks += [observed.noise(used, cal), observed.partitions(cal), observed.terms(cal), observed.coverage(used, cal)]
     if diagnosis is not None:
@@ -157,16 +159,18 @@ def judge(
         checks += [estimate.against_truth(cal, truth, post)]
     checks += requirements
     found = tuple(check if place is None else place.exact(check) for check in checks if check is not None)
-    return Verdict(found, _headline(found, post is not None))
+    return Verdict(found, _headline(found, post is not None, rests))
 
 
-def _headline(checks: tuple[Check, ...], sampled: bool) -> str:
-    """What becomes of the requirements, and whether the numbers can be used."""
+def _headline(checks: tuple[Check, ...], sampled: bool, rests: str) -> str:
+    """What becomes of the requirements, whether the numbers can be used, and what f then rests on."""
     required = [check for check in checks if check.question is Question.REQUIRED]
     violated = [check.phrase for check in required if check.level is Level.FAIL]
     still_open = [check.phrase for check in required if check.level is Level.WARN]
     sentences = [f"Violated: {join_words(violated)}."] if violated else []
     sentences += [_usable([check for check in checks if check not in required], sampled)]
+    if rests and not any(check.level is Level.FAIL for check in checks):
+        sentences += [rests]
     sentences += [f"Open: {join_words(still_open)}."] if still_open else []
     return " ".join(sentences)
 

@@ -19,7 +19,7 @@ from starcal_uq.sky.site import HOUR_DEG, Site
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
     from starcal_uq.diagnostics.air import AirTest
-    from starcal_uq.diagnostics.times import TimeTest
+    from starcal_uq.diagnostics.times import TimeTest, UnseenAberration
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
@@ -43,9 +43,13 @@ ROBUST, NOISE = f"{CALIBRATE} --robust", f"{CALIBRATE} --noise model or sc.calib
 
 
 def directions(
-    obs: Observations, cal: Calibration, found: AirTest | None = None, times: TimeTest | None = None
+    obs: Observations,
+    cal: Calibration,
+    found: AirTest | None = None,
+    times: TimeTest | None = None,
+    rests: str = "",
 ) -> Check:
-    """Is annual aberration in the directions, and refraction where there is air?"""
+    """Is annual aberration in the directions, and refraction where there is air? `rests` is what f rests on."""
     declared = str(obs.meta.get("directions", "undeclared"))
     name, bound = "Catalogue directions", "apparent"
     seen = air(obs)
@@ -60,7 +64,8 @@ def directions(
         level = Level.WARN if small else Level.FAIL
         return Check(name, Question.TRUSTWORTHY, level, "; ".join(values), bound, " ".join(sentences), remedy, advice)
     if declared == "apparent" and seen == "unknown":
-        sentence = f"Aberration is in the directions, refraction is not. {_unsure(cal, found)} {REMEDY}"
+        words = ("Aberration is in the directions, refraction is not.", rests, _unsure(cal, found), REMEDY)
+        sentence = " ".join(filter(None, words))
         return Check(name, Question.TRUSTWORTHY, Level.WARN, "without refraction", bound, sentence, _about_air(obs))
     if declared == "apparent":
         sentence = "The directions are declared as apparent: aberration is in them."
@@ -70,6 +75,7 @@ def directions(
             sentence = (
                 f"Aberration and refraction at the site ({Site.from_dict(obs.meta['site'])}) are in the directions."
             )
+        sentence = f"{sentence} {rests}".rstrip()
         return Check(name, Question.TRUSTWORTHY, Level.PASS, declared, bound, sentence)
     sentence = f"{_undeclared(obs)} {aberration_words(cal)}"
     time = _time_of(obs) if _from_images(obs) else ""
@@ -77,6 +83,18 @@ def directions(
     if seen == "unknown":
         sentence, remedy = f"{sentence} {_unsure(cal, found)} {REMEDY}", f"{remedy} or {_about_air(obs)}"
     return Check(name, Question.TRUSTWORTHY, Level.WARN, declared, bound, sentence, remedy)
+
+
+def rests_on_aberration(obs: Observations, found: UnseenAberration | None) -> str:
+    """That f is conditional on aberration being in the directions once, where no residual can show that."""
+    made = obs.meta.get("source") == "simulated" or obs.meta.get("observer") == "rendered"
+    if found is None or made or obs.meta.get("directions") != "apparent":
+        return ""
+    size = f"{significant(found.f_px)} px ({significant(found.f_sigma)} sigma)"
+    return (
+        "The focal length f rests on annual aberration being in the directions, once: left out or applied twice, it "
+        f"would move f by {'' if found.dated else 'up to '}{size}, and the residuals of these frames would not show it."
+    )
 
 
 def air_words(obs: Observations, found: AirTest) -> str:
