@@ -11,10 +11,10 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import IO, Any
 
 from starcal_uq.core.tasks import processors
+from starcal_uq.core.temporary import TemporaryFolder
 
 _WAIT_S = 0.005
 _PROGRAM = "import sys; sys.path[:] = {path!r}; from starcal_uq.core.beside import serve; serve({folder!r}, {parent})"
@@ -31,7 +31,7 @@ class Beside:
     """
 
     def __init__(self) -> None:
-        self._folder = TemporaryDirectory(prefix="starcal-uq-", ignore_cleanup_errors=True)
+        self._folder = TemporaryFolder()
         self._process: subprocess.Popen[bytes] | None = None
         self._n_calls = 0
 

@@ -19,6 +19,7 @@ from pathlib import Path, PurePath
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.files import (
     STEP,
+    TEMPORARY,
     UNFINISHED,
     PathLike,
     check_new_folder,
@@ -29,6 +30,7 @@ from starcal_uq.core.files import (
 from starcal_uq.core.provenance import provenance
 from starcal_uq.core.records import read_json, write_json
 from starcal_uq.core.store import finished
+from starcal_uq.core.temporary import lock
 from starcal_uq.core.types import AnyDict
 
 MANIFEST, NEW = "run.json", ".new"
@@ -103,11 +105,18 @@ def commit(folder: Path, manifest: Manifest, old: Collection[str]) -> Manifest:
             raise RunFolderError(
                 f"{folder / name}: is in the way of a result, and not of this run: move it elsewhere, and start again."
             )
-    flush_folder(folder / manifest.stage)
+    for place in _folders(folder / manifest.stage, manifest.files):
+        flush_folder(place)
     manifest = replace(manifest, gone=tuple(sorted(set(old) - set(manifest.files))))
     write_manifest(folder, manifest)
     flush_folder(folder)
     return _settle(folder, manifest)
+
+
+def _folders(folder: Path, names: Collection[str]) -> list[Path]:
+    """A folder and those within it in which files of these names stand."""
+    inside = dict.fromkeys((folder / name).parent for name in names)
+    return [folder, *(place for place in inside if place != folder and place.is_dir())]
 
 
 def _settle(folder: Path, manifest: Manifest) -> Manifest:
@@ -122,7 +131,8 @@ def _settle(folder: Path, manifest: Manifest) -> Manifest:
                     os.replace(stage / name, folder / name)
         for name in manifest.gone:
             (folder / name).unlink(missing_ok=True)
-        flush_folder(folder)
+        for place in _folders(folder, (*manifest.files, *manifest.gone)):
+            flush_folder(place)
         settled = replace(manifest, stage="", gone=())
         write_manifest(folder, settled)
     except OSError as error:
@@ -179,6 +189,25 @@ def identity(paths: Mapping[str, Path]) -> AnyDict:
     return found
 
 
+def check_hidden(folder: Path, name: str, ours: Collection[str] = ()) -> None:
+    """Refuse a hidden folder within a run that is a link or a file, or holds what no run has written; nothing goes.
+
+    `ours` are starts of names of files that are the run's without being recorded.
+    """
+    place = folder / name
+    if os.path.islink(place) or (os.path.lexists(place) and not place.is_dir()):
+        raise RunFolderError(f"{place}: is not a folder that a run has made; move it elsewhere, and start again.")
+    if name == STEP or not place.is_dir():
+        return
+    found = read_manifest(place) or Manifest()
+    hidden = (MANIFEST, STEP, UNFINISHED, *ours)
+    for inside, path in files_in(place).items():
+        if not (inside in found.files or inside.startswith(hidden) or TEMPORARY.match(path.name)):
+            raise RunFolderError(
+                f"{path}: is not of a run, and would go with its hidden folder; move it elsewhere, and start again."
+            )
+
+
 def discard(folder: Path, stage: str) -> None:
     """Remove the files of a step, unless the record says that they count."""
     path = folder / MANIFEST
@@ -196,6 +225,7 @@ def sweep(folder: Path) -> None:
 @contextmanager
 def staged(folder: Path) -> Iterator[Path]:
     """Yield a folder for files that wait for `commit`; gone at the end, unless they count."""
+    check_hidden(folder, STEP)
     sweep(folder)
     try:
         yield new_folder(folder / STEP)
@@ -277,13 +307,14 @@ def alone(folder: PathLike, *, make: bool = True) -> Iterator[None]:
 
 @contextmanager
 def _locked(folder: Path) -> Iterator[None]:
-    refused = RunFolderError(f"{folder}: another process is writing there; wait for it, or end it.")
     state = os.stat(folder)
     place, thread = (state.st_dev, state.st_ino), threading.get_ident()
     if _writing.get(place) == thread:
         yield
         return
-    handle = _lock(folder, refused)
+    handle = lock(folder)
+    if handle is None:
+        raise RunFolderError(f"{folder}: another process is writing there; wait for it, or end it.")
     _writing[place] = thread
     try:
         yield
@@ -291,23 +322,3 @@ def _locked(folder: Path) -> Iterator[None]:
         del _writing[place]
         if handle >= 0:
             os.close(handle)
-
-
-def _lock(folder: Path, refused: RunFolderError) -> int:
-    """A handle whose end, like that of the process, ends the lock; -1 where there are no locks."""
-    try:
-        import fcntl
-
-        handle = os.open(folder, os.O_RDONLY)
-    except (ImportError, OSError):
-        # Whoever writes there says what is wrong with the folder.
-        return -1
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(handle)
-        raise refused from None
-    except OSError:
-        # A file system without locks.
-        pass
-    return handle

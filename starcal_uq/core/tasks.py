@@ -17,10 +17,10 @@ from functools import lru_cache
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait as wait_for
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from starcal_uq.core.errors import SamplingError
+from starcal_uq.core.temporary import TemporaryFolder
 
 if TYPE_CHECKING:
     from starcal_uq.core.store import Kept
@@ -122,7 +122,7 @@ def _spread(
             "top level, or use workers=0."
         ) from error
     chunks = [range(first, min(first + chunk, n_tasks)) for first in range(0, n_tasks, chunk)]
-    with TemporaryDirectory(prefix="starcal-uq-") as folder:
+    with TemporaryFolder() as folder:
         # A file, because a process that dies while it starts would leave this one waiting at a pipe that is full.
         path = Path(folder) / "task.pickle"
         path.write_bytes(content)

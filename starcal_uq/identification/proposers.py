@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, TypeAlias, get_args
 
 import numpy as np
@@ -14,6 +13,7 @@ import numpy as np
 from starcal_uq.core.errors import IdentificationError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.settings import Engine
+from starcal_uq.core.temporary import TemporaryFolder
 from starcal_uq.core.types import FloatArray
 from starcal_uq.identification.pairs import StarPairs, prepared_star_pairs
 from starcal_uq.identification.pyramid import CameraTolerance, FieldGeometry, Hypothesis, hypotheses
@@ -72,7 +72,7 @@ class PlateSolver:
         solver = _package()
         fov_deg = _field_deg(geometry)
         margin = tolerance.focal + _FIELD_MARGIN
-        with TemporaryDirectory() as folder:
+        with TemporaryFolder() as folder:
             path = Path(folder) / "stars.bin"
             write_gaia_records(path, stars.ra_deg, stars.dec_deg, stars.mag)
             try:

@@ -23,6 +23,7 @@ from starcal_uq.core.manifest import (
     Manifest,
     alone,
     check_file,
+    check_hidden,
     commit,
     entry_of,
     files_in,
@@ -250,6 +251,8 @@ class RunFolder:
             Function that gets the sentence on what goes.
         """
         old = self.create().manifest
+        if step == "calibrate":
+            self._check_new()
         with self.writing(), staged(self.path) as stage:
             with flushed_together():
                 yield RunFolder(stage)
@@ -297,6 +300,7 @@ class RunFolder:
                 check_new_folder(self.path, force)
             place = self
             if old.files and (old.complete or old.command != wanted):
+                self._check_new()
                 place = RunFolder(self.path / NEW).create()
             present = place.manifest
             if present.complete or present.command != wanted:
@@ -315,7 +319,12 @@ class RunFolder:
             if place == self:
                 write_manifest(self.path, done)
             else:
+                self._check_new()
                 commit(self.path, replace(done, stage=NEW), old.files)
+
+    def _check_new(self) -> None:
+        """Refuse a hidden folder for a new run that holds what is not of a run."""
+        check_hidden(self.path, NEW, (CHECKPOINT,))
 
 
 FILES = {key: value for key, value in vars(RunFolder).items() if isinstance(value, _File)}

@@ -5,16 +5,17 @@ from __future__ import annotations
 import fcntl
 import os
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import pytest
 
+from starcal_uq.core import manifest
 from starcal_uq.core.errors import RunFolderError
-from starcal_uq.core.files import atomic_write_text, new_folder
+from starcal_uq.core.files import atomic_write_text, flush_folder, new_folder
 from starcal_uq.core.manifest import alone, making, read_manifest
 from starcal_uq.core.store import UNFINISHED, Kept
-from tests.helpers.crashes import small_files, snapshots
+from tests.helpers.crashes import losses_of_power, small_files, snapshots
 
 OLD = {"page.html": "old", "table.csv": "old, 1", "figures/one.png": "old, 2", "figures/gone.png": "old, 3"}
 NEW = {"page.html": "new", "table.csv": "new, 1", "figures/one.png": "new, 2", "more.csv": "new, 4"}
@@ -61,6 +62,53 @@ def test_at_every_moment_there_are_the_old_results_or_the_new_ones(tmp_path: Pat
     with snapshots(folder.parent, tmp_path / "control") as states:
         write(folder, OLD)
     assert not all(content(state / "out") in (OLD | MINE, NEW | MINE) for state in states[1:-1])
+
+
+def after_losses_of_power(folder: Path, kept: Path, flush: Callable[[int, Path], bool]) -> list[bool]:
+    """Whether each state that a loss of power may leave while results are replaced holds the old ones or the new ones.
+
+    `flush` says of each call that flushes a folder, by its number, whether it is made.
+    """
+    make(folder, OLD)
+    write(folder, MINE)
+    calls: list[Path] = []
+
+    def flushes(path: Path) -> None:
+        calls.append(path)
+        if flush(len(calls) - 1, path):
+            flush_folder(path)
+
+    with losses_of_power(folder) as states, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(manifest, "flush_folder", flushes)
+        make(folder, NEW, force=True)
+    with pytest.MonkeyPatch.context() as patch:
+        # Whoever reads on needs no disk.
+        patch.setattr(os, "fsync", lambda _: None)
+        return [is_whole(state, kept / str(number)) for number, state in enumerate(states)]
+
+
+def is_whole(state: Mapping[str, bytes], place: Path) -> bool:
+    for name, text in state.items():
+        new_folder((place / name).parent)
+        (place / name).write_bytes(text)
+    try:
+        return content(place) in (OLD | MINE, NEW | MINE)
+    except RunFolderError:
+        return False
+
+
+def test_after_a_loss_of_power_there_are_the_old_results_or_the_new_ones(tmp_path: Path) -> None:
+    made: list[Path] = []
+    good = after_losses_of_power(tmp_path / "out", tmp_path / "states", lambda _, path: not made.append(path))
+    assert len(good) > 20 and all(good)
+    # Control: each call that flushes a folder is needed. The second one of the folder itself is for disks that change
+    # the order of names within one folder, which these states do not do.
+    named = [path.relative_to(tmp_path / "out").as_posix() for path in made]
+    assert named == [".step", ".step/figures", ".", ".", "figures"]
+    for left_out in (0, 1, 2, 4):
+        place = tmp_path / str(left_out)
+        good = after_losses_of_power(place / "out", place / "states", lambda number, _, out=left_out: number != out)
+        assert not all(good), f"{named[left_out]} need not be flushed"
 
 
 def test_an_interrupt_keeps_what_is_done_and_the_results_of_before(tmp_path: Path) -> None:

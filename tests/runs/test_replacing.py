@@ -227,6 +227,46 @@ def test_what_the_run_has_not_written_is_never_overwritten(tmp_path: Path) -> No
     assert (folder / "camera.toml").read_text() == NOTES
 
 
+@pytest.mark.parametrize("hidden", [".new", ".step"])
+def test_a_hidden_folder_that_is_a_link_is_refused_and_what_it_names_survives(
+    hidden: str, whole: dict[int, Path], run: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text(NOTES)
+    (run / hidden).symlink_to(tmp_path / "mine")
+    with pytest.raises(RunFolderError, match=rf"{hidden}: is not a folder that a run has made; move it elsewhere"):
+        if hidden == ".new":
+            make(run, SECOND, force=True)
+        sc.Run(run).couple(force=True)
+    assert (run / hidden).is_symlink() and [path.name for path in (tmp_path / "mine").iterdir()] == ["notes.txt"]
+    (run / hidden).unlink()
+    assert content(run) == content(whole[FIRST])
+
+
+def test_a_file_of_the_users_in_the_hidden_folder_of_a_new_run_survives(whole: dict[int, Path], run: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        make(run, SECOND, force=True, stop="couple")
+    mine = run / ".new" / "figures" / "notes.txt"
+    mine.parent.mkdir(exist_ok=True)
+    mine.write_text(NOTES)
+    # The same command, one of other settings, and a step that would remove the unfinished run.
+    again = sc.Run(run)
+    for call in (
+        lambda: make(run, SECOND, force=True),
+        lambda: make(run, FIRST, force=True),
+        lambda: again.write(again.calibration, again.observations),
+    ):
+        with pytest.raises(
+            RunFolderError, match=r"notes\.txt: is not of a run, .*; move it elsewhere, and start again"
+        ):
+            call()
+        assert mine.read_text() == NOTES and content(run) == content(whole[FIRST])
+    mine.unlink()
+    # Control: without it, the unfinished run goes on.
+    make(run, SECOND, force=True)
+    assert content(run) == content(whole[SECOND]) and not (run / ".new").exists()
+
+
 @pytest.mark.slow
 def test_links_and_the_current_folder_are_replaced_like_others(
     whole: dict[int, Path], run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -9,12 +9,12 @@ import sys
 import threading
 from collections.abc import Collection, Iterator
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from starcal_uq.core.errors import RunFolderError
 from starcal_uq.core.extras import extra
 from starcal_uq.core.tasks import Progress
+from starcal_uq.core.temporary import TemporaryFolder
 
 # File of the run that a part needs, heading, sentence, and cells.
 _PARTS = (
@@ -118,7 +118,7 @@ def executed(cells: Iterator[tuple[str, str]], place: Path, progress: Progress |
         made.append(cell)
     kernel = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
     notebook = make.new_notebook(cells=made, metadata=kernel)
-    with TemporaryDirectory(prefix="starcal-uq-") as own:
+    with TemporaryFolder() as own:
         # The kernel draws inline, whatever this process draws with.
         env = {name: value for name, value in os.environ.items() if name != "MPLBACKEND"} | {"IPYTHONDIR": own}
         client = NotebookClient(

@@ -7,12 +7,12 @@ import os
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from starcal_uq.core.errors import MissingExtraError, RunFolderError
+from starcal_uq.core.temporary import TemporaryFolder
 
 # By these names browsers that print without a window are found, the plainest first.
 _NAMES = (
@@ -61,7 +61,7 @@ def browsers() -> Iterator[str]:
 def _printed(browser: str, page: Path) -> tuple[bytes, str]:
     """What a browser makes of a page, and what went wrong if that is nothing."""
     name = Path(browser).name
-    with tempfile.TemporaryDirectory(prefix="starcal-pdf-", ignore_cleanup_errors=True) as folder:
+    with TemporaryFolder() as folder:
         to = Path(folder, "page.pdf")
         # Nothing on the page asks for the network; nor should the browser itself.
         options = ["--headless", "--disable-gpu", "--no-first-run", "--disable-background-networking"]
