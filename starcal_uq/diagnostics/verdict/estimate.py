@@ -30,8 +30,6 @@ from starcal_uq.inference.named import LIKELIHOODS
 from starcal_uq.maths.intervals import student_quantile
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from starcal_uq.camera.camera import Camera
     from starcal_uq.core.types import FloatArray
     from starcal_uq.diagnostics.diagnose import Diagnosis, MultiStart
@@ -189,23 +187,21 @@ def misfit(found: Misfit, cal: Calibration, attitude: AttitudeError | None = Non
     more = "" if len(rejected) <= 3 else f" and {plural(len(rejected) - 3, 'other test')}"
     booked = on_attitudes(attitude) if found.pattern is not None and found.pattern.families else []
     effect = largest([*of_pattern(found.pattern, rejected, cal), *booked])
-    sentence = f"The residuals hold more than noise: {join_words(words)}{more}. {effect}{_hardly_told(rejected)}"
+    sentence = f"The residuals hold more than noise: {join_words(words)}{more}. {effect}{_hardly_told(rejected[0])}"
     level = effect.level if min(patterns) < MISFIT_FAIL_P else Level.WARN
     # A lens can follow what keeps its place in the field; what does not is at best counted as noise.
     remedy = model_remedy(richer(cal.camera.distortion)) if any(t.against in _OF_THE_LENS for t in rejected) else NOISE
     return Check(name, Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
 
 
-def _hardly_told(tests: Sequence[MisfitTest]) -> str:
-    """That the first of these shapes that can hardly be told from a parameter cannot, as a further sentence."""
-    for test in tests:
-        if test.moved_std > _HARDLY_TOLD and test.moved_sigma < _HARDLY_TOLD * test.moved_std:
-            ratio = significant(float(np.hypot(1.0, test.moved_std)))
-            return (
-                f" These data hardly tell {test.name} from {test.moved_name}: with both fitted, the error of "
-                f"{test.moved_name} would be {ratio} times as large."
-            )
-    return ""
+def _hardly_told(test: MisfitTest) -> str:
+    """That shapes can hardly be told from the parameter that they move, as a further sentence; else nothing."""
+    if not test.moved_std > _HARDLY_TOLD or test.moved_sigma > _HARDLY_TOLD * test.moved_std:
+        return ""
+    return (
+        f" These data hardly tell {test.name} from {test.moved_name}: with both fitted, the error of {test.moved_name} "
+        f"would be {significant(float(np.hypot(1.0, test.moved_std)))} times as large."
+    )
 
 
 def even_noise(found: Misfit, inflated: bool = False) -> Check:
