@@ -248,7 +248,12 @@ def inspect_command(
 
 
 def load_images(
-    images: list[Path], camera_path: Path | None, settings: ImageSettings, sky: SkySettings, keep: Path
+    images: list[Path],
+    camera_path: Path | None,
+    settings: ImageSettings,
+    sky: SkySettings,
+    model: str | None,
+    keep: Path,
 ) -> tuple[Observations, Camera, Centroids, ImageCalibration]:
     """Observations of images with the nominal camera, and what is worth telling; `keep` is a folder to go on from."""
     from starcal_uq.pipeline.images import observations_from_images
@@ -265,6 +270,7 @@ def load_images(
             bayer=settings.bayer,
             focal_tolerance=0.03 if settings.focal_tolerance is None else settings.focal_tolerance,
             engine=settings.engine or "pyramid",
+            model=model,
             workers=None,
             tell=tell,
             progress=progress,

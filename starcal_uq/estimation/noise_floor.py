@@ -100,7 +100,12 @@ def settle_noise(obs: Observations, cal: Calibration) -> Observations:
         if not found.needed:
             break
         before = found.floor_px
-        again = calibrate(raised, cal.nominal, model=cal.nominal.distortion, duplicates="keep")
+        try:
+            # More noise may leave terms of the model open: a simpler one then tells the rest.
+            again = calibrate(raised, cal.nominal, duplicates="keep")
+        except CalibrationError:
+            # The calibration of the run will say what is open.
+            break
         found = noise_floor(again, raised, obs.sigma_px)
         raised = with_noise_floor(obs, found)
         if abs(found.floor_px - before) < _SETTLED * before:

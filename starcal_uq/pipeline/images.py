@@ -95,6 +95,7 @@ def observations_from_images(
     time_utc: str | None = None,
     bayer: Bayer | None = None,
     engine: Engine = "pyramid",
+    model: str | None = None,
     workers: int | None = 0,
     tell: Callable[[str], None] | None = None,
     progress: Progress | None = None,
@@ -130,6 +131,8 @@ def observations_from_images(
         Mosaic of colours of the images, as in `extract_centroids`.
     engine : {"pyramid", "tetra3rs"}
         Solver that finds attitudes.
+    model : str, optional
+        Distortion model that the stars will be calibrated with, as in `identify_and_calibrate`.
     workers : int, optional
         Processes that measure the images, as in `extract_centroids`.
     tell : callable, optional
@@ -180,6 +183,7 @@ def observations_from_images(
         site=site,
         in_space=in_space,
         identification={"engine": engine, "focal_tolerance": focal_tolerance},
+        model=model,
         tell=tell,
     )
     if obs is None or found is None:
@@ -198,6 +202,7 @@ def observations_from_centroids(
     in_space: bool = False,
     identification: dict[str, Any] | None = None,
     known: Calibration | Posterior | None = None,
+    model: str | None = None,
     lenient: bool = False,
     tell: Callable[[str], None] | None = None,
 ) -> tuple[Observations | None, Identification, ImageCalibration | None]:
@@ -275,6 +280,7 @@ def observations_from_centroids(
             to_catalogue=to_catalogue if motion else None,
             # The calibration of the run will ask which frames repeat others.
             method={"duplicates": "keep"},
+            model=model,
             identification=options,
         )
     except CalibrationError:

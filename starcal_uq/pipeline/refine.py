@@ -63,6 +63,7 @@ def identify_and_calibrate(
     prepare: Callable[[Observations], Observations] | None = None,
     to_catalogue: ToCatalogue | None = None,
     method: dict[str, Any] | None = None,
+    model: str | None = None,
     identification: dict[str, Any] | None = None,
 ) -> ImageCalibration:
     """Identify with the nominal camera, calibrate, and do both again with what was learnt.
@@ -85,6 +86,8 @@ def identify_and_calibrate(
         used where `prepare` leaves the directions as they are.
     method : dict, optional
         Options of `calibrate`.
+    model : str, optional
+        Distortion model for stars that determine neither that of the camera nor a simpler one as good.
     identification : dict, optional
         Options of `identify`.
 
@@ -95,8 +98,6 @@ def identify_and_calibrate(
     CalibrationError
         When the stars that were identified do not determine the camera.
     """
-    from starcal_uq.estimation.calibrate import calibrate
-
     options = identification or {}
     found = identify(centroids, camera, stars, **options) if first is None else first
     rounds: list[tuple[Identification, Observations, Calibration]] = []
@@ -107,20 +108,34 @@ def identify_and_calibrate(
         try:
             # Which frames repeat others is asked once, at the end.
             asked = {**(method or {}), **({"duplicates": "keep"} if number == 0 else {})}
-            known = calibrate(obs, found.nominal if number == 0 else rounds[0][0].nominal, **asked)
+            known = _calibrated(obs, found.nominal if number == 0 else rounds[0][0].nominal, model, asked)
         except RepeatedFramesError:
             raise
         except CalibrationError as error:
             stars_words, frames_words = plural(obs.n_stars, "star"), plural(found.n_identified, "frame")
             raise CalibrationError(
                 f"{stars_words} in {frames_words} were identified, but they do not determine the camera ({error}) Give "
-                "more frames, fainter stars (max_mag), or a distortion model with fewer terms in the camera file.",
+                "more frames, or fainter stars (max_mag).",
                 error.status,
             ) from error
         rounds.append((found, obs, known))
         if number == 0:
             found = _again(centroids, found, obs, known, stars, to_catalogue, options)
     return ImageCalibration(tuple(rounds))
+
+
+def _calibrated(obs: Observations, camera: Camera, model: str | None, options: dict[str, Any]) -> Calibration:
+    """The calibration with the lens of a camera; with the model that was asked for where that is of no avail."""
+    from starcal_uq.estimation.calibrate import calibrate
+
+    try:
+        return calibrate(obs, camera, **options)
+    except RepeatedFramesError:
+        raise
+    except CalibrationError:
+        if model in (None, camera.distortion):
+            raise
+        return calibrate(obs, camera.replace(distortion=model), **options)
 
 
 def _again(
