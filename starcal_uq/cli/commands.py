@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, get_args
 
@@ -90,6 +91,8 @@ def usage_sentence(error: Exception) -> str:
     """What is wrong with a call, and where to look."""
     parameter, cause = getattr(error, "param", None), error.__cause__
     if isinstance(error, typer.BadParameter) and parameter is not None:
+        if not error.message and cause is None:
+            return _missing(error.ctx, parameter)
         name = max(parameter.opts, key=len) if parameter.opts[0].startswith("-") else parameter.display_name_raw
         problems: list[AnyDict] = getattr(cause, "errors", list)()
         return f"{name} {_problem(parameter, problems[0]['input']) if problems else error.message}"
@@ -98,6 +101,21 @@ def usage_sentence(error: Exception) -> str:
     words = getattr(error, "format_message", None)
     message = words() if callable(words) else str(error)
     return f"{message.strip().rstrip('.')}; see `starcal-uq --help`."
+
+
+def _missing(context: Any, parameter: Any) -> str:
+    """A parameter that a call lacks, what it is, and all that the command cannot do without."""
+    command = context.command
+    call = " ".join(["starcal-uq", command.name, *(_word(other) for other in command.params if other.required)])
+    what = re.split(r"[.:;(]", parameter.help or "")[0].strip()
+    what = what if what[:2].isupper() else what[:1].lower() + what[1:]
+    return f"{_word(parameter)} is missing{f' ({what})' if what else ''}: give `{call}`."
+
+
+def _word(parameter: Any) -> str:
+    """A parameter as one types it."""
+    value = str(parameter.metavar or parameter.name.upper())
+    return f"{min(parameter.opts, key=len)} {value}" if parameter.opts[0].startswith("-") else value
 
 
 def _problem(parameter: Any, value: object) -> str:

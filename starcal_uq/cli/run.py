@@ -174,7 +174,9 @@ def _calibrate(
     """From the inputs to a calibration, with a bar."""
     obs: Observations | PartitionedObservations
     if from_images:
-        obs, nominal, centroids, identified = load_images(inputs, camera, images, sky, estimation.model, run.folder.path)
+        obs, nominal, centroids, identified = load_images(
+            inputs, camera, images, sky, estimation.model, run.folder.path
+        )
     elif camera is not None:
         obs, nominal = load_table(inputs[0] if len(inputs) == 1 else inputs, camera, sky)
     with progress_bar("passes over the files") as progress:
