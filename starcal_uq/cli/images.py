@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -33,6 +34,7 @@ from starcal_uq.observations.files import WRITTEN
 
 if TYPE_CHECKING:
     from starcal_uq.camera.camera import Camera
+    from starcal_uq.identification.result import Identification
     from starcal_uq.images.centroids import Centroids
     from starcal_uq.observations.table import Observations
     from starcal_uq.pipeline.refine import ImageCalibration
@@ -254,6 +256,7 @@ def load_images(
     sky: SkySettings,
     model: str | None,
     keep: Path,
+    seen: Callable[[Centroids, Identification | None], None],
 ) -> tuple[Observations, Camera, Centroids, ImageCalibration]:
     """Observations of images with the nominal camera, and what is worth telling; `keep` is a folder to go on from."""
     from starcal_uq.pipeline.images import observations_from_images
@@ -273,6 +276,7 @@ def load_images(
             model=model,
             workers=None,
             tell=tell,
+            seen=seen,
             progress=progress,
             keep=keep,
             **known,

@@ -47,13 +47,15 @@ from starcal_uq.cli.settings import (
     settings_of,
 )
 from starcal_uq.cli.steps import load_table, sample_run
-from starcal_uq.core.errors import PriorError
+from starcal_uq.core.errors import CalibrationError, IdentificationError, PriorError
 from starcal_uq.core.store import finished
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.toml import read_section
 from starcal_uq.observations.files import READ
 
 if TYPE_CHECKING:
+    from starcal_uq.identification.result import Identification
+    from starcal_uq.images.centroids import Centroids
     from starcal_uq.observations.partitions import PartitionedObservations
     from starcal_uq.observations.table import Observations
     from starcal_uq.presentation.report.drawing import Ahead
@@ -61,6 +63,8 @@ if TYPE_CHECKING:
 
 # From so many stars on, half of the diagnosis is worth another process.
 _APART_STARS = 50_000
+# Frames on the page of a run that has failed.
+_FAILED_FRAMES = 24
 
 
 def demo(
@@ -173,20 +177,38 @@ def _calibrate(
 ) -> None:
     """From the inputs to a calibration, with a bar."""
     obs: Observations | PartitionedObservations
+    seen: list[Any] = []
+    try:
+        if from_images:
+            obs, nominal, centroids, identified = load_images(
+                inputs, camera, images, sky, estimation.model, run.folder.path, lambda *known: seen.append(known)
+            )
+        elif camera is not None:
+            obs, nominal = load_table(inputs[0] if len(inputs) == 1 else inputs, camera, sky)
+        with progress_bar("passes over the files") as progress:
+            nominal = estimation.started(nominal)
+            run.calibrate(obs, nominal, undetermined=undetermined, progress=progress, **estimation.options())
+    except (IdentificationError, CalibrationError) as error:
+        if seen:
+            page = _keep_failed(run, inputs, camera, *seen[-1])
+            error.args = (f"{error} Every frame, with its detections and its reason: {page}",)
+        raise
     if from_images:
-        obs, nominal, centroids, identified = load_images(
-            inputs, camera, images, sky, estimation.model, run.folder.path
-        )
-    elif camera is not None:
-        obs, nominal = load_table(inputs[0] if len(inputs) == 1 else inputs, camera, sky)
-    with progress_bar("passes over the files") as progress:
-        nominal = estimation.started(nominal)
-        run.calibrate(obs, nominal, undetermined=undetermined, progress=progress, **estimation.options())
-    if from_images:
-        run.keep_images(centroids, identified, inputs)
+        run.keep_images(centroids, identified.identification, identified, inputs)
         finished(run.folder.path)
     if run.screening is not None:
         show_screening(run.screening)
+
+
+def _keep_failed(
+    run: Run, inputs: list[Path], camera: Path | None, centroids: Centroids, identification: Identification | None
+) -> Path:
+    """What there is to be looked at of images that could not be calibrated: their table and a page of their frames."""
+    sheet = None if camera is None else sc.Camera.load(camera)
+    if sheet is None and identification is not None and identification.optics is not None:
+        sheet = identification.nominal
+    run.keep_images(centroids, identification, None, inputs, sheet)
+    return run.keep_frames(run.frames.telling(_FAILED_FRAMES), force=True)
 
 
 @one_thread()

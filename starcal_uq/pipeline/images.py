@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -98,6 +99,7 @@ def observations_from_images(
     model: str | None = None,
     workers: int | None = 0,
     tell: Callable[[str], None] | None = None,
+    seen: Callable[[Centroids, Identification | None], None] | None = None,
     progress: Progress | None = None,
     keep: Path | None = None,
 ) -> tuple[Observations, Centroids, ImageCalibration]:
@@ -137,6 +139,9 @@ def observations_from_images(
         Processes that measure the images, as in `extract_centroids`.
     tell : callable, optional
         Gets what a user should know of the images, one sentence each, before anything is made of them.
+    seen : callable, optional
+        Gets the centroids when they are measured, and once more with the first identification: what is there to be
+        looked at if an error follows.
     progress : callable, optional
         Called with (images done, images in all).
     keep : path, optional
@@ -168,6 +173,8 @@ def observations_from_images(
     centroids = with_time(centroids, time_utc)
     if camera is None:
         centroids = of_one_size(centroids)
+    if seen is not None:
+        seen(centroids, None)
     if centroids.n_left_out == centroids.n_frames and centroids.messages:
         raise IdentificationError(f"no image can be used: {counted(centroids.messages)[0]}")
     if tell is not None:
@@ -185,6 +192,7 @@ def observations_from_images(
         identification={"engine": engine, "focal_tolerance": focal_tolerance},
         model=model,
         tell=tell,
+        seen=None if seen is None else partial(seen, centroids),
     )
     if obs is None or found is None:
         raise IdentificationError(f"no frame is identified: {identification.text}")
@@ -205,6 +213,7 @@ def observations_from_centroids(
     model: str | None = None,
     lenient: bool = False,
     tell: Callable[[str], None] | None = None,
+    seen: Callable[[Identification], None] | None = None,
 ) -> tuple[Observations | None, Identification, ImageCalibration | None]:
     """What `observations_from_images` does with the centroids of its images.
 
@@ -227,6 +236,8 @@ def observations_from_centroids(
     options = dict(identification or {})
     progress = options.pop("progress", None)
     stars, first = identify_to_depth(centroids, camera, year, max_mag, calibration=known, progress=progress, **options)
+    if seen is not None:
+        seen(first)
     if tell is not None and max_mag is None:
         tell(depth_text(stars, first))
     limit = float(stars.mag.max())

@@ -146,6 +146,8 @@ class Frames(Shown):
         Frames of the whole run, of which these may be some.
     large : bool
         Whether the frames are shown one below the other, as finely as their images are.
+    known : bool
+        Whether the run folder has a camera file.
     """
 
     run: str
@@ -161,6 +163,7 @@ class Frames(Shown):
     images: tuple[Path, ...] = ()
     n_run: int = 0
     large: bool = False
+    known: bool = True
 
     def __len__(self) -> int:
         return len(self.record.rows)
@@ -173,6 +176,11 @@ class Frames(Shown):
 
     def __repr__(self) -> str:
         return f"Frames({len(self)} of {self.n_run or len(self)} of {self.run!r})"
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether there is a calibration, which other frames can be identified with."""
+        return bool(self.record.rounds)
 
     @property
     def mirrored(self) -> bool:
@@ -284,7 +292,7 @@ class Frames(Shown):
     @cached_property
     def searched_mag(self) -> float:
         """Magnitude (Gaia G) to which stars were searched for."""
-        stated = self.matched.meta.get("max_mag")
+        stated = self.matched.meta.get("max_mag", self.record.max_mag)
         mags = self.matched.mag if self.matched.mag is not None else np.empty(0)
         return float(stated) if stated is not None else float(np.max(mags, initial=-np.inf))
 

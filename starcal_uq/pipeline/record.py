@@ -63,6 +63,8 @@ class ImageRecord(Shown, Saved):
     parity: str  # "normal" or "mirrored"
     # Files and folders that the images came from; empty in runs of versions that did not keep them.
     sources: tuple[str, ...] = ()
+    # Magnitude (Gaia G) to which stars were searched for, where that is known.
+    max_mag: float | None = None
 
     FILE = "a record of images", "run `starcal-uq run IMAGES... -o RUN` again"
 
@@ -72,11 +74,19 @@ class ImageRecord(Shown, Saved):
         return tuple(row for row in self.rows if not row.n_last)
 
 
-def record_images(centroids: Centroids, images: ImageCalibration, sources: Sequence[PathLike] = ()) -> ImageRecord:
-    """The record of a bootstrapped run; `sources` are the files and folders that the images came from."""
-    first, last = images.rounds[0][0], images.rounds[-1][0]
-    counted = {frame.frame: frame.n_identified for frame in first.frames}
-    by_frame = {frame.frame: frame for frame in last.frames}
+def record_images(
+    centroids: Centroids,
+    last: Identification | None,
+    images: ImageCalibration | None = None,
+    sources: Sequence[PathLike] = (),
+) -> ImageRecord:
+    """The record of images with their last identification and the rounds to it, as far as there are any.
+
+    `sources` are the files and folders that the images came from.
+    """
+    first = last if images is None else images.rounds[0][0]
+    counted = {frame.frame: frame.n_identified for frame in first.frames} if first is not None else {}
+    by_frame = {frame.frame: frame for frame in last.frames} if last is not None else {}
     rows = []
     for k, number in enumerate(centroids.frame_ids.tolist()):
         frame = by_frame.get(number)
@@ -93,12 +103,13 @@ def record_images(centroids: Centroids, images: ImageCalibration, sources: Seque
             )
         )
     rounds, before = [], None
-    for identification, obs, calibration in images.rounds:
+    for identification, obs, calibration in () if images is None else images.rounds:
         rounds.append(_recorded(identification, obs, calibration, before))
         before = identification
-    disturbed = images.observations.meta.get("disturbed_stars", 0)
+    disturbed = 0 if images is None else images.observations.meta.get("disturbed_stars", 0)
     places = tuple(os.path.abspath(source) for source in sources)
-    return ImageRecord(tuple(rounds), tuple(rows), int(disturbed), last.parity, places)
+    parity, limit = ("normal", None) if last is None else (last.parity, last.observations.meta.get("max_mag"))
+    return ImageRecord(tuple(rounds), tuple(rows), int(disturbed), parity, places, limit)
 
 
 def _recorded(

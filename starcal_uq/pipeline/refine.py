@@ -115,7 +115,7 @@ def identify_and_calibrate(
             stars_words, frames_words = plural(obs.n_stars, "star"), plural(found.n_identified, "frame")
             raise CalibrationError(
                 f"{stars_words} in {frames_words} were identified, but they do not determine the camera ({error}) Give "
-                "more frames, or fainter stars (max_mag).",
+                "more frames, or fainter stars (max_mag, --max-mag).",
                 error.status,
             ) from error
         rounds.append((found, obs, known))

@@ -299,6 +299,12 @@ class RunFolder:
             if old.complete:
                 check_new_folder(self.path, force)
             place = self
+            if not old.complete and old.command != wanted and "calibrate" not in old.steps:
+                # One that has come to no calibration has nothing to be kept.
+                for name in old.files:
+                    (self.path / name).unlink(missing_ok=True)
+                old = replace(old, files={}, steps={}, command=None)
+                write_manifest(self.path, old)
             if old.files and (old.complete or old.command != wanted):
                 self._check_new()
                 place = RunFolder(self.path / NEW).create()

@@ -43,6 +43,8 @@ from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.presentation.report.results import Missing, Results
 from starcal_uq.runs.folder import CHECKPOINT, DIAGNOSIS_TABLES, FILES, HISTORY, REST_ON, RunFolder, remove_checkpoints
 
+# A frame to write reasons in.
+_NO_IMAGE = Camera(640, 480, None, None, 319.5, 239.5, focal_px=640.0)
 # Frames in a report, whose pictures are some hundred kilobytes together.
 REPORT_FRAMES = 12
 
@@ -55,6 +57,7 @@ if TYPE_CHECKING:
     from starcal_uq.diagnostics.diagnose import Diagnosis
     from starcal_uq.diagnostics.verdict.judge import Place, Verdict
     from starcal_uq.estimation.screening.result import Screening
+    from starcal_uq.identification.result import Identification
     from starcal_uq.images.centroids import Centroids
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.pipeline.inspection import Frames
@@ -334,7 +337,10 @@ class Run:
         from starcal_uq.pipeline.inspection import Frames
         from starcal_uq.pipeline.record import IMAGES
 
-        obs, record = self.observations, self.images
+        record = self.images
+        if record is not None and not record.rounds:
+            return self._uncalibrated(record)
+        obs = self.observations
         if record is None:
             raise RunFolderError(
                 f"{self.path}: has no {IMAGES}, because the run did not start from images; to look at some, run "
@@ -364,6 +370,40 @@ class Run:
             reasons,
             seconds,
             tuple(Path(source) for source in record.sources),
+        )
+
+    def _uncalibrated(self, record: ImageRecord) -> Frames:
+        """The images where nothing could be calibrated: detections, and stars where some were identified."""
+        import numpy as np
+
+        from starcal_uq.identification.engine import sheet_of
+        from starcal_uq.images.centroids import Centroids
+        from starcal_uq.pipeline.images import CENTROIDS, MATCHED
+        from starcal_uq.pipeline.inspection import Frames
+
+        folder = self.folder.path
+        centroids, none = Centroids.load(folder / CENTROIDS), np.empty(0)
+        nothing = Observations(frame=none.astype(int), x_px=none, y_px=none, ra_deg=none, dec_deg=none)
+        matched = load_observations(folder / MATCHED) if (folder / MATCHED).exists() else nothing
+        known = self.has("camera")
+        if known:
+            camera = self.camera
+        elif centroids.meta.get("optics"):
+            camera = sheet_of(centroids)[0]
+        else:
+            # No image could be read: there is nothing but names to be shown.
+            camera = _NO_IMAGE
+        return Frames(
+            str(folder),
+            record,
+            centroids,
+            matched,
+            nothing,
+            np.empty((0, 2)),
+            camera,
+            {},
+            images=tuple(Path(source) for source in record.sources),
+            known=known,
         )
 
     def inspect(self, *which: int | str, most: int = 24, images: Sequence[PathLike] | None = None) -> Frames:
@@ -404,7 +444,7 @@ class Run:
         self._keep("inspection", force)
         with self._step("inspect", None, {}) as files:
             write_frames(frames, files.inspection)
-        return self.path / RunFolder.inspection
+        return self.folder.inspection
 
     @property
     def shown_frames(self) -> Frames:
@@ -628,16 +668,30 @@ class Run:
         self.camera, self.calibration, self.screening = calibration.nominal, calibration, screened
 
     @_writing
-    def keep_images(self, centroids: Centroids, images: ImageCalibration, sources: Sequence[PathLike] = ()) -> None:
-        """Keep centroids, matches and the record of every image that the run started from, and where these are."""
+    def keep_images(
+        self,
+        centroids: Centroids,
+        identification: Identification | None,
+        images: ImageCalibration | None = None,
+        sources: Sequence[PathLike] = (),
+        camera: Camera | None = None,
+    ) -> None:
+        """Keep centroids, matches and the record of every image that the run started from, and where these are.
+
+        Where nothing is calibrated there are no `images`, and perhaps no identification; the `camera` is kept then.
+        """
         from starcal_uq.pipeline.images import CENTROIDS, IDENTIFICATION, MATCHED
         from starcal_uq.pipeline.record import IMAGES, record_images
 
         with self._step("images", None, {}) as files:
             centroids.save(files.path / CENTROIDS)
-            images.identification.observations.save(files.path / MATCHED)
-            record_images(centroids, images, sources).save(files.path / IMAGES)
-            write_csv(images.identification.to_dataframe(), files.path / IDENTIFICATION)
+            record_images(centroids, identification, images, sources).save(files.path / IMAGES)
+            if identification is not None:
+                write_csv(identification.to_dataframe(), files.path / IDENTIFICATION)
+            if identification is not None and identification.n_identified:
+                identification.observations.save(files.path / MATCHED)
+            if camera is not None:
+                camera.save(files.camera)
         self._forget("images", "frames")
 
     @_writing

@@ -164,11 +164,13 @@ def next_step(frame: InspectedFrame, frames: Frames) -> Step | None:
     run, outcome = quote(frames.run), frame.row.outcome
     # Much fainter ones are not detected, and take longer to be told apart.
     deeper = f"--max-mag {min(np.ceil(frames.searched_mag + 1.0), FAINTEST):g}" if frames.searched_mag > 0.0 else ""
-    again = f"starcal-uq identify {run}/centroids.parquet {run}/camera.toml -o found.csv --calibration {run}"
-    centroid = f"starcal-uq centroid {image} --camera {run}/camera.toml -o stars.csv"
+    camera = f"{run}/camera.toml" if frames.known else ""
+    again = f"starcal-uq identify {run}/centroids.parquet {camera} -o found.csv".replace("  ", " ")
+    again += f" --calibration {run}" if frames.calibrated else ""
+    centroid = f"starcal-uq centroid {image} {f'--camera {camera} ' if camera else ''}-o stars.csv"
     if outcome == "identified":
         images = " ".join(quote(str(source)) for source in frames.images) or "IMAGES"
-        command = f"starcal-uq run {images} {run}/camera.toml -o {quote(frames.run + '-deeper')} {deeper}".rstrip()
+        command = f"starcal-uq run {images} {camera} -o {quote(frames.run + '-deeper')} {deeper}".rstrip()
         return Step("too few of its stars can be calibrated; search among fainter ones.", command)
     if outcome == "too few stars":
         return Step("look for fainter stars, or expose longer.", f"{centroid} --threshold 3.5")
