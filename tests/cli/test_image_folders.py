@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+import html
+import json
+import re
+import shlex
+
 import numpy as np
 import pytest
+from PIL import Image
 
 import starcal_uq as sc
 from starcal_uq.core.errors import CalibrationError
@@ -44,3 +50,82 @@ def test_images_fall_back_to_a_simpler_model_as_a_table_does(noisy_frame, tmp_pa
     # What is asked for by name is fitted or refused there as well, and the way out leads out.
     with pytest.raises(CalibrationError, match="'none' converges"):
         sc.calibrate(obs, found.rounds[0][0].nominal, model="brown")
+
+
+def page_of(folder):
+    return html.unescape((folder / "frames.html").read_text("utf-8"))
+
+
+def test_a_failed_identification_leaves_a_folder_with_every_frame(cli, tmp_path):
+    """Detections that are no stars, a file that is no image, and too little light: each with its reason."""
+    rng = np.random.default_rng(5)
+    frames = tmp_path / "frames"
+    frames.mkdir()
+    for k in range(2):
+        counts = rng.normal(500.0, 10.0, (SIZE, SIZE))
+        x, y = np.meshgrid(np.arange(SIZE), np.arange(SIZE))
+        for place in rng.uniform(20.0, SIZE - 20.0, (6, 2)):
+            counts += 4000.0 * np.exp(-0.5 * np.sum((np.stack([x, y], axis=-1) - place) ** 2, axis=-1) / 1.2)
+        Image.fromarray(counts.astype(np.uint16)).save(frames / f"noise{k}.tiff")
+    Image.fromarray(rng.normal(500.0, 10.0, (SIZE, SIZE)).astype(np.uint16)).save(frames / "dark.tiff")
+    (frames / "text.png").write_text("no picture")
+    sheet(tmp_path / "camera.toml", 3000.0)
+    status, _, err = cli("run", "frames", "camera.toml", "-o", "run", "--max-mag", 5)
+    assert status == 2
+    assert "error: no frame is identified: 0 of 3 frames are identified." in err
+    assert err.rstrip().endswith("Every frame, with its detections and its reason: run/frames.html")
+    page = page_of(tmp_path / "run")
+    for name in ("noise0.tiff", "noise1.tiff", "dark.tiff", "text.png"):
+        assert name in page
+    assert page.count(">not identified<") == 2
+    assert page.count(">too few stars<") == 1
+    assert "the file is not an image, is damaged, or is of a kind that is not read<" in page
+    # Detections are marked where they are.
+    assert page.count('<path class="u" d="M') == 3
+    # What the page names works, and the folder is no obstacle to another attempt.
+    command = shlex.split(re.search(r"(starcal-uq identify [^<]*)<", page)[1])[1:]
+    status, out, err = cli(*command)
+    assert (status, "0 of 3 frames are identified" in out) == (1, True), err
+    status, out, _ = cli("inspect", "run", "--force", "--json")
+    assert [frame["outcome"] for frame in json.loads(out)["frames"]][1:3] == ["not identified", "not identified"]
+
+
+def test_stars_that_do_not_determine_the_camera_are_shown_as_well(cli, tmp_path):
+    rng = np.random.default_rng(0)
+    rng.integers(4)
+    picture(tmp_path / "frame.tiff", attitude(rng), 6000.0, jitter_px=0.4, max_mag=9.0, seed=0)
+    sheet(tmp_path / "camera.toml", 6000.0)
+    status, _, err = cli("run", "frame.tiff", "camera.toml", "-o", "run")
+    assert status == 2
+    assert "they do not determine the camera" in err
+    assert ">identified, not calibrated<" in page_of(tmp_path / "run")
+    # A run of something else takes the place of what has failed.
+    (tmp_path / "text.png").write_text("no picture")
+    status, _, err = cli("run", "text.png", "camera.toml", "-o", "run")
+    assert (status, "no image can be used" in err) == (2, True)
+    assert sorted(path.name for path in (tmp_path / "run").iterdir() if not path.name.startswith(".")) == [
+        "camera.toml",
+        "centroids.parquet",
+        "frames.html",
+        "images.json",
+        "run.json",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (("calibrate",), "OBS is missing (stars in pixels): give `starcal-uq calibrate OBS CAMERA -o RUN`."),
+        (
+            ("run", __file__),
+            "-o RUN is missing (folder for the results): give `starcal-uq run OBS|IMAGES... [CAMERA] -o",
+        ),
+        (("calibrate", __file__, __file__), "-o RUN is missing (folder for the results): give `starcal-uq calibrate"),
+        (("sample",), "RUN is missing (run folder of `starcal-uq calibrate` or `run`): give `starcal-uq sample RUN`."),
+        (("export", __file__), "--to TO is missing (the camera for opencv"),
+    ],
+)
+def test_a_call_that_lacks_an_argument_is_answered_with_a_sentence(cli, call, said):
+    status, _, err = cli(*call)
+    assert status == 2
+    assert err.startswith(f"error: {said}")
