@@ -278,7 +278,8 @@ class Camera(Shown):
         RunFolderError
             If the file exists and `force` is false, or cannot be written.
         """
-        header = _HEADER + _DIRECTION[get_model(self.distortion).direction] + "\n"
+        header = _HEADER if self.pixel_um is not None else _HEADER.replace(_LENGTHS, _PIXELS)
+        header += _DIRECTION[get_model(self.distortion).direction] + "\n"
         write_section(path, "camera", self.to_dict(), header, force)
 
     def to_opencv(self) -> tuple[FloatArray, FloatArray]:
@@ -371,11 +372,12 @@ _HEADER = """\
 # Pixels: x to the right, y down; (0, 0) is the centre of the first pixel, so that the detector spans
 # -0.5 ... width_px - 0.5 along x and -0.5 ... height_px - 0.5 along y.
 # width_px, height_px, x0_px, y0_px: pixels. pixel_um: micrometres. focal_mm: millimetres.
-# Where the pixel pitch is unknown, focal_px (pixels) stands in the place of pixel_um and focal_mm.
 # x0_px, y0_px: principal point. Distortion coefficients act on offsets in pixels from it:
 # k1 px^-2, k2 px^-4, k3 px^-6, p1 and p2 px^-1.
 """
 
+_LENGTHS = "pixel_um: micrometres. focal_mm: millimetres."
+_PIXELS = "focal_px: pixels; where the pitch is known, pixel_um and focal_mm."
 _DIRECTION = {
     "forward": "# distortion maps ideal (pinhole) points to distorted (measured) points.\n",
     "inverse": "# distortion maps distorted (measured) points to ideal (pinhole) points.\n",

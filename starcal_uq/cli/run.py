@@ -189,7 +189,8 @@ def _calibrate(
             nominal = estimation.started(nominal)
             run.calibrate(obs, nominal, undetermined=undetermined, progress=progress, **estimation.options())
     except (IdentificationError, CalibrationError) as error:
-        if seen:
+        # Where no image could be measured there is nothing to be looked at.
+        if seen and seen[-1][0].meta.get("optics"):
             page = _keep_failed(run, inputs, camera, *seen[-1])
             error.args = (f"{error} Every frame, with its detections and its reason: {page}",)
         raise

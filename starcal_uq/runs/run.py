@@ -43,8 +43,6 @@ from starcal_uq.observations.table import Observations, load_observations
 from starcal_uq.presentation.report.results import Missing, Results
 from starcal_uq.runs.folder import CHECKPOINT, DIAGNOSIS_TABLES, FILES, HISTORY, REST_ON, RunFolder, remove_checkpoints
 
-# A frame to write reasons in.
-_NO_IMAGE = Camera(640, 480, None, None, 319.5, 239.5, focal_px=640.0)
 # Frames in a report, whose pictures are some hundred kilobytes together.
 REPORT_FRAMES = 12
 
@@ -386,13 +384,6 @@ class Run:
         nothing = Observations(frame=none.astype(int), x_px=none, y_px=none, ra_deg=none, dec_deg=none)
         matched = load_observations(folder / MATCHED) if (folder / MATCHED).exists() else nothing
         known = self.has("camera")
-        if known:
-            camera = self.camera
-        elif centroids.meta.get("optics"):
-            camera = sheet_of(centroids)[0]
-        else:
-            # No image could be read: there is nothing but names to be shown.
-            camera = _NO_IMAGE
         return Frames(
             str(folder),
             record,
@@ -400,7 +391,7 @@ class Run:
             matched,
             nothing,
             np.empty((0, 2)),
-            camera,
+            self.camera if known else sheet_of(centroids)[0],
             {},
             images=tuple(Path(source) for source in record.sources),
             known=known,

@@ -182,7 +182,7 @@ def test_too_few_stars_say_what_was_identified(cli, frames, tmp_path, monkeypatc
     assert f"stars in {N_IMAGES} frames were identified, but they do not determine the camera (it went nowhere.)" in err
     # What was found in the images was said before.
     assert f"stars in {N_IMAGES} frames.\n" in err
-    assert not (tmp_path / "run").exists()
+    assert "identified, not calibrated" in (tmp_path / "run" / "frames.html").read_text("utf-8")
 
 
 def test_bootstrap_says_what_changed(frames):

@@ -100,13 +100,14 @@ def test_stars_that_do_not_determine_the_camera_are_shown_as_well(cli, tmp_path)
     assert "they do not determine the camera" in err
     assert ">identified, not calibrated<" in page_of(tmp_path / "run")
     # A run of something else takes the place of what has failed.
-    (tmp_path / "text.png").write_text("no picture")
-    status, _, err = cli("run", "text.png", "camera.toml", "-o", "run")
-    assert (status, "no image can be used" in err) == (2, True)
+    Image.fromarray(rng.normal(500.0, 10.0, (SIZE, SIZE)).astype(np.uint16)).save(tmp_path / "dark.tiff")
+    status, _, err = cli("run", "dark.tiff", "camera.toml", "-o", "run")
+    assert (status, "no frame is identified" in err) == (2, True)
     assert sorted(path.name for path in (tmp_path / "run").iterdir() if not path.name.startswith(".")) == [
         "camera.toml",
         "centroids.parquet",
         "frames.html",
+        "identification.csv",
         "images.json",
         "run.json",
     ]
