@@ -7,6 +7,7 @@ import itertools
 import json
 import math
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -371,7 +372,8 @@ _READERS: dict[str, Callable[[str], Any]] = {
     "bool": {"True": True, "False": False}.__getitem__,
     "str": str,
     "tuple[str, ...]": lambda text: tuple(text.split(_SEPARATOR)) if text else (),
-    "tuple[float, ...]": lambda text: tuple(float(value) for value in text.split(_SEPARATOR)) if text else (),
+    # Earlier versions wrote them without brackets.
+    "tuple[float, ...]": lambda text: tuple(float(value) for value in re.findall(r"[^][,|\s]+", text)),
 }
 
 _DERIVED = ("combination", "margin_arcsec", "verdict")
@@ -389,7 +391,9 @@ def _plain(entry: Contributor | Total | Requirement) -> dict[str, str]:
 
 def _text(value: Any) -> str:
     if isinstance(value, tuple):
-        return _SEPARATOR.join(entry if isinstance(entry, str) else repr(entry) for entry in value)
+        # Numbers in brackets: a minus in front of a cell would be that of a formula.
+        texts = all(isinstance(entry, str) for entry in value)
+        return _SEPARATOR.join(value) if texts else json.dumps(value)
     return repr(float(value)) if isinstance(value, float) else str(value)
 
 

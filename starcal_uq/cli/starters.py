@@ -46,7 +46,10 @@ def new_command(
         )
         following = f"starcal-uq run {path / 'stars.ecsv'} {path / 'camera.toml'} -o RUN"
     elif what == "camera":
-        sc.paper.paper_start().replace(name="my camera").save(path, force=force)
+        start = sc.paper.paper_start()
+        # The centre of the detector, where the paper has a corner of its four middle pixels.
+        x0, y0 = start.centre_px
+        start.replace(name="my camera", x0_px=x0, y0_px=y0).save(path, force=force)
         following = f"put in the numbers of your data sheet, then starcal-uq run OBS {path} -o RUN"
     elif what == "site":
         site = sc.sky.Site(52.0, 4.4, 10.0, pressure_hpa=1013.0, temperature_c=15.0, relative_humidity=0.5)

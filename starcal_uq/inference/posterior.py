@@ -392,14 +392,19 @@ class Posterior(Shown):
         return pd.DataFrame(columns)
 
     def to_dataframe(self) -> pd.DataFrame:
-        """All draws in px units, with columns ``ensemble``, ``walker`` and ``step`` before the parameters."""
+        """All draws in px units, with columns ``ensemble``, ``walker`` and ``step`` before the parameters.
+
+        The unit of each column stands in ``.attrs["units"]``.
+        """
         import pandas as pd
 
         half = self.n_steps // 2
         ensemble, part, walker, step = np.indices((self.n_ensembles, 2, self.n_walkers, half)).reshape(4, -1)
         place = {"ensemble": ensemble, "walker": walker, "step": part * half + step}
         draws = dict(zip(self.parameter_names, self.draws.T, strict=True))
-        return pd.DataFrame({**place, **draws})
+        table = pd.DataFrame({**place, **draws})
+        table.attrs["units"] = {shown.name: shown.unit for shown in self.parameters}
+        return table
 
     @bounded
     def thin(self, n: int, seed: int | np.random.SeedSequence | None = None) -> FloatArray:
@@ -418,11 +423,15 @@ class Posterior(Shown):
         ensure_new(path, force)
         arrays: Arrays = {}
         record = to_plain(self, arrays, _ARRAYS)
+        # The draws themselves are in px units, one column a parameter; those of ArviZ's group are scaled.
+        own = {"units": ", ".join(p.unit for p in self.parameters), "columns": ", ".join(self.parameter_names)}
         attrs = {"format": _FORMAT, "record": json.dumps({name: record[name] for name in _RECORD})}
 
         # xarray would do it, but loads Dask for a lock, which takes longer than sampling.
         def fill(file: Any) -> None:
-            write_group(file, {name: (_ARRAYS[name], value, {}) for name, value in arrays.items()}, attrs)
+            held: Variables = {name: (_ARRAYS[name], value, {}) for name, value in arrays.items()}
+            held["draws"][2].update(own)
+            write_group(file, held, attrs)
             for group, (variables, coords, about) in self._groups().items():
                 dimensions: Variables = {name: ((name,), values, {}) for name, values in coords.items()}
                 write_group(file.create_group(group), dimensions | variables, about)

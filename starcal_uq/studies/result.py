@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from starcal_uq.camera.distortion import PARAMETERS
 from starcal_uq.core.constants import AXES as ATTITUDE
 from starcal_uq.core.display import Shown
 from starcal_uq.core.errors import StudyError
@@ -30,15 +31,17 @@ NETCDF, PARQUET = "study.nc", "study.parquet"
 _NO_GAIN = -0.05
 _PARAMETER, _OTHER, _AXIS, _FACTOR, _SIMPLER = "parameter", "parameter_2", "axis", "frames_factor", "simpler"
 
+# In place of a unit: each parameter has its own.
+OWN_UNIT = "unit of the parameter"
 # Dimensions beyond `cell`, unit, and words of every variable.
 VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "n_frames": ((), "", "frames of a campaign"),
     "mean_stars": ((), "", "stars used in a frame on average"),
     "field_deg": ((), "deg", "full width of the field"),
-    "truth": ((_PARAMETER,), "px", "parameters of the cell's camera"),
-    "sigma": ((_PARAMETER,), "px", "standard deviation, all other parameters unknown"),
-    "sigma_data": ((_PARAMETER,), "px", "standard deviation without the prior"),
-    "sigma_conditional": ((_PARAMETER,), "px", "standard deviation, all other parameters known"),
+    "truth": ((_PARAMETER,), OWN_UNIT, "parameters of the cell's camera"),
+    "sigma": ((_PARAMETER,), OWN_UNIT, "standard deviation, all other parameters unknown"),
+    "sigma_data": ((_PARAMETER,), OWN_UNIT, "standard deviation without the prior"),
+    "sigma_conditional": ((_PARAMETER,), OWN_UNIT, "standard deviation, all other parameters known"),
     "variance_inflation": ((_PARAMETER,), "", "square of marginal over conditional standard deviation"),
     "correlation": ((_PARAMETER, _OTHER), "", "correlation of two parameters"),
     "condition_number": ((), "", "condition number of the information with unit diagonal"),
@@ -52,12 +55,12 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str, str]] = {
     "model_bias_attitude_arcsec": ((_SIMPLER, _AXIS), "arcsec", "frame-dependent attitude error if it were fitted"),
     "model_bias_sigma": ((_SIMPLER, _PARAMETER), "", "shift of a parameter in its own sigmas if it were fitted"),
     "error_curve_arcsec": ((_FACTOR,), "arcsec", "frame-dependent error across the boresight per axis, 1 sigma"),
-    "sigma_curve": ((_PARAMETER, _FACTOR), "px", "standard deviation with other numbers of frames"),
-    "estimate": ((_PARAMETER,), "px", "estimate from simulated frames"),
-    "sigma_predicted": ((_PARAMETER,), "px", "standard deviation by the information of the same frames"),
+    "sigma_curve": ((_PARAMETER, _FACTOR), OWN_UNIT, "standard deviation with other numbers of frames"),
+    "estimate": ((_PARAMETER,), OWN_UNIT, "estimate from simulated frames"),
+    "sigma_predicted": ((_PARAMETER,), OWN_UNIT, "standard deviation by the information of the same frames"),
     "z": ((_PARAMETER,), "", "estimate minus truth in sigmas"),
     "covered_95": ((_PARAMETER,), "", "1 where the 95 % interval holds the truth, 0 where not"),
-    "posterior_sigma": ((_PARAMETER,), "px", "standard deviation of the posterior"),
+    "posterior_sigma": ((_PARAMETER,), OWN_UNIT, "standard deviation of the posterior"),
     "posterior_correlation": ((_PARAMETER, _OTHER), "", "correlation in the posterior"),
     "noise_estimate": ((), "px", "estimated centroid noise, or factor on the stated one"),
     "khat": ((), "", "Pareto shape of the importance weights; above 0.7 they are not to be trusted"),
@@ -239,7 +242,7 @@ class Study(Shown):
         return [float(value[i] + (value[i + 1] - value[i]) * excess[i] / (excess[i] - excess[i + 1])) for i in changes]
 
     def table(self) -> pd.DataFrame:
-        """One row per cell and parameter: the axes, what a cell has one number of, and the parameter's own."""
+        """One row per cell and parameter: the axes, what a cell has one number of, then the parameter's in its unit."""
         import pandas as pd
 
         data, names = self.data, self.parameter_names
@@ -248,6 +251,7 @@ class Study(Shown):
         for name in (*self.definition.axes, "seed_index", "key", "status"):
             columns[name] = np.repeat(data[name].values, p)
         columns[_PARAMETER] = np.tile(np.array(names), cells)
+        columns["unit"] = np.tile(np.array([PARAMETERS[name].unit for name in names]), cells)
         late: dict[str, Any] = {}
         for key, array in data.data_vars.items():
             name = str(key)

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.camera.distortion import model_names, parameter_names, simpler_models
+from starcal_uq.camera.distortion import PARAMETERS, model_names, parameter_names, simpler_models
 from starcal_uq.core.cluster import Scheduler, cluster
 from starcal_uq.core.constants import AXES as ATTITUDE
 from starcal_uq.core.errors import StarcalError, StudyError
@@ -29,7 +29,7 @@ from starcal_uq.studies.axes import AXES
 from starcal_uq.studies.cells import FRAME_FACTORS, FisherCells
 from starcal_uq.studies.definition import Cell, StudyDefinition
 from starcal_uq.studies.geometry import Heaven, frames_of, weights_of
-from starcal_uq.studies.result import NETCDF, TEXTS, VARIABLES, Study, frames_for
+from starcal_uq.studies.result import NETCDF, OWN_UNIT, TEXTS, VARIABLES, Study, frames_for
 from starcal_uq.studies.store import FOLDER as CELLS
 from starcal_uq.studies.store import Store, row
 
@@ -299,6 +299,7 @@ def dataset(definition: StudyDefinition, cells: Sequence[Cell], keys: Sequence[s
     there = np.flatnonzero(rows >= 0)
     status[there] = np.array(table["status"].to_pylist(), dtype=object)[rows[there]]
     good = status == "ok"
+    units = [PARAMETERS[name].unit for name in labels["parameter"]]
     variables: AnyDict = {"status": ("cell", status.astype(str))}
     for name in TEXTS:
         texts = np.full(len(cells), "", dtype=object)
@@ -324,10 +325,13 @@ def dataset(definition: StudyDefinition, cells: Sequence[Cell], keys: Sequence[s
             shape = [len(i) for i in index]
             values[np.ix_(members[known], *index)] = numbers.reshape(int(known.sum()), *shape)
         attributes = {"long_name": words} | ({"units": unit} if unit else {})
+        if unit == OWN_UNIT:
+            attributes["units"] = ", ".join(units)
         variables[name] = (("cell", *dims), values, attributes)
     if definition.target_arcsec is not None or definition.target_sigma:
         variables |= _targets(definition, variables, labels)
     coordinates: AnyDict = {k: v for k, v in labels.items() if v}
+    coordinates["parameter_unit"] = ("parameter", np.array(units))
     for name in definition.axes:
         axis = AXES[name]
         content = [cell.settings[name] for cell in cells]

@@ -575,6 +575,23 @@ def test_csv_is_lossless(stated: Path, tmp_path: Path) -> None:
     assert len(found.to_dataframe()) == len(found.rows) and len(found.totals_dataframe()) == len(found.totals)
 
 
+def test_correlations_of_axes_in_csv_are_lists_of_numbers_for_other_readers(stated: Path, tmp_path: Path) -> None:
+    """None begins with an apostrophe, whatever the sign of its first number; those of an earlier version are read."""
+    import pandas as pd
+
+    found = made(stated)
+    signed = (-0.25, 0.1, 1.0)
+    changed = dataclasses.replace(found, rows=(dataclasses.replace(found.rows[0], axis_correlation=signed),))
+    path = tmp_path / "budget.csv"
+    changed.save(path)
+    (cell,) = pd.read_csv(path)["axis_correlation"].dropna()
+    assert json.loads(cell) == [*signed]
+    assert Budget.load(path).rows[0].axis_correlation == signed
+    before = " | ".join(map(repr, signed))
+    path.write_text(path.read_text().replace(f'"{cell}"', f"'{before}"))
+    assert f"'{before}" in path.read_text() and Budget.load(path).rows[0].axis_correlation == signed
+
+
 def test_json_has_null_where_nothing_is_known(stated: Path) -> None:
     found = json.loads(json.dumps(made(stated).to_dict(), allow_nan=False))
     missing = [row for row in found["contributors"] if not row["assessed"]]

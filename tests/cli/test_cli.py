@@ -364,6 +364,15 @@ def test_a_starter_file_is_read_as_it_is(what, cli, tmp_path):
     assert "exists already" in err
 
 
+def test_the_starter_camera_looks_through_the_centre_of_its_detector(cli, tmp_path):
+    """The centre of the first pixel is (0, 0), so that of a detector lies half a pixel before half its width."""
+    assert cli("new", "camera")[0] == 0
+    camera = sc.Camera.load(tmp_path / "camera.toml")
+    assert (camera.x0_px, camera.y0_px) == (0.5 * (camera.width_px - 1), 0.5 * (camera.height_px - 1)) == (511.5, 511.5)
+    # Control: the start that the paper prints stays what it is.
+    assert sc.paper.paper_start().x0_px == 512.0
+
+
 def test_the_example_is_written_into_a_folder(cli, tmp_path):
     status, out, _ = cli("new", "example")
     assert status == 0 and "starcal-uq run esa/stars.ecsv esa/camera.toml -o RUN" in out

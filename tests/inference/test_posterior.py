@@ -63,6 +63,26 @@ def test_other_tools_can_read_the_file(post: Posterior, tmp_path: Path) -> None:
         assert np.array_equal(dataset["k1"].values.ravel(), post.draws[:, 3] / 1e-10)
 
 
+def test_every_place_of_the_draws_states_its_unit(post: Posterior, tmp_path: Path) -> None:
+    """The same draws stand plain at the top of the file and in the data frame, and scaled in ArviZ's group."""
+    import xarray as xr
+
+    post.save(tmp_path / "posterior.nc")
+    units = {"x0": "px", "y0": "px", "f": "px", "k1": "px^-2", "k2": "px^-4", "sigma": "px"}
+    with xr.open_dataset(tmp_path / "posterior.nc", engine="h5netcdf") as file:
+        stated = dict(zip(file["draws"].columns.split(", "), file["draws"].units.split(", "), strict=True))
+        plain = file["draws"].values
+    table = post.to_dataframe()
+    assert stated == units == table.attrs["units"]
+    assert np.array_equal(plain, table[list(units)].to_numpy())
+    with xr.open_dataset(tmp_path / "posterior.nc", group="posterior", engine="h5netcdf") as file:
+        assert all("units" in file[name].attrs for name in units)
+        # Control: by their units the two are the same number, and by their values alone they are not.
+        scale = float(file["k1"].units.split()[0])
+        assert np.allclose(file["k1"].values.ravel() * scale, plain[:, 3], rtol=1e-12, atol=0.0)
+        assert not np.allclose(file["k1"].values.ravel(), plain[:, 3])
+
+
 def test_bad_files_are_named(tmp_path: Path) -> None:
     import h5netcdf
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,9 @@ SAVED: dict[str, Any] = {
 
 
 def content(path: Path) -> Any:
-    """What a file holds, whatever the order of the names in it."""
+    """What a file holds, whatever the order of the names in it, and the comments."""
+    if path.suffix == ".toml":
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     if path.suffix != ".npz":
         return path.read_bytes()
     arrays = read_arrays(path)

@@ -48,6 +48,23 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 # --- what a cell says ------------------------------------------------------------------------------------------------
 
 
+def test_parameters_of_a_study_have_their_own_units(small: Study, tmp_path: Path) -> None:
+    import xarray as xr
+
+    small.save(tmp_path)
+    units = {"x0": "px", "y0": "px", "f": "px", "k1": "px^-2", "k2": "px^-4"}
+    with xr.open_dataset(tmp_path / "study.nc", engine="h5netcdf") as file:
+        assert dict(zip(file["parameter"].values, file["parameter_unit"].values, strict=True)) == units
+        along = [name for name, array in file.data_vars.items() if "parameter" in array.dims and "units" in array.attrs]
+        assert {file[name].units for name in along} == {", ".join(units.values())}
+        assert {"truth", "sigma", "sigma_curve"} <= set(along)
+    table = small.table()
+    assert dict(zip(table["parameter"], table["unit"], strict=True)) == units
+    # A file of before, without that coordinate, is read.
+    small.data.drop_vars("parameter_unit").pipe(Study, small.definition).save(tmp_path)
+    assert Study.load(tmp_path).table()["unit"].tolist() == table["unit"].tolist()
+
+
 def test_sigma_follows_noise_exactly_and_frames_by_the_root(small: Study) -> None:
     sigma = small.data["sigma"].values
     assert sigma.shape == (6, 5)
