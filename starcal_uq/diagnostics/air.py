@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -50,6 +51,8 @@ _DENSITY_SPREAD, _THIN, _THICK = 0.2, 0.64, 1.06
 # explains that refraction by two constants may leave.
 _AIR_CHI2, _INEXACT = 10.8, 0.01
 _PLACES, _DRAWS, _FRAMES, _STARS = 600, 4000, 200, 4000
+# Frames that get a zenith each.
+_FRAMES_APIECE = 80
 # Sine of the lowest altitude that is taken for possible.
 _LOWEST = np.sin(np.radians(5.0))
 # Damped steps towards the best zeniths, until chi-square falls by less than a tenth.
@@ -140,7 +143,9 @@ def air_test(obs: Observations, cal: Calibration, *, seed: int = 0, stars: StarT
 
 def _looked_for(obs: Observations, cal: Calibration, seed: int, stars: StarTest, sigma: float) -> AirTest | None:
     """The test with the noise of the images as the table has it, `sigma` a common factor."""
-    rest = Remainder(obs, cal, seed, _star_noise(obs, cal, stars, sigma))
+    timed = obs.time_utc is not None and bool((obs.time_utc != "").all())
+    most = _FRAMES if timed else _FRAMES_APIECE
+    rest = Remainder(obs, cal, seed, _star_noise(obs, cal, stars, sigma), most)
     air = _Air(rest, cal.camera)
     found = air.of_one_place(seed)
     if not air.timed and (found is None or not found.is_air):
@@ -194,9 +199,14 @@ class Remainder:
     """
 
     def __init__(
-        self, obs: Observations, cal: Calibration, seed: int, errors: tuple[StarErrors, float] | None = None
+        self,
+        obs: Observations,
+        cal: Calibration,
+        seed: int,
+        errors: tuple[StarErrors, float] | None = None,
+        most: int = _FRAMES,
     ) -> None:
-        chosen = one_of_each(obs.n_frames, min(_FRAMES, max(_STARS * obs.n_frames // obs.n_stars, 3)), seed)
+        chosen = one_of_each(obs.n_frames, min(most, max(_STARS * obs.n_frames // obs.n_stars, 3)), seed)
         self.obs = obs if len(chosen) == obs.n_frames else obs.select_frames(obs.frame_ids[chosen])
         model, rotations = cal.camera.distortion, quaternion_to_rotation(cal.quaternions[chosen])
         self.likelihood = MarginalLikelihood(self.obs, model)
@@ -373,10 +383,18 @@ class _Air:
         f_px = -float(self._alone.left(settled.shift[None])[1][0, 2])
         return found._replace(is_air=good and rest is self._rest, like_others=good and rest is self._alone, f_px=f_px)
 
+    @cached_property
+    def _own_left(self) -> FloatArray:
+        """What is left of scale and shape of each frame by itself, (3, K, m)."""
+        rows, _ = self._alone.left(self._own.reshape(-1, *self._own.shape[2:]))
+        return rows.reshape(*self._own.shape[:2], -1)
+
     def _own_shapes(self, rest: Remainder, which: slice = slice(None)) -> FloatArray:
         """What is left of scale and shape of each frame by itself, as orthonormal rows; `which` of the three."""
         shifts = self._own[which].reshape(-1, *self._own.shape[2:])
-        rows, _ = rest.left(shifts)
+        rows = self._own_left[which].reshape(len(shifts), -1)
+        if rest is self._rest:
+            rows = rest.cleared(rows)
         return _orthonormal(rows / np.linalg.norm(shifts.reshape(len(rows), -1), axis=1)[:, None], _ABSORBED)
 
     def _nothing_else(self, rest: Remainder, column: FloatArray, fitted: int = 0) -> bool:

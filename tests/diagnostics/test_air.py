@@ -250,3 +250,12 @@ def test_many_nights_with_air():
     # Places within their errors, and the focal length where it belongs.
     assert 0.5 < np.sqrt(np.mean(np.square(apart))) < 1.3
     assert abs(np.mean(left)) < 0.6
+
+
+@pytest.mark.slow
+def test_many_tables_without_times():
+    for seed in range(100, 130):
+        _, obs, cal = outside(seed, **PATCH)
+        assert not air_test(obs, cal).is_air
+    named = [air_test(*outside(seed, air="each")[1:]).is_air for seed in range(100, 130)]
+    assert sum(named) >= 28
