@@ -36,7 +36,14 @@ from starcal_uq.diagnostics.shapes import (
     shapes,
 )
 from starcal_uq.estimation.marginal import MarginalLikelihood
-from starcal_uq.estimation.noise_model import NoiseModel, fit_noise, sigma_ratios, weighed
+from starcal_uq.estimation.noise_model import (
+    NoiseModel,
+    axis_noise,
+    fit_noise,
+    noise_model_of,
+    sigma_ratios,
+    weighed,
+)
 from starcal_uq.estimation.star_errors import StarModel
 from starcal_uq.maths.intervals import holm
 from starcal_uq.maths.linear import scaled_inverse
@@ -217,6 +224,8 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
         With a false-alarm rate that is the nominal one for each test, and at most that for all of them together. Of an
         estimate with Student-t tails it is about the stars within 4.5 sigma.
     """
+    from scipy.special import ndtr
+
     obs = weighed(obs, cal)
     left_out = tuple(np.flatnonzero(~heard(obs, cal)).tolist())
     obs, cal = of_heard(obs, cal)
@@ -226,10 +235,15 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
     if (test := sums.frame_by_frame()) is not None:
         tests.append(test)
     of_noise = [
-        (f"noise that changes with {name}", name, z, p) for name, z, p in sums.noise.tests(*sums.independent, sums.dof)
+        (f"noise that changes with {name}", name, z, p)
+        for name, z, p in sums.noise.tests(*_independent(sums.apart), sums.dof)
     ]
     if (frames := sums.noise_by_frame()) is not None:
         of_noise.append(("noise that differs from frame to frame", "frame", *frames))
+    axes = axis_noise(MarginalLikelihood(obs, cal.camera.distortion), cal.theta)
+    names = "noise that differs between the axes", "noise whose axes correlate"
+    for name, z in zip(names, axes.z(noise_model_of(cal)), strict=True):
+        of_noise.append((name, "axis", z, float(2.0 * ndtr(-abs(z)))))
     nothing = float("nan")
     tests += [MisfitTest(name, against, z, 0, sums.dof, p, 1.0, nothing, nothing) for name, against, z, p in of_noise]
     corrected = holm([test.p_value for test in tests])
@@ -340,7 +354,8 @@ class _Sums:
     """Sums over all stars from which every test follows; the table is visited once, some frames at a time.
 
     Where stars bring errors along, `gram` is weighted by them. `plain` is of the parameters and the residuals that are
-    left after each star's offset, which are independent: frame by frame, and for unequal noise.
+    left after each star's offset, which are independent: frame by frame. `apart` is the same for unequal noise: where a
+    noise model has fitted the axes, residuals are whitened by them, so that each has the same share of the squares.
     """
 
     families: tuple[Shape, ...]
@@ -351,6 +366,7 @@ class _Sums:
     noise_px: float
     gram: FloatArray
     plain: FloatArray
+    apart: FloatArray
     raw: FloatArray
     blocks: FloatArray
     own: Shape
@@ -373,6 +389,7 @@ class _Sums:
             noise_px=1.0 if obs.sigma_px is None else float(np.sqrt(np.mean(obs.sigma_px**2))),
             gram=np.zeros((size, size)),
             plain=np.zeros((p + 1, p + 1)),
+            apart=np.zeros((p + 1, p + 1)),
             raw=np.zeros(size),
             blocks=np.zeros((size, size)),
             own=frame_shapes(cal.camera),
@@ -390,10 +407,16 @@ class _Sums:
             if stars is not None:
                 stars.add(part, state, np.concatenate([fitted, part.project_out(state, columns.all())]), rows)
                 fitted[p] = cal.residuals_px[rows].T * (1.0 if part.frames.weight is None else part.frames.weight)
-            h, e = fitted[:p], fitted[p]
             flat = fitted.reshape(p + 1, -1)
             found.plain += flat @ flat.T
             found._add_blocks(part, state, view, fitted, columns)
+            if obs.noise_axes is not None and stars is None:
+                part = MarginalLikelihood(replace(part.frames, axes=obs.noise_axes), cal.camera.distortion)
+                state, _ = part.profile(theta, rotations[first:last])
+                fitted = part.project_out(state, np.concatenate([part.derivatives(theta, state), state.e[None]]))
+                flat = fitted.reshape(p + 1, -1)
+            found.apart += flat @ flat.T
+            h, e = fitted[:p], fitted[p]
             found.noise.add(part.frames, state, h, e, rows)
             matrices = np.moveaxis(part.frames.sum(np.einsum("axn,bxn->abn", h, h)), 2, 0)
             squares = part.frames.sum(np.sum(e**2, axis=0))
@@ -467,9 +490,7 @@ class _Sums:
     @property
     def independent(self) -> tuple[FloatArray, FloatArray, float]:
         """`parameters`, `projection` and `rss` of residuals that are independent."""
-        matrix, slope = self.plain[: self.p, : self.p], self.plain[: self.p, self.p]
-        inverse = scaled_inverse(matrix)
-        return matrix, inverse, float(self.plain[self.p, self.p] - slope @ inverse @ slope)
+        return _independent(self.plain)
 
     def family(self, index: int) -> MisfitTest | None:
         """The test of one family; None where nothing of it is left, or too few data."""
@@ -548,7 +569,7 @@ class _Sums:
         from scipy.special import digamma, gammaincc, ndtri, polygamma
 
         squares, dof, matrices = (np.concatenate(column) for column in zip(*self.frames, strict=True))
-        dof = dof - np.einsum("kab,ba->k", matrices, self.independent[1])
+        dof = dof - np.einsum("kab,ba->k", matrices, _independent(self.apart)[1])
         nu = float(dof.sum())
         if len(dof) < _LEAST_FRAMES or nu < _LEAST_DOF or dof.min() < _LEAST_FRAME_DOF or squares.min() <= 0.0:
             return None
@@ -569,6 +590,13 @@ class _Sums:
         return MisfitTest(
             name, against, statistic, rank, rest, p, 1.0, float(np.sqrt(excess)) * self.noise_px, float("nan")
         )
+
+
+def _independent(gram: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Matrix of the parameters, its inverse and the sum of squares that is left, of a gram with the residuals last."""
+    matrix, slope = gram[:-1, :-1], gram[:-1, -1]
+    inverse = scaled_inverse(matrix)
+    return matrix, inverse, float(gram[-1, -1] - slope @ inverse @ slope)
 
 
 def noise_weights(obs: Observations, camera: Camera) -> dict[str, FloatArray]:

@@ -112,7 +112,7 @@ def predictive_check(
     # The statistics settle long before: of very many stars, those of some frames do.
     limit = max(1, min(obs.n_frames, _MAX_STARS * obs.n_frames // obs.n_stars))
     some, places = frame_sample(weighed(obs, cal), limit, seed)
-    part = MarginalLikelihood(some, cal.camera.distortion)
+    part = MarginalLikelihood(some, cal.camera.distortion, axes=cal.star_errors is None)
     frames = part.frames
     state, _ = part.profile(cal.theta, quaternion_to_rotation(cal.quaternions[places]))
     e, h = state.e, part.project_out(state, part.derivatives(cal.theta, state))

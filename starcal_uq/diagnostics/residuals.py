@@ -133,8 +133,10 @@ def _unit_scale(cal: Calibration, n_stars: int) -> float:
 
 
 def normalised_residuals(cal: Calibration, obs: Observations) -> FloatArray:
-    """Residuals in units of their expected standard deviation, shape (N, 2)."""
-    return np.asarray(cal.residuals_px / residual_scale(cal, obs)[:, None], dtype=np.float64)
+    """Residuals in units of their expected standard deviation, shape (N, 2); of fitted axes, the independent parts."""
+    scaled: FloatArray = cal.residuals_px / residual_scale(cal, obs)[:, None]
+    axes = weighed(obs, cal).noise_axes
+    return scaled if axes is None else scaled @ np.linalg.inv(np.linalg.cholesky(axes)).T
 
 
 @dataclass(frozen=True)

@@ -239,7 +239,7 @@ def calibrate(
         calibration = least_squares(obs, camera, solver, max_iterations)
     else:
         # Weights of another calibration's noise model are what this table states.
-        obs = replace(obs, stated_px=None) if obs.stated_px is not None and noise == "common" else obs
+        obs = replace(obs, stated_px=None, noise_axes=None) if obs.stated_px is not None and noise == "common" else obs
         frames = StarFrames.from_observations(obs)
 
         def fitted(start: Camera) -> Calibration:
@@ -319,7 +319,7 @@ def fit(obs: Observations, camera: Camera, *, method: str = "efficient") -> Fit:
 
     CalibrationError as for `calibrate`, whose ``efficient`` and ``three_stage`` are the methods.
     """
-    likelihood = MarginalLikelihood(obs, camera.distortion)
+    likelihood = MarginalLikelihood(obs, camera.distortion, axes=True)
     check_count(likelihood, camera)
     pairs = PairObjective(likelihood.frames, camera.distortion)
     stages, status = _stages(pairs, camera, likelihood, method, "lm", _ITERATIONS, pairs_read=method != "efficient")
@@ -332,7 +332,7 @@ def refit(obs: Observations, cal: Calibration, model: str) -> Fit:
 
     CalibrationError when neither they nor the nominal camera lead to an estimate.
     """
-    likelihood = MarginalLikelihood(obs, model)
+    likelihood = MarginalLikelihood(obs, model, axes=True)
     start = cal.nominal.replace(distortion=model, coefficients=(0.0,) * len(get_model(model).coefficients))
     check_count(likelihood, start)
     known = dict(zip(cal.parameter_names, cal.theta, strict=True))
@@ -422,8 +422,8 @@ def _with_noise_model(obs: Observations, camera: Camera, method: str, solver: st
     if calibration.status.ok:
         model, theta = fit_noise(obs, calibration.camera, max_iterations=max_iterations)
         if model.varies:
-            obs = obs.weighted(model.sigma_px(obs))
-            likelihood = MarginalLikelihood(obs, camera.distortion)
+            obs = obs.weighted(model.sigma_px(obs), model.axes)
+            likelihood = MarginalLikelihood(obs, camera.distortion, axes=True)
             likelihood.use_rotations(likelihood.start_rotations(theta))
             # The estimate from interstar angles has no weights; its covariance and the refinement do.
             stages = [*calibration.stages[:-1], refinement_stage(likelihood, theta, max_iterations)]

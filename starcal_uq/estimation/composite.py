@@ -197,6 +197,8 @@ def expected_godambe(objective: PairObjective, theta: FloatArray, sigma: float) 
         turned = np.einsum("xyn,ayn->axn", bb, db) + np.einsum("axyn,yn->axn", cross, b)
         # A pixel moves b as the principal point does, the other way round.
         gamma = np.einsum("axn,ixn->ain", turned * scale[:, None, None], db[:2]) * (noise * sigma)
+        if part.axes is not None:
+            gamma = np.einsum("ain,ij->ajn", gamma, np.linalg.cholesky(part.axes))
         flat = gamma.reshape(len(gamma), -1)
         v += flat @ flat.T
     covariance: FloatArray = (h @ v @ h) * np.outer(scale, scale)

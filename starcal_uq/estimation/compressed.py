@@ -170,9 +170,8 @@ class _Expansion:
             outputs = (xy, h.reshape(-1, n), a.reshape(-1, n), bent.reshape(-1, n))
             self._kernel.into((self.theta, b, forward_root(self.model_name, self.theta, b)), outputs)
             e = part.pixel - xy
-            if part.weight is not None:
-                for array in (e, h, a, bent):
-                    array *= part.weight
+            for array in (e, h, a, bent):
+                part.whiten(array)
             d = (self.whitening.T @ h.reshape(p, -1)).reshape(p, 2, n)
             packed = np.stack([np.sum(a[i] * a[j], axis=0) for i, j in zip(ROWS, COLUMNS, strict=True)])
             inverse, determinant = inverse_symmetric(part.sum(packed))
@@ -262,7 +261,7 @@ def gram_sums(
     `known`: sums at theta with settled attitudes, where there are any; the compiled path need not make them again.
     """
     theta = np.asarray(theta, dtype=np.float64)
-    if kernels(model_name, frames.n_stars) == "numba":
+    if frames.axes is None and kernels(model_name, frames.n_stars) == "numba":
         sums, at = settled_sums(frames, model_name, theta, rotations) if known is None else known
         # A nanoradian that is left would move the estimate by some 1e-8 sigma.
         moved = (np.zeros_like(at.shift), at.response, at.inverse)

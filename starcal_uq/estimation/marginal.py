@@ -55,10 +55,14 @@ class Profile:
 
 
 class MarginalLikelihood:
-    """Exact attitude-marginalised likelihood of a table of observations."""
+    """Exact attitude-marginalised likelihood of a table of observations.
 
-    def __init__(self, obs: Observations | StarFrames, model_name: str) -> None:
-        self.frames = obs if isinstance(obs, StarFrames) else StarFrames.from_observations(obs)
+    With `axes` it knows the noise of x and y apart, where a noise model has fitted it; without, stars are weighed alike
+    along both.
+    """
+
+    def __init__(self, obs: Observations | StarFrames, model_name: str, axes: bool = False) -> None:
+        self.frames = obs if isinstance(obs, StarFrames) else StarFrames.from_observations(obs, axes)
         self.model_name = model_name
         self._rotations: FloatArray | None = None
         self._last: tuple[NormalSums, Attitudes] | None = None
@@ -71,7 +75,7 @@ class MarginalLikelihood:
     @property
     def kernels(self) -> str:
         """``numpy`` or ``numba``: what sums over all frames are made with."""
-        return kernels(self.model_name, self.frames.n_stars)
+        return "numpy" if self.frames.axes is not None else kernels(self.model_name, self.frames.n_stars)
 
     def start_rotations(self, theta: FloatArray) -> FloatArray:
         """Attitudes (K, 3, 3) by QUEST at theta."""
@@ -131,9 +135,8 @@ class MarginalLikelihood:
             b = part.rotated(rotations)
             kernel.into((theta, b, forward_root(self.model_name, theta, b)), (e, a.reshape(6, n)))
             np.subtract(part.pixel, e, out=e)
-            if part.weight is not None:
-                e *= part.weight
-                a *= part.weight
+            part.whiten(e)
+            part.whiten(a)
             products = np.stack([np.sum(a[i] * a[j], axis=0) for i, j in zip(ROWS, COLUMNS, strict=True)])
             inverse, determinant = inverse_symmetric(part.sum(products))
             slope = part.sum(np.sum(a * e[None], axis=1))
@@ -224,7 +227,8 @@ class MarginalLikelihood:
         _, h, _ = forward_kernel(self.model_name, "first")(
             self.frames.n_stars, theta, state.b, forward_root(self.model_name, theta, state.b)
         )
-        return h if self.frames.weight is None else h * self.frames.weight
+        self.frames.whiten(h)
+        return h
 
     def attitude_response(self, state: Profile, columns: FloatArray) -> FloatArray:
         """Least-squares rotation vectors (q, 3, K) that reproduce columns (q, 2, N) of pixel shifts."""

@@ -1,5 +1,7 @@
 """Centroid noise that varies: its variance as a smooth function of radius and magnitude, times a factor per frame.
 
+Its axes may differ, and correlate, alike for all stars: smear, or time delay and integration.
+
 The squared residuals of a fit tell the variances. With H the hat matrix of attitudes and parameters (weights as
 fitted), the two residuals of star i have the expected square ``v_i (2 - h_i)``, h_i the trace of its block of H.
 Setting ``sum_i z_i (d_i / v_i - (2 - h_i)) = 0`` for every column z of a log-linear model is restricted maximum
@@ -27,7 +29,7 @@ from starcal_uq.core.settings import NoiseKind
 from starcal_uq.core.types import AnyDict, FloatArray, IntArray
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.stages import refinement_stage
-from starcal_uq.maths.linear import scaled_inverse
+from starcal_uq.maths.linear import scaled_cholesky, scaled_inverse
 from starcal_uq.observations.frames import StarFrames
 from starcal_uq.observations.partitions import PartitionedObservations
 
@@ -44,6 +46,8 @@ _ROUNDS, _CHOOSING_ROUNDS, _SETTLED = 10, 2, 1e-3
 _NEWTON_STEPS, _LONGEST_STEP, _STEP_SETTLED = 50, 2.0, 1e-8
 # Logarithms of the degrees of freedom of the frames' distribution: from wild to hardly different.
 _FRAME_LOG_DOF, _FRAME_LOG_DOF_START = (0.0, 9.0), 3.0
+# Correlations beyond leave the noise no second axis.
+_MOST_CORRELATED = 0.99
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +79,10 @@ class NoiseModel:
         Frames, and the factor of each on the variance; empty where frames are alike, and in a posterior.
     frame_mean : float
         Mean of the factors, which stands for frames that were not observed.
+    axis_ratio : float
+        Noise along x over that along y; 1 where they are alike. The variance above is their geometric mean.
+    axis_correlation : float
+        Correlation of the errors of x and y.
     """
 
     terms: tuple[str, ...]
@@ -91,11 +99,21 @@ class NoiseModel:
     frame_ids: IntArray
     frame_factors: FloatArray
     frame_mean: float
+    axis_ratio: float = 1.0
+    axis_correlation: float = 0.0
 
     @property
     def varies(self) -> bool:
         """Whether the data ask for more than one noise."""
-        return bool(self.terms) or self.frame_dof is not None
+        return bool(self.terms) or self.frame_dof is not None or self.axes is not None
+
+    @property
+    def axes(self) -> FloatArray | None:
+        """Covariance (2, 2) of the noise of x and y, of determinant one; None where the axes are alike."""
+        if self.axis_ratio == 1.0 and self.axis_correlation == 0.0:
+            return None
+        matrix = np.array([[self.axis_ratio, self.axis_correlation], [self.axis_correlation, 1.0 / self.axis_ratio]])
+        return np.asarray(matrix / np.sqrt(1.0 - self.axis_correlation**2))
 
     def __str__(self) -> str:
         if not self.varies:
@@ -117,6 +135,10 @@ class NoiseModel:
             )
         if self.frame_dof is not None:
             parts.append("a factor of its own in every frame" + self._frame_words())
+        if self.axis_ratio != 1.0:
+            parts.append(f"{significant(self.axis_ratio)} times as much along x as along y")
+        if self.axis_correlation != 0.0:
+            parts.append(f"a correlation of {fixed(self.axis_correlation, 2)} between x and y")
         return ", and ".join(filter(None, (", ".join(parts[:-1]), parts[-1])))
 
     def _frame_words(self) -> str:
@@ -183,13 +205,13 @@ def weighed(obs: Observations | PartitionedObservations, result: Any) -> Observa
         obs = obs.select(~left_out)
     model = noise_model_of(result)
     if model is None or not model.varies:
-        return obs if obs.stated_px is None else replace(obs, stated_px=None)
+        return obs if obs.stated_px is None else replace(obs, stated_px=None, noise_axes=None)
     if model.multiplies and obs.unweighted.sigma_px is None:
         return obs
     if obs.stated_px is not None and model.frame_dof is not None and not len(model.frame_ids):
         # A posterior keeps no factors of frames; the calibration that weighed these does.
         return obs
-    return obs.weighted(model.sigma_px(obs))
+    return obs.weighted(model.sigma_px(obs), model.axes)
 
 
 def _sample_of(obs: PartitionedObservations, result: Any) -> Observations:
@@ -224,6 +246,79 @@ def star_squares(likelihood: MarginalLikelihood, theta: FloatArray) -> tuple[Flo
     return np.sum(state.e**2, axis=0), np.maximum(2.0 - by_camera - by_attitude, 1e-6)
 
 
+class AxisNoise(NamedTuple):
+    """Noise of x against that of y, by the residuals of a fit."""
+
+    log_ratio: float  # Logarithm of the noise of x over that of y
+    log_ratio_std: float  # Its standard error
+    correlation: float  # Of their errors
+    correlation_std: float  # Its standard error without one
+
+    def z(self, model: NoiseModel | None = None) -> tuple[float, float]:
+        """Standard normal statistics of ratio and correlation, of what a model leaves."""
+        ratio, correlation = (1.0, 0.0) if model is None else (model.axis_ratio, model.axis_correlation)
+        by_ratio = (self.log_ratio - np.log(ratio)) / self.log_ratio_std
+        limited = np.clip([self.correlation, correlation], -_MOST_CORRELATED, _MOST_CORRELATED)
+        by_correlation = float(np.arctanh(limited[0]) - np.arctanh(limited[1])) / self.correlation_std
+        return float(by_ratio), by_correlation
+
+
+def axis_noise(likelihood: MarginalLikelihood, theta: FloatArray) -> AxisNoise:
+    """Noise of x and y and their correlation, free of what attitudes and parameters take from the residuals.
+
+    With U the orthonormal columns that attitudes and parameters span, residuals are ``(I - U U^T)`` times the errors,
+    and the sums of squares and products of their axes expect linear combinations of the variances and the covariance
+    with traces of products of ``U_x^T U_x``, ``U_y^T U_y`` and ``U_x^T U_y``. Standard errors are those of the scatter
+    of the stars' products, which know the tails of the noise.
+
+    `likelihood`: of weights whose axes are alike.
+    `theta` (p,): estimate, px units.
+    """
+    state, _ = likelihood.profile(theta)
+    frames, n = likelihood.frames, likelihood.frames.n_stars
+    h = likelihood.project_out(state, likelihood.derivatives(theta, state))
+    flat = h.reshape(len(h), -1)
+    camera = np.tensordot(scaled_cholesky(scaled_inverse(flat @ flat.T)).T, h, axes=1)
+    root = np.asarray(np.moveaxis(np.linalg.cholesky(np.moveaxis(state.inverse, 2, 0)), 0, 2), dtype=np.float64)
+    attitude = np.einsum("ijn,ixn->jxn", frames.spread(root), state.attitude)
+
+    def products(one: int, other: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """U^T U over the stars of the axes: attitudes of each frame, both ways of attitudes with camera, camera."""
+        a, b, c, d = attitude[:, one], attitude[:, other], camera[:, one], camera[:, other]
+        inner = frames.sum(np.einsum("in,jn->ijn", a, b))
+        mixed = frames.sum(np.einsum("in,jn->ijn", a, d))
+        turned = frames.sum(np.einsum("in,jn->ijn", b, c))
+        return inner, mixed, turned, c @ d.T
+
+    xx, yy, xy = products(0, 0), products(1, 1), products(0, 1)
+    taken = [float(np.einsum("iik->", part[0]) + np.trace(part[3])) for part in (xx, yy, xy)]
+
+    def squared(one: tuple[FloatArray, ...], other: tuple[FloatArray, ...]) -> float:
+        return float(np.sum(one[0] * other[0]) + 2.0 * np.sum(one[1] * other[1]) + np.sum(one[3] * other[3]))
+
+    across = squared(xx, yy)
+    free = np.array([[n - 2.0 * taken[0] + squared(xx, xx), across], [across, n - 2.0 * taken[1] + squared(yy, yy)]])
+    e = state.e
+    variances = np.linalg.solve(free, np.sum(e**2, axis=1))
+    both_ways = float(np.sum(xy[0] ** 2) + np.sum(xy[1] ** 2) + np.sum(xy[2] ** 2) + np.sum(xy[3] ** 2))
+    transposed = float(np.sum(xy[0] * xy[0].swapaxes(0, 1)) + 2.0 * np.sum(xy[1] * xy[2]) + np.sum(xy[3] * xy[3].T))
+    dof = n - taken[0] - taken[1] + both_ways + transposed
+    if not (np.all(variances > 0.0) and dof > 0.0):
+        return AxisNoise(0.0, np.inf, 0.0, np.inf)
+    sigma = np.sqrt(variances)
+    covariance = (float(e[0] @ e[1]) + float(np.mean(variances)) * taken[2]) / dof
+    correlation = covariance / float(sigma[0] * sigma[1])
+    by_star = np.linalg.solve(free, e**2) / variances[:, None]
+    scatter = by_star[0] - by_star[1]
+    scatter = scatter - np.mean(scatter)
+    # Residuals are smaller than errors: the scatter of their products grows by the square of the share that is left.
+    grown = 2.0 * n / likelihood.dof
+    log_ratio_std = 0.5 * float(np.sqrt(grown * np.sum(scatter**2)))
+    mixed = e[0] * e[1] / (sigma[0] * sigma[1])
+    correlation_std = float(np.sqrt(grown * np.sum((mixed - np.mean(mixed)) ** 2))) / dof
+    return AxisNoise(float(np.log(sigma[0] / sigma[1])), log_ratio_std, float(correlation), correlation_std)
+
+
 def fit_noise(
     obs: Observations, camera: Camera, *, rounds: int = _ROUNDS, max_iterations: int = 200
 ) -> tuple[NoiseModel, FloatArray]:
@@ -237,9 +332,11 @@ def fit_noise(
     plain = StarFrames.from_observations(obs)
     stated = np.ones(obs.n_stars) if obs.sigma_px is None else np.asarray(obs.sigma_px)
     variance, before = np.ones(obs.n_stars), np.ones(obs.n_stars)
-    fit = _Fit((), np.zeros(1), np.zeros(1), None, np.ones(obs.n_frames))
+    fit, model = _Fit((), np.zeros(1), np.zeros(1), None, np.ones(obs.n_frames)), None
     for turn in range(rounds):
-        likelihood = MarginalLikelihood(replace(plain, weight=1.0 / (stated * np.sqrt(variance))), camera.distortion)
+        weight = 1.0 / (stated * np.sqrt(variance))
+        frames = replace(plain, weight=weight, axes=None if model is None else model.axes)
+        likelihood = MarginalLikelihood(frames, camera.distortion)
         if turn > 0:
             likelihood.use_rotations(likelihood.start_rotations(theta))
             stage = refinement_stage(likelihood, theta, max_iterations)
@@ -251,10 +348,15 @@ def fit_noise(
         # The first residuals come from wrong weights: terms are chosen again.
         fit = _chosen(stars) if turn < _CHOOSING_ROUNDS else _fitted(stars, fit.terms, fit.frame_dof is not None)
         variance = fit.variance(stars)
-        if not fit.varies or np.max(np.abs(variance / before - 1.0)) < _SETTLED:
+        alike = MarginalLikelihood(replace(plain, weight=1.0 / (stated * np.sqrt(variance))), camera.distortion)
+        found = _model(obs, camera.with_theta(theta), stars, fit, axis_noise(alike, theta))
+        settled = model is not None and abs(found.axis_ratio / model.axis_ratio - 1.0) < _SETTLED
+        model = found
+        if not model.varies or (settled and np.max(np.abs(variance / before - 1.0)) < _SETTLED):
             break
         before = variance
-    return _model(obs, camera.with_theta(theta), stars, fit), theta
+    assert model is not None
+    return model, theta
 
 
 def sigma_ratios(obs: Observations, camera: Camera, model: NoiseModel, sigma: float) -> FloatArray:
@@ -267,7 +369,8 @@ def sigma_ratios(obs: Observations, camera: Camera, model: NoiseModel, sigma: fl
     state, _ = likelihood.profile(camera.theta)
     h = likelihood.project_out(state, likelihood.derivatives(camera.theta, state))
     whitened = model.sigma_px(obs) * (1.0 if likelihood.frames.weight is None else likelihood.frames.weight)
-    flat, noisy = h.reshape(len(h), -1), (h * whitened).reshape(len(h), -1)
+    turned = h if model.axes is None else np.einsum("pxn,xy->pyn", h, np.linalg.cholesky(model.axes))
+    flat, noisy = h.reshape(len(h), -1), (turned * whitened).reshape(len(h), -1)
     inverse = scaled_inverse(flat @ flat.T)
     real = inverse @ (noisy @ noisy.T) @ inverse
     return np.asarray(np.sqrt(np.diag(real) / np.diag(inverse)) / sigma)
@@ -408,9 +511,11 @@ def _frames_cost(x: FloatArray, stars: _Stars, design: FloatArray, dof: FloatArr
     return -float(np.sum(value) - 0.5 * stars.share @ eta), -slope
 
 
-def _model(obs: Observations, camera: Camera, stars: _Stars, fit: _Fit) -> NoiseModel:
+def _model(obs: Observations, camera: Camera, stars: _Stars, fit: _Fit, axes: AxisNoise) -> NoiseModel:
     known = np.zeros(1) if obs.mag is None else obs.mag[np.isfinite(obs.mag)]
     apart = fit.frame_dof is not None
+    # Schwarz's criterion, as for the terms.
+    ratio, correlation = (z**2 > np.log(obs.n_stars) for z in axes.z())
     return NoiseModel(
         terms=fit.terms,
         coefficients=fit.beta[1:],
@@ -426,4 +531,6 @@ def _model(obs: Observations, camera: Camera, stars: _Stars, fit: _Fit) -> Noise
         frame_ids=np.array(obs.frame_ids) if apart else np.zeros(0, dtype=np.int64),
         frame_factors=fit.factors if apart else np.zeros(0),
         frame_mean=float(np.mean(fit.factors)),
+        axis_ratio=float(np.exp(axes.log_ratio)) if ratio else 1.0,
+        axis_correlation=float(np.clip(axes.correlation, -_MOST_CORRELATED, _MOST_CORRELATED)) if correlation else 0.0,
     )

@@ -67,7 +67,7 @@ class FrameNormals:
         scale: FloatArray | None = None,
     ) -> FrameNormals:
         """Normal equations of a distortion model at theta (p,), attitudes searched from `start` (K, 3, 3)."""
-        frames = obs if isinstance(obs, StarFrames) else StarFrames.from_observations(obs)
+        frames = obs if isinstance(obs, StarFrames) else StarFrames.from_observations(obs, axes=True)
         for _ in range(ATTITUDE_STEPS):
             gram, shift, log_determinant = frame_normals(frames, model, theta, start)
             if not np.max(np.abs(shift)) >= ATTITUDE_TOLERANCE_RAD:

@@ -170,7 +170,7 @@ def frame_sums(
     model is not, and what stays with the part.
     """
     theta = np.asarray(theta, dtype=np.float64)
-    fast = loops.kernels(model_name, frames.n_stars) == "numba"
+    fast = frames.axes is None and loops.kernels(model_name, frames.n_stars) == "numba"
     path = loops.frame_loop if fast else _frame_blocks
     with np.errstate(all="ignore"):
         gram, shift, response, inverse, volume = path(frames, model_name, theta, rotations, residuals)
@@ -236,8 +236,7 @@ def _columns(
         flat = columns.reshape(2 * (p + 4), -1)
         kernel.into((theta, b, forward_root(model_name, theta, b)), (flat[6:8], flat[8:], flat[:6]))
         np.subtract(part.pixel, columns[3], out=columns[3])
-        if part.weight is not None:
-            columns *= part.weight
+        part.whiten(columns)
         if residuals is not None:
             residuals[:, int(starts[first]) : int(starts[last])] = columns[3]
         if first == 0:

@@ -43,7 +43,7 @@ class ExactMarginal:
             self._one: MarginalLikelihood = StarLikelihood(obs, model, theta, start, cal.star_errors, cal.sigma)
             self._one.use_rotations(self._one.rotations_at(theta))
             return
-        self._one = MarginalLikelihood(obs, model)
+        self._one = MarginalLikelihood(obs, model, axes=True)
         if rotations is None and len(cal.quaternions) == self._one.frames.n_frames:
             rotations = quaternion_to_rotation(cal.quaternions)
         if rotations is not None:
@@ -68,7 +68,7 @@ class FrameSample:
         self._whole = cal.compressed
         covariance = self._whole.whitening @ self._whole.whitening.T
         rotations = quaternion_to_rotation(cal.quaternions)[places] if len(cal.quaternions) == obs.n_frames else None
-        frames = StarFrames.from_observations(some)
+        frames = StarFrames.from_observations(some, axes=True)
         frame = np.repeat(np.arange(some.n_frames), frames.sizes)
         plain = replace(cal, star_errors=None)
         self._batches = []

@@ -21,24 +21,27 @@ class StarFrames:
     """Measured pixels (2, N), px, and unit vectors `r` (3, N), ICRS, contiguous by frame.
 
     `weight` (N,) is the inverse of the stated noise of each star, 1/px; None when all stars are alike. Frame k holds
-    the stars ``starts[k]:starts[k + 1]``.
+    the stars ``starts[k]:starts[k + 1]``. `axes` (2, 2) is the covariance of the noise of x and y in units of the
+    stated variance, of determinant one; None where the axes are alike.
     """
 
     pixel: FloatArray
     r: FloatArray
     weight: FloatArray | None
     starts: IntArray
+    axes: FloatArray | None = None
 
     SHAPES: ClassVar[Shapes] = {"pixel": (2, "n"), "r": (3, "n"), "weight": ("n",), "starts": ("k+1",)}
 
     @classmethod
-    def from_observations(cls, obs: Observations) -> StarFrames:
-        """Take the arrays that estimators need."""
+    def from_observations(cls, obs: Observations, axes: bool = False) -> StarFrames:
+        """Take the arrays that estimators need; with `axes`, the noise of x and y is what a noise model found."""
         return cls(
             pixel=np.ascontiguousarray(obs.xy.T),
             r=np.ascontiguousarray(obs.directions_icrs.T),
             weight=None if obs.sigma_px is None else 1.0 / obs.sigma_px,
             starts=obs.frame_starts,
+            axes=obs.noise_axes if axes else None,
         )
 
     @classmethod
@@ -54,6 +57,7 @@ class StarFrames:
             r=np.concatenate([piece.r for piece in pieces], axis=1),
             weight=np.concatenate(weights) if len(weights) == len(pieces) else None,
             starts=np.concatenate([*starts, offsets[-1:]]),
+            axes=pieces[0].axes,
         )
 
     @property
@@ -80,8 +84,25 @@ class StarFrames:
         return np.repeat(values, self.sizes, axis=-1)
 
     def in_pixels(self, whitened: FloatArray) -> FloatArray:
-        """Values (..., N) in px that were divided by the stated noise, where there is one."""
+        """Residuals (2, N) in px that were whitened."""
+        if self.axes is not None:
+            whitened = np.linalg.cholesky(self.axes) @ whitened
         return whitened if self.weight is None else whitened / self.weight
+
+    @cached_property
+    def _whitening(self) -> FloatArray | None:
+        return None if self.axes is None else np.linalg.inv(np.linalg.cholesky(self.axes))
+
+    def whiten(self, columns: FloatArray) -> None:
+        """Whiten columns (..., 2, N) of pixels in place: over the stated noise, its axes alike and apart."""
+        w = self._whitening
+        if w is not None:
+            x, y = columns[..., 0, :], columns[..., 1, :]
+            y *= w[1, 1]
+            y += w[1, 0] * x
+            x *= w[0, 0]
+        if self.weight is not None:
+            columns *= self.weight
 
     def part(self, first: int, last: int) -> StarFrames:
         """Frames `first` up to, not including, `last`."""
@@ -91,6 +112,7 @@ class StarFrames:
             r=self.r[:, stars],
             weight=None if self.weight is None else self.weight[stars],
             starts=self.starts[first : last + 1] - self.starts[first],
+            axes=self.axes,
         )
 
     def select(self, mask: BoolArray) -> StarFrames:
@@ -102,6 +124,7 @@ class StarFrames:
             r=np.take(self.r, rows, axis=1),
             weight=None if self.weight is None else self.weight[rows],
             starts=np.concatenate([[0], np.cumsum(sizes[sizes > 0])]).astype(np.int64),
+            axes=self.axes,
         )
 
     def parts(self, max_stars: int = 100_000) -> list[tuple[int, int]]:

@@ -65,6 +65,9 @@ class Observations(FrameRows, Shown):
     stated_px : array, shape (N,), or None
         Noise that the stars state, px, NaN where they state none, of a table whose `sigma_px` comes from a fitted noise
         model (see `weighted`); None for all other tables.
+    noise_axes : array, shape (2, 2), or None
+        Covariance of the noise of x and y in units of `sigma_px` squared, of determinant one, of a fitted noise model
+        whose axes differ; None where they are alike.
 
     Raises
     ------
@@ -85,6 +88,7 @@ class Observations(FrameRows, Shown):
     temperature_c: FloatArray | None = None
     meta: AnyDict = field(default_factory=dict)
     stated_px: FloatArray | None = None
+    noise_axes: FloatArray | None = None
 
     def __post_init__(self) -> None:
         columns = {name: _array(name, values) for name, values in self.columns.items()}
@@ -166,18 +170,19 @@ class Observations(FrameRows, Shown):
         columns = {name: values[chosen] for name, values in self.columns.items()}
         return replace(self, **columns, stated_px=None if self.stated_px is None else self.stated_px[chosen])
 
-    def weighted(self, sigma_px: FloatArray) -> Observations:
-        """The same data with another noise per axis, (N,) px, in `sigma_px`: that of a fitted noise model."""
+    def weighted(self, sigma_px: FloatArray, noise_axes: FloatArray | None = None) -> Observations:
+        """The same data with another noise, (N,) px, in `sigma_px`, and its axes: those of a fitted noise model."""
         stated = self.unweighted.sigma_px
         kept = np.full(len(self), np.nan) if stated is None else stated
-        return replace(self, sigma_px=sigma_px, stated_px=locked(np.array(kept)))
+        return replace(self, sigma_px=sigma_px, stated_px=locked(np.array(kept)), noise_axes=noise_axes)
 
     @property
     def unweighted(self) -> Observations:
         """The table as it was stated, without the noise of a fitted model."""
         if self.stated_px is None:
             return self
-        return replace(self, sigma_px=None if np.isnan(self.stated_px).all() else self.stated_px, stated_px=None)
+        stated = None if np.isnan(self.stated_px).all() else self.stated_px
+        return replace(self, sigma_px=stated, stated_px=None, noise_axes=None)
 
     def select_frames(self, ids: ArrayLike) -> Observations:
         """The rows of the frames with these numbers.

@@ -151,6 +151,7 @@ def _frame_set(
         r=np.ascontiguousarray(stars.directions_icrs[index].T),
         weight=1.0 / noise_of(noise, mag, pixel),
         starts=np.concatenate([[0], np.cumsum([len(seen) for seen, _ in views])]).astype(np.int64),
+        axes=noise.axes if isinstance(noise, NoiseModel) else None,
     )
     return FrameSet(camera, rotations, frames, mag, *frame_matrices(camera, frames, rotations))
 

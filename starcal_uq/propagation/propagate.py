@@ -267,8 +267,9 @@ class FrameGeometry:
 
     Displacements db of the directions turn the attitude by phi = [sum w (I - b b^T)]^-1 sum w b x db; weights (N,) are
     None where all stars count alike. `noise_px` (N,) is the centroid noise per axis; `response` (K, 3, p) is
-    d phi / d theta, rad per px unit, `noise_response` (2, N, 3) the turn of a star's frame when its x, or its y, is off
-    by one standard deviation, rad, and `noise_covariance` (K, 3, 3) the covariance of phi from centroid noise, rad^2.
+    d phi / d theta, rad per px unit, `noise_response` (2, N, 3) the turns of a star's frame by one standard deviation
+    of its x and of its y, or of two independent parts where a noise model has its axes correlate, rad, and
+    `noise_covariance` (K, 3, 3) the covariance of phi from centroid noise, rad^2.
     """
 
     post: Posterior
@@ -295,7 +296,9 @@ class FrameGeometry:
         w = np.ones(obs.n_stars) if weights is None else weights
         inverse = np.linalg.inv(_frame_sums(w[:, None, None] * (np.eye(3) - b[:, :, None] * b[:, None, :]), starts))
         by_theta = _frame_sums(w[:, None, None] * np.cross(b[:, None], np.swapaxes(per_theta, 1, 2)), starts)
+        root = np.eye(2) if obs.noise_axes is None else np.linalg.cholesky(obs.noise_axes)
         torque = np.stack([(w * noise_px)[:, None] * np.cross(b, column) for column in per_pixel])
+        torque = np.einsum("anj,ab->bnj", torque, root)
         turns = np.einsum("nij,anj->ani", np.repeat(inverse, np.diff(starts), axis=0), torque)
         return cls(
             post=post,
@@ -348,7 +351,8 @@ def _with_noise(
     for part in frames.batches(len(draws)):
         thetas = draws[part]
         e = rng.standard_normal((len(thetas), len(xy), 2))
-        noisy = xy + frames.noise_px[:, None] * e
+        errors = e if frames.obs.noise_axes is None else e @ np.linalg.cholesky(frames.obs.noise_axes).T
+        noisy = xy + frames.noise_px[:, None] * errors
         noise = left_error(frames.attitudes(np.repeat(mean, len(thetas), axis=0), noisy), reference)
         both = left_error(frames.attitudes(thetas, noisy), reference)
         linear = np.add.reduceat(np.einsum("dna,ani->dni", e, frames.noise_response), starts[:-1], axis=1)

@@ -68,7 +68,7 @@ def test_cells_are_summed_as_columns_would_be(stated):
 
 def test_false_alarms_are_nominal_after_refitting():
     names, p, overall = null()
-    assert len(names) == 17
+    assert len(names) == 19
     n = len(p)
     for alpha in (0.01, 0.05, 0.2):
         # Over all tests together; they are correlated, so the error is taken from the scatter over data sets.

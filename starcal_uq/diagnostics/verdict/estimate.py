@@ -224,11 +224,12 @@ def even_noise(found: Misfit, inflated: bool = False) -> Check:
     if not uneven.model.varies:
         sentence = f"{changes}, too little of it to change a stated sigma."
         return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, sentence)
+    of_attitude = "" if uneven.model.axes is None else " and the attitude noise of each axis is another"
     worst = int(np.argmax(np.abs(np.log(uneven.ratios))))
     sentence = (
         f"{changes}: {uneven.model}. The stated sigmas do not know it: that of {uneven.parameter_names[worst]} should "
-        f"be {significant(float(uneven.ratios[worst]))} times as large; with fitted weights the estimate itself would "
-        "be more precise."
+        f"be {significant(float(uneven.ratios[worst]))} times as large{of_attitude}; with fitted weights the estimate "
+        "itself would be more precise."
     )
     return Check(name, Question.TRUSTWORTHY, Level.WARN, value, bound, sentence, NOISE)
 
