@@ -35,6 +35,8 @@ _MARKS, _CORNERS = 12, 5
 _SHIFT = 1.5
 # Largest r of one measurement: positions within 0.3 sigma, errors correlated by more than 0.95.
 _SAME = 0.05
+# From this factor on, residuals hold more than the noise that centroids state, and would make exposures look the same.
+_INFLATED = 3.0
 # Below it, no error that a star or a pixel repeats from exposure to exposure is so much larger than the noise.
 _COPY = 0.002
 # Probability that a table without repeated frames is said to have any.
@@ -80,7 +82,11 @@ class Fingerprints:
         left = _unsmooth(xy, residuals_px.T, rows, found)
         error = np.sqrt(left[0] ** 2 + left[1] ** 2)
         free = np.sqrt(1.0 - 1.5 / np.maximum(sizes, 2))
-        error /= np.repeat(free, np.minimum(sizes, _MARKS))
+        kept = np.minimum(sizes, _MARKS)
+        error /= np.repeat(free, kept)
+        stated = stated_noise(obs)
+        if stated is not None and len(rows):
+            error /= np.repeat(_inflation(error / stated[rows], kept), kept)
         return cls(sizes.astype(np.int64), found.T.astype(np.float32, order="C"), error.astype(np.float32))
 
     @classmethod
@@ -102,6 +108,30 @@ class Fingerprints:
     def counts(self) -> IntArray:
         """Stars kept of each frame, (K,)."""
         return np.minimum(self.sizes, _MARKS)
+
+
+def stated_noise(obs: Observations) -> FloatArray | None:
+    """Noise (N,) that the stars state, px per axis, without the floor that was found for all of them."""
+    if obs.sigma_px is None:
+        return None
+    floor, scale = obs.meta.get("noise_floor_px", 0.0), obs.meta.get("noise_scale", 1.0)
+    variance = (obs.sigma_px / min(scale, 1.0)) ** 2 - (floor / scale) ** 2
+    return np.sqrt(np.maximum(variance, 1e-4 * obs.sigma_px**2))
+
+
+def _inflation(ratio: FloatArray, kept: IntArray) -> FloatArray:
+    """Factor (K,) by which the residuals of frames exceed the noise that their centroids state; 1 where it is small.
+
+    What a wrong camera among others or a poor model adds is common to exposures of one field, and is no noise. The
+    mean logarithm of half a chi-square with two degrees of freedom is minus Euler's constant, and a few wrong stars
+    hardly move it.
+    """
+    there = kept > 0
+    starts = (np.cumsum(kept) - kept)[there]
+    logs = np.add.reduceat(np.log(np.maximum(0.5 * ratio**2, 1e-300)), starts) / kept[there]
+    factor = np.ones(len(kept))
+    factor[there] = np.exp(0.5 * (logs + np.euler_gamma))
+    return np.where(factor > _INFLATED, factor, 1.0)
 
 
 def _most_central(distance: FloatArray, starts: IntArray, sizes: IntArray) -> IntArray:

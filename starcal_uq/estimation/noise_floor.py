@@ -122,7 +122,8 @@ def with_noise_floor(obs: Observations, floor: NoiseFloor) -> Observations:
     if not floor.needed or obs.sigma_px is None:
         return obs
     raised: FloatArray = np.hypot(obs.sigma_px, floor.floor_px / floor.scale) * min(floor.scale, 1.0)
-    return replace(obs, sigma_px=raised, meta={**obs.meta, "noise_floor_px": floor.floor_px})
+    found = {"noise_floor_px": floor.floor_px, "noise_scale": floor.scale}
+    return replace(obs, sigma_px=raised, meta={**obs.meta, **found})
 
 
 def _cost(squares: FloatArray, variance: FloatArray) -> float:
