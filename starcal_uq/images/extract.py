@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from starcal_uq.core.errors import ImageError
+from starcal_uq.core.errors import ImageError, MissingExtraError
 from starcal_uq.core.formatting import plural
 from starcal_uq.core.settings import Bayer, bounded
 from starcal_uq.core.store import Kept
@@ -191,7 +191,7 @@ class _Measure:
             return [self._measured(source, source.name or f"image {number}")]
         try:
             images = read_images(source, self.camera)
-        except ImageError as error:
+        except (ImageError, MissingExtraError) as error:
             return [_left_out(error, Path(source).name, source)]
         return [self._measured(image, image.name) for image in images]
 
@@ -203,7 +203,7 @@ class _Measure:
             if self.camera is not None:
                 image.check_size(self.camera)
             found = find_stars(image, self.options)
-        except ImageError as error:
+        except (ImageError, MissingExtraError) as error:
             return _left_out(error, name, None, image.time_utc or "", sha256.digest())
         entry = _entry(name, image.time_utc or "")
         entry.update(background=found.background, noise=found.noise, psf_sigma_px=found.psf_sigma_px)
@@ -225,7 +225,9 @@ def _entry(name: str, time_utc: str = "", problem: str = "") -> AnyDict:
     }
 
 
-def _left_out(error: ImageError, name: str, source: Any, time_utc: str = "", sha256: bytes | None = None) -> _Frame:
+def _left_out(
+    error: ImageError | MissingExtraError, name: str, source: Any, time_utc: str = "", sha256: bytes | None = None
+) -> _Frame:
     """The entry of an image that cannot be used, with its reason."""
     text = str(error)
     message = f"was left out: {text}"

@@ -115,10 +115,13 @@ def other_sizes(optics: Mapping[int, AnyDict], common: AnyDict) -> dict[str, lis
 
 
 def common_optics(optics: Sequence[AnyDict]) -> AnyDict:
-    """What most images say; nothing of none."""
+    """What most images say, of those of the size that most have; nothing of none."""
     if not optics:
         return {}
-    return dict(Counter(tuple(sorted(said.items())) for said in optics).most_common(1)[0][0])
+    sizes = [(said["width_px"], said["height_px"]) for said in optics]
+    most = Counter(sizes).most_common(1)[0][0]
+    alike = (tuple(sorted(said.items())) for said, size in zip(optics, sizes, strict=True) if size == most)
+    return dict(Counter(alike).most_common(1)[0][0])
 
 
 def exif_of(picture: Any) -> AnyDict:
