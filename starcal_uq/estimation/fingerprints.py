@@ -116,7 +116,7 @@ def stated_noise(obs: Observations) -> FloatArray | None:
         return None
     floor, scale = obs.meta.get("noise_floor_px", 0.0), obs.meta.get("noise_scale", 1.0)
     variance = (obs.sigma_px / min(scale, 1.0)) ** 2 - (floor / scale) ** 2
-    return np.sqrt(np.maximum(variance, 1e-4 * obs.sigma_px**2))
+    return np.asarray(np.sqrt(np.maximum(variance, 1e-4 * obs.sigma_px**2)))
 
 
 def _inflation(ratio: FloatArray, kept: IntArray) -> FloatArray:
