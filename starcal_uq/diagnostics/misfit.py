@@ -368,6 +368,7 @@ class _Sums:
     plain: FloatArray
     apart: FloatArray
     raw: FloatArray
+    inner: FloatArray
     blocks: FloatArray
     own: Shape
     block_rank: int = 0
@@ -391,6 +392,7 @@ class _Sums:
             plain=np.zeros((p + 1, p + 1)),
             apart=np.zeros((p + 1, p + 1)),
             raw=np.zeros(size),
+            inner=np.zeros((size - p - 1, size - p - 1)),
             blocks=np.zeros((size, size)),
             own=frame_shapes(cal.camera),
             names=cal.parameter_names,
@@ -442,6 +444,7 @@ class _Sums:
         inner, across = columns.inner(), columns.across(fitted)
         self.raw[:n] += np.sum(own**2, axis=(1, 2))
         self.raw[n:] += np.diag(inner)
+        self.inner += inner
         turned = columns.by_frame(state.attitude)
         answer = sum(turned[i][:, None] * state.inverse[i] for i in range(3))
         self.gram[:n, :n] += flat @ flat.T
@@ -550,14 +553,13 @@ class _Sums:
 
     def pattern(self, found: Sequence[str], n_tests: int) -> Pattern:
         """The shapes of the tests that rejected, fitted together."""
-        fit = Fit(self.gram, self.blocks, self.raw, self.p, self.dof, self.block_rank)
-        places, first = {}, self.p + 1
+        fit = Fit(self.gram, self.blocks, self.raw, self.inner, self.p, self.dof, self.block_rank)
+        families, first = {}, self.p + 1
         for family in self.families:
-            places[family.name] = slice(first, first + family.size)
+            if family.name in found:
+                families[family.name] = family, slice(first, first + family.size)
             first += family.size
-        return fit.pattern(
-            {name: place for name, place in places.items() if name in found}, FRAME_BY_FRAME in found, ALPHA / n_tests
-        )
+        return fit.pattern(families, FRAME_BY_FRAME in found, ALPHA / n_tests)
 
     def noise_by_frame(self) -> tuple[float, float] | None:
         """Normal z and p-value of Bartlett's test that all frames have one noise; None for too few frames.

@@ -9,6 +9,10 @@ The attitude of a frame then errs by its least-squares response
 with A the attitude Jacobian of that frame, C the shapes at its own stars, a their amplitudes, B the derivatives by the
 camera's parameters and G what the calibration's parameters took up of each shape. Amplitudes have an error, so that the
 square of what they give is too large by its own variance on average: that is taken off, and what is left has a bound.
+
+Shapes that are a basis for any smooth misfit hold combinations that attitudes or parameters imitate, and by which even
+a small leak of another misfit would be divided. Their amplitudes have a prior, as large in every combination, px over
+the stars, as those are that the residuals show well.
 """
 
 from __future__ import annotations
@@ -22,7 +26,7 @@ import numpy as np
 from starcal_uq.attitude.rotations import quaternion_to_rotation
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.types import FloatArray, Shapes
-from starcal_uq.diagnostics.shapes import FRAME_BY_FRAME, MAX_CELLS, Shape, View, frame_shapes, shapes
+from starcal_uq.diagnostics.shapes import FRAME_BY_FRAME, MAX_CELLS, OVER_FIELD, Shape, View, frame_shapes, shapes
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.propagation.alignment import alignment_weights
@@ -40,6 +44,8 @@ _UPPER = 1.645
 # Directions of which attitudes and parameters absorb all but this share of the square are not there.
 _ABSORBED = 1e-8
 _DIRECTION_P = 0.05
+# Share of the square of a shape that attitudes and parameters must leave in sight for its amplitude to set a prior.
+_SEEN = 0.1
 # Standard errors that a variance over frames has to exceed.
 _SAID = 3.0
 
@@ -60,12 +66,24 @@ class Pattern:
     variance: float  # Variance of the noise that is left, px^2, or relative to what stars state
     n_frames: int = 0  # Number of frames behind it
     max_cells: int = MAX_CELLS  # Largest number of field cells along the longer side
+    n_with_prior: int = 0  # Number of directions, the last ones, whose amplitudes have a prior
     left_out: tuple[int, ...] = ()  # Rows of the table that had no say in the fit, and in the families' columns
 
     SHAPES: ClassVar[Shapes] = {
         **{"directions": ("q", "j"), "amplitudes": ("j",), "covariance": ("j", "j"), "parameters": ("j", "p")},
         "frame_covariance": (3, 3),
     }
+
+    @property
+    def products(self) -> FloatArray:
+        """Expected products (J, J) of the true amplitudes.
+
+        What has a prior is as large as that leaves it, what has none by its noise smaller than it is estimated.
+        """
+        first = len(self.amplitudes) - self.n_with_prior
+        made = np.outer(self.amplitudes, self.amplitudes) - self.covariance
+        made[first:, first:] += 2.0 * self.covariance[first:, first:]
+        return made
 
     def among(self, families: Sequence[Shape]) -> list[Shape]:
         """Its own families, in the order of the rows of `directions`; LookupError where one is not among these."""
@@ -172,10 +190,10 @@ class _Turned:
 
 
 def _square(matrices: FloatArray, pattern: Pattern) -> tuple[FloatArray, FloatArray]:
-    """Quadratic forms (3,) of the true amplitudes, free of bias, and their standard errors."""
+    """Expected quadratic forms (3,) of the true amplitudes, and their standard errors."""
     a, C = pattern.amplitudes, pattern.covariance
     noisy = matrices @ C
-    value = np.einsum("j,ijk,k->i", a, matrices, a) - np.einsum("ijj->i", noisy)
+    value = np.einsum("ijk,jk->i", matrices, pattern.products)
     linear, quadratic = np.einsum("j,ijk,k->i", a, noisy @ matrices, a), np.einsum("ijk,ikj->i", noisy, noisy)
     # At the estimate the first term counts the noise once too often; it can then not fall below the second.
     return value, np.sqrt(np.maximum(4.0 * linear - 2.0 * quadratic, 2.0 * quadratic))
@@ -190,28 +208,32 @@ class Fit:
     gram: FloatArray
     blocks: FloatArray
     raw: FloatArray  # (p + 1 + q,): squares of the same before attitudes were removed
+    inner: FloatArray  # (q, q): products of the columns among themselves before attitudes were removed
     # `p`, `dof`, `block_rank`: parameters, degrees of freedom of the residuals, and those that frames by themselves
     # take.
     p: int
     dof: int
     block_rank: int
 
-    def pattern(self, places: dict[str, slice], frame_by_frame: bool, alpha: float) -> Pattern:
-        """Fit the families at these places, and frames by themselves, the strongest first.
+    def pattern(self, families: dict[str, tuple[Shape, slice]], frame_by_frame: bool, alpha: float) -> Pattern:
+        """Fit these families, which have these places, and frames by themselves, the strongest first.
 
-        `alpha` is the level of a single test; what does not reach it beside those before is left out.
+        `alpha` is the level of a single test; what does not reach it beside those before is left out. A family without
+        labels is a basis for any smooth misfit: amplitudes of the first one, and of all that come after it, have a
+        prior. One over the field counts with all of its shapes, as a misfit has no reason to be only where attitudes
+        and parameters leave it in sight; terms of a known form are then no longer told from it.
         """
         size = len(self.gram) - self.p - 1
-        left = dict(places)
+        left, places = dict(families), {name: place for name, (_, place) in families.items()}
         chosen: list[str] = []
         directions = np.zeros((size, 0))
-        own = False
+        own, certain = False, None
         while left or (frame_by_frame and not own):
             system = self._system(own)
             rest, dof = _without(system, directions), self._dof(own) - directions.shape[1]
             steps = {
                 name: self._step(rest, dof, slice(at.start - self.p, at.stop - self.p), alpha)
-                for name, at in left.items()
+                for name, (_, at) in left.items()
             }
             gains = {name: step[0] for name, step in steps.items() if step is not None}
             if frame_by_frame and not own:
@@ -227,11 +249,19 @@ class Fit:
             if best == FRAME_BY_FRAME:
                 own = True
                 continue
-            step = steps[best]
+            step, (shape, at) = steps[best], left.pop(best)
             assert step is not None
-            directions = np.column_stack((directions, _placed(step[1], left[best].start - self.p - 1, size)))
-            del left[best]
-        return self._fitted(tuple(chosen), places, directions, own)
+            if certain is None and not shape.labels:
+                certain = directions.shape[1]
+            found = step[1]
+            if not shape.labels and shape.against in OVER_FIELD:
+                norm = np.sqrt(self.raw[at])
+                found = np.diag(1.0 / np.where(norm > 0.0, norm, 1.0))[:, norm > 0.0]
+                left = {name: (s, p) for name, (s, p) in left.items() if not s.labels or s.against not in OVER_FIELD}
+            directions = np.column_stack((directions, _placed(found, at.start - self.p - 1, size)))
+        if certain is None:
+            certain = directions.shape[1]
+        return self._fitted(tuple(chosen), places, directions, own, certain)
 
     def _system(self, own: bool) -> FloatArray:
         """Residuals and columns (1 + q, 1 + q) with the parameters removed, and frames by themselves if `own`."""
@@ -273,17 +303,31 @@ class Fit:
         said = fdtrc(1.0, dof - rank, squares / variance) * rank < _DIRECTION_P
         return gain, vectors[:, said if said.any() else slice(None)] / norm[:, None]
 
-    def _fitted(self, chosen: tuple[str, ...], places: dict[str, slice], directions: FloatArray, own: bool) -> Pattern:
+    def _fitted(
+        self, chosen: tuple[str, ...], places: dict[str, slice], directions: FloatArray, own: bool, certain: int
+    ) -> Pattern:
+        """The pattern of all directions, of which the first `certain` have no prior."""
         system = self._system(own)
         matrix, slope = directions.T @ system[1:, 1:] @ directions, directions.T @ system[1:, 0]
         inverse = _inverse(matrix)
-        amplitudes = inverse @ slope
-        variance = float(system[0, 0] - slope @ amplitudes) / (self._dof(own) - len(slope))
+        variance = float(system[0, 0] - slope @ inverse @ slope) / (self._dof(own) - len(slope))
+        covariance = variance * inverse
+        if certain < len(slope):
+            loose = _without(system, directions[:, :certain])
+            free = directions[:, certain:]
+            lengths = free.T @ self.inner @ free
+            # Columns of two families may make the same shape.
+            raw = lengths + _ABSORBED * np.diag(np.diag(lengths))
+            precision = np.zeros_like(matrix)
+            size = _prior_variance(free.T @ loose[1:, 1:] @ free, raw, free.T @ loose[1:, 0], variance)
+            precision[certain:, certain:] = raw / size
+            covariance = np.asarray(np.linalg.inv(matrix / variance + precision), dtype=np.float64)
+        amplitudes = covariance @ slope / variance
         absorbed = scaled_inverse(self.gram[: self.p, : self.p]) @ self.gram[: self.p, self.p + 1 :] @ directions
         rows = [np.arange(self.p, len(self.gram) - 1)[:0]]
         names = [name for name in chosen if name != FRAME_BY_FRAME]
         rows += [np.arange(places[name].start, places[name].stop) - self.p - 1 for name in names]
-        arrays = (directions[np.concatenate(rows)], amplitudes, variance * inverse, absorbed.T)
+        arrays = (directions[np.concatenate(rows)], amplitudes, covariance, absorbed.T)
         # Nothing is nothing, also when it is read from a file.
         directions, amplitudes, covariance, parameters = (a if a.size else np.zeros(0) for a in arrays)
         return Pattern(
@@ -294,7 +338,24 @@ class Fit:
             parameters=parameters,
             frame_covariance=np.zeros((3, 3)),
             variance=variance,
+            n_with_prior=len(slope) - certain,
         )
+
+
+def _prior_variance(matrix: FloatArray, raw: FloatArray, slope: FloatArray, variance: float) -> float:
+    """Variance of every amplitude of a pattern that is as large in any direction of its shapes.
+
+    `matrix`, `slope`: normal equations of the amplitudes, attitudes and parameters removed. `raw`: products of the
+    shapes before that; in combinations that are orthonormal in it the amplitudes are independent. Those set the size
+    that are in sight: a leak of another misfit into what attitudes imitate is divided by nearly nothing.
+    """
+    from scipy.linalg import eigh
+
+    shares, vectors = eigh(matrix, raw)
+    seen = shares >= min(_SEEN, shares[-1])
+    squares = (vectors[:, seen].T @ slope) ** 2 / shares[seen] ** 2
+    noise = variance / shares[seen]
+    return float(max(np.mean(squares - noise), np.mean(noise) / np.sqrt(len(noise))))
 
 
 def _placed(columns: FloatArray, first: int, size: int) -> FloatArray:

@@ -15,6 +15,7 @@ import numpy as np
 from starcal_uq.core.constants import AXES
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.status import Level
+from starcal_uq.diagnostics.shapes import IN_FIELD
 
 if TYPE_CHECKING:
     from starcal_uq.core.types import FloatArray
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
     from starcal_uq.propagation.attitude_error import AttitudeError
 
 # What keeps its place in the field bends directions; so does a scale of each frame's own, whose mean no frame shows.
-_BENDING = ("radius", "azimuth", "field", "field cells", "frame")
+_BENDING = (*IN_FIELD, "frame")
 
 
 @dataclass(frozen=True)
@@ -67,18 +68,17 @@ def on_directions(noncentrality: float, n_parameters: int) -> Effect:
 def of_pattern(pattern: Pattern | None, found: Sequence[MisfitTest], cal: Calibration) -> list[Effect]:
     """Effects on parameters and directions of a pattern, and of these tests, which rejected.
 
-    Of a pattern the noise of its amplitudes is taken off. Where there is none, as in a diagnosis of an earlier version,
-    the tests stand for it.
+    Where there is no pattern, as in a diagnosis of an earlier version, the tests stand for it.
     """
     effects, absorbed = [], 0.0
     if pattern is not None and pattern.amplitudes.size:
         taken = pattern.parameters / cal.sigmas
-        shift, noise = pattern.amplitudes @ taken, taken.T @ pattern.covariance @ taken
-        sizes = np.sqrt(np.maximum(shift**2 - np.diag(noise), 0.0))
+        shifts = taken.T @ pattern.products @ taken
+        sizes = np.sqrt(np.maximum(np.diag(shifts), 0.0))
         worst = int(np.argmax(sizes))
         effects.append(Effect(cal.parameter_names[worst], float(sizes[worst])))
         weight = np.linalg.pinv(cal.covariance / np.outer(cal.sigmas, cal.sigmas), hermitian=True)
-        absorbed = float(shift @ weight @ shift - np.trace(weight @ noise))
+        absorbed = float(np.sum(weight * shifts))
     fitted = pattern.families if pattern is not None else ()
     bending = [test for test in found if test.against in _BENDING and (not fitted or test.name in fitted)]
     seen = max((_noncentrality(test) for test in bending), default=0.0)

@@ -21,6 +21,7 @@ from starcal_uq.core.status import (
 )
 from starcal_uq.core.types import BoolArray
 from starcal_uq.diagnostics.misfit import ALPHA
+from starcal_uq.diagnostics.shapes import IN_FIELD
 from starcal_uq.diagnostics.verdict.effect import largest, of_pattern, on_attitudes, on_directions
 from starcal_uq.diagnostics.verdict.observed import NOISE, ROBUST, SCREEN, richer
 from starcal_uq.estimation.fallback import fallback_words
@@ -144,7 +145,6 @@ def truth_z(cal: Calibration, truth: Camera, post: Posterior | None = None) -> F
 
 # Frames that scatter by less than this beyond the formal errors are of no consequence, however sure.
 JACKKNIFE_RATIO = 1.1
-_OF_THE_LENS = ("radius", "azimuth", "field", "field cells")
 
 
 def model_checks(
@@ -190,7 +190,7 @@ def misfit(found: Misfit, cal: Calibration, attitude: AttitudeError | None = Non
     sentence = f"The residuals hold more than noise: {join_words(words)}{more}. {effect}{_hardly_told(rejected[0])}"
     level = effect.level if min(patterns) < MISFIT_FAIL_P else Level.WARN
     # A lens can follow what keeps its place in the field; what does not is at best counted as noise.
-    remedy = model_remedy(richer(cal.camera.distortion)) if any(t.against in _OF_THE_LENS for t in rejected) else NOISE
+    remedy = model_remedy(richer(cal.camera.distortion)) if any(t.against in IN_FIELD for t in rejected) else NOISE
     return Check(name, Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
 
 
