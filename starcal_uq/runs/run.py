@@ -1007,7 +1007,7 @@ class Run:
         from starcal_uq.presentation.pages.notebook import executed, write_cells
 
         place = self.path / RunFolder.notebook if to is None else Path(to)
-        ensure_new(place, force)
+        ensure_new(place, force or (to is None and self.folder.is_older("notebook")))
         # What is wrong with the run is told here, and not by a cell.
         _ = self.results
         parts = [name for name in FILES if self.has(name)] + ["images"] * (self.images is not None)

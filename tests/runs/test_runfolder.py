@@ -134,6 +134,27 @@ def test_require_names_the_command(tmp_path):
         run.require("posteriors")
 
 
+def test_a_budget_makes_what_rests_on_it_older_and_takes_nothing_away(tmp_path):
+    run = RunFolder(tmp_path / "run")
+
+    def do(step, name):
+        with run.step(step, {}) as files:
+            atomic_write_text(files.path / name, step)
+
+    for step, name in (("propagate", "attitude.csv"), ("budget", "budget.csv"), ("report", "report.html")):
+        do(step, name)
+    do("notebook", "report.ipynb")
+    assert not any(map(run.is_older, run.manifest.steps))
+    do("budget", "budget.csv")
+    assert [step for step in run.manifest.steps if run.is_older(step)] == ["report", "notebook"]
+    assert run.report.exists() and run.notebook.exists() and run.resting_on("budget") == []
+    do("report", "report.html")
+    assert [step for step in run.manifest.steps if run.is_older(step)] == ["notebook"]
+    # Control: another step takes away what rests on its result.
+    do("propagate", "attitude.csv")
+    assert list(run.manifest.steps) == ["propagate"] and not run.report.exists() and not run.budget.exists()
+
+
 def test_a_file_is_no_run_folder(tmp_path):
     path = tmp_path / "run"
     path.write_text("", encoding="utf-8")
