@@ -235,8 +235,7 @@ def misfit_tests(obs: Observations, cal: Calibration, *, max_cells: int = MAX_CE
     if (test := sums.frame_by_frame()) is not None:
         tests.append(test)
     of_noise = [
-        (f"noise that changes with {name}", name, z, p)
-        for name, z, p in sums.noise.tests(*_independent(sums.apart), sums.dof)
+        (f"noise that changes with {name}", name, z, p) for name, z, p in sums.noise.tests(*sums.independent, sums.dof)
     ]
     if (frames := sums.noise_by_frame()) is not None:
         of_noise.append(("noise that differs from frame to frame", "frame", *frames))
@@ -291,14 +290,15 @@ class _Columns:
         *others, last = families
         frames = view.part.frames
         dense = np.concatenate([family.columns(view) for family in others])
-        if frames.weight is not None:
-            dense *= frames.weight
+        frames.whiten(dense)
         assert last.cell is not None
         return cls(frames, dense, last.cell(view), last.size // 2)
 
     def all(self) -> FloatArray:
         """Every column (q, 2, n)."""
-        return np.concatenate([self.dense, self._weight(cell_columns(self.cell, self.n_cells))])
+        cells = cell_columns(self.cell, self.n_cells)
+        self.frames.whiten(cells)
+        return np.concatenate([self.dense, cells])
 
     def _weight(self, values: Any) -> Any:
         return values if self.frames.weight is None else values * self.frames.weight
@@ -312,8 +312,18 @@ class _Columns:
         found[d:, :d] = self._by_cell(self.dense)
         found[:d, d:] = found[d:, :d].T
         unit = self._weight(self._weight(np.ones(len(self.cell))))
-        found[cells, cells] = np.repeat(np.bincount(self.cell, unit, self.n_cells), 2)
+        squares = np.bincount(self.cell, unit, self.n_cells)
+        w = self.frames.whitening
+        axes = np.eye(2) if w is None else w.T @ w
+        for i in range(2):
+            for j in range(2):
+                found[cells[i::2], cells[j::2]] = axes[i, j] * squares
         return found
+
+    def _turned(self, sums: FloatArray) -> FloatArray:
+        """Sums (c, 2, m) of whitened columns over cells, along the axes of the cells' own shifts."""
+        w = self.frames.whitening
+        return sums if w is None else np.einsum("ba,cbm->cam", w, sums)
 
     def across(self, columns: FloatArray) -> FloatArray:
         """Products (q, m) with columns (m, 2, n)."""
@@ -326,7 +336,7 @@ class _Columns:
         present, first = np.unique(self.cell[order], return_index=True)
         sums = np.zeros((self.n_cells, 2, len(columns)))
         sums[present] = np.add.reduceat(np.take(self._weight(columns), order, axis=-1), first, axis=-1).T
-        return sums.reshape(2 * self.n_cells, -1)
+        return self._turned(sums).reshape(2 * self.n_cells, -1)
 
     def by_frame(self, few: FloatArray) -> FloatArray:
         """Products (i, q, K) with few columns (i, 2, n) over the stars of each frame."""
@@ -339,6 +349,7 @@ class _Columns:
             for axis in range(2):
                 sums = np.bincount(place, self._weight(column[axis]), k * self.n_cells)
                 cells[:, axis] = sums.reshape(k, self.n_cells).T
+            cells[:] = self._turned(cells)
         return found
 
 
@@ -354,8 +365,7 @@ class _Sums:
     """Sums over all stars from which every test follows; the table is visited once, some frames at a time.
 
     Where stars bring errors along, `gram` is weighted by them. `plain` is of the parameters and the residuals that are
-    left after each star's offset, which are independent: frame by frame. `apart` is the same for unequal noise: where a
-    noise model has fitted the axes, residuals are whitened by them, so that each has the same share of the squares.
+    left after each star's offset, which are independent: frame by frame, and for unequal noise.
     """
 
     families: tuple[Shape, ...]
@@ -366,7 +376,6 @@ class _Sums:
     noise_px: float
     gram: FloatArray
     plain: FloatArray
-    apart: FloatArray
     raw: FloatArray
     inner: FloatArray
     blocks: FloatArray
@@ -378,7 +387,7 @@ class _Sums:
 
     @classmethod
     def over(cls, obs: Observations, cal: Calibration, families: tuple[Shape, ...]) -> _Sums:
-        likelihood = MarginalLikelihood(obs, cal.camera.distortion)
+        likelihood = MarginalLikelihood(obs, cal.camera.distortion, axes=cal.star_errors is None)
         p, theta = len(cal.theta), cal.theta
         size = p + 1 + sum(family.size for family in families)
         found = cls(
@@ -390,7 +399,6 @@ class _Sums:
             noise_px=1.0 if obs.sigma_px is None else float(np.sqrt(np.mean(obs.sigma_px**2))),
             gram=np.zeros((size, size)),
             plain=np.zeros((p + 1, p + 1)),
-            apart=np.zeros((p + 1, p + 1)),
             raw=np.zeros(size),
             inner=np.zeros((size - p - 1, size - p - 1)),
             blocks=np.zeros((size, size)),
@@ -412,12 +420,6 @@ class _Sums:
             flat = fitted.reshape(p + 1, -1)
             found.plain += flat @ flat.T
             found._add_blocks(part, state, view, fitted, columns)
-            if obs.noise_axes is not None and stars is None:
-                part = MarginalLikelihood(replace(part.frames, axes=obs.noise_axes), cal.camera.distortion)
-                state, _ = part.profile(theta, rotations[first:last])
-                fitted = part.project_out(state, np.concatenate([part.derivatives(theta, state), state.e[None]]))
-                flat = fitted.reshape(p + 1, -1)
-            found.apart += flat @ flat.T
             h, e = fitted[:p], fitted[p]
             found.noise.add(part.frames, state, h, e, rows)
             matrices = np.moveaxis(part.frames.sum(np.einsum("axn,bxn->abn", h, h)), 2, 0)
@@ -435,9 +437,10 @@ class _Sums:
         A product of columns after projection is that before, less the products of what rotations of the frames make of
         both: nothing of the size of the many columns is written for it.
         """
-        view, weight = View.of(part, state, theta, rows), part.frames.weight
+        view = View.of(part, state, theta, rows)
         columns = _Columns.of(self.families, view)
-        h = view.parameter_columns if weight is None else view.parameter_columns * weight
+        h = view.parameter_columns.copy()
+        part.frames.whiten(h)
         own = np.concatenate([h, state.e[None]])
         fitted = part.project_out(state, own)
         n, flat = len(own), fitted.reshape(len(own), -1)
@@ -459,8 +462,7 @@ class _Sums:
         """Scale and quadrupole of every frame by itself: three columns per frame, which no other frame sees."""
         frames = part.frames
         columns = self.own.columns(view)
-        if frames.weight is not None:
-            columns = columns * frames.weight
+        frames.whiten(columns)
         raw = np.sqrt(frames.sum(np.sum(columns**2, axis=1)))
         columns = part.project_out(state, columns / frames.spread(raw)[:, None])
         gram = np.moveaxis(frames.sum(np.einsum("axn,bxn->abn", columns, columns)), 2, 0)
@@ -493,7 +495,9 @@ class _Sums:
     @property
     def independent(self) -> tuple[FloatArray, FloatArray, float]:
         """`parameters`, `projection` and `rss` of residuals that are independent."""
-        return _independent(self.plain)
+        matrix, slope = self.plain[: self.p, : self.p], self.plain[: self.p, self.p]
+        inverse = scaled_inverse(matrix)
+        return matrix, inverse, float(self.plain[self.p, self.p] - slope @ inverse @ slope)
 
     def family(self, index: int) -> MisfitTest | None:
         """The test of one family; None where nothing of it is left, or too few data."""
@@ -571,7 +575,7 @@ class _Sums:
         from scipy.special import digamma, gammaincc, ndtri, polygamma
 
         squares, dof, matrices = (np.concatenate(column) for column in zip(*self.frames, strict=True))
-        dof = dof - np.einsum("kab,ba->k", matrices, _independent(self.apart)[1])
+        dof = dof - np.einsum("kab,ba->k", matrices, self.independent[1])
         nu = float(dof.sum())
         if len(dof) < _LEAST_FRAMES or nu < _LEAST_DOF or dof.min() < _LEAST_FRAME_DOF or squares.min() <= 0.0:
             return None
@@ -592,13 +596,6 @@ class _Sums:
         return MisfitTest(
             name, against, statistic, rank, rest, p, 1.0, float(np.sqrt(excess)) * self.noise_px, float("nan")
         )
-
-
-def _independent(gram: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Matrix of the parameters, its inverse and the sum of squares that is left, of a gram with the residuals last."""
-    matrix, slope = gram[:-1, :-1], gram[:-1, -1]
-    inverse = scaled_inverse(matrix)
-    return matrix, inverse, float(gram[-1, -1] - slope @ inverse @ slope)
 
 
 def noise_weights(obs: Observations, camera: Camera) -> dict[str, FloatArray]:

@@ -90,12 +90,13 @@ class StarFrames:
         return whitened if self.weight is None else whitened / self.weight
 
     @cached_property
-    def _whitening(self) -> FloatArray | None:
+    def whitening(self) -> FloatArray | None:
+        """Matrix (2, 2) that makes the noise of x and y alike and independent; None where it is."""
         return None if self.axes is None else np.linalg.inv(np.linalg.cholesky(self.axes))
 
     def whiten(self, columns: FloatArray) -> None:
         """Whiten columns (..., 2, N) of pixels in place: over the stated noise, its axes alike and apart."""
-        w = self._whitening
+        w = self.whitening
         if w is not None:
             x, y = columns[..., 0, :], columns[..., 1, :]
             y *= w[1, 1]

@@ -10,11 +10,13 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.core.records import from_plain
 from starcal_uq.core.status import Level
+from starcal_uq.diagnostics import misfit
 from starcal_uq.diagnostics.misfit import misfit_tests
+from starcal_uq.diagnostics.shapes import View, shapes
 from starcal_uq.diagnostics.verdict.estimate import even_noise
 from starcal_uq.estimation.marginal import MarginalLikelihood
 from starcal_uq.estimation.merging import merge
-from starcal_uq.estimation.noise_model import NoiseModel, axis_noise
+from starcal_uq.estimation.noise_model import NoiseModel, axis_noise, weighed
 from starcal_uq.planning.information import random_frames
 from starcal_uq.sky.catalogue import load_catalogue
 from tests.helpers.outside import Campaign, attitude_errors, campaign
@@ -120,6 +122,38 @@ def test_a_model_of_an_earlier_version_has_no_axes():
     record = sc.calibrate(obs, camera, noise="model").noise_model.record()
     older = {name: value for name, value in record.items() if not name.startswith("axis_")}
     assert from_plain(NoiseModel, older).axes is None
+
+
+def test_shapes_are_whitened_as_their_residuals_are():
+    """Sums over cells of the field are those of their columns."""
+    obs, camera = given(observed(TURNED, 4))
+    cal = sc.calibrate(obs, camera, noise="model")
+    part = MarginalLikelihood(weighed(obs, cal), "brown", axes=True)
+    state, _ = part.profile(cal.theta)
+    view = View.of(part, state, cal.theta, slice(None))
+    columns = misfit._Columns.of(shapes(obs, cal.camera), view)
+    every = columns.all()
+    flat = every.reshape(len(every), -1)
+    np.testing.assert_allclose(columns.inner(), flat @ flat.T, atol=1e-9 * np.abs(flat @ flat.T).max())
+    few = state.attitude
+    across = flat @ few.reshape(3, -1).T
+    np.testing.assert_allclose(columns.across(few), across, atol=1e-9 * np.abs(across).max())
+    by_frame = np.stack([part.frames.sum(np.sum(every * column, axis=1)) for column in few])
+    np.testing.assert_allclose(columns.by_frame(few), by_frame, atol=1e-9 * np.abs(by_frame).max())
+
+
+@pytest.mark.slow
+def test_misfit_tests_keep_their_size_with_fitted_axes():
+    """Shapes along one axis alone meet the noise of that axis alone."""
+    least = {"model": [], "common": []}
+    for seed in range(40):
+        obs, camera = given(observed(SMEARED, seed))
+        for noise, found in least.items():
+            tests = misfit_tests(obs, sc.calibrate(obs, camera, noise=noise)).tests
+            found.append([test.p_value for test in tests if not test.is_of_noise])
+    rejected = {noise: np.mean(np.array(found) < 0.05) for noise, found in least.items()}
+    assert rejected["model"] < 0.09
+    assert rejected["common"] > rejected["model"]
 
 
 @pytest.mark.slow
