@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import sys
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -45,6 +43,7 @@ from starcal_uq.cli.settings import (
     refuse_conflicts,
     refuse_others,
     settings_of,
+    typed_words,
 )
 from starcal_uq.cli.steps import load_table, sample_run
 from starcal_uq.core.errors import CalibrationError, IdentificationError, PriorError
@@ -80,7 +79,7 @@ def demo(
 
     run = sc.Run(out, tell=note)
     command = {"command": "demo", "frames": frames, "seed": seed}
-    with run.making(command, force=force, words=typed(sys.argv[1:])), Ahead() as ahead:
+    with run.making(command, force=force, words=typed_words(sys.argv[1:])), Ahead() as ahead:
         truth = sc.paper.paper_camera()
         if not run.did("calibrate"):
             tell(f"Simulating {frames} frames of the paper's sensor (Gaia G <= 6, 0.05 px noise, seed {seed}) ...")
@@ -154,7 +153,7 @@ def run_command(
     files = {f"input {number}": path for number, path in enumerate(inputs)}
     files |= {} if camera is None else {"camera": camera}
     command = command_of("run", settings | aligning | {"budget": budget}, files)
-    with run.making(command, force=force, words=typed(sys.argv[1:])), Ahead() as ahead:
+    with run.making(command, force=force, words=typed_words(sys.argv[1:])), Ahead() as ahead:
         if not (run.did("calibrate") and (run.did("images") or not from_images)):
             # Priors may determine what the data leave open.
             undetermined = sampling.priors is not None
@@ -256,22 +255,6 @@ def _after_calibration(
         run.budget(file=budget, seed=sampling.seed)
     ahead.draw(run.results, AFTER_BUDGET)
     run.report(ahead.figures)
-
-
-def typed(arguments: Sequence[str]) -> list[str]:
-    """A command line that can be given anywhere: files by their whole path, without where and how it wrote."""
-    words: list[str] = []
-    for before, word in zip(["", *arguments], arguments, strict=False):
-        if (
-            before in ("-o", "--out")
-            or word in ("-o", "--out", "--force", "--json")
-            or word.startswith(("--out=", "-o"))
-        ):
-            continue
-        # The value of an option may be the name of a folder that lies about.
-        file = words and not word.startswith("-") and (not before.startswith("-") or Path(word).suffix)
-        words.append(str(Path(word).resolve()) if file and os.path.exists(word) else word)
-    return words
 
 
 def _conclude(run: Run) -> Answer:

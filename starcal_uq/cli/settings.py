@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping
+import os
+from collections.abc import Callable, Mapping, Sequence
 from copy import copy
 from dataclasses import asdict, astuple, dataclass, fields, is_dataclass
 from functools import wraps
@@ -34,7 +35,7 @@ from starcal_uq.cli.options import (
     read_file,
 )
 from starcal_uq.core import settings
-from starcal_uq.core.conflicts import conflict
+from starcal_uq.core.conflicts import conflict, typed
 from starcal_uq.core.settings import EPOCH, KEYS, MAGNITUDES
 from starcal_uq.core.types import AnyDict
 
@@ -290,16 +291,6 @@ def refuse_others(images: bool, sky: SkySettings, of_images: ImageSettings) -> N
             raise typer.BadParameter(f"--{name.replace('_', '-')} belongs to {kind}: leave it out.")
 
 
-# Options that have another name on the command line than in Python, or stand for a value.
-_SPELT = {
-    "likelihood": "--robust",
-    "sampled": "--likelihood",
-    "sampled_dof": "--dof",
-    "screening": "--screen",
-    "frames": "--only-frames",
-}
-
-
 def settings_of(
     estimation: EstimationSettings,
     sky: SkySettings,
@@ -321,21 +312,31 @@ def refuse_conflicts(settings: AnyDict) -> None:
     rule = conflict(settings)
     if rule is None:
         return
-    given, other = spelt(rule.name, settings[rule.name]), settings.get(rule.other)
+    given, other = typed(rule.name, settings[rule.name]), settings.get(rule.other)
     if rule.other == "partitioned":
         words = f"needs a folder of partitions: leave {given} out." if True in rule.allowed else ""
         raise typer.BadParameter(f"{given} {words or f'needs one table, and no folder: leave {given} out.'}")
     if other in (None, False):
         raise typer.BadParameter(
-            f"{given} needs {spelt(rule.other, rule.allowed[0])}: give both, or leave {given} out."
+            f"{given} needs {typed(rule.other, rule.allowed[0])}: give both, or leave {given} out."
         )
-    raise typer.BadParameter(f"{given} and {spelt(rule.other, other)} exclude each other: leave one of them out.")
+    raise typer.BadParameter(f"{given} and {typed(rule.other, other)} exclude each other: leave one of them out.")
 
 
-def spelt(name: str, value: object) -> str:
-    """An option of `settings_of` as it is typed."""
-    option = _SPELT.get(name, f"--{name.replace('_', '-')}")
-    return option if value is True or name == "likelihood" else f"{option} {value}"
+def typed_words(arguments: Sequence[str]) -> list[str]:
+    """A command line that can be given anywhere: files by their whole path, without where and how it wrote."""
+    words: list[str] = []
+    for before, word in zip(["", *arguments], arguments, strict=False):
+        if (
+            before in ("-o", "--out")
+            or word in ("-o", "--out", "--force", "--json")
+            or word.startswith(("--out=", "-o"))
+        ):
+            continue
+        # The value of an option may be the name of a folder that lies about.
+        file = words and not word.startswith("-") and (not before.startswith("-") or Path(word).suffix)
+        words.append(str(Path(word).resolve()) if file and os.path.exists(word) else word)
+    return words
 
 
 def command_of(name: str, settings: Mapping[str, Any], files: Mapping[str, Path]) -> AnyDict:

@@ -33,11 +33,17 @@ def new_command(
             help="Of a study: fov-distortion (the default), frames-stars, magnitude-noise or distortion-models.",
         ),
     ] = None,
+    near: Annotated[
+        tuple[float, float] | None,
+        typer.Option("--near", metavar="LATITUDE LONGITUDE", help="Of a site: where it is, degrees, north and east."),
+    ] = None,
     force: Force = False,
 ) -> Answer:
     """Write a starter file with comments (camera, site, budget, study), or real data to try everything on."""
     if template is not None and what != "study":
         raise typer.BadParameter(f"--template belongs to a study, and this is a new {what}.")
+    if near is not None and what != "site":
+        raise typer.BadParameter(f"--near belongs to a site, and this is a new {what}.")
     path = Path("esa" if what == "example" else f"{what}.toml") if out is None else out
     if what == "example":
         sc.example_data("esa").save(path, force=force)
@@ -52,8 +58,8 @@ def new_command(
         start.replace(name="my camera", x0_px=x0, y0_px=y0).save(path, force=force)
         following = f"put in the numbers of your data sheet, then starcal-uq run OBS {path} -o RUN"
     elif what == "site":
-        site = sc.sky.Site(52.0, 4.4, 10.0, pressure_hpa=1013.0, temperature_c=15.0, relative_humidity=0.5)
-        site.save(path, force=force)
+        example = sc.sky.Site(52.0, 4.4, 10.0, pressure_hpa=1013.0, temperature_c=15.0, relative_humidity=0.5)
+        (example if near is None else sc.sky.Site(*near)).save(path, force=force)
         following = f"put in where the camera stood, then starcal-uq run OBS CAMERA -o RUN --site {path}"
     elif what == "budget":
         sc.budgeting.write_budget_template(path, force=force)

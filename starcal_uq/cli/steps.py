@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shlex
+import sys
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -55,6 +57,7 @@ from starcal_uq.cli.settings import (
     SkySettings,
     refuse_conflicts,
     settings_of,
+    typed_words,
 )
 from starcal_uq.core import settings
 from starcal_uq.core.files import check_new_folder, ensure_new, table_ending
@@ -203,13 +206,19 @@ def calibrate_command(
     check_new_folder(out, force)
     obs, nominal = load_table(observations, camera, sky)
     nominal = estimation.started(nominal)
+    words = typed_words(sys.argv[1:])
     with progress_bar("passes over the files") as progress:
-        calibration = run.calibrate(obs, nominal, force=force, progress=progress, **estimation.options())
+        calibration = run.calibrate(obs, nominal, force=force, words=words, progress=progress, **estimation.options())
     if run.screening is not None:
         show_screening(run.screening)
     warn_air(obs, calibration)
     show_calibration(calibration, run.truth)
-    say(f"Run folder: {out}. Next: starcal-uq sample {out}")
+    everything = shlex.join(["starcal-uq", "run", *words[1:], "-o", f"{out}-2"])
+    say(
+        "No verdict has been made: an optimum was found, and nothing has asked whether the model holds. What asks: "
+        f"{everything}"
+    )
+    say(f"Run folder: {out}. Step by step: starcal-uq sample {out}, then propagate, diagnose and report.")
     return Answer({"run": out, "calibration": (calibration, run.truth), "screening": run.screening})
 
 

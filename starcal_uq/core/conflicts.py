@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from starcal_uq.core.errors import CalibrationError
@@ -68,6 +68,43 @@ RULES = (
     Rule("site", (), "directions", (None, "catalogue")),
     Rule("alignment_frames", (), "alignment", (None, "random")),
 )
+
+
+# Options of a run that have another name on the command line, or stand for a value; of the flags, their values.
+_TYPED = {"--likelihood": "sampled", "--dof": "sampled_dof", "--only-frames": "frames"}
+_FLAGS: dict[str, tuple[str, object]] = {
+    "--robust": ("likelihood", "student_t"),
+    "--screen": ("screening", True),
+    "--star-errors": ("star_errors", True),
+    "--accept-inflation": ("accept_inflation", True),
+    "--in-space": ("in_space", True),
+    "--force": ("force", True),
+    "--json": ("json", True),
+}
+
+
+def takes_value(option: str) -> bool:
+    """Whether an option of a run is followed by a value."""
+    return option not in _FLAGS
+
+
+def named(options: Mapping[str, Sequence[str | None]]) -> dict[str, object]:
+    """Options as they are typed by the names that the rules have for them."""
+    found: dict[str, object] = {}
+    for option, values in options.items():
+        name, value = _FLAGS.get(option, (_TYPED.get(option, option[2:].replace("-", "_")), values[-1]))
+        found[name] = value
+    found.setdefault("sampled", found.get("likelihood"))
+    return found
+
+
+def typed(name: str, value: object) -> str:
+    """An option, by the name that the rules have for it, as it is typed."""
+    flag = next((option for option, meaning in _FLAGS.items() if meaning == (name, value)), None)
+    if flag is not None:
+        return flag
+    options = {meaning: option for option, meaning in _TYPED.items()}
+    return f"{options.get(name, '--' + name.replace('_', '-'))} {value}"
 
 
 def conflict(settings: Mapping[str, object]) -> Rule | None:

@@ -59,8 +59,9 @@ class Manifest:
 
     `files` are those that the run has written, by their names within the folder; others are the user's. `steps` have
     the provenance of each step that is done. Of a run that a single command makes, `command` holds settings and hashes
-    of the inputs, `words` the command as it was typed, without the program's name; it is not `complete` while the
-    command is under way, or was interrupted. In the folder `stage`, files of the last step wait to be moved to their
+    of the inputs, `words` the command as it was typed, without the program's name, and `tried` the options and outcomes
+    of the runs of the same data that it has replaced; it is not `complete` while the command is under way, or was
+    interrupted. In the folder `stage`, files of the last step wait to be moved to their
     places; those that are `gone` rested on what it replaced, and are to be removed.
     """
 
@@ -68,6 +69,7 @@ class Manifest:
     steps: dict[str, AnyDict] = field(default_factory=dict)
     command: AnyDict | None = None
     words: tuple[str, ...] = ()
+    tried: tuple[AnyDict, ...] = ()
     complete: bool = True
     stage: str = ""
     gone: tuple[str, ...] = ()

@@ -137,6 +137,15 @@ class ModelComparison(Shown):
         """The model with the fewest parameters that is not rejected."""
         return min(self.accepted, key=lambda score: (score.n_parameters, -score.elpd))
 
+    @property
+    def better(self) -> str:
+        """Of a fitted model that is rejected, the simplest accepted one that predicts better; else empty."""
+        mine = self.of(self.fitted)
+        if mine is None or not mine.rejected:
+            return ""
+        ahead = [score for score in self.accepted if score.elpd > mine.elpd]
+        return min(ahead, key=lambda score: (score.n_parameters, -score.elpd)).model
+
     def of(self, model: str) -> ModelScore | None:
         """The score of one model."""
         return next((score for score in self.scores if score.model == model), None)

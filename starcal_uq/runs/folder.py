@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -33,6 +33,7 @@ from starcal_uq.core.manifest import (
     sweep,
     write_manifest,
 )
+from starcal_uq.core.status import Level, Question
 from starcal_uq.core.types import AnyDict
 
 _CALIBRATE = "starcal-uq calibrate OBS CAMERA -o RUN"
@@ -235,7 +236,13 @@ class RunFolder:
 
     @contextmanager
     def step(
-        self, step: str, record: AnyDict, *, making: bool = False, tell: Callable[[str], None] | None = None
+        self,
+        step: str,
+        record: AnyDict,
+        *,
+        making: bool = False,
+        tell: Callable[[str], None] | None = None,
+        words: Sequence[str] = (),
     ) -> Iterator[RunFolder]:
         """Yield a folder for the files of a step, which take their places all at once if the block succeeds.
 
@@ -249,6 +256,8 @@ class RunFolder:
             Whether it belongs to the command that makes the whole run; a step of its own ends what that had begun.
         tell : callable, optional
             Function that gets the sentence on what goes.
+        words : sequence of str
+            Of a calibration by itself, the command as it was typed.
         """
         old = self.create().manifest
         if step == "calibrate":
@@ -272,9 +281,10 @@ class RunFolder:
             steps = {name: content for name, content in old.steps.items() if name not in (step, *stale)}
             steps[step] = record
             new = replace(old, files=kept | made, steps=steps, stage=STEP)
+            if step == "calibrate" and not making:
+                new = replace(new, words=tuple(words), tried=())
             if not making:
-                words = () if step == "calibrate" else new.words
-                new = replace(new, command=None, words=words, complete=True)
+                new = replace(new, command=None, complete=True)
             commit(self.path, new, old.files)
 
     @contextmanager
@@ -313,7 +323,8 @@ class RunFolder:
                 if place != self:
                     shutil.rmtree(place.path)
                     place.create()
-                write_manifest(place.path, Manifest(command=wanted, complete=False))
+                tried = self._tried(old, wanted, words)
+                write_manifest(place.path, Manifest(command=wanted, tried=tried, complete=False))
             sweep(place.path)
             try:
                 yield place
@@ -331,6 +342,32 @@ class RunFolder:
     def _check_new(self) -> None:
         """Refuse a hidden folder for a new run that holds what is not of a run."""
         check_hidden(self.path, NEW, (CHECKPOINT,))
+
+    def _tried(self, old: Manifest, command: AnyDict, words: Sequence[str]) -> tuple[AnyDict, ...]:
+        """Options and outcomes of the runs of the same data that stood here, up to one with the options of this one."""
+        from starcal_uq.diagnostics.verdict.remedies import parsed
+
+        if not old.complete or not old.words or _data_of(old.command) != _data_of(command):
+            return ()
+        levels = []
+        with suppress(OSError, ValueError, KeyError, TypeError):
+            checks = json.loads(self.verdict.read_text(encoding="utf-8"))["checks"]
+            levels = [check["level"] for check in checks if check["question"] != Question.REQUIRED.value]
+        if not levels:
+            return ()
+        failed, warned = (levels.count(level.value) for level in (Level.FAIL, Level.WARN))
+        _, options = parsed(old.words)
+        replaced = {"options": options, "failed": failed, "warned": warned}
+        chain = [*old.tried, json.loads(json.dumps(replaced))]
+        now = json.loads(json.dumps(parsed(words)[1]))
+        again = [place for place, one in enumerate(chain) if one["options"] == now]
+        return tuple(chain[: again[0]] if again else chain)
+
+
+def _data_of(command: AnyDict | None) -> AnyDict:
+    """Hashes of the stars or images that a command was made from."""
+    inputs = {} if command is None else command.get("inputs", {})
+    return {name: content for name, content in inputs.items() if name.startswith("input ")}
 
 
 FILES = {key: value for key, value in vars(RunFolder).items() if isinstance(value, _File)}

@@ -53,7 +53,8 @@ if TYPE_CHECKING:
     from starcal_uq.budgeting.result import Budget
     from starcal_uq.core.settings import Scalar, Sense
     from starcal_uq.diagnostics.diagnose import Diagnosis
-    from starcal_uq.diagnostics.verdict.judge import Place, Verdict
+    from starcal_uq.diagnostics.verdict.judge import Verdict
+    from starcal_uq.diagnostics.verdict.remedies import Place
     from starcal_uq.estimation.screening.result import Screening
     from starcal_uq.identification.result import Identification
     from starcal_uq.images.centroids import Centroids
@@ -471,9 +472,16 @@ class Run:
     @property
     def place(self) -> Place:
         """What the commands of remedies name."""
-        from starcal_uq.diagnostics.verdict.judge import Place
+        from starcal_uq.diagnostics.verdict.remedies import Place, Tried
 
-        return Place(str(self.path.resolve()), self._words or self.folder.manifest.words, self.has("observations"))
+        manifest = self.folder.manifest
+        return Place(
+            str(self.path.resolve()),
+            self._words or manifest.words,
+            self.has("observations"),
+            tuple(Tried.of(one) for one in manifest.tried),
+            self.calibration.partitions is not None,
+        )
 
     @property
     def calibrated(self) -> Results:
@@ -553,7 +561,7 @@ class Run:
     @contextmanager
     def _step(self, step: str, seed: int | None, settings: Mapping[str, Any]) -> Iterator[RunFolder]:
         record = provenance(seed, {name: as_setting(value) for name, value in settings.items()}, None)
-        with self.folder.step(step, record, making=self._making, tell=self._tell) as files:
+        with self.folder.step(step, record, making=self._making, tell=self._tell, words=self._words) as files:
             yield files
         if "report" in REST_ON[step]:
             self._forget(*(["error_budget"] if "budget" in REST_ON[step] else []))
@@ -568,6 +576,7 @@ class Run:
         undetermined: bool = False,
         accept_inflation: bool = False,
         force: bool = False,
+        words: Sequence[str] = (),
         progress: Progress | None = None,
         **options: Any,
     ) -> Calibration:
@@ -589,6 +598,8 @@ class Run:
             (`starcal_uq.diagnostics.accept_inflation`); draws are as wide.
         force : bool
             Whether to replace what the folder holds.
+        words : sequence of str
+            The command as it was typed, without the program's name: remedies repeat it.
         progress, **options
             Further options of `starcal_uq.calibrate`.
 
@@ -627,6 +638,7 @@ class Run:
             calibration = jackknife.accept_inflation(calibration, found)
         if not self._making:
             check_new_folder(self.path, force)
+            self._words = tuple(words)
         self.write(calibration, obs, screened)
         return calibration
 

@@ -13,8 +13,9 @@ import starcal_uq as sc
 from starcal_uq.cli import console
 from starcal_uq.core.records import from_plain, to_plain
 from starcal_uq.core.status import CALIBRATE, Check, Level, Question, worst
-from starcal_uq.diagnostics.verdict.judge import Place, judge
+from starcal_uq.diagnostics.verdict.judge import judge
 from starcal_uq.diagnostics.verdict.observed import FROM_IMAGES, SCREEN
+from starcal_uq.diagnostics.verdict.remedies import Place, Tried
 from starcal_uq.inference.checks import check_draws
 from starcal_uq.presentation.report.page import context
 from starcal_uq.presentation.report.results import Results
@@ -122,12 +123,16 @@ def test_what_a_run_was_made_with_is_no_remedy():
     asked = Check("A", Question.TRUSTWORTHY, Level.WARN, "9", "0", "Uneven.", both)
     words = ("run", "obs.csv", "camera.toml", "--noise")
     found = Place("r", (*words, "model")).exact(asked)
-    assert found.remedies == ("starcal-uq run obs.csv camera.toml --noise model -o r --robust --force",)
-    assert found.advice == ""
-    alone = Place("r", (*words, "model", "--robust")).exact(asked)
+    # Student-t tails and a noise model exclude each other.
+    assert found.remedy == "" and "made with --noise model already" in found.advice and "--robust" in found.advice
+    alone = Place("r", ("run", "obs.csv", "camera.toml", "--robust")).exact(asked)
     assert alone.remedy == "" and alone.advice.endswith("the run was made with --robust already.")
-    # Another value of the option, or no option at all, is something else.
-    assert len(Place("r", (*words, "common")).exact(asked).remedies) == 3
+    tried = (Tried({"--noise": ("model",)}, 1, 0),)
+    fresh = Place("r", ("run", "obs.csv", "camera.toml"), tried=tried).exact(asked)
+    assert fresh.remedies == ("starcal-uq run obs.csv camera.toml --robust -o r --force",)
+    # Another value of the option takes its place; no option at all is something else.
+    first, *rest = Place("r", (*words, "common")).exact(asked).remedies
+    assert first == "starcal-uq run obs.csv camera.toml --noise model -o r --force" and len(rest) == 2
     whole = dataclasses.replace(asked, remedy=CALIBRATE)
     assert Place("r", (*words, "model")).exact(whole).remedy.endswith("--noise model -o r --force")
 
@@ -137,17 +142,20 @@ def test_remedies_name_the_files_of_the_run():
     check = Check("Outliers", Question.TRUSTWORTHY, Level.WARN, "9", "0", "Wrong stars.", SCREEN)
     made = Place("/a b/run", ("run", "/data/obs.csv", "/data/camera.toml", "--noise", "model")).exact(check)
     assert made.remedies == (
-        "starcal-uq run /data/obs.csv /data/camera.toml --noise model -o '/a b/run' --screen --force",
+        "starcal-uq run /data/obs.csv /data/camera.toml --noise model --screen -o '/a b/run' --force",
         "sc.estimation.screen(obs, camera)",
     )
     steps = Place("/run or that").exact(check)
     files = "'/run or that/observations.parquet' '/run or that/camera.toml' -o '/run or that-2'"
-    assert steps.remedies[0] == f"starcal-uq run {files} --screen"
+    assert steps.remedies[0] == f"starcal-uq run {files} --screen --force"
     assert Place("r").command("starcal-uq sample RUN --force --steps 400") == "starcal-uq sample r --force --steps 400"
-    images = Place("r", ("run", "/data/images", "--screen")).command(f"{FROM_IMAGES} --site SITE")
-    assert images == "starcal-uq run /data/images --screen -o r --site site.toml --force"
+    images = Place("r", ("run", "/data/images", "--screen")).command(f"{FROM_IMAGES} --site SITE:52.2,7.4")
+    new = "starcal-uq new site --near 52.2 7.4 -o r-site.toml --force"
+    assert images == f"{new} && starcal-uq run /data/images --screen --site r-site.toml -o r --force"
     apparent = Place("r", ("run", "obs.csv", "camera.toml", "--directions", "apparent"))
-    given = "starcal-uq run obs.csv camera.toml --directions apparent -o r"
-    assert apparent.command(f"{CALIBRATE} --site SITE") == f"{given} --site site.toml --directions catalogue --force"
+    made = "starcal-uq run obs.csv camera.toml --directions catalogue --site r-site.toml -o r --force"
+    assert apparent.command(f"{CALIBRATE} --site SITE:52.2,7.4") == f"{new} && {made}"
+    # Where nothing tells the place, there is no command to copy.
+    assert apparent.exact(dataclasses.replace(check, remedy=f"{CALIBRATE} --site SITE")).remedy == ""
     # Without stars there is nothing to calibrate on.
     assert Place("r", observations=False).exact(check).remedies[0].startswith("starcal-uq calibrate OBS CAMERA -o r")

@@ -15,13 +15,13 @@ import pytest
 import starcal_uq as sc
 from starcal_uq.core.formatting import significant
 from starcal_uq.core.tasks import processors
-from starcal_uq.diagnostics.verdict.judge import Place
+from starcal_uq.diagnostics.verdict.remedies import Place
 from starcal_uq.inference.checks import check_draws
 from starcal_uq.presentation.html import symbol
 from starcal_uq.presentation.pages import printing
 from starcal_uq.presentation.report.drawing import FIGURES, Ahead, draw_figures
 from starcal_uq.presentation.report.page import render
-from starcal_uq.presentation.report.summary import terminal_summary
+from starcal_uq.presentation.report.summary import terminal_summary, verdict_lines
 from starcal_uq.presentation.report.tables import attitude_rows, parameter_rows, weak_directions
 from starcal_uq.propagation.attitude_error import AttitudeError, MisfitFound
 from tests.helpers.scenes import camera, nominal, observations
@@ -153,7 +153,15 @@ def test_summary_fits_80_columns_and_its_commands_can_be_put_together(full):
     start = next(i for i, line in enumerate(lines) if line.lstrip().startswith("try: "))
     end = next(i for i in range(start, len(lines)) if not lines[i].endswith("\\"))
     command = "\n".join(lines[start : end + 1]).strip().removeprefix("try: ").replace("\\\n", "")
-    assert shlex.split(command)[1:6] == ["run", "/data/obs.csv", "/data/camera.toml", "-o", f"/data/{name}"]
+    words = shlex.split(command)
+    assert words[1:4] == ["run", "/data/obs.csv", "/data/camera.toml"] and words[-3:] == [
+        "-o",
+        f"/data/{name}",
+        "--force",
+    ]
+    # A list of three commands at most, and a verdict of two lines.
+    assert sum(line.lstrip().startswith("try: ") for line in lines) <= 3
+    assert len(verdict_lines(results.verdict)) <= 2
 
 
 def test_without_a_browser_a_pdf_takes_one_sentence(run, monkeypatch, tmp_path):

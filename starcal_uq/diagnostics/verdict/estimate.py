@@ -23,7 +23,7 @@ from starcal_uq.core.types import BoolArray
 from starcal_uq.diagnostics.misfit import ALPHA
 from starcal_uq.diagnostics.shapes import IN_FIELD
 from starcal_uq.diagnostics.verdict.effect import largest, of_pattern, on_attitudes, on_directions
-from starcal_uq.diagnostics.verdict.observed import NOISE, ROBUST, SCREEN, richer
+from starcal_uq.diagnostics.verdict.observed import NOISE, ROBUST, SCREEN, lens_remedy
 from starcal_uq.estimation.fallback import fallback_words
 from starcal_uq.estimation.undetermined import what_is_open
 from starcal_uq.inference.checks import resample
@@ -145,6 +145,14 @@ def truth_z(cal: Calibration, truth: Camera, post: Posterior | None = None) -> F
 
 # Frames that scatter by less than this beyond the formal errors are of no consequence, however sure.
 JACKKNIFE_RATIO = 1.1
+_OF_FRAMES = "Calibrate stretches of frames apart (--only-frames), and compare the runs."
+_OF_PHASE = "Accept it as noise, or point between frames by parts of a pixel more or less."
+_NOT_OF_THE_LENS = {
+    "pixel phase in x": _OF_PHASE,
+    "pixel phase in y": _OF_PHASE,
+    "magnitude": "Leave out the brightest or the faintest stars, and compare the runs.",
+    "direction": "Check the times, and what the directions were declared to be.",
+}
 
 
 def model_checks(
@@ -152,7 +160,8 @@ def model_checks(
 ) -> list[Check]:
     """Every check that a diagnosis allows, of a calibration whose inflation may be accepted, and of its draws."""
     inflated = cal.inflation is not None
-    checks = [misfit(diagnosis.misfit, cal, attitude), even_noise(diagnosis.misfit, inflated)]
+    better = None if diagnosis.comparison is None else diagnosis.comparison.better
+    checks = [misfit(diagnosis.misfit, cal, attitude, better), even_noise(diagnosis.misfit, inflated)]
     checks += [] if diagnosis.cameras is None else [one_camera(diagnosis.cameras)]
     checks += [] if diagnosis.jackknife is None else [jackknife(diagnosis.jackknife, inflated, post)]
     checks += [] if diagnosis.stars is None else [stars(diagnosis.stars)]
@@ -171,8 +180,8 @@ def one_camera(found: MixedCameras) -> Check:
 _HARDLY_TOLD = 3.0
 
 
-def misfit(found: Misfit, cal: Calibration, attitude: AttitudeError | None = None) -> Check:
-    """Is there structure in the residuals, and does it do more than is stated?"""
+def misfit(found: Misfit, cal: Calibration, attitude: AttitudeError | None = None, better: str | None = None) -> Check:
+    """Is there structure in the residuals, and does it do more than is stated? `better` as for `lens_remedy`."""
     name, bound = "Unexplained structure", f"p ≥ {MISFIT_P:g}"
     patterns = [test.p_holm for test in found.tests if not test.is_of_noise]
     value = f"{p_words(min(patterns, default=1.0))}, corrected for {plural(len(found.tests), 'test')}"
@@ -189,9 +198,11 @@ def misfit(found: Misfit, cal: Calibration, attitude: AttitudeError | None = Non
     effect = largest([*of_pattern(found.pattern, rejected, cal), *booked])
     sentence = f"The residuals hold more than noise: {join_words(words)}{more}. {effect}{_hardly_told(rejected[0])}"
     level = effect.level if min(patterns) < MISFIT_FAIL_P else Level.WARN
-    # A lens can follow what keeps its place in the field; what does not is at best counted as noise.
-    remedy = model_remedy(richer(cal.camera.distortion)) if any(t.against in IN_FIELD for t in rejected) else NOISE
-    return Check(name, Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
+    # A lens can follow what keeps its place in the field, and no option here what does not.
+    remedy, advice = "", _NOT_OF_THE_LENS.get(rejected[0].against, _OF_FRAMES)
+    if any(t.against in IN_FIELD for t in rejected):
+        remedy, advice = lens_remedy(cal.camera.distortion, better)
+    return Check(name, Question.TRUSTWORTHY, level, value, bound, sentence, remedy, advice)
 
 
 def _hardly_told(test: MisfitTest) -> str:
@@ -352,7 +363,7 @@ def comparison(models: ModelComparison, attitude: AttitudeError | None = None) -
         # A gain of one nat is what a displacement gives whose square is two units of the noise.
         bent = on_directions(-2.0 * mine.difference, mine.n_parameters)
         effect = largest([bent, *on_attitudes(attitude)])
-        level, remedy = effect.level, model_remedy(models.simplest.model)
+        level, remedy = effect.level, model_remedy(models.better)
         sentence = f"{sentence} {effect}"
     return Check("Distortion model", Question.TRUSTWORTHY, level, value, "not rejected", sentence, remedy)
 
@@ -364,7 +375,7 @@ def models_sentence(models: ModelComparison) -> str:
         best = models.scores[0]
         first = (
             f"The model {models.fitted!r} predicts left-out frames worse than {best.model!r} by "
-            f"{fixed(-mine.difference, 1)} ± {fixed(mine.difference_se, 1)} nat: use {simplest.model!r}."
+            f"{fixed(-mine.difference, 1)} ± {fixed(mine.difference_se, 1)} nat: use {models.better!r}."
         )
     elif mine is not None and simplest.n_parameters < mine.n_parameters:
         fewer, all_of_them = (_coefficients(model) for model in (simplest.model, models.fitted))

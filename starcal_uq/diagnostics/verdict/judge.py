@@ -6,17 +6,16 @@ may be used by someone who has read it.
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
 from starcal_uq.core.display import Shown
-from starcal_uq.core.formatting import join_words
-from starcal_uq.core.status import CALIBRATE, Check, Level, Question, worst
+from starcal_uq.core.formatting import join_words, plural
+from starcal_uq.core.status import Check, Level, Question, worst
 from starcal_uq.core.types import AnyDict
 from starcal_uq.diagnostics.verdict import draws, estimate, observed
-from starcal_uq.diagnostics.verdict.observed import FROM_IMAGES
+from starcal_uq.diagnostics.verdict.remedies import INPUT, MOST_COMMANDS, Place, by_cause, telling
 from starcal_uq.estimation.noise_model import weighed
 
 if TYPE_CHECKING:
@@ -28,6 +27,8 @@ if TYPE_CHECKING:
     from starcal_uq.propagation.attitude_error import AttitudeError
 
 VERSION = 1
+# Checks that the headline names; of more it says how many there are.
+_NAMED = 2
 
 
 @dataclass(frozen=True)
@@ -40,12 +41,18 @@ class Verdict(Shown):
         In reading order.
     headline : str
         The verdict in one sentence.
+    commands : tuple of str
+        What to try, in this order, each a command; at most three. Empty where no command helps.
+    ended : str
+        That no model here explains the data, and which data would tell; empty where something is left to try.
     """
 
     DOCUMENTED: ClassVar = ("level",)
 
     checks: tuple[Check, ...]
     headline: str
+    commands: tuple[str, ...] = ()
+    ended: str = ""
 
     @property
     def level(self) -> Level:
@@ -63,6 +70,11 @@ class Verdict(Shown):
         return tuple(check for check in self.checks if check.question is question)
 
     @property
+    def causes(self) -> dict[str, list[Check]]:
+        """The checks that did not pass by what they point to: the input, the lens, the noise, the computation."""
+        return by_cause([check for check in self.checks if check.question is not Question.REQUIRED])
+
+    @property
     def doubts(self) -> tuple[Check, ...]:
         """The checks that did not pass, failures first."""
         return (*self.at(Level.FAIL), *self.at(Level.WARN))
@@ -70,57 +82,6 @@ class Verdict(Shown):
     def at(self, level: Level) -> tuple[Check, ...]:
         """The checks with this outcome."""
         return tuple(check for check in self.checks if check.level is level)
-
-
-_STARTS = (CALIBRATE, FROM_IMAGES)
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where a run is and what made it, so that remedies can be commands to copy."""
-
-    run: str  # The folder
-    # Command line that made all of it, without the program and the folder; empty where it was made step by step.
-    words: tuple[str, ...] = ()
-    observations: bool = True  # Whether the folder holds observations
-
-    def exact(self, check: Check) -> Check:
-        """A check whose commands name the files of this run, without those that made it."""
-        kept, done = [], ""
-        for one in check.remedies:
-            done = self._given(one) or (done if one.startswith("sc.") else "")
-            kept += [] if done else [self.command(one)]
-        advice = check.advice
-        if check.remedy and not kept and not advice:
-            advice = f"Look for the cause in the instrument or the data: the run was made with {done} already."
-        remedy = " or ".join(kept)
-        return check if remedy == check.remedy else replace(check, remedy=remedy, advice=advice)
-
-    def _given(self, text: str) -> str:
-        """The options of a command for a calibration if this run was made with them; a call follows its command."""
-        options = next((text.removeprefix(words).split() for words in _STARTS if text.startswith(words)), [])
-        places = range(len(self.words) - len(options) + 1)
-        return " ".join(options) if any([*self.words[i : i + len(options)]] == options for i in places) else ""
-
-    def command(self, text: str) -> str:
-        """A command with the files of this run in place of OBS, CAMERA, SITE and RUN; a call in Python as it is."""
-        if not text.startswith("starcal-uq"):
-            return text
-        start = next((words for words in _STARTS if text.startswith(words)), "")
-        if start and self.words[:1] == ("run",):
-            if " --site " in text and "apparent" in self.words:
-                # Directions are made apparent at a site, and must not be declared so.
-                text += " --directions catalogue"
-            # Everything that was asked for then, and this; of an option that is given twice the last one holds.
-            made = shlex.join([*self.words, "-o", self.run])
-            text = f"starcal-uq {made}{text.removeprefix(start)} --force"
-        elif start == CALIBRATE and self.observations:
-            given = [f"{self.run}/observations.parquet", f"{self.run}/camera.toml", "-o", f"{self.run}-2"]
-            text = f"starcal-uq run {shlex.join(given)}{text.removeprefix(start)}"
-        words, files = text.split(" "), {"RUN": shlex.quote(self.run), "SITE": "site.toml"}
-        if not {"OBS", "IMAGES..."} & set(words):
-            files["CAMERA"] = shlex.quote(f"{self.run}/camera.toml")
-        return " ".join(files.get(word, word) for word in words)
 
 
 def judge(
@@ -146,10 +107,11 @@ def judge(
         checks += [draws.same_data(post, cal.data_hash_of(obs)), *post.diagnostics.checks]
     used = weighed(obs, cal)
     asked = (None, None) if diagnosis is None else (diagnosis.air, diagnosis.times)
+    better = None if diagnosis is None or diagnosis.comparison is None else diagnosis.comparison.better
     unseen = None if diagnosis is None or diagnosis.times is not None else diagnosis.aberration
     rests = observed.rests_on_aberration(used, unseen)
     checks += [observed.directions(used, cal, *asked, rests)]
-    checks += [observed.residual_pattern(used, cal), observed.outliers(used, cal), observed.screening(obs)]
+    checks += [observed.residual_pattern(used, cal, better), observed.outliers(used, cal), observed.screening(obs)]
     checks += [observed.noise(used, cal), observed.partitions(cal), observed.terms(cal), observed.coverage(used, cal)]
     if diagnosis is not None:
         checks += estimate.model_checks(diagnosis, cal, post, attitude)
@@ -159,7 +121,33 @@ def judge(
         checks += [estimate.against_truth(cal, truth, post)]
     checks += requirements
     found = tuple(check if place is None else place.exact(check) for check in checks if check is not None)
-    return Verdict(found, _headline(found, post is not None, rests))
+    commands, ended = _way_on(found, place)
+    return Verdict(found, _headline(found, post is not None, rests), commands, ended)
+
+
+def _way_on(checks: tuple[Check, ...], place: Place | None) -> tuple[tuple[str, ...], str]:
+    """The commands to try, those of the first cause first, or that there is none that helps."""
+    doubts = [check for check in checks if check.question is not Question.REQUIRED]
+    every: list[str] = []
+    for cause, some in by_cause(doubts).items():
+        every += [one for check in some for one in check.remedies if one.startswith("starcal-uq ")]
+        if some[0].level is Level.FAIL and (every or cause == INPUT):
+            # What comes after it in the order may be its consequence.
+            break
+    commands = tuple(dict.fromkeys(every))[:MOST_COMMANDS]
+    tried = () if place is None else place.tried
+    if worst(doubts) is not Level.FAIL or (commands and not (place is not None and place.exhausted(doubts))):
+        return commands, ""
+    steps = f" (tried: {'; '.join(one.text for one in tried)})" if tried else ""
+    return (), f"No model here explains this{steps}. What would tell: {telling(doubts)}."
+
+
+def _named(checks: Sequence[Check], level: Level) -> str:
+    """The checks with this outcome, by name where they are few, else how many point to what."""
+    found = [check for check in checks if check.level is level]
+    if len(found) <= _NAMED:
+        return join_words([check.phrase for check in found])
+    return join_words([f"{plural(len(some), 'check')} of {cause}" for cause, some in by_cause(found).items()])
 
 
 def _headline(checks: tuple[Check, ...], sampled: bool, rests: str) -> str:
@@ -176,13 +164,12 @@ def _headline(checks: tuple[Check, ...], sampled: bool, rests: str) -> str:
 
 
 def _usable(checks: Sequence[Check], sampled: bool) -> str:
-    failed = [c.phrase for c in checks if c.level is Level.FAIL]
-    warned = [c.phrase for c in checks if c.level is Level.WARN]
+    failed, warned = ([c for c in checks if c.level is level] for level in (Level.FAIL, Level.WARN))
     if failed:
-        return f"Do not use these numbers: {join_words(failed)} failed."
+        return f"Do not use these numbers: {_named(checks, Level.FAIL)} failed."
     if warned:
         start = "Converged; usable once " + ("this warning is" if len(warned) == 1 else "these warnings are")
-        return f"{start} resolved or accepted: {join_words(warned)}."
+        return f"{start} resolved or accepted: {_named(checks, Level.WARN)}."
     if not sampled:
         return "The estimate converged and passed every check; the posterior has not been sampled yet."
     return "Converged, and every check passed: the stated uncertainties can be used."

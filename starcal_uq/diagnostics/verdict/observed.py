@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 
 import numpy as np
 
+from starcal_uq.camera.distortion import get_model
 from starcal_uq.core.constants import ARCSEC
 from starcal_uq.core.formatting import fixed, percent, plural, significant
 from starcal_uq.core.status import CALIBRATE, MORE, PLAN, Check, Level, Question, model_remedy, pass_or_warn
@@ -38,6 +39,11 @@ MIN_FRAMES = 5
 _SMALL_SIGMA = 1.0
 # Commands and calls that checks give as remedies.
 SCREEN = f"{CALIBRATE} --screen or sc.estimation.screen(obs, camera)"
+_RICHEST = "brown_tangential"
+_NO_MODEL = (
+    "Count the pattern as an error of the directions, as the attitude error with the misfit found does: no distortion "
+    "model here follows it."
+)
 FROM_IMAGES = "starcal-uq run IMAGES... CAMERA -o RUN --force"
 ROBUST, NOISE = f"{CALIBRATE} --robust", f"{CALIBRATE} --noise model or sc.calibrate(obs, camera, noise='model')"
 
@@ -56,7 +62,9 @@ def directions(
     wrong = [] if times is None else [_time_words(obs, times)]
     if found is not None and found.is_air:
         order = "Give the directions of a catalogue, or apparent ones that hold refraction." if seen == "none" else ""
-        wrong.append((f"refraction, p = {significant(found.p_value)}", air_words(obs, found), _with_site(obs), order))
+        wrong.append(
+            (f"refraction, p = {significant(found.p_value)}", air_words(obs, found), _with_site(obs, found), order)
+        )
     if wrong:
         values, sentences, remedies, orders = zip(*wrong, strict=True)
         remedy, advice = next(filter(None, remedies), ""), " ".join(filter(None, orders))
@@ -176,8 +184,11 @@ def _command(obs: Observations) -> str:
     return FROM_IMAGES if _from_images(obs) else CALIBRATE
 
 
-def _with_site(obs: Observations) -> str:
-    return f"{_command(obs)} --site SITE{_time_of(obs)}"
+def _with_site(obs: Observations, found: AirTest | None = None) -> str:
+    """The command with a site: the one that the residuals point to, where they do, else one that is not known."""
+    known = found is not None and bool(np.isfinite(found.latitude_deg))
+    near = f":{found.latitude_deg:.1f},{found.longitude_deg:.1f}" if found is not None and known else ""
+    return f"{_command(obs)} --site SITE{near}{_time_of(obs)}"
 
 
 def _about_air(obs: Observations) -> str:
@@ -200,8 +211,8 @@ def aberration_size(camera: Camera) -> str:
     )
 
 
-def residual_pattern(obs: Observations, cal: Calibration) -> Check:
-    """Do mean residuals over the field show more than noise?"""
+def residual_pattern(obs: Observations, cal: Calibration, better: str | None = None) -> Check:
+    """Do mean residuals over the field show more than noise? `better` as for `lens_remedy`."""
     binned = bin_residuals(cal, obs)
     p_value, pattern = binned.p_value, binned.pattern_px
     cells = len(binned.counts)
@@ -217,14 +228,20 @@ def residual_pattern(obs: Observations, cal: Calibration) -> Check:
             f"the model does not explain; it is not in any interval of this report. {effect}"
         )
     value = f"p = {significant(p_value)}" + (f", pattern {significant(pattern)} px" if pattern > 0.0 else "")
-    remedy = "" if level is Level.PASS else model_remedy(richer(cal.camera.distortion))
+    remedy, advice = ("", "") if level is Level.PASS else lens_remedy(cal.camera.distortion, better)
     name, bound = "Pattern in the residuals", f"p ≥ {PATTERN_P:g}"
-    return Check(name, Question.TRUSTWORTHY, level, value, bound, sentence, remedy)
+    return Check(name, Question.TRUSTWORTHY, level, value, bound, sentence, remedy, advice)
 
 
-def richer(model: str) -> str:
-    """A distortion model that follows what this one cannot."""
-    return "brown3" if model == "brown_tangential" else "brown_tangential"
+def lens_remedy(fitted: str, better: str | None = None) -> tuple[str, str]:
+    """Command and advice where the residuals hold a pattern of the field.
+
+    `better` is the model that a comparison prefers, empty if none; without a comparison, one with further terms.
+    """
+    has_all = {coefficient.name for coefficient in get_model(_RICHEST).coefficients}
+    further = {coefficient.name for coefficient in get_model(fitted).coefficients} < has_all
+    model = better if better is not None else _RICHEST if further else ""
+    return (model_remedy(model), "") if model else ("", _NO_MODEL)
 
 
 def outliers(obs: Observations, cal: Calibration) -> Check:

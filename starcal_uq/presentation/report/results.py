@@ -16,7 +16,8 @@ from starcal_uq.presentation.words.budgeting import requirement_checks
 if TYPE_CHECKING:
     from starcal_uq.budgeting.result import Budget
     from starcal_uq.diagnostics.diagnose import Diagnosis
-    from starcal_uq.diagnostics.verdict.judge import Place, Verdict
+    from starcal_uq.diagnostics.verdict.judge import Verdict
+    from starcal_uq.diagnostics.verdict.remedies import Place
     from starcal_uq.inference.posterior import Posterior
     from starcal_uq.pipeline.record import ImageRecord
     from starcal_uq.propagation.attitude_error import AttitudeError

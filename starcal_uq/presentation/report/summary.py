@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -240,8 +240,20 @@ def terminal_summary(results: Results) -> list[str]:
             lines.append(f"  {len(budget.not_assessed)} of {every} contributors are {NOT_ASSESSED}: lower bounds")
     counts = [f"{len(results.verdict.at(level))} {words}" for level, words in _COUNTED if results.verdict.at(level)]
     lines.append(f"Checks: {', '.join(counts)} of {len(results.verdict.checks)}")
-    for check in results.verdict.doubts:
-        lines += _told(check)
+    for check in results.verdict.of(Question.REQUIRED):
+        lines += _told([check]) if check.level is not Level.PASS else []
+    before = ""
+    for cause, checks in results.verdict.causes.items():
+        lines += _told(checks, cause, before)
+        before = before or (cause if checks[0].level is Level.FAIL else "")
+    if results.verdict.ended:
+        usable, unusable = uses(results)
+        lines += _wrapped(results.verdict.ended)
+        lines += [line for sentence in usable for line in _wrapped(f"usable: {sentence}", "  ")]
+        lines += [line for sentence in unusable for line in _wrapped(f"not: {sentence}", "  ")]
+    for number, command in enumerate(results.verdict.commands):
+        lines += ["To try, in this order:"] if number == 0 else []
+        lines += _command(command)
     return lines
 
 
@@ -259,25 +271,26 @@ def _both(error: AttitudeError, row: int, axis: int) -> str:
     return held if found == held else f"{found} ({held})"
 
 
-def _told(check: Check) -> list[str]:
-    """A check that did not pass, and what to try."""
-    lines = _wrapped(f"{check.level.value}: {check.name}. {check.sentence}", "  ")
-    lines += _wrapped(check.advice, "    ") if check.advice else []
-    for one in check.remedies:
-        lines += _command(one)
-    return lines
+def _told(checks: Sequence[Check], cause: str = "", before: str = "") -> list[str]:
+    """The checks that one cause explains: the first in full, the others by name; and what may be behind the cause."""
+    first, *others = checks
+    lines = _wrapped(f"{first.level.value}: {first.name}. {first.sentence}", "  ")
+    lines += _wrapped(first.advice, "    ") if first.advice else []
+    if others:
+        named = join_words([f"{check.phrase} ({check.level.value}, {check.value})" for check in others])
+        lines += _wrapped(f"The same, {cause}, shows in: {named}.", "    ")
+    return lines + (_wrapped(f"It may follow from {before}, above.", "    ") if before else [])
 
 
 def _command(text: str) -> list[str]:
-    """A command over lines that a shell puts together again; a call in Python on one line."""
-    if not text.startswith("starcal-uq"):
-        return [f"    or, in Python: {text}"]
+    """A command over lines that a shell puts together again."""
     lines = ["    try:"]
-    for word in map(shlex.quote, shlex.split(text)):
+    for word in shlex.split(text):
+        written = word if word == "&&" else shlex.quote(word)
         # Room for the backslash.
-        if len(lines[-1]) + len(word) + 3 > COLUMNS and lines[-1].strip():
+        if len(lines[-1]) + len(written) + 3 > COLUMNS and lines[-1].strip():
             lines.append("     ")
-        lines[-1] += f" {word}"
+        lines[-1] += f" {written}"
     return [f"{line} \\" for line in lines[:-1]] + lines[-1:]
 
 
