@@ -47,6 +47,7 @@ RULES = (
     Rule("noise", ("model",), "likelihood", (None, "marginal")),
     Rule("star_errors", (True,), "method", (None, "efficient")),
     Rule("star_errors", (True,), "likelihood", (None, "marginal")),
+    Rule("accept_inflation", (True,), "method", (None, "efficient", *_IN_MEMORY)),
     Rule("dof", (), "likelihood", ("student_t",)),
     Rule("recursion", (), "method", _RECURSIVE),
     Rule("method", _IN_MEMORY, "partitioned", (None, False)),

@@ -612,7 +612,12 @@ class Run:
         """
         screened: Screening | None = None
         options |= {"throw": False} if undetermined else {}
-        refuse_conflicts(screening=screening, partitioned=isinstance(obs, PartitionedObservations))
+        refuse_conflicts(
+            screening=screening,
+            accept_inflation=accept_inflation,
+            method=options.get("method"),
+            partitioned=isinstance(obs, PartitionedObservations),
+        )
         if screening:
             from starcal_uq.estimation.screening.screening import screen
 

@@ -59,9 +59,11 @@ VALUES = {
     "--json": (None,),
 }
 # These say how large a run is and where it stands.
-ALWAYS = {"--out": "out", "--force": None, "--ensembles": "2", "--walkers": "14", "--steps": "20", "--draws": "50"}
+ALWAYS = {"--out": "out", "--force": None, "--ensembles": "2", "--walkers": "16", "--steps": "20", "--draws": "50"}
 # What a sentence for the command line has no words of: arguments, calls and attributes of Python.
 PYTHON = re.compile(r"[a-z_]+='|[a-z_]+=(True|None)|\bsc\.|obs\.|, not both\.$|\(throw|Traceback")
+# Whole runs of the slow test.
+ROWS = 24
 COMBINATIONS = [(name, value) for name, values in VALUES.items() for value in values]
 
 
@@ -188,16 +190,17 @@ def test_a_fault_of_the_program_has_a_status_of_its_own(tables, cli, monkeypatch
 
 
 @pytest.mark.slow
-def test_runs_with_every_two_options_that_begin_end_well_too(asked, cli, unreported):
-    """Options in rows such that each two of them that can be given together are together in at least one."""
+def test_runs_with_most_pairs_of_options_end_well_too(asked, cli, unreported):
+    """Options in rows such that most pairs of those that can be given together are together in at least one."""
     begins = {kind: [choice for choice in COMBINATIONS if asked(kind, [choice])] for kind in KINDS}
     possible = {
         kind: {pair for pair in itertools.combinations(some, 2) if different(pair) and asked(kind, pair, read=False)}
         for kind, some in begins.items()
     }
     rows, missing = [], set().union(*possible.values())
+    every = len(missing)
     rng = np.random.default_rng(3)
-    while missing:
+    while len(rows) < ROWS:
         first = min(missing, key=str)
         kind = rng.choice([kind for kind in KINDS if first in possible[kind]])
         row = list(first)
@@ -208,6 +211,7 @@ def test_runs_with_every_two_options_that_begin_end_well_too(asked, cli, unrepor
                 row.append(more)
         missing -= {tuple(sorted(pair, key=COMBINATIONS.index)) for pair in itertools.combinations(row, 2)}
         rows.append((kind, row))
+    assert len(missing) < 0.3 * every
     ended = []
     for kind, row in rows:
         words = command(kind, row)

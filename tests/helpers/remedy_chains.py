@@ -143,23 +143,41 @@ def follow(call: Call, words: Sequence[str], folder: Path) -> list[Step]:
         assert options not in [step.options for step in steps], (lines[-1], "was there before")
         assert all(len(values) == 1 for name, values in options.items() if name != "--column"), lines[-1]
         found = re.search(r"Checks: (.*) of \d+", out)
-        assert found is not None
+        assert found is not None, (lines, out[-600:])
         counts = {word: int(number) for number, word in re.findall(r"(\d+) (passed|gave|failed)", found[1])}
         commands = printed(out)
         assert len(commands) <= 3
-        for command in commands:
+        runs = [command for command in commands if command.split(" && ")[-1].startswith("starcal-uq run ")]
+        for command in runs:
             _, asked = parsed(shlex.split(command.split(" && ")[-1]))
             assert conflict(named(asked)) is None, command
             assert asked not in [*(step.options for step in steps), options], command
             assert not {"UTC", "SITE", "OBS", "CAMERA"} & set(shlex.split(command)), command
         end = re.search(r"No model here explains this[\s\S]*?(?=^Report:)", out, re.M)
-        said = end[0] if end else ""
+        said = " ".join(end[0].split()) if end else ""
         doubts = counts.get("failed", 0), counts.get("gave", 0)
         # A failure that nothing is left to try against is said to be one, with the data that would tell.
         assert bool(said) == (bool(doubts[0]) and not commands), (options, out[-1500:])
-        assert not said or ("usable: " in said and "not: " in said and "What would tell" in said)
+        assert not said or ("usable: " in said and "not: " in said and "What would tell" in said), said
         steps.append(Step(options, status, doubts, commands, said))
-        if not commands:
+        for command in set(commands) - set(runs):
+            status, _, err = call(shlex.split(command)[1:])
+            assert status in (0, 1), (command, status, err[-400:])
+        if not runs:
             return steps
         assert len(steps) < LONGEST, [step.options for step in steps]
-        lines = [shlex.split(line)[1:] for line in commands[0].split(" && ")]
+        lines = [shlex.split(line)[1:] for line in runs[0].split(" && ")]
+
+
+def row(name: str, steps: Sequence[Step]) -> tuple[str, str, str, str]:
+    """A misfit, what it failed at first, what was tried, and how it ended, for a table."""
+    start = steps[0].options
+    tried = []
+    for step in steps[1:]:
+        words = [word for name, values in step.options.items() if start.get(name) != values for word in (name, *values)]
+        shown = " ".join("SITE" if str(word).endswith(".toml") else str(word) for word in words if word)
+        tried.append(f"`{shown}` {step.doubts[0]}, {step.doubts[1]}")
+    last = steps[-1]
+    end = "passes" if last.doubts == (0, 0) else "warnings, no command left" if last.doubts[0] == 0 else "no model here"
+    end = "more frames (`plan`)" if last.commands else end
+    return name, f"{steps[0].doubts[0]}, {steps[0].doubts[1]}", " → ".join(tried) or "–", end

@@ -23,7 +23,7 @@ from starcal_uq.core.types import BoolArray
 from starcal_uq.diagnostics.misfit import ALPHA
 from starcal_uq.diagnostics.shapes import IN_FIELD
 from starcal_uq.diagnostics.verdict.effect import largest, of_pattern, on_attitudes, on_directions
-from starcal_uq.diagnostics.verdict.observed import NOISE, ROBUST, SCREEN, lens_remedy
+from starcal_uq.diagnostics.verdict.observed import NOISE, PLAUSIBLE_NOISE_PX, ROBUST, SCREEN, lens_remedy
 from starcal_uq.estimation.fallback import fallback_words
 from starcal_uq.estimation.undetermined import what_is_open
 from starcal_uq.inference.checks import resample
@@ -306,6 +306,13 @@ STAR_REMEDY = f"{CALIBRATE} --star-errors or sc.calibrate(obs, camera, star_erro
 def stars(found: StarTest) -> Check:
     """Do stars bring errors of their own along?"""
     name, bound = "Errors of the stars", f"p ≥ {STAR_P:g}"
+    if found.included_px > PLAUSIBLE_NOISE_PX[1]:
+        # What is wrong with the directions or the lens looks like this where all frames show one field.
+        value = f"{significant(found.included_px)} ± {significant(found.included_px_std)} px"
+        bound = f"≤ {PLAUSIBLE_NOISE_PX[1]:g} px"
+        sentence = f"{star_sentence(found)} No catalogue errs by that: something else is wrong, and is hidden by it."
+        advice = "Leave --star-errors out (star_errors=False), and see which checks then fail."
+        return Check(name, Question.TRUSTWORTHY, Level.FAIL, value, bound, sentence, advice=advice)
     if not found.applicable:
         value = "too few stars recur"
         return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, star_sentence(found))
