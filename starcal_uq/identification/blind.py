@@ -43,6 +43,8 @@ _GROUPS = (20_000, 40_000, 80_000, 160_000)
 _LEAST_IN_FIELD, _MOST_IN_FIELD = 0.3, 8.0
 # Nearest stars that a star makes patterns with, on levels of up to so many stars.
 _NEAREST = ((10_000, 7), (40_000, 6), (200_000, 5))
+# Patterns whose codes are computed together.
+_AT_ONCE = 20_000
 # Patterns of a frame are made of this many of its brightest stars, each with as many of its nearest.
 _BRIGHTEST, _FRAME_NEAREST = (8, 11, 16, 22, 32), 7
 # Codes differ by less than this, in units of the pattern's longest side: noise, and what an unknown lens bends.
@@ -132,7 +134,10 @@ def make_level(directions: FloatArray) -> Level:
 
     stars = cKDTree(directions)
     nearest = next((k for most, k in _NEAREST if len(directions) <= most), _NEAREST[-1][1])
-    codes, quads, size = codes_of(directions, quads_of(stars.query(directions, nearest + 1)[1]))
+    quads = quads_of(stars.query(directions, nearest + 1)[1])
+    # In blocks that stay in the processor's cache.
+    blocks = [codes_of(directions, quads[k : k + _AT_ONCE]) for k in range(0, len(quads), _AT_ONCE)]
+    codes, quads, size = (np.concatenate(column) for column in zip(*blocks, strict=True))
     return Level(directions, stars, quads, size, cKDTree(codes, balanced_tree=False, compact_nodes=False))
 
 

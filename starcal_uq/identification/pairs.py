@@ -30,14 +30,16 @@ if TYPE_CHECKING:
 
 # Stars a field should hold; a star with this many brighter ones within a field's area around it is no pattern star.
 PATTERN_STARS = 18
-# Steps of angle in the table of neighbours.
-_STEPS = 256
+# Pairs that are listed at the most, about: in narrow fields, with most stars, those at larger angles are left out.
+_MOST_PAIRS = 5_000_000
+# Steps of angle in the table of neighbours of a star, and of all of them.
+_STEPS, _ALL_STEPS = (8, 256), 1 << 22
 # Numbers of the table of cubes that says where no star is near, its least chord, and questions that it is worth.
 _CUBES, _LEAST_CUBE, _MANY = 1 << 22, 2.0**-12, 5_000
 # Pairs whose angles are computed together.
 _AT_ONCE = 1 << 17
 # Part of the key of every cache file: to be raised when the content or its meaning changes.
-_VERSION = 1
+_VERSION = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,12 +68,12 @@ class StarPairs:
 
         Of each hit the index into `star`, and the pattern star, (h,) each.
         """
-        edges, per_rad = self._steps
-        place = star * _STEPS
+        edges, steps, per_rad = self._steps
+        place = star * steps
         # NumPy's `clip` takes longer than these arrays of some thousand numbers deserve.
         first = np.maximum((angle_rad - tolerance_rad) * per_rad, 0.0).astype(np.int64)
-        last = np.minimum((angle_rad + tolerance_rad) * per_rad, _STEPS - 1.0).astype(np.int64)
-        start = edges[place + np.minimum(first, _STEPS - 1)]
+        last = np.minimum((angle_rad + tolerance_rad) * per_rad, steps - 1.0).astype(np.int64)
+        start = edges[place + np.minimum(first, steps - 1)]
         count = edges[place + last + 1] - start
         # A range beyond the largest angle is the last step, which the comparison below empties.
         some = np.flatnonzero(count > 0)
@@ -114,14 +116,15 @@ class StarPairs:
         return cKDTree(self.directions)
 
     @cached_property
-    def _steps(self) -> tuple[NDArray[np.int32], float]:
-        """Where each step of each star's neighbours begins, (n * steps + 1,), and the steps per rad."""
-        width = (float(self.angle[-1]) if len(self.angle) else 1.0) / _STEPS * (1.0 + 1e-12)
-        star = np.repeat(np.arange(len(self), dtype=np.int32) * np.int32(_STEPS), np.diff(self.neighbour_start))
-        star += np.minimum(self.neighbour_angle * (1.0 / width), _STEPS - 1.0).astype(np.int32)
-        edges = np.zeros(len(self) * _STEPS + 1, dtype=np.int32)
+    def _steps(self) -> tuple[NDArray[np.int32], int, float]:
+        """Where each step of each star's neighbours begins, (n * steps + 1,), the steps, and how many of them a rad."""
+        steps = min(max(_ALL_STEPS // max(len(self), 1), _STEPS[0]), _STEPS[1])
+        width = (float(self.angle[-1]) if len(self.angle) else 1.0) / steps * (1.0 + 1e-12)
+        star = np.repeat(np.arange(len(self), dtype=np.int32) * np.int32(steps), np.diff(self.neighbour_start))
+        star += np.minimum(self.neighbour_angle * (1.0 / width), steps - 1.0).astype(np.int32)
+        edges = np.zeros(len(self) * steps + 1, dtype=np.int32)
         np.cumsum(np.bincount(star, minlength=len(edges) - 1), out=edges[1:])
-        return edges, 1.0 / width
+        return edges, steps, 1.0 / width
 
 
 def find_star_pairs(
@@ -140,6 +143,8 @@ def find_star_pairs(
     brighter = np.bincount(near[:, 1], minlength=len(order))
     star = order[brighter < per_field].astype(np.int64)
     chosen = np.ascontiguousarray(directions[star])
+    # Stars at random have n^2 (1 - cos angle) / 4 pairs, which is n^2 angle^2 / 8 where there are many.
+    max_angle_rad = min(max_angle_rad, float(np.sqrt(8.0 * _MOST_PAIRS) / max(len(star), 1)))
     pairs = cKDTree(chosen).query_pairs(_chord(max_angle_rad), output_type="ndarray").reshape(-1, 2).astype(np.int32)
     angle = np.empty(len(pairs))
     for rows in (slice(k, k + _AT_ONCE) for k in range(0, len(pairs), _AT_ONCE)):

@@ -31,6 +31,9 @@ _HANDED_ON = 6
 # Catalogue triangles that one search of a frame looks at. More than three times as many as any that found an attitude
 # took; so many fit by chance where the camera is too little known for the noise, and more of them would say no more.
 _MOST_CANDIDATES = 100_000
+# Pairs of the catalogue that one search of a frame tries as a base: twice as many as any took in fields of two degrees
+# and more, half of whose brightest detections were false.
+_MOST_PAIRS = 5_000_000
 
 
 @dataclass(frozen=True)
@@ -110,7 +113,8 @@ def hypotheses(
     """For each triangle, the hypotheses that a fourth star supports, best first.
 
     Triangles are made of the first `max_centroids` of `points` (n, 2), ideal pixels, brightest first; only those that a
-    search of the first `searched` has left (`remaining_order`). Ends where too many triangles of the catalogue fit.
+    search of the first `searched` has left (`remaining_order`). Ends where too many pairs or triangles of the catalogue
+    fit.
     """
     n = min(len(points), max_centroids)
     if n < 4:
@@ -121,11 +125,12 @@ def hypotheses(
     angle = angle_between(b[:, None], b[None])
     length = np.hypot(*(u[:, None] - u[None]).transpose(2, 0, 1))
     bases: dict[tuple[int, int], tuple[IntArray, IntArray, FloatArray]] = {}
-    left = _MOST_CANDIDATES
+    left, pairs_left = _MOST_CANDIDATES, _MOST_PAIRS
     for triangle in _sorted_triangles(triangles, length, geometry):
         candidates = _look_up(triangle, b, angle, sigma, pairs, geometry, tolerance, bases)
         left -= len(candidates)
-        if left < 0:
+        pairs_left -= len(bases[_key(triangle)][0])
+        if left < 0 or pairs_left < 0:
             return
         if len(candidates):
             yield _supported(triangle, candidates, u, sigma, angle, length, pairs, geometry, tolerance)
@@ -148,6 +153,11 @@ def _sorted_triangles(triangles: IntArray, length: FloatArray, geometry: FieldGe
     return [(i, j, k) if length[i, k] <= length[j, k] else (j, i, k) for i, j, k in chosen[order].tolist()]
 
 
+def _key(triangle: tuple[int, int, int]) -> tuple[int, int]:
+    """The base of a triangle, in ascending order."""
+    return min(triangle[:2]), max(triangle[:2])
+
+
 def _look_up(
     triangle: tuple[int, int, int],
     b: FloatArray,
@@ -163,7 +173,7 @@ def _look_up(
     f, bias = geometry.focal_px, geometry.relative_bias(tolerance)
     noise = SIGMAS * np.sqrt(2.0) * float(max(sigma[i], sigma[j], sigma[k])) / f
     base = angle[i, j]
-    key = (min(i, j), max(i, j))
+    key = _key(triangle)
     if key not in bases:
         slack = base * (tolerance.focal + bias) + SIGMAS * np.hypot(sigma[i], sigma[j]) / f
         low, high = np.searchsorted(pairs.angle, (base - slack, base + slack))
