@@ -207,7 +207,7 @@ def identify(
             grown = other.grown(frame, patch)
             if grown is not None:
                 optics = replace(optics, focal_px=grown.camera.focal_px, distortion_px=abs(grown.bend_px))
-                other = other.bent(grown, _with(sheet, tolerance, optics, told)[0])
+                other = other.bent(frame, grown, _with(sheet, tolerance, optics, told)[0])
             other.run(progress, False)
             if other.n_solved > attempt.n_solved or not told:
                 attempt = other
@@ -267,8 +267,8 @@ class _Attempt:
         found = grow(self.field.xy[k], self.field.sigma[k], patch, sky, self.field.camera)
         return found if found is not None and found.log10_false < _SURE else None
 
-    def bent(self, grown: GrownField, nominal: Camera) -> _Attempt:
-        """The same frames, to be searched with a lens that one of them shows."""
+    def bent(self, k: int, grown: GrownField, nominal: Camera) -> _Attempt:
+        """The same frames, to be searched with a lens that one of them shows, whose own attitude is known."""
         other = copy(self)
         mirrored = self.parity == "mirrored"
         largest = _bending(self.tolerance, self.camera, grown.bend_px)
@@ -276,6 +276,9 @@ class _Attempt:
         other.nominal, other.tolerance = nominal, calibrated_tolerance(grown, largest)
         other.field = FrameTable(self.centroids, other.camera, mirrored)
         other.results, other._narrowed, other._search = {}, {}, None
+        known = other.search.near(other.field, k, grown.patch.rotation)
+        if known.match is not None:
+            other.results[k] = known
         return other
 
     def filled(self, progress: Callable[[int, int], None] | None) -> _Attempt:
@@ -293,7 +296,7 @@ class _Attempt:
         grown = self.grown(k, patch)
         if grown is None:
             return self
-        other = self.bent(grown, self.nominal)
+        other = self.bent(k, grown, self.nominal)
         more = len(grown.patch.centroid) > _MORE * len(match)
         missed = len(self._failed()) > _MISSED * len(self.results)
         beyond = self.tolerance.distortion_px + other.tolerance.distortion_px

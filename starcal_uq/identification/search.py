@@ -18,7 +18,7 @@ from starcal_uq.identification.brightness import instrumental_mag
 from starcal_uq.identification.match import CameraState, Match, match_frame, start_state
 from starcal_uq.identification.nearby import NearbyStars
 from starcal_uq.identification.proposers import Proposer
-from starcal_uq.identification.pyramid import CameraTolerance, FieldGeometry
+from starcal_uq.identification.pyramid import CameraTolerance, FieldGeometry, Hypothesis
 from starcal_uq.identification.result import FrameStatus
 from starcal_uq.maths.linear import scaled_inverse
 from starcal_uq.sky.catalogue import StarCatalogue
@@ -169,6 +169,15 @@ class Search:
             return Found("too few stars", None, perf_counter() - clock)
         status, match = self._look(field, k)
         return Found(status, match, perf_counter() - clock)
+
+    def near(self, field: FrameTable, k: int, rotation: FloatArray) -> Found:
+        """Identify one frame whose attitude is known."""
+        clock = perf_counter()
+        match = self._matched(field, k, start_state(Hypothesis(rotation, 1.0)), polished=True)
+        accepted = match is not None and match.log10_false < _LOG10_ACCEPTED
+        return Found(
+            "identified" if accepted else "not identified", match if accepted else None, perf_counter() - clock
+        )
 
     def again(self, field: FrameTable, k: int, first: Found, shared: FloatArray) -> Found:
         """The second pass: match anew with the common camera, or search once more."""

@@ -145,6 +145,18 @@ def test_thousands_of_detections(stars: StarCatalogue, barrel: float) -> None:
     assert right > 0.8 * np.count_nonzero(truth[0][0] != "")
 
 
+def test_the_frame_that_shows_the_lens_is_identified(stars: StarCatalogue) -> None:
+    """Hot pixels are the brightest of its detections, so that no triangle of the brightest is one of stars."""
+    lens = Lens(1600, 1200, 60.0, 0.05)
+    table, truth = measured(stars, lens, [80], 14, 0.2, 8)
+    table.flux[truth[0][0] == ""] = table.flux.max()
+    found = identify(table, None, stars, cache=False)
+    assert found.n_identified == 1
+    wrong, right = wrong_and_right(found, *truth[0])
+    assert wrong == 0
+    assert right > 0.8 * 80
+
+
 def noise_frames(lens: Lens, n: list[int], seed: int) -> Any:
     rng = np.random.default_rng(seed)
     size = np.array([lens.width - 1.0, lens.height - 1.0])
