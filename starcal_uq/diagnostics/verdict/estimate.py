@@ -22,7 +22,7 @@ from starcal_uq.core.status import (
 from starcal_uq.core.types import BoolArray
 from starcal_uq.diagnostics.misfit import ALPHA
 from starcal_uq.diagnostics.shapes import IN_FIELD
-from starcal_uq.diagnostics.verdict.effect import largest, of_pattern, on_attitudes, on_directions
+from starcal_uq.diagnostics.verdict.effect import Effect, largest, of_pattern, on_attitudes, on_directions
 from starcal_uq.diagnostics.verdict.observed import NOISE, PLAUSIBLE_NOISE_PX, ROBUST, SCREEN, lens_remedy
 from starcal_uq.estimation.fallback import fallback_words
 from starcal_uq.estimation.undetermined import what_is_open
@@ -299,7 +299,6 @@ def _resample(post: Posterior) -> str:
     return resample(post) if post.diagnostics.likelihood in LIKELIHOODS else resample(post, likelihood="marginal")
 
 
-STAR_WIDENING = 1.5
 STAR_REMEDY = f"{CALIBRATE} --star-errors or sc.calibrate(obs, camera, star_errors=True)"
 
 
@@ -324,7 +323,8 @@ def stars(found: StarTest) -> Check:
     if found.included_px > 0.0:
         value, bound = f"{significant(found.included_px)} ± {significant(found.included_px_std)} px", "in the intervals"
         return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, star_sentence(found))
-    level = Level.FAIL if ratio > STAR_WIDENING and found.p_value < STAR_FAIL_P else Level.WARN
+    added = Effect(found.parameter_names[widest], float(np.sqrt(max(ratio**2 - 1.0, 0.0))))
+    level = added.level if found.p_value < STAR_FAIL_P else Level.WARN
     return Check(name, Question.TRUSTWORTHY, level, value, bound, star_sentence(found), STAR_REMEDY)
 
 
