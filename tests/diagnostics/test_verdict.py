@@ -10,7 +10,7 @@ import pytest
 
 import starcal_uq as sc
 from starcal_uq.core.formatting import significant
-from starcal_uq.core.status import Level, Question
+from starcal_uq.core.status import Check, Level, Question
 from starcal_uq.diagnostics.diagnose import diagnose
 from starcal_uq.diagnostics.models import REJECT_P
 from starcal_uq.diagnostics.pattern import Pattern
@@ -55,6 +55,23 @@ def test_a_good_run_passes_every_check(run):
     assert {check.question for check in verdict.checks} == {Question.CONVERGED, Question.TRUSTWORTHY}
     assert all(check.sentence.endswith(".") and check.value and check.bound for check in verdict.checks)
     assert "every check passed" in verdict.headline
+
+
+@pytest.mark.parametrize(
+    ("level", "words"),
+    [
+        (Level.FAIL, "Violated: requirement 'R-1'. Converged, and every check passed"),
+        (Level.WARN, "can be used. Open: requirement 'R-1'."),
+        (Level.PASS, "Converged, and every check passed: the stated uncertainties can be used."),
+    ],
+)
+def test_a_requirement_of_the_budget_is_part_of_the_verdict(run, level, words):
+    required = Check("Requirement 'R-1'", Question.REQUIRED, level, "2 arcsec", "at most 1 arcsec", "It is so.")
+    verdict = judge(run.obs, run.cal, run.post, run.truth, requirements=[required])
+    assert verdict.level is level and verdict.level.exit_status == (level is Level.FAIL)
+    assert words in verdict.headline and verdict.of(Question.REQUIRED) == (required,)
+    # Control: the numbers themselves are judged as they were.
+    assert judge(run.obs, run.cal, run.post, run.truth).level is Level.PASS
 
 
 def test_without_posterior_the_headline_says_so(run):
