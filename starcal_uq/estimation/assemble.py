@@ -82,6 +82,7 @@ def assemble(
     names, factors = undetermined(likelihood, theta, normal.matrix, sigma, nominal, status)
     if names:
         status = Status.SINGULAR
+    pair_covariance = pair_covariance * np.outer(factors, factors)
     efficient, information = scaled_inverse(normal.matrix) * sigma**2, normal.matrix / sigma**2
     compressed = compress(likelihood, theta, efficient)
     if refined and status.ok:
@@ -110,7 +111,7 @@ def assemble(
         method=method,
         solver=solver,
         theta=theta,
-        covariance=(efficient if refined else pair_covariance) * np.outer(factors, factors),
+        covariance=efficient * np.outer(factors, factors) if refined else pair_covariance,
         sigma=sigma,
         sigma_std=sigma / float(np.sqrt(2.0 * dof)),
         sigma_name=sigma_parameter(likelihood.frames.weight is not None).name,
@@ -126,7 +127,7 @@ def assemble(
         rotation_per_theta=np.mean(attitudes.response, axis=2),
         attitude_noise=np.mean(attitudes.inverse, axis=2) * sigma**2,
         pair_theta=pair_theta,
-        pair_covariance=pair_covariance * np.outer(factors, factors),
+        pair_covariance=pair_covariance,
         compressed=compressed,
         provenance=provenance(None, record | (settings or {}), obs.data_hash)
         | {"kernels": likelihood.kernels}
