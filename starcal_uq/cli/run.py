@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from functools import partial
 from pathlib import Path
@@ -47,6 +48,7 @@ from starcal_uq.cli.settings import (
 )
 from starcal_uq.cli.steps import load_table, sample_run
 from starcal_uq.core.errors import CalibrationError, IdentificationError, PriorError
+from starcal_uq.core.formatting import plural
 from starcal_uq.core.store import finished
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.toml import read_section
@@ -195,9 +197,28 @@ def _calibrate(
         raise
     if from_images:
         run.keep_images(centroids, identified.identification, identified, inputs)
+        _tell_other_cameras(run)
         finished(run.folder.path)
     if run.screening is not None:
         show_screening(run.screening)
+
+
+# Options that hold for the images of another camera as well, and whether a value follows.
+_OF_ANY_CAMERA = {"--time": 1, "--epoch": 1, "--site": 1, "--directions": 1, "--max-mag": 1, "--in-space": 0}
+
+
+def _tell_other_cameras(run: Run) -> None:
+    """Images of other cameras, and the command that calibrates each of these."""
+    frames, words = run.frames, typed(sys.argv[1:])
+    kept: list[str] = []
+    for place, word in enumerate(words):
+        if word.partition("=")[0] in _OF_ANY_CAMERA:
+            kept += words[place : place + 1 + _OF_ANY_CAMERA[word.partition("=")[0]] * ("=" not in word)]
+    for place, other in enumerate(frames.record.others, 2):
+        paths = [str(frames.paths[frame]) for frame in other.frames if frame in frames.paths]
+        command = shlex.join(["starcal-uq", "run", *paths, *kept, "-o", f"{run.path}-{place}"])
+        images = plural(len(other.frames), "image")
+        note(f"{images} of another camera ({other.words}) left out; to calibrate that one: {command}")
 
 
 def _keep_failed(

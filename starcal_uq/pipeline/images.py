@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -181,8 +180,16 @@ def observations_from_images(
         for message in counted(centroids.messages):
             tell(f"note: {message}")
         tell(centroids.text)
+    asked = centroids
+
+    def noted(of_camera: Centroids, identification: Identification) -> None:
+        nonlocal centroids
+        centroids = of_camera
+        if seen is not None:
+            seen(of_camera, identification)
+
     obs, identification, found = observations_from_centroids(
-        centroids,
+        asked,
         camera,
         max_mag=max_mag,
         epoch=epoch,
@@ -192,7 +199,7 @@ def observations_from_images(
         identification={"engine": engine, "focal_tolerance": focal_tolerance},
         model=model,
         tell=tell,
-        seen=None if seen is None else partial(seen, centroids),
+        seen=noted,
     )
     if obs is None or found is None:
         raise IdentificationError(f"no frame is identified: {identification.text}")
@@ -213,7 +220,7 @@ def observations_from_centroids(
     model: str | None = None,
     lenient: bool = False,
     tell: Callable[[str], None] | None = None,
-    seen: Callable[[Identification], None] | None = None,
+    seen: Callable[[Centroids, Identification], None] | None = None,
 ) -> tuple[Observations | None, Identification, ImageCalibration | None]:
     """What `observations_from_images` does with the centroids of its images.
 
@@ -221,6 +228,7 @@ def observations_from_centroids(
     camera are taken as they were identified first, and none is no error. The last identification is returned; the
     observations are None where no star was identified, the calibration where they were identified once.
     """
+    from starcal_uq.pipeline.cameras import of_one_camera
     from starcal_uq.pipeline.depth import depth_text, identify_to_depth
     from starcal_uq.pipeline.refine import identify_and_calibrate
     from starcal_uq.sky.catalogue import load_catalogue
@@ -236,8 +244,17 @@ def observations_from_centroids(
     options = dict(identification or {})
     progress = options.pop("progress", None)
     stars, first = identify_to_depth(centroids, camera, year, max_mag, calibration=known, progress=progress, **options)
+    if known is None:
+
+        def search(table: Centroids) -> Identification:
+            return identify_to_depth(table, None, year, max_mag, engine=options.get("engine", "pyramid"))[1]
+
+        kept = of_one_camera(centroids, first, camera, options.get("focal_tolerance", 0.03), search)
+        if kept is not centroids:
+            centroids = kept
+            stars, first = identify_to_depth(centroids, camera, year, max_mag, progress=progress, **options)
     if seen is not None:
-        seen(first)
+        seen(centroids, first)
     if tell is not None and max_mag is None:
         tell(depth_text(stars, first))
     limit = float(stars.mag.max())

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from starcal_uq.core.display import Shown
 from starcal_uq.core.files import PathLike
 from starcal_uq.core.records import Saved
+from starcal_uq.pipeline.cameras import OtherCamera, other_cameras
 from starcal_uq.pipeline.refine import identified_pairs
 
 if TYPE_CHECKING:
@@ -65,6 +66,8 @@ class ImageRecord(Shown, Saved):
     sources: tuple[str, ...] = ()
     # Magnitude (Gaia G) to which stars were searched for, where that is known.
     max_mag: float | None = None
+    # Frames of other cameras, which were left out.
+    others: tuple[OtherCamera, ...] = ()
 
     FILE = "a record of images", "run `starcal-uq run IMAGES... -o RUN` again"
 
@@ -109,7 +112,7 @@ def record_images(
     disturbed = 0 if images is None else images.observations.meta.get("disturbed_stars", 0)
     places = tuple(os.path.abspath(source) for source in sources)
     parity, limit = ("normal", None) if last is None else (last.parity, last.observations.meta.get("max_mag"))
-    return ImageRecord(tuple(rounds), tuple(rows), int(disturbed), parity, places, limit)
+    return ImageRecord(tuple(rounds), tuple(rows), int(disturbed), parity, places, limit, other_cameras(centroids))
 
 
 def _recorded(

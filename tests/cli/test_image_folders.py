@@ -130,3 +130,65 @@ def test_a_call_that_lacks_an_argument_is_answered_with_a_sentence(cli, call, sa
     status, _, err = cli(*call)
     assert status == 2
     assert err.startswith(f"error: {said}")
+
+
+@pytest.fixture
+def mixed_folder(tmp_path):
+    """Five pictures of one camera among what else lies in a folder: two of a longer lens, and what is no picture."""
+
+    def made(longer):
+        frames = tmp_path / "frames"
+        frames.mkdir()
+        rng = np.random.default_rng(3)
+        for number in range(7):
+            focal = 2400.0 * (longer if number in (2, 5) else 1.0)
+            picture(frames / f"{number}.tiff", attitude(rng), focal, max_mag=8.0, seed=number)
+        picture(frames / "small.tiff", attitude(rng), 2400.0, size=300, max_mag=8.0)
+        whole = (frames / "0.tiff").read_bytes()
+        (frames / "cut.tiff").write_bytes(whole[: len(whole) // 3])
+        (frames / "raw.nef").write_bytes(b"II*\0")
+        (frames / "empty.fits").write_bytes(b"")
+        return frames
+
+    return made
+
+
+@pytest.mark.parametrize(("longer", "with_sheet"), [(1.75, False), (1.015, True)])
+def test_frames_of_another_camera_are_left_out(mixed_folder, tmp_path, longer, with_sheet):
+    """One that is found by itself, and one that a sheet's tolerance takes for the same."""
+    folder = mixed_folder(longer)
+    sheet(tmp_path / "camera.toml", 2400.0)
+    camera = sc.Camera.load(tmp_path / "camera.toml") if with_sheet else None
+    obs, centroids, found = observations_from_images([folder], camera)
+    assert np.unique(obs.frame).size == 5
+    assert abs(found.calibration.camera.focal_px / 2400.0 - 1.0) < 2e-4
+    why = dict(zip(centroids.image.tolist(), centroids.problem.tolist(), strict=True))
+    for name in ("2.tiff", "5.tiff"):
+        assert why[name].startswith(f"another camera took it: f = {2400.0 * longer:.4g}"[:-1])
+    assert "truncated or damaged" in why["cut.tiff"]
+    assert why["empty.fits"] == "the file is empty"
+    assert why["raw.nef"].startswith("raw files of cameras need rawpy") or "damaged" in why["raw.nef"]
+    assert why["small.tiff"].startswith("the image is 300 x 300 px")
+    assert [name for name, words in why.items() if not words] == ["0.tiff", "1.tiff", "3.tiff", "4.tiff", "6.tiff"]
+    # No noise of another lens is in that of the frames.
+    assert obs.meta.get("noise_floor_px", 0.0) < 0.1
+
+
+@pytest.mark.slow
+def test_the_command_for_the_other_camera_works(cli, mixed_folder, tmp_path):
+    mixed_folder(1.75)
+    status, _, err = cli("run", "frames", "-o", "run", "--directions", "apparent", *FAST)
+    assert status in (0, 1), err
+    notes = [line for line in err.splitlines() if "of another camera" in line]
+    assert [re.search(r"\((.*)\) left out", line)[1] for line in notes] == ["300 x 300 px", "f = 4200 px"]
+    command = shlex.split(notes[1].partition("to calibrate that one: ")[2])
+    assert command[:2] == ["starcal-uq", "run"]
+    assert command[-4:] == ["--directions", "apparent", "-o", "run-3"]
+    status, _, err = cli(*command[1:], *FAST)
+    assert status in (0, 1), err
+    assert sc.Run(tmp_path / "run-3").calibration.camera.focal_px == pytest.approx(4200.0, rel=1e-3)
+    frames = sc.Run(tmp_path / "run").frames
+    assert next(frame.row.outcome for frame in frames if frame.row.frame == 2).startswith("another camera took it")
+    page = cli("inspect", "run", "--force")
+    assert page[0] == 0
+    assert "calibrate the frames of that camera by themselves" in page_of(tmp_path / "run")

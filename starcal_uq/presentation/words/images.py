@@ -168,6 +168,10 @@ def next_step(frame: InspectedFrame, frames: Frames) -> Step | None:
     again = f"starcal-uq identify {run}/centroids.parquet {camera} -o found.csv".replace("  ", " ")
     again += f" --calibration {run}" if frames.calibrated else ""
     centroid = f"starcal-uq centroid {image} {f'--camera {camera} ' if camera else ''}-o stars.csv"
+    if other := next((other for other in frames.record.others if frame.row.frame in other.frames), None):
+        paths = [quote(str(frames.paths[number])) for number in other.frames if number in frames.paths]
+        command = f"starcal-uq run {' '.join(paths)} -o {quote(frames.run + '-other')}"
+        return Step("another camera took it: calibrate the frames of that camera by themselves.", command)
     if outcome == "identified":
         images = " ".join(quote(str(source)) for source in frames.images) or "IMAGES"
         command = f"starcal-uq run {images} {camera} -o {quote(frames.run + '-deeper')} {deeper}".rstrip()
