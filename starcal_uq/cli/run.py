@@ -209,7 +209,7 @@ _OF_ANY_CAMERA = {"--time": 1, "--epoch": 1, "--site": 1, "--directions": 1, "--
 
 def _tell_other_cameras(run: Run) -> None:
     """Images of other cameras, and the command that calibrates each of these."""
-    frames, words = run.frames, typed(sys.argv[1:])
+    frames, words = run.frames, typed_words(sys.argv[1:])
     kept: list[str] = []
     for place, word in enumerate(words):
         if word.partition("=")[0] in _OF_ANY_CAMERA:
