@@ -15,7 +15,7 @@ these explain as well as air does cannot be told from it.
 from __future__ import annotations
 
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -39,7 +39,6 @@ from starcal_uq.sky.site import Site
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from starcal_uq.camera.camera import Camera
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.observations.table import Observations
 
@@ -98,14 +97,14 @@ class AirTest:
     p_value: float
     amplitude: float
     amplitude_std: float
-    is_air: bool
-    latitude_deg: float
-    longitude_deg: float
-    latitude_std_deg: float
-    longitude_std_deg: float
-    f_px: float
-    f_sigma: float
-    n_frames: int
+    is_air: bool = False
+    latitude_deg: float = np.nan
+    longitude_deg: float = np.nan
+    latitude_std_deg: float = np.nan
+    longitude_std_deg: float = np.nan
+    f_px: float = np.nan
+    f_sigma: float = np.nan
+    n_frames: int = 0
     like_others: bool = False
 
 
@@ -126,7 +125,8 @@ def air_test(obs: Observations, cal: Calibration, *, seed: int = 0, stars: StarT
     Returns
     -------
     AirTest or None
-        None where the camera was in space, or where from no place all stars were above the horizon.
+        None where the camera was in space, or where from no place all stars were above the horizon and frames by
+        themselves hold no scale and shape.
     """
     if obs.meta.get("observer") in _NO_AIR:
         return None
@@ -146,33 +146,13 @@ def _looked_for(obs: Observations, cal: Calibration, seed: int, stars: StarTest,
     timed = obs.time_utc is not None and bool((obs.time_utc != "").all())
     most = _FRAMES if timed else _FRAMES_APIECE
     rest = Remainder(obs, cal, seed, _star_noise(obs, cal, stars, sigma), most)
-    air = _Air(rest, cal.camera)
+    air = _Air(rest, cal)
     found = air.of_one_place(seed)
     if not air.timed and (found is None or not found.is_air):
         apiece = air.of_each_frame()
         if apiece is not None and (found is None or apiece.is_air or apiece.like_others):
-            found = apiece
-    if found is None:
-        return None
-    nothing = float("nan")
-    place = dict.fromkeys(("latitude_deg", "longitude_deg", "latitude_std_deg", "longitude_std_deg"), nothing)
-    if found.is_air and found.place is not None:
-        direction, std = found.place
-        latitude, longitude = np.arcsin(direction[2]), np.arctan2(direction[1], direction[0])
-        place = {"latitude_deg": float(np.degrees(latitude)), "longitude_deg": float(np.degrees(longitude))}
-        place |= {"latitude_std_deg": float(std[0]), "longitude_std_deg": float(std[1] / max(np.cos(latitude), 1e-3))}
-    shift = found.f_px if found.is_air or found.like_others else nothing
-    return AirTest(
-        found.p_value,
-        found.amplitude,
-        found.amplitude_std,
-        found.is_air,
-        f_px=shift,
-        f_sigma=shift / float(cal.sigmas[2]),
-        n_frames=rest.obs.n_frames,
-        like_others=found.like_others,
-        **place,
-    )
+            return apiece
+    return found
 
 
 def _star_noise(obs: Observations, cal: Calibration, found: StarTest, sigma: float) -> tuple[StarErrors, float] | None:
@@ -262,18 +242,6 @@ def _orthonormal(rows: FloatArray, least: float = 1e-6) -> FloatArray:
     return found
 
 
-class _Found(NamedTuple):
-    """What air explains; the place is its direction and the standard errors to north and east, degrees."""
-
-    p_value: float
-    amplitude: float
-    amplitude_std: float
-    is_air: bool
-    like_others: bool
-    f_px: float
-    place: tuple[FloatArray, FloatArray] | None = None
-
-
 class _Settled(NamedTuple):
     """Zeniths (n, 3) whose air explains the most, its density, shifts (2, N) by it, what is left of these (m,)."""
 
@@ -287,9 +255,9 @@ class _Settled(NamedTuple):
 class _Air:
     """Refraction of some frames from any place."""
 
-    def __init__(self, rest: Remainder, camera: Camera) -> None:
+    def __init__(self, rest: Remainder, cal: Calibration) -> None:
         # Air is looked for beside terms that the lens may lack and a drift of f; `_alone` is without these.
-        likelihood, state = rest.likelihood, rest.state
+        likelihood, state, camera = rest.likelihood, rest.state, cal.camera
         view = View.of(likelihood, state, camera.theta, slice(0, likelihood.frames.n_stars))
         weight = 1.0 if likelihood.frames.weight is None else likelihood.frames.weight
         others = (*lens_shapes(camera), *focal_drift(rest.obs))
@@ -297,7 +265,7 @@ class _Air:
         self._alone, self._rest = rest, rest.beside(shifts)
         own = self._apart(frame_shapes(camera).columns(view) * weight)
         self._own = own.reshape(3, -1, *own.shape[1:])
-        self._theta, self._focal = camera.theta, camera.focal_px
+        self._cal = cal
         self._axes, self.timed = _earth(rest.obs)
         self._constants = refraction_constants(Site(45.0, 0.0))
 
@@ -334,7 +302,7 @@ class _Air:
         found: FloatArray = places[np.min(places @ seen, axis=1) > _LOWEST]
         return found
 
-    def of_one_place(self, seed: int) -> _Found | None:
+    def of_one_place(self, seed: int) -> AirTest | None:
         """The air of one place; None where from no place all stars were above the horizon."""
         places = self._possible(_sphere(_PLACES))
         if not len(places):
@@ -342,7 +310,7 @@ class _Air:
         alone, _ = self._alone.left(np.stack([self._shift(self._above(place[None])) for place in places]))
         rest, columns = self._rest, self._rest.cleared(alone)
         p_value, amplitude, std = _largest(rest, columns, seed)
-        found = _Found(p_value, amplitude, std, False, False, np.nan)
+        found = AirTest(p_value, amplitude, std, n_frames=rest.obs.n_frames)
         if p_value >= AIR_P:
             if _largest(self._alone, alone, seed)[0] >= AIR_P:
                 return found
@@ -351,15 +319,27 @@ class _Air:
         settled = self._settled(rest, places[np.argmax(gain)][None], self._above)
         gained, most = _gained(rest, settled.column), _most(rest, columns)
         good = most - gained < max(_AIR_CHI2, _INEXACT * most) and self._nothing_else(rest, settled.column)
-        place = (settled.zeniths[0], np.degrees(settled.errors[:2])) if self.timed else None
-        return self._of(settled, found, rest, good)._replace(place=place)
+        if not good:
+            return found
+        found = self._with(found, settled, rest)
+        if not (self.timed and found.is_air):
+            return found
+        x, y, z = settled.zeniths[0]
+        north, east, _ = np.degrees(settled.errors)
+        return replace(
+            found,
+            latitude_deg=float(np.degrees(np.arcsin(z))),
+            longitude_deg=float(np.degrees(np.arctan2(y, x))),
+            latitude_std_deg=float(north),
+            longitude_std_deg=float(east / max(np.hypot(x, y), 1e-3)),
+        )
 
-    def of_each_frame(self) -> _Found | None:
+    def of_each_frame(self) -> AirTest | None:
         """Air with a zenith for every frame; None where frames by themselves hold no scale and shape."""
         found = self._of_each_frame(self._rest)
         return self._of_each_frame(self._alone) if found is None or found.p_value >= AIR_P else found
 
-    def _of_each_frame(self, rest: Remainder) -> _Found | None:
+    def _of_each_frame(self, rest: Remainder) -> AirTest | None:
         own, k = self._own_shapes(rest), rest.obs.n_frames
         if _f_tail(_explained(rest, own), len(own), rest) >= AIR_P:
             return None
@@ -373,15 +353,15 @@ class _Air:
             for first, last in ((0, 1), (1, 3)):
                 one = _explained(rest, self._own_shapes(rest, slice(first, last))) / rest.sigma**2
                 good = good and gained > one + (3 - last + first) * k + _AIR_CHI2
-        return self._of(settled, _Found(p_value, np.nan, np.nan, False, False, np.nan), rest, good)
+        found = AirTest(p_value, settled.density, float(settled.errors[-1]), n_frames=k)
+        return self._with(found, settled, rest) if good else found
 
-    def _of(self, settled: _Settled, found: _Found, rest: Remainder, good: bool) -> _Found:
-        """What was found, with the air that explains it where it is good; beside terms of the lens or alone."""
-        if not good and np.isfinite(found.amplitude):
-            return found
-        found = found._replace(amplitude=settled.density, amplitude_std=float(settled.errors[-1]))
+    def _with(self, found: AirTest, settled: _Settled, rest: Remainder) -> AirTest:
+        """What was found, with the air that explains it, beside terms of the lens or only without these."""
         f_px = -float(self._alone.left(settled.shift[None])[1][0, 2])
-        return found._replace(is_air=good and rest is self._rest, like_others=good and rest is self._alone, f_px=f_px)
+        alike, errors = rest is self._alone, float(settled.errors[-1])
+        found = replace(found, amplitude=settled.density, amplitude_std=errors, is_air=not alike, like_others=alike)
+        return replace(found, f_px=f_px, f_sigma=f_px / float(self._cal.sigmas[2]))
 
     @cached_property
     def _own_left(self) -> FloatArray:
@@ -455,13 +435,13 @@ class _Air:
         lowest = np.minimum.reduceat(grid @ state.b, frames.starts[:-1], axis=1)
         columns = likelihood.project_out(state, shifts)
         size = np.where(lowest > _LOWEST, frames.sum(np.sum(columns**2, axis=1)), np.inf)
-        h = likelihood.project_out(state, likelihood.derivatives(self._theta, state))
+        h = likelihood.project_out(state, likelihood.derivatives(self._cal.theta, state))
         e = likelihood.project_out(state, state.e[None])[0]
         basis = np.linalg.qr(h.reshape(len(h), -1).T)[0]
         number, star = np.repeat(np.arange(frames.n_frames), frames.sizes), np.arange(n)
         best, least = np.zeros(frames.n_frames, dtype=np.int64), np.inf
         for tangent in _TANGENTS:
-            left = e - h[2] * (self._focal * self._constants[0] * (1.0 + 0.5 * tangent**2))
+            left = e - h[2] * (self._cal.camera.focal_px * self._constants[0] * (1.0 + 0.5 * tangent**2))
             for _ in range(_ROUNDS):
                 gain = 2.0 * frames.sum(np.sum(columns * left, axis=1)) - size
                 chosen = np.argmax(gain, axis=0)
