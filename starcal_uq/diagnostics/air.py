@@ -30,7 +30,7 @@ from starcal_uq.diagnostics.residuals import of_heard
 from starcal_uq.diagnostics.shapes import View, focal_drift, frame_shapes, lens_shapes
 from starcal_uq.diagnostics.stars import StarTest, star_test
 from starcal_uq.estimation.marginal import MarginalLikelihood
-from starcal_uq.estimation.noise_model import fit_noise, weighed
+from starcal_uq.estimation.noise_model import NoiseModel, fit_noise, weighed
 from starcal_uq.estimation.star_errors import StarErrors, StarLikelihood
 from starcal_uq.observations.splits import one_of_each
 from starcal_uq.sky.refraction import refraction_constants, site_among_stars
@@ -132,42 +132,42 @@ def air_test(obs: Observations, cal: Calibration, *, seed: int = 0, stars: StarT
         return None
     stars = star_test(obs, cal) if stars is None else stars
     obs, cal = of_heard(weighed(obs, cal), cal)
-    found = _looked_for(obs, cal, seed, stars, cal.sigma)
-    if found is not None and (found.is_air or found.like_others) and cal.noise_model is None:
-        # Noise that grows towards the edge looks like scale and shape of single frames.
-        model, _ = fit_noise(obs, cal.camera, rounds=1)
-        if model.varies:
-            found = _looked_for(obs.weighted(model.sigma_px(obs)), cal, seed, stars, 1.0)
-    return found
+    errors = _star_noise(obs, cal, stars)
+    air = _Air(obs, cal, seed, errors)
+    found = air.test(seed)
+    if found is None or not (found.is_air or found.like_others) or cal.noise_model is not None:
+        return found
+    # Noise that grows towards the edge looks like scale and shape of single frames.
+    model = air.noise()
+    if not model.varies:
+        return found
+    weighted = obs.weighted(model.sigma_px(obs), model.axes)
+    if errors is not None:
+        errors = errors[0], errors[1] * _rms(obs.sigma_px) / _rms(weighted.sigma_px)
+    again = _Air(weighted, cal, seed, errors)
+    found = again.test(seed)
+    if found is None or np.isnan(found.f_px):
+        return found
+    # What the estimate took up of it is by the weights that it was made with.
+    f_px = air.f_px(again.seen_px)
+    return replace(found, f_px=f_px, f_sigma=f_px / float(cal.sigmas[2]))
 
 
-def _looked_for(obs: Observations, cal: Calibration, seed: int, stars: StarTest, sigma: float) -> AirTest | None:
-    """The test with the noise of the images as the table has it, `sigma` a common factor."""
-    timed = obs.time_utc is not None and bool((obs.time_utc != "").all())
-    most = _FRAMES if timed else _FRAMES_APIECE
-    rest = Remainder(obs, cal, seed, _star_noise(obs, cal, stars, sigma), most)
-    air = _Air(rest, cal)
-    found = air.of_one_place(seed)
-    if not air.timed and (found is None or not found.is_air):
-        apiece = air.of_each_frame()
-        if apiece is not None and (found is None or apiece.is_air or apiece.like_others):
-            return apiece
-    return found
+def _rms(sigma_px: FloatArray | None) -> float:
+    return 1.0 if sigma_px is None else float(np.sqrt(np.mean(sigma_px**2)))
 
 
-def _star_noise(obs: Observations, cal: Calibration, found: StarTest, sigma: float) -> tuple[StarErrors, float] | None:
+def _star_noise(obs: Observations, cal: Calibration, found: StarTest) -> tuple[StarErrors, float] | None:
     """Direction errors of the stars and the noise of their images: those fitted, or those that recurring stars show."""
-    errors = cal.star_errors
-    if errors is None:
-        if not found.tau_px > 0.0:
-            return None
-        numbers = found.n_stars, found.n_recurring
-        errors = StarErrors(found.tau_px, found.tau_px_std, 0.0, float(cal.theta[2]), *numbers)
-    elif sigma == cal.sigma:
-        return errors, sigma
-    # A factor on all of the noise holds both.
-    of_stars = errors.total_px**2 * float(np.mean(1.0 if obs.sigma_px is None else obs.sigma_px**-2.0))
-    return errors, float(np.sqrt(max(sigma**2 - of_stars, 0.1 * sigma**2)))
+    if cal.star_errors is not None:
+        return cal.star_errors, cal.sigma
+    if not found.tau_px > 0.0:
+        return None
+    # The estimate's noise holds both.
+    of_stars = found.tau_px**2 * float(np.mean(1.0 if obs.sigma_px is None else obs.sigma_px**-2.0))
+    own = float(np.sqrt(max(cal.sigma**2 - of_stars, 0.1 * cal.sigma**2)))
+    numbers = found.n_stars, found.n_recurring
+    return StarErrors(found.tau_px, found.tau_px_std, 0.0, float(cal.theta[2]), *numbers), own
 
 
 class Remainder:
@@ -189,7 +189,7 @@ class Remainder:
         chosen = one_of_each(obs.n_frames, min(most, max(_STARS * obs.n_frames // obs.n_stars, 3)), seed)
         self.obs = obs if len(chosen) == obs.n_frames else obs.select_frames(obs.frame_ids[chosen])
         model, rotations = cal.camera.distortion, quaternion_to_rotation(cal.quaternions[chosen])
-        self.likelihood = MarginalLikelihood(self.obs, model)
+        self.likelihood = MarginalLikelihood(self.obs, model, axes=True)
         if errors is not None:
             self.likelihood = StarLikelihood(self.obs, model, cal.theta, rotations, *errors)
         self.state, _ = self.likelihood.profile(cal.theta, rotations)
@@ -255,19 +255,52 @@ class _Settled(NamedTuple):
 class _Air:
     """Refraction of some frames from any place."""
 
-    def __init__(self, rest: Remainder, cal: Calibration) -> None:
+    def __init__(self, obs: Observations, cal: Calibration, seed: int, errors: tuple[StarErrors, float] | None) -> None:
+        timed = obs.time_utc is not None and bool((obs.time_utc != "").all())
+        rest = Remainder(obs, cal, seed, errors, _FRAMES if timed else _FRAMES_APIECE)
         # Air is looked for beside terms that the lens may lack and a drift of f; `_alone` is without these.
         likelihood, state, camera = rest.likelihood, rest.state, cal.camera
         view = View.of(likelihood, state, camera.theta, slice(0, likelihood.frames.n_stars))
-        weight = 1.0 if likelihood.frames.weight is None else likelihood.frames.weight
         others = (*lens_shapes(camera), *focal_drift(rest.obs))
-        shifts = np.concatenate([shape.columns(view) for shape in others]) * weight
+        shifts = np.concatenate([shape.columns(view) for shape in others])
         self._alone, self._rest = rest, rest.beside(shifts)
-        own = self._apart(frame_shapes(camera).columns(view) * weight)
+        own = frame_shapes(camera).columns(view)
+        for columns in (shifts, own):
+            likelihood.frames.whiten(columns)
+        own = self._apart(own)
         self._own = own.reshape(3, -1, *own.shape[1:])
         self._cal = cal
         self._axes, self.timed = _earth(rest.obs)
         self._constants = refraction_constants(Site(45.0, 0.0))
+        self.seen_px = np.zeros((2, likelihood.frames.n_stars))
+
+    def test(self, seed: int) -> AirTest | None:
+        """Test the air of one place, and without times of a zenith for each frame."""
+        found = self.of_one_place(seed)
+        if not self.timed and (found is None or not found.is_air):
+            apiece = self.of_each_frame()
+            if apiece is not None and (found is None or apiece.is_air or apiece.like_others):
+                return apiece
+        return found
+
+    def _taken(self, shift_px: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Whitened shifts (1, 2, N) of shifts (2, N) of images, px, and what parameters take up of them (p,)."""
+        shifts = np.array(shift_px)[None]
+        self._alone.likelihood.frames.whiten(shifts)
+        return shifts, self._alone.left(shifts)[1][0]
+
+    def f_px(self, shift_px: FloatArray) -> float:
+        """How much too short f is without air that shifts images so, (2, N) px."""
+        return -float(self._taken(shift_px)[1][2])
+
+    def noise(self) -> NoiseModel:
+        """Fit the noise that the images have without the air that was found."""
+        rest, theta = self._alone, self._cal.theta
+        shifts, taken = self._taken(self.seen_px)
+        left = shifts[0] - np.tensordot(taken, rest.likelihood.derivatives(theta, rest.state), 1)
+        x, y = rest.likelihood.frames.in_pixels(left)
+        clean = replace(rest.obs, x_px=rest.obs.x_px - x, y_px=rest.obs.y_px - y)
+        return fit_noise(clean, self._cal.camera, rounds=1)[0]
 
     def _apart(self, shifts: FloatArray) -> FloatArray:
         """Shifts (q, 2, N) of each frame by itself, (q K, 2, N)."""
@@ -358,7 +391,8 @@ class _Air:
 
     def _with(self, found: AirTest, settled: _Settled, rest: Remainder) -> AirTest:
         """What was found, with the air that explains it, beside terms of the lens or only without these."""
-        f_px = -float(self._alone.left(settled.shift[None])[1][0, 2])
+        self.seen_px = rest.likelihood.frames.in_pixels(settled.shift)
+        f_px = self.f_px(self.seen_px)
         alike, errors = rest is self._alone, float(settled.errors[-1])
         found = replace(found, amplitude=settled.density, amplitude_std=errors, is_air=not alike, like_others=alike)
         return replace(found, f_px=f_px, f_sigma=f_px / float(self._cal.sigmas[2]))
