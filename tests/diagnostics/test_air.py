@@ -72,7 +72,7 @@ def test_refraction_and_the_place_it_was_seen_from():
     # The focal length is where it is known not to be, and comes back.
     assert found.f_sigma > 3.0 and abs(cal.theta[2] + found.f_px - focal) < 4.0 * cal.sigmas[2]
     check = observed.directions(obs, cal, found)
-    assert check.level is Level.FAIL and check.remedy.endswith("--site SITE")
+    assert check.level is Level.FAIL and "--site SITE" in check.remedy
     assert "° N" in check.sentence and "too short" in check.sentence
 
 
