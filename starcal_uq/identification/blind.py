@@ -38,7 +38,8 @@ if TYPE_CHECKING:
 _FIRST_LEVEL = 64
 LEVELS = [_FIRST_LEVEL << k for k in range(12)]
 # Levels searched together: those that are made in a second first, then the deeper ones, which only narrow fields need.
-_GROUPS = (20_000, 40_000, 80_000, 160_000)
+FIRST_GROUP = 20_000
+_GROUPS = (FIRST_GROUP, 40_000, 80_000, 160_000)
 # Stars of a level that a field holds, at the least and at the most, for each star down to a pattern's faintest.
 _LEAST_IN_FIELD, _MOST_IN_FIELD = 0.3, 8.0
 # Nearest stars that a star makes patterns with, on levels of up to so many stars.
@@ -199,6 +200,10 @@ class BlindSearch:
         self.geometry = FieldGeometry(self.width, self.width, self.height, corner)
         self.tolerance = CameraTolerance(_FOCAL, _CENTRE * self.width, max(1.0, _DISTORTION * corner))
         self.sky = NearbyStars(stars.directions_icrs, stars.mag, self.geometry)
+
+    def sizes(self, most: int, focal_px: tuple[float, float]) -> list[int]:
+        """Levels of at most so many stars, of which a field shows enough."""
+        return [n for n in LEVELS if n <= most and _useful(n, self.width * self.height, focal_px)]
 
     def candidates(self, u: FloatArray, sigma_px: FloatArray, sizes: list[int], focal_px: tuple[float, float]) -> _Seen:
         """What patterns of a frame, points (n, 2) from the middle, brightest first, have like ones on these levels."""

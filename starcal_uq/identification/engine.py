@@ -25,7 +25,7 @@ from starcal_uq.core.errors import IdentificationError
 from starcal_uq.core.settings import Engine, bounded
 from starcal_uq.core.tasks import one_thread
 from starcal_uq.core.types import FloatArray
-from starcal_uq.identification.blind import AGREEMENT, FOCAL_RANGE, find_optics
+from starcal_uq.identification.blind import AGREEMENT, FIRST_GROUP, FOCAL_RANGE, BlindSearch, find_optics
 from starcal_uq.identification.growth import GrownField, Patch, grow
 from starcal_uq.identification.match import CameraState, Match
 from starcal_uq.identification.nearby import NearbyStars
@@ -209,6 +209,8 @@ def identify(
                 optics = replace(optics, focal_px=grown.camera.focal_px, distortion_px=abs(grown.bend_px))
                 other = other.bent(frame, grown, _with(sheet, tolerance, optics, told)[0])
             other.run(progress, False)
+            if grown is not None and share_camera:
+                other.by_patterns(catalogue)
             if other.n_solved > attempt.n_solved or not told:
                 attempt = other
     if told or optics is not None:
@@ -280,6 +282,22 @@ class _Attempt:
         if known.match is not None:
             other.results[k] = known
         return other
+
+    def by_patterns(self, catalogue: StarsByDepth) -> None:
+        """Look in frames that failed at patterns of more of their brightest detections, which may be hot pixels.
+
+        All frames are looked at where one of the first few is found so.
+        """
+        camera = self.field.camera
+        search = BlindSearch(catalogue.for_level(FIRST_GROUP), camera.width_px, camera.height_px)
+        limits = camera.focal_px * (1.0 - AGREEMENT), camera.focal_px * (1.0 + AGREEMENT)
+        failed = self._failed()
+        for number, k in enumerate(failed):
+            if number == _PROBES and all(self.results[i].match is None for i in failed[:number]):
+                return
+            solved = search.solve(self.field.points[k], self.field.sigma[k], search.sizes(FIRST_GROUP, limits), limits)
+            if solved is not None:
+                self.results[k] = self.search.near(self.field, k, solved.patch.rotation)
 
     def filled(self, progress: Callable[[int, int], None] | None) -> _Attempt:
         """The frames with the lens that the best of them shows, where that explains more than this camera does.
