@@ -79,7 +79,7 @@ class EstimationSettings:
     noise: Annotated[
         settings.NoiseKind,
         typer.Option(
-            help="common (one noise for all stars), or model (fitted against radius, magnitude and frame, as far as "
+            help="common (one noise for all stars), or model (fitted against radius, magnitude, frame and axis, as far as "
             "the residuals ask for it)."
         ),
     ] = "common"

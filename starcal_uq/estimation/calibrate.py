@@ -120,7 +120,8 @@ def calibrate(
     model : str, optional
         Distortion model in place of the camera's. A model asked for here is fitted or refused. By default it is that of
         `camera`, and where the data do not determine it (methods ``efficient`` and ``three_stage`` on a table), the
-        richest simpler one that they do: ``provenance["fallback"]`` then says which, and why.
+        richest simpler one that they do: ``provenance["fallback"]`` then says which, and why. Where the distortion may
+        be none, sigmas leave out what its coma tells of the principal point (`Calibration.coma_factors`).
     method : {"efficient", "three_stage", "least_squares", "samaan", "griffith"}
         ``three_stage`` is Ye & Yang 2017: interstar angles without distortion, linear distortion, interstar angles with
         both; its covariance is the sandwich of composite likelihood, from the scatter of frames if there are 50 for
@@ -152,7 +153,7 @@ def calibrate(
         Options of ``samaan`` and ``griffith``.
     noise : {"common", "model"}
         One noise for all stars (or one factor on what they state), or a variance that is fitted as a function of
-        radius, magnitude and frame, as far as the residuals ask for it: `Calibration.noise_model`. Everything that
+        radius, magnitude, frame and axis, as far as the residuals ask for it: `Calibration.noise_model`. Everything that
         takes the result then weighs the stars by it, and `sigma` is a factor on it. It needs the ``efficient`` method
         and the ``marginal`` likelihood.
     duplicates : {"refuse", "drop", "keep"}

@@ -222,7 +222,9 @@ def even_noise(found: Misfit, inflated: bool = False) -> Check:
     name, bound = "Evenness of the noise", f"p ≥ {MISFIT_P:g}"
     value = p_words(min((test.p_holm for test in tests), default=1.0))
     if not rejected:
-        sentence = "The noise does not change with radius, magnitude, time or frame beyond what the weights know of it."
+        sentence = (
+            "The noise does not change with radius, magnitude, time, frame or axis beyond what the weights know of it."
+        )
         return Check(name, Question.TRUSTWORTHY, Level.PASS, value, bound, sentence)
     changes = f"The residuals hold {join_words([test.name for test in rejected])}"
     if found.uneven is None and inflated:
