@@ -79,8 +79,8 @@ class EstimationSettings:
     noise: Annotated[
         settings.NoiseKind,
         typer.Option(
-            help="common (one noise for all stars), or model (fitted against radius, magnitude, frame and axis, as far as "
-            "the residuals ask for it)."
+            help="common (one noise for all stars), or model (fitted against radius, magnitude, frame and axis, as far "
+            "as the residuals ask for it)."
         ),
     ] = "common"
     start: Annotated[

@@ -153,9 +153,9 @@ def calibrate(
         Options of ``samaan`` and ``griffith``.
     noise : {"common", "model"}
         One noise for all stars (or one factor on what they state), or a variance that is fitted as a function of
-        radius, magnitude, frame and axis, as far as the residuals ask for it: `Calibration.noise_model`. Everything that
-        takes the result then weighs the stars by it, and `sigma` is a factor on it. It needs the ``efficient`` method
-        and the ``marginal`` likelihood.
+        radius, magnitude, frame and axis, as far as the residuals ask for it: `Calibration.noise_model`. Everything
+        that takes the result then weighs the stars by it, and `sigma` is a factor on it. It needs the ``efficient``
+        method and the ``marginal`` likelihood.
     duplicates : {"refuse", "drop", "keep"}
         What to do with frames that hold the same measurement as an earlier one, whatever their numbers, order and
         stars (`starcal_uq.estimation.repeated_frames`): they would count twice. ``drop`` leaves them out, there and in
