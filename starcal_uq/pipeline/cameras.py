@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 # A focal length that differs by more is another camera's; what frames scatter by is less.
 _APART = 0.003
 # Frames that no star is found for are asked for another camera when they have so many centroids, the richest first.
-_CENTROIDS, _ASKED = 8, 3
+_CENTROIDS, _ASKED = 12, 3
 
 
 @dataclass(frozen=True)

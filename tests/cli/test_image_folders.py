@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 import starcal_uq as sc
+from starcal_uq.cli.answers import Answer
 from starcal_uq.core.errors import CalibrationError
 from starcal_uq.pipeline.images import observations_from_images
 from tests.helpers.sky_pictures import SIZE, attitude, picture
@@ -34,12 +35,16 @@ def noisy_frame(tmp_path):
     return tmp_path / "frame.tiff"
 
 
-def test_a_model_that_is_asked_for_is_fitted_whatever_the_sheet_has(cli, noisy_frame, tmp_path):
+def test_a_model_that_is_asked_for_is_fitted_whatever_the_sheet_has(cli, noisy_frame, tmp_path, monkeypatch):
+    # What follows the calibration is not asked about.
+    monkeypatch.setattr("starcal_uq.cli.run._after_calibration", lambda *_, **__: None)
+    monkeypatch.setattr("starcal_uq.cli.run._conclude", lambda run: Answer({"run": run.path}))
     status, _, err = cli("run", noisy_frame, "camera.toml", "-o", "run", "--model", "none", *FAST)
     assert status in (0, 1), err
     assert sc.Run(tmp_path / "run").calibration.camera.distortion == "none"
 
 
+@pytest.mark.slow
 def test_images_fall_back_to_a_simpler_model_as_a_table_does(noisy_frame, tmp_path):
     camera = sc.Camera.load(tmp_path / "camera.toml")
     obs, _, found = observations_from_images([noisy_frame], camera)
@@ -90,6 +95,7 @@ def test_a_failed_identification_leaves_a_folder_with_every_frame(cli, tmp_path)
     assert [frame["outcome"] for frame in json.loads(out)["frames"]][1:3] == ["not identified", "not identified"]
 
 
+@pytest.mark.slow
 def test_stars_that_do_not_determine_the_camera_are_shown_as_well(cli, tmp_path):
     rng = np.random.default_rng(0)
     rng.integers(4)
@@ -153,7 +159,7 @@ def mixed_folder(tmp_path):
     return made
 
 
-@pytest.mark.parametrize(("longer", "with_sheet"), [(1.75, False), (1.015, True)])
+@pytest.mark.parametrize(("longer", "with_sheet"), [pytest.param(1.75, False, marks=pytest.mark.slow), (1.015, True)])
 def test_frames_of_another_camera_are_left_out(mixed_folder, tmp_path, longer, with_sheet):
     """One that is found by itself, and one that a sheet's tolerance takes for the same."""
     folder = mixed_folder(longer)

@@ -83,7 +83,7 @@ def test_the_pitch_can_be_stated(cli, stars, tmp_path):
     # The search for millimetres finds them where there are some.
     assert len(millimetres({"terminal": out})["terminal"]) == 1
     assert millimetres(dict(texts(tmp_path / "stated"))).keys() >= {"camera.toml", "calibrated.toml"}
-    assert "--pixel-um" not in out
+    assert "state it with --pixel-um" not in out
     with_pitch, without = sc.Run(tmp_path / "stated").calibration, sc.Run(tmp_path / "unknown").calibration
     assert with_pitch.camera.focal_px == pytest.approx(without.camera.focal_px, rel=1e-9)
     assert with_pitch.camera.focal_mm == pytest.approx(35.2866, abs=0.01)
