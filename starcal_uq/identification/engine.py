@@ -395,7 +395,8 @@ class _Attempt:
                 self.results = {k: other[k] if k in other else mirror.frame(field, k) for k in self.results}
         # Two attitudes that explain a frame are not told apart by knowing less.
         failed = [k for k in self._failed() if self.results[k].status != "ambiguous"]
-        if len(failed) > self.n_solved:
+        # What shows no lens at any focal length, however it bends, does not show a worse one.
+        if len(failed) > self.n_solved and (self.n_solved or not hopeless):
             worse = self.search.widened(_WORSE_LENS)
             other = _retry(worse, self.field, failed)
             self.results |= other
