@@ -35,7 +35,13 @@ def new_command(
     ] = None,
     near: Annotated[
         tuple[float, float] | None,
-        typer.Option("--near", metavar="LATITUDE LONGITUDE", help="Of a site: where it is, degrees, north and east."),
+        typer.Option(
+            "--near",
+            min=-180.0,
+            max=360.0,
+            metavar="LATITUDE LONGITUDE",
+            help="Of a site: where it is, degrees, north and east.",
+        ),
     ] = None,
     force: Force = False,
 ) -> Answer:

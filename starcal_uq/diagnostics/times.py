@@ -155,6 +155,7 @@ def time_test(obs: Observations, cal: Calibration, *, seed: int = 0) -> TimeTest
     return best
 
 
+@bounded
 def unseen_aberration(obs: Observations, cal: Calibration, *, seed: int = 0) -> UnseenAberration | None:
     """Ask how far annual aberration would move f without being seen in the residuals of a calibration.
 

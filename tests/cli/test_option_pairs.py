@@ -39,6 +39,7 @@ VALUES = {
     "--time": ("2026-11-25T02:00:00",),
     "--column": ("sigma_px=x_px / 10000",),
     "--only-frames": ("0-3", "9"),
+    "--pixel-um": ("12",),
     "--observer-velocity": ("7.5,0,0",),
     "--max-mag": ("5",),
     "--epoch": ("2020",),

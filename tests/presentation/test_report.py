@@ -277,7 +277,7 @@ def test_misfit_section_shows_tests_jackknife_models_and_replicates(full):
     section = text[text.rindex("Model error is in no posterior") : text.index("Fig. 3 of Ye")]
     for words_of in (
         "Error with the pixel phase in x",
-        "None of the 17 tests found any (overall p",
+        "None of the 19 tests found any (overall p",
         "Jackknife over frames",
         "No other model predicts left-out frames better than 'brown'",
         "brown (this report)",
