@@ -196,7 +196,7 @@ def _calibrate(
             error.args = (f"{error} Every frame, with its detections and its reason: {page}",)
         raise
     if from_images:
-        run.keep_images(centroids, identified.identification, identified, inputs)
+        run.keep_images(centroids, identified, inputs)
         _tell_other_cameras(run)
         finished(run.folder.path)
     if run.screening is not None:
@@ -228,7 +228,7 @@ def _keep_failed(
     sheet = None if camera is None else sc.Camera.load(camera)
     if sheet is None and identification is not None and identification.optics is not None:
         sheet = identification.nominal
-    run.keep_images(centroids, identification, None, inputs, sheet)
+    run.keep_images(centroids, identification, inputs, sheet)
     return run.keep_frames(run.frames.telling(_FAILED_FRAMES), force=True)
 
 

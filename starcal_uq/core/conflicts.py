@@ -63,6 +63,7 @@ RULES = (
     Rule("sampled", ("marginal",), "likelihood", (None, "marginal")),
     Rule("sampled", (*_COMPOSITE, "student_t"), "star_errors", (None, False)),
     Rule("sampled", (*_COMPOSITE, "student_t"), "partitioned", (None, False)),
+    Rule("evaluation", ("exact",), "partitioned", (None, False)),
     Rule("sampled", _COMPOSITE, "method", (None, "efficient", *_IN_MEMORY)),
     Rule("site", (), "in_space", (None, False)),
     Rule("site", (), "observer_velocity", (None,)),

@@ -84,7 +84,7 @@ def check_names(likelihood: Any, evaluation: Any, dof: Any, has_observations: bo
     if likelihood != "marginal":
         raise SamplingError(f"the likelihood {likelihood!r} needs the observations: give obs.")
     if evaluation == "exact":
-        raise SamplingError("the exact likelihood needs the observations: give obs, or use evaluation='compressed'.")
+        raise SamplingError("the exact likelihood needs the observations: give them, or evaluate the compressed form.")
 
 
 def label_of(likelihood: str | Likelihood) -> str:

@@ -11,14 +11,13 @@ from starcal_uq.core.display import Shown
 from starcal_uq.core.files import PathLike
 from starcal_uq.core.records import Saved
 from starcal_uq.pipeline.cameras import OtherCamera, other_cameras
-from starcal_uq.pipeline.refine import identified_pairs
+from starcal_uq.pipeline.refine import ImageCalibration, identified_pairs
 
 if TYPE_CHECKING:
     from starcal_uq.estimation.calibration import Calibration
     from starcal_uq.identification.result import Identification
     from starcal_uq.images.centroids import Centroids
     from starcal_uq.observations.table import Observations
-    from starcal_uq.pipeline.refine import ImageCalibration
 
 # File in the run folder.
 IMAGES = "images.json"
@@ -78,16 +77,15 @@ class ImageRecord(Shown, Saved):
 
 
 def record_images(
-    centroids: Centroids,
-    last: Identification | None,
-    images: ImageCalibration | None = None,
-    sources: Sequence[PathLike] = (),
+    centroids: Centroids, images: ImageCalibration | Identification | None, sources: Sequence[PathLike] = ()
 ) -> ImageRecord:
     """The record of images with their last identification and the rounds to it, as far as there are any.
 
     `sources` are the files and folders that the images came from.
     """
-    first = last if images is None else images.rounds[0][0]
+    calibrated = images if isinstance(images, ImageCalibration) else None
+    last = images.identification if isinstance(images, ImageCalibration) else images
+    first = last if calibrated is None else calibrated.rounds[0][0]
     counted = {frame.frame: frame.n_identified for frame in first.frames} if first is not None else {}
     by_frame = {frame.frame: frame for frame in last.frames} if last is not None else {}
     rows = []
@@ -106,10 +104,10 @@ def record_images(
             )
         )
     rounds, before = [], None
-    for identification, obs, calibration in () if images is None else images.rounds:
+    for identification, obs, calibration in () if calibrated is None else calibrated.rounds:
         rounds.append(_recorded(identification, obs, calibration, before))
         before = identification
-    disturbed = 0 if images is None else images.observations.meta.get("disturbed_stars", 0)
+    disturbed = 0 if calibrated is None else calibrated.observations.meta.get("disturbed_stars", 0)
     places = tuple(os.path.abspath(source) for source in sources)
     parity, limit = ("normal", None) if last is None else (last.parity, last.observations.meta.get("max_mag"))
     return ImageRecord(tuple(rounds), tuple(rows), int(disturbed), parity, places, limit, other_cameras(centroids))

@@ -679,21 +679,22 @@ class Run:
     def keep_images(
         self,
         centroids: Centroids,
-        identification: Identification | None,
-        images: ImageCalibration | None = None,
+        images: ImageCalibration | Identification | None,
         sources: Sequence[PathLike] = (),
         camera: Camera | None = None,
     ) -> None:
         """Keep centroids, matches and the record of every image that the run started from, and where these are.
 
-        Where nothing is calibrated there are no `images`, and perhaps no identification; the `camera` is kept then.
+        Where nothing is calibrated, `images` is the identification, if there is one, and the `camera` is kept too.
         """
         from starcal_uq.pipeline.images import CENTROIDS, IDENTIFICATION, MATCHED
         from starcal_uq.pipeline.record import IMAGES, record_images
+        from starcal_uq.pipeline.refine import ImageCalibration
 
         with self._step("images", None, {}) as files:
             centroids.save(files.path / CENTROIDS)
-            record_images(centroids, identification, images, sources).save(files.path / IMAGES)
+            record_images(centroids, images, sources).save(files.path / IMAGES)
+            identification = images.identification if isinstance(images, ImageCalibration) else images
             if identification is not None:
                 write_csv(identification.to_dataframe(), files.path / IDENTIFICATION)
             if identification is not None and identification.n_identified:

@@ -404,7 +404,9 @@ def test_a_run_with_priors_goes_to_the_end(tmp_path, cli):
     assert status == 2 and "do not determine" in err and not (tmp_path / "run" / "calibration.json").exists()
     status, out, err = cli(*command, *sampling, "--priors", tmp_path / "priors.toml")
     assert status in (0, 1), err
-    assert (
-        "there the posterior is that of the priors" in " ".join(out.split())
-        and (tmp_path / "run" / "report.html").exists()
-    )
+    verdict = json.loads((tmp_path / "run" / "verdict.json").read_text("utf-8"))
+    assert "estimation (warning, singular)" in " ".join(out.split())
+    assert any("there the posterior is that of the priors" in check["sentence"] for check in verdict["checks"])
+    # Two checks ask for more steps, one of them for ten times as many: one command.
+    assert sum(" sample " in command for command in verdict["commands"]) == 1
+    assert (tmp_path / "run" / "report.html").exists()

@@ -6,6 +6,7 @@ may be used by someone who has read it.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
@@ -134,12 +135,25 @@ def _way_on(checks: tuple[Check, ...], place: Place | None) -> tuple[tuple[str, 
         if some[0].level is Level.FAIL and (every or cause == INPUT):
             # What comes after it in the order may be its consequence.
             break
-    commands = tuple(dict.fromkeys(every))[:MOST_COMMANDS]
+    commands = _largest(every)[:MOST_COMMANDS]
     tried = () if place is None else place.tried
     if worst(doubts) is not Level.FAIL or (commands and not (place is not None and place.exhausted(doubts))):
         return commands, ""
     steps = f" (tried: {'; '.join(one.text for one in tried)})" if tried else ""
     return (), f"No model here explains this{steps}. What would tell: {telling(doubts)}."
+
+
+def _largest(commands: Sequence[str]) -> tuple[str, ...]:
+    """Commands without repeats; of those that differ in whole numbers alone, such as steps, that with the largest."""
+    found: dict[str, str] = {}
+    for command in commands:
+        form = re.sub(r"(?<= )\d+(?= |$)", "N", command)
+        found[form] = max(found.get(form, command), command, key=_whole_numbers)
+    return tuple(found.values())
+
+
+def _whole_numbers(command: str) -> list[int]:
+    return [int(word) for word in command.split() if word.isdigit()]
 
 
 def _named(checks: Sequence[Check], level: Level) -> str:
