@@ -63,7 +63,7 @@ VALUES = {
 ALWAYS = {"--out": "out", "--force": None, "--ensembles": "2", "--walkers": "16", "--steps": "20", "--draws": "50"}
 # What a sentence for the command line has no words of: arguments, calls and attributes of Python.
 PYTHON = re.compile(r"[a-z_]+='|[a-z_]+=(True|None)|\bsc\.|obs\.|, not both\.$|\(throw|Traceback")
-# These change which stars are calibrated, or where they are, and need a scheduler: with wrong directions no run ends well.
+# These change which stars are calibrated or where they are, or need a scheduler: wrong directions end no run well.
 OF_THE_DATA = {"--only-frames", "--max-mag", "--column", "--directions", "--site", "--observer-velocity", "--scheduler"}
 # Whole runs of the slow test.
 ROWS = 8

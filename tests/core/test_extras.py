@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import re
 import sys
 from collections.abc import Callable
@@ -27,6 +28,8 @@ PREVIOUS = Path(__file__).parents[1] / "runs" / "data" / "previous"
 
 def hide(monkeypatch: pytest.MonkeyPatch, library: str) -> None:
     """With what is imported of it already."""
+    # What other tests left, such as a client without a scheduler, imports when it is removed.
+    gc.collect()
     for name in [library, *(name for name in sys.modules if name.startswith(f"{library}."))]:
         monkeypatch.setitem(sys.modules, name, None)
 
