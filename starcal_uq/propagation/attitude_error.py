@@ -459,13 +459,14 @@ def choice_words(error: AttitudeError) -> str:
         return ""
     names = join_words([repr(name) for name in error.misfit.choice_models])
     verb = "predicts" if len(error.misfit.choice_models) == 1 else "predict"
-    common, rest = (
-        f"{significant(float(row[3]))} arcsec across the boresight and {significant(float(row[2]))} in roll"
-        for row in error.choice_of_model_arcsec[1:3]
-    )
+    moved = []
+    for what, row in zip(("the common rotation", "the rest"), error.choice_of_model_arcsec[1:3], strict=True):
+        sizes = ((row[3], "across the boresight"), (row[2], "in roll"))
+        stated = [f"{significant(float(size))} arcsec {where}" for size, where in sizes if size > 0.0]
+        moved += [f"{what} by up to {join_words(stated)}"] if stated else []
     return (
         f"{CHOICE_OF_MODEL[0].upper()}{CHOICE_OF_MODEL[1:]}, in none of these errors: {names} {verb} about as well as "
-        f"the fitted model, and would move the common rotation by up to {common}, the rest by up to {rest}."
+        f"the fitted model, and would move {', '.join(moved)}."
     )
 
 
