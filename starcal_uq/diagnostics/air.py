@@ -4,12 +4,12 @@ Air raises a star at zenith distance z by about A tan z: what the attitude and t
 compression towards the zenith that grows with z. Where frames have times, a place on the Earth has one zenith for each;
 without times all frames are taken to be of one moment. For places all over the globe from which every star was
 above the horizon, the amplitude of refraction is fitted in units of the standard air's; the largest amplitude in its
-sigmas is held against the largest of as many that noise gives, which are as correlated as their shapes. Frames without
+sigmas is compared with the largest of as many that noise gives, which are as correlated as their shapes. Frames without
 times that are not of one moment get a zenith each.
 
 Noise is that of the calibration: its model of the images' noise, and the direction errors of stars that it fitted or,
 where it fitted none, that the stars which recur show. Terms that the lens may lack are fitted beside the air. What
-these explain as well as air does cannot be told from it.
+these explain as well as air does cannot be separated from it.
 """
 
 from __future__ import annotations

@@ -117,7 +117,7 @@ class MisfitTest:
     moved_name : str
         That parameter.
     moved_std : float
-        Standard error of that change, in the same unit: large where the shapes can hardly be told from the parameter.
+        Standard error of that change, in the same unit: large where shapes can hardly be separated from the parameter.
     detectable_px : float
         Root mean square per axis of a pattern that the test finds nine times in ten, at level ALPHA of all tests
         together, px; NaN for unequal noise.

@@ -221,7 +221,7 @@ class Fit:
         `alpha` is the level of a single test; what does not reach it beside those before is left out. A family without
         labels is a basis for any smooth misfit: amplitudes of the first one, and of all that come after it, have a
         prior. One over the field counts with all of its shapes, as a misfit has no reason to be only where attitudes
-        and parameters leave it in sight; terms of a known form are then no longer told from it.
+        and parameters leave it in sight; terms of a known form are then no longer separated from it.
         """
         size = len(self.gram) - self.p - 1
         left, places = dict(families), {name: place for name, (_, place) in families.items()}

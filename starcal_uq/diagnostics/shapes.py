@@ -29,7 +29,7 @@ _RADIAL_DEGREE, _TWIST_DEGREE = 6, 3
 _TIME_DEGREE = 3
 _STARS_PER_CELL = 25.0
 MAX_CELLS = 8
-# What shapes are held against that keep their place in the field, and with the directions of one frame.
+# Coordinates of shapes that keep their place in the field, and those of the directions of one frame.
 IN_FIELD = ("radius", "azimuth", "field", "field cells")
 OVER_FIELD = (*IN_FIELD, "direction")
 FRAME_BY_FRAME = "scale and shape that change from frame to frame"

@@ -202,7 +202,7 @@ class BlindSearch:
         self.sky = NearbyStars(stars.directions_icrs, stars.mag, self.geometry)
 
     def sizes(self, most: int, focal_px: tuple[float, float]) -> list[int]:
-        """Levels of at most so many stars, of which a field shows enough."""
+        """Levels with at most this number of stars, of which a field shows enough."""
         return [n for n in LEVELS if n <= most and _useful(n, self.width * self.height, focal_px)]
 
     def candidates(self, u: FloatArray, sigma_px: FloatArray, sizes: list[int], focal_px: tuple[float, float]) -> _Seen:

@@ -468,7 +468,7 @@ def _with(sheet: Camera, tolerance: CameraTolerance, optics: FoundOptics, told: 
 
 
 def _bending(tolerance: CameraTolerance, camera: Camera, bend_px: float) -> CameraTolerance:
-    """Tolerances for a lens that bends by so much at the corner, whatever is said of that."""
+    """Tolerances for a lens that bends by this much at the corner, whatever the sheet states."""
     return replace(
         tolerance,
         centre_px=max(tolerance.centre_px, _CENTRE * camera.width_px),

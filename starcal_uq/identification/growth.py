@@ -2,7 +2,7 @@
 
 The stars that a search at any focal length matched lie where a pinhole is right to a pixel. Attitude, focal length,
 principal point and two radial terms are fitted to them and predict the stars around them, each with its uncertainty. A
-star is looked for within that, but only among so many of the brightest that hardly one would be met there by chance;
+star is looked for within that, but only among as many of the brightest as leave hardly one there by chance;
 the fit to all that are found reaches farther, until nothing more is found. The number of brightest stars and
 centroids that are compared follows from the uncertainty, at each place.
 """

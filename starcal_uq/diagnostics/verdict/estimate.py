@@ -176,7 +176,7 @@ def one_camera(found: MixedCameras) -> Check:
     return Check("One camera", Question.TRUSTWORTHY, Level.FAIL, f"{found.n} cameras", "1", sentence, remedy)
 
 
-# Errors by which a change of a parameter is told from none, and growth of its error that is far.
+# Standard errors by which a change of a parameter differs from none, and growth of its error that is far.
 _HARDLY_TOLD = 3.0
 
 
@@ -206,7 +206,7 @@ def misfit(found: Misfit, cal: Calibration, attitude: AttitudeError | None = Non
 
 
 def _hardly_told(test: MisfitTest) -> str:
-    """That shapes can hardly be told from the parameter that they move, as a further sentence; else nothing."""
+    """Statement that shapes can hardly be separated from the parameter that they move; else nothing."""
     if not test.moved_std > _HARDLY_TOLD or test.moved_sigma > _HARDLY_TOLD * test.moved_std:
         return ""
     return (

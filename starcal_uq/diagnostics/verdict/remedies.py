@@ -1,4 +1,4 @@
-"""What to try: the options that a check asks for, among those that the run was made with, as a command to copy.
+"""Commands to try: the options that a check requests, among those that the run was made with, as a command to copy.
 
 A remedy changes options. They take the place of those of the same name, the whole has to pass what the command line
 asks of it (`starcal_uq.core.conflicts`), and what the run or one before it in the same folder was made with already is
@@ -68,7 +68,7 @@ _ENDS = {
 
 @dataclass(frozen=True)
 class Tried:
-    """A run of before in the same folder and of the same data: its options, and how many checks did not pass."""
+    """An earlier run in the same folder and of the same data: its options, and how many checks did not pass."""
 
     options: Options
     failed: int
