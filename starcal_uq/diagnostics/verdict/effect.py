@@ -1,7 +1,8 @@
 """The one rule for the level of a check of the model: it fails where the misfit does more than is stated.
 
 Residuals of many stars show what is too small to matter. So what a misfit does to parameters, directions and
-attitudes is compared with their stated standard deviations: up to one of these the check warns, beyond that the numbers are wrong.
+attitudes is compared with their stated standard deviations: up to one of these the check warns, beyond that the
+numbers are wrong.
 """
 
 from __future__ import annotations
