@@ -281,7 +281,6 @@ ELSEWHERE = {
 
 # Arguments that sentences advise, and a call with each.
 ARGUMENTS = {
-    "evaluation='compressed'": "sc.sample(None, cal, n_ensembles=2, n_walkers=14, n_steps=20, {})",
     "evaluation='exact'": "sc.sample(obs, cal, n_ensembles=2, n_walkers=14, n_steps=20, {})",
     "likelihood='marginal'": "sc.sample(obs, cal, n_ensembles=2, n_walkers=14, n_steps=20, {})",
     "likelihood='pairs'": "sc.sample(obs, cal, n_ensembles=2, n_walkers=14, n_steps=20, {})",
