@@ -22,6 +22,7 @@ from starcal_uq.propagation.alignment import alignment_weights
 from starcal_uq.propagation.attitude_error import AttitudeError
 from starcal_uq.propagation.propagate import FrameGeometry
 from tests.helpers.outside import Campaign, attitude_errors, campaign
+from tests.helpers.posteriors import normal_posterior
 
 CORNER = 512.0 * np.sqrt(2.0)
 
@@ -37,16 +38,7 @@ def assessed(seed: int, n_frames: int, **options: Any) -> SimpleNamespace:
     c = campaign(np.random.default_rng(seed), n_frames=n_frames, **options)
     obs = sc.Observations(**c.columns, meta={"directions": "apparent"})
     cal = sc.calibrate(obs, sc.Camera(**c.camera_toml(), coefficients=(0.0, 0.0)))  # type: ignore[arg-type]
-    post: Any = SimpleNamespace(
-        camera=cal.camera,
-        mean=cal.theta,
-        covariance=cal.covariance,
-        sigma_draws=np.array([cal.sigma]),
-        sigma_name=cal.sigma_name,
-        provenance=cal.provenance,
-        star_error_px=0.0,
-        inflation=None,
-    )
+    post = normal_posterior(cal)
     frames = FrameGeometry.of(post, obs)
     weights, _ = alignment_weights(frames.noise_covariance)
     together = np.einsum("nij,njp->ip", weights, frames.response)

@@ -21,6 +21,7 @@ from starcal_uq.diagnostics.inflation import with_misfit
 from starcal_uq.diagnostics.misfit import misfit_tests
 from starcal_uq.propagation.attitude_error import AttitudeError
 from tests.helpers.outside import Campaign, attitude_errors, campaign
+from tests.helpers.posteriors import normal_posterior
 
 WIDTH, HEIGHT, FOCAL = 1280, 960, 2657.0
 # Scales of single frames, as refraction makes them.
@@ -96,15 +97,7 @@ def errors(seed: int, scales: FloatArray = SCALES, rms_px: float = 0.2) -> Error
         coefficients=(0.0, 0.0),
     )
     cal = sc.calibrate(obs, sheet)
-    post: Any = SimpleNamespace(
-        camera=cal.camera,
-        mean=cal.theta,
-        covariance=cal.covariance,
-        sigma_draws=np.array([cal.sigma]),
-        sigma_name=cal.sigma_name,
-        provenance=cal.provenance,
-        star_error_px=0.0,
-    )
+    post = normal_posterior(cal)
     diagnosis: Any = SimpleNamespace(
         misfit=misfit_tests(obs, cal), jackknife=None, comparison=None, theta=cal.theta.tolist()
     )

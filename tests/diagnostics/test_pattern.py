@@ -16,6 +16,7 @@ from starcal_uq.diagnostics.inflation import with_misfit
 from starcal_uq.diagnostics.misfit import Misfit, misfit_tests
 from starcal_uq.propagation.attitude_error import AttitudeError
 from tests.helpers.outside import Campaign, attitude_errors, campaign, slew
+from tests.helpers.posteriors import normal_posterior
 
 CORNER = 512.0 * np.sqrt(2.0)
 CELSIUS = np.random.default_rng(9).uniform(5.0, 35.0, 1000)
@@ -79,15 +80,7 @@ def calibrated(planted: str, seed: int = 1) -> SimpleNamespace:
 
 def questioned(obs: sc.Observations, cal: sc.Calibration) -> SimpleNamespace:
     """A calibration with its tests; the posterior is the normal approximation."""
-    post = SimpleNamespace(
-        camera=cal.camera,
-        mean=cal.theta,
-        covariance=cal.covariance,
-        sigma_draws=np.array([cal.sigma]),
-        sigma_name=cal.sigma_name,
-        provenance=cal.provenance,
-        star_error_px=0.0,
-    )
+    post = normal_posterior(cal)
     diagnosis = SimpleNamespace(
         misfit=misfit_tests(obs, cal), jackknife=None, comparison=None, theta=cal.theta.tolist()
     )
